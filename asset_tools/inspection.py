@@ -12,7 +12,7 @@ from typing import TypeAlias
 from asset_tools.reading.limits import SECONDS, reading_limits
 from asset_tools.reading.model import read_model
 from robocas_ms3.core.errors import AssetError, RobocasError
-from robocas_ms3.core.processes import Calls, Limits, Pool
+from robocas_ms3.core.workers import FunctionWorker, Limits, WorkerPool
 
 Inspect: TypeAlias = "Callable[[Mapping[str, ModelSource]], Mapping[str, Inspection]]"
 
@@ -64,9 +64,8 @@ def inspect_models(
         What was found, by id; models that can't be read have an error.
     """
     limits, found = Limits(SECONDS + GRACE, MEMORY_GB), {}
-    count = min(processes, len(models))
-    with Pool(partial(Calls, _inspect), count, died=_died, here=not count, limits=limits) as pool:
-        for id_, inspection in pool.do(models.items()):
+    with WorkerPool(partial(FunctionWorker, _inspect), processes, limits=limits, on_crash=_crashed) as pool:
+        for id_, inspection in pool.map(models.items(), ordered=False):
             found[id_] = inspection
             on_inspected()
     return {id_: found[id_] for id_ in models}
@@ -86,6 +85,6 @@ def _inspect(task: tuple[str, ModelSource]) -> tuple[str, Inspection]:
         return id_, Inspection(error=AssetError("can't read this model", where=source.paths[0], found=found))
 
 
-def _died(task: tuple[str, ModelSource], why: str) -> tuple[str, Inspection]:
+def _crashed(task: tuple[str, ModelSource], why: str) -> tuple[str, Inspection]:
     id_, source = task
     return id_, Inspection(error=AssetError("the process that read the model died", where=source.paths[0], found=why))

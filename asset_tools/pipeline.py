@@ -29,8 +29,8 @@ from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import AssetError, RobocasError
 from robocas_ms3.core.files import replacing_folder, write_json
 from robocas_ms3.core.outputs import check_overwrite
-from robocas_ms3.core.processes import Calls, Pool
 from robocas_ms3.core.strict import validate_json
+from robocas_ms3.core.workers import FunctionWorker, WorkerPool
 
 MADE_FROM = "made_from.json"  # of a pack: asset id -> hash of what it was made from
 ENTRY = "asset.json"  # what the manifest says of a kept asset; written last
@@ -167,11 +167,12 @@ def _code(package: str) -> str:
 
 
 def _run(todo: list[tuple[Job, Path]], processes: int) -> Iterator[tuple[JobResult, Path]]:
-    with Pool(partial(Calls, _make), min(processes, len(todo)), died=_died) as pool:
-        yield from pool.do(todo)
+    workers = processes if min(processes, len(todo)) > 1 else 0
+    with WorkerPool(partial(FunctionWorker, _make), workers, on_crash=_crashed) as pool:
+        yield from pool.map(todo, ordered=False)
 
 
-def _died(task: tuple[Job, Path], why: str) -> tuple[JobResult, Path]:
+def _crashed(task: tuple[Job, Path], why: str) -> tuple[JobResult, Path]:
     job, place = task
     return JobResult(job.id, None, f"{job.id}: the process that made it died ({why}); is there memory enough?"), place
 

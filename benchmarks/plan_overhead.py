@@ -44,7 +44,7 @@ class Wait:
 
     seconds: float
 
-    def do(self, task: Task) -> dict[str, Any]:
+    def run(self, task: Task) -> dict[str, Any]:
         """Do nothing for a while."""
         time.sleep(self.seconds)
         return {"success": True, "steps": 1}

@@ -11,8 +11,7 @@ from asset_tools.quality.measure import HULL_VERTICES, Violation, remeasure
 from robocas_ms3.assets.manifest import FurnitureQuality, ObjectQuality
 from robocas_ms3.assets.pack import LoadedFurniture, LoadedObject, Pack
 from robocas_ms3.core.errors import AssetError
-from robocas_ms3.core.processes import Calls
-from robocas_ms3.core.processes import Pool as Processes
+from robocas_ms3.core.workers import FunctionWorker, WorkerPool
 
 Quality = ObjectQuality | FurnitureQuality
 
@@ -24,8 +23,9 @@ def remeasure_pack(pack: Pack, processes: int = 1) -> Iterator[tuple[str, Qualit
         AssetError: the process that measured one died.
     """
     assets = [*pack.objects.values(), *pack.furniture.values()]
-    with Processes(partial(Calls, _measure), min(processes, len(assets)), died=_died) as pool:
-        yield from pool.do(assets, in_order=True)
+    workers = processes if min(processes, len(assets)) > 1 else 0
+    with WorkerPool(partial(FunctionWorker, _measure), workers, on_crash=_raise_crash) as pool:
+        yield from pool.map(assets)
 
 
 FURNITURE_HEADER = ("furniture", "hulls", "vertices", "joints that work %", "surfaces that hold %")
@@ -59,6 +59,6 @@ def _measure(asset: LoadedObject | LoadedFurniture) -> tuple[str, Quality]:
     return asset.asset.id, remeasure(asset) if isinstance(asset, LoadedObject) else measure_furniture(asset)
 
 
-def _died(asset: LoadedObject | LoadedFurniture, why: str) -> NoReturn:
+def _raise_crash(asset: LoadedObject | LoadedFurniture, why: str) -> NoReturn:
     fix = "Is memory short? Use fewer --jobs."
     raise AssetError("the process that measured it died", where=asset.asset.id, found=why, fix=fix)

@@ -19,7 +19,7 @@ from robocas_ms3.assets.hulls import Array, box_of, read_hulls, slenderness
 from robocas_ms3.assets.pack import HULLS
 from robocas_ms3.assets.physics import cook
 from robocas_ms3.core.errors import AssetError
-from robocas_ms3.core.processes import Calls, Pool
+from robocas_ms3.core.workers import FunctionWorker, WorkerPool
 
 # m that a hull may lose anywhere: PhysX leaves out vertices, and makes faces one, within 0.7 mm each
 SHRINKAGE = 0.0015
@@ -82,11 +82,11 @@ def cooking_faults(folder: Path) -> list[CookingFault]:
         return []
     pieces = [vertices for _, _, vertices in named]
 
-    def died(task: object, why: str) -> NoReturn:
+    def raise_crash(task: object, why: str) -> NoReturn:
         raise AssetError("the process that cooked its hulls died", where=folder, found=why, fix="Is memory short?")
 
-    with Pool(_as_a_gpu_does, 1, died=died, here=False) as pool:
-        (on_gpu,) = pool.do([pieces])
+    with WorkerPool(_as_a_gpu_does, 1, on_crash=raise_crash) as pool:
+        on_gpu = pool.run(pieces)
     ways = {"GPU": on_gpu, "CPU": cook_hulls(pieces)}
     return [
         CookingFault(name, number, way, result)
@@ -112,6 +112,6 @@ def cook_hulls(hulls: Sequence[Array]) -> list[CookedHull]:
     return results
 
 
-def _as_a_gpu_does() -> Calls[Sequence[Array], list[CookedHull]]:
+def _as_a_gpu_does() -> FunctionWorker[Sequence[Array], list[CookedHull]]:
     physx._enable_gpu()
-    return Calls(cook_hulls)
+    return FunctionWorker(cook_hulls)

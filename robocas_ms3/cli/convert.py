@@ -137,8 +137,8 @@ def _format(cfg: Convert) -> Format:
 def _convert(cfg: Convert) -> int:
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.terminal import say
-    from robocas_ms3.core.processes import Limits
     from robocas_ms3.core.words import count_of
+    from robocas_ms3.core.workers import Limits
     from robocas_ms3.datasets.pictures.stored import Pictures
 
     chosen = _format(cfg)

@@ -118,9 +118,9 @@ def run(cfg: Eval) -> int:
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.eval_results import write_pages
     from robocas_ms3.cli.terminal import say, say_lines
-    from robocas_ms3.core.processes import Limits, use_one_torch_thread
     from robocas_ms3.core.strict import check_number
     from robocas_ms3.core.words import count_of
+    from robocas_ms3.core.workers import Limits, use_one_torch_thread
     from robocas_ms3.evaluation.policies import check_policy, open_policy
     from robocas_ms3.evaluation.protocol import load_protocol
     from robocas_ms3.evaluation.results import read

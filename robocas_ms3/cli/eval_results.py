@@ -104,7 +104,7 @@ def videos(folder: Path, protocol: str | None, policy: str, count: int) -> int:
     if name not in {*POLICIES.builtin, *POLICIES.entry_points} and policy != name:
         fix = f"Name it yourself, if you trust it: --policy {name}"
         raise EvaluationError("this result is of a policy of somebody's own", where=folder, found=name, fix=fix)
-    from robocas_ms3.core.processes import use_one_torch_thread
+    from robocas_ms3.core.workers import use_one_torch_thread
     from robocas_ms3.evaluation.videos import failed_of_each_kind, film
 
     use_one_torch_thread()

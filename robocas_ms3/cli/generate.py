@@ -95,7 +95,7 @@ def run(cfg: Generate) -> int:
     loaded = load_task_config(name, overrides=cfg.set)  # before seconds go by for what is imported next
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.terminal import say
-    from robocas_ms3.core.processes import Limits
+    from robocas_ms3.core.workers import Limits
     from robocas_ms3.demos.checks import check_limits
     from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings, recordable_config
     from robocas_ms3.demos.generate import generate

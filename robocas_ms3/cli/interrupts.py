@@ -5,15 +5,13 @@ Python can't handle a signal during a long native call. There the second Ctrl-C 
 
 from __future__ import annotations
 
-import atexit
 import os
 import signal
 import sys
 import threading
-from contextlib import suppress
 from types import FrameType
 
-from robocas_ms3.core.exits import handle_interrupt
+from robocas_ms3.core.exits import end_process, handle_interrupt
 
 INTERRUPTED = 130  # what a shell reports of a program that Ctrl-C ended
 _TERMINATED = 143  # and of one that `timeout`, `kill` or a batch system did
@@ -29,13 +27,9 @@ def heed_ctrl_c() -> None:
 
 
 def leave(code: int) -> None:
-    """Leave the process, without what torch and SAPIEN do in the end, which takes a second, if it was interrupted."""
+    """Leave the process, at once if it was interrupted."""
     if code == INTERRUPTED:
-        atexit._run_exitfuncs()
-        for stream in (sys.stdout, sys.stderr):
-            with suppress(OSError, ValueError):
-                stream.flush()
-        os._exit(_code)
+        end_process(_code)
     sys.exit(code)
 
 

@@ -49,7 +49,7 @@ def main(cfg: Replay) -> int:
 
     trajectory = cfg.trajectory / "trajectory.h5" if cfg.trajectory.is_dir() else cfg.trajectory
     total = len(read_json(trajectory)["episodes"][: cfg.count])
-    from robocas_ms3.core.processes import use_one_torch_thread
+    from robocas_ms3.core.workers import use_one_torch_thread
     from robocas_ms3.demos.replay import replay  # takes seconds to import
 
     use_one_torch_thread()

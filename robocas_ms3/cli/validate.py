@@ -79,7 +79,7 @@ def main(cfg: Validate) -> int:
 
 def _replay(root: Path, pack: str | None) -> ReplayReport:
 
-    from robocas_ms3.core.processes import use_one_torch_thread
+    from robocas_ms3.core.workers import use_one_torch_thread
     from robocas_ms3.datasets.checks.replay import replay_dataset
 
     use_one_torch_thread()

@@ -77,6 +77,14 @@ class MissingExtraError(RobocasError):
     """An optional dependency is needed; the message names the extra that brings it."""
 
 
+class WorkerCrashed(RobocasError):
+    """A worker process crashed, or was killed because its task exceeded a limit; ``found`` is the reason."""
+
+
+class WorkerStartError(RobocasError):
+    """A worker process died before its first task."""
+
+
 class VectorEnvError(RobocasError):
     """Several environments at once can't be made, or can't go on."""
 

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from traceback import extract_tb
 from types import FrameType
-from typing import Any
+from typing import Any, NoReturn
 
 from robocas_ms3.core.errors import ExtensionError
 
 Handler = Callable[[int, FrameType | None], Any]
+_PR_SET_PDEATHSIG = 1
 _SECOND = 0.5  # s from one SIGINT to the next that is a second one; sooner, it is the same key pressed, sent twice
 
 
@@ -136,6 +139,27 @@ def uninterrupted() -> Iterator[None]:
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
             _command.holds -= 1
+
+
+def end_process(code: int) -> NoReturn:
+    """Run exit functions, and end the process without what torch and SAPIEN do then: it takes a second, or crashes."""
+    atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError, AttributeError):  # a closed one, or none, as in a service
+            stream.flush()
+    os._exit(code)
+
+
+def die_with_parent(parent: int) -> None:
+    """Have the system kill this process as soon as the thread that started it ends; on Linux alone.
+
+    Args:
+        parent: process id of the parent, which may have ended before this call.
+    """
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != parent:
+            os.kill(os.getpid(), signal.SIGKILL)
 
 
 @contextmanager

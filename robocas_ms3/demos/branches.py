@@ -21,7 +21,7 @@ from multiprocessing.connection import Connection
 from typing import Any, NoReturn, TypeVar
 
 from robocas_ms3.core.errors import PlanningFailed
-from robocas_ms3.core.processes import SentError
+from robocas_ms3.core.sent_errors import SentError
 from robocas_ms3.demos.backtracking import DeadEnd, Tally, turns
 from robocas_ms3.demos.forking import Child, ChildCrash, ChildGone, fork, set_up_child
 from robocas_ms3.planning.decisions import ONE_BY_ONE, Effort

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import gc
 import logging
 import os
@@ -17,8 +16,8 @@ from typing import Any, cast
 import torch
 
 from robocas_ms3.core.errors import RobocasError
+from robocas_ms3.core.exits import die_with_parent
 
-_PR_SET_PDEATHSIG = 1
 _log = logging.getLogger(__name__)
 
 
@@ -93,9 +92,7 @@ def fork() -> Child | Connection:
 
 def set_up_child(parent: int) -> None:
     """Set right what a child has to before anything else; the system kills it when the process ``parent`` ends."""
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:  # it ended before that
-        os._exit(0)
+    die_with_parent(parent)
     gc.freeze()  # a collection that walks all objects would copy all of the parent's memory
     # Threads that are not here may hold the locks of the parent's streams. A line is written as soon as it ends, since
     # a child ends without ado. Where there is no stream, as in a service, none is opened.

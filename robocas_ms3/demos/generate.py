@@ -14,7 +14,7 @@ import numpy as np
 from robocas_ms3.core.errors import DatasetError, RobocasError
 from robocas_ms3.core.files import flush_to_disk, make_folder, write_json
 from robocas_ms3.core.outputs import FolderKind, OutputFolder
-from robocas_ms3.core.processes import Limits, Worker
+from robocas_ms3.core.workers import Limits, Worker
 from robocas_ms3.demos.checks import WEIGHTS, check_arguments, upgrade_run
 from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings
 from robocas_ms3.demos.ledger import FAILURES_FILE, Failure, Ledger, count_by_stage, failed_attempts

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-import multiprocessing
 from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
-from robocas_ms3.core.processes import NO_LIMITS, Limits, Pool, Worker, use_one_torch_thread
+from robocas_ms3.core.workers import NO_LIMITS, Limits, Worker, WorkerPool, use_one_torch_thread
 from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings
 from robocas_ms3.demos.ledger import Failure
 from robocas_ms3.demos.takeover import Takeover
 
 if TYPE_CHECKING:
     from robocas_ms3.demos.generator import EpisodeGenerator
+
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
 
 
 def shard_name(seed: int) -> str:
@@ -39,17 +42,21 @@ def generate_seeds(
     Where ``players`` act first they do so in as many processes of their own, ahead of the generators: what renders, or
     uses CUDA, can't go back by forking.
     """
-    opened, here = partial(_open, settings, folder, fork), jobs <= 1 and limits is None
-    bounds = limits or NO_LIMITS
+    num_workers = 0 if jobs <= 1 and limits is None else jobs
+
+    def pool(
+        make_worker: Callable[[], Worker[Task, Result]], on_crash: Callable[[Task, str], Result]
+    ) -> WorkerPool[Task, Result]:
+        in_process = partial(_make_in_process, make_worker) if num_workers else make_worker
+        return WorkerPool(in_process, num_workers, limits=limits or NO_LIMITS, on_crash=on_crash)
+
     with ExitStack() as stack:
         tasks: Iterator[int | Takeover] = seeds
         if players is not None:
-            acting = stack.enter_context(
-                Pool(players, jobs, died=partial(_none_left, settings.after_policy), here=here, limits=bounds)
-            )
-            tasks = stack.enter_context(closing(acting.do(seeds, in_order=True)))
-        pool = stack.enter_context(Pool(opened, jobs, died=_died, here=here, limits=bounds))
-        yield from pool.do(tasks, in_order=True)
+            acting = stack.enter_context(pool(players, partial(_none_left, settings.after_policy)))
+            tasks = stack.enter_context(closing(acting.map(seeds)))
+        generating = stack.enter_context(pool(partial(_open, settings, folder, fork), _crashed))
+        yield from generating.map(tasks)
 
 
 @dataclass(frozen=True)
@@ -59,7 +66,7 @@ class _Generates:
     generator: EpisodeGenerator
     folder: Path
 
-    def do(self, task: int | Takeover) -> EpisodeResult:
+    def run(self, task: int | Takeover) -> EpisodeResult:
         seed, takeover = (task, None) if isinstance(task, int) else (task.seed, task)
         return self.generator.generate(seed, self.folder, shard_name(seed), takeover)
 
@@ -70,9 +77,12 @@ class _Generates:
 def _open(settings: EpisodeSettings, folder: Path, fork: bool) -> _Generates:
     from robocas_ms3.demos.generator import EpisodeGenerator  # seconds, which a process that only waits can save
 
-    if multiprocessing.parent_process():  # one of ours; the user's own keeps its threads
-        use_one_torch_thread()
     return _Generates(EpisodeGenerator(settings, fork=fork), folder)
+
+
+def _make_in_process(make_worker: Callable[[], Worker[Task, Result]]) -> Worker[Task, Result]:
+    use_one_torch_thread()
+    return make_worker()
 
 
 def _none_left(policy: str, seed: int, why: str) -> Takeover:
@@ -80,7 +90,7 @@ def _none_left(policy: str, seed: int, why: str) -> Takeover:
     return Takeover(seed, policy, 0, {}, 1.0, why)
 
 
-def _died(task: int | Takeover, why: str) -> EpisodeResult:
+def _crashed(task: int | Takeover, why: str) -> EpisodeResult:
     """Return the result of a seed whose worker process died."""
     seed = task if isinstance(task, int) else task.seed
     return EpisodeResult(seed, success=False, attempts=1, failures=[Failure(seed, 0, "worker", why, 0.0)])

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import logging
-import multiprocessing
 import tempfile
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -18,7 +17,6 @@ import gymnasium as gym
 import numpy as np
 
 from robocas_ms3.core.errors import LayoutError
-from robocas_ms3.core.processes import use_one_torch_thread
 from robocas_ms3.datasets.writing.render import require_renderer
 from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.demos.takeover import Takeover
@@ -57,7 +55,7 @@ def check_acting(settings: EpisodeSettings) -> str:
 
 @dataclass(frozen=True)
 class Players:
-    """Opens a player: one environment and one policy of its own (`processes.Worker`).
+    """Opens a player: one environment and one policy of its own (`core.workers.Worker`).
 
     Attributes:
         settings: of the demonstrations.
@@ -67,8 +65,6 @@ class Players:
 
     def __call__(self) -> Player:
         """Open it."""
-        if multiprocessing.parent_process():
-            use_one_torch_thread()
         return Player(self.settings)
 
 
@@ -88,7 +84,7 @@ class Player:
         self._vector = NumpyVectorEnv(vector)
         self._config = self._file_of(settings.config)
 
-    def do(self, seed: int) -> Takeover:
+    def run(self, seed: int) -> Takeover:
         """What the policy leaves in the scene of a seed."""
         settings, steps = self._settings, steps_of(seed, self._settings.after_steps)
         rules = Rules(steps, ends_on=("success", "fail"))

@@ -14,8 +14,8 @@ from robocas_ms3.assets.pack import MANIFEST, load_pack, sha256
 from robocas_ms3.core.errors import EvaluationError, WorkerDied
 from robocas_ms3.core.locks import locked_folder
 from robocas_ms3.core.outputs import while_there
-from robocas_ms3.core.processes import NO_LIMITS, Limits
 from robocas_ms3.core.strict import nearest
+from robocas_ms3.core.workers import NO_LIMITS, Limits
 from robocas_ms3.datasets.writing.render import require_renderer
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.outcomes import Outcome

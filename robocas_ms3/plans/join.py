@@ -16,8 +16,8 @@ from robocas_ms3.core.documents import DAMAGED, load_array, load_json
 from robocas_ms3.core.errors import PlanError
 from robocas_ms3.core.files import flush_to_disk, json_text, make_folder, replacing, write_json
 from robocas_ms3.core.outputs import sweep
-from robocas_ms3.core.processes.child import Limits
 from robocas_ms3.core.words import count_of
+from robocas_ms3.core.workers import Limits
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.sources.provenance import recording_entry
 from robocas_ms3.datasets.writing.info import write_info

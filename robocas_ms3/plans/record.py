@@ -8,7 +8,7 @@ from typing import Any
 
 from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.core.files import write_json
-from robocas_ms3.core.processes import use_one_torch_thread
+from robocas_ms3.core.workers import use_one_torch_thread
 from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.recordings.entries import read_json
@@ -37,7 +37,7 @@ class Records:
         self._generator: EpisodeGenerator | None = None
         self._layouts: LayoutMaker | None = None
 
-    def do(self, task: Task) -> dict[str, Any]:
+    def run(self, task: Task) -> dict[str, Any]:
         """Make a seed's layout and record its episode, whatever is asked for, and say what came of it."""
         begun = _cpu_seconds()
         self._turn_to(task.part)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.core.processes import use_one_torch_thread
+from robocas_ms3.core.workers import use_one_torch_thread
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.writing.frames import FrameSource, OpenSource
 from robocas_ms3.datasets.writing.players import RecordingPlayer, Request, open_env
@@ -35,7 +35,7 @@ class Renders:
         self._player: RecordingPlayer | None = None
         self._embedder: Any = None
 
-    def do(self, task: Task) -> dict[str, Any]:
+    def run(self, task: Task) -> dict[str, Any]:
         """Render a seed's episode, and say what it takes."""
         begun = time.process_time()
         if not task.episode.is_dir():  # else its process died after it was there

@@ -4,16 +4,25 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import CancelledError
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from robocas_ms3.core.errors import DatasetError, LayoutError, PlanError, PlanningFailed, RobocasError, SimulationError
+from robocas_ms3.core.errors import (
+    DatasetError,
+    LayoutError,
+    PlanError,
+    PlanningFailed,
+    RobocasError,
+    SimulationError,
+    WorkerCrashed,
+    WorkerStartError,
+)
 from robocas_ms3.core.files import flush_to_disk, make_folder, write_json
 from robocas_ms3.core.outputs import sweep
-from robocas_ms3.core.processes import Worker
-from robocas_ms3.core.processes.child import Child, ChildDied, NotBegun, Stopped
+from robocas_ms3.core.workers import Limits, Worker, WorkerPool
 from robocas_ms3.demos.recordings.versions import versions
 from robocas_ms3.plans.begun import check_versions
 from robocas_ms3.plans.plan import Plan
@@ -62,9 +71,9 @@ class Slot:
     def __init__(self, plan: Plan, out: Path, stages: Stages | None = None) -> None:
         stages = stages or Stages(open_record, open_render)
         self._plan, self._out = plan, out
-        memory = plan.limits.memory_gb
-        self._record: Child[Task, dict[str, Any]] = Child(partial(stages.record, plan), memory)
-        self._render: Child[Task, dict[str, Any]] = Child(partial(stages.render, plan), memory)
+        limits = plan.limits
+        self._record = _open_process(stages.record, plan, Limits(limits.record_seconds, limits.memory_gb))
+        self._render = _open_process(stages.render, plan, Limits(limits.render_seconds, limits.memory_gb))
 
     def do(self, unit: Unit) -> list[Outcome]:
         """Do what is left of a unit; nobody else may be at it.
@@ -95,17 +104,16 @@ class Slot:
         write_json(folder / DONE, {"versions": versions()})
 
     def _seed(self, task: Task) -> Outcome:
-        limits = self._plan.limits
         task.clear()
-        recorded = self._survive(self._record, "record", task, limits.record_seconds)
+        recorded = self._survive(self._record, "record", task)
         known: dict[str, Any] = {"success": False} | recorded
         if known["success"] and self._plan.makes_datasets:
-            known |= self._survive(self._render, "render", task, limits.render_seconds)
+            known |= self._survive(self._render, "render", task)
             known["success"] = known["success"] and task.episode.is_dir()
         size = task.size() if known["success"] else 0
         return Outcome(seed=task.seed, at=time.time(), size=size, **known)
 
-    def _survive(self, child: Child[Task, dict[str, Any]], stage: str, task: Task, seconds: float) -> dict[str, Any]:
+    def _survive(self, process: WorkerPool[Task, dict[str, Any]], stage: str, task: Task) -> dict[str, Any]:
         """A stage of an episode; a seed whose process died is begun again, and left out if it dies again."""
         noted = deaths(task.folder)
         while True:
@@ -113,30 +121,39 @@ class Slot:
             if len(died) >= TRIES:
                 return {"success": False, "failures": [f"{stage}: {died[-1].why}"]}
             try:
-                return child.do(task, seconds)
-            except NotBegun as failed:  # it would befall every seed
-                raise PlanError("a process could not begin", found=failed.said()) from failed.error
-            except ChildDied as death:
-                why = str(death)
+                return process.run(task)
+            except WorkerStartError as failed:  # it would befall every seed
+                raise PlanError("a process could not begin", found=failed) from failed
+            except WorkerCrashed as death:
+                why = str(death.found)
             except Exception as error:
                 if not _is_of_a_seed(error):
                     raise
                 why = f"{type(error).__name__}: {error}".splitlines()[0][:200]
-                child.end()
             noted.append([Death(task.seed, stage, why)], sync=True)
             _sweep(task.folder)
 
     def stop(self) -> None:
-        """Want nothing more; `do` in another thread raises `Stopped`."""
+        """Want nothing more; `do` in another thread raises `CancelledError`."""
         self._record.stop()
         self._render.stop()
 
-    def close(self, until: float | None = None) -> None:
-        """End the processes, whatever they are at, by ``until`` of the monotonic clock; default: two seconds."""
+    def close(self) -> None:
+        """End the processes, whatever they are at."""
         self.stop()
-        until = time.monotonic() + 2 if until is None else until
-        for child in (self._record, self._render):
-            child.wait(max(0.0, until - time.monotonic()))
+        self._record.close()
+        self._render.close()
+
+
+def _open_process(stage: OpenStage, plan: Plan, limits: Limits) -> WorkerPool[Task, dict[str, Any]]:
+    return WorkerPool(partial(_open_stage, stage, plan), 1, limits=limits, retries=0)
+
+
+def _open_stage(stage: OpenStage, plan: Plan) -> Worker[Task, dict[str, Any]]:
+    try:
+        return stage(plan)
+    except Exception as error:  # it would befall every seed
+        raise PlanError("a process could not begin", found=error) from error
 
 
 def _is_of_a_seed(error: Exception) -> bool:
@@ -146,7 +163,7 @@ def _is_of_a_seed(error: Exception) -> bool:
     """
     if isinstance(error, RobocasError):
         return isinstance(error, _OF_A_SEED)
-    return not isinstance(error, Stopped | OSError)
+    return not isinstance(error, CancelledError | OSError)
 
 
 def _sweep(folder: Path) -> None:

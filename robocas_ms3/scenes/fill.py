@@ -6,7 +6,7 @@ from collections.abc import Generator, Iterable
 from functools import partial
 
 from robocas_ms3.core.errors import LayoutError
-from robocas_ms3.core.processes import Calls, Pool
+from robocas_ms3.core.workers import FunctionWorker, WorkerPool
 from robocas_ms3.scenes.bank import LayoutBank
 from robocas_ms3.scenes.table import Pair
 
@@ -39,14 +39,15 @@ def fill(bank: LayoutBank, pairs: Iterable[Pair], jobs: int = 1) -> Generator[tu
     missing = bank.missing(pairs)
     firsts = [pair for pair in missing if pair[0] == pair[1]]
     without: dict[int, str] = {}  # objects seeds without objects, and why
-    with Pool(partial(Calls, partial(_make, bank)), min(jobs, len(missing)), died=_died) as pool:
-        for pair, problem in pool.do(firsts):
+    workers = jobs if min(jobs, len(missing)) > 1 else 0
+    with WorkerPool(partial(FunctionWorker, partial(_make, bank)), workers, on_crash=_crashed) as pool:
+        for pair, problem in pool.map(firsts, ordered=False):
             if problem:
                 without[pair[0]] = problem
             yield pair, problem
         others = [pair for pair in missing if pair[0] != pair[1]]
         yield from ((pair, without[pair[0]]) for pair in others if pair[0] in without)
-        yield from pool.do([pair for pair in others if pair[0] not in without])
+        yield from pool.map((pair for pair in others if pair[0] not in without), ordered=False)
 
 
 def _make(bank: LayoutBank, pair: Pair) -> tuple[Pair, str]:
@@ -57,5 +58,5 @@ def _make(bank: LayoutBank, pair: Pair) -> tuple[Pair, str]:
     return pair, ""
 
 
-def _died(pair: Pair, why: str) -> tuple[Pair, str]:
+def _crashed(pair: Pair, why: str) -> tuple[Pair, str]:
     return pair, f"the process that made it died ({why}); is memory short?"

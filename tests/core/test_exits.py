@@ -13,7 +13,7 @@ import pytest
 from robocas_ms3.core.errors import ExtensionError
 from robocas_ms3.core.exits import no_exit
 from robocas_ms3.core.extensions import Registry, load
-from robocas_ms3.core.processes import Calls, Pool
+from robocas_ms3.core.workers import FunctionWorker, WorkerPool
 
 ROOT = Path(__file__).resolve().parents[2]
 PYTHONS_OWN = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
@@ -155,5 +155,5 @@ def leave(how: BaseException) -> None:
 
 @pytest.mark.parametrize("how", [SystemExit(0), KeyboardInterrupt()])
 def test_code_in_a_worker_can_not_end_the_program(how):
-    with Pool(partial(Calls, leave), 2) as pool, pytest.raises(ExtensionError):
-        list(pool.do([how]))
+    with WorkerPool(partial(FunctionWorker, leave), 2) as pool, pytest.raises(ExtensionError):
+        list(pool.map([how]))

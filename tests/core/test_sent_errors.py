@@ -7,7 +7,7 @@ import pickle
 import pytest
 
 from robocas_ms3.core.errors import ExtensionError, VectorEnvError
-from robocas_ms3.core.processes import SentError, SentTraceback
+from robocas_ms3.core.sent_errors import SentError, SentTraceback
 
 
 class TwoWords(Exception):

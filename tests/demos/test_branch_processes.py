@@ -16,7 +16,7 @@ import pytest
 from branch_notes import Notes
 
 from robocas_ms3.core.errors import PlanningFailed, RobocasError
-from robocas_ms3.core.processes import SentTraceback
+from robocas_ms3.core.sent_errors import SentTraceback
 from robocas_ms3.demos import branches
 from robocas_ms3.demos.branches import ForkedBranches
 from robocas_ms3.demos.forking import why_not_fork
@@ -311,7 +311,7 @@ SLEEPER = """
 import os, sys, time
 from robocas_ms3.demos.branches import ForkedBranches
 from robocas_ms3.planning.decisions import Effort
-from robocas_ms3.core.processes import SentTraceback
+from robocas_ms3.core.sent_errors import SentTraceback
 class Notes:
     exhausted = False
     def failed(self, error): pass

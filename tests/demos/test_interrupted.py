@@ -8,7 +8,7 @@ import h5py
 import pytest
 
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.core.processes import Pool
+from robocas_ms3.core.workers import WorkerPool
 from robocas_ms3.demos import generate as module
 from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings
 from robocas_ms3.demos.generate import generate
@@ -179,8 +179,8 @@ def test_fewer_than_there_are(tmp_path, made):
 
 
 def test_a_seed_that_takes_its_process_down_is_a_failure_of_its_own(monkeypatch):
-    """Whose fault it was is the pool's to find out: tests/test_process_pool.py."""
-    monkeypatch.setattr(Pool, "do", lambda pool, seeds, in_order: (pool._died(seed, "SIGSEGV") for seed in seeds))
+    """Whose fault it was is the pool's to find out: tests/core/test_workers.py."""
+    monkeypatch.setattr(WorkerPool, "map", lambda pool, seeds: (pool._on_crash(seed, "SIGSEGV") for seed in seeds))
     (result,) = generate_seeds(SETTINGS, iter([5]), Path(), 2)
     assert (result.seed, result.success, result.attempts) == (5, False, 1)
     assert [(one.stage, one.reason) for one in result.failures] == [("worker", "SIGSEGV")]

@@ -69,9 +69,9 @@ def test_weights_of_what_acts_have_a_hash():
 
 @pytest.mark.parametrize("player", [("random", (12, 12))], indirect=True)
 def test_what_is_left_follows_from_the_seed_alone(player):
-    first = player.do(3)
-    other = player.do(4)
-    again = player.do(3)
+    first = player.run(3)
+    other = player.run(4)
+    again = player.run(3)
     assert first.policy_steps == again.policy_steps == 12
     assert not first.refused
     ours, theirs = numbers(first.state), numbers(again.state)
@@ -82,7 +82,7 @@ def test_what_is_left_follows_from_the_seed_alone(player):
 
 @pytest.mark.parametrize("player", [("scripted-motions", (90, 90))], indirect=True)
 def test_there_is_nothing_to_take_over_where_the_policy_succeeded(player, generator, tmp_path):
-    takeover = player.do(4)
+    takeover = player.run(4)
     assert takeover.refused == "succeeded"
     assert takeover.policy_steps < 90
     result = generator.generate(4, tmp_path, "one", takeover)
@@ -94,7 +94,7 @@ def test_there_is_nothing_to_take_over_where_the_policy_succeeded(player, genera
 @pytest.mark.slow
 @pytest.mark.parametrize("player", [("random", (31, 31))], indirect=True)
 def test_the_record_begins_where_the_policy_was(player, generator, tmp_path):
-    takeover = player.do(2)
+    takeover = player.run(2)
     assert takeover.gripper == -1.0
     for name in ("one", "two"):
         assert generator.generate(2, tmp_path, name, takeover).success
@@ -125,7 +125,7 @@ def test_the_record_begins_where_the_policy_was(player, generator, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("player", [("scripted-motions", (31, 31))], indirect=True)
 def test_a_target_in_the_hand_is_carried_on(player, generator, tmp_path):
-    takeover = player.do(2)
+    takeover = player.run(2)
     assert generator.generate(2, tmp_path, "one", takeover).success
     (episode,) = read_json(tmp_path / "one.h5")["episodes"]
     assert [part["goal_type"] for part in episode["robocas"]["subgoals"]] == ["transfer object"]
@@ -139,7 +139,7 @@ def test_a_target_in_the_hand_is_carried_on(player, generator, tmp_path):
 @pytest.mark.parametrize("player", [("scripted-beside", (31, 31))], indirect=True)
 def test_who_has_closed_the_gripper_beside_is_shown_how_to_go_on(player, generator, tmp_path):
     """In the same scene as above, in which the target is in the hand by then."""
-    takeover = player.do(2)
+    takeover = player.run(2)
     assert takeover.gripper == -1.0
     assert generator.generate(2, tmp_path, "one", takeover).success
     (episode,) = read_json(tmp_path / "one.h5")["episodes"]
@@ -152,7 +152,7 @@ def test_who_has_closed_the_gripper_beside_is_shown_how_to_go_on(player, generat
 @pytest.mark.slow
 @pytest.mark.parametrize("player", [("random", (31, 31))], indirect=True)
 def test_it_is_converted_from_where_the_policy_was(player, generator, tmp_path, needs_renderer):
-    assert generator.generate(2, tmp_path, "one", player.do(2)).success
+    assert generator.generate(2, tmp_path, "one", player.run(2)).success
     pictures = Pictures(("base_camera",), (64, 48), depth=False)
     convert(tmp_path / "one.h5", tmp_path / "dataset", pictures=pictures, embeddings=False)
     report = replay_dataset(tmp_path / "dataset")

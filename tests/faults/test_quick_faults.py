@@ -12,7 +12,7 @@ from faults import SITE, begun, files_of
 from synthetic import RayCaster, write_trajectory
 
 from robocas_ms3.core.errors import IncompleteError
-from robocas_ms3.core.processes import Limits
+from robocas_ms3.core.workers import Limits
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.writing.convert import convert

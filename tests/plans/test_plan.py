@@ -134,9 +134,9 @@ def test_what_fails_while_a_part_is_opened_ends_the_run(written, tmp_path, error
 
     plan = load_plan(written("embeddings: false\nparts:\n  - {task: pick, episodes: 3, name: a}\n"))
     task = Task(0, 7, tmp_path)
-    MadeUp(plan).do(task)
+    MadeUp(plan).run(task)
     with pytest.raises(raised, match=match) as found:
-        Renders(plan, fail).do(task)
+        Renders(plan, fail).run(task)
     assert "\n" not in str(found.value)
 
 

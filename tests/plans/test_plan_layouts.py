@@ -26,7 +26,7 @@ def task(tmp_path):
 
 
 def test_layouts_alone_are_made_and_joined(task, tmp_path):
-    found = Records(ALONE).do(task)
+    found = Records(ALONE).run(task)
     assert (found["success"], set(found)) == (True, {"success", "record_seconds"})
     assert [path.name for path in task.folder.iterdir()] == [task.layout.name]
     outcome = Outcome(11, True, size=task.size())
@@ -45,5 +45,5 @@ def test_a_seed_without_a_layout_is_one_that_failed(task, monkeypatch):
         raise LayoutError("no room for all objects")
 
     monkeypatch.setattr(LayoutMaker, "write", nothing)
-    found = Records(ALONE).do(task)
+    found = Records(ALONE).run(task)
     assert (found["success"], found["failures"]) == (False, ["layout: no room for all objects"])

@@ -38,10 +38,10 @@ class Slow(MadeUp):
         super().__init__(plan)
         self.notes, self.seconds = notes, seconds
 
-    def do(self, task):
+    def run(self, task):
         begun = time.time()
         time.sleep(self.seconds)
-        made = super().do(task)
+        made = super().run(task)
         with (self.notes / f"{os.getpid()}.jsonl").open("a") as file:
             file.write(json.dumps([task.folder.name, task.part, begun, time.time()]) + "\n")
         return made
@@ -255,7 +255,7 @@ def test_an_error_of_all_seeds_ends_the_plan_in_one_line(cluster, slots, tmp_pat
 class Lacking(MadeUp):
     """Meets the same at every seed."""
 
-    def do(self, task):
+    def run(self, task):
         raise MissingExtraError("nothing to record with")
 
 
@@ -268,11 +268,11 @@ def test_a_unit_that_goes_on_killing_its_actors_ends_the_plan(cluster, slots, tm
 class Deadly(MadeUp):
     """Kills the actor at the second seed."""
 
-    def do(self, task):
+    def run(self, task):
         if task.seed == 11:
             os.kill(os.getppid(), signal.SIGKILL)
             time.sleep(60)
-        return super().do(task)
+        return super().run(task)
 
 
 def test_nodes_that_do_not_see_the_folder_are_said(cluster, slots, tmp_path):

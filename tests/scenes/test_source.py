@@ -1,13 +1,15 @@
-"""A process that makes layouts for another: what it can't make, and what becomes of it."""
+"""Layouts that a worker process samples, where PhysX has a GPU."""
 
 from __future__ import annotations
 
+import _thread
+import gc
 import os
-import pickle
 import signal
-from unittest.mock import Mock
+import threading
 
 import numpy as np
+import psutil
 import pytest
 from sapien import physx
 
@@ -16,56 +18,77 @@ from robocas_ms3.core.errors import LayoutError, SimulationError
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.sample import sample_layout
-from robocas_ms3.scenes.source import OtherProcess, Sampler
+from robocas_ms3.scenes.source import Sampler
 
 
-def model(**changes) -> SceneModel:
+def load_model(**changes) -> SceneModel:
     pack = load_pack("builtin")
     data = {**load_task_config("pick_table_scattered").model_dump(mode="json"), **changes}
     return SceneModel.load(load_task_config(data), pack, pack)
 
 
-def test_it_makes_the_same_layouts_and_ends_with_its_object(monkeypatch):
-    monkeypatch.setattr("robocas_ms3.scenes.source._GRACE", 30)  # it leaves by itself, on a busy machine too
-    scene = model()
-    other = OtherProcess(scene)
-    process = other._process
+def children() -> list[psutil.Process]:
+    return psutil.Process().children()
+
+
+@pytest.fixture(autouse=True)
+def gpu(monkeypatch):
+    monkeypatch.setattr(physx, "is_gpu_enabled", lambda: True)
+
+
+def test_the_process_samples_the_same_layouts_and_ends_with_its_object():
+    model, before = load_model(), children()
+    sampler = Sampler(model)
     for seed in (3, 4):
-        np.testing.assert_array_equal(other.layout(3, seed).object_poses, sample_layout(scene, 3, seed).object_poses)
-    del other
-    assert process.poll() == 0
+        np.testing.assert_array_equal(sampler(3, seed).object_poses, sample_layout(model, 3, seed).object_poses)
+    (process,) = [child for child in children() if child not in before]
+    del sampler
+    gc.collect()
+    assert psutil.wait_procs([process], timeout=30)[0] == [process]
 
 
-def test_what_it_can_not_make_is_an_error_as_here_and_it_goes_on():
-    target, few = {"min_grasps": 10_000}, {"ids": "all", "count": 2}
+def test_no_layout_is_the_same_error_as_in_this_process():
     data = load_task_config("pick_table_scattered").model_dump(mode="json")
-    other = OtherProcess(model(target={**data["target"], **target}, objects=few))
+    target = {**data["target"], "min_grasps": 10_000}
+    sampler = Sampler(load_model(target=target, objects={"ids": "all", "count": 2}))
     for _ in range(2):
-        with pytest.raises(LayoutError, match="no object qualifies"):
-            other.layout(0, 0)
+        with pytest.raises(LayoutError):
+            sampler(0, 0)
 
 
-def test_that_it_died_is_no_want_of_a_layout():
-    other = OtherProcess(model())
-    other.layout(0, 0)
-    os.kill(other._process.pid, signal.SIGKILL)
-    for _ in range(2):
-        with pytest.raises(
-            SimulationError, match=r"seed 1: the process that makes layouts died \(found exit code -9\)"
-        ):
-            other.layout(1, 1)
+class Deadly:
+    """Object ids that kill the process that unpickles them."""
+
+    def __reduce__(self):
+        return kill_this_process, ()
 
 
-def test_after_an_interruption_no_answer_is_taken_for_another(monkeypatch):
-    monkeypatch.setattr(physx, "is_gpu_enabled", lambda: True)
-    scene = model()
-    layouts = Sampler(scene)
-    layouts(1, 1)
-    process = layouts._elsewhere._process
-    monkeypatch.setattr(pickle, "load", Mock(side_effect=KeyboardInterrupt))
+def kill_this_process():
+    os.kill(os.getpid(), signal.SIGSEGV)
+
+
+def test_a_process_that_dies_twice_is_no_lack_of_a_layout():
+    with pytest.raises(SimulationError) as caught:
+        Sampler(load_model()).make(0, 1, Deadly())  # pyright: ignore[reportArgumentType]
+    assert (caught.value.where, caught.value.found) == ("seed 1", "SIGSEGV")
+
+
+def test_a_process_that_dies_is_replaced():
+    model, before = load_model(), children()
+    sampler = Sampler(model)
+    sampler(0, 0)
+    (process,) = [child for child in children() if child not in before]
+    process.kill()
+    process.wait()
+    np.testing.assert_array_equal(sampler(1, 1).object_poses, sample_layout(model, 1, 1).object_poses)
+
+
+def test_after_an_interruption_no_layout_is_taken_for_another():
+    model = load_model()
+    sampler = Sampler(model)
+    sampler(1, 1)
+    threading.Timer(0.05, _thread.interrupt_main).start()
     with pytest.raises(KeyboardInterrupt):
-        layouts(2, 2)
-    monkeypatch.undo()
-    assert process.poll() is not None
-    monkeypatch.setattr(physx, "is_gpu_enabled", lambda: True)
-    np.testing.assert_array_equal(layouts(3, 3).object_poses, sample_layout(scene, 3, 3).object_poses)
+        for seed in range(2, 1000):
+            sampler(seed, seed)
+    np.testing.assert_array_equal(sampler(3, 3).object_poses, sample_layout(model, 3, 3).object_poses)

@@ -27,7 +27,7 @@ class MadeUp:
     def __init__(self, plan):
         self.plan = plan
 
-    def do(self, task):
+    def run(self, task):
         fault = _fault(task)
         if fault == "crash":
             os.kill(os.getpid(), signal.SIGSEGV)

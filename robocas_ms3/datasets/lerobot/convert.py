@@ -16,7 +16,7 @@ from robocas_ms3.core.errors import DatasetError, IncompleteError
 from robocas_ms3.core.files import flush_to_disk, make_folder, naming, remove, write_json
 from robocas_ms3.core.locks import locked_folder
 from robocas_ms3.core.outputs import check_there, claim_output, kept_if_begun, sweep, while_there
-from robocas_ms3.core.processes import Limits as EpisodeLimits
+from robocas_ms3.core.workers import Limits as EpisodeLimits
 from robocas_ms3.datasets.lerobot.plan import PARTS, PLAN, check_resume, only, plan_of
 from robocas_ms3.datasets.lerobot.schema import CONTENT, INFO_FILE, STAGING, Limits, require_extra, whole_rate
 from robocas_ms3.datasets.lerobot.variants import NEWEST, find_variant

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import json_text, replacing_folder
-from robocas_ms3.core.processes import Limits
+from robocas_ms3.core.workers import Limits
 from robocas_ms3.datasets.lerobot.arrays import frame_columns
 from robocas_ms3.datasets.lerobot.depth import to_levels
 from robocas_ms3.datasets.lerobot.language import EVENTS, EVENTS_TYPE, event_rows
@@ -122,7 +122,7 @@ class _Stager:
     def __init__(self, job: StageJob) -> None:
         self.job, self.player = job, open_player(job.request)
 
-    def do(self, task: tuple[int, int]) -> WrittenEpisode:
+    def run(self, task: tuple[int, int]) -> WrittenEpisode:
         return stage_episode(self.job, self.player, *task)
 
     def close(self) -> None:

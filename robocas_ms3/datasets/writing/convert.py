@@ -18,7 +18,7 @@ from robocas_ms3.core.errors import DatasetError, IncompleteError
 from robocas_ms3.core.files import make_folder, write_json
 from robocas_ms3.core.locks import locked_folder
 from robocas_ms3.core.outputs import check_there, claim_output, kept_if_begun, sweep, while_there
-from robocas_ms3.core.processes import Limits
+from robocas_ms3.core.workers import Limits
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.preview import FEW, finish_previews, on_sheet
 from robocas_ms3.datasets.pictures.stored import Pictures

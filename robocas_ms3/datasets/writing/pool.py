@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Generic, TypeVar
 
 from robocas_ms3.core.errors import DatasetError, IncompleteError, MissingExtraError, RobocasError
-from robocas_ms3.core.processes import NO_LIMITS, Limits, Pool, SentError, Worker, use_one_torch_thread
+from robocas_ms3.core.sent_errors import SentError
 from robocas_ms3.core.words import count_of
+from robocas_ms3.core.workers import NO_LIMITS, Limits, Worker, WorkerPool, use_one_torch_thread
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -58,7 +59,7 @@ def do_all(
         Exception: whatever a task raises, where none is done.
     """
 
-    def died(task: Task, why: str) -> _Failed[Task]:
+    def crashed(task: Task, why: str) -> _Failed[Task]:
         error = DatasetError(f"its process died twice: {why}", where=name(task))
         return _Failed(task, SentError.of(error, "a worker"))
 
@@ -67,12 +68,12 @@ def do_all(
     threads = one_torch_thread() if renders and here else nullcontext()
     opened = partial(_open_renderer, open_worker, processes) if renders and not here else open_worker
     careful = partial(_Careful[Task, Result], opened)
-    pool: Pool[Task, Result | _Failed[Task]] = Pool(
-        careful, processes, died=died, here=here, limits=limits or NO_LIMITS
+    pool: WorkerPool[Task, Result | _Failed[Task]] = WorkerPool(
+        careful, 0 if here else processes, on_crash=crashed, limits=limits or NO_LIMITS
     )
     failed: list[_Failed[Task]] = []
     done = 0
-    with threads, pool, closing(pool.do(tasks)) as results:
+    with threads, pool, closing(pool.map(tasks, ordered=False)) as results:
         for result in results:
             if not isinstance(result, _Failed):
                 done += 1
@@ -125,11 +126,11 @@ class _Careful(Generic[Task, Result]):
         self._open_worker = open_worker
         self._worker: Worker[Task, Result] | None = open_worker()
 
-    def do(self, task: Task) -> Result | _Failed[Task]:
+    def run(self, task: Task) -> Result | _Failed[Task]:
         try:
             if self._worker is None:
                 self._worker = self._open_worker()
-            return self._worker.do(task)
+            return self._worker.run(task)
         except Exception as error:
             if _befalls_all(error):
                 raise

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.core.processes import Limits
+from robocas_ms3.core.workers import Limits
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.preview import Preview
 from robocas_ms3.datasets.writing.players import RecordingPlayer, Request
@@ -67,7 +67,7 @@ class _Writer:
     def __init__(self, job: Job) -> None:
         self.job, self.player = job, RecordingPlayer(job.request)
 
-    def do(self, task: tuple[int, int]) -> WrittenEpisode:
+    def run(self, task: tuple[int, int]) -> WrittenEpisode:
         job, (number, source) = self.job, task
         preview = partial(Preview, job.out, self.player.rate_hz, row=number in (job.sheet or ()))
         return write_episode(

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
-from robocas_ms3.core.processes import uninterrupted
+from robocas_ms3.core.exits import uninterrupted
 from robocas_ms3.plans.engines import refuse_options
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.slot import Slot, Stages
@@ -53,7 +52,6 @@ class LocalEngine:
             self._threads.shutdown(wait=False, cancel_futures=True)
             for slot in self._all:
                 slot.stop()
-            until = time.monotonic() + 2
             for slot in self._all:
-                slot.close(until)
+                slot.close()
             self._threads.shutdown()

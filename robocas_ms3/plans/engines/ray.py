@@ -5,15 +5,14 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Mapping
-from concurrent.futures import Future
+from concurrent.futures import CancelledError, Future
 from dataclasses import dataclass, field
 from pathlib import Path
 from queue import Empty, PriorityQueue
 from typing import Any
 
 from robocas_ms3.core.errors import PlanError
-from robocas_ms3.core.processes import SentError
-from robocas_ms3.core.processes.child import Stopped
+from robocas_ms3.core.sent_errors import SentError
 from robocas_ms3.demos.recordings.versions import versions
 from robocas_ms3.plans.engines.pieces import Arriving
 from robocas_ms3.plans.engines.ray_actor import RaySlot, Terms
@@ -251,7 +250,7 @@ class RayEngine:
         while not self._jobs.empty():
             job = self._jobs.get()
             if not job.future.cancel():
-                job.future.set_exception(Stopped())
+                job.future.set_exception(CancelledError())
         if self._disconnects:
             self._ray.shutdown()
 

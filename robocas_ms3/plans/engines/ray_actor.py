@@ -23,7 +23,7 @@ from robocas_ms3.core.errors import PlanError, RobocasError
 from robocas_ms3.core.files import write_json
 from robocas_ms3.core.locks import locked_folder
 from robocas_ms3.core.outputs import check_same
-from robocas_ms3.core.processes import SentError
+from robocas_ms3.core.sent_errors import SentError
 from robocas_ms3.demos.recordings.versions import versions
 from robocas_ms3.plans.engines.pieces import Pieces, sent
 from robocas_ms3.plans.plan import Plan

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.core.errors import PlanError
-from robocas_ms3.core.processes import SentError
+from robocas_ms3.core.sent_errors import SentError
 from robocas_ms3.plans.driver import current_run
 from robocas_ms3.plans.engines.slurm_job import UnitsJob
 from robocas_ms3.plans.engines.slurm_options import read_options

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.core.extensions import load
-from robocas_ms3.core.processes import SentError
+from robocas_ms3.core.sent_errors import SentError
 from robocas_ms3.plans.claims import claimed
 from robocas_ms3.plans.driver import is_current
 from robocas_ms3.plans.engines.local import LocalEngine

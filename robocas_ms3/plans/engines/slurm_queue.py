@@ -15,7 +15,7 @@ from typing import Any, Protocol
 
 from robocas_ms3.core.errors import MissingExtraError, PlanError
 from robocas_ms3.core.files import make_folder
-from robocas_ms3.core.processes import SentError
+from robocas_ms3.core.sent_errors import SentError
 from robocas_ms3.plans.engines.slurm_job import FOLDER, UnitsJob
 from robocas_ms3.plans.engines.slurm_options import SlurmOptions
 from robocas_ms3.plans.units import Unit

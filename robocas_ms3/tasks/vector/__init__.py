@@ -11,7 +11,7 @@ from gymnasium.vector import VectorEnv
 from mani_skill.utils.registration import REGISTERED_ENVS
 
 from robocas_ms3.core.errors import VectorEnvError
-from robocas_ms3.core.processes import NO_LIMITS, Limits
+from robocas_ms3.core.workers import NO_LIMITS, Limits
 from robocas_ms3.scenes.task_specs import TASKS
 from robocas_ms3.tasks.vector.backend import Backend, choose_backend
 from robocas_ms3.tasks.vector.environment import NumpyVectorEnv, RoboCASVectorEnv

@@ -18,8 +18,8 @@ from typing import Any
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import VectorEnvError, WorkerDied
-from robocas_ms3.core.exits import responsive
-from robocas_ms3.core.processes import NO_LIMITS, is_too_large, uninterrupted
+from robocas_ms3.core.exits import responsive, uninterrupted
+from robocas_ms3.core.workers import NO_LIMITS, exceeds_memory
 
 STEP, LEAVE = b"s", b"q"  # messages; all others are pickled
 NUMBER = 8  # bytes before each message, its number, which the answer repeats
@@ -121,7 +121,7 @@ class WorkerHandle:
             why = "too slow" if now - begun > self.limits.seconds else ""
             if now - self._looked > _LOOK and self.limits.memory_gb < math.inf:
                 self._looked = now
-                why = "too much memory" if is_too_large(self.process.pid, self.limits.memory_gb, forks=False) else why
+                why = "too much memory" if exceeds_memory(self.process.pid, self.limits.memory_gb, forks=False) else why
             if why:
                 self.process.kill()
                 raise self._died(why)

@@ -17,7 +17,8 @@ from mani_skill.utils.common import torch_clone_dict
 from mani_skill.utils.registration import REGISTERED_ENVS
 
 from robocas_ms3.core.errors import VectorEnvError, WorkerDied
-from robocas_ms3.core.processes import NO_LIMITS, Limits, SentError
+from robocas_ms3.core.sent_errors import SentError
+from robocas_ms3.core.workers import NO_LIMITS, Limits
 from robocas_ms3.tasks.seeds import following_seeds
 from robocas_ms3.tasks.vector.block import Block, nest, open_memory
 from robocas_ms3.tasks.vector.handle import STEP, WorkerHandle, close_all, name_envs

@@ -7,6 +7,8 @@ import importlib
 import logging
 import os
 import pickle
+import threading
+import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from multiprocessing.connection import Connection
@@ -18,12 +20,14 @@ import torch
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import LayoutError, VectorEnvError
-from robocas_ms3.core.processes import SentError, leave_with, use_one_torch_thread
+from robocas_ms3.core.sent_errors import SentError
 from robocas_ms3.core.words import escape_log_lines, escape_tracebacks
+from robocas_ms3.core.workers import use_one_torch_thread
 from robocas_ms3.tasks.vector.block import Block, Field, Path, leaves, space_fields
 from robocas_ms3.tasks.vector.handle import LEAVE, NUMBER, STEP, name_envs
 from robocas_ms3.tasks.vector.messages import Call, EnvDescription, Order, Reset, Row, Share
 
+_LOOK = 0.5  # s between two looks at the parent
 FIRST_SEED = 2022  # of env 0's resets without a seed, as in ManiSkill; env 1 has the next
 _log = logging.getLogger(__name__)
 
@@ -39,13 +43,23 @@ def main(connection: int, memory: int, parent: int) -> None:
     faulthandler.enable()
     escape_log_lines()
     escape_tracebacks()
-    leave_with(parent)
+    threading.Thread(target=_leave_with, args=(parent,), daemon=True).start()
     for descriptor in (connection, memory):
         os.set_inheritable(descriptor, False)
     use_one_torch_thread()
     with suppress(EOFError, OSError):  # nobody is there any more
         _Worker(Connection(connection), memory).serve()
     os._exit(0)  # environments are closed; what else would be torn down takes long, and may crash
+
+
+def _leave_with(parent: int) -> None:
+    """End this process when its parent is no more, even during a step.
+
+    Not `die_with_parent`: the thread that started this process may end before the environments do.
+    """
+    while os.getppid() == parent:
+        time.sleep(_LOOK)
+    os._exit(1)
 
 
 class _Worker:

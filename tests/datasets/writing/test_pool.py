@@ -15,7 +15,7 @@ from robocas_ms3.datasets.writing.pool import do_all
 class Looking:
     """Says what a process is like."""
 
-    def do(self, task):
+    def run(self, task):
         return task, os.getpid(), torch.get_num_threads(), os.environ.get("LP_NUM_THREADS")
 
     def close(self):
@@ -45,7 +45,7 @@ def test_torch_has_one_thread_where_pictures_are_rendered():
 
 
 class Deadly(Looking):
-    def do(self, task):
+    def run(self, task):
         return os._exit(9) if task == 2 else task
 
 
@@ -62,7 +62,7 @@ class Picky(Looking):
 
     spoilt = False
 
-    def do(self, task):
+    def run(self, task):
         assert not self.spoilt
         if task % 2:
             self.spoilt = True
@@ -97,9 +97,9 @@ def test_what_befalls_all_is_raised_as_it_is(tasks, tried):
     begun = []
 
     class Counting(Picky):
-        def do(self, task):
+        def run(self, task):
             begun.append(task)
-            return super().do(task)
+            return super().run(task)
 
     with pytest.raises(LookupError, match="1 is odd"):
         list(do_all(Counting, tasks, 1, Path("out"), renders=False))
@@ -114,7 +114,7 @@ def test_what_befalls_all_is_raised_as_it_is(tasks, tried):
 )
 def test_what_is_wrong_with_the_machine_ends_it_at_once(error):
     class Failing(Looking):
-        def do(self, task):
+        def run(self, task):
             if task == 2:
                 raise error
             return task
@@ -132,7 +132,7 @@ def test_elsewhere_torch_is_left_alone():
 
 def test_torch_gets_its_threads_back_after_a_failure():
     class Failing(Looking):
-        def do(self, task):
+        def run(self, task):
             raise ValueError(task)
 
     with pytest.raises(ValueError, match="7"):

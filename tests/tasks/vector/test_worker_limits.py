@@ -6,7 +6,7 @@ import time
 import pytest
 
 from robocas_ms3.core.errors import WorkerDied
-from robocas_ms3.core.processes import Limits
+from robocas_ms3.core.workers import Limits
 from robocas_ms3.tasks.vector import handle
 from robocas_ms3.tasks.vector.handle import WorkerHandle
 

@@ -1,0 +1,429 @@
+"""Run tasks in worker processes, within limits of time and memory, whichever of the processes dies.
+
+What `WorkerPool` guarantees:
+
+- Worker processes are started anew, not forked: a renderer, CUDA and locks held by threads do not survive a fork. The
+  user's main module is not run again.
+- Each process makes its worker once, before its first task, and again after a task that raised an error. An error of
+  making it is the task's error.
+- A process that crashes, or exceeds a limit, costs only its own task, which another process tries again once.
+- Tasks may be endless: they are taken as workers become free. Results come in the order of the tasks, or when they are
+  there.
+- Ctrl-C in the program stops the running tasks and starts no others; the processes print nothing.
+- The processes end when the program ends, even by ``kill -9``, and so do their forks that call `die_with_parent`.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Generator, Iterable
+from concurrent.futures import CancelledError
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import islice
+from multiprocessing import Pipe
+from multiprocessing.connection import wait
+from queue import Empty, SimpleQueue
+from typing import Any, Generic, Protocol, TypeVar
+
+import cloudpickle
+import psutil
+
+from robocas_ms3.core.errors import RobocasError, WorkerCrashed, WorkerStartError
+from robocas_ms3.core.exits import responsive
+from robocas_ms3.core.sent_errors import SentError
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+Task_contra = TypeVar("Task_contra", contravariant=True)
+Result_co = TypeVar("Result_co", covariant=True)
+
+_START_SECONDS = 900.0  # until a worker is made
+_EXIT_SECONDS = 1.0  # until an idle process has left
+_POLL_SECONDS = 1.0  # between two checks of limits, and of signals
+_JOB_KILL_SECONDS = 2.0  # until this process is ended too, where a batch system ends all processes of a job
+_TASKS_PER_WORKER = 2  # running and queued, so that no worker waits for its next task
+# Not `multiprocessing`, whose spawn runs the user's main module again: it needs `if __name__ == "__main__"` there, and
+# fails in a program from standard input.
+_PROGRAM = "import sys; sys.path[:] = {path!r}; from robocas_ms3.core.worker_main import main; main({fd}, {parent})"
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What one task may take.
+
+    Attributes:
+        seconds: of wall-clock time.
+        memory_gb: GiB of resident memory, of the worker process and of each process that it forked.
+    """
+
+    seconds: float = math.inf
+    memory_gb: float = math.inf
+
+
+NO_LIMITS = Limits()
+
+
+class Worker(Protocol[Task_contra, Result_co]):
+    """Keeps what tasks need, and runs one task after the other."""
+
+    def run(self, task: Task_contra, /) -> Result_co:
+        """Run a task."""
+        ...
+
+    def close(self) -> None:
+        """Free what it holds: after a task that raised an error, and when a pool without processes is closed."""
+        ...
+
+
+@dataclass(frozen=True)
+class FunctionWorker(Generic[Task, Result]):
+    """A worker that calls a function.
+
+    Attributes:
+        function: task -> result.
+    """
+
+    function: Callable[[Task], Result]
+
+    def run(self, task: Task) -> Result:
+        """Call the function."""
+        return self.function(task)
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+class WorkerPool(Generic[Task, Result]):
+    """Worker processes that run tasks; a context manager, which ends them.
+
+    Args:
+        make_worker: is called in each process; sent by cloudpickle, so it may be of the main module. Tasks and results
+            are pickled.
+        num_workers: number of processes, of which each starts when it is needed; 0: tasks run in this process, without
+            limits.
+        limits: of each task.
+        retries: how often a task is tried again whose process crashed.
+        on_crash: gives the result of a task whose last process crashed, and the reason, or raises an error; default:
+            raises `WorkerCrashed`.
+    """
+
+    def __init__(
+        self,
+        make_worker: Callable[[], Worker[Task, Result]],
+        num_workers: int,
+        *,
+        limits: Limits = NO_LIMITS,
+        retries: int = 1,
+        on_crash: Callable[[Task, str], Result] | None = None,
+    ) -> None:
+        self._make_worker, self._num_workers, self._limits = make_worker, num_workers, limits
+        self._retries, self._on_crash = retries, on_crash or _raise_crash
+        self._worker: Worker[Task, Result] | None = None  # in this process
+        self._jobs: SimpleQueue[_Job[Task, Result] | None] = SimpleQueue()
+        self._threads: list[threading.Thread] = []  # each supervises one process
+        self._owner = 0  # process id of the threads' process: a fork has no threads
+        self._stop_reader: Any = None  # a Connection; readable once the pool is stopped
+        self._stop_writer: Any = None
+        self._stopped = False
+
+    def map(self, tasks: Iterable[Task], *, ordered: bool = True) -> Generator[Result, None, None]:
+        """Run tasks, which are taken from the iterable as workers become free.
+
+        Args:
+            tasks: may be endless.
+            ordered: whether results come in the order of the tasks, or each when it is there.
+
+        Raises:
+            WorkerStartError: no process can start.
+            CancelledError: another thread stopped the pool.
+            Exception: whatever a task, making a worker or ``on_crash`` raises.
+        """
+        if self._num_workers == 0:
+            return self._map_here(tasks)
+        return self._map_in_processes(tasks, ordered)
+
+    def run(self, task: Task) -> Result:
+        """Run one task and wait for it; raises as `map` does."""
+        (result,) = self.map([task])
+        return result
+
+    def _map_here(self, tasks: Iterable[Task]) -> Generator[Result, None, None]:
+        for task in tasks:
+            if self._worker is None:
+                self._worker = self._make_worker()
+            try:
+                result = self._worker.run(task)
+            except BaseException:
+                self._close_worker()
+                raise
+            yield result
+
+    def _map_in_processes(self, tasks: Iterable[Task], ordered: bool) -> Generator[Result, None, None]:
+        remaining = iter(tasks)
+        pending: list[_Job[Task, Result]] = []  # in the order of the tasks
+        finished: SimpleQueue[_Job[Task, Result]] = SimpleQueue()
+        try:
+            while True:
+                for task in islice(remaining, _TASKS_PER_WORKER * self._num_workers - len(pending)):
+                    pending.append(_Job(task, finished))
+                    self._submit(pending[-1])
+                if not pending:
+                    return
+                job = pending[0] if ordered else self._next(finished)
+                while not job.done:
+                    self._next(finished)
+                pending.remove(job)
+                if job.error is not None:
+                    raise job.error
+                yield job.result  # pyright: ignore[reportReturnType]  (of a job that is done)
+        finally:
+            for job in pending:
+                job.cancelled = True
+
+    def _submit(self, job: _Job[Task, Result]) -> None:
+        if self._owner != os.getpid():
+            self._owner, self._jobs = os.getpid(), SimpleQueue()
+            self._stop_reader, self._stop_writer = Pipe(duplex=False)
+            # daemons: a pool that nobody closed does not keep the program from ending
+            self._threads = [threading.Thread(target=self._supervise, daemon=True) for _ in range(self._num_workers)]
+            for thread in self._threads:
+                thread.start()
+        self._jobs.put(job)
+
+    def _next(self, finished: SimpleQueue[_Job[Task, Result]]) -> _Job[Task, Result]:
+        """Wait for a job.
+
+        Not by `concurrent.futures`, whose locks stay held after a Ctrl-C at the wrong moment. In steps, since a signal
+        that another thread got wakes nobody here.
+        """
+        while True:
+            if self._stopped:
+                raise CancelledError
+            with suppress(Empty), responsive():
+                return finished.get(timeout=_POLL_SECONDS)
+
+    def _supervise(self) -> None:
+        """Run jobs in one process; in a thread of its own."""
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # for the process, until it ignores Ctrl-C
+        process: _WorkerProcess[Task, Result] = _WorkerProcess(self._make_worker, self._limits, self._stop_reader)
+        while (job := self._jobs.get()) is not None and not self._stopped:
+            if not job.cancelled:
+                try:
+                    job.result = self._run_job(process, job.task)
+                except BaseException as error:  # noqa: BLE001  (it is raised where the result is waited for)
+                    job.error = error
+                job.done = True
+                job.finished.put(job)
+        process.leave()
+
+    def _run_job(self, process: _WorkerProcess[Task, Result], task: Task) -> Result:
+        reason = ""
+        for retries_left in reversed(range(self._retries + 1)):
+            try:
+                return process.run(task)
+            except WorkerStartError:
+                if not retries_left:
+                    raise
+            except WorkerCrashed as crash:
+                reason = str(crash.found)
+                if retries_left:
+                    _log.warning("%s: its worker process died (%s); it is tried again", _name(task), reason)
+        return self._on_crash(task, reason)
+
+    def stop(self) -> None:
+        """Kill the running tasks, and let the idle processes leave; does not wait for that."""
+        self._stopped = True
+        if self._owner == os.getpid():
+            self._stop_writer.close()
+            for _ in self._threads:
+                self._jobs.put(None)
+
+    def close(self) -> None:
+        """End the processes, whatever they do."""
+        self.stop()
+        if self._owner == os.getpid():
+            for thread in self._threads:
+                thread.join()
+            self._stop_reader.close()
+        self._threads = []
+        self._close_worker()
+
+    def _close_worker(self) -> None:
+        worker, self._worker = self._worker, None
+        if worker is not None:
+            worker.close()
+
+    def __enter__(self) -> WorkerPool[Task, Result]:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+
+class _Job(Generic[Task, Result]):
+    """A task, what became of it, and the queue that it goes to then."""
+
+    def __init__(self, task: Task, finished: SimpleQueue[_Job[Task, Result]]) -> None:
+        self.task, self.finished = task, finished
+        self.cancelled = self.done = False
+        self.result: Result | None = None
+        self.error: BaseException | None = None
+
+
+class _WorkerProcess(Generic[Task, Result]):
+    """A process that runs one task after the other; it starts with a task, and again after it died.
+
+    One thread uses it, and lives as long: Linux kills a process when the thread that started it ends.
+
+    Args:
+        make_worker: is called in the process.
+        limits: of each task.
+        stop: a `Connection` that becomes readable when the running task has to be killed.
+    """
+
+    def __init__(self, make_worker: Callable[[], Worker[Task, Result]], limits: Limits, stop: Any) -> None:
+        self._make_worker, self._limits, self._stop = make_worker, limits, stop
+        self._process: subprocess.Popen[bytes] | None = None
+        self._connection: Any = None  # a Connection
+
+    def run(self, task: Task) -> Result:
+        """Run a task.
+
+        Raises:
+            WorkerStartError: the process can't start, or died before its first task.
+            WorkerCrashed: it died, or exceeded a limit.
+            CancelledError: the pool was stopped.
+            Exception: whatever the task, or making the worker, raises.
+        """
+        if self._process is None or self._process.poll() is not None:
+            try:
+                self._start()
+            except WorkerCrashed as crash:
+                what, fix = "a worker process died before its first task", "See its output above, and robocas doctor."
+                raise WorkerStartError(what, found=crash.found, fix=fix) from crash
+            except BaseException:
+                self._end()
+                raise
+        return self._ask(task, self._limits.seconds)
+
+    def leave(self) -> None:
+        """Let the process leave; kill it where that takes too long, or where it is busy."""
+        if self._process is not None:
+            self._connection.close()
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(_EXIT_SECONDS)
+        self._end()
+
+    def _start(self) -> None:
+        self._end()
+        try:
+            connection, theirs = Pipe()
+            with theirs:
+                program = _PROGRAM.format(path=sys.path, fd=theirs.fileno(), parent=os.getpid())
+                command = [sys.executable, "-c", program]
+                self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, pass_fds=(theirs.fileno(),))
+        except OSError as error:
+            what, fix = "can't start another process", "Use fewer --jobs, or raise the limits (ulimit -u, -n)."
+            raise RobocasError(what, found=error.strerror or error, fix=fix) from error
+        self._connection = connection
+        self._receive(_START_SECONDS)  # that it reads: nothing below waits for a full pipe
+        self._ask(cloudpickle.dumps(self._make_worker), _START_SECONDS)
+
+    def _ask(self, message: object, seconds: float) -> Any:
+        try:
+            self._connection.send(message)
+        except OSError as error:
+            raise self._crash() from error
+        return self._receive(seconds)
+
+    def _receive(self, seconds: float) -> Any:
+        assert self._process is not None
+        deadline = time.monotonic() + seconds
+        while not (ready := wait([self._connection, self._stop], _POLL_SECONDS)):
+            if time.monotonic() > deadline:
+                raise self._crash("too slow")
+            if exceeds_memory(self._process.pid, self._limits.memory_gb):
+                raise self._crash("too much memory")
+        if self._stop in ready:
+            self._end()
+            raise CancelledError
+        try:
+            answer = self._connection.recv()
+        except (EOFError, OSError) as error:
+            raise self._crash() from error
+        if isinstance(answer, SentError):
+            answer.reraise()
+        return answer
+
+    def _crash(self, reason: str = "") -> WorkerCrashed:
+        """End the process, and return the error that says why."""
+        assert self._process is not None
+        if not reason:
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(5)
+            code = self._process.returncode
+            reason = signal.Signals(-code).name if code is not None and code < 0 else f"exit code {code}"
+            if code in (-signal.SIGTERM, -signal.SIGKILL):
+                wait([self._stop], _JOB_KILL_SECONDS)  # else the task would be blamed for the end of all
+        self._end()
+        return WorkerCrashed("its worker process died", found=reason)
+
+    def _end(self) -> None:
+        if self._process is not None:
+            kill_tree(self._process)
+            self._process = None
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
+
+
+def exceeds_memory(pid: int, memory_gb: float, *, forks: bool = True) -> bool:
+    """Return whether a process, or one that it forked, uses more than ``memory_gb`` GiB.
+
+    Args:
+        pid: process id.
+        memory_gb: limit of each process.
+        forks: whether to look for processes that it forked, which takes milliseconds.
+    """
+    if memory_gb == math.inf:
+        return False
+    try:
+        process = psutil.Process(pid)
+        processes = [process, *(process.children(recursive=True) if forks else ())]
+        return any(one.memory_info().rss > memory_gb * 2**30 for one in processes)
+    except psutil.Error:
+        return False  # it has just ended
+
+
+def kill_tree(process: subprocess.Popen[bytes]) -> None:
+    """Kill a process and what it forked, which must not go on writing files, and wait for its end."""
+    with suppress(psutil.Error):
+        for forked in psutil.Process(process.pid).children(recursive=True):
+            forked.kill()
+    process.kill()
+    process.wait()
+
+
+def use_one_torch_thread() -> None:
+    """Let torch use one thread from now on: several threads of small operations wait for each other."""
+    import torch
+
+    torch.set_num_threads(1)
+
+
+def _name(task: Any) -> str:
+    return f"{task}"[:80]
+
+
+def _raise_crash(task: Any, reason: str) -> Any:
+    what, fix = "its worker process died", "Is memory short? Use fewer --jobs."
+    raise WorkerCrashed(what, where=_name(task), found=reason, fix=fix)

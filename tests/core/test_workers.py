@@ -1,0 +1,268 @@
+"""The worker pool: order, errors, limits, and what the death of a worker process costs."""
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from concurrent.futures import CancelledError
+from functools import partial
+from itertools import count
+
+import pytest
+
+from robocas_ms3.core.errors import AssetError, RobocasError, WorkerCrashed, WorkerStartError
+from robocas_ms3.core.workers import FunctionWorker, Limits, WorkerPool
+
+ROOT = os.path.dirname(os.path.dirname(os.path.dirname(__file__)))
+
+
+class Counter:
+    """Returns each task with the process and the number of tasks before; some tasks are slow, deadly or wrong."""
+
+    def __init__(self, made=None, log=None):
+        self.count, self.log = 0, log
+        if made is not None:
+            (made / str(os.getpid())).touch()
+
+    def run(self, task):
+        if task == "die":
+            os.kill(os.getpid(), signal.SIGSEGV)
+        if task == "die once" and not (self.log.parent / "died").exists():
+            (self.log.parent / "died").touch()
+            os.kill(os.getpid(), signal.SIGSEGV)
+        if task == "terminate":
+            os.kill(os.getpid(), signal.SIGTERM)
+        if task == "hang":
+            time.sleep(1000)
+        if task == "grow":
+            hog = bytearray(600 * 2**20)
+            time.sleep(1000)
+            del hog
+        if task == "fail":
+            raise AssetError("no such thing", where="it")
+        if isinstance(task, float):
+            time.sleep(task)
+        self.count += 1
+        if self.log is not None:
+            with self.log.open("a") as file:
+                file.write(f"{task}\n")
+        return task, os.getpid(), self.count
+
+    def close(self):
+        self.count = -1
+
+
+class CannotBeMade(Counter):
+    def __init__(self):
+        raise AssetError("nothing to work with")
+
+
+def square(number):
+    return number**2
+
+
+def tasks_of(results):
+    return [task for task, *_ in results]
+
+
+def test_without_processes_tasks_run_in_this_process():
+    with WorkerPool(Counter, 0) as pool:
+        assert list(pool.map(["a", "b"])) == [("a", os.getpid(), 1), ("b", os.getpid(), 2)]
+    with WorkerPool(CannotBeMade, 0) as pool:
+        assert list(pool.map([])) == []  # no worker is made
+
+
+def test_each_process_makes_one_worker_which_runs_all_tasks(tmp_path):
+    with WorkerPool(partial(Counter, tmp_path), 2) as pool:
+        first, second = list(pool.map(map(str, range(9)))), list(pool.map(["x", "y"]))
+    pids = {pid for _, pid, _ in first + second}
+    assert tasks_of(first) == list(map(str, range(9)))
+    assert tasks_of(second) == ["x", "y"]
+    assert os.getpid() not in pids
+    assert {path.name for path in tmp_path.iterdir()} == {str(pid) for pid in pids}
+    assert len(pids) <= 2
+
+
+def test_results_are_ordered_or_come_when_they_are_there_and_tasks_may_be_endless():
+    tasks = [0.6, 0.0, 0.01, 0.02]
+    with WorkerPool(Counter, 2) as pool:
+        assert tasks_of(pool.map(tasks)) == tasks
+        assert next(pool.map(tasks, ordered=False))[0] != 0.6
+    with WorkerPool(partial(FunctionWorker, square), 2) as pool:
+        squares = pool.map(count())
+        assert [next(squares) for _ in range(20)] == [number**2 for number in range(20)]
+
+
+@pytest.mark.parametrize("num_workers", [0, 1])
+def test_an_error_is_raised_as_it_is_and_the_worker_is_made_again(num_workers):
+    with WorkerPool(Counter, num_workers) as pool:
+        assert [pool.run("a")[2], pool.run("a")[2]] == [1, 2]
+        with pytest.raises(AssetError) as caught:
+            pool.run("fail")
+        assert caught.value.where == "it"
+        assert pool.run("a")[2] == 1
+
+
+@pytest.mark.parametrize("num_workers", [0, 2])
+def test_an_error_of_making_the_worker_is_raised_as_it_is(num_workers):
+    with WorkerPool(CannotBeMade, num_workers) as pool, pytest.raises(AssetError):
+        list(pool.map(["a", "b", "c"]))
+
+
+@pytest.mark.parametrize("ordered", [True, False])
+def test_a_crash_costs_only_its_own_task(ordered):
+    tasks = ["a", "b", "die", "c", "die", "d", "e"]
+    with WorkerPool(Counter, 2, on_crash=lambda task, reason: (f"{task}d: {reason}", 0, 0)) as pool:
+        found = tasks_of(pool.map(tasks, ordered=ordered))
+    expected = ["a", "b", "died: SIGSEGV", "c", "died: SIGSEGV", "d", "e"]
+    assert found == expected if ordered else sorted(found) == sorted(expected)
+
+
+def test_finished_tasks_do_not_run_again_after_a_crash(tmp_path):
+    tasks = [0.5, "fast", "fast too", "die"]
+    with WorkerPool(partial(Counter, log=tmp_path / "log"), 2, on_crash=lambda task, reason: (task, 0, 0)) as pool:
+        assert tasks_of(pool.map(tasks)) == tasks
+    done = (tmp_path / "log").read_text().split("\n")
+    assert [done.count(task) for task in ("fast", "fast too")] == [1, 1]
+
+
+def test_a_crash_is_an_error_by_default():
+    with WorkerPool(Counter, 1) as pool:
+        with pytest.raises(WorkerCrashed) as caught:
+            list(pool.map(["die", "a"]))
+        assert (caught.value.where, caught.value.found) == ("die", "SIGSEGV")
+
+
+@pytest.mark.parametrize(
+    ("task", "limits", "reason"),
+    [("hang", Limits(seconds=1.2), "too slow"), ("grow", Limits(memory_gb=0.3), "too much memory")],
+)
+def test_a_task_that_exceeds_a_limit_is_tried_again_once(tmp_path, caplog, task, limits, reason):
+    def crashed(task, reason):
+        return f"{task}: {reason}", 0, 0
+
+    with WorkerPool(partial(Counter, log=tmp_path / "log"), 1, limits=limits, on_crash=crashed) as pool:
+        results = list(pool.map(["a", task, "die once"]))
+    assert tasks_of(results) == ["a", f"{task}: {reason}", "die once"]
+    assert len(caplog.records) == 2  # each task has been tried again
+
+
+def test_a_task_is_not_tried_again_where_none_is(tmp_path):
+    with WorkerPool(partial(Counter, log=tmp_path / "log"), 1, retries=0) as pool:
+        with pytest.raises(WorkerCrashed):
+            pool.run("die once")
+        assert pool.run("die once")[0] == "die once"
+
+
+def make_unpicklable(task):
+    return lambda: task
+
+
+def test_a_result_that_cannot_be_pickled_is_an_error():
+    with WorkerPool(partial(FunctionWorker, make_unpicklable), 1) as pool, pytest.raises(Exception, match="pickle"):
+        pool.run(1)
+
+
+def test_a_process_outlives_the_thread_that_asked_for_it():
+    with WorkerPool(Counter, 1) as pool:
+        found = []
+        thread = threading.Thread(target=lambda: found.append(pool.run("a")))
+        thread.start()
+        thread.join()
+        time.sleep(0.2)
+        assert pool.run("b") == ("b", found[0][1], 2)
+
+
+def test_stopping_a_pool_cancels_what_other_threads_wait_for():
+    errors = []
+
+    def wait():
+        try:
+            pool.run("hang")
+        except CancelledError as error:
+            errors.append(error)
+
+    pool = WorkerPool(Counter, 1)
+    pool.run("a")
+    threads = [threading.Thread(target=wait) for _ in range(2)]  # of a running task, and of a queued one
+    for thread in threads:
+        thread.start()
+    time.sleep(0.2)
+    pool.close()
+    for thread in threads:
+        thread.join(10)
+    assert len(errors) == 2
+
+
+def test_a_signal_that_ends_a_whole_job_is_not_a_crash():
+    with WorkerPool(Counter, 1) as pool:
+        assert pool.run("terminate")[0] == "terminate"
+
+
+def test_a_process_that_the_system_refuses_is_an_error_and_ends_nothing(monkeypatch):
+    def refuse(*args, **kwargs):
+        raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+
+    with WorkerPool(Counter, 1) as pool:
+        with monkeypatch.context() as patch:
+            patch.setattr("subprocess.Popen", refuse)
+            with pytest.raises(RobocasError) as caught:
+                pool.run("a")
+            assert caught.value.found == os.strerror(errno.EAGAIN)
+        assert pool.run("a")[0] == "a"
+
+
+def test_a_fork_starts_processes_of_its_own():
+    with WorkerPool(Counter, 1) as pool:
+        process = pool.run("a")[1]
+        pid = os.fork()
+        if not pid:
+            try:
+                with WorkerPool(Counter, 1) as other:
+                    os._exit(0 if {pool.run("b")[2], other.run("b")[2]} == {1} else 1)
+            finally:
+                os._exit(2)
+        assert os.waitpid(pid, 0)[1] == 0
+        assert pool.run("b") == ("b", process, 2)
+
+
+class TooLarge(Counter):
+    def __init__(self):
+        self.hog = bytearray(300 * 2**20)
+        time.sleep(1000)
+
+
+def test_a_process_that_is_too_large_before_its_first_task_blames_no_task():
+    with WorkerPool(TooLarge, 1, limits=Limits(memory_gb=0.2), on_crash=lambda task, reason: (task, 0, 0)) as pool:
+        with pytest.raises(WorkerStartError) as caught:
+            pool.run("a")
+        assert caught.value.found == "too much memory"
+
+
+PROGRAM = """
+import time
+from tqdm import tqdm
+from robocas_ms3.core.workers import WorkerPool
+
+class Busy:
+    def run(self, task):
+        list(tqdm([task], disable=False))
+        time.sleep(1000 * task)
+        return task
+
+    def close(self):
+        pass
+
+with WorkerPool(Busy, 2) as pool:
+    print(next(pool.map([0, 1, 1])))
+"""
+
+
+def test_a_program_from_standard_input_needs_no_guard_and_leaves_no_semaphores():
+    env = {**os.environ, "PYTHONPATH": ROOT}
+    done = subprocess.run([sys.executable, "-"], env=env, input=PROGRAM, capture_output=True, text=True, check=True)
+    assert done.stdout == "0\n"
+    assert "leaked" not in done.stderr  # the semaphore of a progress bar, of which Python would warn
