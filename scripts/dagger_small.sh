@@ -30,5 +30,5 @@ timed "$robocas" generate "$task" --config "${task}_upstream_eval" -n "$episodes
 timed "$robocas" convert "$out/demos/trajectory.h5" --out "$out/parts" --size 512 384 --no-depth --no-video \
     --cameras base_camera gripper_camera --jobs "$jobs" --resume
 timed "$robocas" merge "$from/data" "$out/parts" --out "$out/data" --resume
-timed "$robocas" train small --data "$out/data" --out "$out/run" --start "$from/run" --steps "$steps" --resume
+timed "$robocas" train small --data "$out/data" --out "$out/run" --start "$from/run" --steps "$steps"
 timed "$robocas" eval "$task" --policy "$out/run" --protocol paper-v1 --out "$out/eval" --envs "$jobs" --resume

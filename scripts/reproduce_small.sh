@@ -55,5 +55,5 @@ for part in "${parts[@]}"; do
     data+=("$out/parts/$name")
 done
 timed "$robocas" merge "${data[@]}" --out "$out/data" --resume
-timed "$robocas" train small --data "$out/data" --out "$out/run" --steps "$steps" ${start:+--start "$start"} --resume
+timed "$robocas" train small --data "$out/data" --out "$out/run" --steps "$steps" ${start:+--start "$start"}
 timed "$robocas" eval "$played" --policy "$out/run" --protocol paper-v1 --out "$out/eval" --envs "$jobs" --resume

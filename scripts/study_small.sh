@@ -43,6 +43,6 @@ for what in "${whats[@]}"; do
             timed "$robocas" split "$made" --parts "$share" "$rest" --out "$out/data" --resume
             ;;
     esac
-    timed "$robocas" train small --data "$data" --out "$out/run" --steps "$steps" "${more[@]}" --resume
+    timed "$robocas" train small --data "$data" --out "$out/run" --steps "$steps" "${more[@]}"
     timed "$robocas" eval pick --policy "$out/run" --protocol paper-v1 --episodes "$episodes" --out "$out/eval" --envs "$jobs" --resume
 done

@@ -212,7 +212,7 @@ class TrialBaseline(_Kind, Protocol):
     Attributes:
         Config: form of its configuration.
         trials: (configuration, ``cpu`` or ``cuda``) to what it learns in.
-        training: (configuration, trials, run's folder, ``run.json``, accelerator, resume=, on_note=) to a `Training`.
+        training: (configuration, trials, `OutputFolder`, `RunRecord`, accelerator, start=, on_note=) to a `Training`.
     """
 
     Config: type[TrialConfig]

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.baselines.baseline import Baseline, BaselineConfig
-from robocas_ms3.baselines.runs import CHECKPOINT, RUN, WEIGHTS, RunRecord, find_run, hash_of_weights, read_run
+from robocas_ms3.baselines.runs import CHECKPOINT, WEIGHTS, RunRecord, find_run, hash_of_weights, read_run
 from robocas_ms3.core.errors import TrainingError
 from robocas_ms3.core.strict import parse
 
@@ -53,44 +53,21 @@ def find_start(baseline: Baseline, start: Path | None, before: RunRecord | None,
     start = find_run(start)
     record = read_run(start)
     name = f"{start.resolve().name}, {hash_of_weights(start)[:12]}"
-    if before is not None and before.start != name:
-        fix = "Leave --start out, or train anew with --overwrite."
-        raise TrainingError(
-            "a run goes on from what it began with",
-            where=out,
-            expected=before.start or "no --start",
-            found=name,
-            fix=fix,
-        )
     expected = {"baseline": baseline.name, "version": str(baseline.version)}
     return Start(record, name, None if begun else checkpoints.load(start / WEIGHTS, expected)[0])
 
 
 def config_of(
-    baseline: Baseline, changes: Mapping[str, Any] | None, before: RunRecord | None, begin: Start | None, out: Path
+    baseline: Baseline, changes: Mapping[str, Any] | None, before: RunRecord | None, begin: Start | None
 ) -> BaselineConfig:
-    """The configuration of a run: as it was begun, or as the run that it begins with, or the defaults, and ``changes``.
+    """Return the recorded configuration, that of the run to start from, or the defaults, with ``changes``.
 
     Raises:
-        TrainingError: it is wrong, or a run that goes on would have another one.
+        TrainingError: it is wrong.
     """
-    if before is None:
-        below = begin.record.config if begin else baseline.Config().model_dump(mode="json")
-        return parse(baseline.Config, merged(below, changes or {}), TrainingError, where=baseline.name)
-    config = parse(baseline.Config, before.config, TrainingError, where=out / RUN)
-    if changes:
-        wanted = parse(baseline.Config, merged(before.config, changes), TrainingError, where=baseline.name)
-        if wanted != config:
-            now, asked = (one.model_dump(mode="json") for one in (config, wanted))
-            name, expected, found = _other(now, asked, "", 0.0) or ("its configuration", now, asked)
-            raise TrainingError(
-                "a run goes on as it was begun",
-                where=f"{out}, {name.removeprefix('.')}",
-                expected=expected,
-                found=found,
-                fix=f"Leave that out; --start {out} --out ANOTHER trains on otherwise; --overwrite trains anew.",
-            )
-    return config
+    source = before or (begin.record if begin else None)
+    below = source.config if source else baseline.Config().model_dump(mode="json")
+    return parse(baseline.Config, merged(below, changes or {}), TrainingError, where=baseline.name)
 
 
 def precision_of(config: BaselineConfig, before: RunRecord | None) -> Any:
@@ -148,13 +125,11 @@ def others(record: RunRecord, accelerator: Any) -> str:
         "device": str(accelerator.device.type),
         "precision": str(accelerator.mixed_precision),
         "threads": threads_of(accelerator) if record.threads else 0,
-        **versions(),
     }
     before = {
         "device": record.device,
         "precision": record.precision,
         "threads": record.threads,
-        **record.versions,
     }
     return ", ".join(f"{name} {value}" for name, value in now.items() if before.get(name) != value)
 
@@ -164,36 +139,6 @@ def threads_of(accelerator: Any) -> int:
     import torch
 
     return torch.get_num_threads() if accelerator.device.type == "cpu" else 0
-
-
-def check_kind(before: RunRecord, baseline: Baseline, out: Path) -> None:
-    """See that a run is of a baseline, before its configuration is read, which another version may have otherwise."""
-    if before.baseline != baseline.name:
-        raise TrainingError("a run of another baseline", where=out, expected=baseline.name, found=before.baseline)
-    if before.version != baseline.version:
-        raise TrainingError(
-            f"a run of another version of {baseline.name}",
-            where=out,
-            expected=baseline.version,
-            found=before.version,
-            fix="Train anew with --overwrite.",
-        )
-
-
-def check_same_data(before: RunRecord, hashed: str, out: Path) -> None:
-    """See that a run goes on with the data that it was begun with.
-
-    Raises:
-        TrainingError: it is other data.
-    """
-    if before.data.hash != hashed:
-        raise TrainingError(
-            "a run on another dataset",
-            where=out,
-            expected=f"{before.data.name}, {before.data.hash[:12]}",
-            found=hashed[:12],
-            fix="Name that one by --data, or choose another --out.",
-        )
 
 
 def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from robocas_ms3.core.files import replacing
 
 _HINTS = {
     CHECKPOINT: "It is damaged, or of another program: train anew with --overwrite.",
-    WEIGHTS: "It is damaged, or of another program: `robocas train` with --resume writes it anew.",
+    WEIGHTS: "It is damaged, or of another program: `robocas train` into this folder writes it again.",
 }
 
 
@@ -65,7 +65,7 @@ def load(path: Path, expected: Mapping[str, str]) -> tuple[dict[str, torch.Tenso
         TrainingError: there is no such file, it is damaged, or of something else.
     """
     if not path.is_file():
-        fix = "A training that ended before it wrote one goes on with --resume."
+        fix = "`robocas train` into this folder continues a training that ended before it wrote one."
         raise TrainingError("no such file", where=path, fix=fix)
     try:
         with safe_open(path, "pt") as file:

@@ -17,7 +17,6 @@ from typing import Any, Literal
 
 from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import TrainingError
-from robocas_ms3.core.files import write_json
 from robocas_ms3.core.strict import StrictModel, parse
 
 RUN, METRICS, BOARD = "run.json", "metrics.csv", "tensorboard"
@@ -97,11 +96,6 @@ def read_run(folder: Path) -> RunRecord:
     if not isinstance(found, dict) or found.get("kind") != RunRecord.model_fields["kind"].default:
         raise TrainingError("no run of robocas train", where=path, expected="kind robocas training run")
     return parse(RunRecord, found, TrainingError, where=path)
-
-
-def write_run(folder: Path, record: RunRecord) -> None:
-    """Write the record of a run."""
-    write_json(folder / RUN, record.model_dump(mode="json"), sync=True)
 
 
 def hash_of(data: Path) -> str:

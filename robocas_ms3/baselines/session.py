@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
@@ -11,8 +12,6 @@ from typing import Any
 from robocas_ms3.baselines.baseline import Baseline, BaselineConfig, OnRead, Samples, Training
 from robocas_ms3.baselines.begin import (
     Start,
-    check_kind,
-    check_same_data,
     config_of,
     facts_of,
     find_start,
@@ -21,21 +20,14 @@ from robocas_ms3.baselines.begin import (
     threads_of,
     versions,
 )
-from robocas_ms3.baselines.runs import RUN, DataRecord, RunRecord, hash_of, read_run, write_run
+from robocas_ms3.baselines.runs import RUN, DataRecord, RunRecord, hash_of
 from robocas_ms3.baselines.table import find_baseline, need_extra
-from robocas_ms3.core.errors import EmptySplitError, OutputExistsError, TrainingError
+from robocas_ms3.core.errors import EmptySplitError, TrainingError
 from robocas_ms3.core.exits import no_exit
-from robocas_ms3.core.files import make_folder
-from robocas_ms3.core.locks import locked_folder
-from robocas_ms3.core.outputs import (
-    check_one_way,
-    check_overwrite,
-    check_run,
-    claim_output,
-    is_taken,
-    sweep,
-    while_there,
-)
+from robocas_ms3.core.outputs import FolderKind, OutputFolder
+from robocas_ms3.core.strict import parse
+
+OUTPUT = FolderKind("robocas train", (RUN,), "baseline")
 
 
 @dataclass
@@ -61,91 +53,85 @@ def train_run(
     *,
     start: Path | None = None,
     device: str = "auto",
-    resume: bool = False,
     overwrite: bool = False,
     said: Said | None = None,
 ) -> RunRecord:
-    """Train a baseline.
+    """Train a baseline, or continue a run with the same settings.
 
     Args:
         name: of the baseline.
         data: dataset; None for a baseline that learns by trying.
         out: folder of the run.
-        changes: of its configuration, nested as that is; for a run that goes on they may be left out.
+        changes: of its configuration, nested as that is; of a run that continues, they may be left out.
         start: folder of a run to begin with, such as one on less data: its weights and scales, and its configuration
             below ``changes``.
         device: ``auto``, ``cpu`` or ``cuda``.
-        resume: whether to go on with a run that is there.
-        overwrite: whether to replace one.
+        overwrite: start again, and replace the run in ``out`` once the data is read.
         said: what to call meanwhile.
 
     Raises:
-        TrainingError: the configuration is wrong, or the run that is there is of something else.
+        TrainingError: the configuration is wrong.
         DatasetError: the data does not suit the baseline.
-        OutputExistsError: there is something.
-        KeyboardInterrupt: Ctrl-C; ``resume`` goes on.
+        OutputExistsError: ``out`` is a run with other settings, versions or data, or no run.
+        KeyboardInterrupt: Ctrl-C; the run can be continued.
     """
-    check_one_way("train", resume=resume, overwrite=overwrite, error=TrainingError)
     need_extra("accelerate", "safetensors", "tensorboard", "transformers")
     baseline, said = find_baseline(name), said or Said()
     trier: Any = baseline if hasattr(baseline, "trials") else None  # a `TrialBaseline`
     _check_data(baseline, data, by_trial=trier is not None)
-    before = read_run(out) if resume and (out / RUN).is_file() else None
-    if before is not None:
-        check_kind(before, baseline, out)
-    begin = find_start(baseline, start, before, out)
-    config = config_of(baseline, changes, before, begin, out)
-    check_run(out / RUN, "baseline", "train")
-    from robocas_ms3.baselines.devices import make_accelerator
-    from robocas_ms3.baselines.train import Trainer
-
-    accelerator = make_accelerator(device, precision_of(config, before))
-    if config.train.batch_size % accelerator.num_processes:
-        found = f"{config.train.batch_size} for {accelerator.num_processes} processes"
-        raise TrainingError("processes share a batch evenly", where="train.batch_size", found=found)
+    output = OutputFolder(out, OUTPUT, overwrite=overwrite)
+    is_main = os.environ.get("RANK", "0") == "0"  # of the processes of `accelerate launch`, this one writes
     with ExitStack() as stack:
         stack.enter_context(no_exit(f"baseline {name}"))
-        if accelerator.is_main_process:
-            stack.enter_context(locked_folder(out))
-            if out.is_dir() and ((out / RUN).is_file() or all(path.name.startswith(".") for path in out.iterdir())):
-                sweep(out)
-            if overwrite:
-                check_overwrite(out, [RUN], "a run of robocas train")
-            if resume and before is None and is_taken(out):
-                what, fix = "no run of robocas train to go on with", "Choose another --out."
-                raise OutputExistsError(what, where=out, expected=RUN, fix=fix)
-            # What is replaced stays until there is something instead.
-            claim_output(out, resume=before is not None or overwrite)
+        if is_main:
+            stack.enter_context(output)
+        else:
+            output.read()
+        output.check_settings({"baseline": baseline.name, "version": baseline.version, "versions": versions()})
+        before = None
+        if output.recorded is not None:
+            before = parse(RunRecord, output.recorded, TrainingError, where=out / RUN)
+            config = parse(baseline.Config, before.config, TrainingError, where=out / RUN)
+            # Options that are newer than the run have their defaults
+            before = before.model_copy(update={"config": config.model_dump(mode="json")})
+            output.recorded = before.model_dump(mode="json")
+        begin = find_start(baseline, start, before, out)
+        config = config_of(baseline, changes, before, begin)
+        settings: dict[str, Any] = {"config": config.model_dump(mode="json")}
+        output.check_settings(settings | ({"start": begin.name} if begin else {}))
+        from robocas_ms3.baselines.devices import make_accelerator
+        from robocas_ms3.baselines.train import Trainer
+
+        accelerator = make_accelerator(device, precision_of(config, before))
+        if config.train.batch_size % accelerator.num_processes:
+            found = f"{config.train.batch_size} for {accelerator.num_processes} processes"
+            raise TrainingError("processes share a batch evenly", where="train.batch_size", found=found)
         samples: Any = None
         if trier is not None:
             samples = stack.enter_context(closing(trier.trials(config, accelerator.device.type)))
         hashed = samples.hash if data is None else hash_of(data)
         if before is not None:
-            check_same_data(before, hashed, out)
+            output.check_settings({"data": {**before.data.model_dump(), "hash": hashed}})
         check = None
         if data is not None:
             said.note(f"reading {data}")
             samples = baseline.data(config, data, "train", said.read)
             check = _validation(baseline, config, data, said)
         record = before or _record(baseline, config, data, hashed, samples, begin, accelerator)
-        more: dict[str, Any] = {"resume": resume, "start": begin.weights if begin else None, "on_note": said.note}
+        more: dict[str, Any] = {"start": begin.weights if begin else None, "on_note": said.note}
         if trier is not None:
-            trainer: Training = trier.training(config, samples, out, record, accelerator, **more)
+            trainer: Training = trier.training(config, samples, output, record, accelerator, **more)
         else:
-            trainer = Trainer(baseline, config, samples, check, out, record, accelerator, **more)
-        if accelerator.is_main_process and before is None:
-            claim_output(out, overwrite=overwrite, resume=True)
-            make_folder(out)
-            write_run(out, record)
-        elif accelerator.is_main_process and (changed := others(record, accelerator)):
+            trainer = Trainer(baseline, config, samples, check, output, record, accelerator, **more)
+        if before is not None and (changed := others(record, accelerator)):
             record.resumed.append(f"from step {trainer.step} by {changed}")
-            said.note(f"goes on {record.resumed[-1]}: not what it would be by what it was begun by")
-            write_run(out, record)
+            said.note(f"continues {record.resumed[-1]}: results differ from those of an uninterrupted run")
+        if is_main:
+            output.start(record.model_dump(mode="json"))
         accelerator.wait_for_everyone()
         of = f"{len(samples)} {'samples of' if trier is None else 'steps in'} {samples.episodes}"
         said.note(_line(record, trainer, f"{of} {'episodes' if trier is None else 'layouts'}", accelerator))
-        with while_there(out / RUN, TrainingError):
-            trainer.train(said.step)
+        trainer.train(said.step)
     return record
 
 

@@ -23,7 +23,7 @@ from robocas_ms3.baselines.runs import CHECKPOINT, RunRecord
 from robocas_ms3.baselines.schedule import Batches, epochs_at, learning_rate
 from robocas_ms3.core.errors import RobocasError, TrainingError
 from robocas_ms3.core.exits import deferred_interrupts, exit_error, uninterrupted
-from robocas_ms3.core.outputs import check_there
+from robocas_ms3.core.outputs import OutputFolder
 
 
 class Trainer:
@@ -34,10 +34,9 @@ class Trainer:
         config: its configuration.
         samples: of training.
         check: of validation; None: there is none.
-        folder: of the run, with its ``run.json``.
-        record: that.
+        output: folder of the run.
+        record: of the run.
         accelerator: see `make_accelerator`.
-        resume: whether to go on from the folder's checkpoint, if it has one.
         start: weights to begin with; None: random ones.
         on_note: called with a line when there is something to say.
     """
@@ -48,16 +47,16 @@ class Trainer:
         config: BaselineConfig,
         samples: Samples,
         check: Samples | None,
-        folder: Path,
+        output: OutputFolder,
         record: RunRecord,
         accelerator: Accelerator,
         *,
-        resume: bool = False,
         start: Mapping[str, torch.Tensor] | None = None,
         on_note: Callable[[str], None] = lambda text: None,
     ) -> None:
         self.settings, self._samples, self._check = config.train, samples, check
-        self._folder, self._note, self._accelerator = folder, on_note, accelerator
+        self._output, self._folder = output, output.path
+        self._note, self._accelerator = on_note, accelerator
         self._about = {"baseline": record.baseline, "version": str(record.version), "dataset": record.data.hash}
         torch.manual_seed(self.settings.seed)
         model = baseline.model(config, record.facts)
@@ -71,7 +70,7 @@ class Trainer:
         self._sums: dict[str, torch.Tensor] = {}
         self._norms = torch.zeros((), dtype=torch.float64, device=accelerator.device)  # of all gradients, summed up
         kept: dict[str, torch.Tensor] = {}
-        if resume and (folder / CHECKPOINT).is_file():
+        if output.recorded is not None and (self._folder / CHECKPOINT).is_file():
             kept = self._go_on(model)
         else:
             torch.manual_seed(self.settings.seed + 1 + accelerator.process_index)
@@ -174,7 +173,7 @@ class Trainer:
                 raise TrainingError(
                     f"the {name} is no number any more",
                     where=f"{self._folder}, step {step}",
-                    fix="Lower train.learning_rate; --resume goes on from the last checkpoint.",
+                    fix="Start another run from this one (--start), with a lower train.learning_rate.",
                 )
 
     def _of_all(self, sums: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
@@ -213,7 +212,7 @@ class Trainer:
     def _tell(self, log: MetricsLog | None, split: str, metrics: dict[str, float], seconds: float) -> None:
         if log is None:
             return
-        check_there(self._folder / "run.json", TrainingError)
+        self._output.check_exists()
         about = {
             "epoch": epochs_at(self.step, len(self._samples), self.settings),
             "seconds": seconds,
@@ -237,7 +236,7 @@ class Trainer:
         tensors |= {f"random.{name}": state for name, state in random.items()}
         if not self._accelerator.is_main_process:
             return
-        check_there(self._folder / "run.json", TrainingError)
+        self._output.check_exists()
         with uninterrupted():
             about = {**self._about, "step": str(self.step)}
             checkpoints.save_run(self._folder, tensors, self._acting().state_dict(), about)

@@ -116,7 +116,7 @@ def run(argv: Sequence[str]) -> int:
         if debug or error.errno not in _ENVIRONMENT:
             raise
         where = f"{error.filename}: " if error.filename else ""
-        return _say(f"error: {where}{os.strerror(error.errno)}{_room(error, arguments[0])}", sys.stderr, 1)
+        return _say(f"error: {where}{os.strerror(error.errno)}{_room(error)}", sys.stderr, 1)
 
 
 def _dispatch(arguments: list[str]) -> int:
@@ -183,17 +183,15 @@ def _lend_folders() -> None:
             os.environ[variable] = str(folder / usual.name)
 
 
-def _room(error: OSError, command: str) -> str:
+def _room(error: OSError) -> str:
     """How much there is where it does not suffice, and what to do then."""
     variable = variable_of(error.filename) if error.filename else ""
     if error.errno not in FULL:
         return f". Set {variable} to a folder that can be written to." if variable else ""
     folders = [folder for folder in Path(error.filename or "").absolute().parents if folder.is_dir()]
     free = f" ({shutil.disk_usage(folders[0]).free / 2**20:.0f} MB free)" if error.filename else ""
-    of_command = config_type(module_of(command), command)
-    goes_on = command == "plan" or any(field.name == "resume" for field in fields(of_command))
     elsewhere = f", or set {variable} to a folder that has some" if variable else ""
-    return f"{free}. Make room{elsewhere}" + (", then go on with --resume." if goes_on else ".")
+    return f"{free}. Make room{elsewhere}, then run the command again."
 
 
 def module_of(name: str) -> ModuleType:

@@ -47,10 +47,8 @@ class Train:
     random weights, the baseline's defaults."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where it computes. Auto: a GPU if there is one."""
-    resume: bool = False
-    """Go on with a run that was interrupted, as if it had not been."""
     overwrite: bool = False
-    """Replace the run that is there."""
+    """Start again. Default: continue a run with the same settings, as if it had not been interrupted."""
 
 
 def main(cfg: Train) -> int:
@@ -79,12 +77,11 @@ def main(cfg: Train) -> int:
                 changes_of(cfg),
                 start=start,
                 device=cfg.device,
-                resume=cfg.resume,
                 overwrite=cfg.overwrite,
                 said=said,
             )
         except KeyboardInterrupt:
-            raise KeyboardInterrupt("the same command with --resume goes on") from None
+            raise KeyboardInterrupt("the same command continues") from None
     if first:
         say(f"{shown}: trained. Next: robocas eval TASK --policy {shown} --protocol {'paper-v1' if cfg.data else 'P'}")
     return 0

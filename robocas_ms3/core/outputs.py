@@ -91,9 +91,7 @@ class OutputFolder:
     def __enter__(self) -> OutputFolder:
         with ExitStack() as stack:
             self.has_lock = stack.enter_context(locked_folder(self.path))
-            self.recorded = self._read()
-            if self._settings is not None:
-                self.check_settings(self._settings)
+            self.read()
             self._stack = stack.pop_all()
         return self
 
@@ -111,6 +109,16 @@ class OutputFolder:
             with suppress(OSError, RobocasError):
                 if not self._has_results():
                     _delete(self.path)
+
+    def read(self) -> None:
+        """Check the folder without locking it, as is enough for further processes of one run.
+
+        Raises:
+            OutputExistsError: the folder was not written by the command, or with other settings.
+        """
+        self.recorded = self._load_matching()
+        if self._settings is not None:
+            self.check_settings(self._settings)
 
     def check_settings(self, settings: Mapping[str, Any]) -> None:
         """Check that recorded settings match; not those of a folder that is to be overwritten.
@@ -161,7 +169,7 @@ class OutputFolder:
         paths = [self.path / record for record in self._kind.records]
         return next((path for path in paths if path.is_file()), paths[0])
 
-    def _read(self) -> dict[str, Any] | None:
+    def _load_matching(self) -> dict[str, Any] | None:
         """Return the record; None if there is nothing to continue."""
         if is_empty(self.path):
             return None

@@ -296,7 +296,7 @@ def test_code_that_exits_inside_a_command_is_an_error(failing, capsys, how):
 def test_a_full_disk_is_one_line_but_a_bug_is_not(failing, capsys):
     failing(OSError(errno.ENOSPC, "No space left on device", "out/x.h5"))
     assert cli.run(["list"]) == 1
-    said = r"error: out/x.h5: No space left on device \(\d+ MB free\)\. Make room\.\n"
+    said = r"error: out/x.h5: No space left on device \(\d+ MB free\)\. Make room.*\n"
     assert re.fullmatch(said, capsys.readouterr().err)
 
     failing(FileNotFoundError(errno.ENOENT, "No such file or directory", "x"))
@@ -328,7 +328,7 @@ def test_a_full_disk_says_how_to_go_on(monkeypatch, tmp_path, capsys):
 
     monkeypatch.setattr("robocas_ms3.cli.generate.main", full)
     assert cli.run(["generate", "pick"]) == 1
-    assert capsys.readouterr().err.endswith(" MB free). Make room, then go on with --resume.\n")
+    assert capsys.readouterr().err.endswith(" MB free). Make room, then run the command again.\n")
 
 
 def test_a_full_or_forbidden_cache_says_what_puts_it_elsewhere(failing, monkeypatch, tmp_path, capsys):

@@ -31,7 +31,7 @@ def check(dataset, tmp_path, name, precision, device):
     changes = {**CHANGES[name], "train": {**TRAIN, "precision": precision}}
     with pytest.raises(KeyboardInterrupt):
         train_run(name, dataset, out, changes, device=device, said=stop_at(3))
-    record = train_run(name, dataset, out, device=device, resume=True)
+    record = train_run(name, dataset, out, device=device)
     assert (record.device, record.resumed) == (device, [])
     rows = (out / "metrics.csv").read_text().splitlines()
     assert [row.split(",")[:2] for row in rows[1:]] == [

@@ -111,4 +111,4 @@ if __name__ == "__main__":
     try:
         train_run("made-up", data, out / "again", device="cpu", said=crash_at(17))
     except RuntimeError:
-        train_run("made-up", data, out / "again", device="cpu", resume=True)
+        train_run("made-up", data, out / "again", device="cpu")

@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from pathlib import Path
 
 import torch
 from accelerate import Accelerator
@@ -21,7 +20,7 @@ from robocas_ms3.baselines.ppo.trials import FIRST_TRIAL, EnvTrials
 from robocas_ms3.baselines.runs import CHECKPOINT, RunRecord
 from robocas_ms3.core.errors import TrainingError
 from robocas_ms3.core.exits import deferred_interrupts, uninterrupted
-from robocas_ms3.core.outputs import check_there
+from robocas_ms3.core.outputs import OutputFolder
 
 
 class PpoTraining:
@@ -34,10 +33,9 @@ class PpoTraining:
     Args:
         config: see `PpoConfig`.
         trials: environments to try in.
-        folder: of the run, with its ``run.json``.
-        record: that.
+        output: folder of the run.
+        record: of the run.
         accelerator: what it computes on; one process.
-        resume: whether to go on from the folder's checkpoint, if it has one.
         start: weights to begin with; None: random ones.
         on_note: called with a line when there is something to say.
 
@@ -49,18 +47,18 @@ class PpoTraining:
         self,
         config: PpoConfig,
         trials: EnvTrials,
-        folder: Path,
+        output: OutputFolder,
         record: RunRecord,
         accelerator: Accelerator,
         *,
-        resume: bool = False,
         start: Mapping[str, torch.Tensor] | None = None,
         on_note: Callable[[str], None] = lambda text: None,
     ) -> None:
         if accelerator.num_processes > 1:
             found, fix = f"{accelerator.num_processes} processes", "Run it without `accelerate launch`."
             raise TrainingError("learns in one process", where=record.baseline, found=found, fix=fix)
-        self.config, self._trials, self._folder, self._note = config, trials, folder, on_note
+        self.config, self._trials, self._note = config, trials, on_note
+        self._output, self._folder = output, output.path
         self._about = {"baseline": record.baseline, "version": str(record.version), "dataset": record.data.hash}
         torch.manual_seed(config.train.seed)
         self.agent = Agent(record.facts["observed"], record.facts["acted"], config.width).to(accelerator.device)
@@ -69,7 +67,7 @@ class PpoTraining:
         self.optimizer = torch.optim.Adam(self.agent.parameters(), lr=config.train.learning_rate, eps=1e-5)
         self.step, self._tried_out = 0, False
         self.played = 0, torch.empty(0, len(OUTCOMES))
-        if resume and (folder / CHECKPOINT).is_file():
+        if output.recorded is not None and (self._folder / CHECKPOINT).is_file():
             self._go_on()
 
     def parameters(self) -> Iterator[nn.Parameter]:
@@ -126,12 +124,12 @@ class PpoTraining:
             raise TrainingError(
                 f"the {'gradient' if wrong == ['gradient'] else 'loss'} is no number any more",
                 where=f"{self._folder}, step {self.step}",
-                fix="Lower train.learning_rate; --resume goes on from the last checkpoint.",
+                fix="Start another run from this one (--start), with a lower train.learning_rate.",
             )
 
     def _tell(self, log: MetricsLog, split: str, ended: torch.Tensor, seconds: float, losses: dict[str, float]) -> None:
         """Means of what came of episodes (n, 4), NaN of none."""
-        check_there(self._folder / "run.json", TrainingError)
+        self._output.check_exists()
         about = {
             "epoch": self.played[0] / self.config.layouts,
             "seconds": seconds,
@@ -154,7 +152,7 @@ class PpoTraining:
         tensors |= {"tried_out": torch.tensor(self._tried_out), "random.cpu": torch.get_rng_state()}
         if self.agent.mean.is_cuda:
             tensors["random.cuda"] = torch.cuda.get_rng_state()
-        check_there(self._folder / "run.json", TrainingError)
+        self._output.check_exists()
         about = {**self._about, "step": str(self.step)}
         with uninterrupted():
             checkpoints.save_run(self._folder, tensors, self.agent.state_dict(), about)

@@ -110,14 +110,14 @@ def test_ctrl_c_keeps_what_was_learned(made_up, tmp_path):
     assert weights["count"].item() == pytest.approx(640, abs=1e-3)
     assert int(kept["episodes.played"]) == 640 // STEPS
     steps = []
-    train_run("ppo", None, run, device="cpu", resume=True, said=Said(step=lambda done, of: steps.append(done)))
+    train_run("ppo", None, run, device="cpu", said=Said(step=lambda done, of: steps.append(done)))
     assert steps == list(range(640, 1281, 64))
     assert [int(row["step"]) for row in lines(run)] == list(range(64, 1281, 64))
     assert load_file(run / "weights.safetensors")["count"].item() == pytest.approx(1280, abs=1e-3)
     first, second = (envs.seeds[0] for envs in MadeUpTrials.made)
     assert (first, second) == (0, 640 // STEPS % 10)  # the layouts after those that were played
     before = (run / "weights.safetensors").read_bytes()
-    train_run("ppo", None, run, device="cpu", resume=True)  # what is done is done
+    train_run("ppo", None, run, device="cpu")  # what is done is done
     assert (run / "weights.safetensors").read_bytes() == before
     assert len(lines(run, "val")) == 1
 
@@ -128,7 +128,7 @@ def test_what_goes_on_is_what_was_there(made_up, tmp_path):
         train_run("ppo", None, run, SMALL, device="cpu", said=interrupt_at(640))
     before = load_file(run / "checkpoint.safetensors")
     with pytest.raises(KeyboardInterrupt):
-        train_run("ppo", None, run, device="cpu", resume=True, said=interrupt_at(640))  # before the next update
+        train_run("ppo", None, run, device="cpu", said=interrupt_at(640))  # before the next update
     again = load_file(run / "checkpoint.safetensors")
     assert before.keys() == again.keys()
     assert any(name.startswith("optimizer.") for name in before)
@@ -165,7 +165,7 @@ def test_other_scenes_do_not_go_on(made_up, monkeypatch, tmp_path):
     train_run("ppo", None, tmp_path / "run", SMALL | {"trials": 0}, device="cpu")
     monkeypatch.setattr(MadeUpTrials, "hash", "5678")
     with pytest.raises(TrainingError, match="a run on another dataset"):
-        train_run("ppo", None, tmp_path / "run", device="cpu", resume=True)
+        train_run("ppo", None, tmp_path / "run", device="cpu")
 
 
 @pytest.mark.slow

@@ -138,7 +138,7 @@ def test_a_full_disk_ends_a_merge_which_goes_on_later(small_disk, tmp_path, caps
     parts = [make(tmp_path, name, (seed, seed + 1)) for name, seed in (("a", 1), ("b", 5))]
     out = small_disk / "out"
     assert run(["merge", *map(str, parts), "--out", str(out)]) == 1
-    assert capsys.readouterr().err.strip().splitlines()[-1].endswith("Make room, then go on with --resume.")
+    assert "Make room" in capsys.readouterr().err.strip().splitlines()[-1]
     left = sorted(path.name for path in out.iterdir())
     assert left == ["conversion.json", *(f"episode_{n:07d}" for n in range(len(left) - 1))]
     assert 1 < len(left) < 5
