@@ -32,7 +32,8 @@ from convert_memory import repeated
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.writing.convert import convert
-from robocas_ms3.datasets.writing.render import EnvFrames
+from robocas_ms3.datasets.writing.render import EnvRenderer
+from robocas_ms3.datasets.writing.settings import ConversionSettings
 from robocas_ms3.demos.recordings.motion import sample_states, sample_stride
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
 
@@ -93,7 +94,7 @@ def in_turns(cfg: Benchmark, trajectory: Path, work: Path) -> dict[str, Any]:
         steps = sum(
             len(sample_states(file.recording(i).control_steps, _stride(cfg, file))) for i in range(cfg.episodes)
         )
-        with closing(EnvFrames(file.env, file.recording(0).control_mode, Pictures(size=cfg.size))) as source:
+        with closing(EnvRenderer(file.env, file.recording(0).control_mode, Pictures(size=cfg.size))) as source:
             for _ in range(cfg.turns):
                 for depth, spent in bare.items():
                     spent.append(alone(cfg, file, source, TEXTURES[depth]))
@@ -117,7 +118,7 @@ def in_turns(cfg: Benchmark, trajectory: Path, work: Path) -> dict[str, Any]:
     }
 
 
-def alone(cfg: Benchmark, file: TrajectoryFile, source: EnvFrames, textures: tuple[str, ...]) -> tuple[float, float]:
+def alone(cfg: Benchmark, file: TrajectoryFile, source: EnvRenderer, textures: tuple[str, ...]) -> tuple[float, float]:
     """CPU and wall seconds of rendering the recordings; scenes are built outside."""
     total = (0.0, 0.0)
     env: Any = source.env.unwrapped
@@ -153,9 +154,9 @@ def convert_one(cfg: Benchmark, trajectory: Path, work: Path, to: str, depth: bo
     common: dict[str, Any] = {"rate_hz": cfg.rate, "pictures": pictures, "jobs": jobs}
     with tempfile.TemporaryDirectory(dir=work) as out:
         if to == "lerobot":
-            convert_lerobot(trajectory, Path(out) / "out", **common)
+            convert_lerobot(ConversionSettings(trajectory, Path(out) / "out", **common))
             return
-        convert(trajectory, Path(out) / "out", embeddings=False, previews=None, **common)
+        convert(ConversionSettings(trajectory, Path(out) / "out", embeddings=False, previews=None, **common))
 
 
 def generated(out: Path, episodes: int) -> Path:

@@ -63,7 +63,7 @@ class StandIn:
 
     def frames(self, _recording: Any, samples: np.ndarray) -> Iterator[Any]:
         """A ramp that moves."""
-        from robocas_ms3.datasets.writing.frames import Frame
+        from robocas_ms3.datasets.sources.protocol import Frame
 
         for sample in samples:
             rgb = {name: np.roll(self.rgb, sample, 1) for name in self.pictures.cameras}
@@ -72,7 +72,7 @@ class StandIn:
 
     def cameras(self) -> dict[str, Any]:
         """All in one place."""
-        from robocas_ms3.datasets.writing.frames import CameraModel
+        from robocas_ms3.datasets.sources.protocol import CameraModel
 
         return {name: CameraModel(np.array([24.0, 24.0, 32.0, 24.0]), np.eye(4)) for name in self.pictures.cameras}
 
@@ -116,22 +116,27 @@ def repeated(source: Path, count: int, target: Path) -> Path:
 def measure(cfg: Benchmark, trajectory: Path, to: str, out: Path) -> dict[str, Any]:
     """One conversion, in the process that this is called in."""
     from robocas_ms3.datasets.pictures.stored import Pictures
-    from robocas_ms3.datasets.writing.convert import convert, open_env
+    from robocas_ms3.datasets.writing.convert import convert
+    from robocas_ms3.datasets.writing.rendering import open_env
+    from robocas_ms3.datasets.writing.settings import ConversionSettings
 
     peaks: list[int] = []
     common: dict[str, Any] = {
         "rate_hz": cfg.rate,
         "pictures": Pictures(size=cfg.size),
         "jobs": cfg.jobs,
-        "on_episode": lambda _: peaks.append(_peak(resource.RUSAGE_SELF)),
-        "open_source": StandIn if cfg.stand_in else open_env,
+        "open_renderer": StandIn if cfg.stand_in else open_env,
     }
+
+    def on_episode(_: Any) -> None:
+        peaks.append(_peak(resource.RUSAGE_SELF))
+
     if to == "lerobot":
         from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 
-        done = convert_lerobot(trajectory, out, **common)
+        done = convert_lerobot(ConversionSettings(trajectory, out, **common), on_episode=on_episode)
     else:
-        done = convert(trajectory, out, embeddings=False, **common)
+        done = convert(ConversionSettings(trajectory, out, embeddings=False, **common), on_episode=on_episode)
     count = len(done.episodes)
     return {
         "to": to,

@@ -26,6 +26,7 @@ import tyro
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.writing.convert import convert
+from robocas_ms3.datasets.writing.settings import ConversionSettings
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "tests" / "viewer"), str(ROOT / "tests" / "datasets")]
@@ -62,11 +63,13 @@ def _made_up(folder: Path) -> Path:
 
     trajectory = synthetic.write_trajectory(folder / "trajectory.h5")
     convert(
-        trajectory,
-        folder / "made_up",
-        open_source=synthetic.RayCaster,
-        embeddings=False,
-        pictures=Pictures(size=(640, 480)),
+        ConversionSettings(
+            trajectory,
+            folder / "made_up",
+            open_renderer=synthetic.RayCaster,
+            embeddings=False,
+            pictures=Pictures(size=(640, 480)),
+        )
     )
     return folder / "made_up"
 

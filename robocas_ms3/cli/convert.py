@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 if TYPE_CHECKING:
     from robocas_ms3.datasets.formats import Format
-    from robocas_ms3.datasets.writing.convert import Conversion
+    from robocas_ms3.datasets.writing.settings import Conversion
 
 from robocas_ms3.cli.options import Maybe
 from robocas_ms3.datasets.lerobot.variants import NEWEST, Version
@@ -140,32 +141,30 @@ def _convert(cfg: Convert) -> int:
     from robocas_ms3.core.words import count_of
     from robocas_ms3.core.workers import Limits
     from robocas_ms3.datasets.pictures.stored import Pictures
+    from robocas_ms3.datasets.writing.settings import ConversionSettings
 
     chosen = _format(cfg)
+    settings = ConversionSettings(
+        cfg.trajectory,
+        cfg.out,
+        rate_hz=cfg.rate,
+        pictures=Pictures(cfg.cameras, cfg.size, cfg.depth, cfg.image_format),
+        include_failed=cfg.include_failed,
+        pack=cfg.pack,
+        overwrite=cfg.overwrite,
+        resume=cfg.resume,
+        append=cfg.append,
+        leave_out=cfg.leave_out,
+        embeddings=cfg.embeddings,
+        previews=(True if cfg.all_videos else None) if cfg.video else False,
+        codec=cfg.codec,
+        lerobot_version=cfg.lerobot_version,
+        jobs=cfg.jobs,
+        limits=Limits(cfg.episode_seconds, cfg.memory_gb),
+    )
     with bar("episodes written") as shown:
-        options: dict[str, Any] = {
-            "append": cfg.append,
-            "embeddings": cfg.embeddings,
-            "previews": (True if cfg.all_videos else None) if cfg.video else False,
-            "codec": cfg.codec,
-            "lerobot_version": cfg.lerobot_version,
-            "leave_out": cfg.leave_out,
-            "episode_limits": Limits(cfg.episode_seconds, cfg.memory_gb),
-        }
-        done: Conversion = chosen.part("writer")(
-            cfg.trajectory,
-            cfg.out,
-            rate_hz=cfg.rate,
-            pictures=Pictures(cfg.cameras, cfg.size, cfg.depth, cfg.image_format),
-            include_failed=cfg.include_failed,
-            overwrite=cfg.overwrite,
-            resume=cfg.resume,
-            jobs=cfg.jobs,
-            pack=cfg.pack,
-            on_start=shown.start,
-            on_episode=shown.advance,
-            **{name: value for name, value in options.items() if name in chosen.options},
-        )
+        write: Callable[..., Conversion] = chosen.part("writer")
+        done = write(settings, on_start=shown.start, on_episode=shown.advance)
     count = len(done.episodes)
     said = [f"{cfg.out}: {count_of(count, 'episode')}"] + ([f"{done.kept} kept"] if done.kept else [])
     if count:

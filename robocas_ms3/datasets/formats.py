@@ -32,10 +32,10 @@ class Format:
         title: for people.
         holds: whether a path holds such episodes, whole or not; reads little.
         reader: (path, *, rate_hz=None, include_failed=False) -> `EpisodeSource`.
-        writer: converts a trajectory file, see `writing.convert.convert` for its parameters up to ``on_episode`` and
-            what it gives; empty: it can't be written.
+        writer: (`writing.settings.ConversionSettings`, *, on_start=None, on_episode=None) -> `Conversion`, see
+            `writing.convert.convert`; empty: it can't be written.
         checker: (root, *, on_episode=None) -> `checks.dataset.Report`; empty: there is none.
-        options: further keyword arguments of the writer, of those that ``robocas convert`` has flags for.
+        options: flags of ``robocas convert`` that not every format has, of those that the writer heeds.
     """
 
     name: str
@@ -86,7 +86,7 @@ _BUILTIN = (
         f"{_PACKAGE}.lerobot.reader:open_lerobot",
         f"{_PACKAGE}.lerobot.convert:convert_lerobot",
         f"{_PACKAGE}.lerobot.check:report_lerobot",
-        ("codec", "lerobot_version", "leave_out", "episode_limits"),
+        ("codec", "lerobot_version", "leave_out"),
     ),
     Format(
         "robocas",
@@ -95,7 +95,7 @@ _BUILTIN = (
         f"{_PACKAGE}.sources.reader:open_folder",
         f"{_PACKAGE}.writing.convert:convert",
         f"{_PACKAGE}.checks.dataset:validate",
-        ("append", "embeddings", "previews", "image_format", "leave_out", "episode_limits"),
+        ("append", "image_format", "leave_out"),
     ),
 )
 

@@ -219,10 +219,12 @@ def _say_source(path: Path, source: dict[str, Any]) -> None:
 
 def _convert_lerobot(plan: Plan, robocas: Path, out: Path, jobs: int) -> None:
     from robocas_ms3.datasets.lerobot.convert import convert_lerobot
+    from robocas_ms3.datasets.writing.settings import ConversionSettings
 
     limits = Limits(plan.limits.render_seconds, plan.limits.memory_gb)
     jobs = min(jobs, os.cpu_count() or 1)  # those of a plan may be a cluster's
-    convert_lerobot(robocas, out, resume=True, jobs=jobs, episode_limits=limits, lerobot_version=plan.lerobot_version)
+    version = plan.lerobot_version
+    convert_lerobot(ConversionSettings(robocas, out, resume=True, jobs=jobs, limits=limits, lerobot_version=version))
 
 
 def _write_statistics(out: Path) -> None:

@@ -4,6 +4,7 @@ import pytest
 from synthetic import RayCaster, made_up_vectors, write_trajectory
 
 from robocas_ms3.datasets.writing.convert import convert
+from robocas_ms3.datasets.writing.settings import ConversionSettings
 
 
 @pytest.fixture(scope="session")
@@ -17,7 +18,7 @@ def made(trajectory, tmp_path_factory):
     out = tmp_path_factory.mktemp("made") / "dataset"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("robocas_ms3.datasets.writing.convert.embed_texts", made_up_vectors)
-        convert(trajectory, out, open_source=RayCaster)
+        convert(ConversionSettings(trajectory, out, open_renderer=RayCaster))
     return out
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from synthetic import RayCaster, write_trajectory
 
 from robocas_ms3.datasets.writing.convert import convert
+from robocas_ms3.datasets.writing.settings import ConversionSettings
 
 
 def files_of(root):
@@ -73,7 +74,7 @@ def arrays_of(episode):
 def make(folder, name, seeds, **kwargs):
     """A dataset of these seeds, without embeddings."""
     trajectory = write_trajectory(folder / f"{name}.h5", seeds=tuple(seeds))
-    convert(trajectory, folder / name, embeddings=False, open_source=RayCaster, **kwargs)
+    convert(ConversionSettings(trajectory, folder / name, embeddings=False, open_renderer=RayCaster, **kwargs))
     return folder / name
 
 

@@ -14,6 +14,7 @@ from robocas_ms3.datasets.checks.replay import replay_dataset
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.convert import convert
+from robocas_ms3.datasets.writing.settings import ConversionSettings
 from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.recordings.entries import read_json
@@ -154,7 +155,7 @@ def test_who_has_closed_the_gripper_beside_is_shown_how_to_go_on(player, generat
 def test_it_is_converted_from_where_the_policy_was(player, generator, tmp_path, needs_renderer):
     assert generator.generate(2, tmp_path, "one", player.run(2)).success
     pictures = Pictures(("base_camera",), (64, 48), depth=False)
-    convert(tmp_path / "one.h5", tmp_path / "dataset", pictures=pictures, embeddings=False)
+    convert(ConversionSettings(tmp_path / "one.h5", tmp_path / "dataset", pictures=pictures, embeddings=False))
     report = replay_dataset(tmp_path / "dataset")
     assert report.episodes[0].success is None
     assert "another policy" in report.episodes[0].skipped

@@ -16,6 +16,7 @@ from robocas_ms3.datasets import RoboCASDataset, formats
 from robocas_ms3.datasets.formats import format_of, open_source
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.writing import convert as conversion
+from robocas_ms3.datasets.writing.settings import ConversionSettings
 
 
 @pytest.fixture
@@ -23,7 +24,7 @@ def stranger(tmp_path, monkeypatch):
     """Its package is installed; nothing of it is left behind."""
     folder = install("A dataset format", tmp_path / "site")
     monkeypatch.syspath_prepend(folder)
-    monkeypatch.setattr("robocas_ms3.datasets.writing.render.EnvFrames", RayCaster)
+    monkeypatch.setattr("robocas_ms3.datasets.writing.render.EnvRenderer", RayCaster)
     table = Registry("dataset format", formats.GROUP, formats.Format, formats.FORMATS.builtin)
     monkeypatch.setattr(formats, "FORMATS", table)  # as if the process had begun now
     yield folder
@@ -36,7 +37,7 @@ def both(stranger, tmp_path, capsys):
     file = write_trajectory(tmp_path / "F.h5", seeds=(3, 4, 5))
     assert run(["convert", str(file), "--to", "toy", "--out", str(tmp_path / "toy")]) == 0
     assert "3 episodes, 21 steps" in capsys.readouterr().out
-    conversion.convert(file, tmp_path / "folder", embeddings=False, open_source=RayCaster)
+    conversion.convert(ConversionSettings(file, tmp_path / "folder", embeddings=False, open_renderer=RayCaster))
     return tmp_path / "toy", tmp_path / "folder"
 
 
@@ -69,7 +70,7 @@ def test_it_is_counted_checked_shown_and_converted(both, tmp_path, capsys):
     assert "3 episodes, 21 steps, valid" in capsys.readouterr().out
     assert run(["video", str(toy), "--out", str(tmp_path / "video")]) == 0
     assert len(list((tmp_path / "video").glob("*.mp4"))) == 3
-    made = [convert_lerobot(root, tmp_path / root.name.upper()).episodes for root in (toy, folder)]
+    made = [convert_lerobot(ConversionSettings(root, tmp_path / root.name.upper())).episodes for root in (toy, folder)]
     assert [[e.steps for e in episodes] for episodes in made] == [[7, 7, 7]] * 2
     files = [
         {p.relative_to(root): p.read_bytes() for p in root.rglob("*.mp4")}

@@ -120,13 +120,14 @@ from synthetic import RayCaster
 from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.writing.convert import convert
+from robocas_ms3.datasets.writing.settings import ConversionSettings
 from robocas_ms3.demos.open_loop import OpenLoop
 from robocas_ms3.core.poses import from_wxyz, inverse
 from robocas_ms3.demos.recordings.motion import sample_states, stored_actions
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
 file, out = Path({str(recorded)!r}), Path({str(tmp_path)!r})
-convert(file, out / "folder", embeddings=False, open_source=RayCaster)
-convert_lerobot(out / "folder", out / "lerobot")
+convert(ConversionSettings(file, out / "folder", embeddings=False, open_renderer=RayCaster))
+convert_lerobot(ConversionSettings(out / "folder", out / "lerobot"))
 print(json.loads((out / "lerobot/meta/info.json").read_text())["robot_type"])
 arrays = open_source(out / "folder").episode(0).arrays
 with TrajectoryFile(file) as opened:

@@ -22,6 +22,7 @@ from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.convert import convert
+from robocas_ms3.datasets.writing.settings import ConversionSettings
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.comparison import comparison
 from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
@@ -64,8 +65,10 @@ def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("made")
     trajectory = write_trajectory(folder / "trajectory.h5", seeds=(3, 4))
     pictures = Pictures(size=(64, 48))
-    convert(trajectory, folder / "robocas", embeddings=False, open_source=RayCaster, pictures=pictures)
-    convert_lerobot(trajectory, folder / "lerobot", open_source=RayCaster, pictures=pictures)
+    convert(
+        ConversionSettings(trajectory, folder / "robocas", embeddings=False, open_renderer=RayCaster, pictures=pictures)
+    )
+    convert_lerobot(ConversionSettings(trajectory, folder / "lerobot", open_renderer=RayCaster, pictures=pictures))
     return folder
 
 

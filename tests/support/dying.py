@@ -3,15 +3,17 @@
 import os
 import signal
 import sys
+from pathlib import Path
 
 from synthetic import RayCaster
 
 from robocas_ms3.core import files
-from robocas_ms3.datasets.writing import convert, writer
+from robocas_ms3.datasets.writing import convert, episode_folder
+from robocas_ms3.datasets.writing.settings import ConversionSettings
 
 PLACES = {  # moment -> (module, function, which call is the last)
-    "picture": (writer, "write_picture", 50),  # in the second episode
-    "arrays": (writer, "write_cameras", 2),
+    "picture": (episode_folder, "write_picture", 50),  # in the second episode
+    "arrays": (episode_folder, "write_cameras", 2),
     "rename": (files, "_move_in", 2),
     "overview": (convert, "write_info", 1),
     "rmtree": (os, "rmdir", 3),  # --overwrite, with two folders of the old one gone
@@ -35,5 +37,12 @@ if __name__ == "__main__":
     die_at(*PLACES[moment])
     overwrite = moment == "rmtree"
     convert.convert(
-        trajectory, out, embeddings=False, overwrite=overwrite, previews=bool(previews), open_source=RayCaster
+        ConversionSettings(
+            Path(trajectory),
+            Path(out),
+            embeddings=False,
+            overwrite=overwrite,
+            previews=bool(previews),
+            open_renderer=RayCaster,
+        )
     )

@@ -8,6 +8,7 @@ from synthetic import RayCaster
 
 from robocas_ms3.core import files
 from robocas_ms3.datasets.lerobot import assemble, convert, stage, table_writing, video
+from robocas_ms3.datasets.writing.settings import ConversionSettings
 
 PLACES = {  # moment -> (module, name of the function or method's owner and it, which call is the last)
     "frame": (video.Encoder, "add", 50),  # in the second episode
@@ -25,4 +26,4 @@ if __name__ == "__main__":
     moment, trajectory, out = sys.argv[1:]
     assert stage
     die_at(*PLACES[moment])
-    convert.convert_lerobot(trajectory, out, open_source=RayCaster)
+    convert.convert_lerobot(ConversionSettings(Path(trajectory), Path(out), open_renderer=RayCaster))

@@ -19,7 +19,7 @@ import psutil
 
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
-from robocas_ms3.datasets.writing.cut_off import cut_off
+from robocas_ms3.datasets.writing.episode_folder import find_damaged
 from robocas_ms3.demos.ledger import FAILURES_FILE, Ledger
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
 from robocas_ms3.demos.recordings.stored import open_trajectory
@@ -112,7 +112,7 @@ def readable(command, out):
         return sum(bool(json.loads(line)) for line in lines if line.endswith(b"\n"))
     folders = sorted(out.glob("episode_*" if command.name == "convert" else "units/*/*/episodes/*/episode_*"))
     for folder in folders:
-        assert cut_off(folder, Pictures(size=(64, 48), depth=False)) is None, folder
+        assert find_damaged(folder, Pictures(size=(64, 48), depth=False)) is None, folder
     return len(folders)
 
 

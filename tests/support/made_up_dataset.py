@@ -6,6 +6,7 @@ import pytest
 from synthetic import RayCaster, made_up_vectors, write_trajectory
 
 from robocas_ms3.datasets.writing.convert import convert
+from robocas_ms3.datasets.writing.settings import ConversionSettings
 
 
 def made_up_dataset(folder: Path) -> Path:
@@ -13,5 +14,5 @@ def made_up_dataset(folder: Path) -> Path:
     trajectory = write_trajectory(folder / "F.h5", seeds=range(3, 9))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("robocas_ms3.datasets.writing.convert.embed_texts", made_up_vectors)
-        convert(trajectory, folder / "dataset", open_source=RayCaster)
+        convert(ConversionSettings(trajectory, folder / "dataset", open_renderer=RayCaster))
     return folder / "dataset"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -10,7 +11,7 @@ import numpy as np
 
 from robocas_ms3.datasets.pictures.boxes import box_of
 from robocas_ms3.datasets.pictures.stored import Pictures
-from robocas_ms3.datasets.writing.frames import CameraModel, Frame
+from robocas_ms3.datasets.sources.protocol import CameraModel, Frame
 from robocas_ms3.robots.description import MOBILE_PANDA
 
 STEPS = 22  # control steps: with a stride of 4 the last dataset step is a short one
@@ -46,8 +47,13 @@ CAMERA_IN_PARENT = {
 }
 
 
+def render_by(renderer, convert):
+    """Return a conversion that renders with another renderer, whatever its settings say."""
+    return lambda settings, **more: convert(replace(settings, open_renderer=renderer), **more)
+
+
 class RayCaster:
-    """A ``FrameSource``: floor, room, table and a cube for each actor."""
+    """A ``Renderer``: floor, room, table and a cube for each actor."""
 
     def __init__(self, env_info, control_mode, pictures=None):
         self.pictures = pictures or Pictures()
@@ -184,10 +190,10 @@ def write_trajectory(path: Path, seeds=(3, 4, 5), failed=(), steps=STEPS):
     return path
 
 
-def made_up_vectors(player, entries):
+def made_up_vectors(source, entries):
     """Unit vectors in place of sentence embeddings, which take seconds to load."""
-    texts = {text for entry in entries for text in player.texts(entry["source"])}
+    texts = {text for entry in entries for text in source.texts(entry["source"])}
     return {text: np.eye(384, dtype=np.float32)[number] for number, text in enumerate(sorted(texts))}
 
 
-__all__ = ["RayCaster", "made_up_vectors", "make_states", "write_trajectory"]
+__all__ = ["RayCaster", "made_up_vectors", "make_states", "render_by", "write_trajectory"]

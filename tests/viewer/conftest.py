@@ -35,9 +35,14 @@ def run_folder(made_up, tmp_path_factory):
 def folder(run_folder, made_up, tmp_path_factory):
     """The same as a RoboCAS folder of all three, small pictures, nobody may change it."""
     from robocas_ms3.datasets.writing.convert import convert
+    from robocas_ms3.datasets.writing.settings import ConversionSettings
 
     out = tmp_path_factory.mktemp("folder") / "dataset"
-    convert(run_folder / "trajectory.h5", out, open_source=made_up.RayCaster, embeddings=False, include_failed=True)
+    convert(
+        ConversionSettings(
+            run_folder / "trajectory.h5", out, open_renderer=made_up.RayCaster, embeddings=False, include_failed=True
+        )
+    )
     (out / "failures.jsonl").write_bytes((run_folder / "failures.jsonl").read_bytes())
     return out
 
@@ -48,8 +53,9 @@ def lerobot(folder, tmp_path_factory):
     pytest.importorskip("av", reason="needs the extra 'lerobot'")
     pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
     from robocas_ms3.datasets.lerobot.convert import convert_lerobot
+    from robocas_ms3.datasets.writing.settings import ConversionSettings
 
     out = tmp_path_factory.mktemp("lerobot") / "dataset"
-    convert_lerobot(folder, out, include_failed=True)
+    convert_lerobot(ConversionSettings(folder, out, include_failed=True))
     (out / "failures.jsonl").write_bytes((folder / "failures.jsonl").read_bytes())
     return out

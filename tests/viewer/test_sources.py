@@ -9,6 +9,7 @@ import pytest
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.convert import convert
+from robocas_ms3.datasets.writing.settings import ConversionSettings
 from robocas_ms3.viewer.parts import make_index, plot, rounded
 from robocas_ms3.viewer.plots import base_plot, motion_plots
 from robocas_ms3.viewer.source import open_source
@@ -187,7 +188,11 @@ def test_a_seed_means_a_scene_of_its_own_environment_only(run_folder, folder, ma
     both = shutil.copytree(folder, tmp_path / "both")
     (both / "failures.jsonl").unlink()
     for path in (run_folder / "trajectory.h5", other):
-        convert(path, both, open_source=made_up.RayCaster, embeddings=False, include_failed=True, append=True)
+        convert(
+            ConversionSettings(
+                path, both, open_renderer=made_up.RayCaster, embeddings=False, include_failed=True, append=True
+            )
+        )
     for scene in both.glob("*/scene.json"):  # the frames' source has one task
         change = {"task": "open_pick"} if "OpenPick" in scene.read_text() else {}
         scene.write_text(json.dumps({**json.loads(scene.read_text()), **change}))

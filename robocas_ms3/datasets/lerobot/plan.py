@@ -15,8 +15,8 @@ from robocas_ms3.core.words import count_of
 from robocas_ms3.datasets.lerobot.records import ConversionRecord
 from robocas_ms3.datasets.lerobot.schema import CONVERSION_FILE, INFO_FILE
 from robocas_ms3.datasets.sources.split import split_by_seed
+from robocas_ms3.datasets.writing.inputs import ConversionInput
 from robocas_ms3.datasets.writing.plan import LEFT_OUT, check_versions
-from robocas_ms3.datasets.writing.players import Player
 from robocas_ms3.demos.recordings.versions import versions
 
 PARTS = ".parts"
@@ -24,11 +24,11 @@ PARTS = ".parts"
 PLAN = "plan.json"
 
 
-def plan_of(player: Player, fps: int, codec: str, version: str) -> dict[str, Any]:
-    """What a conversion will do: settings, episodes, split."""
-    entries, pictures = player.entries(), player.pictures
+def plan_of(given: ConversionInput, fps: int, codec: str, version: str) -> dict[str, Any]:
+    """Return what a conversion will do: settings, episodes, split."""
+    entries, pictures = given.entries(), given.pictures
     place = {entry["source"]: i for i, entry in enumerate(entries)}
-    before_train, before_val = ([place[n] for n in side if n in place] for side in player.sides())
+    before_train, before_val = ([place[n] for n in side if n in place] for side in given.source.settled_split())
     seeds = {i: i if e["seed"] is None else _seed(e["seed"]) for i, e in enumerate(entries)}
     train, val = split_by_seed(seeds, (before_train, before_val))
     plan = {

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Generator
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +16,6 @@ from numpy.typing import NDArray
 from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import json_text, replacing_folder
-from robocas_ms3.core.workers import Limits
 from robocas_ms3.datasets.lerobot.arrays import frame_columns
 from robocas_ms3.datasets.lerobot.depth import to_levels
 from robocas_ms3.datasets.lerobot.language import EVENTS, EVENTS_TYPE, event_rows
@@ -29,39 +26,12 @@ from robocas_ms3.datasets.lerobot.variants import Variant
 from robocas_ms3.datasets.lerobot.video import CODINGS, Coding, Encoder
 from robocas_ms3.datasets.pictures.boxes import Box
 from robocas_ms3.datasets.schema import episode_folder
-from robocas_ms3.datasets.sources.protocol import Kind
-from robocas_ms3.datasets.writing.dataset_player import open_player
-from robocas_ms3.datasets.writing.frames import Frame
-from robocas_ms3.datasets.writing.players import Player, Request
-from robocas_ms3.datasets.writing.pool import do_all
-from robocas_ms3.datasets.writing.timing import Timing
-from robocas_ms3.datasets.writing.writer import WrittenEpisode
+from robocas_ms3.datasets.sources.protocol import Frame, Kind
+from robocas_ms3.datasets.writing.inputs import ConversionInput, complete_arrays
+from robocas_ms3.datasets.writing.settings import Timing, WrittenEpisode
 
 FRAMES_FILE, EPISODE_FILE = "frames.parquet", "episode.json"
 SUBGOAL = "subgoal"  # column of texts, which become numbers when parts are joined
-
-
-@dataclass(frozen=True)
-class StageJob:
-    """What a process needs to know.
-
-    Attributes:
-        request: what is converted.
-        parts: folder of the parts.
-        codec: of RGB.
-        variant: what is written.
-        tasks: (episode index, number in the source) of those to write.
-        limits: of an episode; None: there are none, and one process is this one.
-        begun: whether there are parts already.
-    """
-
-    request: Request
-    parts: Path
-    codec: str
-    variant: Variant
-    tasks: list[tuple[int, int]]
-    limits: Limits | None = None
-    begun: bool = False
 
 
 def part_folder(parts: Path, index: int) -> Path:
@@ -95,88 +65,82 @@ def video_name(camera: str, kind: Kind, coding: Coding) -> str:
     return f"{kind}_{camera}{coding.suffix}"
 
 
-def stage_all(job: StageJob, processes: int) -> Generator[WrittenEpisode, None, None]:
-    """Write parts; gives each episode when it is done, in any order.
+@dataclass(frozen=True)
+class PartWriter:
+    """Writes each episode by itself, as a part of a LeRobot dataset; can be sent to another process.
 
-    Raises:
-        IncompleteError: episodes can't be written; all others are.
-        Exception: what is wrong with all.
+    Attributes:
+        parts: folder of the parts.
+        codec: of RGB.
+        variant: what is written.
     """
-    return do_all(
-        partial(_Stager, job),
-        job.tasks,
-        processes,
-        job.parts,
-        renders=job.request.is_trajectory,
-        limits=job.limits,
-        apart=job.limits is not None and job.request.renders,
-        name=lambda task: episode_folder(task[0]),
-        begun=job.begun,
-        fix="--resume tries again; with --leave-out too, the others make the dataset where that fails.",
-    )
 
+    parts: Path
+    codec: str
+    variant: Variant
 
-class _Stager:
-    """One process's share: keeps what plays the episodes open from one episode to the next."""
+    def write(self, number: int, given: ConversionInput, source: int) -> WrittenEpisode:
+        """Write an episode's part.
 
-    def __init__(self, job: StageJob) -> None:
-        self.job, self.player = job, open_player(job.request)
+        Args:
+            number: index of the episode.
+            given: what is converted.
+            source: its number there.
 
-    def run(self, task: tuple[int, int]) -> WrittenEpisode:
-        return stage_episode(self.job, self.player, *task)
+        Raises:
+            DatasetError: it can't be shown or written.
+        """
+        start, timing, fps = time.perf_counter(), Timing(), whole_rate(given.source.rate_hz)
+        with replacing_folder(part_folder(self.parts, number), sync=True) as folder:
+            with timing.measure("load"):
+                episode = given.source.episode(source)
+                arrays = complete_arrays(episode)
+            with _Videos(folder, self, fps, timing) as videos, closing(given.frames(episode)) as frames:
+                for frame in timing.each(given.stage, frames):
+                    videos.add(frame)
+            begin_write, steps, scene = time.perf_counter(), int(arrays["episode_length"]), episode.scene
+            if videos.steps != steps:
+                what = "images and arrays differ in length"
+                raise DatasetError(what, where=source, expected=steps, found=videos.steps)
+            pq.write_table(self._table(arrays, videos.boxes, scene, fps), folder / FRAMES_FILE)
+            about = {
+                "steps": steps,
+                "instruction": str(arrays["language_goal"]),
+                "scene": scene,
+                "cameras": {
+                    name: {
+                        "intrinsic": np.asarray(episode.intrinsic(name)).tolist(),
+                        "camera_in_parent": np.asarray(episode.camera_in_parent(name)).tolist(),
+                    }
+                    for name in given.pictures.cameras
+                },
+                "depth": given.pictures.depth,
+                "depth_clipped": videos.clipped,
+                "levels": {key: levels.counts.tolist() for key, levels in videos.levels.items()},
+                "sizes": _sizes(folder),
+            }
+            text = json_text(about, f"episode {source}", error=DatasetError)
+            (folder / EPISODE_FILE).write_text(text, encoding="utf-8")
+            size = sum(file.stat().st_size for file in folder.iterdir())
+        timing.write += time.perf_counter() - begin_write  # with the folder's renaming
+        timing.total += time.perf_counter() - start
+        return WrittenEpisode(number, steps, size, timing)
 
-    def close(self) -> None:
-        self.player.close()
-
-
-def stage_episode(job: StageJob, player: Player, index: int, number: int) -> WrittenEpisode:
-    """Write one episode's part.
-
-    Raises:
-        DatasetError: it can't be shown or written.
-    """
-    started, timing, fps = time.perf_counter(), Timing(), whole_rate(player.rate_hz)
-    with replacing_folder(part_folder(job.parts, index), sync=True) as folder:
-        played = player.open(number, timing)
-        with _Videos(folder, job, fps, timing) as videos, closing(played.frames()) as frames:
-            for frame in frames:
-                videos.add(frame)
-        begun, arrays, cameras = time.perf_counter(), played.arrays, played.cameras()
-        steps, scene = int(arrays["episode_length"]), played.scene()
-        if videos.steps != steps:
-            raise DatasetError("pictures and arrays differ in length", where=number, expected=steps, found=videos.steps)
+    def _table(
+        self, arrays: dict[str, NDArray], boxes: list[dict[str, Box]], scene: dict[str, Any], fps: int
+    ) -> pa.Table:
+        """Return the rows of an episode, but for the numbers that follow from the episodes before."""
+        steps = int(arrays["episode_length"])
         columns: dict[str, Any] = {key: column(values) for key, values in frame_columns(arrays).items()}
         columns[SUBGOAL_TYPE.key] = pa.array(arrays["step_goal_type"].tolist(), pa.string())
         columns["timestamp"] = pa.array((np.arange(steps) / fps).astype(np.float32))
         columns["frame_index"] = pa.array(np.arange(steps))
         columns[SUBGOAL] = pa.array(arrays["step_lang_goals"].tolist(), pa.string())
-        if job.variant.language:
+        if self.variant.language:
             target = str((scene.get("target") or {}).get("name") or "")
-            events = [event_rows(boxes, target) if target.strip() else [] for boxes in videos.boxes]
+            events = [event_rows(found, target) if target.strip() else [] for found in boxes]
             columns[EVENTS] = pa.array(events, EVENTS_TYPE)
-        pq.write_table(pa.table(columns), folder / FRAMES_FILE)
-        about = {
-            "steps": steps,
-            "instruction": str(arrays["language_goal"]),
-            "scene": scene,
-            "cameras": {
-                name: {
-                    "intrinsic": np.asarray(cameras[name].intrinsic).tolist(),
-                    "camera_in_parent": np.asarray(cameras[name].camera_in_parent).tolist(),
-                }
-                for name in player.pictures.cameras
-            },
-            "depth": player.pictures.depth,
-            "depth_clipped": videos.clipped,
-            "levels": {key: levels.counts.tolist() for key, levels in videos.levels.items()},
-            "sizes": _sizes(folder),
-        }
-        text = json_text(about, f"episode {number}", error=DatasetError)
-        (folder / EPISODE_FILE).write_text(text, encoding="utf-8")
-        size = sum(file.stat().st_size for file in folder.iterdir())
-    timing.write += time.perf_counter() - begun  # with the folder's renaming
-    timing.total += time.perf_counter() - started
-    return WrittenEpisode(index, steps, size, timing)
+        return pa.table(columns)
 
 
 class _Videos:
@@ -189,8 +153,8 @@ class _Videos:
         clipped: whether depth was out of the range of a native depth video.
     """
 
-    def __init__(self, folder: Path, job: StageJob, fps: int, timing: Timing) -> None:
-        self._folder, self._job, self._fps, self._timing = folder, job, fps, timing
+    def __init__(self, folder: Path, writer: PartWriter, fps: int, timing: Timing) -> None:
+        self._folder, self._writer, self._fps, self._timing = folder, writer, fps, timing
         self._encoders: dict[tuple[str, str], Encoder] = {}
         self._stack = ExitStack()
         self.levels: dict[str, Levels] = {}
@@ -211,7 +175,7 @@ class _Videos:
                 self.levels.setdefault(image_key(camera), Levels.rgb()).add(picture)
             for camera, picture in frame.depth.items():
                 levels = picture
-                if self._job.variant.native_depth:
+                if self._writer.variant.native_depth:
                     levels = to_levels(picture)
                     self.clipped = self.clipped or bool(picture.max() > MAX_DEPTH_MM)
                     self.levels.setdefault(depth_key(camera), Levels.depth()).add(levels)
@@ -222,7 +186,7 @@ class _Videos:
     def _encoder(self, kind: Kind, camera: str, picture: NDArray) -> Encoder:
         if (kind, camera) not in self._encoders:
             height, width = picture.shape[:2]
-            coding = coding_of(kind, self._job.codec, self._job.variant)
+            coding = coding_of(kind, self._writer.codec, self._writer.variant)
             path = self._folder / video_name(camera, kind, coding)
             encoder = self._stack.enter_context(Encoder(path, coding, self._fps, (width, height)))
             self._encoders[kind, camera] = encoder

@@ -22,14 +22,14 @@ from robocas_ms3.datasets.manage.parts import schema_version
 from robocas_ms3.datasets.manage.reading import read_episode
 from robocas_ms3.datasets.manage.survey import Survey, read_info
 from robocas_ms3.datasets.sources.episode import Overview
+from robocas_ms3.datasets.sources.protocol import CameraModel
 from robocas_ms3.datasets.sources.provenance import ConversionRecord
 from robocas_ms3.datasets.sources.reader import Dataset, Episode
 from robocas_ms3.datasets.sources.tolerant import SPECS, EpisodeArrays
-from robocas_ms3.datasets.writing.frames import CameraModel
+from robocas_ms3.datasets.writing.episode_folder import write_cameras
 from robocas_ms3.datasets.writing.info import write_info
 from robocas_ms3.datasets.writing.output import Placer, begun_output
 from robocas_ms3.datasets.writing.plan import dataset_settings
-from robocas_ms3.datasets.writing.writer import write_cameras
 
 Embed = Callable[[list[str]], NDArray[np.float32]]
 REPORT_FILE = "import_report.json"

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import ExitStack, closing
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.actions import action_space
 from robocas_ms3.datasets.pictures.boxes import Box
+from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.demos.recordings.seeds import one_seed
 from robocas_ms3.demos.recordings.subgoals import SubGoal, subgoal_runs
@@ -26,6 +28,35 @@ Side = Literal["train", "val", "all"]
 """Of the split into training and validation."""
 Kind = Literal["rgb", "depth"]
 """Of picture."""
+
+
+@dataclass(frozen=True)
+class CameraModel:
+    """Intrinsics and mounting pose of a camera, which are constant during an episode.
+
+    Attributes:
+        intrinsic: (4,) fx, fy, cx, cy, pixels.
+        camera_in_parent: (4, 4) OpenCV camera frame.
+    """
+
+    intrinsic: NDArray[np.float64]
+    camera_in_parent: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The images of one step.
+
+    Attributes:
+        rgb: camera -> (H, W, 3) uint8.
+        depth: camera -> (H, W) uint16, mm; empty where depth is not wanted.
+        boxes: camera -> box of the target's visible pixels, of the cameras that see it; empty where boxes are not
+            wanted or not known.
+    """
+
+    rgb: dict[str, NDArray[np.uint8]]
+    depth: dict[str, NDArray[np.uint16]]
+    boxes: dict[str, Box] = field(default_factory=dict)
 
 
 class SourceEpisode(Protocol):
@@ -110,6 +141,18 @@ class SourceEpisode(Protocol):
         for step in range(first, self.steps if count is None else first + count):
             yield picture(camera, step)
 
+    def images(self, pictures: Pictures) -> Generator[Frame, None, None]:
+        """Yield the images of every step; close the generator unless it is read to the end.
+
+        Args:
+            pictures: which cameras, with depth or without, with boxes or without.
+        """
+        boxes = self.target_boxes if pictures.boxes else []
+        with closing(shots(self, pictures.cameras, "rgb")) as rgb, ExitStack() as stack:
+            depth = stack.enter_context(closing(shots(self, pictures.cameras, "depth"))) if pictures.depth else None
+            for step, images in enumerate(rgb):
+                yield Frame(images, next(depth) if depth else {}, boxes[step] if boxes else {})
+
     def intrinsic(self, camera: str) -> NDArray[np.float64]:
         """(4,) fx, fy, cx, cy in pixels."""
         ...
@@ -117,6 +160,10 @@ class SourceEpisode(Protocol):
     def camera_in_parent(self, camera: str) -> NDArray[np.float64]:
         """(4, 4) OpenCV camera frame in its parent, see ``schema.CAMERAS``."""
         ...
+
+    def camera(self, name: str) -> CameraModel:
+        """Return the model of a camera."""
+        return CameraModel(self.intrinsic(name), self.camera_in_parent(name))
 
 
 def shots(
@@ -162,6 +209,15 @@ class EpisodeSource(Protocol):
         sides = split_by_seed({number: number if seed is None else seed for number, seed in seeds.items()})
         return sides[side == "val"]
 
+    def settled_split(self) -> tuple[list[int], list[int]]:
+        """Return the training and validation episodes that a conversion keeps; both empty where none are settled."""
+        return self.split("train"), self.split("val")
+
+    def texts(self, number: int) -> list[str]:
+        """Return the instruction of an episode and the texts of its sub-goals."""
+        arrays = self.episode(number).read(("language_goal", "step_lang_goals"))
+        return [str(arrays["language_goal"]), *arrays["step_lang_goals"].tolist()]
+
     def entry(self, number: int) -> Mapping[str, Any]:
         """Which recording an episode is of, see ``provenance.recording_entry``; empty where that is not known."""
         return {}
@@ -174,3 +230,6 @@ class EpisodeSource(Protocol):
     def episode(self, number: int) -> SourceEpisode:
         """Open an episode."""
         ...
+
+    def close(self) -> None:
+        """Free what is open."""

@@ -58,6 +58,12 @@ class TrajectorySource(EpisodeSource):
         path: of the HDF5 file.
         rate_hz: steps a second; divides the control frequency.
         include_failed: also episodes without success.
+        pack: name or folder of the object pack, instead of the one that the file names.
+
+    Attributes:
+        file: the trajectory file, closed.
+        stride: control steps per step.
+        index: position of each episode in the file.
 
     Raises:
         DatasetError: it can't be read, or the rate does not divide its frequency.
@@ -66,13 +72,20 @@ class TrajectorySource(EpisodeSource):
     cameras: tuple[str, ...] = ()
     has_depth = False
 
-    def __init__(self, path: Path, *, rate_hz: float | None = None, include_failed: bool = False) -> None:
-        self.root, self.rate_hz = path, DEFAULT_RATE if rate_hz is None else rate_hz
-        with TrajectoryFile(path) as file:
+    def __init__(
+        self,
+        path: Path,
+        *,
+        rate_hz: float | None = None,
+        include_failed: bool = False,
+        pack: str | Path | None = None,
+    ) -> None:
+        self.root, self.rate_hz = path, float(DEFAULT_RATE if rate_hz is None else rate_hz)
+        with TrajectoryFile(path, pack=pack) as file:
             self.stride = sample_stride(file.control_freq, self.rate_hz)
             self.index = [n for n, e in enumerate(file.episodes) if include_failed or succeeded(e)]
             self._said = [_attempt(file, index) for index in self.index]
-        self.numbers, self._closed = list(range(len(self.index))), file
+        self.numbers, self.file = list(range(len(self.index))), file
 
     def said(self, number: int) -> SaidOfRecording:
         """What the JSON says of an episode.
@@ -105,7 +118,7 @@ class TrajectorySource(EpisodeSource):
 
     def entry(self, number: int) -> Mapping[str, Any]:
         """Which recording it is."""
-        with self._closed.reopened() as file:
+        with self.file.reopened() as file:
             return recording_entry(file, self.index[number])
 
     def recording(self, number: int, *, bodies: bool = True) -> Recording:
@@ -114,7 +127,7 @@ class TrajectorySource(EpisodeSource):
         Raises:
             DatasetError: it is damaged.
         """
-        with self._closed.reopened() as file:
+        with self.file.reopened() as file:
             return file.recording(self.index[number], bodies=bodies)
 
     def episode(self, number: int) -> RecordedEpisode:

@@ -1,4 +1,4 @@
-"""``data_info.json``: what is in a dataset, and how it splits into training and validation."""
+"""Overviews of a RoboCAS folder: ``data_info.json``, which has the split, and ``failures.jsonl``."""
 
 from __future__ import annotations
 
@@ -13,11 +13,14 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import write_json
+from robocas_ms3.core.ledger import Ledger
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.actions import action_space
+from robocas_ms3.datasets.sources.provenance import environment_of, task_of
 from robocas_ms3.datasets.sources.reader import Dataset, Episode
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.datasets.sources.tolerant import first_line, read_arrays
+from robocas_ms3.demos.ledger import FAILURES_FILE
 from robocas_ms3.demos.recordings.seeds import one_seed
 from robocas_ms3.demos.recordings.subgoals import SubGoal, subgoal_runs
 
@@ -110,3 +113,31 @@ def data_info(
         "step_goals": {str(n): [goal.as_json() for goal in episode.subgoals] for n, episode in episodes.items()},
         "action_space": action_space([e.rel_pos for e in parts], [e.rel_orn for e in parts]),
     }
+
+
+def add_failures(run: Path, out: Path, env_info: Mapping[str, Any]) -> None:
+    """Add a run's lines that the dataset does not have yet.
+
+    Each gets ``task`` and ``environment``, as a seed alone does not tell which of several runs it is of.
+
+    Args:
+        run: folder with the trajectory; where there is no such file in it, nothing is done. Lines cut off by a crash
+            stay there.
+        out: the dataset.
+        env_info: of the trajectory.
+    """
+    made_in = {"task": task_of(str(env_info.get("env_id"))), "environment": environment_of(env_info)}
+    there = _lines_of(out)
+    known = {_key(line) for line in there.read()}
+    marked = ((line, {**line, **made_in}) for line in _lines_of(run).read())
+    new = [line for before, line in marked if not {_key(before), _key(line)} & known]
+    if new:  # anew: files of a dataset may be linked from another one
+        there.rewrite([*there.read(), *new])
+
+
+def _lines_of(folder: Path) -> Ledger[dict[str, Any]]:
+    return Ledger(folder / FAILURES_FILE, dict[str, Any])
+
+
+def _key(line: Mapping[str, Any]) -> str:
+    return json.dumps(line, sort_keys=True)

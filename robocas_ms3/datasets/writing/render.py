@@ -17,15 +17,15 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import inverse
 from robocas_ms3.datasets.pictures.boxes import Box, box_of
 from robocas_ms3.datasets.pictures.stored import Pictures
-from robocas_ms3.datasets.writing.frames import CameraModel, Frame
+from robocas_ms3.datasets.sources.protocol import CameraModel, Frame
 from robocas_ms3.demos.recordings.environment import RecordedEnv
 from robocas_ms3.demos.recordings.reading import Recording
 
 _SAME_PLACE = 1e-3  # m
 
 
-class EnvFrames:
-    """A ``FrameSource`` made of the environment that recorded a trajectory.
+class EnvRenderer:
+    """Renders with the environment that recorded a trajectory: a `rendering.Renderer`.
 
     Attributes:
         env: the environment.

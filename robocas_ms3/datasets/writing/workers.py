@@ -1,87 +1,210 @@
-"""Writes many episodes of a conversion, in this process or in several."""
+"""Writes the episodes of a conversion: a loop, in this process or shared among several."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+import errno
+import logging
+import os
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
+from robocas_ms3.core.errors import DatasetError, IncompleteError, MissingExtraError, RobocasError
+from robocas_ms3.core.outputs import check_there
+from robocas_ms3.core.sent_errors import SentError
+from robocas_ms3.core.words import count_of
+from robocas_ms3.core.workers import NO_LIMITS, WorkerPool, use_one_torch_thread
+from robocas_ms3.datasets.schema import episode_folder
+from robocas_ms3.datasets.writing.inputs import ConversionInput, open_input
+from robocas_ms3.datasets.writing.settings import ConversionSettings, WrittenEpisode
 
-from robocas_ms3.core.workers import Limits
-from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.pictures.preview import Preview
-from robocas_ms3.datasets.writing.players import RecordingPlayer, Request
-from robocas_ms3.datasets.writing.pool import do_all
-from robocas_ms3.datasets.writing.writer import WrittenEpisode, write_episode
+_ENOUGH = 3  # failures before any success: the other episodes would fail too
+_LISTED = 5  # failures that an error lists
+_log = logging.getLogger(__name__)
+
+Task = tuple[int, int]
+"""Number of an episode in the dataset, and in the source."""
+
+
+class EpisodeWriter(Protocol):
+    """Writes the episodes of one format; can be sent to another process."""
+
+    def write(self, number: int, given: ConversionInput, source: int) -> WrittenEpisode:
+        """Write one episode.
+
+        Args:
+            number: of the episode in the dataset.
+            given: what is converted.
+            source: its number there.
+
+        Raises:
+            DatasetError: it can't be shown or written.
+        """
+        ...
 
 
 @dataclass(frozen=True)
-class Job:
-    """What a process needs to know.
+class WriteJob:
+    """The episodes of a conversion that are not there yet.
 
     Attributes:
-        request: what is converted.
-        out: the dataset.
-        vectors: embedding (384,) of every text; None: no embeddings.
-        sheet: episodes on the contact sheet; None: no previews are made.
-        tasks: (number in the dataset, number in the source) of each episode to write.
-        limits: of an episode; None: there are none, and one process is this one.
-        begun: whether there are episodes already.
+        settings: of the conversion.
+        writer: of the format.
+        tasks: the episodes.
+        mark: a file that is there as long as the output folder is.
+        continued: whether there are episodes already.
+        fix: how to go on if episodes can't be written.
     """
 
-    request: Request
-    out: Path
-    vectors: dict[str, NDArray[np.float32]] | None
-    sheet: tuple[int, ...] | None
-    tasks: list[tuple[int, int]]
-    limits: Limits | None = None
-    begun: bool = False
+    settings: ConversionSettings
+    writer: EpisodeWriter
+    tasks: list[Task]
+    mark: Path
+    continued: bool
+    fix: str
 
 
-def write_all(job: Job, processes: int) -> Generator[WrittenEpisode, None, None]:
-    """Write the job's episodes; gives each when it is done, in any order.
+def write_missing(
+    job: WriteJob, on_episode: Callable[[WrittenEpisode], None] | None
+) -> tuple[list[WrittenEpisode], IncompleteError | None]:
+    """Write episodes; return them by number, and an error that names those that can't be written.
 
     Raises:
-        IncompleteError: episodes can't be written; all others are.
-        Exception: what is wrong with all.
+        DatasetError: the output folder is gone.
+        Exception: an error that all episodes share.
     """
-    return do_all(
-        partial(_Writer, job),
-        job.tasks,
-        processes,
-        job.out,
-        limits=job.limits,
-        apart=job.limits is not None and job.request.renders,
-        name=lambda task: schema.episode_folder(task[0]),
-        begun=job.begun,
-        fix="The dataset is complete without, and valid; --resume tries again, --leave-out takes it as it is.",
+    written: list[WrittenEpisode] = []
+    incomplete: IncompleteError | None = None
+    try:
+        with closing(write_episodes(job)) as episodes:
+            for episode in episodes:
+                check_there(job.mark, DatasetError)
+                written.append(episode)
+                if on_episode:
+                    on_episode(episode)
+    except IncompleteError as error:
+        incomplete = error
+    return sorted(written, key=lambda episode: episode.number), incomplete
+
+
+def write_episodes(job: WriteJob) -> Generator[WrittenEpisode, None, None]:
+    """Write episodes; yield each when it is done, in any order.
+
+    An episode that fails does not end the others, unless all share its error: the disk, an extra, or the first three.
+
+    Raises:
+        IncompleteError: episodes failed, or their processes died twice; the others are written.
+        Exception: the error of an episode, if none is written.
+    """
+    settings = job.settings
+    renders, processes = settings.is_trajectory, min(settings.jobs, len(job.tasks))
+    apart = settings.limits is not None and settings.needs_device  # a crash of the renderer ends that process alone
+    here = processes <= 1 and not apart
+    threads = one_torch_thread() if renders and here else nullcontext()
+    open_worker = partial(_EpisodeWorker, job, one_rasterizer_thread=processes > 1, shared=here)
+    pool: WorkerPool[Task, WrittenEpisode | _Failure] = WorkerPool(
+        open_worker, 0 if here else processes, on_crash=_death, limits=settings.limits or NO_LIMITS
     )
+    failures: list[_Failure] = []
+    done = 0
+    with threads, pool, closing(pool.map(job.tasks, ordered=False)) as results:
+        for result in results:
+            if isinstance(result, WrittenEpisode):
+                done += 1
+                yield result
+                continue
+            failures.append(result)
+            if done or job.continued:
+                _log.warning("%s could not be written: %s", result.episode, result.reason)
+            elif len(failures) == _ENOUGH:
+                break
+    if not failures:
+        return
+    first = failures[0].sent.with_traceback()
+    if not (done or job.continued):
+        raise first
+    raise _incomplete(failures, job) from first
 
 
-class _Writer:
-    """One process's share: keeps what plays the episodes open from one to the next."""
+@dataclass(frozen=True)
+class _Failure:
+    """An episode that could not be written."""
 
-    def __init__(self, job: Job) -> None:
-        self.job, self.player = job, RecordingPlayer(job.request)
+    episode: str
+    sent: SentError
 
-    def run(self, task: tuple[int, int]) -> WrittenEpisode:
-        job, (number, source) = self.job, task
-        preview = partial(Preview, job.out, self.player.rate_hz, row=number in (job.sheet or ()))
-        return write_episode(
-            job.out,
-            number,
-            self.player,
-            source,
-            embed=self._embed(),
-            open_preview=None if job.sheet is None else preview,
-        )
+    @property
+    def reason(self) -> str:
+        error = self.sent.error
+        message = str(error) if isinstance(error, RobocasError) else f"{type(error).__name__}: {error}"
+        return " ".join(message.split()).rstrip(".")
 
-    def _embed(self) -> Callable[[list[str]], NDArray[np.float32]] | None:
-        vectors = self.job.vectors
-        return None if vectors is None else lambda texts: np.stack([vectors[text] for text in texts])
+
+def _death(task: Task, why: str) -> _Failure:
+    episode = episode_folder(task[0])
+    error = DatasetError(f"its process died twice: {why}", where=episode)
+    return _Failure(episode, SentError.of(error, "a worker"))
+
+
+def _incomplete(failures: list[_Failure], job: WriteJob) -> IncompleteError:
+    reasons = {one.episode: one.reason for one in sorted(failures, key=lambda one: one.episode)}
+    listed = [why if why.startswith(f"{one}: ") else f"{one}: {why}" for one, why in reasons.items()]
+    more = f"; and {len(listed) - _LISTED} more" if len(listed) > _LISTED else ""
+    what = f"{count_of(len(listed), 'episode')} could not be written"
+    error = IncompleteError(what, where=job.settings.out, found="; ".join(listed[:_LISTED]) + more, fix=job.fix)
+    error.reasons = reasons
+    return error
+
+
+class _EpisodeWorker:
+    """Writes the episodes of one process. The source stays open, and is opened again after a failure."""
+
+    def __init__(self, job: WriteJob, *, one_rasterizer_thread: bool, shared: bool) -> None:
+        if job.settings.is_trajectory and not shared:
+            if one_rasterizer_thread:  # processes that render in software on all cores get in each other's way
+                os.environ.setdefault("LP_NUM_THREADS", "1")
+            use_one_torch_thread()
+        self._job = job
+        self._given: ConversionInput | None = open_input(job.settings)
+
+    def run(self, task: Task) -> WrittenEpisode | _Failure:
+        number, source = task
+        try:
+            self._given = self._given or open_input(self._job.settings)
+            return self._job.writer.write(number, self._given, source)
+        except Exception as error:
+            if _is_shared(error):
+                raise
+            self.close()
+            return _Failure(episode_folder(number), SentError.of(error, "a worker"))
 
     def close(self) -> None:
-        self.player.close()
+        given, self._given = self._given, None
+        if given is not None:
+            given.close()
+
+
+def _is_shared(error: Exception) -> bool:
+    """Return whether all episodes share an error: the system's, or one of an installation.
+
+    FFmpeg's errors are OSErrors too, but have numbers of their own.
+    """
+    if isinstance(error, OSError) and error.errno in errno.errorcode:
+        return True
+    return isinstance(error, MissingExtraError)
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """Use one thread in torch inside: next to a renderer its other threads spin, which doubles the CPU time."""
+    import torch
+
+    before = torch.get_num_threads()
+    use_one_torch_thread()
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

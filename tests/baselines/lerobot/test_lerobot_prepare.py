@@ -18,6 +18,7 @@ from robocas_ms3.baselines.lerobot.observations import EMBEDDING, STATE, STATE_N
 from robocas_ms3.baselines.lerobot.prepare import main, prepare
 from robocas_ms3.core.errors import DatasetError, OutputExistsError
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
+from robocas_ms3.datasets.writing.settings import ConversionSettings
 
 DATA = "data/chunk-000/file-000.parquet"
 EPISODES = "meta/episodes/chunk-000/file-000.parquet"
@@ -27,7 +28,9 @@ EPISODES = "meta/episodes/chunk-000/file-000.parquet"
 def source(tmp_path_factory):
     """Two episodes with an instruction each."""
     folder = tmp_path_factory.mktemp("source")
-    convert_lerobot(write_trajectory(folder / "F.h5", seeds=(3, 4)), folder / "dataset", open_source=RayCaster)
+    convert_lerobot(
+        ConversionSettings(write_trajectory(folder / "F.h5", seeds=(3, 4)), folder / "dataset", open_renderer=RayCaster)
+    )
     return folder / "dataset"
 
 
@@ -97,7 +100,7 @@ def test_videos_are_the_same_files(source, out):
 
 
 def test_another_format_is_refused(source, tmp_path):
-    convert_lerobot(source, tmp_path / "old", lerobot_version="2.1")
+    convert_lerobot(ConversionSettings(source, tmp_path / "old", lerobot_version="2.1"))
     with pytest.raises(DatasetError, match="no LeRobot dataset of ours .*expected v3.0, found v2.1"):
         prepare(tmp_path / "old", tmp_path / "out", None)
     assert not (tmp_path / "out").exists()

@@ -18,6 +18,7 @@ from robocas_ms3.datasets.manage.merging import merge
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.datasets.writing.info import write_info
+from robocas_ms3.datasets.writing.settings import ConversionSettings
 
 
 class Bomb:
@@ -116,7 +117,7 @@ def test_schema_versions_that_are_mixed(dataset, trajectory, tmp_path):
     assert f"conversion.json, schema_version: expected {expected}, found 1" in violations(dataset)
     before = files_of(dataset)
     with pytest.raises(DatasetError, match="another schema version .expected 2, found 1.*again from its recording"):
-        convert(trajectory, dataset, append=True, open_source=RayCaster)
+        convert(ConversionSettings(trajectory, dataset, append=True, open_renderer=RayCaster))
     with pytest.raises(DatasetError, match="another schema version"):
         merge([dataset], tmp_path / "out")
     assert files_of(dataset) == before
@@ -126,7 +127,7 @@ def test_appending_to_a_damaged_dataset_says_which_episode(trajectory, tmp_path)
     root = make(tmp_path, "ds", (1, 2))
     (root / "episode_0000000" / "episode_info.npz").write_bytes(b"PK")
     with pytest.raises(DatasetError, match=r"episode_0000000.*this episode can't be read.*robocas validate"):
-        convert(trajectory, root, append=True, embeddings=False, open_source=RayCaster)
+        convert(ConversionSettings(trajectory, root, append=True, embeddings=False, open_renderer=RayCaster))
     assert json.loads((root / "conversion.json").read_text())["episodes"].keys() >= {"0", "1"}
 
 
@@ -152,13 +153,13 @@ def test_a_full_disk_ends_a_conversion_which_goes_on_later(small_disk, tmp_path)
     trajectory = write_trajectory(tmp_path / "F.h5", seeds=range(5))
     out = small_disk / "out"
     with pytest.raises(OSError, match="No space left on device"):
-        convert(trajectory, out, embeddings=False, open_source=RayCaster)
+        convert(ConversionSettings(trajectory, out, embeddings=False, open_renderer=RayCaster))
     left = sorted(path.name for path in out.iterdir())
     assert left == ["conversion.json", *(f"episode_{n:07d}" for n in range(len(left) - 1))]
     assert 1 < len(left) < 6
     grow(small_disk)
-    convert(trajectory, out, embeddings=False, resume=True, open_source=RayCaster)
-    convert(trajectory, tmp_path / "whole", embeddings=False, open_source=RayCaster)
+    convert(ConversionSettings(trajectory, out, embeddings=False, resume=True, open_renderer=RayCaster))
+    convert(ConversionSettings(trajectory, tmp_path / "whole", embeddings=False, open_renderer=RayCaster))
     assert files_of(out) == files_of(tmp_path / "whole")
 
 

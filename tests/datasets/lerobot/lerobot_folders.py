@@ -11,11 +11,13 @@ DEPTH = "depth/base_camera/chunk-000/file-000.mkv"
 """Files of a dataset of version 0.5."""
 
 
-def convert(source, out, **kwargs):
+def convert(source, out, on_episode=None, **settings):
     """Convert with made-up images."""
     from robocas_ms3.datasets.lerobot.convert import convert_lerobot  # needs the extra 'lerobot'
+    from robocas_ms3.datasets.writing.settings import ConversionSettings
 
-    return convert_lerobot(source, out, open_source=RayCaster, **kwargs)
+    settings = ConversionSettings(source, out, open_renderer=RayCaster, **settings)
+    return convert_lerobot(settings, on_episode=on_episode)
 
 
 def files_of(root):

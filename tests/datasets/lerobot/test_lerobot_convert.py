@@ -21,8 +21,8 @@ from robocas_ms3.datasets.lerobot.schema import Limits
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.tolerant import arrays_fingerprint
-from robocas_ms3.datasets.writing.dataset_player import open_player
-from robocas_ms3.datasets.writing.players import Request
+from robocas_ms3.datasets.writing.inputs import open_input
+from robocas_ms3.datasets.writing.settings import ConversionSettings
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
 
 
@@ -76,7 +76,7 @@ def test_from_a_folder_as_from_the_trajectory(trajectory, made, tmp_path):
     """Nothing is rendered the second time, and it is the same but for where it comes from."""
     lerobot, out = tmp_path / "lerobot", tmp_path / "out"
     convert(trajectory, lerobot, lerobot_version="0.5")
-    convert_lerobot(made, out, open_source=None, lerobot_version="0.5")  # type: ignore[arg-type]
+    convert_lerobot(ConversionSettings(made, out, open_renderer=None, lerobot_version="0.5"))  # type: ignore[arg-type]
     before, after = files_of(lerobot), files_of(out)
     different = {name for name in before if before[name] != after.get(name)}
     assert different == {"meta/robocas/conversion.json", "meta/robocas/episodes.parquet"}
@@ -120,7 +120,7 @@ def test_depth_of_all_16_bits(trajectory, tmp_path):
                 frame.depth["gripper_camera"][:] = noise[step]
                 yield frame
 
-    convert_lerobot(trajectory, tmp_path / "out", open_source=Noisy, lerobot_version="0.5")
+    convert_lerobot(ConversionSettings(trajectory, tmp_path / "out", open_renderer=Noisy, lerobot_version="0.5"))
     found = LeRobotDataset(tmp_path / "out").episode(1)
     np.testing.assert_array_equal(np.stack(list(found.frames("gripper_camera", "depth"))), noise)
 
@@ -135,7 +135,11 @@ def test_each_video_frame_is_that_of_its_step(trajectory, tmp_path):
                 yield frame
 
     out = tmp_path / "out"
-    convert_lerobot(trajectory, out, open_source=Grey, include_failed=True, pictures=Pictures(("base_camera",)))
+    convert_lerobot(
+        ConversionSettings(
+            trajectory, out, open_renderer=Grey, include_failed=True, pictures=Pictures(("base_camera",))
+        )
+    )
     dataset = LeRobotDataset(out)
     for number, seed in enumerate((3, 4, 5)):
         for step in (6, 0, 5, 2):
@@ -161,9 +165,11 @@ def test_statistics_are_those_of_the_data(lerobot):
     assert rows[0]["stats/action/count"] == [7]
 
 
-def test_files_roll_over_at_their_limits(trajectory, tmp_path):
+def test_files_roll_over_at_their_limits(trajectory, tmp_path, monkeypatch):
     out = tmp_path / "out"
-    convert(trajectory, out, include_failed=True, limits=Limits(data_mb=1e-6, video_mb=100, video_seconds=14 / 5))
+    limits = "robocas_ms3.datasets.lerobot.convert.FILE_LIMITS"
+    monkeypatch.setattr(limits, Limits(data_mb=1e-6, video_mb=100, video_seconds=14 / 5))
+    convert(trajectory, out, include_failed=True)
     dataset = LeRobotDataset(out)
     assert [row["data/file_index"] for row in dataset.rows] == [0, 1, 2]
     assert [row["videos/observation.images.base_camera/file_index"] for row in dataset.rows] == [0, 0, 1]
@@ -172,7 +178,8 @@ def test_files_roll_over_at_their_limits(trajectory, tmp_path):
     assert [row["meta/episodes/file_index"] for row in dataset.rows] == [0, 0, 0]
     assert check_lerobot(out) == []
     by_size = tmp_path / "by_size"
-    convert(trajectory, by_size, include_failed=True, limits=Limits(video_mb=1e-6))
+    monkeypatch.setattr(limits, Limits(video_mb=1e-6))
+    convert(trajectory, by_size, include_failed=True)
     assert [row[f"{depth}/file_index"] for row in LeRobotDataset(by_size).rows] == [0, 1, 2]
     assert check_lerobot(by_size) == []
 
@@ -202,7 +209,7 @@ def test_errors_leave_nothing_behind(trajectory, made, tmp_path):
     fails("no such trajectory file", tmp_path / "none.h5", out)
     fails("no dataset here", tmp_path, out)
     fails("a dataset keeps its rate .expected 5 Hz, found 10.", made, out, rate_hz=10)
-    fails("a dataset keeps its pictures' size .expected 64 x 48", made, out, pictures=Pictures(size=(32, 32)))
+    fails("a dataset keeps the size of its images .expected 64 x 48", made, out, pictures=Pictures(size=(32, 32)))
     fails("videos need even sizes .expected .* found 65 x 48", trajectory, out, pictures=Pictures(size=(65, 48)))
     fails("no successful episodes", write_trajectory(tmp_path / "failed.h5", seeds=(1,), failed=(0,)), out)
 
@@ -265,7 +272,7 @@ def test_episodes_of_unknown_recordings_are_told_by_their_arrays(dataset, source
     content = json.loads(ledger.read_text())
     content["episodes"]["1"]["recording"] = None
     ledger.write_text(json.dumps(content))
-    entries = open_player(Request(dataset, None, Pictures(), False, RayCaster)).entries()
+    entries = open_input(ConversionSettings(dataset, dataset.with_name("out"))).entries()
     expected = arrays_fingerprint(Dataset(dataset).episode(1).arrays)
     assert entries[1]["recording"] == f"arrays {expected}"
 

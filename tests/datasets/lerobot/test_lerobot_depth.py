@@ -10,6 +10,7 @@ from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.lerobot.depth import DEPTH_INFO, to_depth, to_levels
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.video import CODINGS, Encoder, read_frames
+from robocas_ms3.datasets.writing.settings import ConversionSettings
 
 
 def test_depth_in_range_is_exact():
@@ -61,7 +62,7 @@ def test_the_video_is_lossless_and_the_same_each_time(tmp_path):
 
 
 def test_depth_out_of_range_is_reported_once(trajectory, tmp_path, caplog):
-    convert_lerobot(trajectory, tmp_path / "out", open_source=RayCaster)  # its room is 5 m deep
+    convert_lerobot(ConversionSettings(trajectory, tmp_path / "out", open_renderer=RayCaster))  # its room is 5 m deep
     said = [record.getMessage() for record in caplog.records if "depth" in record.getMessage()]
     assert said == ["2 episodes: depth above 4095 mm is stored as 4095 mm"]
     episode = LeRobotDataset(tmp_path / "out").episode(0)

@@ -24,6 +24,7 @@ from robocas_ms3.datasets.manage.importing import import_robocas
 from robocas_ms3.datasets.manage.survey import survey
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.tolerant import arrays_fingerprint
+from robocas_ms3.datasets.writing.settings import ConversionSettings
 
 
 def test_an_episode_with_an_error_is_converted_on_resume(trajectory, lerobot, tmp_path):
@@ -36,7 +37,7 @@ def test_an_episode_with_an_error_is_converted_on_resume(trajectory, lerobot, tm
 
     out = tmp_path / "out"
     with pytest.raises(DatasetError, match="it broke"):
-        convert_lerobot(trajectory, out, open_source=Breaking)
+        convert_lerobot(ConversionSettings(trajectory, out, open_renderer=Breaking))
     assert {path.name for path in out.iterdir()} == {".parts"}
     assert not (out / ".parts" / "episode_0000001").exists()
     done = convert(trajectory, out, resume=True)

@@ -22,6 +22,7 @@ from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.variants import NEWEST, VARIANTS, Version
 from robocas_ms3.datasets.pictures.boxes import box_of
 from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.datasets.writing.settings import ConversionSettings
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
 from robocas_ms3.viewer.source import open_source as open_page
 
@@ -31,7 +32,11 @@ def datasets(trajectory, tmp_path_factory):
     """A dataset of three episodes of each version, of which the second failed."""
     root = tmp_path_factory.mktemp("versions")
     for version in VARIANTS:
-        convert_lerobot(trajectory, root / version, open_source=RayCaster, include_failed=True, lerobot_version=version)
+        convert_lerobot(
+            ConversionSettings(
+                trajectory, root / version, open_renderer=RayCaster, include_failed=True, lerobot_version=version
+            )
+        )
     return root
 
 
@@ -67,15 +72,21 @@ def test_each_version_passes_the_check_and_restores_the_episodes(datasets, versi
 
 def test_the_same_input_gives_the_same_bytes(datasets, version, trajectory, tmp_path):
     out = tmp_path / "out"
-    convert_lerobot(trajectory, out, open_source=RayCaster, include_failed=True, lerobot_version=version, jobs=2)
+    convert_lerobot(
+        ConversionSettings(
+            trajectory, out, open_renderer=RayCaster, include_failed=True, lerobot_version=version, jobs=2
+        )
+    )
     assert files_of(out) == files_of(datasets / version)
 
 
 def test_each_version_from_a_folder_and_from_another_version(datasets, version, made, tmp_path):
-    convert_lerobot(made, tmp_path / "folder", lerobot_version=version)
+    convert_lerobot(ConversionSettings(made, tmp_path / "folder", lerobot_version=version))
     assert check_lerobot(tmp_path / "folder") == []
     for other in VARIANTS:
-        convert_lerobot(datasets / other, tmp_path / other, include_failed=True, lerobot_version=version)
+        convert_lerobot(
+            ConversionSettings(datasets / other, tmp_path / other, include_failed=True, lerobot_version=version)
+        )
         assert check_lerobot(tmp_path / other) == []
         ours, theirs = LeRobotDataset(tmp_path / other).episode(2), LeRobotDataset(datasets / other).episode(2)
         assert ours.goals == theirs.goals
@@ -195,7 +206,7 @@ def test_videos_of_version_2_1_that_are_wrong(spoiled):
 
 def test_an_unknown_version_lists_the_choices(trajectory, tmp_path, capsys):
     with pytest.raises(DatasetError, match="unknown LeRobot version .expected 0.6, 0.5, 2.1, found 0.7"):
-        convert_lerobot(trajectory, tmp_path / "out", lerobot_version="0.7")
+        convert_lerobot(ConversionSettings(trajectory, tmp_path / "out", lerobot_version="0.7"))
     assert not (tmp_path / "out").exists()
     command = ["convert", str(trajectory), "--out", str(tmp_path / "out"), "--lerobot-version", "2.1"]
     assert main.run(command) == 1

@@ -16,6 +16,7 @@ from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.datasets.writing.output import Placer
+from robocas_ms3.datasets.writing.settings import ConversionSettings
 
 
 @pytest.fixture(scope="module")
@@ -166,7 +167,7 @@ def test_what_is_appended_leaves_a_split_of_texts_as_it_is(parts, tmp_path):
     for number, seed in ((0, [10]), (1, [11])):  # as ManiSkill writes seeds
         edit(part / f"episode_000000{number}" / "scene.json", lambda c, seed=seed: c.update(seed=seed))
     trajectory = write_trajectory(tmp_path / "more.h5", seeds=(30,))
-    convert(trajectory, part, embeddings=False, open_source=RayCaster, append=True)
+    convert(ConversionSettings(trajectory, part, embeddings=False, open_renderer=RayCaster, append=True))
     train, val = Dataset(part).sides
     assert ([n for n in train if n < 2], [n for n in val if n < 2]) == sides
 
@@ -280,10 +281,10 @@ def test_the_command_wants_datasets(tmp_path, capsys):
 
 def test_a_merged_dataset_can_be_appended_to(parts, tmp_path):
     merge(parts, tmp_path / "out")
-    settings = {"embeddings": False, "append": True, "open_source": RayCaster}
-    known = convert(parts[1].with_suffix(".h5"), tmp_path / "out", **settings)
+    settings = {"embeddings": False, "append": True, "open_renderer": RayCaster}
+    known = convert(ConversionSettings(parts[1].with_suffix(".h5"), tmp_path / "out", **settings))
     assert (known.kept, known.episodes) == (2, [])
-    new = convert(write_trajectory(tmp_path / "c.h5", seeds=(30,)), tmp_path / "out", **settings)
+    new = convert(ConversionSettings(write_trajectory(tmp_path / "c.h5", seeds=(30,)), tmp_path / "out", **settings))
     assert [episode.number for episode in new.episodes] == [4]
     assert validate(parts[0]).violations == []  # whose files are shared
     assert validate(tmp_path / "out").violations == []

@@ -3,14 +3,13 @@
 import signal
 import subprocess
 import sys
-from functools import partial
 from pathlib import Path
 
 import imageio.v2 as imageio
 import numpy as np
 import pytest
 from PIL import Image
-from synthetic import RayCaster, write_trajectory
+from synthetic import RayCaster, render_by, write_trajectory
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.datasets.checks.dataset import validate
@@ -20,13 +19,14 @@ from robocas_ms3.datasets.pictures.preview import PANEL
 from robocas_ms3.datasets.pictures.video import _pictures, contact_sheet
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing import convert as conversion
+from robocas_ms3.datasets.writing.settings import ConversionSettings
 
 SUPPORT = Path(__file__).parents[2] / "support"
 
 
 @pytest.fixture
 def made_up_pictures(monkeypatch):
-    monkeypatch.setattr(conversion, "convert", partial(conversion.convert, open_source=RayCaster))
+    monkeypatch.setattr(conversion, "convert", render_by(RayCaster, conversion.convert))
 
 
 def converted(path, out, *flags, seeds=None):
@@ -41,7 +41,9 @@ def shown(out):
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_shows_what_the_dataset_holds(trajectory, tmp_path, jobs):
     out = tmp_path / "out"
-    conversion.convert(trajectory, out, embeddings=False, previews=None, jobs=jobs, open_source=RayCaster)
+    conversion.convert(
+        ConversionSettings(trajectory, out, embeddings=False, previews=None, jobs=jobs, open_renderer=RayCaster)
+    )
     assert shown(out) == ["contact_sheet.png", "episode_0000000.mp4", "episode_0000001.mp4"]
     dataset = Dataset(out)
     for number in dataset.numbers:
@@ -119,15 +121,17 @@ def test_a_killed_run_leaves_nothing_half_written(trajectory, tmp_path):
     command = [sys.executable, SUPPORT / "dying.py", "picture", trajectory, out, "previews"]
     assert subprocess.run(command, check=False).returncode == -signal.SIGKILL
     assert [name for name in shown(out) if not name.startswith(".")] == ["episode_0000000.mp4"]
-    again = partial(conversion.convert, trajectory, out, embeddings=False, previews=None, open_source=RayCaster)
-    again(resume=True)
+    settings = ConversionSettings(
+        trajectory, out, embeddings=False, open_renderer=RayCaster, resume=True, previews=None
+    )
+    conversion.convert(settings)
     assert shown(out) == ["contact_sheet.png", "episode_0000000.mp4", "episode_0000001.mp4"]
 
 
 def test_a_failed_episode_has_none(trajectory, tmp_path, monkeypatch):
-    from robocas_ms3.datasets.writing import writer
+    from robocas_ms3.datasets.writing import episode_folder
 
-    done, write = [], writer.write_picture
+    done, write = [], episode_folder.write_picture
 
     def failing(path, picture):
         done.append(path)
@@ -135,9 +139,11 @@ def test_a_failed_episode_has_none(trajectory, tmp_path, monkeypatch):
             raise OSError(28, "No space left on device")
         return write(path, picture)
 
-    monkeypatch.setattr(writer, "write_picture", failing)
+    monkeypatch.setattr(episode_folder, "write_picture", failing)
     with pytest.raises(OSError, match="No space left"):
-        conversion.convert(trajectory, tmp_path / "out", embeddings=False, previews=True, open_source=RayCaster)
+        conversion.convert(
+            ConversionSettings(trajectory, tmp_path / "out", embeddings=False, previews=True, open_renderer=RayCaster)
+        )
     assert shown(tmp_path / "out") == ["episode_0000000.mp4"]
 
 

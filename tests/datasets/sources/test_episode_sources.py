@@ -18,6 +18,7 @@ from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.sources.trajectory import TrajectorySource
 from robocas_ms3.datasets.statistics.collect import collect
 from robocas_ms3.datasets.writing.convert import convert
+from robocas_ms3.datasets.writing.settings import ConversionSettings
 from robocas_ms3.demos.recordings import reading
 
 
@@ -26,8 +27,8 @@ def paths(tmp_path_factory):
     """Three episodes as trajectory, RoboCAS folder and LeRobot folder."""
     root = tmp_path_factory.mktemp("sources")
     trajectory = write_trajectory(root / "trajectory.h5", seeds=(1, 2, 3))
-    convert(trajectory, root / "folder", embeddings=False, open_source=RayCaster)
-    convert_lerobot(root / "folder", root / "lerobot")
+    convert(ConversionSettings(trajectory, root / "folder", embeddings=False, open_renderer=RayCaster))
+    convert_lerobot(ConversionSettings(root / "folder", root / "lerobot"))
     return {"trajectory": trajectory, "robocas": root / "folder", "lerobot": root / "lerobot"}
 
 

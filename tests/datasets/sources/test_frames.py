@@ -17,6 +17,7 @@ from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.pictures.video import write_video
 from robocas_ms3.datasets.sources.protocol import shots
 from robocas_ms3.datasets.training.torch_dataset import RoboCASDataset
+from robocas_ms3.datasets.writing.settings import ConversionSettings
 
 CAMERAS = ("base_camera", "gripper_camera", "static_camera")
 STEPS = 7
@@ -28,7 +29,7 @@ SIZES = 2 * len(CAMERAS)
 def lerobot(made, tmp_path_factory):
     """A dataset of two episodes that nobody may change."""
     out = tmp_path_factory.mktemp("lerobot") / "dataset"
-    convert_lerobot(made, out, open_source=RayCaster)
+    convert_lerobot(ConversionSettings(made, out, open_renderer=RayCaster))
     return out
 
 
@@ -82,7 +83,7 @@ def test_cameras_in_step_are_closed_with_the_run(lerobot, runs):
 
 
 def test_a_conversion_opens_each_video_once_an_episode(lerobot, tmp_path, runs):
-    convert_lerobot(lerobot, tmp_path / "out")
+    convert_lerobot(ConversionSettings(lerobot, tmp_path / "out"))
     assert len(runs) == SIZES + 2 * 2 * len(CAMERAS)
     assert all_closed(runs)
     again = open_source(tmp_path / "out").episode(1)
@@ -102,7 +103,7 @@ def test_a_conversion_that_fails_leaves_no_video_open(lerobot, tmp_path, runs, m
 
     monkeypatch.setattr(video.Encoder, "add", full)
     with pytest.raises(OSError, match="No space left"):
-        convert_lerobot(lerobot, tmp_path / "out")
+        convert_lerobot(ConversionSettings(lerobot, tmp_path / "out"))
     assert len(runs) == SIZES + 2 * len(CAMERAS)
     assert all_closed(runs)
 

@@ -6,7 +6,7 @@ import h5py
 import numpy as np
 import pytest
 from managing import files_of
-from synthetic import RayCaster, write_trajectory
+from synthetic import RayCaster, render_by, write_trajectory
 
 from robocas_ms3.cli.main import run as run_command
 from robocas_ms3.core.errors import AssetError, DatasetError, IncompleteError
@@ -14,6 +14,7 @@ from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing import convert as conversion
 from robocas_ms3.datasets.writing.convert import convert
+from robocas_ms3.datasets.writing.settings import ConversionSettings
 
 SEEDS = tuple(range(10, 24))
 
@@ -45,7 +46,7 @@ class OfOddSeeds(RayCaster):
 
 
 def run(trajectory, out, **kwargs):
-    return convert(trajectory, out, **{"embeddings": False, "open_source": RayCaster, **kwargs})
+    return convert(ConversionSettings(trajectory, out, **{"embeddings": False, "open_renderer": RayCaster, **kwargs}))
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +94,7 @@ def test_a_broken_recording(many, tmp_path, how):
 def test_an_episode_that_cannot_be_shown_or_stored(many, tmp_path, source, jobs):
     trajectory, whole = many
     with pytest.raises(IncompleteError, match="found episode_0000003: .*(no such object|can't encode this picture)"):
-        run(trajectory, tmp_path / "out", open_source=source, jobs=jobs)
+        run(trajectory, tmp_path / "out", open_renderer=source, jobs=jobs)
     assert validate(tmp_path / "out").violations == []
     assert len(Dataset(tmp_path / "out").numbers) == len(SEEDS) - 1
     run(trajectory, tmp_path / "out", resume=True)
@@ -110,7 +111,7 @@ def test_the_only_one_of_its_side(many, tmp_path):
 
     for resume in (False, True):
         with pytest.raises(IncompleteError, match=f"episode_{val:07d}"):
-            run(trajectory, tmp_path / "out", open_source=OfVal, resume=resume)
+            run(trajectory, tmp_path / "out", open_renderer=OfVal, resume=resume)
         assert validate(tmp_path / "out").violations == []
         assert Dataset(tmp_path / "out").sides[1] == []
     run(trajectory, tmp_path / "out", resume=True)
@@ -121,7 +122,7 @@ def test_others_are_appended_meanwhile(many, tmp_path):
     trajectory, _ = many
     more = write_trajectory(tmp_path / "more.h5", seeds=(50, 51), steps=16)
     with pytest.raises(IncompleteError):
-        run(trajectory, tmp_path / "out", open_source=OfOddSeeds)
+        run(trajectory, tmp_path / "out", open_renderer=OfOddSeeds)
     run(more, tmp_path / "out", append=True)
     assert validate(tmp_path / "out").violations == []
     ledger = json.loads((tmp_path / "out" / "conversion.json").read_text())
@@ -141,7 +142,7 @@ def test_what_is_wrong_with_the_first_three_is_wrong_with_all(many, tmp_path):
             raise DatasetError(f"seed {recording.seed}: no renderer")
 
     with pytest.raises(DatasetError, match="^seed 10: no renderer$"):
-        run(many[0], tmp_path / "out", open_source=Hopeless)
+        run(many[0], tmp_path / "out", open_renderer=Hopeless)
     assert not (tmp_path / "out").exists()
 
 
@@ -167,8 +168,8 @@ def test_the_command(many, tmp_path, monkeypatch, capsys, to):
         owner, name = lerobot, "convert_lerobot"
     else:
         owner, name = conversion, "convert"
-    whole, source = getattr(owner, name), [Breaking]
-    monkeypatch.setattr(owner, name, lambda *args, **more: whole(*args, open_source=source[0], **more))
+    whole = getattr(owner, name)
+    monkeypatch.setattr(owner, name, render_by(Breaking, whole))
     out = tmp_path / "out"
     command = ["convert", str(many[0]), "--to", to, "--out", str(out), "--no-embeddings", "--no-video"]
     assert run_command(command) == 1
@@ -179,7 +180,7 @@ def test_the_command(many, tmp_path, monkeypatch, capsys, to):
     assert run_command([*command, "--resume", "--leave-out"]) == 0
     assert run_command(["validate", str(out)]) == 0
     assert "13 episodes" in capsys.readouterr().out
-    source[0] = RayCaster
+    monkeypatch.setattr(owner, name, render_by(RayCaster, whole))
     assert run_command([*command, "--resume"]) == 0
     assert run_command(["validate", str(out)]) == 0
     count = 14 if to == "robocas" else 13  # LeRobot's numbers have no gap that it could fill

@@ -7,8 +7,8 @@ import pytest
 from synthetic import RayCaster
 
 from robocas_ms3.datasets.writing import convert as conversion
-from robocas_ms3.datasets.writing import writer
-from robocas_ms3.datasets.writing.timing import Timing
+from robocas_ms3.datasets.writing import episode_folder
+from robocas_ms3.datasets.writing.settings import ConversionSettings, Timing
 
 
 class Clock:
@@ -66,24 +66,28 @@ def test_what_fails_is_measured_too(clock):
 
 
 def test_of_a_robocas_dataset(trajectory, tmp_path, monkeypatch, clock):
-    calls, write = Counter(), writer.write_picture
+    calls, write = Counter(), episode_folder.write_picture
 
     def encode(path, picture):
         calls[picture.ndim] += 1
         write(path, picture)
         return 0.5
 
-    monkeypatch.setattr(writer, "write_picture", encode)
-    monkeypatch.setattr(writer, "write_cameras", slow(writer.write_cameras, clock, 0.25))
-    monkeypatch.setattr(writer.np, "savez", slow(writer.np.savez, clock, 0.5))
-    done = conversion.convert(trajectory, tmp_path / "out", embeddings=False, open_source=slow_source(clock))
+    monkeypatch.setattr(episode_folder, "write_picture", encode)
+    monkeypatch.setattr(episode_folder, "write_cameras", slow(episode_folder.write_cameras, clock, 0.25))
+    monkeypatch.setattr(episode_folder.np, "savez", slow(episode_folder.np.savez, clock, 0.5))
+    done = conversion.convert(
+        ConversionSettings(trajectory, tmp_path / "out", embeddings=False, open_renderer=slow_source(clock))
+    )
     assert calls == {3: 2 * 7 * 3, 2: 2 * 7 * 3}
     # two episodes of 7 steps, three cameras of two kinds; encoding is beside the rest and not in the total
     expected = Timing(load=5 + 2 * 3, render=2 * 7 * 2, encode=2 * 42 * 0.5, write=2 * 0.75, total=5 + 2 * (3 + 14.75))
     assert done.timing == expected
     assert done.seconds == expected.total
     assert [episode.timing.load for episode in done.episodes] == [8, 3]
-    again = conversion.convert(trajectory, tmp_path / "out", embeddings=False, open_source=RayCaster, resume=True)
+    again = conversion.convert(
+        ConversionSettings(trajectory, tmp_path / "out", embeddings=False, open_renderer=RayCaster, resume=True)
+    )
     assert again.timing == Timing()
 
 
@@ -97,12 +101,14 @@ def test_of_a_lerobot_dataset(trajectory, made, tmp_path, monkeypatch, clock):
     monkeypatch.setattr(stage.Encoder, "add", slow(stage.Encoder.add, clock, 0.5))
     monkeypatch.setattr(stage.pq, "write_table", slow(stage.pq.write_table, clock, 0.25))
     monkeypatch.setattr(assemble, "assemble", slow(assemble.assemble, clock, 10))
-    done = convert_lerobot(trajectory, tmp_path / "out", open_source=slow_source(clock), lerobot_version="0.5")
+    done = convert_lerobot(
+        ConversionSettings(trajectory, tmp_path / "out", open_renderer=slow_source(clock), lerobot_version="0.5")
+    )
     assert done.joining == 10 + 2 * 0.25  # with the tables of tasks and sub-goals
     parts = {"encode": 2 * 42 * 0.5, "write": 2 * 0.25 + done.joining}
     assert done.timing == Timing(load=11, render=28, **parts, total=11 + 28 + 42 + 0.5)
     assert done.seconds == done.timing.total + done.joining
     # of a dataset pictures are read, not rendered
     monkeypatch.setattr(Episode, "rgb", slow(Episode.rgb, clock, 1))
-    done = convert_lerobot(made, tmp_path / "again", lerobot_version="0.5")
+    done = convert_lerobot(ConversionSettings(made, tmp_path / "again", lerobot_version="0.5"))
     assert done.timing == Timing(load=2 * 7 * 3, **parts, total=42 + 42 + 0.5)

@@ -20,11 +20,13 @@ from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.convert import convert
+from robocas_ms3.datasets.writing.settings import ConversionSettings
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
 
 
-def run(trajectory, out, **kwargs):
-    return convert(trajectory, out, embeddings=False, open_source=RayCaster, **kwargs)
+def run(trajectory, out, on_episode=None, **kwargs):
+    settings = ConversionSettings(trajectory, out, embeddings=False, open_renderer=RayCaster, **kwargs)
+    return convert(settings, on_episode=on_episode)
 
 
 def files_of(root):
@@ -215,7 +217,7 @@ def test_no_render_device_is_said_before_anything_is_written(trajectory, tmp_pat
 
     monkeypatch.setattr(sapien.render, "RenderMaterial", no_device)
     with pytest.raises(DatasetError, match="no render device. Run scripts/setup.sh or install a Vulkan driver"):
-        convert(trajectory, tmp_path / "out", embeddings=False)
+        convert(ConversionSettings(trajectory, tmp_path / "out", embeddings=False))
     assert not (tmp_path / "out").exists()
 
 
@@ -335,24 +337,24 @@ def test_what_would_be_numbered_alike_is_refused(trajectory, tmp_path, monkeypat
     more = write_trajectory(tmp_path / "more.h5", seeds=(10,))
     other = write_trajectory(tmp_path / "other.h5", seeds=(11,))
     monkeypatch.setattr("robocas_ms3.datasets.writing.convert.embed_texts", made_up_vectors)
-    convert(trajectory, out, open_source=RayCaster)
+    convert(ConversionSettings(trajectory, out, open_renderer=RayCaster))
 
     def meanwhile(file, chosen):
         with pytest.raises(RobocasError, match="another process is writing here"):
-            convert(other, out, append=True, open_source=RayCaster)
+            convert(ConversionSettings(other, out, append=True, open_renderer=RayCaster))
         return made_up_vectors(file, chosen)
 
     monkeypatch.setattr("robocas_ms3.datasets.writing.convert.embed_texts", meanwhile)
-    convert(more, out, append=True, open_source=RayCaster)
+    convert(ConversionSettings(more, out, append=True, open_renderer=RayCaster))
     monkeypatch.setattr("robocas_ms3.datasets.writing.convert.embed_texts", made_up_vectors)
-    convert(other, out, append=True, open_source=RayCaster)
+    convert(ConversionSettings(other, out, append=True, open_renderer=RayCaster))
     ledger = json.loads((out / "conversion.json").read_text())["episodes"]
     assert [entry["seed"] for entry in ledger.values()] == [3, 5, 10, 11]
 
 
 def test_a_recording_that_is_there_twice_is_converted_once(tmp_path, caplog):
     trajectory = write_trajectory(tmp_path / "trajectory.h5", seeds=(3, 4, 3))
-    done = convert(trajectory, tmp_path / "out", embeddings=False, open_source=RayCaster)
+    done = convert(ConversionSettings(trajectory, tmp_path / "out", embeddings=False, open_renderer=RayCaster))
     assert [episode.number for episode in done.episodes] == [0, 1]
     assert "the same recordings again, left out: 2" in caplog.text
     assert validate(tmp_path / "out").violations == []

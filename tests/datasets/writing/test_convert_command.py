@@ -3,24 +3,23 @@
 import json
 import re
 import shutil
-from functools import partial
 
 import pytest
-from synthetic import RayCaster, write_trajectory
+from synthetic import RayCaster, render_by, write_trajectory
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.writing import convert as conversion
 from robocas_ms3.datasets.writing.plan import still_missing
-from robocas_ms3.datasets.writing.writer import WrittenEpisode
+from robocas_ms3.datasets.writing.settings import Conversion, ConversionSettings, Timing, WrittenEpisode
 
 SECONDS = r"\d+\.\d"
 
 
 @pytest.fixture
 def made_up_pictures(monkeypatch):
-    monkeypatch.setattr(conversion, "convert", partial(conversion.convert, open_source=RayCaster))
+    monkeypatch.setattr(conversion, "convert", render_by(RayCaster, conversion.convert))
 
 
 def test_the_parts_of_the_time_come_last(trajectory, made_up_pictures, tmp_path, capsys):
@@ -41,8 +40,8 @@ def test_the_parts_of_the_time_come_last(trajectory, made_up_pictures, tmp_path,
 
 def test_seconds_are_those_of_an_episode(monkeypatch, tmp_path, capsys):
     def convert(*args, **kwargs):
-        timing = conversion.Timing(load=1, render=5, encode=3, wait=0.4, write=0.1, total=7)
-        return conversion.Conversion([WrittenEpisode(n, 7, 100, timing) for n in range(4)], 0, 30.0, joining=2.0)
+        timing = Timing(load=1, render=5, encode=3, wait=0.4, write=0.1, total=7)
+        return Conversion([WrittenEpisode(n, 7, 100, timing) for n in range(4)], 0, 30.0, joining=2.0)
 
     monkeypatch.setattr(conversion, "convert", convert)
     assert run(["convert", "F.h5", "--out", str(tmp_path / "out"), "--no-video", "--jobs", "2"]) == 0
@@ -96,14 +95,20 @@ def tried(path, *rates):
 def test_actions_that_were_tried_at_another_rate(tmp_path, caplog, to, rates, rate_hz, said):
     trajectory = tried(tmp_path / "F.h5", *rates)
     if to == "robocas":
-        conversion.convert(trajectory, tmp_path / "out", rate_hz=rate_hz, embeddings=False, open_source=RayCaster)
+        conversion.convert(
+            ConversionSettings(trajectory, tmp_path / "out", rate_hz=rate_hz, embeddings=False, open_renderer=RayCaster)
+        )
     else:
         pytest.importorskip("av", reason="needs the extra 'lerobot'")
         pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
         from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 
         pictures = Pictures(depth=False)  # the made-up room is farther than a depth video reaches
-        convert_lerobot(trajectory, tmp_path / "out", rate_hz=rate_hz, open_source=RayCaster, pictures=pictures)
+        convert_lerobot(
+            ConversionSettings(
+                trajectory, tmp_path / "out", rate_hz=rate_hz, open_renderer=RayCaster, pictures=pictures
+            )
+        )
     warnings = [record.getMessage() for record in caplog.records if record.name.startswith("robocas_ms3")]
     assert len(warnings) == bool(said)
     assert not said or warnings[0].startswith(said)
@@ -114,7 +119,9 @@ def test_only_the_recordings_that_are_converted_count(tmp_path, caplog):
     content = json.loads(path.with_suffix(".json").read_text())
     content["episodes"][0]["success"] = False
     path.with_suffix(".json").write_text(json.dumps(content))
-    conversion.convert(path, tmp_path / "out", rate_hz=10, embeddings=False, open_source=RayCaster)
+    conversion.convert(
+        ConversionSettings(path, tmp_path / "out", rate_hz=10, embeddings=False, open_renderer=RayCaster)
+    )
     assert caplog.records == []
 
 
@@ -186,20 +193,20 @@ def test_what_another_trajectory_left_missing_is_said(tmp_path, caplog):
     """--append of b was killed; --resume of a can't make b's episodes."""
     a, b = (write_trajectory(tmp_path / f"{n}.h5", seeds=seeds) for n, seeds in (("a", (1, 2)), ("b", (3, 4, 5))))
     out = tmp_path / "out"
-    options = {"embeddings": False, "open_source": RayCaster}
-    conversion.convert(a, out, **options)
-    conversion.convert(b, out, append=True, **options)
+    options = {"embeddings": False, "open_renderer": RayCaster}
+    conversion.convert(ConversionSettings(a, out, **options))
+    conversion.convert(ConversionSettings(b, out, append=True, **options))
     for number in (2, 4):
         shutil.rmtree(out / f"episode_000000{number}")
     assert caplog.records == []
-    conversion.convert(a, out, resume=True, **options)
+    conversion.convert(ConversionSettings(a, out, resume=True, **options))
     said = [record.getMessage() for record in caplog.records]
     assert said == [f"{out}: episodes 2, 4 of b.h5 are still missing: convert that with --append"]
     hint = "found no folder (convert b.h5 again with --append or --resume)"
     assert [str(v) for v in validate(out).violations] == [
         f"conversion.json, episodes.{number}: expected the episodes on disk, {hint}" for number in (2, 4)
     ]
-    conversion.convert(b, out, append=True, **options)
+    conversion.convert(ConversionSettings(b, out, append=True, **options))
     assert len(caplog.records) == 1
     assert validate(out).violations == []
 

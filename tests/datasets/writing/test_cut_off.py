@@ -10,7 +10,8 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.writing.convert import convert
-from robocas_ms3.datasets.writing.cut_off import cut_off
+from robocas_ms3.datasets.writing.episode_folder import find_damaged
+from robocas_ms3.datasets.writing.settings import ConversionSettings
 
 FILES = (
     "episode_info.npz",
@@ -23,7 +24,7 @@ FILES = (
 
 
 def run(trajectory, out, **kwargs):
-    return convert(trajectory, out, embeddings=False, open_source=RayCaster, **kwargs)
+    return convert(ConversionSettings(trajectory, out, embeddings=False, open_renderer=RayCaster, **kwargs))
 
 
 def harm(path, left):
@@ -60,11 +61,11 @@ def test_pictures_of_each_format(trajectory, tmp_path, image_format):
     pictures = Pictures(image_format=image_format, depth=False)
     run(trajectory, tmp_path / "out", pictures=pictures)
     folder = tmp_path / "out" / "episode_0000000"
-    assert cut_off(folder, pictures) is None
+    assert find_damaged(folder, pictures) is None
     for left in (0.9, 0):
         path = folder / "base_camera" / "rgb" / f"0002.{image_format}"
         harm(path, left)
-        assert cut_off(folder, pictures) == path
+        assert find_damaged(folder, pictures) == path
 
 
 def test_a_split_that_is_cut_off_is_made_anew_if_one_wants(whole, trajectory, tmp_path):
@@ -89,9 +90,11 @@ def test_parts_of_a_lerobot_dataset(trajectory, tmp_path, monkeypatch, name):
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(lerobot, "_join", killed)
-        lerobot.convert_lerobot(trajectory, tmp_path / "out", open_source=RayCaster)
+        lerobot.convert_lerobot(ConversionSettings(trajectory, tmp_path / "out", open_renderer=RayCaster))
     harm(tmp_path / "out" / ".parts" / "episode_0000001" / name, 0.5)
-    done = lerobot.convert_lerobot(trajectory, tmp_path / "out", open_source=RayCaster, resume=True)
+    done = lerobot.convert_lerobot(
+        ConversionSettings(trajectory, tmp_path / "out", open_renderer=RayCaster, resume=True)
+    )
     assert (done.kept, [episode.number for episode in done.episodes]) == (1, [1])
-    lerobot.convert_lerobot(trajectory, tmp_path / "whole", open_source=RayCaster)
+    lerobot.convert_lerobot(ConversionSettings(trajectory, tmp_path / "whole", open_renderer=RayCaster))
     assert files_of(tmp_path / "out") == files_of(tmp_path / "whole")

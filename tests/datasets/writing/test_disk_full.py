@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from managing import files_of
-from synthetic import RayCaster
+from synthetic import RayCaster, render_by
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.datasets.checks.dataset import validate
@@ -74,7 +74,7 @@ def ends_in_one_line(command, capsys):
 
 @pytest.fixture
 def made_up_pictures(monkeypatch):
-    monkeypatch.setattr(conversion, "convert", partial(conversion.convert, open_source=RayCaster))
+    monkeypatch.setattr(conversion, "convert", render_by(RayCaster, conversion.convert))
 
 
 PYTHON = {

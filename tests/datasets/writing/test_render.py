@@ -16,7 +16,8 @@ from robocas_ms3.datasets.checks import depth as geometry
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.writing.convert import convert
-from robocas_ms3.datasets.writing.render import EnvFrames
+from robocas_ms3.datasets.writing.render import EnvRenderer
+from robocas_ms3.datasets.writing.settings import ConversionSettings
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
 
 ENV_ID = "robocas_ms3:RoboCASPick-v1"
@@ -79,7 +80,7 @@ def recording(recorded):
 @pytest.fixture(scope="module")
 def source(recorded, recording):
     with TrajectoryFile(recorded[0]) as file:
-        frames = EnvFrames(file.env, "pd_joint_pos", Pictures(size=SIZE))
+        frames = EnvRenderer(file.env, "pd_joint_pos", Pictures(size=SIZE))
     frames.load(recording)
     yield frames
     frames.close()
@@ -107,7 +108,7 @@ def test_states_look_as_they_did(source, recording, recorded):
 def test_boxes_hold_the_target(recorded, recording):
     """Where the target's centre is visible in an image, it is in the target's box."""
     with TrajectoryFile(recorded[0]) as file:
-        frames = EnvFrames(file.env, "pd_joint_pos", Pictures(size=SIZE, boxes=True))
+        frames = EnvRenderer(file.env, "pd_joint_pos", Pictures(size=SIZE, boxes=True))
     frames.load(recording)
     frame = shown(frames, recording, 0)
     base, cameras = frames.env.unwrapped, frames.cameras()
@@ -196,7 +197,7 @@ def test_a_scene_that_is_another_leaves_nothing_behind(recorded, tmp_path):
     metadata["episodes"][0]["episode_seed"] = 12
     (tmp_path / "F.json").write_text(json.dumps(metadata))
     with pytest.raises(DatasetError, match="episode 0, seed 12, object_0: the seed builds another scene"):
-        convert(path, tmp_path / "out", embeddings=False, pictures=Pictures(size=SIZE))
+        convert(ConversionSettings(path, tmp_path / "out", embeddings=False, pictures=Pictures(size=SIZE)))
     assert {entry.name for entry in tmp_path.iterdir()} == {"F.h5", "F.json"}
 
 
@@ -244,17 +245,17 @@ def test_torch_has_one_thread_while_it_converts(recorded, tmp_path, monkeypatch)
     """And as many as before afterwards."""
     import torch
 
-    seen, frames = [], EnvFrames.frames
+    seen, frames = [], EnvRenderer.frames
 
     def counted(self, *args):
         seen.append(torch.get_num_threads())
         return frames(self, *args)
 
-    monkeypatch.setattr(EnvFrames, "frames", counted)
+    monkeypatch.setattr(EnvRenderer, "frames", counted)
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     try:
-        convert(recorded[0], tmp_path / "out", embeddings=False, pictures=Pictures(size=SIZE))
+        convert(ConversionSettings(recorded[0], tmp_path / "out", embeddings=False, pictures=Pictures(size=SIZE)))
         assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(before)

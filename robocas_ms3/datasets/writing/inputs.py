@@ -1,0 +1,218 @@
+"""Opens what is converted: a trajectory file, which is rendered, or a dataset of any format, whose images are read."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Generator, Mapping
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.core.documents import DAMAGED
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.words import count_of
+from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.formats import open_source
+from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.sources.protocol import EpisodeSource, Frame, SourceEpisode
+from robocas_ms3.datasets.sources.tolerant import arrays_fingerprint
+from robocas_ms3.datasets.writing.rendering import RenderedSource
+from robocas_ms3.datasets.writing.settings import ConversionSettings
+
+NEEDED = frozenset(s.name for s in schema.EPISODE_INFO if not s.embedding) - {"base_rel_pos", "base_rel_orn"}
+"""Arrays that an episode must have to be converted."""
+_VALIDATE = "robocas validate lists all that is wrong."
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class ConversionInput:
+    """An open source, and what of it is converted.
+
+    Attributes:
+        source: gives the episodes.
+        pictures: images to convert: those that are wanted and there.
+        include_failed: whether episodes without success are converted too.
+        sizes: width and height of the stored images, by camera; empty: images are rendered.
+    """
+
+    source: EpisodeSource
+    pictures: Pictures
+    include_failed: bool = False
+    sizes: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+
+    @property
+    def stage(self) -> str:
+        """The field of `settings.Timing` that gets the time of images."""
+        return "load" if self.sizes else "render"
+
+    def entries(self) -> list[dict[str, Any]]:
+        """Return the recording of each episode to convert, in order, and ``source``, its number in the source.
+
+        Raises:
+            DatasetError: there is none.
+        """
+        entries = ((number, self._entry(number)) for number in self.source.numbers)
+        chosen = [{"source": number, **entry} for number, entry in entries if entry is not None]
+        if not chosen:
+            some = bool(self.source.numbers)
+            raise DatasetError(
+                "no successful episodes to convert" if some else "no episodes to convert",
+                where=self.source.root,
+                found=count_of(len(self.source.numbers), "episode"),
+                fix="Pass --include-failed to convert them all the same." if some else "",
+            )
+        if isinstance(self.source, RenderedSource):
+            _warn_of_other_rates(self.source, chosen)
+            return _distinct(self.source, chosen)
+        return chosen
+
+    def _entry(self, number: int) -> dict[str, Any] | None:
+        """Return the recording of an episode, as ``conversion.json`` has it; None where it is not wanted."""
+        known = self.source.entry(number)
+        if isinstance(self.source, RenderedSource):
+            return dict(known) if self.include_failed or known["success"] else None
+        episode = self.source.episode(number)
+        scene = episode.scene
+        success = scene.get("success", known.get("success"))
+        if success is False and not self.include_failed:
+            return None
+        mark = (scene.get("source") or {}).get("recording") or known.get("recording")
+        return {
+            "trajectory": known.get("trajectory"),
+            "trajectory_episode": known.get("trajectory_episode"),
+            "seed": scene.get("seed", known.get("seed")),
+            "success": success,
+            "target": scene.get("target", known.get("target")),
+            "recording": mark or f"arrays {arrays_fingerprint(complete_arrays(episode))}",
+        }
+
+    def frames(self, episode: SourceEpisode) -> Generator[Frame, None, None]:
+        """Yield the images of every step; close the generator unless it is read to the end.
+
+        Raises:
+            DatasetError: a stored image is damaged, or of another size than the first one of its dataset. An encoder
+                would scale it without a word.
+        """
+        with closing(episode.images(self.pictures)) as frames:
+            for step, frame in enumerate(frames):
+                for camera, size in self.sizes.items():
+                    for kind, images in (("rgb", frame.rgb), ("depth", frame.depth)):
+                        if camera in images and _size(images[camera]) != size:
+                            raise DatasetError(
+                                "this image is not of the dataset's size",
+                                where=f"{episode.where}, {camera}/{kind}, step {step}",
+                                expected="{} x {}".format(*size),
+                                found="{} x {}".format(*_size(images[camera])),
+                                fix=_VALIDATE,
+                            )
+                yield frame
+
+    def close(self) -> None:
+        """Close the source."""
+        self.source.close()
+
+
+def open_input(settings: ConversionSettings) -> ConversionInput:
+    """Open what is converted.
+
+    Raises:
+        DatasetError: it is neither a trajectory file nor a dataset, can't be read, or the settings don't suit it.
+    """
+    if settings.is_trajectory:
+        return ConversionInput(open_trajectory(settings), settings.pictures, settings.include_failed)
+    return _open_dataset(open_source(settings.source), settings)
+
+
+def open_trajectory(settings: ConversionSettings) -> RenderedSource:
+    """Open a trajectory file, which is rendered.
+
+    Raises:
+        DatasetError: it is none, can't be read, or the rate does not suit it.
+    """
+    return RenderedSource(
+        settings.source,
+        rate_hz=settings.rate_hz,
+        pictures=settings.pictures,
+        pack=settings.pack,
+        open_renderer=settings.open_renderer,
+    )
+
+
+def _open_dataset(source: EpisodeSource, settings: ConversionSettings) -> ConversionInput:
+    where, wanted = source.root, settings.pictures
+    if settings.rate_hz is not None and abs(settings.rate_hz - source.rate_hz) > 1e-9:
+        found, expected = f"{settings.rate_hz:g}", f"{source.rate_hz:g} Hz"
+        fix = "Convert the trajectory at this rate."
+        raise DatasetError("a dataset keeps its rate", where=where, expected=expected, found=found, fix=fix)
+    first = source.episode(source.numbers[0])
+    cameras = tuple(camera for camera in wanted.cameras if camera in first.cameras)
+    if not cameras:
+        raise DatasetError("none of these cameras", where=where, expected=first.cameras, found=wanted.cameras)
+    sizes = {camera: _size(first.rgb(camera, 0)) for camera in cameras}
+    width, height = size = sizes[cameras[0]]
+    if wanted.size not in (None, size):
+        raise DatasetError(
+            "a dataset keeps the size of its images",
+            where=where,
+            expected=f"{width} x {height}",
+            found=list(wanted.size or ()),
+            fix="Convert the trajectory with this size.",
+        )
+    pictures = replace(wanted, cameras=cameras, size=size, depth=wanted.depth and source.has_depth)
+    return ConversionInput(source, pictures, settings.include_failed, sizes)
+
+
+def complete_arrays(episode: SourceEpisode) -> dict[str, NDArray]:
+    """Return all arrays of an episode.
+
+    Raises:
+        DatasetError: they can't be read, one is missing, has another length, or holds NaN or infinity.
+    """
+    fix = "robocas validate says what is wrong."
+    try:
+        arrays = episode.arrays
+    except DAMAGED as error:
+        found = str(error).splitlines()[0]
+        raise DatasetError("these arrays can't be read", where=episode.where, found=found, fix=fix) from error
+    there = NEEDED & set(arrays)
+    for key in sorted(there):
+        if arrays[key].dtype.kind == "f" and not np.isfinite(arrays[key]).all():
+            where = f"{episode.where}/{schema.EPISODE_FILE}, {key}"
+            raise DatasetError("this array holds NaN or infinity", where=where, fix=_VALIDATE)
+    missing, lengths = sorted(NEEDED - set(arrays)), {len(arrays[key]) for key in there if arrays[key].ndim}
+    if missing or lengths != {episode.steps}:
+        found = f"no {', '.join(missing)}" if missing else f"lengths {sorted(lengths)}"
+        raise DatasetError("this episode is not complete", where=episode.where, found=found, fix=fix)
+    return arrays
+
+
+def _size(image: NDArray) -> tuple[int, int]:
+    """Return width and height."""
+    return image.shape[1], image.shape[0]
+
+
+def _distinct(source: EpisodeSource, entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the first entry of each recording; those that can't be read count as different."""
+    first = {entry["recording"]: entry for entry in reversed(entries)}
+    once = [entry for entry in entries if entry["recording"] is None or first[entry["recording"]] is entry]
+    if len(once) < len(entries):
+        again = [str(entry["trajectory_episode"]) for entry in entries if entry not in once]
+        _log.warning("%s: the same recordings again, left out: %s", source.root, ", ".join(again))
+    return once
+
+
+def _warn_of_other_rates(source: RenderedSource, entries: list[dict[str, Any]]) -> None:
+    """Warn if the open-loop check of the actions was made at another rate than the dataset's."""
+    recorded = [source.file.episodes[entry["source"]].get("robocas") for entry in entries]
+    checked = [one.get("replay_rate") for one in recorded if isinstance(one, dict)]
+    rates = {float(rate) for rate in checked if isinstance(rate, int | float) and rate}  # else not checked, or unknown
+    others = sorted(rate for rate in rates if abs(rate - source.rate_hz) > 1e-9)
+    if others:
+        _log.warning(
+            "actions were tried at %s Hz; at %g Hz they were not: robocas validate --replay tells (of RoboCAS folders)",
+            *(" and ".join(f"{rate:g}" for rate in others), source.rate_hz),
+        )

@@ -1,0 +1,178 @@
+"""Renders the recordings of a trajectory file: an episode source whose episodes have images."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.sources.protocol import CameraModel, Frame
+from robocas_ms3.datasets.sources.provenance import recording_entry, scene_record, unread_entry
+from robocas_ms3.datasets.sources.trajectory import RecordedEpisode, TrajectorySource
+from robocas_ms3.demos.recordings.environment import RecordedEnv
+from robocas_ms3.demos.recordings.motion import sample_states
+from robocas_ms3.demos.recordings.reading import Recording, TrajectoryFile
+
+
+class Renderer(Protocol):
+    """Renders recorded states: `render.EnvRenderer`, or a ray caster where no render device is wanted."""
+
+    def load(self, recording: Recording) -> None:
+        """Build the scene of a recording."""
+        ...
+
+    def frames(self, recording: Recording, samples: NDArray[np.int64]) -> Iterator[Frame]:
+        """Render some of its states, in order."""
+        ...
+
+    def cameras(self) -> dict[str, CameraModel]:
+        """Return the camera models at the state rendered last."""
+        ...
+
+    def scene(self) -> dict[str, Any]:
+        """Return ``task``, ``config``, ``layout`` and ``objects`` of ``scene.json``."""
+        ...
+
+    def close(self) -> None:
+        """Free the render device."""
+        ...
+
+
+OpenRenderer = Callable[[RecordedEnv, str, Pictures], Renderer]
+"""(environment of the recording, its control mode, images to render) -> renderer."""
+
+
+def open_env(env: RecordedEnv, control_mode: str, pictures: Pictures) -> Renderer:
+    """Open the environment that recorded an episode."""
+    from robocas_ms3.datasets.writing.render import EnvRenderer
+
+    return EnvRenderer(env, control_mode, pictures)
+
+
+class RenderedSource(TrajectorySource):
+    """A trajectory file whose episodes are rendered. The environment is made with the first episode and kept.
+
+    Episodes have the numbers of the file, failed ones included.
+
+    Args:
+        path: of the HDF5 file.
+        rate_hz: steps per second; None: 5.
+        pictures: images to render.
+        pack: name or folder of the object pack, instead of the one that the file names.
+        open_renderer: opens the renderer.
+
+    Raises:
+        DatasetError: the file can't be read, or the rate does not divide its control frequency.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        rate_hz: float | None,
+        pictures: Pictures,
+        pack: str | Path | None = None,
+        open_renderer: OpenRenderer = open_env,
+    ) -> None:
+        super().__init__(path, rate_hz=rate_hz, include_failed=True, pack=pack)
+        self.cameras, self.has_depth = pictures.cameras, pictures.depth
+        self._pack, self._pictures, self._open_renderer = pack, pictures, open_renderer
+        self._renderer: Renderer | None = None
+        self._control_mode = ""
+
+    def turn_to(self, path: Path) -> None:
+        """Read another file of the same environment, which stays open.
+
+        Raises:
+            DatasetError: the file can't be read, or is of another environment or control rate.
+        """
+        env, control_freq = self.file.env, self.file.control_freq
+        with TrajectoryFile(path, pack=self._pack) as file:
+            if (file.env, file.control_freq) != (env, control_freq):
+                raise DatasetError("this file is of another environment", where=path, expected=self.root)
+        super().__init__(path, rate_hz=self.rate_hz, include_failed=True, pack=self._pack)
+
+    def settled_split(self) -> tuple[list[int], list[int]]:
+        """Return two empty lists: a trajectory file has no split."""
+        return [], []
+
+    def entry(self, number: int) -> dict[str, Any]:
+        """Return the recording of an episode; one that can't be read, which fails when opened, has no fingerprint."""
+        with self.file.reopened() as file:
+            try:
+                return recording_entry(file, number)
+            except DatasetError:
+                return unread_entry(file, number)
+
+    def texts(self, number: int) -> list[str]:
+        """Return the instruction of an episode and the texts of its sub-goals."""
+        entry = self.said(number).entry
+        return [entry.instruction, *(goal.goal_description for goal in entry.subgoals)]
+
+    def episode(self, number: int) -> RenderedEpisode:
+        """Build the scene of a recording. The episode is valid until the next one is opened.
+
+        Raises:
+            DatasetError: it is damaged, has more than 9999 steps, or its scene can't be built.
+        """
+        recording = self.recording(number)
+        samples = sample_states(recording.control_steps, self.stride)
+        if len(samples) > schema.MAX_STEPS:
+            where = f"episode {recording.episode_id}"
+            raise DatasetError("too many steps", where=where, expected=f"<= {schema.MAX_STEPS}", found=len(samples))
+        if self._renderer is None or recording.control_mode != self._control_mode:
+            self.close()
+            self._renderer = self._open_renderer(self.file.env, recording.control_mode, self._pictures)
+            self._control_mode = recording.control_mode
+        self._renderer.load(recording)
+        return RenderedEpisode(self, number, recording, self._renderer)
+
+    def close(self) -> None:
+        """Close the environment."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+
+class RenderedEpisode(RecordedEpisode):
+    """An episode of a `RenderedSource`: its images are rendered once, in order; camera models follow after that."""
+
+    def __init__(self, source: RenderedSource, number: int, recording: Recording, renderer: Renderer) -> None:
+        super().__init__(source, number)
+        self.cameras = source.cameras
+        self._recording, self._renderer = recording, renderer
+
+    def recording(self, *, bodies: bool = True) -> Recording:
+        """Return all control steps."""
+        return self._recording
+
+    def images(self, pictures: Pictures) -> Generator[Frame, None, None]:
+        """Render every step; ``pictures`` are those that the source was opened with."""
+        yield from self._renderer.frames(
+            self._recording, sample_states(self._recording.control_steps, self._source.stride)
+        )
+
+    @property
+    def scene(self) -> dict[str, Any]:
+        """Content of ``scene.json``."""
+        source, rendered = self._source, self._renderer.scene()
+        return scene_record(source.file, self._number, self._recording, rendered, source.rate_hz)
+
+    @cached_property
+    def _models(self) -> dict[str, CameraModel]:
+        return self._renderer.cameras()
+
+    def intrinsic(self, camera: str) -> NDArray[np.float64]:
+        """(4,) fx, fy, cx, cy in pixels."""
+        return self._models[camera].intrinsic
+
+    def camera_in_parent(self, camera: str) -> NDArray[np.float64]:
+        """(4, 4) OpenCV camera frame in its parent."""
+        return self._models[camera].camera_in_parent
