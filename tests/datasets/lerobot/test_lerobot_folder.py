@@ -11,7 +11,7 @@ from synthetic import RayCaster, write_trajectory
 pytest.importorskip("av", reason="needs the extra 'lerobot'")
 pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
 
-from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.errors import DatasetError, IncompleteError
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.manage.splitting import Share, resplit
@@ -37,11 +37,11 @@ def test_a_picture_of_another_size(dataset, tmp_path, episode, camera, kind, ste
     """An encoder would scale it without a word."""
     folder = dataset / f"episode_{episode:07d}"
     shrink(folder / camera / kind / f"{step:04d}.png", size)
-    with pytest.raises(DatasetError) as caught:
+    with pytest.raises(IncompleteError) as caught:
         convert_lerobot(ConversionSettings(dataset, tmp_path / "out"))
-    said = f"{folder}, {camera}/{kind}, step {step}: this image is not of the dataset's size"
-    assert f"{said} (expected 64 x 48, found {size[0]} x {size[1]}). " in str(caught.value)
-    assert str(caught.value).startswith(f"{tmp_path / 'out' / '.parts'}: 1 episode could not be written (found ")
+    assert list(caught.value.reasons) == [folder.name]
+    assert caught.value.reasons[folder.name].startswith(f"{folder}, {camera}/{kind}, step {step}: ")
+    assert f"expected 64 x 48, found {size[0]} x {size[1]}" in caught.value.reasons[folder.name]
     assert (tmp_path / "out").exists()  # to go on with, as the other episode was done
 
 
