@@ -237,7 +237,7 @@ def _run_coacd(body: trimesh.Trimesh, threshold: float) -> list[Array]:
     try:
         import coacd
     except ImportError as error:
-        raise MissingExtraError("CoACD is not installed", fix="pip install 'robocas-ms3[assets]'") from error
+        raise MissingExtraError("CoACD is not installed", fix="In the clone: pip install -e '.[assets]'") from error
     coacd.set_log_level("error")
     least = SLIVER * float(body.volume)
     vertices: Any = np.asarray(body.vertices)

@@ -208,7 +208,9 @@ def _remeshed(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     try:
         from skimage.measure import marching_cubes
     except ImportError as error:
-        raise MissingExtraError("scikit-image is not installed", fix="pip install 'robocas-ms3[assets]'") from error
+        raise MissingExtraError(
+            "scikit-image is not installed", fix="In the clone: pip install -e '.[assets]'"
+        ) from error
     pitch = float(mesh.extents.max()) / CELLS
     low = mesh.bounds[0] - 2 * pitch
     shape = np.ceil(mesh.extents / pitch).astype(int) + 5

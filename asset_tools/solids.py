@@ -10,7 +10,7 @@ from robocas_ms3.core.errors import MissingExtraError
 try:
     from manifold3d import Error, Manifold, Mesh64
 except ImportError as error:
-    raise MissingExtraError("manifold3d is not installed", fix="pip install 'robocas-ms3[assets]'") from error
+    raise MissingExtraError("manifold3d is not installed", fix="In the clone: pip install -e '.[assets]'") from error
 
 
 def to_solid(mesh: trimesh.Trimesh) -> Manifold | None:

@@ -210,7 +210,7 @@ def _unwrapped(body: trimesh.Trimesh, size: int) -> tuple[NDArray[np.int64], NDA
     try:
         import xatlas
     except ImportError as error:
-        raise MissingExtraError("xatlas is not installed", fix="pip install 'robocas-ms3[assets]'") from error
+        raise MissingExtraError("xatlas is not installed", fix="In the clone: pip install -e '.[assets]'") from error
     scaled = (np.asarray(body.vertices) - body.bounds[0]) / np.linalg.norm(body.extents)
     atlas = xatlas.Atlas()
     atlas.add_mesh(scaled.astype(np.float32), np.asarray(body.faces, dtype=np.uint32))

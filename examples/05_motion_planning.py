@@ -142,7 +142,20 @@ def main(
     debug: bool = False,
     vis: bool = False,
 ) -> None:
-    """Solve episodes of consecutive seeds; write an image of the last step to ``image``."""
+    """Solve episodes of consecutive seeds.
+
+    Args:
+        env: environment to solve.
+        seed: of the first episode, from 0 on.
+        episodes: how many.
+        image: file for an image of the last step, such as ``last.png``.
+        debug: print why grasps and motions are rejected.
+        vis: open ManiSkill's viewer, which needs a display.
+    """
+    if image is not None:
+        if not cv2.haveImageWriter(str(image)):
+            raise SystemExit(f"--image {image}: unknown image format, expected for example {image.with_suffix('.png')}")
+        image.parent.mkdir(parents=True, exist_ok=True)
     no_renderer = dict(render_backend="none") if env == "RoboCASPick-v1" and not (image or vis) else {}
     made = gym.make(env, obs_mode="state", control_mode="pd_joint_pos", sim_backend="cpu", **no_renderer)
     successes = 0
@@ -156,8 +169,8 @@ def main(
             print(f"seed {number}: {error}")
         successes += success
     print(f"{successes} of {episodes} episodes succeeded")
-    if image:
-        cv2.imwrite(str(image), made.unwrapped.render_rgb_array()[0].cpu().numpy()[..., ::-1])
+    if image and not cv2.imwrite(str(image), made.unwrapped.render_rgb_array()[0].cpu().numpy()[..., ::-1]):
+        raise SystemExit(f"--image {image}: the file can't be written")
     made.close()
 
 

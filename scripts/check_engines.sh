@@ -41,7 +41,7 @@ else
     [ "${venv#/}" != "$venv" ] || venv=$here/$venv
 fi
 python=$venv/bin/python
-"$python" -c 'import ray, submitit' || { say "$venv lacks an extra: pip install 'robocas-ms3[slurm,ray]'" >&2; exit 2; }
+"$python" -c 'import ray, submitit' || { say "$venv lacks an extra: pip install -e '.[slurm,ray]'" >&2; exit 2; }
 
 if ! timeout 10 sinfo --noheader >/dev/null 2>&1; then
     if [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null && bash scripts/slurm_here.sh; then

@@ -7,7 +7,8 @@
 # ROBOCAS_VENV            folder of the virtual environment instead of .venv or .venv-lerobot
 # ROBOCAS_PYTHON          interpreter to create it with (default: the first of python3.11, 3.12, 3.13, 3.10, python3 that
 #                         is supported)
-# ROBOCAS_NUMPY           another version of numpy than that of requirements.lock, such as 1.26.4
+# ROBOCAS_NUMPY           another version of numpy than that of requirements.lock, such as 1.26.4. Later calls for the same
+#                         environment keep it; ROBOCAS_NUMPY=lock goes back.
 # ROBOCAS_SKIP_RENDERER=1 do not install a software renderer
 # ROBOCAS_SKIP_BROWSER=1  do not install Chromium for the tests of robocas view
 set -euo pipefail
@@ -85,11 +86,22 @@ install_packages() {
     fi
 }
 
+# The version of numpy that was chosen is kept, as test.sh and demo.sh call this script too; ROBOCAS_NUMPY=lock goes back.
+if [ -z "${ROBOCAS_NUMPY:-}" ]; then ROBOCAS_NUMPY=$(cat "$venv/.robocas-numpy" 2>/dev/null || true); fi
+if [ "${ROBOCAS_NUMPY:-}" = lock ]; then ROBOCAS_NUMPY=; fi
+is_editable() { # pip install ".[...]" replaces the editable install by a copy
+    local checkout=$PWD absolute
+    absolute=$(realpath -s "$python")
+    local code="import sys; from importlib.util import find_spec as find; sys.exit(find('robocas_ms3').origin != sys.argv[1])"
+    (cd / && "$absolute" -c "$code" "$checkout/robocas_ms3/__init__.py" 2>/dev/null)
+}
+
 stamp=$({ pwd; echo "$lerobot ${ROBOCAS_NUMPY:-}"; cat pyproject.toml lerobot_env_robocas/pyproject.toml requirements.lock scripts/setup.sh; } | sha256sum | cut -d ' ' -f 1)
-if [ "$(cat "$stamp_file" 2>/dev/null)" != "$stamp" ] || ! is_supported "$python"; then
+if [ "$(cat "$stamp_file" 2>/dev/null)" != "$stamp" ] || ! is_supported "$python" || ! is_editable; then
     rm -f "$stamp_file"
     is_supported "$python" || make_venv "$@"
     install_packages
+    if [ "$lerobot" = 0 ]; then echo "${ROBOCAS_NUMPY:-}" >"$venv/.robocas-numpy"; fi
     echo "$stamp" >"$stamp_file"
     say "done: $venv/bin/robocas"
 fi

@@ -46,7 +46,9 @@ def read_exchange(path: Path, files: ModelFiles) -> list[Part]:
     """
     data, suffix = files.read(path), path.suffix.lower()[1:]
     if suffix == "dae" and find_spec("collada") is None:
-        raise MissingExtraError("pycollada is not installed", where=path, fix="pip install 'robocas-ms3[assets]'")
+        raise MissingExtraError(
+            "pycollada is not installed", where=path, fix="In the clone: pip install -e '.[assets]'"
+        )
     if suffix == "3mf":
         _check_archive(data, path, files)
     textures, faces = _Textures(path, files), 0

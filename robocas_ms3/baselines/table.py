@@ -77,5 +77,5 @@ def need_extra(*modules: str) -> None:
         try:
             import_module(module)
         except ModuleNotFoundError as error:
-            fix = 'Run pip install "robocas-ms3[train]".'
+            fix = 'In the clone: pip install -e ".[train]"'
             raise MissingExtraError("baselines need an extra", found=f"no {error.name}", fix=fix) from error

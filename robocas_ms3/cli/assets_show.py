@@ -210,5 +210,5 @@ def mesh_tools() -> Iterator[None]:
     except ImportError as error:
         if (error.name or "").partition(".")[0] in ("asset_tools", "robocas_ms3"):
             raise  # a fault of ours, no missing package
-        what, fix = "mesh tools are not installed", "pip install 'robocas-ms3[assets]'"
+        what, fix = "mesh tools are not installed", "In the clone: pip install -e '.[assets]'"
         raise MissingExtraError(what, found=error.name or error, fix=fix) from error

@@ -152,4 +152,4 @@ def write_pages(result: Result, out: Path, given: str | None) -> None:
     written = write_report(result, out, protocol)
     say(f"{out}: {', '.join(path.name for path in written)}")
     if not any(path.suffix == ".parquet" for path in written):
-        say('no episodes.parquet without pyarrow: pip install "robocas-ms3[lerobot]" brings it')
+        say('no episodes.parquet without pyarrow; in the clone: pip install -e ".[lerobot]"')

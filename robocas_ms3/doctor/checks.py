@@ -133,7 +133,7 @@ def check_extra(extra: str) -> Finding:
     name, bad = f"extra {extra}", [finding for finding in findings if finding.status != "ok"]
     if not findings or bad:
         found = ", ".join(f"{finding.name} {finding.found}" for finding in bad) or "not installed"
-        return Finding(name, "limited", found, f"For {EXTRAS[extra]}: pip install 'robocas-ms3[{extra}]'")
+        return Finding(name, "limited", found, f"For {EXTRAS[extra]}: pip install -e '.[{extra}]' in the clone")
     return Finding(name, "ok", ", ".join(f"{finding.name} {finding.found}" for finding in findings))
 
 

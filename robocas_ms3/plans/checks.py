@@ -30,7 +30,7 @@ def check_plan(plan: Plan) -> None:
         from importlib.util import find_spec
 
         if find_spec("matplotlib") is None:
-            fix = 'pip install "robocas-ms3[plots]", or leave the stage out.'
+            fix = 'In the clone: pip install -e ".[plots]", or leave the stage out.'
             raise MissingExtraError("statistics are drawn with matplotlib", fix=fix)
 
 

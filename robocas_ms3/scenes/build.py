@@ -18,6 +18,8 @@ from robocas_ms3.scenes.layout import PARKING_HEIGHT
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.randomise import draw_camera_shift, draw_finishes, draw_lights
 
+_SHADOW_NEAR = -2.0  # m along the light from the origin; farther back, ceiling and walls would shade the whole room
+
 
 @dataclass(frozen=True)
 class Fixtures:
@@ -74,7 +76,13 @@ def build_lights(scene: ManiSkillScene, config: TaskConfig, seeds: Sequence[int]
         scene.sub_scenes[i].ambient_light = [lights.ambient] * 3
         bright = [lights.directional] * 3
         scene.add_directional_light(
-            lights.direction.tolist(), bright, shadow=shadow, shadow_scale=5, shadow_map_size=2048, scene_idxs=[i]
+            lights.direction.tolist(),
+            bright,
+            shadow=shadow,
+            shadow_scale=5,
+            shadow_near=_SHADOW_NEAR,
+            shadow_map_size=2048,
+            scene_idxs=[i],
         )
         scene.add_directional_light([0, 0, -1], bright, scene_idxs=[i])
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("submitit", reason='the engine slurm needs submitit: pip install "robocas-ms3[slurm]"')
+pytest.importorskip("submitit", reason='the engine slurm needs submitit: pip install -e ".[slurm]"')
 
 from plan_stages import PLAN, assert_same, plan_faults, stages
 from slurm_runs import (

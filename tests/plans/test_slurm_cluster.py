@@ -8,7 +8,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-pytest.importorskip("submitit", reason='the engine slurm needs submitit: pip install "robocas-ms3[slurm]"')
+pytest.importorskip("submitit", reason='the engine slurm needs submitit: pip install -e ".[slurm]"')
 
 from plan_stages import PLAN, assert_same, plan_faults
 from slurm_runs import NO_SLURM, SLURM, assert_done_once, holds, run, slurm_answers, stages_in_jobs, start, wait_for

@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-pytest.importorskip("submitit", reason='the engine slurm needs submitit: pip install "robocas-ms3[slurm]"')
+pytest.importorskip("submitit", reason='the engine slurm needs submitit: pip install -e ".[slurm]"')
 
 from plan_stages import PLAN
 

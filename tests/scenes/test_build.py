@@ -125,3 +125,17 @@ def test_an_asset_is_built_once_for_all_envs_that_have_it_and_bodies_are_in_the_
     assert alike.name == "object_3"
     assert len(alike._objs) == 5
     assert list(scene.state_dict_registry.actors) == ["object_2", "object_3"]
+
+
+@pytest.mark.slow
+def test_objects_cast_shadows_and_the_room_does_not(needs_renderer):
+    images = []
+    for shadow in (False, True):
+        data = pick_config(lights={"shadow": shadow})
+        env = gym.make("RoboCASPick-v1", config=data, obs_mode="rgb", sim_backend="physx_cpu", reward_mode="none")
+        observed, _ = env.reset(seed=0)
+        images.append(observed["sensor_data"]["static_camera"]["rgb"][0].float().mean(-1))
+        env.close()
+    ratio = images[1] / images[0].clamp(min=1)
+    assert ratio.median() > 0.98
+    assert 0.002 < (ratio < 0.85).float().mean() < 0.2

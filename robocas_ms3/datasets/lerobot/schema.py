@@ -257,7 +257,7 @@ def require_extra() -> None:
     missing = [name for name in ("pyarrow", "av") if importlib.util.find_spec(name) is None]
     if missing:
         raise MissingExtraError(
-            f"LeRobot datasets need {' and '.join(missing)}", fix='Run pip install "robocas-ms3[lerobot]".'
+            f"LeRobot datasets need {' and '.join(missing)}", fix='In the clone: pip install -e ".[lerobot]"'
         )
 
 

@@ -53,7 +53,8 @@ def _matplotlib() -> FigureOf:
         from matplotlib.figure import Figure
     except ImportError as error:
         raise MissingExtraError(
-            "statistics are drawn with matplotlib, which is not installed", fix='Run pip install "robocas-ms3[plots]".'
+            "statistics are drawn with matplotlib, which is not installed",
+            fix='In the clone: pip install -e ".[plots]"',
         ) from error
 
     def figure_of(width: float, height: float) -> Any:

@@ -13,5 +13,5 @@ try:
 except ImportError as error:
     raise MissingExtraError(
         f"remote policies need {error.name or 'websockets and msgpack'}, which is not installed",
-        fix='Run pip install "robocas-ms3[remote]".',
+        fix='In the clone: pip install -e ".[remote]"',
     ) from error

@@ -60,7 +60,7 @@ def require_ray() -> Any:
     try:
         return import_module("ray")
     except ImportError as error:
-        fix = 'Run pip install "robocas-ms3[ray]".'
+        fix = 'In the clone: pip install -e ".[ray]"'
         raise MissingExtraError("plans on Ray need ray, which is not installed", fix=fix) from error
 
 

@@ -25,7 +25,7 @@ try:
     from submitit.core.utils import pickle_load  # pyright: ignore[reportMissingImports]
 except ImportError as error:
     raise MissingExtraError(
-        "plans on Slurm need submitit, which is not installed", fix='Run pip install "robocas-ms3[slurm]".'
+        "plans on Slurm need submitit, which is not installed", fix='In the clone: pip install -e ".[slurm]"'
     ) from error
 
 _ASK = 5.0  # s between two questions to Slurm

@@ -189,6 +189,8 @@ def _find(config: str | Path, folder: Path | None = None, where: str = "") -> Pa
         files = [str(path.relative_to(folder)) for end in _SUFFIXES for path in sorted(folder.glob(f"*{end}"))]
         what, expected = "no such base", f"a shipped name or a YAML file (.yaml, .yml) relative to {folder}"
         likely = nearest(name, [*shipped, *files]) or nearest(f"{name}.yaml", files) or likely
+    if is_yaml and not likely:
+        raise ConfigError("no such file", where=where or name, expected=expected, found=str(path.absolute()))
     raise ConfigError(
         what,
         where=where or name,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, StrictInt, model_validator
+from pydantic import AfterValidator, Field, StrictInt, model_validator
 
 from robocas_ms3.core.errors import ConfigError, ExtensionError
 from robocas_ms3.core.extensions import load
@@ -16,6 +16,15 @@ from robocas_ms3.scenes.task_specs import TASKS
 Coordinate = Annotated[float, Field(ge=-100, le=100)]
 Vec2 = tuple[Coordinate, Coordinate]
 Vec3 = tuple[Coordinate, Coordinate, Coordinate]
+
+
+def _check_direction(vector: Vec3) -> Vec3:
+    if not any(vector):
+        raise ValueError("a direction is not the zero vector")
+    return vector
+
+
+Direction = Annotated[Vec3, AfterValidator(_check_direction)]
 
 
 class PoseConfig(StrictModel):
@@ -39,7 +48,7 @@ class LightConfig(StrictModel):
 
     ambient: Annotated[float, Field(ge=0, le=2)] = Field(default=0.4, description="light from everywhere")
     directional: Annotated[float, Field(ge=0, le=10)] = Field(default=1.0, description="light from one direction")
-    direction: Vec3 = Field(default=(0.3, 0.6, -1.0), description="along which that light shines")
+    direction: Direction = Field(default=(0.3, 0.6, -1.0), description="along which that light shines")
     shadow: bool = Field(default=False, description="doubles the cost of a frame on a CPU")
 
 

@@ -51,7 +51,7 @@ class TextEmbedder:
         if importlib.util.find_spec("sentence_transformers") is None:
             raise MissingExtraError(
                 "sentence embeddings need sentence-transformers",
-                fix='Run pip install "robocas-ms3[language]"; robocas convert does without by --no-embeddings.',
+                fix='In the clone: pip install -e ".[language]"; robocas convert --no-embeddings does not need it.',
             )
         self._model = None
         self._cache: dict[str, NDArray[np.float32]] = {}

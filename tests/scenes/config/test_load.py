@@ -91,3 +91,14 @@ def test_broken_yaml_and_missing_files_are_errors(tmp_path):
 def test_a_loaded_configuration_survives_a_round_trip():
     config = load_task_config("pick_table_scattered")
     assert load_task_config(config.model_dump(mode="json")) == config
+
+
+def test_a_missing_file_is_called_missing(tmp_path):
+    with pytest.raises(ConfigError, match="no such file") as found:
+        load_task_config(tmp_path / "mine_of_the_lab.yaml")
+    assert "pick_table_scattered" not in str(found.value)
+
+
+def test_a_light_needs_a_direction():
+    with pytest.raises(ConfigError, match="direction"):
+        load_task_config("pick_table_scattered", changes={"lights.direction": [0, 0, 0]})
