@@ -15,7 +15,7 @@ from robocas_ms3.tasks import TASKS
 
 JOINT_TOLERANCE = 1e-5  # rad, m and rewards
 HEAP_TOLERANCE = 2.5e-3  # m and rewards, of objects in a heap, whose contacts amplify the last bit
-HEAP_QUATERNION_TOLERANCE = 5e-3
+HEAP_QUATERNION_TOLERANCE = 0.025  # a turn that moves a point 5 cm from the axis by `HEAP_TOLERANCE`
 _SETTINGS = dict(obs_mode="state_dict", reward_mode="normalized_dense", render_backend="none")
 
 
