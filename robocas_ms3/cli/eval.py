@@ -1,4 +1,4 @@
-"""``robocas eval``: measure a policy by a protocol; compare, verify and list."""
+"""``robocas eval``: measure a policy by a protocol; report, compare and check results; make protocols."""
 
 from __future__ import annotations
 
@@ -9,31 +9,30 @@ from typing import Annotated, Literal
 
 import tyro
 
-from robocas_ms3.cli.options import Maybe, Repeated, Several, Word
+from robocas_ms3.cli import eval_protocols, eval_results
+from robocas_ms3.cli.options import Maybe, Several, Word
+
+DESCRIPTION = """Measure a policy by a protocol, and work with results.
+
+`robocas eval pick --policy small` is short for `robocas eval run pick --policy small`.
+"""
 
 
 @dataclass
-class Eval:
+class Run:
     """Measure a policy by a protocol: every episode of its list once, written as it ends.
 
-    - eval [TASK ...] --policy P --protocol NAME --out DIR: plays the episodes of these tasks, or of all
-    - eval report DIR ...: tables of a result, and its page report.html
-    - eval merge DIR ... --out DIR: parts of a result, such as shards, as one
-    - eval compare DIR DIR ...: over the same scenes, by exact tests; of one result its splits
-    - eval verify DIR ...: whether a result is whole, and of its protocol
-    - eval videos DIR: plays failed episodes again and films them
-    - eval protocols: lists the protocols that are shipped
-    - eval freeze PLAN.yaml --out DIR [--set objects.count=12]: makes a protocol of your own
+    Example: robocas eval pick --policy runs/pick --protocol paper-v1 --out eval/pick
     """
 
-    words: Annotated[Several[str], tyro.conf.Positional] = ()
-    """Tasks; or one of the words above, and what it is about."""
+    tasks: Annotated[Several[str], tyro.conf.Positional] = ()
+    """Only the episodes of these tasks. Default: all."""
     policy: str = "scripted"
-    """Of whom: scripted (joint targets), scripted-motions (RoboCAS' 7 numbers), scripted-beside (these, off by some
+    """Policy: scripted (joint targets), scripted-motions (RoboCAS' 7 numbers), scripted-beside (these, off by some
     cm), random, still, replay:TRAJECTORY.h5, a folder of `robocas train`, module:Class of your own, one that an
     installed package brings (`robocas list`), or ws://HOST:PORT, a server's (`robocas serve-policy`)."""
     protocol: Maybe[str] = None
-    """Name of a shipped protocol, or a folder. Default: ms3-v1; of a result, the shipped one that it names."""
+    """Name of a bundled protocol, or its folder. Default: ms3-v1."""
     out: Maybe[Path] = None
     """Folder to write to. Default: eval/PROTOCOL/POLICY, with the weld eval/PROTOCOL/POLICY_weld."""
     resume: bool = False
@@ -52,8 +51,7 @@ class Eval:
     backend: Literal["auto", "processes", "gpu"] = "auto"
     """Where envs run. Auto: a GPU if there is one."""
     shard: str = "0/1"
-    """Only a part of the episodes, K/N: the K-th of N runs, from 0 on. The words above take the folders of
-    all parts."""
+    """K/N: only every N-th episode, from the K-th on (K = 0 ... N - 1). `robocas eval merge` joins the results."""
     split: Word = ""
     """Only the episodes of this split, such as `seen`."""
     episodes: Maybe[int] = None
@@ -61,60 +59,19 @@ class Eval:
     weld: bool = False
     """Weld what closed fingers have lifted to the hand, as upstream does, until the gripper is told to open. Only in
     protocols with upstream's steps (paper-v1), in processes; never to be compared with results without."""
-    count: int = 8
-    """How many videos, of all kinds of failures in turn."""
-    set: Repeated[str] = ()
-    """With freeze: set a key in all configurations of the plan, such as `--set objects.count=12`; repeatable
-    (docs/configuration.md)."""
 
 
-WORDS = ("report", "merge", "compare", "verify", "videos", "protocols", "freeze")
-
-
-def main(cfg: Eval) -> int:
-    """Run the command; gives the exit code."""
-    from robocas_ms3.cli import eval_protocols, eval_results
-    from robocas_ms3.core.errors import EvaluationError
-
-    first = cfg.words[0] if cfg.words else ""
-    if cfg.set and first != "freeze":
-        raise EvaluationError(
-            "a protocol's configurations are frozen",
-            where="--set",
-            expected="eval freeze PLAN.yaml --set KEY=VALUE",
-            found=cfg.set[0],
-            fix="Freeze a protocol of your own.",
-        )
-    if first not in WORDS:
-        return run(cfg)
-    about = [Path(word) for word in cfg.words[1:]]
-    if first == "protocols":
-        return eval_protocols.protocols()
-    if first == "freeze":
-        return eval_protocols.freeze(_one(about, first), cfg.out, cfg.set)
-    if not about:
-        raise EvaluationError("of what?", where=first, expected="a folder of a result, or those of its parts")
-    if first == "compare":
-        return eval_results.compare(about, cfg.protocol)
-    if first == "merge":
-        return eval_results.merge(about, cfg.out, cfg.protocol)
-    if first == "videos":
-        return eval_results.videos(_one(about, first), cfg.protocol, cfg.policy, cfg.count)
-    if first == "report":
-        return eval_results.report(about, cfg.out, cfg.protocol)
-    return eval_results.verify(about, cfg.protocol)
-
-
-def run(cfg: Eval) -> int:
-    """Play what a result lacks."""
+def run(cfg: Run) -> int:
+    """Play the episodes that the result does not have yet."""
     from robocas_ms3.core.errors import EvaluationError
     from robocas_ms3.core.strict import nearest
     from robocas_ms3.scenes.task_specs import TASKS
 
-    for word in cfg.words:  # before seconds go by for what is imported next
+    for word in cfg.tasks:  # before seconds go by for what is imported next
         if word not in TASKS:
-            expected = f"one of {', '.join(TASKS)}; or {', '.join(WORDS)}"
-            raise EvaluationError("no such task", where=word, expected=expected, fix=nearest(word, [*TASKS, *WORDS]))
+            expected = f"one of {', '.join(TASKS)}; or {', '.join(COMMANDS)}"
+            fix = nearest(word, [*TASKS, *COMMANDS])
+            raise EvaluationError("no such task", where=word, expected=expected, fix=fix)
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.eval_results import write_pages
     from robocas_ms3.cli.terminal import say, say_lines
@@ -146,7 +103,7 @@ def run(cfg: Eval) -> int:
         backend=cfg.backend,
         workers=cfg.workers,
         shard=shard,
-        tasks=cfg.words,
+        tasks=cfg.tasks,
         episodes=cfg.episodes,
         split=cfg.split,
         weld=cfg.weld,
@@ -188,9 +145,14 @@ def shard_of(text: str) -> tuple[int, int]:
     return int(number), int(of)
 
 
-def _one(about: list[Path], word: str) -> Path:
-    from robocas_ms3.core.errors import EvaluationError
-
-    if len(about) != 1:
-        raise EvaluationError("takes one thing", where=word, expected="a folder or file", found=len(about))
-    return about[0]
+COMMANDS = {
+    "run": run,
+    "report": eval_results.report,
+    "merge": eval_results.merge,
+    "compare": eval_results.compare,
+    "verify": eval_results.verify,
+    "videos": eval_results.videos,
+    "protocols": eval_protocols.list_protocols,
+    "freeze": eval_protocols.freeze,
+}
+DEFAULT = "run"

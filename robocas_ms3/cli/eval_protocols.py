@@ -1,30 +1,54 @@
-"""``robocas eval protocols | freeze``: protocols that are shipped, and one's own."""
+"""``robocas eval protocols | freeze``: list the bundled protocols, make one."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
+import tyro
+
+from robocas_ms3.cli.options import Repeated
 from robocas_ms3.core.words import count_of
 
 
-def protocols() -> int:
-    """List the protocols that are shipped."""
+@dataclass
+class Protocols:
+    """List the bundled protocols, and the configurations to train on that belong to them."""
+
+
+@dataclass
+class Freeze:
+    """Make a protocol of your own from a plan: choose its scenes and write them to files.
+
+    Example: robocas eval freeze scripts/protocols/smoke.yaml --out protocols/mine --set objects.count=12
+    """
+
+    plan: Annotated[Path, tyro.conf.Positional]
+    """YAML file of the plan; scripts/protocols has those of the bundled protocols."""
+    out: Path
+    """Folder of the protocol."""
+    set: Repeated[str] = ()
+    """Set a key in all configurations of the plan, such as `--set objects.count=12`; repeatable
+    (docs/configuration.md)."""
+
+
+def list_protocols(cfg: Protocols) -> int:
+    """Run ``protocols``."""
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
 
     for name in shipped_protocols():
         protocol = load_protocol(name)
-        say(
-            f"{name}: {count_of(len(protocol.episodes), 'episode')}, {protocol.hash[:12]}: {protocol.rules.description}"
-        )
-        if protocol.train_files():
-            say(f"    to train on: {', '.join(map(str, protocol.train_files()))}")
+        count = count_of(len(protocol.episodes), "episode")
+        say(f"{name}: {count}, {protocol.hash[:12]}: {protocol.rules.description}")
+        if files := protocol.train_files():
+            say(f"    to train on: {', '.join(map(str, files))}")
     return 0
 
 
-def freeze(plan: Path, out: Path | None, overrides: Sequence[str] = ()) -> int:
-    """Make a protocol; ``overrides`` are set in all configurations of the plan."""
+def freeze(cfg: Freeze) -> int:
+    """Run ``freeze``."""
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.core.errors import EvaluationError
@@ -33,12 +57,11 @@ def freeze(plan: Path, out: Path | None, overrides: Sequence[str] = ()) -> int:
     from robocas_ms3.evaluation.freeze import read_plan
     from robocas_ms3.evaluation.protocol import load_protocol
 
-    if out is None:
-        raise EvaluationError("where to?", where="--out", expected="a folder")
-    read = read_plan(plan)
-    check_absent(out, EvaluationError)
+    plan = read_plan(cfg.plan)
+    check_absent(cfg.out, EvaluationError)
     with bar("episodes chosen") as shown:
-        for done, total in make(read, out, overrides=overrides):
+        for done, total in make(plan, cfg.out, overrides=cfg.set):
             shown.at(done, total)
-    say(f"{out}: {count_of(len(load_protocol(out).episodes), 'episode')}, {load_protocol(out).hash}")
+    protocol = load_protocol(cfg.out)
+    say(f"{cfg.out}: {count_of(len(protocol.episodes), 'episode')}, {protocol.hash}")
     return 0

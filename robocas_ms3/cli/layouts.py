@@ -61,19 +61,6 @@ class Info:
     """Folder of all banks. Default: in the cache."""
 
 
-@dataclass
-class Layouts:
-    """Make layouts ahead, and see which there are."""
-
-    command: Annotated[Build, tyro.conf.subcommand("build")] | Annotated[Info, tyro.conf.subcommand("info")]
-    """What to do."""
-
-
-def main(cfg: Layouts) -> int:
-    """Run the command; 1 where a seed has no layout."""
-    return build(cfg.command) if isinstance(cfg.command, Build) else info(cfg.command)
-
-
 def build(command: Build) -> int:
     """Run ``build``."""
     from robocas_ms3.assets.pack import load_pack
@@ -212,3 +199,7 @@ def objects_seeds(text: str) -> list[int]:
     if match is None or int(match[1]) >= int(match[2]):
         raise ConfigError("no seeds of objects", where="--objects", expected="0:4, or 3,7", found=text)
     return list(range(int(match[1]), int(match[2])))
+
+
+DESCRIPTION = "Build layouts ahead, and list those that are there."
+COMMANDS = {"build": build, "info": info}

@@ -1,4 +1,4 @@
-"""The ``robocas`` command: finds the subcommand, turns what goes wrong into one line and an exit code."""
+"""The ``robocas`` command: parse the words, run the command, turn an error into one line and an exit code."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ import operator
 import os
 import shutil
 import sys
-from collections.abc import Iterable, Sequence
-from dataclasses import fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, Any, TextIO, get_args, get_type_hints
+from typing import Annotated, Any, NoReturn, TextIO, get_type_hints
 
 import platformdirs
 import tyro
 
 from robocas_ms3 import __version__
-from robocas_ms3.cli.absolute import with_absolute_paths
 from robocas_ms3.cli.interrupts import INTERRUPTED, heed_ctrl_c, leave
+from robocas_ms3.cli.options import with_absolute_paths
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.core.exits import no_exit
 from robocas_ms3.core.files import FULL
 from robocas_ms3.core.paths import ensure_home, is_writable, temporary_cache, variable_of
 from robocas_ms3.core.words import escape_log_lines, escape_tracebacks, printable
 
-# Each names a module beside this one, with a dataclass called as the command and `main(cfg) -> int`; a dash in its name
-# is an underscore in the module's: import-robocas, import_robocas.py, ImportRobocas.
+# Each is a module next to this one (import-robocas: import_robocas.py) with a function `main(cfg: Settings) -> int`. A
+# command with commands of its own has instead `COMMANDS`, such functions by name, `DESCRIPTION` and perhaps `DEFAULT`.
 COMMANDS = (
     "doctor",
     "list",
@@ -92,7 +92,10 @@ def run(argv: Sequence[str]) -> int:
         logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)  # it says that it looks for fonts
     escape_log_lines()
     try:
-        return _dispatch(arguments)
+        command, settings = parse(arguments)
+        _lend_folders()
+        with no_exit(f"robocas {arguments[0]}"):
+            return command(with_absolute_paths(settings))
     except KeyboardInterrupt as interrupt:  # a command may say how to go on
         return _say("; ".join(["interrupted", *map(str, interrupt.args)]), sys.stderr, INTERRUPTED)
     except BrokenPipeError:
@@ -116,55 +119,69 @@ def run(argv: Sequence[str]) -> int:
         if debug or error.errno not in _ENVIRONMENT:
             raise
         where = f"{error.filename}: " if error.filename else ""
-        return _say(f"error: {where}{os.strerror(error.errno)}{_room(error)}", sys.stderr, 1)
+        return _say(f"error: {where}{os.strerror(error.errno)}{_remedy(error)}", sys.stderr, 1)
 
 
-def _dispatch(arguments: list[str]) -> int:
-    if arguments and arguments[0] in COMMANDS:  # only the command that is asked for is imported
-        name, rest = arguments[0], arguments[1:]
-        module = module_of(name)
-        of_command = config_type(module, name)
-        known = subcommands(of_command)
-        if known and rest and not rest[0].startswith("-") and rest[0] not in known:
-            return _unknown(rest[0], f"command of robocas {name}", known)
-        if wrong := _misspelt(of_command, known, f"robocas {name}", rest):
-            return _say(f"error: {wrong}", sys.stderr, 2)
-        cfg = tyro.cli(of_command, prog=f"robocas {name}", args=rest, config=CLI_STYLE)
-        _lend_folders()
-        with no_exit(f"robocas {name}"):
-            return module.main(with_absolute_paths(cfg))
-    if arguments and not arguments[0].startswith("-"):
-        return _unknown(arguments[0], "command", COMMANDS)
-    modules = {name: module_of(name) for name in COMMANDS}
-    choices = [Annotated[config_type(module, name), tyro.conf.subcommand(name)] for name, module in modules.items()]
-    choice: Any = reduce(operator.or_, choices)
-    tyro.cli(choice, prog="robocas", description=DESCRIPTION, args=arguments or ["--help"], config=CLI_STYLE)
+def parse(words: Sequence[str]) -> tuple[Callable[[Any], int], Any]:
+    """Parse a command line without running it. Only the module of its command is imported.
+
+    Args:
+        words: command, then its own arguments.
+
+    Returns:
+        The function of the command, and its settings.
+
+    Raises:
+        SystemExit: help was printed (exit code 0), or the words are wrong (exit code 2).
+    """
+    if not words or words[0] not in COMMANDS:
+        commands = {name: module_of(name) for name in COMMANDS}
+        _print_help("robocas", DESCRIPTION, commands, words)
+    module, prog, rest = module_of(words[0]), f"robocas {words[0]}", list(words[1:])
+    if not hasattr(module, "COMMANDS"):
+        return module.main, tyro.cli(settings_type(module.main), prog=prog, args=rest, config=CLI_STYLE)
+    commands, default = module.COMMANDS, getattr(module, "DEFAULT", None)
+    if default and not (rest and rest[0] in (*commands, "-h", "--help")) and _takes(commands[default], rest):
+        rest = [default, *rest]
+    if not rest or rest[0] not in commands:
+        _print_help(prog, module.DESCRIPTION, commands, rest)
+    command, prog = commands[rest[0]], f"{prog} {rest[0]}"
+    return command, tyro.cli(settings_type(command), prog=prog, args=rest[1:], config=CLI_STYLE)
+
+
+def module_of(name: str) -> ModuleType:
+    """Import the module of a command."""
+    return importlib.import_module(f"robocas_ms3.cli.{name.replace('-', '_')}")
+
+
+def settings_type(command: Callable[[Any], int]) -> type:
+    """Return the dataclass that the function of a command takes: its options."""
+    (parameter, *_) = get_type_hints(command).values()
+    return parameter
+
+
+def _takes(command: Callable[[Any], int], words: Sequence[str]) -> bool:
+    """Return whether words may belong to a command: they start with an option, or it has positional arguments."""
+    types = get_type_hints(settings_type(command), include_extras=True).values()
+    positional = any(tyro.conf.Positional in getattr(found, "__metadata__", ()) for found in types)
+    return positional or not words or words[0].startswith("-")
+
+
+@dataclass
+class _Group:
+    """Commands of a command, in the overview."""
+
+
+def _print_help(prog: str, description: str, commands: Mapping[str, Any], words: Sequence[str]) -> NoReturn:
+    """Print the overview of some commands, or that there is no such command among them."""
+    rows = []
+    for name, command in commands.items():
+        of_group = getattr(command, "DESCRIPTION", None)
+        settings = _Group if of_group else settings_type(getattr(command, "main", command))
+        rows.append(Annotated[settings, tyro.conf.subcommand(name, description=of_group)])
+    choice: Any = reduce(operator.or_, rows)
+    tyro.cli(choice, prog=prog, description=description, args=words or ["--help"], config=CLI_STYLE)
     raise AssertionError("tyro leaves the process on --help and on an unknown command")
-
-
-def subcommands(of_command: type) -> dict[str, type]:
-    """Dataclasses of a command's own commands by name; empty where it has none."""
-    if "command" not in {field.name for field in fields(of_command)}:
-        return {}
-    choices = map(get_args, get_args(get_type_hints(of_command, include_extras=True)["command"]))
-    return {about.name: dataclass for dataclass, about in choices}
-
-
-def _misspelt(of_command: type, known: dict[str, type], prog: str, words: list[str]) -> str:
-    if not words or {"-h", "--help"} & set(words):
-        return ""
-    from robocas_ms3.cli.spelling import misspelt
-
-    if not known:
-        return misspelt(of_command, prog, words)
-    return misspelt(known[words[0]], f"{prog} {words[0]}", words[1:]) if words[0] in known else ""
-
-
-def _unknown(word: str, what: str, known: Iterable[str]) -> int:
-    from robocas_ms3.core.strict import nearest
-
-    fix = nearest(word, known) or f"There are: {', '.join(known)}."
-    return _say(f"error: {word}: no such {what}. {fix}", sys.stderr, 2)
 
 
 def _lend_folders() -> None:
@@ -183,8 +200,8 @@ def _lend_folders() -> None:
             os.environ[variable] = str(folder / usual.name)
 
 
-def _room(error: OSError) -> str:
-    """How much there is where it does not suffice, and what to do then."""
+def _remedy(error: OSError) -> str:
+    """Return how much space is free where it does not suffice, and what to do."""
     variable = variable_of(error.filename) if error.filename else ""
     if error.errno not in FULL:
         return f". Set {variable} to a folder that can be written to." if variable else ""
@@ -192,16 +209,6 @@ def _room(error: OSError) -> str:
     free = f" ({shutil.disk_usage(folders[0]).free / 2**20:.0f} MB free)" if error.filename else ""
     elsewhere = f", or set {variable} to a folder that has some" if variable else ""
     return f"{free}. Make room{elsewhere}, then run the command again."
-
-
-def module_of(name: str) -> ModuleType:
-    """Module of a command."""
-    return importlib.import_module(f"robocas_ms3.cli.{name.replace('-', '_')}")
-
-
-def config_type(module: ModuleType, name: str) -> type:
-    """Dataclass of a command, in its module."""
-    return getattr(module, "".join(word.capitalize() for word in name.split("-")))
 
 
 def _say(text: str, stream: TextIO, code: int) -> int:

@@ -1,19 +1,63 @@
-"""Types of options whose help says itself what happens without them, so that no default is shown after it."""
+"""Options of the commands: types for the settings dataclasses, and absolute paths.
+
+Help texts of options with these types say themselves what happens without the option, so tyro adds no default.
+"""
 
 from __future__ import annotations
 
-from typing import Annotated, TypeVar
+import os
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
 
 import tyro
 
-_T = TypeVar("_T")
-_UNSAID = tyro.conf.arg(help_behavior_hint="")
+from robocas_ms3.core.errors import RobocasError
+from robocas_ms3.core.paths import CACHE, DATA
 
-Maybe = Annotated[_T | None, _UNSAID]
-"""A value, by default none."""
-Several = Annotated[tuple[_T, ...], _UNSAID]
-"""Values, by default none."""
-Repeated = Annotated[tuple[_T, ...], _UNSAID, tyro.conf.UseAppendAction]
-"""Values, one for each time that the option is given; by default none."""
-Word = Annotated[str, _UNSAID]
-"""A text, by default empty."""
+_T = TypeVar("_T")
+_NO_DEFAULT = tyro.conf.arg(help_behavior_hint="")
+
+Maybe = Annotated[_T | None, _NO_DEFAULT]
+"""A value; default: None."""
+Several = Annotated[tuple[_T, ...], _NO_DEFAULT]
+"""Values; default: none."""
+Repeated = Annotated[tuple[_T, ...], _NO_DEFAULT, tyro.conf.UseAppendAction]
+"""Values of an option that may be given several times; default: none."""
+Word = Annotated[str, _NO_DEFAULT]
+"""A text; default: empty."""
+Folders = Annotated[
+    tuple[Path, ...],
+    tyro.conf.Positional,
+    # tyro also accepts no folder at all, so commands check the number themselves
+    tyro.conf.arg(metavar="DIR [DIR ...]", help_behavior_hint="(required)"),
+]
+"""Positional folders, at least one."""
+
+
+def with_absolute_paths(settings: _T) -> _T:
+    """Return settings with absolute paths, because libraries may change the working directory.
+
+    The folders named by environment variables become absolute too.
+
+    Raises:
+        RobocasError: the working directory was removed.
+    """
+    try:
+        os.getcwd()
+    except FileNotFoundError as error:
+        raise RobocasError("the working directory was removed", fix="Change to a folder that exists.") from error
+    for variable in (CACHE, DATA):
+        if path := os.environ.get(variable):
+            os.environ[variable] = str(Path(path).absolute())
+    return _absolute(settings)
+
+
+def _absolute(value: Any) -> Any:
+    if isinstance(value, Path):
+        return value.absolute()
+    if isinstance(value, tuple):
+        return tuple(map(_absolute, value))
+    if is_dataclass(value) and not isinstance(value, type):
+        return replace(value, **{field.name: _absolute(getattr(value, field.name)) for field in fields(value)})
+    return value

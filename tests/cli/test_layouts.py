@@ -3,7 +3,7 @@ import json
 import pytest
 
 from robocas_ms3.cli import layouts
-from robocas_ms3.cli.layouts import Build, Info, Layouts, main, objects_seeds, seed_range
+from robocas_ms3.cli.layouts import Build, Info, objects_seeds, seed_range
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import ConfigError, LayoutError
 from robocas_ms3.scenes import bank, source
@@ -11,7 +11,7 @@ from robocas_ms3.scenes.sample import sample_layout
 
 
 def build(folder, seeds):
-    return main(Layouts(Build("pick_table_scattered", seeds=seeds, jobs=1, out=folder)))
+    return layouts.build(Build("pick_table_scattered", seeds=seeds, jobs=1, out=folder))
 
 
 def test_layouts_are_made_once_and_a_later_run_goes_on(tmp_path, monkeypatch, capsys):
@@ -23,7 +23,7 @@ def test_layouts_are_made_once_and_a_later_run_goes_on(tmp_path, monkeypatch, ca
     assert build(tmp_path, "0:3") == 0
     assert made == [(0, 0), (1, 1), (2, 2)]
     assert "1 layout made, 2 there already, 0 seeds without one" in capsys.readouterr().out
-    main(Layouts(Info(tmp_path)))
+    layouts.info(Info(tmp_path))
     listed = capsys.readouterr().out
     assert "scattered" in listed and "builtin" in listed and " 3 " in listed
 
@@ -33,7 +33,7 @@ def test_a_description_with_brackets_is_shown_as_it_is(tmp_path, capsys):
     (about,) = tmp_path.glob(f"*/{bank.ABOUT}")
     said = json.loads(about.read_text())
     about.write_text(json.dumps({**said, "object_pack": {"name": "[/red]"}}))
-    assert main(Layouts(Info(tmp_path))) == 0
+    assert layouts.info(Info(tmp_path)) == 0
     assert "[/red]" in capsys.readouterr().out
 
 
@@ -53,7 +53,7 @@ def test_seeds_without_a_layout_are_named_and_the_others_made(tmp_path, monkeypa
 @pytest.mark.slow
 def test_processes_make_the_same_files(tmp_path):
     for jobs in (1, 2):
-        main(Layouts(Build("pick_table_scattered", seeds="0:3", jobs=jobs, out=tmp_path / str(jobs))))
+        layouts.build(Build("pick_table_scattered", seeds="0:3", jobs=jobs, out=tmp_path / str(jobs)))
     one, two = (sorted((tmp_path / jobs).glob("*/*/*.npz")) for jobs in "12")
     assert [path.name for path in one] == [path.name for path in two]
     for a, b in zip(one, two, strict=True):

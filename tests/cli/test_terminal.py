@@ -10,6 +10,7 @@ from rich.text import Text
 
 from robocas_ms3.cli import bars
 from robocas_ms3.cli import main as cli
+from robocas_ms3.cli.list import List
 from robocas_ms3.cli.terminal import console, say, say_lines, tell
 from robocas_ms3.core.documents import DocumentError
 from robocas_ms3.core.errors import RobocasError
@@ -58,10 +59,10 @@ def test_bars_and_their_notes(monkeypatch):
 
 @pytest.mark.parametrize("error", [RobocasError(HOSTILE, where=HOSTILE, found=HOSTILE), DocumentError(HOSTILE)])
 def test_an_error_is_one_line(monkeypatch, capsys, error):
-    def fail(arguments):
+    def main(cfg: List) -> int:
         raise error
 
-    monkeypatch.setattr(cli, "_dispatch", fail)
+    monkeypatch.setattr("robocas_ms3.cli.list.main", main)
     assert cli.run(["list"]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert not controls(line)

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from made_up_results import of_protocol, outcome, write
 
-from robocas_ms3.cli import eval as command
+from robocas_ms3.cli.eval import Run, run
+from robocas_ms3.cli.eval_results import Videos, videos
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.freeze import Plan, freeze
 from robocas_ms3.evaluation.policies.plain import RandomPolicy
@@ -33,18 +34,18 @@ def test_another_protocol_is_refused(tmp_path):
 @pytest.mark.parametrize("installed", ["random", "small"])
 def test_where_none_failed_there_is_nothing_to_film(tmp_path, capsys, installed):
     result = of_protocol(tmp_path / "b", load_protocol("smoke"))
-    run = result.folder / "run.json"
-    run.write_text(run.read_text().replace('"mine"', f'"{installed}"'))
-    assert command.main(command.Eval(("videos", str(result.folder)))) == 0
+    record = result.folder / "run.json"
+    record.write_text(record.read_text().replace('"mine"', f'"{installed}"'))
+    assert videos(Videos(result.folder)) == 0
     assert "no episode failed" in capsys.readouterr().out
 
 
 def test_a_result_chooses_no_code(tmp_path, capsys):
     result = of_protocol(tmp_path / "b", load_protocol("smoke"))
     with pytest.raises(EvaluationError, match=r"a policy of somebody's own \(found mine\).*--policy mine"):
-        command.main(command.Eval(("videos", str(result.folder))))
+        videos(Videos(result.folder))
     with pytest.raises(EvaluationError, match="mine: no such policy"):  # now it is asked for
-        command.main(command.Eval(("videos", str(result.folder)), policy="mine"))
+        videos(Videos(result.folder, policy="mine"))
 
 
 @pytest.mark.slow
@@ -53,8 +54,8 @@ def test_a_failure_is_filmed_and_linked(tmp_path, needs_renderer, capsys):
     plan = {"rules": rules, "parts": [{"config": "pick_table_scattered", "count": 1, "first_seed": 110000}]}
     list(freeze(Plan.model_validate(plan), tmp_path / "tiny"))
     out, protocol = tmp_path / "result", str(tmp_path / "tiny")
-    assert command.main(command.Eval((), policy="random", protocol=protocol, out=out, backend="processes")) == 0
-    assert command.main(command.Eval(("videos", str(out)), protocol=protocol)) == 0
+    assert run(Run(policy="random", protocol=protocol, out=out, backend="processes")) == 0
+    assert videos(Videos(out, protocol=protocol)) == 0
     said = capsys.readouterr().out
     assert "episode_00000.mp4" in said and "differently" not in said
     frames = np.stack([np.asarray(frame) for frame in imageio.get_reader(out / "videos" / "episode_00000.mp4")])

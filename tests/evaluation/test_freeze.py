@@ -4,7 +4,7 @@ import pytest
 import yaml
 
 from robocas_ms3.assets.pack import load_pack
-from robocas_ms3.cli import eval as command
+from robocas_ms3.cli import eval_protocols as command
 from robocas_ms3.core.errors import EvaluationError, RobocasError
 from robocas_ms3.evaluation.freeze import Plan, freeze, read_plan
 from robocas_ms3.evaluation.protocol import load_protocol
@@ -42,7 +42,7 @@ def test_its_episode_is_that_of_the_shipped_protocol_of_the_same_seed(made):
 def test_a_folder_that_is_there_is_refused_before_anything_is_drawn(made, tmp_path):
     (tmp_path / "plan.yaml").write_text(yaml.safe_dump(PLAN))
     with pytest.raises(EvaluationError, match="something already"):
-        command.main(command.Eval(("freeze", str(tmp_path / "plan.yaml")), out=made))
+        command.freeze(command.Freeze(tmp_path / "plan.yaml", made))
 
 
 def test_scenes_may_be_changed_and_misnamed(tmp_path):
@@ -100,7 +100,7 @@ def test_a_configuration_is_found_beside_the_plan(tmp_path, monkeypatch):
 def test_no_plan(tmp_path, text):
     (tmp_path / "plan.yaml").write_text(text)
     with pytest.raises(EvaluationError, match=r"plan.yaml: no plan of a protocol") as caught:
-        command.main(command.Eval(("freeze", str(tmp_path / "plan.yaml")), out=tmp_path / "out"))
+        command.freeze(command.Freeze(tmp_path / "plan.yaml", tmp_path / "out"))
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "out").exists()
 

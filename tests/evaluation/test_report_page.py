@@ -4,12 +4,13 @@ import importlib.util
 import re
 from collections import Counter
 from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
 from made_up_results import of_protocol, outcome, write
 
-from robocas_ms3.cli import eval as command
+from robocas_ms3.cli.eval_results import Compare, Merge, Report, Verify, compare, merge, report, verify
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.report import PARQUET, write_report
@@ -149,7 +150,7 @@ def test_columns(result, tmp_path):
 def test_without_pyarrow_there_are_no_columns(result, tmp_path, monkeypatch, capsys):
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "pyarrow" else find(name))
-    assert command.main(command.Eval(("report", str(result.folder)))) == 0
+    assert report(Report((result.folder,))) == 0
     assert not (result.folder / PARQUET).exists()
     assert "no episodes.parquet without pyarrow" in capsys.readouterr().out
 
@@ -158,28 +159,29 @@ def test_commands_on_parts(tmp_path, capsys):
     parts = [tmp_path / name for name in "abc"]
     for number, part in enumerate(parts):
         write(part, [outcome(number)], **({"policy": {"name": "other"}} if part.name == "c" else {}))
-    words = tuple(map(str, parts))
-    assert command.main(command.Eval(("report", *words[:2]))) == 0
+    assert report(Report((*parts[:2],))) == 0
     assert "2 episodes" in capsys.readouterr().out
-    assert command.main(command.Eval(("merge", *words[:2]), out=tmp_path / "all")) == 0
+    assert merge(Merge((*parts[:2],), tmp_path / "all")) == 0
     assert (tmp_path / "all" / "report.html").is_file()
     write(tmp_path / "d", [outcome(1)], policy={"name": "other"})
-    assert command.main(command.Eval(("compare", words[0], words[1], words[2], str(tmp_path / "d")))) == 0
+    assert compare(Compare((*parts, tmp_path / "d"))) == 0
     assert "1 episode of made_up that both have" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("command", "settings", "where"),
     [
-        (("report",), "of what?"),
-        (("merge", "a"), "where to?"),
-        (("compare", "a"), "no result"),
-        (("compare", "ok"), "its protocol is not shipped"),
-        (("verify", "a"), "no result"),
+        (report, Report(()), "DIR"),
+        (merge, Merge((), Path("o")), "DIR"),
+        (compare, Compare((Path("a"),)), Path("a")),
+        (compare, Compare((Path("ok"),)), Path("ok")),
+        (verify, Verify((Path("a"),)), Path("a")),
     ],
 )
-def test_wrong_words_are_errors(tmp_path, monkeypatch, words, said):
+def test_wrong_folders_are_errors(tmp_path, monkeypatch, command, settings, where):
     monkeypatch.chdir(tmp_path)
     write(tmp_path / "ok", [outcome(0)])
-    with pytest.raises(EvaluationError, match=re.escape(said)):
-        command.main(command.Eval(words))
+    with pytest.raises(EvaluationError) as caught:
+        command(settings)
+    assert caught.value.where == where
+    assert [path.name for path in tmp_path.iterdir()] == ["ok"]

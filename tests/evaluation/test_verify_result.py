@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 from made_up_results import of_protocol
 
-from robocas_ms3.cli import eval as command
+from robocas_ms3.cli.eval_results import Verify, verify
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.results import OUTCOMES, RUN, read
@@ -135,10 +135,10 @@ def test_a_weld_where_none_can_be_is_found(folder, protocol):
 
 
 def test_the_command_fails_where_something_is_wrong(folder, capsys):
-    assert command.main(command.Eval(("verify", str(folder)))) == 0
+    assert verify(Verify((folder,))) == 0
     assert "8 episodes of smoke, all well" in capsys.readouterr().out
     tamper(folder, 3, seed=5)
-    assert command.main(command.Eval(("verify", str(folder)))) == 1
+    assert verify(Verify((folder,))) == 1
     assert "episode 3: seed is 5, not 110001" in capsys.readouterr().out
 
 
@@ -176,9 +176,9 @@ def test_the_stages_of_an_episode_are_those_of_its_task(folder, protocol, monkey
 def test_a_result_chooses_no_folder(folder, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "ms3-v1").mkdir()  # the default's name is none that was given
-    assert command.main(command.Eval(("verify", str(folder)))) == 0
+    assert verify(Verify((folder,))) == 0
     shutil.copytree(load_protocol("smoke").folder, tmp_path / "easy")
     tamper_run(folder, protocol="easy")
     with pytest.raises(EvaluationError, match="its protocol is not shipped.*found easy.*--protocol FOLDER"):
-        command.main(command.Eval(("verify", str(folder))))
-    assert command.main(command.Eval(("verify", str(folder)), protocol="easy")) == 0
+        verify(Verify((folder,)))
+    assert verify(Verify((folder,), protocol="easy")) == 0

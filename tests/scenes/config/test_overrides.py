@@ -122,11 +122,6 @@ def test_commands_refuse_a_wrong_key_and_write_nothing(words, tmp_path, monkeypa
     assert [path.name for path in tmp_path.iterdir()] == ["plan.yaml"]
 
 
-def test_a_frozen_protocol_takes_no_overrides(capsys):
-    assert run(["eval", "pick", "--protocol", "smoke", "--set", "objects.count=3"]) == 1
-    assert "error: --set: a protocol's configurations are frozen" in capsys.readouterr().err
-
-
 def test_freeze_sets_them_after_the_changes_of_the_plan():
     part = {"config": NAME, "count": 1, "first_seed": 0, "change": {"objects": {"count": 3, "repeats": True}}}
     plan = Plan.model_validate({"rules": {}, "parts": [part]})

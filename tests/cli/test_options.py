@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from robocas_ms3.cli.absolute import with_absolute_paths
+from robocas_ms3.cli.options import with_absolute_paths
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.core.paths import CACHE, DATA
 
