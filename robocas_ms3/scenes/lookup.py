@@ -10,6 +10,7 @@ from robocas_ms3.assets.manifest import Joint
 from robocas_ms3.assets.pack import LoadedFurniture, Pack, load_pack
 from robocas_ms3.core.errors import ConfigError
 from robocas_ms3.core.poses import planar
+from robocas_ms3.core.strict import nearest
 from robocas_ms3.scenes.config.relations import NEED_THREE, RELATIONS
 from robocas_ms3.scenes.config.task import OrderlyLayout, PlacedConfig, PoseConfig, SurfaceConfig, TaskConfig
 from robocas_ms3.scenes.placement import Array, Region
@@ -55,10 +56,14 @@ def find_room(pack: Pack, config: TaskConfig) -> LoadedFurniture:
     """
     room = find_furniture(pack, config.room.asset, key="room.asset")
     for part, finish in config.room.finishes.items():
-        known = room.asset.finishes.get(part, ())
+        parts = sorted(room.asset.finishes)
+        if part not in parts:
+            what, fix = f"room.finishes.{part}: no such part of the room", nearest(part, parts)
+            raise ConfigError(what, expected=f"one of {parts}", found=part, fix=fix)
+        known = room.asset.finishes[part]
         if finish not in known:
-            expected = f"one of {list(known)}" if known else f"a part among {sorted(room.asset.finishes)}"
-            raise ConfigError(f"room.finishes.{part}: no such finish", expected=expected, found=finish)
+            what, fix = f"room.finishes.{part}: no such finish", nearest(finish, known)
+            raise ConfigError(what, expected=f"one of {list(known)}", found=finish, fix=fix)
     for part, finishes in config.randomisation.finishes.items():
         unknown = sorted(set(finishes) - set(room.asset.finishes.get(part, finishes)))
         if unknown:
@@ -153,7 +158,12 @@ def resolve_ids(pack: Pack, wanted: list[str | int] | list[str], *, key: str) ->
         expected = f"one of {sorted(pack.objects)}" + (
             f", or a GraspNet number of {sorted(numbers)}" if numbers else ""
         )
-        raise ConfigError(f"{key}: no such object in pack {pack.name!r}", expected=expected, found=", ".join(unknown))
+        likely = " ".join(filter(None, (nearest(i, pack.objects) for i in unknown)))
+        if likely:
+            expected = f"ids of `robocas assets info {pack.name}`"
+        raise ConfigError(
+            f"{key}: no such object in pack {pack.name!r}", expected=expected, found=", ".join(unknown), fix=likely
+        )
     return ids
 
 

@@ -12,7 +12,7 @@ from robocas_ms3.core.errors import ConfigError
 from robocas_ms3.core.paths import task_configs_dir
 from robocas_ms3.scenes import build
 from robocas_ms3.scenes.config import TaskConfig
-from robocas_ms3.scenes.lookup import find_objects, furniture_pose
+from robocas_ms3.scenes.lookup import find_objects, find_room, furniture_pose
 
 
 def pick_config(**changes):
@@ -139,3 +139,13 @@ def test_objects_cast_shadows_and_the_room_does_not(needs_renderer):
     ratio = images[1] / images[0].clamp(min=1)
     assert ratio.median() > 0.98
     assert 0.002 < (ratio < 0.85).float().mean() < 0.2
+
+
+def test_a_misspelt_object_or_part_of_the_room_is_pointed_out():
+    with pytest.raises(ConfigError) as found:
+        objects_of(["aple"])
+    assert "apple" in found.value.fix
+    config = TaskConfig.model_validate(pick_config(room={"asset": "room", "finishes": {"wal": "plaster"}}))
+    with pytest.raises(ConfigError) as found:
+        find_room(load_pack("builtin"), config)
+    assert "wall" in found.value.fix

@@ -155,7 +155,9 @@ class ObjectsConfig(StrictModel):
         default="all", description="asset ids of the object pack, or their numbers in GraspNet-1Billion"
     )
     count: Annotated[int, Field(ge=1, le=64)] = Field(default=10, description="how many of them")
-    repeats: bool = Field(default=False, description="an object, or a kind of columns, may be drawn more than once")
+    repeats: bool = Field(
+        default=False, description="draw an object, or a kind of columns, more than once; else only if ids are too few"
+    )
 
 
 class TargetConfig(StrictModel):
