@@ -28,7 +28,7 @@ from robocas_ms3.assets.pack import MANIFEST, sha256
 from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import AssetError, RobocasError
 from robocas_ms3.core.files import replacing_folder, write_json
-from robocas_ms3.core.outputs import check_overwrite
+from robocas_ms3.core.outputs import check_replaceable
 from robocas_ms3.core.strict import validate_json
 from robocas_ms3.core.workers import FunctionWorker, WorkerPool
 
@@ -287,7 +287,7 @@ def check_target(folder: Path) -> None:
     if not re.fullmatch(PACK_NAME, folder.name):
         expected = "small letters, digits, _ and -"
         raise AssetError("this is no name for a pack", where=folder, expected=expected, found=folder.name)
-    check_overwrite(folder, (MANIFEST,), "an asset pack")
+    check_replaceable(folder, overwrite=True, marks=(MANIFEST,))
 
 
 def made_of(jobs: Sequence[Job], folder: Path, *, skip_bad: bool = False) -> bool:

@@ -51,14 +51,13 @@ def freeze(cfg: Freeze) -> int:
     """Run ``freeze``."""
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.terminal import say
-    from robocas_ms3.core.errors import EvaluationError
-    from robocas_ms3.core.outputs import check_absent
+    from robocas_ms3.core.outputs import check_replaceable
     from robocas_ms3.evaluation.freeze import freeze as make
     from robocas_ms3.evaluation.freeze import read_plan
     from robocas_ms3.evaluation.protocol import load_protocol
 
     plan = read_plan(cfg.plan)
-    check_absent(cfg.out, EvaluationError)
+    check_replaceable(cfg.out)
     with bar("episodes chosen") as shown:
         for done, total in make(plan, cfg.out, overrides=cfg.set):
             shown.at(done, total)

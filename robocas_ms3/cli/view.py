@@ -65,12 +65,10 @@ def main(cfg: View) -> int:
 def _write(cfg: View, out: Path, source) -> int:
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.terminal import say
-    from robocas_ms3.core.outputs import check_overwrite, claim_output
+    from robocas_ms3.core.outputs import check_replaceable
     from robocas_ms3.viewer.export import export
 
-    if cfg.overwrite:
-        check_overwrite(out, ("data/index.js",), "made by `robocas view`")
-    claim_output(out, resume=cfg.overwrite or None)  # what is there stays until the new one is written
+    check_replaceable(out, overwrite=cfg.overwrite, marks=("data/index.js",))
     with bar("episodes written", transient=True) as shown:
         count, damaged = export(
             source,

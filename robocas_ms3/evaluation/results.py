@@ -10,7 +10,8 @@ Parts of a result, such as shards, are read as one (`read`) or written as one (`
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -22,7 +23,7 @@ from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.files import json_text, make_folder, replacing_folder, write_json
 from robocas_ms3.core.ledger import Ledger
-from robocas_ms3.core.outputs import check_absent, check_run
+from robocas_ms3.core.outputs import FolderKind, OutputFolder, check_replaceable, check_run
 from robocas_ms3.core.strict import parse, parse_json
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.statistics import Share, share
@@ -91,6 +92,37 @@ class Result:
         for outcome in self.outcomes.values():
             found.setdefault(getattr(outcome, name), []).append(outcome)
         return found if name == "split" else dict(sorted(found.items()))
+
+
+@contextmanager
+def open_result(
+    folder: Path, run: dict[str, Any], *, overwrite: bool = False, retry_errors: bool = False
+) -> Iterator[dict[int, Outcome]]:
+    """Lock the folder of a result, and start it or continue it.
+
+    Args:
+        folder: of the result.
+        run: what it is measured with.
+        overwrite: start again.
+        retry_errors: drop episodes that an error broke off, so that they are played again.
+
+    Yields:
+        The outcomes that exist, by number of the episode.
+
+    Raises:
+        OutputExistsError: it was measured with something else, or the folder is not of an evaluation.
+        EvaluationError: ``run`` has a value that `read` would refuse.
+        RobocasError: another process writes there; or somebody removed the folder.
+    """
+    text = json_text({**_BEFORE, **run}, folder / RUN, error=EvaluationError)
+    parse_json(_RunRecord, text, EvaluationError, where=folder / RUN, about="this evaluation can't be recorded")
+    with OutputFolder(folder, OUTPUT, _settings_of(run), overwrite=overwrite) as output:
+        output.start(run if output.recorded is None else load_json(folder / RUN))
+        outcomes = _outcomes(folder)
+        if retry_errors and any(one.error for one in outcomes.values()):
+            outcomes = {number: one for number, one in outcomes.items() if not one.error}
+            _ledger(folder).rewrite(outcomes.values())
+        yield outcomes
 
 
 def begin(folder: Path, run: dict[str, Any], *, resume: bool, again: bool = False) -> dict[int, Outcome]:
@@ -189,10 +221,11 @@ def merge(folders: Sequence[Path], out: Path) -> Result:
     """Write parts of a result as one, into a folder that appears whole.
 
     Raises:
-        EvaluationError: see `read`; or something is there already.
+        EvaluationError: see `read`.
+        OutputExistsError: ``out`` exists.
     """
     result = read(*folders)
-    check_absent(out, EvaluationError)
+    check_replaceable(out)
     with replacing_folder(out) as folder:
         write_json(folder / RUN, result.run)
         _ledger(folder).rewrite(result.outcomes.values())
@@ -204,9 +237,22 @@ def versions() -> dict[str, str]:
     return {name: version(name) for name in _PACKAGES}
 
 
+def _settings_of(run: dict[str, Any]) -> dict[str, Any]:
+    """Return what has to match to continue: of a server that names its policy, not its address."""
+    return {key: _telling(key, value) for key, value in {**_BEFORE, **run}.items()}
+
+
+OUTPUT = FolderKind("robocas eval", (RUN,), "protocol_hash", upgrade=_settings_of)
+
+
 def _telling(key: str, value: Any) -> Any:
     """What of a run's entry tells it from others: of a server that says what it serves not where that is."""
-    if key == "policy" and value and value.get("server") and value.get("name", "").startswith(_ADDRESSES):
+    if (
+        key == "policy"
+        and isinstance(value, dict)
+        and value.get("server")
+        and value.get("name", "").startswith(_ADDRESSES)
+    ):
         return {name: said for name, said in value.items() if name != "name"}
     return value
 

@@ -169,7 +169,7 @@ def test_what_is_no_pack_is_not_replaced(tmp_path):
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "chapter").write_text("1")
     todo = jobs(tmp_path / "log", a="1" * 64)
-    with pytest.raises(OutputExistsError, match="refusing to overwrite what is not an asset pack"):
+    with pytest.raises(OutputExistsError, match="refusing to replace"):
         write_pack(todo, tmp_path / "thesis", tmp_path / "kept")
     with pytest.raises(AssetError, match="no name for a pack"):
         write_pack(todo, tmp_path / "My.Pack", tmp_path / "kept")

@@ -5,7 +5,7 @@ import yaml
 
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.cli import eval_protocols as command
-from robocas_ms3.core.errors import EvaluationError, RobocasError
+from robocas_ms3.core.errors import EvaluationError, OutputExistsError, RobocasError
 from robocas_ms3.evaluation.freeze import Plan, freeze, read_plan
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.scenes.config import load_task_config
@@ -41,7 +41,7 @@ def test_its_episode_is_that_of_the_shipped_protocol_of_the_same_seed(made):
 
 def test_a_folder_that_is_there_is_refused_before_anything_is_drawn(made, tmp_path):
     (tmp_path / "plan.yaml").write_text(yaml.safe_dump(PLAN))
-    with pytest.raises(EvaluationError, match="something already"):
+    with pytest.raises(OutputExistsError):
         command.freeze(command.Freeze(tmp_path / "plan.yaml", made))
 
 

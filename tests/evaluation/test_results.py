@@ -1,21 +1,28 @@
 """A result is appended to, gone on with, read in parts and merged."""
 
+import shutil
 from dataclasses import replace
 
 import pytest
 from made_up_results import RUN_OF, outcome, write
 
-from robocas_ms3.core.errors import EvaluationError
+from robocas_ms3.core.errors import EvaluationError, OutputExistsError, RobocasError
 from robocas_ms3.evaluation.outcomes import failure_stage
-from robocas_ms3.evaluation.results import OUTCOMES, RUN, append, begin, merge, parts_of, read
+from robocas_ms3.evaluation.results import OUTCOMES, RUN, append, merge, open_result, parts_of, read
 
 SEARCH = dict.fromkeys(("obstacles_cleared", "reached_any", "target_grasped", "target_lifted", "success"))
 
 
+def start(folder, run=RUN_OF, new=(), **options):
+    """Start or continue a result, add outcomes, and return the numbers of those that were there."""
+    with open_result(folder, run, **options) as done:
+        for one in new:
+            append(folder, one)
+        return list(done)
+
+
 def test_what_is_appended_is_read(tmp_path):
-    begin(tmp_path / "a", RUN_OF, resume=False)
-    for number in (3, 1):
-        append(tmp_path / "a", outcome(number))
+    start(tmp_path / "a", new=[outcome(3), outcome(1)])
     assert read(tmp_path / "a").outcomes == {1: outcome(1), 3: outcome(3)}
     assert read(tmp_path / "a").run == RUN_OF
 
@@ -25,8 +32,7 @@ def test_a_line_that_was_cut_is_dropped_and_written_over(tmp_path):
     path = tmp_path / "a" / OUTCOMES
     path.write_bytes(path.read_bytes()[:-20])
     assert list(read(tmp_path / "a").outcomes) == [0]
-    assert list(begin(tmp_path / "a", RUN_OF, resume=True)) == [0]
-    append(tmp_path / "a", outcome(2))
+    assert start(tmp_path / "a", new=[outcome(2)]) == [0]
     assert list(read(tmp_path / "a").outcomes) == [0, 2]
 
 
@@ -44,10 +50,9 @@ def test_a_damaged_line_is_an_error_with_its_number(tmp_path):
 def test_a_run_that_could_not_be_read_does_not_begin(tmp_path, said):
     run = {**RUN_OF, "policy": {**RUN_OF["policy"], **said}}
     with pytest.raises(EvaluationError) as error:
-        begin(tmp_path / "a", run, resume=False)
+        start(tmp_path / "a", run)
     assert str(error.value.where).startswith(str(tmp_path / "a" / RUN))
     assert not (tmp_path / "a").exists()
-    begin(tmp_path / "a", RUN_OF, resume=False)
 
 
 @pytest.mark.parametrize(
@@ -63,20 +68,20 @@ def test_a_run_that_could_not_be_read_does_not_begin(tmp_path, said):
 )
 def test_resuming_with_something_else_is_refused(tmp_path, key, value):
     write(tmp_path / "a", [outcome(0)])
-    with pytest.raises(EvaluationError, match=f"another {key}"):
-        begin(tmp_path / "a", {**RUN_OF, key: value}, resume=True)
+    with pytest.raises(OutputExistsError, match=key):
+        start(tmp_path / "a", {**RUN_OF, key: value})
+    assert start(tmp_path / "a", {**RUN_OF, key: value}, overwrite=True) == []
 
 
 def test_a_result_from_before_there_was_a_weld_is_one_without_it(tmp_path):
     run = {name: value for name, value in RUN_OF.items() if name != "weld"}
-    begin(tmp_path / "a", run, resume=False)
-    append(tmp_path / "a", outcome(0))
+    start(tmp_path / "a", run, [outcome(0)])
     write(tmp_path / "b", [outcome(1)])
     assert read(tmp_path / "a").run == RUN_OF
     assert list(read(tmp_path / "a", tmp_path / "b").outcomes) == [0, 1]
-    assert list(begin(tmp_path / "a", RUN_OF, resume=True)) == [0]
-    with pytest.raises(EvaluationError, match="another weld"):
-        begin(tmp_path / "a", {**RUN_OF, "weld": True}, resume=True)
+    assert start(tmp_path / "a") == [0]
+    with pytest.raises(OutputExistsError, match="weld: false -> true"):
+        start(tmp_path / "a", {**RUN_OF, "weld": True})
 
 
 def test_parts_with_the_weld_and_without_are_two_results(tmp_path):
@@ -85,12 +90,6 @@ def test_parts_with_the_weld_and_without_are_two_results(tmp_path):
     assert len(parts_of([tmp_path / "a", tmp_path / "b"])) == 2
     with pytest.raises(EvaluationError, match=r"another weld.*expected False, found True"):
         merge([tmp_path / "a", tmp_path / "b"], tmp_path / "both")
-
-
-def test_a_result_that_is_there_is_not_gone_on_with_unasked(tmp_path):
-    write(tmp_path / "a", [outcome(0)])
-    with pytest.raises(EvaluationError, match="--resume"):
-        begin(tmp_path / "a", RUN_OF, resume=False)
 
 
 def test_no_result(tmp_path):
@@ -169,8 +168,8 @@ def test_merged_parts_are_a_result_that_can_be_gone_on_with(tmp_path):
         write(folder, [outcome(number)])
     merged = merge(folders, tmp_path / "all")
     assert merged.outcomes == read(*folders).outcomes
-    assert list(begin(tmp_path / "all", RUN_OF, resume=True)) == [0, 1]
-    with pytest.raises(EvaluationError, match="something already"):
+    assert start(tmp_path / "all") == [0, 1]
+    with pytest.raises(OutputExistsError):
         merge(folders, tmp_path / "all")
 
 
@@ -241,10 +240,11 @@ def test_where_a_server_was_is_not_who_it_served(tmp_path):
     write(tmp_path / "b", [outcome(1)], policy={"name": "ws://b:8002", **SERVED})
     assert list(read(tmp_path / "a", tmp_path / "b").outcomes) == [0, 1]
     assert parts_of([tmp_path / "a", tmp_path / "b"]) == [[tmp_path / "a", tmp_path / "b"]]
-    begin(tmp_path / "a", {**RUN_OF, "policy": {"name": "ws://c:1", **SERVED}}, resume=True)
+    assert start(tmp_path / "a", {**RUN_OF, "policy": {"name": "ws://c:1", **SERVED}}) == [0]
+    assert read(tmp_path / "a").run["policy"]["name"].startswith("ws://a")
     other = {**SERVED, "server": {"name": "other"}}
-    with pytest.raises(EvaluationError, match=r"another policy.*'server': .'name': 'mine'.*'name': 'other'"):
-        begin(tmp_path / "a", {**RUN_OF, "policy": {"name": "ws://c:1", **other}}, resume=True)
+    with pytest.raises(OutputExistsError, match='policy.server.name: "mine" -> "other"'):
+        start(tmp_path / "a", {**RUN_OF, "policy": {"name": "ws://c:1", **other}})
     silent = {**SERVED, "server": None}  # a plain openpi server: nobody knows what it serves
     write(tmp_path / "c", [outcome(0)], policy={"name": "ws://a:1", **silent})
     write(tmp_path / "d", [outcome(1)], policy={"name": "ws://a:2", **silent})
@@ -255,32 +255,37 @@ def test_where_a_server_was_is_not_who_it_served(tmp_path):
 def test_what_an_error_broke_off_is_played_again_if_that_is_asked_for(tmp_path):
     broken = outcome(1, 0, error="no server", failure_stage="error")
     write(tmp_path / "a", [outcome(0), broken, outcome(2)])
-    assert list(begin(tmp_path / "a", RUN_OF, resume=True)) == [0, 1, 2]
+    assert start(tmp_path / "a") == [0, 1, 2]
     assert read(tmp_path / "a").broken_off() == 1
-    assert list(begin(tmp_path / "a", RUN_OF, resume=True, again=True)) == [0, 2]
-    append(tmp_path / "a", outcome(1))
+    assert start(tmp_path / "a", new=[outcome(1)], retry_errors=True) == [0, 2]
     assert read(tmp_path / "a").outcomes[1].success
 
 
 def test_a_run_that_died_before_its_first_episode_is_in_nobodys_way(tmp_path):
-    begin(tmp_path / "a", RUN_OF, resume=False)
-    begin(tmp_path / "a", {**RUN_OF, "policy": {"name": "another"}}, resume=False)
-    append(tmp_path / "a", outcome(0))
+    start(tmp_path / "a")
+    start(tmp_path / "a", {**RUN_OF, "policy": {"name": "another"}}, [outcome(0)])
     assert read(tmp_path / "a").run["policy"] == {"name": "another"}
 
 
-@pytest.mark.parametrize("resume", [False, True])
+@pytest.mark.parametrize("overwrite", [False, True])
 @pytest.mark.parametrize("notes", ['{"settings": {"task": "pick"}, "first_seed": 0}', "[]", "{"])
-def test_the_folder_of_another_command_stays_as_it_is(tmp_path, notes, resume):
+def test_the_folder_of_another_command_stays_as_it_is(tmp_path, notes, overwrite):
     """Demonstrations have a run.json too."""
     (tmp_path / RUN).write_text(notes)
-    with pytest.raises(EvaluationError, match=r"run.json: refusing to write over what `robocas eval` has not made"):
-        begin(tmp_path, RUN_OF, resume=resume)
+    with pytest.raises(OutputExistsError):
+        start(tmp_path, overwrite=overwrite)
     assert (tmp_path / RUN).read_text() == notes
 
 
 def test_episodes_without_what_they_were_measured_with_are_not_gone_on_with(tmp_path):
     write(tmp_path / "a", [outcome(0)])
     (tmp_path / "a" / RUN).unlink()
-    with pytest.raises(EvaluationError, match=r"episodes of nobody knows what .*run.json"):
-        begin(tmp_path / "a", RUN_OF, resume=True)
+    with pytest.raises(OutputExistsError):
+        start(tmp_path / "a")
+
+
+def test_a_folder_that_is_removed_during_the_run(tmp_path):
+    with pytest.raises(RobocasError) as error, open_result(tmp_path / "a", RUN_OF):
+        shutil.rmtree(tmp_path / "a")
+        append(tmp_path / "a", outcome(0))
+    assert error.value.where == tmp_path / "a"

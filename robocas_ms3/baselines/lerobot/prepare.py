@@ -34,7 +34,7 @@ from robocas_ms3.baselines.lerobot.observations import (
 )
 from robocas_ms3.core.errors import DatasetError, RobocasError
 from robocas_ms3.core.files import replacing_folder, write_json
-from robocas_ms3.core.outputs import check_absent
+from robocas_ms3.core.outputs import check_replaceable
 from robocas_ms3.core.words import printable
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.records import episode_columns, frame_columns
@@ -62,7 +62,7 @@ def prepare(source: Path, out: Path, embed: Embed | None) -> None:
         DatasetError: it is no such dataset, has numbers that are none, or its base drives.
         OutputExistsError: there is something at ``out``.
     """
-    check_absent(out)
+    check_replaceable(out)
     info = _info(source)
     with replacing_folder(out) as part:
         ignored = shutil.ignore_patterns(*_NOT_COPIED, *_depth_keys(info["features"]))
