@@ -1,9 +1,11 @@
-"""What the page shows of an `EpisodeSource`: the table, an episode, its pictures."""
+"""What the page shows of an `EpisodeSource`: the table, an episode, its images."""
 
 from __future__ import annotations
 
+import re
 import threading
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -16,23 +18,25 @@ from robocas_ms3.datasets.sources.protocol import EpisodeSource, Kind
 from robocas_ms3.demos.ledger import Failure
 from robocas_ms3.demos.recordings.seeds import one_seed
 from robocas_ms3.viewer import damage
-from robocas_ms3.viewer.arrays import facts_of, show_arrays
 from robocas_ms3.viewer.damage import attempt, readable, together
-from robocas_ms3.viewer.failures import Failures, describe, stages
-from robocas_ms3.viewer.parts import Picture, make_index, rounded, row
-from robocas_ms3.viewer.pictures import encode_jpeg
+from robocas_ms3.viewer.episode import facts_of, rounded, show_arrays
+from robocas_ms3.viewer.pictures import Picture, encode_jpeg
+from robocas_ms3.viewer.table import Failures, Row, describe, stages
+
+CAMERA_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,79}")
+"""Names of cameras that are shown: names become addresses and folders."""
 
 
 class PageContent:
-    """Episodes as the page shows them: what is damaged is left out, and its row says so. For several threads at once.
+    """Episodes as the page shows them, for several threads. Damaged values are left out, and the row says so.
 
-    What a format adds is in a subclass; those of other packages are shown by what `EpisodeSource` has alone.
+    Subclasses add what a format has beyond `EpisodeSource`.
     """
 
     scene_name = schema.SCENE_FILE
-    """Where ``scene`` of an episode is from, for people."""
+    """File that holds ``scene`` of an episode, for messages."""
     entry_name = schema.CONVERSION_FILE
-    """Where ``entry`` of the source is from."""
+    """File that holds ``entry`` of the source, for messages."""
 
     def __init__(
         self, source: EpisodeSource, kind: str, *, notes: Sequence[str] = (), split: Mapping[int, str] | None = None
@@ -40,10 +44,10 @@ class PageContent:
         """Show a source.
 
         Args:
-            source: where the episodes are from.
-            kind: its format, for people.
-            notes: what people should know of it.
-            split: side of each episode that is on one; None: as the source says.
+            source: reader of the episodes.
+            kind: name of its format, for people.
+            notes: remarks on the dataset, for people.
+            split: ``train`` or ``val`` by episode; None: as the source says.
         """
         self.root, self.source, self._kind, self._split = source.root, source, kind, split
         self.failures = Failures.read(self.root if self.root.is_dir() else self.root.parent)
@@ -51,7 +55,7 @@ class PageContent:
         self._reading = threading.Lock()
 
     def index(self) -> dict[str, Any]:
-        """Everything the table needs, see `make_index`; arrays are read only where the overviews are silent.
+        """Return what the table shows; arrays are read only for episodes whose length is not listed.
 
         Seeds without an episode, from ``failures.jsonl``, come last.
         """
@@ -60,13 +64,22 @@ class PageContent:
         found = [self._row(number, lengths.get(number, 0), split.get(number, "")) for number in source.numbers]
         rows = [row for row, _ in found]
         rows += self.failures.given_up(rows, [env_info for _, env_info in found])
-        return make_index(self.root, self._kind, source.rate_hz, source.cameras, source.has_depth, rows, self._note)
+        path = self.root.resolve()
+        return {
+            "name": path.name if path.is_dir() else f"{path.parent.name}/{path.name}",
+            "kind": self._kind,
+            "rate_hz": source.rate_hz,
+            "cameras": [name for name in source.cameras if CAMERA_NAME.fullmatch(name)],
+            "depth": source.has_depth,
+            "note": self._note,
+            "episodes": [asdict(row) for row in rows],
+        }
 
     def episode(self, number: int) -> dict[str, Any]:
-        """All of an episode but its pictures.
+        """Return everything of an episode except its images.
 
         Raises:
-            DatasetError: there is none of this number, or it can't be read.
+            DatasetError: there is no such episode, or it can't be read.
         """
         where = f"{self.root.name}, episode {number}"
         with readable(where):
@@ -87,7 +100,7 @@ class PageContent:
             }
 
     def rgb(self, number: int, camera: str, step: int) -> Picture:
-        """A picture, as it is stored where that is an encoded one.
+        """Return an image, as it is stored if it is stored encoded.
 
         Raises:
             DatasetError: there is none.
@@ -95,15 +108,15 @@ class PageContent:
         return encode_jpeg(self._picture(number, camera, "rgb", step))
 
     def depth(self, number: int, camera: str, step: int) -> NDArray[np.uint16]:
-        """(H, W) mm, 0 = nothing.
+        """Return (H, W) depth in mm; 0: no measurement.
 
         Raises:
             DatasetError: there is none.
         """
         return self._picture(number, camera, "depth", step)
 
-    def _row(self, number: int, steps: int, split: str) -> tuple[dict[str, Any], Any]:
-        """Its row, and the environment it is of, as far as that is known."""
+    def _row(self, number: int, steps: int, split: str) -> tuple[Row, Any]:
+        """Return the row of an episode, and its environment as far as it is known."""
         scene, wrong = self._scene(number)
         entry, wrong_entry = self._entry(number)
         wrong_steps = ""
@@ -113,12 +126,12 @@ class PageContent:
         recorded = scene.get("recorded") or {}
         scene = {**entry, **scene}
         target = scene.get("target") or entry.get("target") or {}
-        shown = row(
+        row = Row(
             number,
             steps=steps,
             instruction=instruction,
             task=scene.get("task") or "",
-            target=called(target.get("asset_id") or "", target.get("name") or ""),
+            object=called(target.get("asset_id") or "", target.get("name") or ""),
             seed=one_seed(scene.get("seed")),
             success=scene.get("success"),
             split=split,
@@ -126,14 +139,14 @@ class PageContent:
             attempts=recorded.get("attempts"),
             damage=together(wrong, wrong_entry, wrong_steps),
         )
-        return shown, scene.get("env_info")
+        return row, scene.get("env_info")
 
     def _scene(self, number: int) -> tuple[dict[str, Any], str]:
-        """How an episode was made, without what is wrong, and that in words."""
+        """Return the valid values of how an episode was made, and what is wrong with the others."""
         return damage.scene(lambda: self.source.episode(number).scene, self.scene_name)
 
     def _entry(self, number: int) -> tuple[dict[str, Any], str]:
-        """What the dataset says of it where its scene is silent."""
+        """Return what the overview of the dataset says of an episode, and what is wrong with it."""
 
         def read() -> Any:
             entry = self.source.entry(number)
@@ -150,15 +163,15 @@ class PageContent:
         return {**dict.fromkeys(train, "train"), **dict.fromkeys(val, "val")}
 
     def _failures(self, scene: Mapping[str, Any]) -> Sequence[Failure]:
-        """Known of its seed in its environment."""
+        """Return the failures of the seed of a scene in its environment."""
         return self.failures.of_seed(one_seed(scene.get("seed")), scene.get("env_info"))
 
     def _show(self, number: int, scene: Mapping[str, Any]) -> dict[str, Any]:
-        """What an episode of this scene is on the page, see `show_motion`; ``facts`` for people where they differ."""
+        """Return what is shown of an episode, see `show_motion`; may replace ``facts``."""
         return show_arrays(self.source.episode(number).arrays, scene)
 
     def _picture(self, number: int, camera: str, kind: Kind, step: int) -> NDArray:
-        """A picture, decoded."""
+        """Return a decoded image."""
         with readable(f"{self.root.name}, episode {number}"), self._reading:
             episode = self.source.episode(number)
             return episode.rgb(camera, step) if kind == "rgb" else episode.depth(camera, step)

@@ -12,7 +12,7 @@ from robocas_ms3.core.files import make_folder, replacing_folder
 from robocas_ms3.viewer import pictures
 from robocas_ms3.viewer.content import PageContent
 from robocas_ms3.viewer.damage import readable, reason, together
-from robocas_ms3.viewer.parts import Picture
+from robocas_ms3.viewer.pictures import Picture
 from robocas_ms3.viewer.routes import PAGE_FILES, make_thumbnail, page_file, script
 
 WIDTH = 480

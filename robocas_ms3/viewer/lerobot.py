@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +16,11 @@ from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.sources.protocol import Kind
 from robocas_ms3.viewer.content import PageContent
 from robocas_ms3.viewer.damage import readable, split_of, table
-from robocas_ms3.viewer.kept import KeptPictures
-from robocas_ms3.viewer.parts import plot
+from robocas_ms3.viewer.episode import plot
 from robocas_ms3.viewer.pictures import inside
 
-_AT_ONCE = 8  # pictures decoded together: a video opens and seeks slowly, and who looks at one looks at the next
-_KEPT = 128 * 2**20  # bytes of such groups in memory: 17 of 640 x 480
+_AT_ONCE = 8  # images decoded together: a video opens and seeks slowly, and the next step is asked for next
+_CACHED = 16  # such groups in memory: 118 MB at 640 x 480
 
 
 class LeRobotContent(PageContent):
@@ -42,7 +42,7 @@ class LeRobotContent(PageContent):
         dataset.described, wrong_scenes = table(lambda: dataset.described, schema.SCENES_FILE)
         notes = wrong_scenes, wrong_settings
         super().__init__(dataset, "LeRobot dataset", notes=notes, split=split_of(dataset.settings))
-        self._kept = KeptPictures(_KEPT)
+        self._decoded = lru_cache(maxsize=_CACHED)(self._decode)
 
     def _show(self, number: int, scene: Mapping[str, Any]) -> dict[str, Any]:
         """As a RoboCAS folder is shown, or each numeric column as a plot."""
@@ -67,8 +67,7 @@ class LeRobotContent(PageContent):
         if not 0 <= step < self.dataset.episode(number).steps:
             raise DatasetError("no such step", where=f"{self.root}, episode {number}", found=step)
         with self._reading:
-            key = number, camera, kind, step // _AT_ONCE
-            return self._kept.get(key, lambda: self._decode(*key))[step % _AT_ONCE]
+            return self._decoded(number, camera, kind, step // _AT_ONCE)[step % _AT_ONCE]
 
     def _decode(self, number: int, camera: str, kind: Kind, group: int) -> list[NDArray]:
         episode, first = self.dataset.episode(number), group * _AT_ONCE

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -10,11 +11,23 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.pictures.video import colour_depth
-from robocas_ms3.viewer.parts import Picture
 
 THUMBNAIL = (96, 72)
 """Width and height: twice what the table shows, for dense screens."""
 _QUALITY = 85
+
+
+@dataclass(frozen=True)
+class Picture:
+    """An encoded picture.
+
+    Attributes:
+        kind: media type, ``image/png``, ``image/jpeg`` or ``image/webp``.
+        data: the file.
+    """
+
+    kind: str
+    data: bytes
 
 
 def inside(path: Path, root: Path) -> Path:

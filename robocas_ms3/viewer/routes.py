@@ -27,9 +27,9 @@ from typing import Any
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.words import printable
 from robocas_ms3.viewer import pictures
-from robocas_ms3.viewer.content import PageContent
+from robocas_ms3.viewer.content import CAMERA_NAME, PageContent
 from robocas_ms3.viewer.damage import without_nan
-from robocas_ms3.viewer.parts import CAMERA_NAME, Picture
+from robocas_ms3.viewer.pictures import Picture
 
 PAGE_FILES = {
     "index.html": "text/html; charset=utf-8",

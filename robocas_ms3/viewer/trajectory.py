@@ -21,11 +21,9 @@ from robocas_ms3.demos.recordings.reading import Recording, TrajectoryFile
 from robocas_ms3.demos.recordings.subgoals import SubGoal
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.viewer import damage
-from robocas_ms3.viewer.arrays import facts_of, show_motion
 from robocas_ms3.viewer.content import PageContent
 from robocas_ms3.viewer.damage import readable
-from robocas_ms3.viewer.parts import plot
-from robocas_ms3.viewer.plots import ARM, ROLL_PITCH_YAW, XYZ
+from robocas_ms3.viewer.episode import ARM, ROLL_PITCH_YAW, XYZ, facts_of, plot, show_motion
 
 NOTE = "A trajectory file holds states, no pictures: `robocas convert {name} --to robocas --out DIR` renders them."
 _STILL = 0.002  # m: an object that moves less is drawn where it stands

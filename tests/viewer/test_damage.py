@@ -9,9 +9,9 @@ import pytest
 from robocas_ms3.cli.view import View, main
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
-from robocas_ms3.viewer.failures import Failures
 from robocas_ms3.viewer.routes import Routes, script
 from robocas_ms3.viewer.source import open_source
+from robocas_ms3.viewer.table import Failures
 
 WRONG = ["x", 7, True, ["x"], {"x": 1}, None, [[]], {"poses": 3}, [{"slot": "x"}], 2**62]
 
@@ -191,6 +191,17 @@ def test_a_static_page_of_a_damaged_dataset(spoilt, tmp_path, capsys):
     text = (out / "data/index.js").read_text()
     index = json.loads(text.removeprefix('robocas.put("index",').removesuffix(");\n"))
     assert [bool(row["damage"]) for row in index["episodes"]] == [True, True, True, False]
+
+
+def test_control_characters_reach_the_page_as_escapes():
+    texts = ["\x1b[31m\x9b\x7f", "\u202eevil\u2069\u2028", "\\u202e", "\\\u202e\u202e", "é 😀 \u0645", "two\nlines"]
+    data = script("index", {"name": texts, "number": float("nan")})
+    assert data.isascii()
+    shown = json.loads(data[len(b'robocas.put("index",') : -len(b");\n")])
+    assert shown["name"] == [
+        *("\\u001b[31m\\u009b\\u007f", "\\u202eevil\\u2069\\u2028"),
+        *("\\u202e", "\\\\u202e\\u202e", "é 😀 \u0645", "two\nlines"),
+    ]
 
 
 def test_numbers_that_json_does_not_know():

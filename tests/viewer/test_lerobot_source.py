@@ -9,6 +9,7 @@ import pytest
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.lerobot.schema import MAX_DEPTH_MM
 from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.viewer.lerobot import LeRobotContent
 from robocas_ms3.viewer.pictures import decode
 from robocas_ms3.viewer.source import open_source
 
@@ -44,12 +45,11 @@ def test_pictures_are_those_of_that_step(lerobot, folder):
         source.rgb(3, "static_camera", 0)
 
 
-def test_decoded_pictures_take_little_memory(lerobot, monkeypatch):
-    """A group of 7 pictures is 64 x 48 x 3 x 7 bytes."""
-    monkeypatch.setattr("robocas_ms3.viewer.lerobot._KEPT", 2 * 64 * 48 * 3 * 7)
-    source, decoded = open_source(lerobot), []
-    decode = source._decode
-    source._decode = lambda *key: decoded.append(key[0]) or decode(*key)
+def test_few_decoded_images_are_kept_in_memory(lerobot, monkeypatch):
+    monkeypatch.setattr("robocas_ms3.viewer.lerobot._CACHED", 2)
+    decoded, decode = [], LeRobotContent._decode
+    monkeypatch.setattr(LeRobotContent, "_decode", lambda self, *key: decoded.append(key[0]) or decode(self, *key))
+    source = open_source(lerobot)
     for number in (0, 1, 0, 2, 0, 1):
         source.rgb(number, "base_camera", 3)
     assert decoded == [0, 1, 2, 1]

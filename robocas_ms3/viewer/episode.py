@@ -1,4 +1,4 @@
-"""An episode of RoboCAS arrays and ``scene.json`` as the page shows it, whichever files they came from."""
+"""What the page shows of an episode: plots, sub-goals, the path of the TCP among the objects, facts."""
 
 from __future__ import annotations
 
@@ -13,26 +13,28 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import from_xyzw
 from robocas_ms3.core.words import called
 from robocas_ms3.demos.recordings.subgoals import SubGoal, subgoal_runs
-from robocas_ms3.viewer.parts import plot, rounded
-from robocas_ms3.viewer.plots import ROLL_PITCH_YAW, XYZ, base_plot, gripper_plot, motion_plots
 
+XYZ = ("x", "y", "z")
+ROLL_PITCH_YAW = ("roll", "pitch", "yaw")
+ARM = tuple(f"j{i}" for i in range(1, 8))
+_OPEN_WIDTH = 0.08  # m
 NEEDED = (
     *("ee_pos", "ee_orn", "base_pos", "base_orn", "rel_pos", "rel_orn", "robot_joints", "gripper_width"),
     *("step_goal_type", "step_lang_goals"),
 )
-"""Arrays without which there is nothing to show."""
+"""Arrays that an episode must have to be shown."""
 
 
 def show_arrays(a: Mapping[str, NDArray], scene: Mapping[str, Any]) -> dict[str, Any]:
-    """Arrays as plots, sub-goals, and the TCP's path among the objects where they stood at the start.
+    """Return what is shown of the arrays of an episode; objects where they were at the start.
 
     Args:
-        a: arrays by the schema's keys.
-        scene: ``scene.json`` without values that are wrong; empty where there is none.
+        a: arrays by the keys of the schema.
+        scene: ``scene.json`` without invalid values; empty without such a file.
 
     Raises:
-        DatasetError: one is missing.
-        ValueError: they contradict each other.
+        DatasetError: an array is missing.
+        ValueError: arrays have different lengths.
     """
     missing = sorted(set(NEEDED) - set(a))
     if missing:
@@ -53,14 +55,14 @@ def show_arrays(a: Mapping[str, NDArray], scene: Mapping[str, Any]) -> dict[str,
 def show_motion(
     a: Mapping[str, NDArray], goals: Sequence[SubGoal], actions: list[dict], objects: list[dict], *, moving: bool
 ) -> dict[str, Any]:
-    """The same of the arrays that say where the robot was, with what is known from elsewhere.
+    """Return what is shown of the motion of the robot and of the objects.
 
     Args:
-        a: arrays by the schema's keys.
+        a: arrays by the keys of the schema.
         goals: sub-goals over the steps.
-        actions: plots of them.
-        objects: {name, target, path}: path in the world (T, 3), or (1, 3) where only its start is known or it stands.
-        moving: whether the objects' motion is known.
+        actions: plots of the actions.
+        objects: {name, target, path}: path in the world (T, 3), or (1, 3) of an object that does not move.
+        moving: whether the motion of the objects is known.
     """
     base = from_xyzw(a["base_pos"].astype(float), a["base_orn"].astype(float))
     tcp = base @ from_xyzw(a["ee_pos"].astype(float), a["ee_orn"].astype(float))
@@ -102,7 +104,7 @@ def _objects(scene: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def facts_of(scene: Mapping[str, Any]) -> dict[str, Any]:
-    """What people may want to know of an episode beside its table row."""
+    """Return facts on an episode that the table does not show, by their title."""
     recorded, source = scene.get("recorded") or {}, scene.get("source") or {}
     recording = f"{source['trajectory']}, episode {source.get('episode_id')}" if source.get("trajectory") else None
     kwargs = (scene.get("env_info") or {}).get("env_kwargs") or {}
@@ -115,3 +117,55 @@ def facts_of(scene: Mapping[str, Any]) -> dict[str, Any]:
         "Relation": recorded.get("relation"),
         **{str(name).capitalize(): value for name, value in (recorded.get("facts") or {}).items()},
     }
+
+
+def motion_plots(position: NDArray, xyzw: NDArray, arm_joints: NDArray) -> list[dict[str, Any]]:
+    """Plot the TCP pose and the joint positions.
+
+    Args:
+        position: (T, 3) m, TCP in the arm's base.
+        xyzw: (T, 4) quaternions, orientation of the TCP in that frame.
+        arm_joints: (T, 7) rad.
+    """
+    if len(xyzw) and xyzw[0][np.abs(xyzw[0]).argmax()] < 0:
+        xyzw = -xyzw
+    # q and -q are the same orientation: choose signs without jumps
+    flips = np.cumsum(np.sum(xyzw[1:] * xyzw[:-1], axis=1) < 0) % 2
+    xyzw = np.concatenate([xyzw[:1], xyzw[1:] * np.where(flips, -1, 1)[:, None]])
+    return [
+        plot("TCP position, arm base", "m", XYZ, position),
+        plot("TCP orientation, arm base", "quaternion", ("x", "y", "z", "w"), xyzw),
+        plot("Arm joints", "rad", ARM, arm_joints),
+    ]
+
+
+def gripper_plot(width: NDArray, is_open: NDArray | None) -> dict[str, Any]:
+    """Plot the width in mm, and the command as the commanded width."""
+    if is_open is None:
+        return plot("Gripper", "mm", ("width",), np.ravel(width)[:, None] * 1000)
+    command = np.where(is_open, _OPEN_WIDTH, 0.0)
+    return plot("Gripper", "mm", ("width", "command"), np.column_stack([width, command]) * 1000)
+
+
+def base_plot(pose: NDArray) -> list[dict[str, Any]]:
+    """Plot the pose of the mobile base (T, 3): x, y in m, yaw in rad. No plot if it does not move."""
+    pose = np.column_stack([pose[:, :2], np.unwrap(pose[:, 2])])
+    moves = len(pose) > 0 and np.ptp(pose, axis=0).max() > 1e-3
+    return [plot("Mobile base, world", "m, rad", ("x", "y", "yaw"), pose)] if moves else []
+
+
+def plot(title: str, unit: str, names: Sequence[str], values: NDArray, *, steps: bool = False) -> dict[str, Any]:
+    """Return a plot of (T, N) values; ``steps`` draws each value until the next one."""
+    columns = np.atleast_2d(np.asarray(values, float).T)
+    series = [{"name": name, "values": rounded(column)} for name, column in zip(names, columns, strict=True)]
+    return {"title": title, "unit": unit, "series": series, "steps": steps}
+
+
+def rounded(values: Any) -> list:
+    """Return nested lists of rounded numbers; NaN and infinity, which JSON does not have, become None."""
+    array = np.round(np.asarray(values, float), 5) + 0.0  # + 0.0: no -0.0
+    if np.isfinite(array).all():
+        return array.tolist()
+    known = array.astype(object)
+    known[~np.isfinite(array)] = None
+    return known.tolist()

@@ -1,9 +1,9 @@
-"""What is known of attempts that failed: ``failures.jsonl`` of a run or dataset, and recoveries left in an episode."""
+"""Rows of the table: episodes, and seeds without an episode according to ``failures.jsonl``."""
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,22 +11,52 @@ from typing import Any
 from robocas_ms3.core.ledger import Ledger
 from robocas_ms3.datasets.sources.provenance import environment_of
 from robocas_ms3.demos.ledger import FAILURES_FILE, Failure
-from robocas_ms3.viewer.parts import row
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of the table.
+
+    Attributes:
+        n: episode; None: a seed without an episode.
+        steps: number of steps.
+        instruction: what the robot was told to do.
+        task: its name.
+        object: name of the target.
+        seed: of the scene.
+        success: whether the episode succeeded; None: unknown.
+        split: ``train``, ``val`` or empty.
+        stages: where attempts failed.
+        attempts: how many there were.
+        damage: what of the episode is damaged and therefore not shown.
+    """
+
+    n: int | None
+    steps: int = 0
+    instruction: str = ""
+    task: str = ""
+    object: str = ""
+    seed: int | None = None
+    success: bool | None = None
+    split: str = ""
+    stages: Sequence[str] = ()
+    attempts: int | None = None
+    damage: str = ""
 
 
 @dataclass(frozen=True)
 class FailedAttempt(Failure):
-    """A line of the file.
+    """A line of ``failures.jsonl``.
 
     Attributes:
-        task, environment: which run it is of, where a dataset may be of several; None where it does not say.
+        task, environment: of the run, where a dataset may be of several; None: unknown.
     """
 
     task: str | None = None
     environment: str | None = None
 
     def is_of(self, env_info: Any) -> bool:
-        """Whether it is of a run in this environment, as far as either is known."""
+        """Return whether the attempt may be of a run in this environment."""
         if not self.environment or not isinstance(env_info, Mapping):
             return True
         return environment_of(env_info) in ("", self.environment)
@@ -34,10 +64,10 @@ class FailedAttempt(Failure):
 
 @dataclass(frozen=True)
 class Failures:
-    """The file.
+    """The lines of ``failures.jsonl``.
 
     Attributes:
-        by_seed: {seed: failures}.
+        by_seed: failures by seed.
         note: which lines are damaged, for people.
     """
 
@@ -46,7 +76,7 @@ class Failures:
 
     @classmethod
     def read(cls, folder: Path) -> Failures:
-        """Read that of a folder; nothing where there is none."""
+        """Read the file of a folder; without one there are no failures."""
         try:
             lines = Ledger[FailedAttempt](folder / FAILURES_FILE, FailedAttempt).lines()
         except OSError as error:
@@ -58,38 +88,35 @@ class Failures:
         return cls(dict(found), _damaged([str(line.number) for line in lines if line.record is None]))
 
     def of_seed(self, seed: int | None, env_info: Any = None) -> list[FailedAttempt]:
-        """Of one seed in an environment; none where the seed is not known."""
-        return [] if seed is None else [told for told in self.by_seed.get(seed, []) if told.is_of(env_info)]
+        """Return the failures of a seed in an environment; none if the seed is unknown."""
+        return [] if seed is None else [failure for failure in self.by_seed.get(seed, []) if failure.is_of(env_info)]
 
-    def given_up(self, rows: Iterable[Mapping[str, Any]], env_infos: Iterable[Any]) -> list[dict[str, Any]]:
-        """Rows of the seeds that were given up, but those that have an episode after all.
+    def given_up(self, rows: Sequence[Row], env_infos: Sequence[Any]) -> list[Row]:
+        """Return rows of the seeds that were given up and have no episode.
 
         Args:
-            rows: of the episodes.
-            env_infos: the environment of each, as far as it is known.
+            rows: rows of the episodes.
+            env_infos: environment of each of them, as far as it is known.
         """
-        there: dict[int, list[Any]] = defaultdict(list)
-        tasks = set()
-        for entry, env_info in zip(rows, env_infos, strict=True):
-            there[entry["seed"]].append(env_info)
-            tasks.add(entry["task"])
-        task = tasks.pop() if len(tasks) == 1 else ""  # where the file does not say
+        environments: dict[int | None, list[Any]] = defaultdict(list)
+        for row, env_info in zip(rows, env_infos, strict=True):
+            environments[row.seed].append(env_info)
+        tasks = {row.task for row in rows}
+        task = tasks.pop() if len(tasks) == 1 else ""  # if the file does not name it
         lost = []
         for seed, of_seed in sorted(self.by_seed.items()):
             runs: dict[str | None, list[FailedAttempt]] = defaultdict(list)
-            for told in of_seed:
-                runs[told.environment].append(told)
+            for failure in of_seed:
+                runs[failure.environment].append(failure)
             for of_run in runs.values():
-                made = any(of_run[0].is_of(env_info) for env_info in there[seed])
-                if not made and any(told.gave_up for told in of_run):
-                    tried = [told for told in of_run if not told.gave_up]
-                    lost.append(_lost(seed, of_run[0].task or task, tried))
+                recorded = any(of_run[0].is_of(env_info) for env_info in environments[seed])
+                if recorded or not any(failure.gave_up for failure in of_run):
+                    continue
+                tried = [failure for failure in of_run if not failure.gave_up]
+                named = stages(tried, {}) or ["given up"]
+                of_task = of_run[0].task or task
+                lost.append(Row(None, task=of_task, seed=seed, success=False, stages=named, attempts=len(tried)))
         return lost
-
-
-def _lost(seed: int, task: str, tried: list[FailedAttempt]) -> dict[str, Any]:
-    named = stages(tried, {}) or ["given up"]
-    return row(None, task=task, seed=seed, success=False, stages=named, attempts=len(tried))
 
 
 def _damaged(lines: list[str]) -> str:
@@ -102,13 +129,13 @@ def _damaged(lines: list[str]) -> str:
 
 
 def stages(failures: Iterable[Failure], recorded: Mapping[str, Any]) -> list[str]:
-    """Where attempts at an episode failed."""
+    """Return the stages at which attempts at an episode failed."""
     named = {failure.stage for failure in failures if not failure.gave_up}
     return sorted(named | {kept["stage"] for kept in recorded.get("recoveries") or ()})
 
 
 def describe(failures: Iterable[Failure], recorded: Mapping[str, Any]) -> list[dict[str, str]]:
-    """The same for people, one attempt a line."""
+    """Describe each failed attempt for people."""
     lines = [
         {"stage": f.stage, "reason": f.reason, "text": f"attempt {f.attempt + 1}, {f.seconds:.1f} s, undone"}
         for f in failures
