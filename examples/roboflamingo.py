@@ -1,0 +1,129 @@
+"""Serve a RoboFlamingo model as a policy: an adapter around its `ModelWrapper`, without torch.
+
+RoboFlamingo pins torch 2.0.1, so this file runs in an environment of its own; docs/baselines_lerobot.md has the script.
+"""
+
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.core.documents import load_json
+from robocas_ms3.core.errors import EvaluationError
+from robocas_ms3.datasets.actions import ActionScale
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
+
+HORIZON = 11  # frames, as in the paper's appendix
+MODEL_SIZE = (320, 256)  # width, height in pixels: the paper trains it on the images of its RT-1
+DATASET_SIZE = (640, 480)  # squeezed to MODEL_SIZE; a camera that renders 320 x 256 sees another part of the scene
+RATE_HZ = 5.0
+
+WindowModel = Callable[[NDArray[np.uint8], NDArray[np.uint8], str], Any]
+"""(11, H, W, 3) images of the base camera and of the gripper camera, and the instruction, to actions.
+
+Returns one action (7,) or one per frame (11, 7), of which the last is used: position and Euler angles from -1 to 1 over
+the dataset's ranges, and the gripper's opening from 0 to 1.
+"""
+
+
+class StepModel(Protocol):
+    """RoboFlamingo's `ModelWrapper`: takes one frame at a time and keeps the frames itself."""
+
+    def reset(self) -> None: ...
+
+    def step(self, obs: dict[str, Any], goal: str) -> Any:
+        """Return 7 numbers from -1 to 1 for `{"rgb_obs": {"rgb_static", "rgb_gripper"}}`; gripper 1 is open."""
+        ...
+
+
+class Stepwise:
+    """Make a `WindowModel` of a `StepModel`: reset it and show it the whole window at each step.
+
+    One model serves several envs this way, at 11 model steps per action.
+
+    Args:
+        model: with `use_state` and `tcp_rel` off: there is no robot state, and actions are in the TCP's frame.
+    """
+
+    def __init__(self, model: StepModel) -> None:
+        self._model = model
+
+    def __call__(self, base: NDArray[np.uint8], gripper: NDArray[np.uint8], instruction: str) -> NDArray[np.floating]:
+        self._model.reset()
+        action: Any = None
+        for static, hand in zip(base, gripper, strict=True):
+            action = self._model.step({"rgb_obs": {"rgb_static": static, "rgb_gripper": hand}}, instruction)
+        action = np.asarray(action, np.float64)
+        return np.append(action[..., :6], (action[..., 6:] + 1) / 2)
+
+
+class RoboFlamingoPolicy:
+    """Policy that shows the model the last 11 frames of each env; the first frame is repeated at the start.
+
+    Args:
+        model: to ask.
+        scale: action ranges of the training dataset, see `load_scale`.
+        model_size: (width, height) in pixels of the images that the model takes.
+        dataset_size: (width, height) in pixels of the images in the training dataset.
+        rate_hz: of the dataset.
+    """
+
+    def __init__(
+        self,
+        model: WindowModel,
+        scale: ActionScale,
+        model_size: tuple[int, int] = MODEL_SIZE,
+        dataset_size: tuple[int, int] = DATASET_SIZE,
+        rate_hz: float = RATE_HZ,
+    ) -> None:
+        self._model, self._scale, self._model_size = model, scale, model_size
+        cameras = {"base_camera": dataset_size, "gripper_camera": dataset_size}
+        self.spec = PolicySpec(convention="robocas", reference="tcp", rate_hz=rate_hz, cameras=cameras)
+        self._frames: dict[int, deque[tuple[NDArray[np.uint8], NDArray[np.uint8]]]] = {}
+
+    def describe(self) -> dict[str, Any]:
+        """Return what results record about the policy."""
+        ranges = {"low": self._scale.low.tolist(), "high": self._scale.high.tolist()}
+        return {"model": type(self._model).__qualname__, "horizon": HORIZON, "ranges": ranges}
+
+    def reset(self, starts: list[EpisodeSpec]) -> None:
+        """Forget the frames of the envs that start an episode."""
+        for start in starts:
+            self._frames[start.env] = deque(maxlen=HORIZON)
+
+    def act(self, observations: Observations) -> NDArray[np.floating]:
+        """Return (E, 7) actions of the convention `robocas`."""
+        return np.stack([self._act(env, observations, row) for row, env in enumerate(observations.envs.tolist())])
+
+    def _act(self, env: int, observations: Observations, row: int) -> NDArray[np.float32]:
+        frames, images = self._frames[env], observations.images
+        frame = self._squeezed(images["base_camera"][row]), self._squeezed(images["gripper_camera"][row])
+        frames.extend([frame] if frames else [frame] * HORIZON)
+        base, gripper = (np.stack(window) for window in zip(*frames, strict=True))
+        action = np.asarray(self._model(base, gripper, observations.instructions[row]), np.float64)
+        if action.shape == (HORIZON, 7):
+            action = action[-1]
+        if action.shape != (7,) or not np.isfinite(action).all():
+            expected = f"7 numbers, or {HORIZON} times 7"
+            raise EvaluationError("invalid action of RoboFlamingo", expected=expected, found=action.tolist())
+        return self._scale.decode(np.append(np.clip(action[:6], -1, 1), np.clip(action[6:], 0, 1)))
+
+    def _squeezed(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return a copy in the model's size, resampled by areas as samples of a dataset are."""
+        if image.shape[1::-1] == self._model_size:
+            return image.copy()
+        resized: Any = cv2.resize(image, self._model_size, interpolation=cv2.INTER_AREA)
+        return resized
+
+
+def load_scale(data_info: Path) -> ActionScale:
+    """Load the action ranges from a dataset's `data_info.json`: 1st to 99th percentile of each axis, m and rad."""
+    try:
+        info = load_json(data_info)
+    except (OSError, ValueError) as error:
+        raise EvaluationError("no data_info.json of a RoboCAS dataset", where=data_info, found=error) from error
+    return ActionScale.of(info.get("action_space", {}) if isinstance(info, dict) else {}, where=data_info)
