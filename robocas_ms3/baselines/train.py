@@ -22,7 +22,7 @@ from robocas_ms3.baselines.metrics import means_of, summed
 from robocas_ms3.baselines.runs import CHECKPOINT, RunRecord
 from robocas_ms3.baselines.schedule import Batches, epochs_at, learning_rate
 from robocas_ms3.core.errors import RobocasError, TrainingError
-from robocas_ms3.core.exits import deferred_interrupts, exit_error, uninterrupted
+from robocas_ms3.core.exits import deferred_interrupts, exit_error
 from robocas_ms3.core.outputs import OutputFolder
 
 
@@ -237,7 +237,7 @@ class Trainer:
         if not self._accelerator.is_main_process:
             return
         self._output.check_exists()
-        with uninterrupted():
+        with deferred_interrupts(second_ends=False):
             about = {**self._about, "step": str(self.step)}
             checkpoints.save_run(self._folder, tensors, self._acting().state_dict(), about)
 

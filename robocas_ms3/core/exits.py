@@ -30,7 +30,7 @@ class _CommandInterrupt:
 
     def __init__(self) -> None:
         self.installed = False
-        self.holds = 0  # of `uninterrupted` and `responsive` that are under way
+        self.protected = False  # from the second SIGINT too
         self._handler: Handler = signal.default_int_handler
         self._handled = threading.Event()
 
@@ -70,7 +70,7 @@ class _CommandInterrupt:
             pass
         default = signal.SIG_IGN
         while not self._handled.is_set():
-            if not self.holds:
+            if not self.protected:
                 libc.signal(int(signal.SIGINT), ctypes.c_void_p(int(default)))
             default = signal.SIG_DFL
             self._handled.wait(_SECOND)
@@ -90,10 +90,13 @@ def was_interrupted() -> bool:
 
 
 @contextmanager
-def deferred_interrupts() -> Iterator[None]:
-    """Handle a SIGINT or SIGTERM that comes inside afterwards, once; of a command, a second SIGINT ends the process.
+def deferred_interrupts(*, second_ends: bool = True) -> Iterator[None]:
+    """Handle a SIGINT or SIGTERM that comes inside afterwards, once.
 
-    A mask is not enough: the system gives the signal to another thread, of which Python tells the main one.
+    A signal mask is not enough: the system gives the signal to another thread, and Python tells the main thread.
+
+    Args:
+        second_ends: whether a second SIGINT, half a second after the first or later, ends a command at once.
     """
     came: list[tuple[int, FrameType | None]] = []
     held: dict[int, Any] = {}
@@ -102,43 +105,16 @@ def deferred_interrupts() -> Iterator[None]:
             if callable(handler := signal.getsignal(number)):
                 held[number] = handler
                 signal.signal(number, lambda number, frame: came.append((number, frame)))
+    protected, _command.protected = _command.protected, _command.protected or not second_ends
     try:
         yield
     finally:
+        _command.protected = protected
         with ExitStack() as restored:  # one that comes now interrupts this, but not what is restored after it
             for number, handler in held.items():
                 restored.callback(_restore, number, handler)
         if came:
             held[came[0][0]](*came[0])
-
-
-@contextmanager
-def responsive() -> Iterator[None]:
-    """Wait inside, in Python: a second SIGINT right after the first changes nothing."""
-    waits = _command.waits() and threading.current_thread() is threading.main_thread()
-    if waits:
-        _command.holds += 1
-        signal.signal(signal.SIGINT, _command.handle)
-    try:
-        yield
-    finally:
-        if waits:
-            _command.holds -= 1
-            if _command.waits():
-                _command.arm()
-
-
-@contextmanager
-def uninterrupted() -> Iterator[None]:
-    """Hold Ctrl-C back for a moment, the second one too; processes that are started during that inherit it."""
-    with deferred_interrupts():
-        _command.holds += 1
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        try:
-            yield
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
-            _command.holds -= 1
 
 
 def end_process(code: int) -> NoReturn:

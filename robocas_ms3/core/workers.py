@@ -16,72 +16,28 @@ What `WorkerPool` guarantees:
 from __future__ import annotations
 
 import logging
-import math
 import os
 import signal
-import subprocess
-import sys
 import threading
-import time
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import CancelledError
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
 from multiprocessing import Pipe
-from multiprocessing.connection import wait
 from queue import Empty, SimpleQueue
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
-import cloudpickle
-import psutil
-
-from robocas_ms3.core.errors import RobocasError, WorkerCrashed, WorkerStartError
-from robocas_ms3.core.exits import responsive
-from robocas_ms3.core.sent_errors import SentError
+from robocas_ms3.core.errors import WorkerCrashed, WorkerStartError
+from robocas_ms3.core.exits import deferred_interrupts
+from robocas_ms3.core.worker_process import NO_LIMITS, Limits, Worker, WorkerProcess
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
-Task_contra = TypeVar("Task_contra", contravariant=True)
-Result_co = TypeVar("Result_co", covariant=True)
 
-_START_SECONDS = 900.0  # until a worker is made
-_EXIT_SECONDS = 1.0  # until an idle process has left
-_POLL_SECONDS = 1.0  # between two checks of limits, and of signals
-_JOB_KILL_SECONDS = 2.0  # until this process is ended too, where a batch system ends all processes of a job
+_POLL_SECONDS = 0.2  # between two checks of signals
 _TASKS_PER_WORKER = 2  # running and queued, so that no worker waits for its next task
-# Not `multiprocessing`, whose spawn runs the user's main module again: it needs `if __name__ == "__main__"` there, and
-# fails in a program from standard input.
-_PROGRAM = "import sys; sys.path[:] = {path!r}; from robocas_ms3.core.worker_main import main; main({fd}, {parent})"
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Limits:
-    """What one task may take.
-
-    Attributes:
-        seconds: of wall-clock time.
-        memory_gb: GiB of resident memory, of the worker process and of each process that it forked.
-    """
-
-    seconds: float = math.inf
-    memory_gb: float = math.inf
-
-
-NO_LIMITS = Limits()
-
-
-class Worker(Protocol[Task_contra, Result_co]):
-    """Keeps what tasks need, and runs one task after the other."""
-
-    def run(self, task: Task_contra, /) -> Result_co:
-        """Run a task."""
-        ...
-
-    def close(self) -> None:
-        """Free what it holds: after a task that raised an error, and when a pool without processes is closed."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -208,13 +164,13 @@ class WorkerPool(Generic[Task, Result]):
         while True:
             if self._stopped:
                 raise CancelledError
-            with suppress(Empty), responsive():
+            with suppress(Empty), deferred_interrupts():
                 return finished.get(timeout=_POLL_SECONDS)
 
     def _supervise(self) -> None:
         """Run jobs in one process; in a thread of its own."""
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # for the process, until it ignores Ctrl-C
-        process: _WorkerProcess[Task, Result] = _WorkerProcess(self._make_worker, self._limits, self._stop_reader)
+        process: WorkerProcess[Task, Result] = WorkerProcess(self._make_worker, self._limits, self._stop_reader)
         while (job := self._jobs.get()) is not None and not self._stopped:
             if not job.cancelled:
                 try:
@@ -225,7 +181,7 @@ class WorkerPool(Generic[Task, Result]):
                 job.finished.put(job)
         process.leave()
 
-    def _run_job(self, process: _WorkerProcess[Task, Result], task: Task) -> Result:
+    def _run_job(self, process: WorkerProcess[Task, Result], task: Task) -> Result:
         reason = ""
         for retries_left in reversed(range(self._retries + 1)):
             try:
@@ -277,140 +233,6 @@ class _Job(Generic[Task, Result]):
         self.cancelled = self.done = False
         self.result: Result | None = None
         self.error: BaseException | None = None
-
-
-class _WorkerProcess(Generic[Task, Result]):
-    """A process that runs one task after the other; it starts with a task, and again after it died.
-
-    One thread uses it, and lives as long: Linux kills a process when the thread that started it ends.
-
-    Args:
-        make_worker: is called in the process.
-        limits: of each task.
-        stop: a `Connection` that becomes readable when the running task has to be killed.
-    """
-
-    def __init__(self, make_worker: Callable[[], Worker[Task, Result]], limits: Limits, stop: Any) -> None:
-        self._make_worker, self._limits, self._stop = make_worker, limits, stop
-        self._process: subprocess.Popen[bytes] | None = None
-        self._connection: Any = None  # a Connection
-
-    def run(self, task: Task) -> Result:
-        """Run a task.
-
-        Raises:
-            WorkerStartError: the process can't start, or died before its first task.
-            WorkerCrashed: it died, or exceeded a limit.
-            CancelledError: the pool was stopped.
-            Exception: whatever the task, or making the worker, raises.
-        """
-        if self._process is None or self._process.poll() is not None:
-            try:
-                self._start()
-            except WorkerCrashed as crash:
-                what, fix = "a worker process died before its first task", "See its output above, and robocas doctor."
-                raise WorkerStartError(what, found=crash.found, fix=fix) from crash
-            except BaseException:
-                self._end()
-                raise
-        return self._ask(task, self._limits.seconds)
-
-    def leave(self) -> None:
-        """Let the process leave; kill it where that takes too long, or where it is busy."""
-        if self._process is not None:
-            self._connection.close()
-            with suppress(subprocess.TimeoutExpired):
-                self._process.wait(_EXIT_SECONDS)
-        self._end()
-
-    def _start(self) -> None:
-        self._end()
-        try:
-            connection, theirs = Pipe()
-            with theirs:
-                program = _PROGRAM.format(path=sys.path, fd=theirs.fileno(), parent=os.getpid())
-                command = [sys.executable, "-c", program]
-                self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, pass_fds=(theirs.fileno(),))
-        except OSError as error:
-            what, fix = "can't start another process", "Use fewer --jobs, or raise the limits (ulimit -u, -n)."
-            raise RobocasError(what, found=error.strerror or error, fix=fix) from error
-        self._connection = connection
-        self._receive(_START_SECONDS)  # that it reads: nothing below waits for a full pipe
-        self._ask(cloudpickle.dumps(self._make_worker), _START_SECONDS)
-
-    def _ask(self, message: object, seconds: float) -> Any:
-        try:
-            self._connection.send(message)
-        except OSError as error:
-            raise self._crash() from error
-        return self._receive(seconds)
-
-    def _receive(self, seconds: float) -> Any:
-        assert self._process is not None
-        deadline = time.monotonic() + seconds
-        while not (ready := wait([self._connection, self._stop], _POLL_SECONDS)):
-            if time.monotonic() > deadline:
-                raise self._crash("too slow")
-            if exceeds_memory(self._process.pid, self._limits.memory_gb):
-                raise self._crash("too much memory")
-        if self._stop in ready:
-            self._end()
-            raise CancelledError
-        try:
-            answer = self._connection.recv()
-        except (EOFError, OSError) as error:
-            raise self._crash() from error
-        if isinstance(answer, SentError):
-            answer.reraise()
-        return answer
-
-    def _crash(self, reason: str = "") -> WorkerCrashed:
-        """End the process, and return the error that says why."""
-        assert self._process is not None
-        if not reason:
-            with suppress(subprocess.TimeoutExpired):
-                self._process.wait(5)
-            code = self._process.returncode
-            reason = signal.Signals(-code).name if code is not None and code < 0 else f"exit code {code}"
-            if code in (-signal.SIGTERM, -signal.SIGKILL):
-                wait([self._stop], _JOB_KILL_SECONDS)  # else the task would be blamed for the end of all
-        self._end()
-        return WorkerCrashed("its worker process died", found=reason)
-
-    def _end(self) -> None:
-        if self._process is not None:
-            kill_tree(self._process)
-            self._process = None
-        if self._connection is not None:
-            self._connection.close()
-            self._connection = None
-
-
-def exceeds_memory(pid: int, memory_gb: float, *, forks: bool = True) -> bool:
-    """Return whether a process, or one that it forked, uses more than ``memory_gb`` GiB.
-
-    Args:
-        pid: process id.
-        memory_gb: limit of each process.
-        forks: whether to look for processes that it forked, which takes milliseconds.
-    """
-    if memory_gb == math.inf:
-        return False
-    try:
-        process = psutil.Process(pid)
-        processes = [process, *(process.children(recursive=True) if forks else ())]
-        return any(one.memory_info().rss > memory_gb * 2**30 for one in processes)
-    except psutil.Error:
-        return False  # it has just ended
-
-
-def kill_tree(process: subprocess.Popen[bytes]) -> None:
-    """Kill a process and what it forked, which must not go on writing files, and wait for its end."""
-    with suppress(psutil.Error):
-        for forked in psutil.Process(process.pid).children(recursive=True):
-            forked.kill()
-    process.kill()
-    process.wait()
 
 
 def use_one_torch_thread() -> None:

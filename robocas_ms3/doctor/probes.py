@@ -125,6 +125,7 @@ def _main() -> int:
 
 
 if __name__ == "__main__":
-    code = _main()
-    sys.stderr.flush()
-    os._exit(code)  # a library that crashes while it is torn down has worked nevertheless
+    exit_code = _main()
+    from robocas_ms3.core.exits import end_process
+
+    end_process(exit_code)  # a library that crashes while it is torn down has worked nevertheless

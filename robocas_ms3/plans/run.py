@@ -15,7 +15,7 @@ from queue import Empty, SimpleQueue
 from typing import Any
 
 from robocas_ms3.core.errors import PlanError
-from robocas_ms3.core.exits import responsive
+from robocas_ms3.core.exits import deferred_interrupts
 from robocas_ms3.core.files import make_folder, write_json
 from robocas_ms3.core.locks import locked_folder
 from robocas_ms3.core.outputs import (
@@ -42,6 +42,7 @@ from robocas_ms3.plans.units import CLAIMS, DRIVER, PLAN, Outcome, Task, Unit, o
 _AHEAD = 2  # units a slot that are under way, so that none waits for the next
 _ROUNDS = 3  # so often is made again what a disk does not keep
 _LOOK = 1.0  # s between two looks at what is under way, at least
+_WAIT = 0.2  # s until a signal is handled
 _LOOKS = 200.0  # units a second that are looked at, at most
 _log = logging.getLogger(__name__)
 OpenEngine = Callable[[Plan, Path], Engine]
@@ -253,8 +254,8 @@ def _do_units(plan: Plan, out: Path, engine: Engine, parts: Sequence[_Part], on_
 def _some_done(done: SimpleQueue[Future[Any]]) -> Iterator[Future[Any]]:
     """What is done by now; waits a moment for the first."""
     with suppress(Empty):
-        with responsive():
-            first = done.get(timeout=_LOOK)
+        with deferred_interrupts():
+            first = done.get(timeout=_WAIT)
         yield first
         while True:
             yield done.get_nowait()

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -21,9 +22,9 @@ NATIVE = """
 import hashlib
 from contextlib import nullcontext
 from robocas_ms3.cli.interrupts import heed_ctrl_c
-from robocas_ms3.core.exits import deferred_interrupts, uninterrupted
+from robocas_ms3.core.exits import deferred_interrupts
 heed_ctrl_c()
-with uninterrupted():
+with deferred_interrupts(second_ends=False):
     pass
 with {around}:
     print("ready", flush=True)
@@ -51,15 +52,47 @@ except KeyboardInterrupt:
 WAITING = """
 import os, signal, time
 from robocas_ms3.cli.interrupts import heed_ctrl_c
-from robocas_ms3.core.exits import responsive
+from robocas_ms3.core.exits import deferred_interrupts
 heed_ctrl_c()
 try:
-    with responsive():
-        print("ready", flush=True)
-        time.sleep(100)
+    print("ready", flush=True)
+    while True:
+        with deferred_interrupts():
+            time.sleep(0.2)
 except KeyboardInterrupt:
     print("handled", flush=True)
 os._exit(0)
+"""
+WRITING = """
+import time
+from robocas_ms3.cli.interrupts import heed_ctrl_c
+from robocas_ms3.core.exits import deferred_interrupts
+heed_ctrl_c()
+try:
+    with deferred_interrupts(second_ends=False):
+        print("ready", flush=True)
+        time.sleep(3)
+        print("written", flush=True)
+except KeyboardInterrupt:
+    print("handled", flush=True)
+"""
+OTHER_THREAD = """
+import os, signal, threading, time
+from robocas_ms3.core.exits import deferred_interrupts
+def wait():
+    started.set()
+    time.sleep(60)
+signal.signal(signal.SIGTERM, signal.default_int_handler)
+started = threading.Event()
+threading.Thread(target=wait, daemon=True).start()
+started.wait()
+try:
+    with deferred_interrupts():
+        os.kill(os.getpid(), signal.{name})  # the other thread gets it
+        time.sleep(0.3)
+        print("written", flush=True)
+except KeyboardInterrupt:
+    print("handled", flush=True)
 """
 UNSIGNALLED = """
 from robocas_ms3.cli.interrupts import heed_ctrl_c
@@ -112,6 +145,21 @@ def test_the_first_of_two_at_once_is_handled_while_a_command_waits():
         for _ in range(2):
             process.send_signal(signal.SIGINT)
         assert (process.communicate()[0], process.returncode) == ("handled\n", 0)
+
+
+def test_a_file_is_written_although_ctrl_c_came_twice():
+    with python(WRITING) as process:
+        assert process.stdout is not None and process.stdout.readline() == "ready\n"
+        for _ in range(2):
+            process.send_signal(signal.SIGINT)
+            time.sleep(0.8)
+        assert (process.communicate()[0], process.returncode) == ("written\nhandled\n", 0)
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_a_signal_is_deferred_although_another_thread_gets_it(name):
+    with python(OTHER_THREAD.format(name=name)) as process:
+        assert (process.communicate()[0], process.returncode) == ("written\nhandled\n", 0)
 
 
 def test_an_interrupt_that_no_signal_caused_is_an_error_of_its_source():

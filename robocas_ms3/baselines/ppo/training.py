@@ -19,7 +19,7 @@ from robocas_ms3.baselines.ppo.rollouts import OUTCOMES, Rollouts, Tried, outcom
 from robocas_ms3.baselines.ppo.trials import FIRST_TRIAL, EnvTrials
 from robocas_ms3.baselines.runs import CHECKPOINT, RunRecord
 from robocas_ms3.core.errors import TrainingError
-from robocas_ms3.core.exits import deferred_interrupts, uninterrupted
+from robocas_ms3.core.exits import deferred_interrupts
 from robocas_ms3.core.outputs import OutputFolder
 
 
@@ -106,7 +106,7 @@ class PpoTraining:
                 on_step(min(self.step, settings.steps), settings.steps)
             if self.config.trials and not self._tried_out:
                 found = try_out(self.agent, self._trials, self.config.trials)
-                with uninterrupted():
+                with deferred_interrupts(second_ends=False):
                     self._tell(log, "val", found, time.monotonic() - begun, {})
                     self._tried_out = True
                     self._save()
@@ -154,7 +154,7 @@ class PpoTraining:
             tensors["random.cuda"] = torch.cuda.get_rng_state()
         self._output.check_exists()
         about = {**self._about, "step": str(self.step)}
-        with uninterrupted():
+        with deferred_interrupts(second_ends=False):
             checkpoints.save_run(self._folder, tensors, self.agent.state_dict(), about)
 
     def _go_on(self) -> None:

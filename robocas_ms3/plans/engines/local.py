@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
-from robocas_ms3.core.exits import uninterrupted
 from robocas_ms3.plans.engines import refuse_options
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.slot import Slot, Stages
@@ -48,10 +47,9 @@ class LocalEngine:
 
     def close(self) -> None:
         """End the processes."""
-        with uninterrupted():  # one who is impatient would leave them behind
-            self._threads.shutdown(wait=False, cancel_futures=True)
-            for slot in self._all:
-                slot.stop()
-            for slot in self._all:
-                slot.close()
-            self._threads.shutdown()
+        for slot in self._all:
+            slot.stop()
+        self._threads.shutdown(wait=False, cancel_futures=True)
+        for slot in self._all:
+            slot.close()
+        self._threads.shutdown()

@@ -18,13 +18,15 @@ from typing import Any
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import VectorEnvError, WorkerDied
-from robocas_ms3.core.exits import responsive, uninterrupted
-from robocas_ms3.core.workers import NO_LIMITS, exceeds_memory
+from robocas_ms3.core.exits import deferred_interrupts
+from robocas_ms3.core.worker_process import exceeds_memory
+from robocas_ms3.core.workers import NO_LIMITS
 
 STEP, LEAVE = b"s", b"q"  # messages; all others are pickled
 NUMBER = 8  # bytes before each message, its number, which the answer repeats
 _GRACE, _GRACE_AT_WORK = 10.0, 1.0  # s to leave in
 _LOOK = 1.0  # s between two looks at what it takes
+_POLL = 0.2  # s until a signal is handled
 # Neither fork nor multiprocessing's spawn: a process with a renderer or CUDA can't be forked, and spawn runs the user's
 # program again, which a program without `if __name__ == "__main__"`, a notebook and a program from a pipe don't stand.
 _PROGRAM = """\
@@ -60,11 +62,12 @@ class WorkerHandle:
         with there:
             program = _PROGRAM.format(path=sys.path, connection=there.fileno(), memory=memory, parent=os.getpid())
             try:
-                with uninterrupted():  # which the process inherits, until it ignores Ctrl-C
+                with deferred_interrupts():
                     self.process = subprocess.Popen(
                         [sys.executable, "-c", program],
                         pass_fds=(there.fileno(), memory),
                         stdin=subprocess.DEVNULL,
+                        start_new_session=True,  # a terminal sends its Ctrl-C to this process alone
                         # one thread each, also of the software renderer: those of several get in each other's way
                         env={"OMP_NUM_THREADS": "1", "LP_NUM_THREADS": "1", **os.environ},
                     )
@@ -125,8 +128,8 @@ class WorkerHandle:
             if why:
                 self.process.kill()
                 raise self._died(why)
-            with responsive():
-                answered = self.connection.poll(_LOOK)
+            with deferred_interrupts():
+                answered = self.connection.poll(_POLL)
             if answered:
                 return
 

@@ -20,6 +20,7 @@ import torch
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import LayoutError, VectorEnvError
+from robocas_ms3.core.exits import end_process
 from robocas_ms3.core.sent_errors import SentError
 from robocas_ms3.core.words import escape_log_lines, escape_tracebacks
 from robocas_ms3.core.workers import use_one_torch_thread
@@ -49,7 +50,7 @@ def main(connection: int, memory: int, parent: int) -> None:
     use_one_torch_thread()
     with suppress(EOFError, OSError):  # nobody is there any more
         _Worker(Connection(connection), memory).serve()
-    os._exit(0)  # environments are closed; what else would be torn down takes long, and may crash
+    end_process(0)
 
 
 def _leave_with(parent: int) -> None:
