@@ -3,63 +3,143 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-import tyro
-
+from robocas_ms3.baselines.table import BASELINES
 from robocas_ms3.cli.options import Maybe, Repeated
 
+DESCRIPTION = """Train a baseline on demonstrations, for `robocas eval TASK --policy RUN`; docs/baselines.md.
 
-@dataclass
-class Train:
-    """Train a baseline on a dataset of `robocas convert`, for `robocas eval TASK --policy RUN`.
+Several GPUs: `accelerate launch --no_python robocas train ...`.
+"""
 
-    - small: base and gripper camera, language; made for two processor cores
-    - bc-state: what only a simulator knows, from the trajectory.h5 of `robocas generate`
-    - rt1: the paper's RT-1
-    - ppo: learns by trying, without --data, from dense rewards and what only a simulator knows (docs/rl.md)
 
-    docs/baselines.md says what they are, what they cost and what they reach. Several GPUs:
-    `accelerate launch --no_python robocas train ...`.
-    """
+@dataclass(kw_only=True)
+class Training:
+    """Options of every baseline."""
 
-    baseline: Annotated[str, tyro.conf.Positional] = "small"
-    """Which: small, bc-state, rt1, ppo, or another package's."""
-    data: Maybe[Path] = None
-    """Folder of a dataset, or a trajectory.h5. Needed, but for ppo."""
     out: Maybe[Path] = None
-    """Folder of the run. Default: runs/BASELINE-DATA, or runs/BASELINE."""
+    """Folder of the run. Default: runs/BASELINE-DATA, or runs/BASELINE without data."""
     config: Maybe[Path] = None
-    """YAML file of what differs from the baseline's defaults."""
+    """YAML file with the values that differ from the defaults of the baseline."""
     set: Repeated[str] = ()
-    """A value of the configuration, such as `--set chunk=4` or `--set train.learning_rate=3e-4`; may be given again."""
+    """Set a value of the configuration, such as `--set chunk=4` or `--set train.learning_rate=3e-4`; repeatable."""
     steps: Maybe[int] = None
-    """Steps of the optimiser; train.steps of the configuration."""
+    """Steps of the optimiser; short for --set train.steps."""
     batch_size: Maybe[int] = None
-    """Samples a step; train.batch_size."""
+    """Samples per step; short for --set train.batch_size."""
     seed: Maybe[int] = None
-    """Of everything random; train.seed."""
+    """Random seed; short for --set train.seed."""
     start: Maybe[str] = None
-    """Folder of a run to begin with, such as one on less data, or small, which comes with the package (a folder of
-    that name needs a longer path): with its weights, and its configuration where no option says otherwise. Default:
-    random weights, the baseline's defaults."""
+    """Start from the weights of this run, and from its configuration where no option says otherwise: a folder, or small
+    for the bundled weights (name a folder of that name ./small). Default: random weights."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where it computes. Auto: a GPU if there is one."""
+    """Device of the networks. Auto: a GPU if there is one."""
     overwrite: bool = False
     """Start again. Default: continue a run with the same settings, as if it had not been interrupted."""
 
 
-def main(cfg: Train) -> int:
-    """Run the command; gives the exit code."""
+@dataclass(kw_only=True)
+class FromData(Training):
+    """Options of a baseline that learns from demonstrations."""
+
+    data: Path
+    """Folder of a dataset of `robocas convert`."""
+
+
+@dataclass(kw_only=True)
+class Small(FromData):
+    """Train `small`: base and gripper camera, language; chunks of poses by a small transformer, for two CPU cores.
+
+    Example: robocas train small --data datasets/pick --out runs/pick
+    """
+
+
+@dataclass(kw_only=True)
+class BCState(Training):
+    """Train `bc-state`: privileged state of the simulator; chunks of poses by residual layers.
+
+    Example: robocas train bc-state --data demos/pick/trajectory.h5 --steps 4000
+    """
+
+    data: Path
+    """The trajectory.h5 of `robocas generate`."""
+
+
+@dataclass(kw_only=True)
+class RT1(FromData):
+    """Train `rt1`, the RT-1 of the RoboCAS paper: base and gripper camera, language; action tokens.
+
+    Example: robocas train rt1 --data datasets/pick --set train.workers=4
+    """
+
+
+@dataclass(kw_only=True)
+class PPO(Training):
+    """Train `ppo` in simulation, without data: dense rewards, privileged state of the simulator; docs/rl.md.
+
+    Example: robocas train ppo --seed 1 --out runs/ppo
+    """
+
+
+@dataclass(kw_only=True)
+class Other(Training):
+    """Train a baseline of another package."""
+
+    data: Maybe[Path] = None
+    """Folder of a dataset, or a trajectory.h5, if the baseline learns from data."""
+
+
+def small(cfg: Small) -> int:
+    """Run ``small``."""
+    return train("small", cfg, cfg.data)
+
+
+def bc_state(cfg: BCState) -> int:
+    """Run ``bc-state``."""
+    return train("bc-state", cfg, cfg.data)
+
+
+def rt1(cfg: RT1) -> int:
+    """Run ``rt1``."""
+    return train("rt1", cfg, cfg.data)
+
+
+def ppo(cfg: PPO) -> int:
+    """Run ``ppo``."""
+    return train("ppo", cfg, None)
+
+
+def other(name: str) -> Callable[[Other], int]:
+    """Return the command of a baseline of another package."""
+
+    def command(cfg: Other) -> int:
+        return train(name, cfg, cfg.data)
+
+    return command
+
+
+COMMANDS = {
+    "small": small,
+    "bc-state": bc_state,
+    "rt1": rt1,
+    "ppo": ppo,
+    **{name: other(name) for name in BASELINES.entry_points},
+}
+DEFAULT = "small"
+
+
+def train(baseline: str, cfg: Training, data: Path | None) -> int:
+    """Train a baseline, with a progress bar."""
     from robocas_ms3.baselines.runs import find_run
     from robocas_ms3.baselines.session import Said, train_run
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.terminal import say
 
-    shown = cfg.out or _default_out(cfg)
-    out = shown.absolute()
+    out = cfg.out or _default_out(baseline, data)
     start = None if cfg.start is None else find_run(Path(cfg.start)).absolute()
     with bar("episodes read", transient=True) as reading, bar("steps trained") as stepping:
 
@@ -67,35 +147,27 @@ def main(cfg: Train) -> int:
             reading.stop()  # a terminal has room for one
             stepping.at(done, of)
 
-        first = os.environ.get("RANK", "0") == "0"  # of several processes it speaks
+        first = os.environ.get("RANK", "0") == "0"  # one of several processes writes to the terminal
         said = Said(stepping.note, reading.at, step) if first else Said()
+        options: dict[str, Any] = {"start": start, "device": cfg.device, "overwrite": cfg.overwrite}
         try:
-            train_run(
-                cfg.baseline,
-                cfg.data,
-                out,
-                changes_of(cfg),
-                start=start,
-                device=cfg.device,
-                overwrite=cfg.overwrite,
-                said=said,
-            )
+            train_run(baseline, data, out.absolute(), changes_of(cfg), said=said, **options)
         except KeyboardInterrupt:
             raise KeyboardInterrupt("the same command continues") from None
     if first:
-        say(f"{shown}: trained. Next: robocas eval TASK --policy {shown} --protocol {'paper-v1' if cfg.data else 'P'}")
+        say(f"{out}: trained. Next: robocas eval TASK --policy {out} --protocol {'paper-v1' if data else 'P'}")
     return 0
 
 
-def _default_out(cfg: Train) -> Path:
-    if cfg.data is None:
-        return Path("runs") / cfg.baseline
-    data = cfg.data.resolve()
-    return Path("runs") / f"{cfg.baseline}-{data.parent.name if data.is_file() else data.name}"
+def _default_out(baseline: str, data: Path | None) -> Path:
+    if data is None:
+        return Path("runs") / baseline
+    data = data.resolve()
+    return Path("runs") / f"{baseline}-{data.parent.name if data.is_file() else data.name}"
 
 
-def changes_of(cfg: Train) -> dict[str, Any]:
-    """What differs from the defaults, as the file and the options have it; options win."""
+def changes_of(cfg: Training) -> dict[str, Any]:
+    """Return the configuration values of the file and of the options; options win."""
     from robocas_ms3.baselines.begin import merged
     from robocas_ms3.core.documents import load_yaml
     from robocas_ms3.core.errors import TrainingError

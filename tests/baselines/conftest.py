@@ -11,6 +11,7 @@ from made_up_dataset import made_up_dataset
 from robocas_ms3.baselines.session import train_run
 from robocas_ms3.baselines.table import BASELINES
 from robocas_ms3.cli.main import run
+from robocas_ms3.cli.train import COMMANDS, other
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -18,6 +19,7 @@ ROOT = Path(__file__).resolve().parents[2]
 @pytest.fixture
 def made_up(monkeypatch):
     monkeypatch.setitem(BASELINES.builtin, "made-up", MadeUp)
+    monkeypatch.setitem(COMMANDS, "made-up", other("made-up"))
     return MadeUp
 
 

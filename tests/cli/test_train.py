@@ -9,15 +9,21 @@ from made_up_baseline import MadeUp
 
 from robocas_ms3.baselines.table import BASELINES
 from robocas_ms3.cli.main import run
-from robocas_ms3.cli.train import Train, changes_of
+from robocas_ms3.cli.train import COMMANDS, Training, changes_of, other
 from robocas_ms3.core.errors import TrainingError
+
+
+@pytest.fixture
+def made_up(monkeypatch):
+    monkeypatch.setitem(BASELINES.builtin, "made-up", MadeUp)
+    monkeypatch.setitem(COMMANDS, "made-up", other("made-up"))
 
 
 def test_options_win_over_the_file_and_later_ones_over_earlier(tmp_path):
     file = tmp_path / "c.yaml"
     file.write_text("chunk: 4\ntrain: {steps: 10, seed: 1, ema: 0.5}\nviews: {gripper_camera: null}\n")
     told = ("chunk=5", "train.seed=2", "train.learning_rate=3e-4", "chunk=6")
-    found = changes_of(Train(config=file, set=told, steps=20, batch_size=8, seed=3))
+    found = changes_of(Training(config=file, set=told, steps=20, batch_size=8, seed=3))
     assert found == {
         "chunk": 6,
         "views": {"gripper_camera": None},
@@ -30,13 +36,13 @@ def test_options_win_over_the_file_and_later_ones_over_earlier(tmp_path):
     [("null", None), ("false", False), ("[1, 2]", [1, 2]), ("3e-4", 3e-4), ("word", "word"), ("b=c", "b=c")],
 )
 def test_a_value_is_yaml(text, value):
-    assert changes_of(Train(set=(f"a={text}",))) == {"a": value}
+    assert changes_of(Training(set=(f"a={text}",))) == {"a": value}
 
 
 @pytest.mark.parametrize("text", ["steps", "=3", "train.=3", ".a=3", "a=[1"])
 def test_what_is_no_value(text):
     with pytest.raises(TrainingError, match="--set: invalid override"):
-        changes_of(Train(set=(text,)))
+        changes_of(Training(set=(text,)))
 
 
 @pytest.mark.parametrize(
@@ -48,8 +54,7 @@ def test_what_is_no_value(text):
         ("widht: 3", "Did you mean width"),
     ],
 )
-def test_a_file_that_is_none(tmp_path, monkeypatch, capsys, content, said):
-    monkeypatch.setitem(BASELINES.builtin, "made-up", MadeUp)
+def test_a_file_that_is_none(made_up, tmp_path, capsys, content, said):
     file, data = tmp_path / "c.yaml", tmp_path / "data.h5"
     data.write_text("demonstrations")
     if content is not None:
@@ -61,8 +66,7 @@ def test_a_file_that_is_none(tmp_path, monkeypatch, capsys, content, said):
     assert not (tmp_path / "run").exists()
 
 
-def test_a_training_from_the_command_line(tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(BASELINES.builtin, "made-up", MadeUp)
+def test_a_training_from_the_command_line(made_up, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("data.h5").write_text("demonstrations")
     options = ["--steps", "8", "--batch-size", "2", "--seed", "5", "--set", "width=3", "--device", "cpu"]
