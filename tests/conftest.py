@@ -24,8 +24,8 @@ ROOT = Path(__file__).resolve().parents[1]
 PROBES = ROOT / "robocas_ms3" / "doctor" / "probes.py"
 LONGEST = {
     "tests/asset_tools/test_bad_scans.py",
-    "tests/asset_tools/test_builtin_furniture.py",
-    "tests/asset_tools/test_builtin_toys.py",
+    "tests/asset_tools/builtin/test_builtin_furniture.py",
+    "tests/asset_tools/builtin/test_builtin_toys.py",
     "tests/datasets/writing/test_render.py",
     "tests/demos/test_generate.py",
     "tests/evaluation/test_run.py",

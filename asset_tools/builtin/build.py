@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -16,6 +17,16 @@ from robocas_ms3.core.errors import AssetError
 
 NAME = "builtin"
 DESCRIPTION = "Everyday objects, furniture and a room, made of formulas"
+FORMULAS_HASH = "formulas.sha256"
+"""File of the shipped pack with the `formulas_hash` it was built from."""
+
+
+def formulas_hash() -> str:
+    """Return the SHA-256 of the code and tables of this package, which the shipped pack is built from."""
+    digest, here = hashlib.sha256(), Path(__file__).parent
+    for path in sorted(path for path in here.rglob("*") if path.suffix in (".py", ".yaml")):
+        digest.update(path.relative_to(here).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()
 
 
 def builtin_jobs(ids: Sequence[str] = ()) -> list[Job]:

@@ -168,7 +168,7 @@ def build(command: Build) -> int:
 
     try:
         with mesh_tools():
-            from asset_tools.builtin.build import DESCRIPTION, NAME, builtin_jobs
+            from asset_tools.builtin.build import DESCRIPTION, FORMULAS_HASH, NAME, builtin_jobs, formulas_hash
     except ModuleNotFoundError as error:
         if error.name != "asset_tools.builtin":
             raise
@@ -182,7 +182,10 @@ def build(command: Build) -> int:
         raise AssetError("the shipped pack is made as a whole", found="--ids without --out", fix="Pass --out FOLDER.")
     out = command.out or builtin_packs_dir() / NAME
     making = _Making(jobs=command.jobs, overwrite=True)
-    return _write(builtin_jobs(command.ids), making, out, DESCRIPTION, record=False)
+    status = _write(builtin_jobs(command.ids), making, out, DESCRIPTION, record=False)
+    if status == 0 and command.out is None:
+        (out / FORMULAS_HASH).write_text(f"{formulas_hash()}\n")
+    return status
 
 
 @contextmanager
