@@ -136,7 +136,7 @@ def test_a_damaged_trajectory(run_folder, tmp_path):
     metadata["episodes"][1]["robocas"] = {"instruction": 3, "target": whole["episodes"][1]["robocas"]["target"]}
     path.write_text(json.dumps(metadata))
     (_, row, *_) = open_source(folder).index()["episodes"]
-    assert row["damage"].startswith("its entry of the JSON: the JSON's entry is incomplete")
+    assert row["damage"].startswith("its entry of the JSON: the JSON's entry: ")
     assert (row["object"], row["seed"], row["success"], row["stages"]) == ("cube 4 (cube)", 4, False, ["grasp"])
     for spoilt in ({"episodes": 3}, {"episodes": ["x"]}, {"env_info": {"env_id": 3, "env_kwargs": 4}}, {"robocas": []}):
         path.write_text(json.dumps({**whole, **spoilt}))

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.demos.recordings.entries import Entry, read_entry, read_json
+from robocas_ms3.demos.recordings.entries import Entry, RunRecord, read_entry, read_json
 from robocas_ms3.demos.recordings.environment import read_env
 from robocas_ms3.demos.recordings.motion import Motion, gripper_commands
 from robocas_ms3.demos.recordings.stored import (
@@ -87,15 +87,16 @@ class TrajectoryFile:
         self.episodes: list[dict[str, Any]] = metadata["episodes"]
         self.env = read_env(self.env_info, metadata_path, pack=pack)
         self.robot = self.env.robot(f"{metadata_path}, env_info.env_kwargs.robot_uids")
-        if "robocas" not in metadata:
+        run = metadata.get("robocas")
+        if run is None:
             raise DatasetError(
                 "the JSON lacks the instructions and sub-goals",
                 where=metadata_path,
                 expected="key 'robocas'",
                 fix="Convert the file written by robocas generate; replays of it drop them.",
             )
-        self.control_freq = _frequency(metadata["robocas"], metadata_path)
-        self.versions: dict[str, Any] = metadata["robocas"].get("versions", {})
+        self.control_freq = float(run.get("control_freq", RunRecord().control_freq))
+        self.versions: dict[str, Any] = run.get("versions", {})
         self._file = open_trajectory(self.path)
         listed = {f"traj_{episode['episode_id']}" for episode in self.episodes}
         with readable(self.path, "this file is damaged"):
@@ -182,10 +183,3 @@ class TrajectoryFile:
     def _where(self, index: int) -> str:
         return f"{self.path}, traj_{self.episodes[index]['episode_id']}"
 
-
-def _frequency(said: Any, path: Path) -> float:
-    freq = said.get("control_freq", 20) if isinstance(said, dict) else None
-    if not isinstance(freq, int | float) or isinstance(freq, bool) or not 0 < freq < np.inf:
-        where = f"{path}, robocas.control_freq"
-        raise DatasetError("no such frequency", where=where, expected="a number > 0", found=freq)
-    return float(freq)

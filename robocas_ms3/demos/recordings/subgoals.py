@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, model_validator
 
 from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.strict import parse
 
 
 @dataclass(frozen=True)
@@ -37,35 +39,43 @@ class SubGoal:
         }
 
 
+class SubGoalRecord(BaseModel):
+    """A sub-goal in JSON; see `SubGoal.as_json`."""
+
+    model_config = ConfigDict(strict=True, extra="allow", frozen=True)
+
+    goal_type: str
+    goal_description: str
+    goal_range: Annotated[list[NonNegativeInt], Field(min_length=2, max_length=2)]
+
+    @model_validator(mode="after")
+    def _is_range(self) -> SubGoalRecord:
+        first, last = self.goal_range
+        if first > last:
+            raise ValueError(f"goal_range: expected [first, last], found {self.goal_range}")
+        return self
+
+
+class SubGoalsRecord(BaseModel):
+    """What has sub-goals in JSON."""
+
+    model_config = ConfigDict(strict=True, extra="allow", frozen=True)
+
+    subgoals: list[SubGoalRecord]
+
+    @property
+    def goals(self) -> list[SubGoal]:
+        """The sub-goals."""
+        return [SubGoal(goal.goal_type, goal.goal_description, *goal.goal_range) for goal in self.subgoals]
+
+
 def read_subgoals(entries: Any, where: object) -> list[SubGoal]:
-    """Sub-goals of their JSON, a list of `SubGoal.as_json`.
+    """Read sub-goals from their JSON, a list of `SubGoal.as_json`.
 
     Raises:
         DatasetError: they are something else.
     """
-    try:
-        goals = []
-        for entry in entries:
-            first, last = entry["goal_range"]
-            goals.append(SubGoal(entry["goal_type"], entry["goal_description"], first, last))
-        sound = all(
-            isinstance(goal.goal_type, str) and isinstance(goal.goal_description, str) and _is_range(goal)
-            for goal in goals
-        )
-    except (KeyError, TypeError, ValueError):
-        sound = False
-    if not sound:
-        raise DatasetError(
-            "these sub-goals are damaged",
-            where=where,
-            expected="goal_type, goal_range [first, last], goal_description of each",
-            found=str(entries)[:80],
-        )
-    return goals
-
-
-def _is_range(goal: SubGoal) -> bool:
-    return type(goal.first) is int and type(goal.last) is int and 0 <= goal.first <= goal.last
+    return parse(SubGoalsRecord, {"subgoals": entries}, DatasetError, where=where, about="damaged sub-goals").goals
 
 
 def sample_subgoals(subgoals: Sequence[SubGoal], samples: NDArray[np.int64]) -> list[SubGoal]:

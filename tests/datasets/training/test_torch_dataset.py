@@ -431,7 +431,7 @@ def test_missing_pieces(dataset, tmp_path):
     for change, message in (
         (dict(ep_length={"0": 7}), "episodes of unknown length.*1"),
         (dict(ep_length=[7, 7]), "this overview is damaged"),
-        (dict(step_goals={"0": [{"goal_type": 1}]}), r"step_goals\.0: these sub-goals are damaged"),
+        (dict(step_goals={"0": [{"goal_type": 1}]}), r"step_goals\.0: damaged sub-goals"),
     ):
         (dataset / "data_info.json").write_text(json.dumps({**info, **change}))
         with pytest.raises(DatasetError, match=message):
