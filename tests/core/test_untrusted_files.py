@@ -12,10 +12,11 @@ from synthetic import write_trajectory
 
 from robocas_ms3.core.documents import DocumentError
 from robocas_ms3.core.errors import RobocasError, TrainingError
+from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.provenance import recorded_scene, recording_entry
 from robocas_ms3.datasets.sources.trajectory import TrajectorySource
 from robocas_ms3.datasets.statistics.collect import collect
-from robocas_ms3.datasets.writing.plan import resumed_plan
+from robocas_ms3.datasets.writing.plan import dataset_settings, resumed_plan
 from robocas_ms3.demos.checks import check_same_run
 from robocas_ms3.demos.ledger import Ledger, count_by_stage
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
@@ -186,7 +187,7 @@ def test_the_json_of_a_trajectory(tmp_path):
 
 def test_the_settings_of_a_conversion_that_is_resumed(tmp_path):
     entry = {"trajectory": "F.h5", "trajectory_episode": 0, "seed": 3, "success": True, "recording": "ab", "source": 0}
-    settings = dict.fromkeys(("rate_hz", "cameras", "image_size", "image_format", "depth", "embeddings"))
+    settings = dataset_settings(5, Pictures(), False)
     (tmp_path / "conversion.json").write_text("{}")
     whole = {"schema_version": 2, "made_with": {}, **settings, "episodes": {"0": entry}}
     assert refused(lambda: resumed_plan(tmp_path, [entry], settings), tmp_path / "conversion.json", whole)

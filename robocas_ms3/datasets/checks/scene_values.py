@@ -1,124 +1,19 @@
-"""Values of ``scene.json`` and ``conversion.json``, declared for `robocas validate` and whoever shows damaged ones."""
+"""Checks the values of ``scene.json`` and ``conversion.json`` by their declared forms, `sources.records`."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, NonNegativeInt, PlainValidator, ValidationError
+from pydantic import BaseModel, ValidationError
 
 from robocas_ms3.core.strict import Mistake, mistakes
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.violation import Violation
-
-
-def one_seed(value: Any) -> int | None:
-    """A seed as an integer; ManiSkill writes a list of one. None where it is neither."""
-    if isinstance(value, list) and len(value) == 1:
-        value = value[0]
-    return value if type(value) is int else None
-
-
-def _seed(value: Any) -> Any:
-    if value is not None and one_seed(value) is None:
-        raise ValueError("an integer, or a list of one")
-    return value
-
-
-Rate = Annotated[FiniteFloat, Field(gt=0)]
-Pose = Annotated[list[FiniteFloat], Field(min_length=7, max_length=7)]
-
-
-class _Part(BaseModel):
-    model_config = ConfigDict(strict=True, extra="allow")  # further keys are their writer's
-
-
-class _EnvInfo(_Part):
-    env_id: str
-    env_kwargs: dict[str, Any]
-
-
-class _Layout(_Part):
-    object_ids: list[str] = []
-    poses: list[Pose] = []
-    present: list[bool] = []
-    robot_pose: Pose | None = None
-    basket_pose: Pose | None = None
-    relation: str | None = None
-
-
-class _Object(_Part):
-    slot: NonNegativeInt
-    id: str
-    name: str
-
-
-class _Target(_Part):
-    slot: NonNegativeInt
-    asset_id: str
-    name: str
-
-
-class _Source(_Part):
-    trajectory: str | None = None
-    episode_id: int | None = None
-    recording: str | None = None
-
-
-class _Recovery(_Part):
-    range: Annotated[list[int], Field(min_length=2, max_length=2)]
-    stage: str
-    reason: str
-
-
-class _Recorded(_Part):
-    instruction_template: str | None = None
-    relation: str | None = None
-    support: str | None = None
-    facts: dict[str, Any] | None = None
-    attempts: NonNegativeInt | None = None
-    recoveries: list[_Recovery] | None = None
-    seconds: dict[str, Any] | None = None
-
-
-class _Rated(_Part):
-    rate_hz: Rate
-
-
-class Settings(_Rated):
-    """``conversion.json``."""
-
-    cameras: list[str]
-    image_size: Annotated[list[int], Field(min_length=2, max_length=2)] | None
-    image_format: str
-    depth: bool
-    episodes: dict[str, dict[str, Any]] = {}
-
-
-class Scene(_Part):
-    """``scene.json``. None is what nobody knows, as of datasets made elsewhere."""
-
-    schema_version: Literal[schema.SCHEMA_VERSION]  # pyright: ignore[reportInvalidTypeForm]
-    task: str | None
-    env_info: _EnvInfo | None
-    seed: Annotated[Any, PlainValidator(_seed)]
-    reset_options: dict[str, Any] | None
-    config: dict[str, Any] | None
-    layout: _Layout | None
-    objects: list[_Object] | None
-    target: _Target | None
-    success: bool | None
-    control_mode: str | None
-    control_freq: Rate | None
-    rate_hz: Rate
-    source: _Source
-    recorded: _Recorded | None
-    versions: dict[str, Any] | None
-
+from robocas_ms3.datasets.sources.records import ConversionRecord, RateRecord, SceneRecord
 
 _UNKNOWN = {**dict.fromkeys(schema.SCENE), "schema_version": schema.SCHEMA_VERSION, "rate_hz": 1.0, "source": {}}
-# JSON's
 _WORDS = {
     "int_type": "an integer",
     "string_type": "text",
@@ -134,7 +29,7 @@ def check_values(scene: Mapping[str, Any], file: str = schema.SCENE_FILE) -> lis
         scene: its content.
         file: it is in.
     """
-    wrong = check_form(Scene, scene, file)
+    wrong = check_form(SceneRecord, scene, file)
     if wrong:
         return wrong
     layout = scene["layout"] or {}
@@ -148,12 +43,12 @@ def check_values(scene: Mapping[str, Any], file: str = schema.SCENE_FILE) -> lis
 
 def check_settings_values(settings: Mapping[str, Any]) -> list[Violation]:
     """What is wrong with the values of a ``conversion.json``."""
-    return check_form(Settings, settings, schema.CONVERSION_FILE)
+    return check_form(ConversionRecord, settings, schema.CONVERSION_FILE)
 
 
 def check_rate(content: Mapping[str, Any]) -> list[Violation]:
     """What is wrong with ``rate_hz``, which both files have."""
-    return check_form(_Rated, content, "")
+    return check_form(RateRecord, content, "")
 
 
 def sound(scene: Any, file: str = schema.SCENE_FILE) -> tuple[dict[str, Any], str]:

@@ -14,7 +14,7 @@ from robocas_ms3.core.strict import parse
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.tables import INTEGER, INTEGERS, NUMBER, NUMBERS, TEXT, TEXTS, Column, Kind
 from robocas_ms3.datasets.lerobot.variants import CHUNK_FILES, LAYOUTS
-from robocas_ms3.datasets.sources.provenance import EntryRecord
+from robocas_ms3.datasets.sources.records import EntryRecord
 from robocas_ms3.datasets.sources.tolerant import first_line
 
 MAX_EPISODES = 10**6
@@ -133,6 +133,12 @@ def read_lines(path: Path, form: type[_Line], most: int) -> list[_Line]:
     return [parse(form, found, DatasetError, where=f"{path}, line {n}") for n, found in enumerate(values, 1)]
 
 
+class SourceEntryRecord(EntryRecord):
+    """The recording of an episode, and its number in the source of the conversion."""
+
+    source: NonNegativeInt | None = None
+
+
 class ConversionRecord(_Record):
     """``meta/robocas/conversion.json``, and the plan of a conversion that was interrupted."""
 
@@ -140,8 +146,8 @@ class ConversionRecord(_Record):
     settings: dict[str, Any] = {}
     train_eps: list[NonNegativeInt] = []
     val_eps: list[NonNegativeInt] = []
-    episodes: list[EntryRecord] = []
-    left_out: list[EntryRecord] = []
+    episodes: list[SourceEntryRecord] = []
+    left_out: list[SourceEntryRecord] = []
 
 
 class CameraRecord(_Record):

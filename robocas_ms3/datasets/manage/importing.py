@@ -21,10 +21,9 @@ from robocas_ms3.datasets.manage.findings import EMBEDDINGS, EpisodeImport
 from robocas_ms3.datasets.manage.parts import schema_version
 from robocas_ms3.datasets.manage.reading import read_episode
 from robocas_ms3.datasets.manage.survey import Survey, read_info
-from robocas_ms3.datasets.sources.episode import Overview
 from robocas_ms3.datasets.sources.protocol import CameraModel
-from robocas_ms3.datasets.sources.provenance import ConversionRecord
 from robocas_ms3.datasets.sources.reader import Dataset, Episode
+from robocas_ms3.datasets.sources.records import EpisodesRecord
 from robocas_ms3.datasets.sources.tolerant import SPECS, EpisodeArrays
 from robocas_ms3.datasets.writing.episode_folder import write_cameras
 from robocas_ms3.datasets.writing.info import write_info
@@ -102,7 +101,7 @@ def import_robocas(
 def _plan(dataset: Dataset, surveyed: Survey, embedded: bool) -> dict[str, Any]:
     assert surveyed.pictures is not None
     unknown = dict.fromkeys(("trajectory", "trajectory_episode", "seed", "success", "target", "recording"))
-    parse(ConversionRecord, dataset.settings, DatasetError, where=dataset.root / schema.CONVERSION_FILE)
+    parse(EpisodesRecord, dataset.settings, DatasetError, where=dataset.root / schema.CONVERSION_FILE)
     before = dataset.settings.get("episodes", {})  # of one that is ours
     name = surveyed.root.resolve().name
     episodes = {
@@ -119,7 +118,7 @@ def _plan(dataset: Dataset, surveyed: Survey, embedded: bool) -> dict[str, Any]:
     }
 
 
-def _format(dataset: Overview) -> str:
+def _format(dataset: Dataset) -> str:
     return f"robocas v{schema_version(dataset)}"
 
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from robocas_ms3.core.documents import check_regular
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks import arrays as laws
@@ -15,12 +13,10 @@ from robocas_ms3.datasets.checks.pictures import check_cameras, check_pictures
 from robocas_ms3.datasets.checks.scene import read_settings
 from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.manage.parts import Part
-from robocas_ms3.datasets.pictures.headers import PictureHeader, read_header
+from robocas_ms3.datasets.pictures.headers import PictureHeader, has_both_ends, read_header
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.tolerant import SPECS, read_arrays
-
-_TAIL = 32  # bytes at the end of a picture that are looked at
 
 
 def check_episodes(part: Part, numbers: Iterable[int]) -> None:
@@ -73,20 +69,6 @@ def look_at_ends(path: Path) -> PictureHeader | None:
         ValueError: it is damaged or not a regular file.
         OSError: it can't be read.
     """
-    check_regular(path)
-    with path.open("rb") as file:
-        head = file.read(_TAIL)
-        size = os.fstat(file.fileno()).st_size
-        file.seek(max(0, size - _TAIL))
-        tail = file.read()
-    if not _has_ends(path.suffix, head, tail, size):
+    if not has_both_ends(path):
         read_header(path)
     return None
-
-
-def _has_ends(suffix: str, head: bytes, tail: bytes, size: int) -> bool:
-    if suffix == ".png":
-        return head.startswith(b"\x89PNG\r\n\x1a\n") and tail.endswith(b"\0\0\0\0IEND\xaeB`\x82")
-    if suffix == ".jpg":
-        return head.startswith(b"\xff\xd8\xff") and tail.endswith(b"\xff\xd9")
-    return head.startswith(b"RIFF") and head[8:12] == b"WEBP" and size == 8 + int.from_bytes(head[4:8], "little")

@@ -11,9 +11,8 @@ from typing import Any
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.strict import parse
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.sources.episode import Overview
-from robocas_ms3.datasets.sources.provenance import ConversionRecord
 from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.datasets.sources.records import ConversionRecord
 from robocas_ms3.datasets.sources.tolerant import arrays_fingerprint
 
 Sides = tuple[list[int], list[int]]
@@ -50,7 +49,7 @@ class Part:
         return mark or f"arrays {arrays_fingerprint(self.dataset.episode(number).arrays)}"
 
 
-def schema_version(dataset: Overview) -> object:
+def schema_version(dataset: Dataset) -> object:
     """Version of a dataset's schema: 0 is upstream's."""
     return dataset.settings.get("schema_version", 1) if dataset.settings else 0
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 import zlib
 from dataclasses import dataclass
@@ -10,13 +11,14 @@ from pathlib import Path
 
 from PIL import Image, UnidentifiedImageError
 
-from robocas_ms3.core.documents import DocumentError, read_bytes
+from robocas_ms3.core.documents import DocumentError, check_regular, read_bytes
 from robocas_ms3.datasets.pictures.png import SIGNATURE
 
 LARGEST = 8192
 """Pixels per side."""
 BYTES_LIMIT = 2**28
 """Of a file: the largest picture without compression has 200 MB."""
+_END = 32  # bytes
 _FORMATS = {".png": "PNG", ".jpg": "JPEG", ".webp": "WEBP"}
 _CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 
@@ -43,6 +45,25 @@ def read_header(path: Path) -> PictureHeader:
     """
     data = read_picture_bytes(path)
     return _read_png(data) if path.suffix == ".png" else _decode(data, _FORMATS[path.suffix])
+
+
+def has_both_ends(path: Path) -> bool:
+    """Return whether a picture begins and ends as its format does, which one that was cut off does not.
+
+    Raises:
+        DocumentError: not a regular file.
+        OSError: the file cannot be read.
+    """
+    check_regular(path)
+    with path.open("rb", buffering=0) as file:
+        head, size = file.read(_END), os.fstat(file.fileno()).st_size
+        file.seek(max(0, size - _END))
+        tail = file.read()
+    if path.suffix == ".png":
+        return head.startswith(SIGNATURE) and tail.endswith(b"\0\0\0\0IEND\xaeB`\x82")
+    if path.suffix == ".jpg":
+        return head.startswith(b"\xff\xd8\xff") and tail.endswith(b"\xff\xd9")
+    return head.startswith(b"RIFF") and head[8:12] == b"WEBP" and size == 8 + int.from_bytes(head[4:8], "little")
 
 
 def read_picture_bytes(path: Path) -> bytes:

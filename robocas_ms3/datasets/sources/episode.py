@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,26 +23,10 @@ from robocas_ms3.datasets.sources.protocol import SourceEpisode
 from robocas_ms3.datasets.sources.tolerant import completed, is_declared, load_arrays, read_arrays
 from robocas_ms3.demos.recordings.subgoals import SubGoal, read_subgoals
 
+if TYPE_CHECKING:
+    from robocas_ms3.datasets.sources.reader import Dataset
+
 DEFAULT_RATE = 5.0  # upstream's, Hz
-
-
-class Overview(Protocol):
-    """What an episode's dataset says, see `reader.Dataset`."""
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """``conversion.json``."""
-        ...
-
-    @property
-    def info(self) -> dict[str, Any]:
-        """``data_info.json``."""
-        ...
-
-    @property
-    def rate_hz(self) -> float:
-        """Steps a second."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -55,7 +39,7 @@ class Episode(SourceEpisode):
     """
 
     folder: Path
-    dataset: Overview | None = field(default=None, repr=False, compare=False)
+    dataset: Dataset | None = field(default=None, repr=False, compare=False)
 
     @cached_property
     def arrays(self) -> dict[str, NDArray]:

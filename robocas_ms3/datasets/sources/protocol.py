@@ -123,11 +123,11 @@ class SourceEpisode(Protocol):
 
     def rgb(self, camera: str, step: int) -> NDArray[np.uint8]:
         """(H, W, 3) RGB."""
-        ...
+        raise _no_images(self)
 
     def depth(self, camera: str, step: int) -> NDArray[np.uint16]:
         """(H, W) mm, 0 = nothing."""
-        ...
+        raise _no_images(self)
 
     def frames(
         self, camera: str, kind: Kind = "rgb", first: int = 0, count: int | None = None
@@ -155,15 +155,20 @@ class SourceEpisode(Protocol):
 
     def intrinsic(self, camera: str) -> NDArray[np.float64]:
         """(4,) fx, fy, cx, cy in pixels."""
-        ...
+        raise _no_images(self)
 
     def camera_in_parent(self, camera: str) -> NDArray[np.float64]:
         """(4, 4) OpenCV camera frame in its parent, see ``schema.CAMERAS``."""
-        ...
+        raise _no_images(self)
 
     def camera(self, name: str) -> CameraModel:
         """Return the model of a camera."""
         return CameraModel(self.intrinsic(name), self.camera_in_parent(name))
+
+
+def _no_images(episode: SourceEpisode) -> DatasetError:
+    fix = "Convert it with robocas convert."
+    return DatasetError("this episode has no images", where=episode.where, fix=fix)
 
 
 def shots(

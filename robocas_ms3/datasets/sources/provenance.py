@@ -6,40 +6,12 @@ import hashlib
 import json
 import re
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, NonNegativeInt, StringConstraints
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.demos.recordings.reading import Recording, TrajectoryFile
-
-
-class EntryRecord(BaseModel):
-    """The recording that an episode is of, in ``conversion.json``; see `recording_entry`."""
-
-    model_config = ConfigDict(strict=True, extra="allow")
-
-    trajectory: str | None = None
-    trajectory_episode: int | None = None
-    seed: int | list[int] | None = None
-    success: bool | None = None
-    recording: str | None = None
-    source: NonNegativeInt | None = None
-
-
-Number = Annotated[str, StringConstraints(pattern=r"^[0-9]{1,7}$")]
-"""An episode's, as a key of JSON."""
-
-
-class ConversionRecord(BaseModel):
-    """``conversion.json``, as far as datasets are continued, merged and divided by it."""
-
-    model_config = ConfigDict(strict=True, extra="allow")
-
-    made_with: dict[str, str] = {}
-    episodes: dict[Number, EntryRecord] = {}
-    left_out: dict[Number, EntryRecord] = {}
 
 
 def fingerprint(recording: Recording) -> str:

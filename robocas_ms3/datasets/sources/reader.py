@@ -12,14 +12,14 @@ import numpy as np
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.sources.episode import DEFAULT_RATE, Episode, Overview
+from robocas_ms3.datasets.sources.episode import DEFAULT_RATE, Episode
 from robocas_ms3.datasets.sources.files import no_dataset, read_json
 from robocas_ms3.datasets.sources.protocol import EpisodeSource, Side
 
 _SPLIT = "robocas split --in-place --val-share 0.1 makes a new one."
 
 
-class Dataset(EpisodeSource, Overview):
+class Dataset(EpisodeSource):
     """A dataset's folder.
 
     Raises:

@@ -8,7 +8,6 @@ from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.assets.pack import load_pack, pack_folders
@@ -220,26 +219,6 @@ class RecordedEpisode(SourceEpisode):
             DatasetError: it is damaged.
         """
         return self._source.recording(self._number, bodies=bodies)
-
-    def _no_pictures(self) -> DatasetError:
-        fix = "Convert it with robocas convert."
-        return DatasetError("a trajectory file holds no pictures", where=self._source.root, fix=fix)
-
-    def rgb(self, camera: str, step: int) -> NDArray[np.uint8]:
-        """Not here: raises."""
-        raise self._no_pictures()
-
-    def depth(self, camera: str, step: int) -> NDArray[np.uint16]:
-        """Not here: raises."""
-        raise self._no_pictures()
-
-    def intrinsic(self, camera: str) -> NDArray[np.float64]:
-        """Not here: raises."""
-        raise self._no_pictures()
-
-    def camera_in_parent(self, camera: str) -> NDArray[np.float64]:
-        """Not here: raises."""
-        raise self._no_pictures()
 
 
 def _attempt(file: TrajectoryFile, index: int) -> SaidOfRecording | DatasetError:

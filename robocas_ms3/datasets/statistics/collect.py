@@ -15,8 +15,8 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.words import count_of
 from robocas_ms3.datasets.actions import ACTION_ARRAYS, ACTION_NAMES
 from robocas_ms3.datasets.formats import open_source
-from robocas_ms3.datasets.sources.facts import Facts, facts_of
 from robocas_ms3.datasets.statistics.described import counted, described, histogram, rounded
+from robocas_ms3.datasets.statistics.facts import Facts, facts_of
 from robocas_ms3.datasets.statistics.layout_map import LayoutMap, layout_map
 from robocas_ms3.datasets.training.sample_arrays import checked_actions
 

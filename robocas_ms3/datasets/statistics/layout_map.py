@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.datasets.sources.facts import Facts
 from robocas_ms3.datasets.statistics.described import rounded
+from robocas_ms3.datasets.statistics.facts import Facts
 
 Array = NDArray[np.float64]
 

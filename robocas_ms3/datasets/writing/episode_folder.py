@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -15,11 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.core.documents import DAMAGED, DocumentError, check_regular, load_array, load_json
+from robocas_ms3.core.documents import DAMAGED, DocumentError, load_array, load_json
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import json_text, replacing_folder
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.drawing import Story
+from robocas_ms3.datasets.pictures.headers import has_both_ends
 from robocas_ms3.datasets.pictures.preview import Preview
 from robocas_ms3.datasets.pictures.stored import Pictures, write_picture
 from robocas_ms3.datasets.sources.arrays import with_embeddings
@@ -31,7 +31,6 @@ from robocas_ms3.datasets.writing.settings import Timing, WrittenEpisode
 
 ENCODERS = 2  # threads; ISA-L and OpenCV work outside Python's lock
 _MAX_WAITING = 24  # images, which bounds memory
-_ENDS = {".png": b"\0\0\0\0IEND\xaeB\x60\x82", ".jpg": b"\xff\xd9"}
 
 
 @dataclass(frozen=True)
@@ -192,14 +191,6 @@ def _is_readable(path: Path) -> bool:
 
 def _has_end(path: Path) -> bool:
     try:
-        check_regular(path)
-        with path.open("rb", buffering=0) as file:
-            size = file.seek(0, os.SEEK_END)
-            if path.suffix == ".webp":  # its header says how much follows
-                file.seek(4)
-                return int.from_bytes(file.read(4), "little") + 8 == size
-            end = _ENDS[path.suffix]
-            file.seek(max(0, size - len(end)))
-            return file.read() == end
+        return has_both_ends(path)
     except (OSError, DocumentError):
         return False

@@ -17,7 +17,7 @@ from robocas_ms3.core.outputs import check_same, is_taken
 from robocas_ms3.core.strict import parse
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.stored import Pictures
-from robocas_ms3.datasets.sources.provenance import ConversionRecord
+from robocas_ms3.datasets.sources.records import ConversionRecord, SettingsRecord
 from robocas_ms3.datasets.sources.split import SPLIT_RULE, split_by_seed
 from robocas_ms3.demos.recordings.seeds import one_seed
 from robocas_ms3.demos.recordings.versions import versions
@@ -25,8 +25,8 @@ from robocas_ms3.demos.recordings.versions import versions
 Entries = Sequence[dict[str, Any]]
 """What is to be converted, see `players.Player.entries`."""
 
-SETTINGS = ("rate_hz", "cameras", "image_size", "image_format", "depth", "embeddings")
-"""What all episodes of a dataset share."""
+SETTINGS = tuple(SettingsRecord.model_fields)
+"""Keys of the settings."""
 
 LEFT_OUT = "left_out"
 """Key of the episodes that could not be written, each with ``why``; a conversion that goes on tries them again."""
@@ -46,15 +46,16 @@ class Plan:
 
 
 def dataset_settings(rate_hz: float, pictures: Pictures, embeddings: bool) -> dict[str, Any]:
-    """The settings part of ``conversion.json``."""
-    return {
-        "rate_hz": float(rate_hz),
-        "cameras": list(pictures.cameras),
-        "image_size": list(pictures.size) if pictures.size else None,
-        "image_format": pictures.image_format,
-        "depth": pictures.depth,
-        "embeddings": embeddings,
-    }
+    """Return the settings of ``conversion.json``."""
+    settings = SettingsRecord(
+        rate_hz=float(rate_hz),
+        cameras=list(pictures.cameras),
+        image_size=list(pictures.size) if pictures.size else None,
+        image_format=pictures.image_format,
+        depth=pictures.depth,
+        embeddings=embeddings,
+    )
+    return settings.model_dump()
 
 
 def new_plan(entries: Entries, settings: dict[str, Any]) -> Plan:

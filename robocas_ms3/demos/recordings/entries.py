@@ -159,7 +159,7 @@ def read_reset_options(options: Any, where: object) -> dict[str, Any]:
 
 
 def _options(reset: ResetRecord | None) -> dict[str, Any]:
-    return dict(reset.options or {}) if reset else {}
+    return {**reset.options} if reset and reset.options else {}
 
 
 def read_json(trajectory: Path) -> dict[str, Any]:

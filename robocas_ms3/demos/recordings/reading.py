@@ -182,4 +182,3 @@ class TrajectoryFile:
 
     def _where(self, index: int) -> str:
         return f"{self.path}, traj_{self.episodes[index]['episode_id']}"
-

@@ -7,7 +7,8 @@ import pytest
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.dataset import validate
-from robocas_ms3.datasets.checks.scene_values import Scene, check_values, sound
+from robocas_ms3.datasets.checks.scene_values import check_values, sound
+from robocas_ms3.datasets.sources.records import SceneRecord
 from robocas_ms3.demos.recordings.seeds import one_seed
 
 FILE = "episode_0000001/scene.json"
@@ -49,7 +50,7 @@ def said(violation):
 
 
 def test_the_declared_keys_are_those_of_the_schema():
-    assert list(Scene.model_fields) == list(WHOLE) == list(schema.SCENE)
+    assert list(SceneRecord.model_fields) == list(WHOLE) == list(schema.SCENE)
 
 
 def test_what_is_whole_has_no_violations():

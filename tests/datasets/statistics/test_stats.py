@@ -12,8 +12,8 @@ from robocas_ms3.cli.stats import Stats as Command
 from robocas_ms3.cli.stats import main
 from robocas_ms3.core.errors import DatasetError, MissingExtraError
 from robocas_ms3.datasets.actions import ACTION_NAMES
-from robocas_ms3.datasets.sources.facts import Facts, Surface
 from robocas_ms3.datasets.statistics.collect import collect, described, histogram, layout_map
+from robocas_ms3.datasets.statistics.facts import Facts, Surface
 from robocas_ms3.datasets.statistics.plots import PICTURES, write_stats
 
 TABLE = Surface("table, top", x=0.9, y=1.0, yaw=-np.pi / 2, region=[[0.0, -0.1], [0.1, 0.1]])
@@ -170,6 +170,6 @@ def test_no_episodes(told):
 
 def test_without_matplotlib(made, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with pytest.raises(MissingExtraError, match=r"robocas-ms3\[plots\]"):
+    with pytest.raises(MissingExtraError, match="plots"):
         write_stats(collect(made), tmp_path / "out")
     assert not (tmp_path / "out").exists()

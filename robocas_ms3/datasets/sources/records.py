@@ -1,0 +1,139 @@
+"""Declared forms of ``conversion.json`` and ``scene.json``; writers, readers, checks and the viewer share them."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, NonNegativeInt, PlainValidator, StringConstraints
+
+from robocas_ms3.datasets import schema
+from robocas_ms3.demos.recordings.seeds import one_seed
+
+
+def _seed(value: Any) -> Any:
+    if value is not None and one_seed(value) is None:
+        raise ValueError("an integer, or a list of one")
+    return value
+
+
+Rate = Annotated[FiniteFloat, Field(gt=0)]
+EpisodeNumber = Annotated[str, StringConstraints(pattern=r"^[0-9]{1,7}$")]
+"""A key of JSON."""
+Pose = Annotated[list[FiniteFloat], Field(min_length=7, max_length=7)]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(strict=True, extra="allow")  # further keys are their writer's
+
+
+class _EnvInfo(_Part):
+    env_id: str
+    env_kwargs: dict[str, Any]
+
+
+class _Layout(_Part):
+    object_ids: list[str] = []
+    poses: list[Pose] = []
+    present: list[bool] = []
+    robot_pose: Pose | None = None
+    basket_pose: Pose | None = None
+    relation: str | None = None
+
+
+class _Object(_Part):
+    slot: NonNegativeInt
+    id: str
+    name: str
+
+
+class _Target(_Part):
+    slot: NonNegativeInt
+    asset_id: str
+    name: str
+
+
+class _Source(_Part):
+    trajectory: str | None = None
+    episode_id: int | None = None
+    recording: str | None = None
+
+
+class _Recovery(_Part):
+    range: Annotated[list[int], Field(min_length=2, max_length=2)]
+    stage: str
+    reason: str
+
+
+class _Recorded(_Part):
+    instruction_template: str | None = None
+    relation: str | None = None
+    support: str | None = None
+    facts: dict[str, Any] | None = None
+    attempts: NonNegativeInt | None = None
+    recoveries: list[_Recovery] | None = None
+    seconds: dict[str, Any] | None = None
+
+
+class RateRecord(_Part):
+    """``rate_hz``, which both files have."""
+
+    rate_hz: Rate
+
+
+class EntryRecord(_Part):
+    """The recording that an episode is of, in ``conversion.json``; see `provenance.recording_entry`."""
+
+    trajectory: str | None = None
+    trajectory_episode: int | None = None
+    seed: Annotated[Any, PlainValidator(_seed)] = None
+    success: bool | None = None
+    recording: str | None = None
+
+
+class EpisodesRecord(_Part):
+    """The episodes of ``conversion.json``, which datasets of other writers may have too.
+
+    Attributes:
+        made_with: versions of packages.
+        episodes: number -> recording.
+        left_out: number -> recording of an episode that could not be written, with ``why``.
+    """
+
+    made_with: dict[str, str] = {}
+    episodes: dict[EpisodeNumber, EntryRecord] = {}
+    left_out: dict[EpisodeNumber, EntryRecord] = {}
+
+
+class SettingsRecord(RateRecord):
+    """The settings of ``conversion.json``, which all episodes of a dataset share."""
+
+    cameras: list[str]
+    image_size: Annotated[list[int], Field(min_length=2, max_length=2)] | None
+    image_format: str
+    depth: bool
+    embeddings: bool = True
+
+
+class ConversionRecord(EpisodesRecord, SettingsRecord):
+    """``conversion.json``."""
+
+
+class SceneRecord(_Part):
+    """``scene.json``. None is what nobody knows, as of datasets made elsewhere."""
+
+    schema_version: Literal[schema.SCHEMA_VERSION]  # pyright: ignore[reportInvalidTypeForm]
+    task: str | None
+    env_info: _EnvInfo | None
+    seed: Annotated[Any, PlainValidator(_seed)]
+    reset_options: dict[str, Any] | None
+    config: dict[str, Any] | None
+    layout: _Layout | None
+    objects: list[_Object] | None
+    target: _Target | None
+    success: bool | None
+    control_mode: str | None
+    control_freq: Rate | None
+    rate_hz: Rate
+    source: _Source
+    recorded: _Recorded | None
+    versions: dict[str, Any] | None
