@@ -2,19 +2,17 @@
 
 import json
 import shutil
-from pathlib import Path
 
 import h5py
 import pytest
 
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.core.workers import WorkerPool
 from robocas_ms3.demos import generate as module
 from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings
 from robocas_ms3.demos.generate import generate
 from robocas_ms3.demos.ledger import FAILURES_FILE, Failure, Ledger
 from robocas_ms3.demos.recordings.entries import read_json
-from robocas_ms3.demos.workers import generate_seeds, shard_name
+from robocas_ms3.demos.workers import shard_name
 
 SETTINGS = EpisodeSettings("pick", "pick_table_scattered", "builtin")
 HOPELESS = 2  # a seed without an episode
@@ -176,14 +174,6 @@ def test_fewer_than_there_are(tmp_path, made):
     assert seeds_of(out) == [0, 1, 3, 4]
     assert (after.episodes, after.seeds, after.gave_up) == (before.episodes, before.seeds, before.gave_up)
     assert made == [0, 1, 2, 3, 4]
-
-
-def test_a_seed_that_takes_its_process_down_is_a_failure_of_its_own(monkeypatch):
-    """Whose fault it was is the pool's to find out: tests/core/test_workers.py."""
-    monkeypatch.setattr(WorkerPool, "map", lambda pool, seeds: (pool._on_crash(seed, "SIGSEGV") for seed in seeds))
-    (result,) = generate_seeds(SETTINGS, iter([5]), Path(), 2)
-    assert (result.seed, result.success, result.attempts) == (5, False, 1)
-    assert [(one.stage, one.reason) for one in result.failures] == [("worker", "SIGSEGV")]
 
 
 def test_an_output_folder_that_vanishes_is_one_clear_line(tmp_path, made):
