@@ -18,8 +18,9 @@ from typing import Annotated, Any
 import tyro
 import yaml
 
-from robocas_ms3.plans.plan import Plan, load_plan
-from robocas_ms3.plans.status import PartStatus, status
+from robocas_ms3.plans.load import load_plan
+from robocas_ms3.plans.plan import Plan
+from robocas_ms3.plans.status import PartStatus, read_status
 
 
 @dataclass
@@ -47,7 +48,7 @@ def main(cfg: Benchmark) -> None:
         command = [sys.executable, "-W", "ignore", "robocas_cli.py", "plan", "run", str(path), "--out", str(out)]
         begun = time.monotonic()
         subprocess.run([*command, "--jobs", str(cfg.jobs)], check=True, stdout=subprocess.DEVNULL)
-        print(json.dumps(report(plan, cfg, status(out).parts, time.monotonic() - begun), indent=2))
+        print(json.dumps(report(plan, cfg, read_status(out).parts, time.monotonic() - begun), indent=2))
 
 
 def sample_of(plan: Plan, cfg: Benchmark) -> dict[str, Any]:

@@ -9,7 +9,6 @@ import json
 import os
 import tempfile
 import time
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,12 +17,13 @@ from typing import Any
 import numpy as np
 import tyro
 
-from robocas_ms3.core.errors import PlanError
-from robocas_ms3.plans.engines.local import LocalEngine
+from robocas_ms3.plans.executors import Setting
+from robocas_ms3.plans.executors.local import LocalExecutor
 from robocas_ms3.plans.plan import PartConfig, Plan
-from robocas_ms3.plans.run import run_plan
-from robocas_ms3.plans.slot import Stages
-from robocas_ms3.plans.units import Task, Unit, outcomes
+from robocas_ms3.plans.progress import Shard
+from robocas_ms3.plans.run import run_shard
+from robocas_ms3.plans.units import SeedFiles, Unit
+from robocas_ms3.plans.worker import UnitWorker
 
 
 @dataclass
@@ -44,7 +44,7 @@ class Wait:
 
     seconds: float
 
-    def run(self, task: Task) -> dict[str, Any]:
+    def run(self, files: SeedFiles) -> dict[str, Any]:
         """Do nothing for a while."""
         time.sleep(self.seconds)
         return {"success": True, "steps": 1}
@@ -58,15 +58,6 @@ def wait(seconds: float, plan: Plan) -> Wait:
     return Wait(seconds)
 
 
-class AllDoneError(Exception):
-    """There is nothing to join."""
-
-
-def stop(stage: str) -> None:
-    """End the run where it would join."""
-    raise AllDoneError(stage)
-
-
 def main(cfg: Benchmark) -> None:
     """Run it."""
     plan = Plan.model_validate(
@@ -77,20 +68,15 @@ def main(cfg: Benchmark) -> None:
         },
         strict=False,
     )
-    stage = partial(wait, cfg.seconds)
+    record = partial(wait, cfg.seconds)
     with tempfile.TemporaryDirectory() as folder:
         out, begun = Path(folder) / "out", time.time()
         cpu = time.process_time()
-        with suppress(AllDoneError, PlanError):  # there is nothing to join
-            run_plan(
-                plan,
-                out,
-                lambda plan, out: LocalEngine(plan, out, cfg.workers, stages=Stages(stage, stage)),
-                on_stage=stop,
-            )
+        setting = Setting(plan, out, cfg.workers, open_worker=partial(UnitWorker, record=record))
+        run_shard(plan, out, lambda: LocalExecutor(setting), Shard())
         cpu = time.process_time() - cpu
         units = [Unit(0, block) for block in range(cfg.units)]
-        at = np.sort([one.at for unit in units for one in outcomes(unit.folder(plan, out)).values()])
+        at = np.sort([one.at for unit in units for one in unit.outcomes(plan, out) or ()])
     # from when every worker has begun until the first has nothing left to do
     first, last = 2 * cfg.workers, cfg.units - cfg.workers
     rate = (last - first) / (at[last] - at[first])

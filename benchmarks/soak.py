@@ -22,8 +22,10 @@ import psutil
 import tyro
 import yaml
 
-from robocas_ms3.plans.status import status
-from robocas_ms3.plans.units import DEATHS, Outcome, ledger, outcomes
+from robocas_ms3.plans.folder import read_plan
+from robocas_ms3.plans.progress import Progress
+from robocas_ms3.plans.status import read_status
+from robocas_ms3.plans.units import Outcome
 
 LOOK = 5.0  # s between two looks at memory
 
@@ -107,12 +109,12 @@ def watch(process: subprocess.Popen[bytes], until: float) -> dict[int, Memory]:
 
 def report(cfg: Benchmark, out: Path, wall: float, ctrl_c: float, memory: dict[int, Memory]) -> dict[str, Any]:
     """The figures."""
+    plan = read_plan(out)
+    progress = Progress(plan, out)
     found: dict[str, list[Outcome]] = defaultdict(list)
-    doubled = 0
-    for folder in sorted((out / "units").glob("*/*")):
-        made = list(outcomes(folder).values())
-        doubled += len(ledger(folder).read()) - len(made)
-        found[folder.parent.name.split("-")[0]] += made
+    for part, partial in progress.partial().items():
+        done = progress.parts[part].done.values()
+        found[plan.name_of(part).split("-")[0]] += [*(outcome for unit in done for outcome in unit), *partial]
     good = {task: [one for one in made if one.success] for task, made in found.items()}
     cpu = {
         task: sum(one.record_seconds + one.render_seconds for one in made) / max(1, len(good[task]))
@@ -125,7 +127,7 @@ def report(cfg: Benchmark, out: Path, wall: float, ctrl_c: float, memory: dict[i
         "episodes": {task: len(made) for task, made in good.items()},
         "seeds": {task: len(made) for task, made in found.items()},
         "episodes_an_hour": round(3600 * episodes / wall, 1),
-        "episodes_an_hour_lately": status(out).episodes_an_hour,
+        "episodes_an_hour_lately": read_status(out).episodes_an_hour,
         "cpu_seconds_an_episode": {task: round(seconds, 2) for task, seconds in cpu.items()},
         "wall_seconds_times_jobs_an_episode": round(wall * cfg.jobs / max(1, episodes), 2),
         "steps_an_episode": {
@@ -134,8 +136,7 @@ def report(cfg: Benchmark, out: Path, wall: float, ctrl_c: float, memory: dict[i
         "megabytes_an_episode": {
             task: round(sum(one.size for one in made) / 1e6 / max(1, len(made)), 2) for task, made in good.items()
         },
-        "deaths": sum(len(path.read_text().splitlines()) for path in out.rglob(DEATHS)),
-        "doubled": doubled,
+        "deaths": sum(len(one.deaths) for made in found.values() for one in made),
         "ctrl_c_seconds": round(ctrl_c, 2),
         "processes": [growth(one, episodes / cfg.jobs / wall) for one in memory.values() if len(one.at) * LOOK > 60],
     }

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Slurm on this machine alone: a cluster of one node with all its cores, to try `robocas plan run --on slurm`.
+# Slurm on this machine alone: a cluster of one node with all its cores, to try `robocas plan run --executor slurm`.
 #
 #     scripts/slurm_here.sh           installs (Debian, Ubuntu) and starts munge, slurmctld and slurmd; needs root
 #     scripts/slurm_here.sh status    says what runs; ends with 0 if Slurm answers

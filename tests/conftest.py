@@ -31,7 +31,7 @@ LONGEST = {
     "tests/evaluation/test_run.py",
     "tests/evaluation/test_weld.py",
     "tests/examples/test_examples.py",
-    "tests/plans/test_run_plan.py",
+    "tests/plans/test_run.py",
     "tests/tasks/test_registry.py",
     "tests/tasks/vector/test_processes.py",
     "tests/tasks/vector/test_same_episodes.py",

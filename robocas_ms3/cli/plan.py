@@ -1,10 +1,13 @@
-"""``robocas plan run | status | list``: datasets of any size, from a plan."""
+"""``robocas plan run | join | status | list``: datasets of any size, from a plan."""
 
 from __future__ import annotations
 
+import json
+import os
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -14,40 +17,51 @@ from robocas_ms3.core.words import count_of
 
 @dataclass
 class Run:
-    """Make the dataset that a plan says: record, render, join. docs/scale.md.
+    """Make the dataset of a plan, or continue: record, render, join. docs/scale.md.
 
-    What is there is kept, and Ctrl-C or a crash loses no episode: the same command with --resume goes on.
+    Ctrl-C or a crash loses no finished episode: the same command continues.
     """
 
     plan: Annotated[str, tyro.conf.Positional]
-    """Name of a shipped plan (`robocas plan list`), or a YAML file."""
+    """Name of a bundled plan (`robocas plan list`), or a YAML file."""
     out: Path
-    """Folder of everything the plan makes."""
-    on: Literal["local", "slurm", "ray"] = "local"
-    """Where the work is done: on this machine, by jobs of Slurm, by a Ray cluster."""
+    """Output folder."""
+    executor: Literal["local", "slurm", "ray"] = "local"
+    """What does the work: this machine, jobs of Slurm, or tasks of Ray."""
     jobs: Maybe[int] = None
-    """How many episodes are made at once. Default: one for each CPU core of this machine."""
+    """How many episodes are made at once. Default: one per CPU core of this machine."""
     executor_option: Repeated[str] = ()
     """Set an option of Slurm or Ray, such as `--executor-option partition=cpu`; repeatable (docs/scale.md)."""
-    resume: bool = False
-    """Go on with a plan that was begun."""
+    shard: Maybe[str] = None
+    """K/N: do only every N-th work unit, from the K-th on (K = 0 ... N - 1), and do not join. All shards may run at
+    the same time, on machines that see the folder; `robocas plan join` then joins."""
     overwrite: bool = False
     """Replace the output folder if it exists."""
 
 
 @dataclass
-class Status:
-    """Say how far a plan is, from any machine that sees its folder."""
+class Join:
+    """Join the episodes of a plan whose work units are done, as by `robocas plan run --shard`."""
 
     out: Annotated[Path, tyro.conf.Positional]
-    """The folder."""
+    """Output folder of the plan."""
+    jobs: Maybe[int] = None
+    """Processes that make the LeRobot dataset. Default: one per CPU core."""
+
+
+@dataclass
+class Status:
+    """Print the status of a plan, from any machine that sees its folder."""
+
+    out: Annotated[Path, tyro.conf.Positional]
+    """Output folder of the plan."""
     json: bool = False
     """As JSON."""
 
 
 @dataclass
 class List:
-    """List the shipped plans."""
+    """List the bundled plans."""
 
 
 @dataclass
@@ -56,6 +70,7 @@ class Plan:
 
     command: (
         Annotated[Run, tyro.conf.subcommand("run")]
+        | Annotated[Join, tyro.conf.subcommand("join")]
         | Annotated[Status, tyro.conf.subcommand("status")]
         | Annotated[List, tyro.conf.subcommand("list")]
     )
@@ -68,11 +83,69 @@ def main(cfg: Plan) -> int:
         try:
             return run(cfg.command)
         except KeyboardInterrupt:
-            raise KeyboardInterrupt("the same command with --resume goes on") from None
+            raise KeyboardInterrupt("the same command continues") from None
+    if isinstance(cfg.command, Join):
+        return join(cfg.command)
     if isinstance(cfg.command, Status):
         return show_status(cfg.command)
+    return list_plans()
+
+
+def run(command: Run) -> int:
+    """Run ``run``."""
+    from robocas_ms3.cli.plan_progress import PlanProgress
     from robocas_ms3.cli.terminal import say
-    from robocas_ms3.plans.plan import load_plan, shipped_plans
+    from robocas_ms3.core.errors import PlanError
+    from robocas_ms3.core.strict import check_number
+    from robocas_ms3.plans.executors import Setting, check_executor, open_executor
+    from robocas_ms3.plans.load import load_plan
+    from robocas_ms3.plans.progress import Shard
+    from robocas_ms3.plans.run import Callbacks, run_plan, run_shard
+
+    jobs = command.jobs if command.jobs is not None else os.cpu_count() or 1
+    check_number("jobs", jobs, 1)
+    shard = Shard.parse(command.shard) if command.shard is not None else None
+    if shard and (command.overwrite or command.executor != "local"):
+        found = "--overwrite" if command.overwrite else f"--executor {command.executor}"
+        raise PlanError("a shard continues in its folder, on this machine", where="--shard", found=found)
+    options = dict(_option(word) for word in command.executor_option)
+    plan = load_plan(command.plan)
+    check_executor(command.executor, options)
+    if command.executor == "local" and plan.makes_datasets:
+        from robocas_ms3.datasets.writing.render import require_renderer
+
+        require_renderer()
+    setting = Setting(plan, command.out, jobs, options)
+    opened = partial(open_executor, command.executor, setting)
+    with PlanProgress(plan) as progress:
+        callbacks = Callbacks(progress.show, progress.note)
+        if shard:
+            complete = run_shard(plan, command.out, opened, shard, callbacks)
+        else:
+            overwrite = command.overwrite
+            report = run_plan(plan, command.out, opened, jobs=jobs, overwrite=overwrite, callbacks=callbacks)
+    if shard:
+        then = f"robocas plan join {command.out} joins all" if complete else "other work units are missing"
+        say(f"{command.out}: the work units of shard {command.shard} are done; {then}")
+    else:
+        _say_products(command.out, report)
+    return 0
+
+
+def join(command: Join) -> int:
+    """Run ``join``."""
+    from robocas_ms3.cli.terminal import tell
+    from robocas_ms3.plans.run import join_plan
+
+    jobs = command.jobs if command.jobs is not None else os.cpu_count() or 1
+    _say_products(command.out, join_plan(command.out, jobs=jobs, say=tell))
+    return 0
+
+
+def list_plans() -> int:
+    """Run ``list``."""
+    from robocas_ms3.cli.terminal import say
+    from robocas_ms3.plans.load import load_plan, shipped_plans
 
     for name in shipped_plans():
         plan = load_plan(name)
@@ -80,63 +153,15 @@ def main(cfg: Plan) -> int:
     return 0
 
 
-def run(command: Run) -> int:
-    """Run ``run``."""
-    import os
-
-    from robocas_ms3.cli.plan_progress import PlanProgress
-    from robocas_ms3.cli.terminal import say
-    from robocas_ms3.demos.checks import check_number
-    from robocas_ms3.plans.engines import check_engine, open_engine
-    from robocas_ms3.plans.plan import load_plan
-    from robocas_ms3.plans.run import run_plan
-    from robocas_ms3.plans.units import REPORT
-
-    jobs = command.jobs if command.jobs is not None else os.cpu_count() or 1
-    check_number("jobs", jobs, 1)
-    options = dict(_option(word) for word in command.executor_option)
-    plan = load_plan(command.plan)
-    check_engine(command.on, options)
-    if command.on == "local" and plan.makes_datasets:
-        from robocas_ms3.datasets.writing.render import require_renderer
-
-        require_renderer()
-    with PlanProgress(plan, command.out) as progress:
-        report = run_plan(
-            plan,
-            command.out,
-            lambda plan, out: open_engine(command.on, plan, out, jobs, options),
-            resume=command.resume,
-            overwrite=command.overwrite,
-            jobs=jobs,
-            on_progress=progress.at,
-            on_stage=progress.note,
-        )
-    made = [str(path.relative_to(command.out)) for path in sorted(command.out.glob("d[ae]*s/*"))]
-    say(f"{command.out}: {count_of(report['episodes'], 'episode')}; {', '.join([*made, REPORT])}")
-    return 0
-
-
-def _option(word: str) -> tuple[str, str]:
-    from robocas_ms3.core.errors import PlanError
-
-    name, sign, value = word.partition("=")
-    if not (name and sign):
-        raise PlanError("invalid option", where="--executor-option", expected="NAME=VALUE", found=word)
-    return name, value
-
-
 def show_status(command: Status) -> int:
     """Run ``status``."""
-    import json
-
     from rich.markup import escape
     from rich.table import Table
 
     from robocas_ms3.cli.terminal import say, say_lines, table_console
-    from robocas_ms3.plans.status import status
+    from robocas_ms3.plans.status import read_status
 
-    found = status(command.out)
+    found = read_status(command.out)
     if command.json:
         say_lines(json.dumps(found.as_json(), indent=2))
         return 0
@@ -147,7 +172,7 @@ def show_status(command: Status) -> int:
             part.name,
             f"{part.done} of {part.wanted}",
             str(part.tried),
-            escape(failed),  # a reason may be anything
+            escape(failed),  # a reason may be any text
             f"{part.record_seconds:.1f}",
             f"{part.render_seconds:.1f}",
             f"{part.bytes / 1e6:.0f}",
@@ -155,11 +180,25 @@ def show_status(command: Status) -> int:
     table_console().print(table)
     if found.finished:
         say("finished")
-        return 0
-    if found.seconds_left is not None:
+    elif found.seconds_left is not None:
         left, idle = found.seconds_left / 60, found.idle_seconds or 0.0
         rate = count_of(round(found.episodes_an_hour), "episode")
-        say(f"{rate} an hour, {left:.0f} min left; the last {idle:.0f} s ago")
-    joins = ", and joins" * all(part.done == part.wanted for part in found.parts)
-    say(f"{found.at_work} is at it{joins}" if found.at_work else "nobody is at it; --resume goes on")
+        say(f"{rate} per hour, {left:.0f} min left; the last one {idle:.0f} s ago")
     return 0
+
+
+def _say_products(out: Path, report: dict[str, Any]) -> None:
+    from robocas_ms3.cli.terminal import say
+    from robocas_ms3.plans.folder import REPORT
+
+    made = [str(path.relative_to(out)) for path in sorted(out.glob("d[ae]*s/*"))]
+    say(f"{out}: {count_of(report['episodes'], 'episode')}; {', '.join([*made, REPORT])}")
+
+
+def _option(word: str) -> tuple[str, str]:
+    from robocas_ms3.core.errors import PlanError
+
+    name, sign, value = word.partition("=")
+    if not (name and sign):
+        raise PlanError("invalid option", where="--executor-option", expected="NAME=VALUE", found=word)
+    return name, value

@@ -129,7 +129,9 @@ class OutputFolder:
         if self.recorded is None:
             return
         now = json.loads(json_text(settings, self.path))
-        changes = [change for key, value in now.items() for change in _changes(self.recorded.get(key), value, key)]
+        changes = [
+            change for key, value in now.items() for change in setting_changes(self.recorded.get(key), value, key)
+        ]
         if changes:
             more = len(changes) - _SHOWN_CHANGES
             found = "; ".join(changes[:_SHOWN_CHANGES]) + (f"; {more} more" if more > 0 else "")
@@ -274,14 +276,14 @@ def sweep(folder: Path) -> None:
             remove(leftover)
 
 
-def _changes(before: Any, now: Any, path: str) -> list[str]:
+def setting_changes(before: Any, now: Any, path: str) -> list[str]:
     """Return ``path: before -> now`` for each value that differs."""
     if isinstance(before, dict) and isinstance(now, dict):
         keys = dict.fromkeys([*before, *now])
-        return [change for key in keys for change in _changes(before.get(key), now.get(key), f"{path}.{key}")]
+        return [change for key in keys for change in setting_changes(before.get(key), now.get(key), f"{path}.{key}")]
     if isinstance(before, list) and isinstance(now, list) and len(before) == len(now):
         pairs = enumerate(zip(before, now, strict=True))
-        return [change for index, (old, new) in pairs for change in _changes(old, new, f"{path}.{index}")]
+        return [change for index, (old, new) in pairs for change in setting_changes(old, new, f"{path}.{index}")]
     return [] if before == now else [f"{path}: {_shortened(before)} -> {_shortened(now)}"]
 
 

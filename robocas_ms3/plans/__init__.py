@@ -1,1 +1,4 @@
-"""Datasets of any size from a plan: what they are made of, done in units by any engine, and joined."""
+"""Datasets of any size from a plan: work units that any executor does, joined into one dataset.
+
+`load.py` reads a plan, `run.py` has its work units done by one of `executors/`, `join.py` joins their episodes.
+"""

@@ -1,4 +1,4 @@
-"""Joins what the units made: layouts and demonstrations part by part, and datasets of all of them."""
+"""Joins the episodes of work units: layouts and demonstrations by part, and datasets of all parts."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,45 +25,47 @@ from robocas_ms3.datasets.writing.plan import dataset_settings, header
 from robocas_ms3.demos.recordings.entries import reason
 from robocas_ms3.demos.recordings.merging import damage_of, merge
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
+from robocas_ms3.plans.folder import REPORT, UNITS
 from robocas_ms3.plans.plan import Plan
-from robocas_ms3.plans.sides import rule_of, sides_of
-from robocas_ms3.plans.units import EPISODES, REPORT, UNITS, Outcome, Task, Unit
+from robocas_ms3.plans.split import rule_of, split_of
+from robocas_ms3.plans.units import Outcome, SeedFiles, Unit
 from robocas_ms3.scenes.frozen import join_frozen
 
 LAYOUTS, DEMOS, DATASETS, STATISTICS = "layouts", "demos", "datasets", "statistics"
 TRAJECTORY = "trajectory.h5"
 Chosen = Mapping[int, Sequence[tuple[Unit, Outcome]]]
 """Part -> its episodes, in the order of their seeds."""
-Tasks = Mapping[int, Sequence[Task]]
-Say = Callable[[str], None]
+EpisodeFiles = Mapping[int, Sequence[SeedFiles]]
 
 
-def join(plan: Plan, out: Path, chosen: Chosen, *, jobs: int, say: Say) -> dict[str, Any]:
-    """Join everything; killed at any moment, it goes on and ends the same.
+def join(
+    plan: Plan, out: Path, chosen: Chosen, *, jobs: int = 1, say: Callable[[str], None] = lambda text: None
+) -> dict[str, Any]:
+    """Join all episodes; after a kill at any moment, another call continues and makes the same.
 
-    What was made by units is deleted once what was joined of it is on the disk, and holds what it must.
+    Files of units are deleted once the joined files are on the disk and complete.
 
     Args:
-        plan: it.
+        plan: the plan.
         out: its folder.
         chosen: the episodes.
-        jobs: processes, of this machine no more than it has cores.
-        say: called with what is done.
+        jobs: processes that make the LeRobot dataset, at most one per core.
+        say: called with each stage.
 
     Returns:
-        The report.
+        The content of ``report.json``.
 
     Raises:
-        PlanError: what was joined is damaged, and what it was joined from is gone; or the disk does not keep it.
+        PlanError: a joined file is damaged, and the files of units are gone; or the disk does not keep it.
     """
     report = _report(plan, chosen)
-    tasks = {
-        number: [Task(number, outcome.seed, unit.folder(plan, out)) for unit, outcome in episodes]
-        for number, episodes in chosen.items()
+    files = {
+        part: [unit.files(plan, out, outcome.seed) for unit, outcome in episodes] for part, episodes in chosen.items()
     }
     finished = _is_written(out / REPORT, report)
     if not finished or _left(out):
-        _join_units(plan, out, tasks, say)
+        for joined in _joined_files(plan, out, files):
+            joined.write(say)
     if not finished:
         if plan.makes_datasets and "lerobot" in plan.formats:
             say("making the LeRobot dataset")
@@ -75,145 +77,150 @@ def join(plan: Plan, out: Path, chosen: Chosen, *, jobs: int, say: Say) -> dict[
     if not finished:
         write_json(out / REPORT, report, sync=True)
     for path in _left(out):
-        shutil.rmtree(path) if path.is_dir() else path.unlink()  # they are joined, or more than were asked for
+        shutil.rmtree(path)  # joined, more than the plan asks for, or left behind by a process that was killed
     return report
 
 
-def has_begun(out: Path) -> bool:
-    """Whether files of units have been moved already."""
+def has_moved(out: Path) -> bool:
+    """Whether files of units may have been moved or deleted already."""
     return (out / DATASETS).exists() or (out / DEMOS).exists() or (out / REPORT).is_file()
 
 
+def damaged_episodes(plan: Plan, out: Path, chosen: Chosen) -> dict[Unit, list[int]]:
+    """Return seeds whose files have lost their size, as a disk with errors may do."""
+    found: dict[Unit, list[int]] = {}
+    for unit, outcome in (episode for episodes in chosen.values() for episode in episodes):
+        if unit.files(plan, out, outcome.seed).size() != outcome.size:
+            found.setdefault(unit, []).append(outcome.seed)
+    return found
+
+
+@dataclass(frozen=True)
+class _Joined:
+    """A file or folder that is joined from others.
+
+    Attributes:
+        path: of it.
+        sources: files that it is joined from, as far as they are not joined yet.
+        damage: returns what is wrong with it; empty: nothing.
+        join: writes it.
+        stage: for the user.
+    """
+
+    path: Path
+    sources: Iterable[Path]
+    damage: Callable[[], str]
+    join: Callable[[], None]
+    stage: str
+
+    def write(self, say: Callable[[str], None]) -> None:
+        """Join it, unless it is complete.
+
+        Raises:
+            PlanError: it is damaged and a source is gone, or it is damaged right after it was written.
+        """
+        if not (found := self.damage()):
+            return
+        if gone := next((source for source in self.sources if not source.exists()), None):
+            found = f"{found}; {gone.parent.name}/{gone.name} is gone"
+            fix = "Restore either from a copy, or start again with --overwrite."
+            raise PlanError("this is damaged, and can't be joined again", where=self.path, found=found, fix=fix)
+        say(self.stage)
+        self.join()
+        if found := self.damage():
+            fix = "Check the disk; then run the command again."
+            raise PlanError("this is not what was written", where=self.path, found=found, fix=fix)
+
+
+def _joined_files(plan: Plan, out: Path, files: EpisodeFiles) -> Iterator[_Joined]:
+    for part, episodes in files.items() if plan.makes_layouts else ():
+        path, layouts = out / LAYOUTS / f"{plan.name_of(part)}.npy", [each.layout for each in episodes]
+        sweep(make_folder(path.parent))
+        damage = partial(_layouts_damage, path, [each.seed for each in episodes])
+        join_layouts = partial(join_frozen, path, layouts)
+        yield _Joined(path, layouts, damage, join_layouts, f"joining layouts, {plan.name_of(part)}")
+    if plan.makes_datasets:
+        root, count = out / DATASETS / "robocas", sum(map(len, files.values()))
+        damage = partial(_dataset_damage, root, count)
+        join_dataset = partial(_join_dataset, plan, root, files)
+        yield _Joined(root, _dataset_sources(plan, root, files), damage, join_dataset, "joining the dataset")
+    for part, episodes in files.items() if plan.makes_demonstrations else ():
+        path, recordings = out / DEMOS / plan.name_of(part) / TRAJECTORY, [each.recording for each in episodes]
+        sweep(make_folder(path.parent))
+        damage = partial(damage_of, path, [each.seed for each in episodes])
+        join_demos = partial(merge, recordings, path)
+        yield _Joined(path, recordings, damage, join_demos, f"joining demonstrations, {plan.name_of(part)}")
+
+
 def _is_written(path: Path, report: Mapping[str, Any]) -> bool:
-    """Whether the report is there; one that is damaged is written again."""
+    """Whether the report is written; a damaged one is written again."""
     with suppress(OSError, ValueError):
         return load_json(path) == report
     return False
 
 
 def _left(out: Path) -> list[Path]:
-    """What units made and nobody has deleted."""
-    return [*(out / UNITS).glob("*/*/seed_*"), *(out / UNITS).glob(f"*/*/{EPISODES}")]
+    """Return folders of seeds, and temporary ones of processes that were killed."""
+    return [path for path in (out / UNITS).glob("*/*/*") if path.is_dir()]
 
 
-def _join_units(plan: Plan, out: Path, tasks: Tasks, say: Say) -> None:
-    """Join what units made, where that is not done."""
-    for number, made in tasks.items() if plan.makes_layouts else ():
-        path, sources = out / LAYOUTS / f"{plan.parts[number].name}.npy", [task.layout for task in made]
-        sweep(make_folder(path.parent))
-        _join_once(
-            path,
-            sources,
-            partial(_damage_of_layouts, path, [task.seed for task in made]),
-            partial(join_frozen, path, sources),
-            partial(say, f"joining layouts, {plan.parts[number].name}"),
-        )
-    if plan.makes_datasets:
-        robocas = out / DATASETS / "robocas"
-        _join_once(
-            robocas,
-            _needed(plan, robocas, tasks),
-            partial(_damage_of_dataset, robocas, sum(map(len, tasks.values()))),
-            partial(_join_episodes, plan, robocas, tasks),
-            partial(say, "joining the dataset"),
-        )
-    for number, recorded in tasks.items() if plan.makes_demonstrations else ():
-        path, sources = out / DEMOS / f"{plan.parts[number].name}" / TRAJECTORY, [task.recording for task in recorded]
-        sweep(make_folder(path.parent))
-        _join_once(
-            path,
-            sources,
-            partial(damage_of, path, [task.seed for task in recorded]),
-            partial(merge, sources, path),
-            partial(say, f"joining demonstrations, {plan.parts[number].name}"),
-        )
-
-
-def _join_once(
-    path: Path, sources: Iterable[Path], damage: Callable[[], str], join: Callable[[], None], say: Callable[[], None]
-) -> None:
-    """Join some files, unless that is done and nothing is wrong with it.
-
-    Args:
-        path: of what is made of them.
-        sources: the files.
-        damage: says what is wrong with it, if anything.
-        join: makes it.
-        say: that it is made.
-
-    Raises:
-        PlanError: it is damaged and some of the files are gone, or it is not what it should be right after it was made.
-    """
-    if not (found := damage()):
-        return
-    if gone := next((source for source in sources if not source.exists()), None):
-        found, fix = f"{found}; {gone.name} is gone", "Put either back from a copy, or begin again with --overwrite."
-        raise PlanError("this is not whole, and can't be joined again", where=path, found=found, fix=fix)
-    say()
-    join()
-    if found := damage():
-        raise PlanError("this is not what was written", where=path, found=found, fix="Look at the disk; then --resume.")
-
-
-def _damage_of_layouts(path: Path, seeds: Sequence[int]) -> str:
+def _layouts_damage(path: Path, seeds: Sequence[int]) -> str:
     try:
         found = load_array(path)["seed"].tolist()
     except (*DAMAGED, IndexError, KeyError, TypeError) as error:
-        return _said(error)
+        return _reason(error)
     return "" if found == list(seeds) else f"{len(found)} layouts, of other seeds"
 
 
-def _damage_of_dataset(root: Path, count: int) -> str:
+def _dataset_damage(root: Path, count: int) -> str:
     try:
         load_json(root / schema.DATA_INFO_FILE)
-        said = len(load_json(root / schema.CONVERSION_FILE)["episodes"])
-        there = set(os.listdir(root))
+        listed = len(load_json(root / schema.CONVERSION_FILE)["episodes"])
+        names = set(os.listdir(root))
     except (OSError, ValueError, KeyError, TypeError) as error:
-        return _said(error)
-    missing = sorted({schema.episode_folder(number) for number in range(count)} - there)
-    return f"no {missing[0]}" if missing else "" if said == count else f"{said} of {count_of(count, 'episode')}"
+        return _reason(error)
+    missing = sorted({schema.episode_folder(number) for number in range(count)} - names)
+    return f"no {missing[0]}" if missing else "" if listed == count else f"{listed} of {count_of(count, 'episode')}"
 
 
-def _said(error: Exception) -> str:
-    return "it is not there" if isinstance(error, FileNotFoundError) else reason(error)
+def _reason(error: Exception) -> str:
+    return "it does not exist" if isinstance(error, FileNotFoundError) else reason(error)
 
 
-def _needed(plan: Plan, robocas: Path, tasks: Tasks) -> Iterator[Path]:
-    """What a dataset is made of, as far as it is not there yet."""
-    for part, recorded in tasks.items():
-        for place, task in enumerate(recorded):
-            yield task.recording
-            if not (robocas / schema.episode_folder(plan.first_episode(part) + place)).is_dir():
-                yield task.episode
+def _dataset_sources(plan: Plan, root: Path, files: EpisodeFiles) -> Iterator[Path]:
+    for part, episodes in files.items():
+        for place, each in enumerate(episodes):
+            yield each.recording
+            if not (root / schema.episode_folder(plan.first_episode(part) + place)).is_dir():
+                yield each.episode
 
 
-def _join_episodes(plan: Plan, out: Path, tasks: Tasks) -> None:
+def _join_dataset(plan: Plan, root: Path, files: EpisodeFiles) -> None:
     """Move the rendered episodes into one dataset, numbered part by part."""
-    sweep(make_folder(out))
+    sweep(make_folder(root))
     entries: dict[str, Any] = {}
-    for part, recorded in tasks.items():
-        name = plan.parts[part].name
-        for place, task in enumerate(recorded):
+    for part, episodes in files.items():
+        trajectory = {"trajectory": f"{DEMOS}/{plan.name_of(part)}/{TRAJECTORY}"}  # that of the unit is deleted
+        for place, each in enumerate(episodes):
             number = plan.first_episode(part) + place
-            joined = {"trajectory": f"{DEMOS}/{name}/{TRAJECTORY}"}  # not the file that goes once it is joined
-            folder = out / schema.episode_folder(number)
+            folder = root / schema.episode_folder(number)
             if not folder.is_dir():
-                _say_source(task.episode / schema.SCENE_FILE, {**joined, "episode_id": place})
-                os.replace(task.episode, folder)
-            with TrajectoryFile(task.recording, pack=plan.parts[part].pack) as file:
+                _set_source(each.episode / schema.SCENE_FILE, {**trajectory, "episode_id": place})
+                os.replace(each.episode, folder)
+            with TrajectoryFile(each.recording, pack=plan.parts[part].pack) as file:
                 entry = recording_entry(file, 0)
-            entries[str(number)] = {**entry, **joined, "trajectory_episode": place}
+            entries[str(number)] = {**entry, **trajectory, "trajectory_episode": place}
     settings = dataset_settings(plan.rate, plan.pictures.chosen(), plan.embeddings)
-    write_json(out / schema.CONVERSION_FILE, {**header(settings, rule_of(plan)), "episodes": entries}, sync=True)
-    flush_to_disk(out)  # what was moved, before there is what says that all of it was
-    write_info(out, sides_of(plan, out))
+    write_json(root / schema.CONVERSION_FILE, {**header(settings, rule_of(plan)), "episodes": entries}, sync=True)
+    flush_to_disk(root)  # the episodes, before the file that lists them
+    write_info(root, split_of(plan, root))
 
 
-def _say_source(path: Path, source: dict[str, Any]) -> None:
-    """Say in an episode's ``scene.json`` where its recording is in the end."""
+def _set_source(path: Path, source: dict[str, Any]) -> None:
+    """Set in an episode's ``scene.json`` where its recording is in the end."""
     scene = load_json(path)
     text = json_text({**scene, "source": {**scene["source"], **source}}, path, indent=1)
-    with replacing(path, sync=True) as tmp:  # nobody else makes it again
+    with replacing(path, sync=True) as tmp:
         tmp.write_text(text + "\n", encoding="utf-8")
 
 
@@ -232,15 +239,15 @@ def _write_statistics(out: Path) -> None:
     from robocas_ms3.datasets.statistics.plots import write_stats
 
     dataset = Path(DATASETS, "robocas")
-    write_stats(replace(collect(out / dataset), path=dataset), out / STATISTICS)  # the same wherever the folder lies
+    write_stats(replace(collect(out / dataset), path=dataset), out / STATISTICS)  # the same wherever the folder is
 
 
 def _report(plan: Plan, chosen: Chosen) -> dict[str, Any]:
-    """What was made, without anything that a clock or another machine would say otherwise."""
+    """Return the report, without anything that a clock or a machine decides."""
     parts = {}
-    for number, episodes in chosen.items():
+    for part, episodes in chosen.items():
         found = [outcome for _, outcome in episodes]
-        parts[f"{plan.parts[number].name}"] = {
+        parts[plan.name_of(part)] = {
             "episodes": len(found),
             "seeds": [outcome.seed for outcome in found],
             "steps": sum(outcome.steps for outcome in found),

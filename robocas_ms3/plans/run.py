@@ -1,268 +1,224 @@
-"""Runs a plan: has units done until every part has its episodes, then joins them."""
+"""Runs a plan: has work units done until every part has its episodes, then joins them."""
 
 from __future__ import annotations
 
-import logging
 import math
 import time
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future
-from contextlib import suppress
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
-from queue import Empty, SimpleQueue
 from typing import Any
 
 from robocas_ms3.core.errors import PlanError
-from robocas_ms3.core.exits import deferred_interrupts
 from robocas_ms3.core.files import make_folder, write_json
 from robocas_ms3.core.locks import locked_folder
-from robocas_ms3.core.outputs import (
-    check_one_way,
-    check_overwrite,
-    check_run,
-    check_there,
-    claim_output,
-    is_taken,
-    sweep,
-    while_there,
-)
+from robocas_ms3.core.outputs import OutputFolder, is_empty
 from robocas_ms3.core.words import count_of
-from robocas_ms3.plans.begun import check_plan_of, content_of
-from robocas_ms3.plans.checks import check_plan
-from robocas_ms3.plans.claims import refuse_claimed
-from robocas_ms3.plans.driver import new_run, refuse_other, sole, wait_for_killed
-from robocas_ms3.plans.engines import Engine
-from robocas_ms3.plans.join import has_begun, join
+from robocas_ms3.plans.executors import Executor
+from robocas_ms3.plans.folder import KIND, PLAN, check_plan_record, plan_record, read_plan, settings_of
+from robocas_ms3.plans.join import damaged_episodes, has_moved, join
+from robocas_ms3.plans.load import check_plan
 from robocas_ms3.plans.plan import Plan
-from robocas_ms3.plans.tally import Tally, tally_path
-from robocas_ms3.plans.units import CLAIMS, DRIVER, PLAN, Outcome, Task, Unit, outcomes
+from robocas_ms3.plans.progress import Progress, Shard
+from robocas_ms3.plans.status import Status, status_of
+from robocas_ms3.plans.units import Unit
 
-_AHEAD = 2  # units a slot that are under way, so that none waits for the next
-_ROUNDS = 3  # so often is made again what a disk does not keep
-_LOOK = 1.0  # s between two looks at what is under way, at least
-_WAIT = 0.2  # s until a signal is handled
-_LOOKS = 200.0  # units a second that are looked at, at most
-_log = logging.getLogger(__name__)
-OpenEngine = Callable[[Plan, Path], Engine]
-OnProgress = Callable[[Sequence[int]], None]
-"""Takes the episodes there are of each part, not more than were asked for."""
+_ROUNDS = 3  # how often episodes are made again that a disk has damaged
+_TRIES = 3  # jobs in a row that may end at the same seed of a unit
+_LOOK = 1.0  # s between two looks at the folder, at least
+_LOOKS = 10_000.0  # seeds per second that are looked at, at most
+
+
+@dataclass(frozen=True)
+class Callbacks:
+    """What a run calls.
+
+    Attributes:
+        progress: called now and then.
+        stage: called with what is done now, when that changes.
+    """
+
+    progress: Callable[[Status], None] = lambda status: None
+    stage: Callable[[str], None] = lambda text: None
 
 
 def run_plan(
     plan: Plan,
     out: Path,
-    open_engine: OpenEngine,
+    open_executor: Callable[[], Executor],
     *,
-    resume: bool = False,
-    overwrite: bool = False,
     jobs: int = 1,
-    on_start: Callable[[], None] = lambda: None,
-    on_progress: OnProgress = lambda counts: None,
-    on_stage: Callable[[str], None] = lambda text: None,
+    overwrite: bool = False,
+    callbacks: Callbacks = Callbacks(),  # noqa: B008  (frozen)
 ) -> dict[str, Any]:
-    """Make what a plan says; which episodes come of it depends on the plan alone.
+    """Make the dataset of a plan, or continue; its content depends on the plan alone.
 
     Args:
-        plan: it.
+        plan: the plan.
         out: gets ``plan.json``, ``units/``, and in the end ``demos/``, ``datasets/``, ``statistics/``, ``report.json``.
-        open_engine: where units are done.
-        resume: go on with what is in ``out``.
-        overwrite: replace what is in ``out``.
+        open_executor: opens what has units done, in ``out``.
         jobs: processes that join.
-        on_start: called once plan and output turned out right.
-        on_progress: called now and then.
-        on_stage: called with what is done now, when that changes.
+        overwrite: replace the content of ``out``.
+        callbacks: see there.
 
     Returns:
-        The report: what is in ``report.json``.
+        The content of ``report.json``.
 
     Raises:
-        PlanError: both flags are set; ``out`` was begun with another plan or other versions; somebody is at it; or far
-            too many seeds of a part fail.
-        OutputExistsError: ``out`` is not empty and neither flag is set.
-        RobocasError: another run writes there; something is wrong with all episodes.
+        OutputExistsError: ``out`` was started with another plan or other versions, or by another command.
+        PlanError: almost all seeds of a part fail.
+        RobocasError: another run writes into ``out``; or an error that every seed would meet.
     """
-    check_one_way("plan run", resume=resume, overwrite=overwrite, error=PlanError)
     check_plan(plan)
-    if overwrite:
-        check_overwrite(out, (PLAN,), "made by `robocas plan run`", PlanError)
-        check_run(out / PLAN, "versions", "plan run", PlanError)
-    with locked_folder(out) as locked:
-        refuse_other(out / DRIVER, locked=locked)
-        if not overwrite and is_taken(out) and not (out / PLAN).exists():
-            raise PlanError("this is no plan's folder", where=out, expected=PLAN, fix="Choose another --out.")
-        if overwrite:  # what goes on with it asks when it begins, unless it is of Slurm itself
-            refuse_claimed(out / CLAIMS)
-        wait_for_killed(out)
-        claim_output(out, overwrite=overwrite, resume=resume)
-        if is_taken(out):
-            check_plan_of(out, plan)
-        elif resume:
-            _log.warning("%s: no plan was begun there, so it begins", out)
-        sweep(make_folder(out))
-        with while_there(out / PLAN, PlanError), sole(out / DRIVER, locked=locked):
-            write_json(out / PLAN, content_of(plan))
-            on_start()
-            with new_run(out) as run:
-                engine = open_engine(plan, out)
-                try:
-                    run.write(engine.lingers)
-                    parts = _do_all(plan, out, engine, on_progress, on_stage)
-                finally:
-                    engine.close()
-            return join(plan, out, {part.number: list(part.chosen()) for part in parts}, jobs=jobs, say=on_stage)
+    record = plan_record(plan)
+    with OutputFolder(out, KIND, settings_of(record), overwrite=overwrite) as output:
+        output.start(record)
+        with _opened(open_executor) as executor:
+            progress = _make_episodes(plan, output, executor, callbacks)
+        return join(plan, out, progress.chosen(), jobs=jobs, say=callbacks.stage)
 
 
-@dataclass
-class _Part:
-    """How far a part is."""
+def run_shard(
+    plan: Plan,
+    out: Path,
+    open_executor: Callable[[], Executor],
+    shard: Shard,
+    callbacks: Callbacks = Callbacks(),  # noqa: B008  (frozen)
+) -> bool:
+    """Do the work units of a shard that are needed and not done, next to other shards in the same folder.
 
-    plan: Plan
-    number: int
-    done: dict[int, list[Outcome]] = field(default_factory=dict)
-    next_block: int = 0
-    good: int = 0
-    """Episodes of units that are done."""
-    judged: int = 0
-    """So many blocks without a gap have been looked at for failures: the verdict must not depend on who is first."""
-    judged_seeds: int = 0
-    judged_good: int = 0
-    tally: Tally = field(default_factory=Tally)
-    """For `status`."""
-    written: int = -1
-    """So many units the tally had when it was written last."""
+    Args:
+        plan, out, open_executor, callbacks: as of `run_plan`.
+        shard: the units.
 
-    def wants_more(self) -> bool:
-        """Whether there may be too few even if all that is under way succeeds."""
-        under_way = (self.next_block - len(self.done)) * self.plan.block_of(self.number)
-        return self.good + under_way < self.plan.parts[self.number].episodes
-
-    def next(self) -> Unit:
-        unit = Unit(self.number, self.next_block)
-        self.next_block += 1
-        return unit
-
-    def take(self, unit: Unit, found: list[Outcome], out: Path) -> None:
-        """Note what came of a unit.
-
-        Raises:
-            PlanError: hardly anything succeeds.
-        """
-        self.done[unit.block] = found
-        self.tally.add(unit.block, found)
-        self.good += sum(outcome.success for outcome in found)
-        while self.judged in self.done:
-            block = self.done[self.judged]
-            self.judged += 1
-            self.judged_seeds += len(block)
-            self.judged_good += sum(outcome.success for outcome in block)
-            failed = self.judged_seeds - self.judged_good
-            if failed > max(20, 3 * self.judged_good):
-                where, found_now = (
-                    unit.folder(self.plan, out).parent,
-                    f"{failed} of {self.judged_seeds}{self._mostly()}",
-                )
-                fix = "See seeds.jsonl there; a smaller objects.count may help."
-                raise PlanError("far too many seeds fail", where=where, found=found_now, fix=fix)
-
-    def _mostly(self) -> str:
-        """What most of what failed says."""
-        said = Counter(one.failures[-1] for done in self.done.values() for one in done if one.failures)
-        return f", most of them: {said.most_common(1)[0][0]}" if said else ""
-
-    def write_tally(self, out: Path) -> None:
-        """Say in the plan's folder what came of the units that are done, if there are more of them."""
-        if len(self.done) > self.written:
-            self.written = len(self.done)
-            self.tally.write(tally_path(out, f"{self.plan.parts[self.number].name}"))
-
-    def chosen(self) -> Iterator[tuple[Unit, Outcome]]:
-        """The first episodes in the order of their seeds, as many as were asked for."""
-        left = self.plan.parts[self.number].episodes
-        for block in sorted(self.done):
-            for outcome in self.done[block]:
-                if outcome.success and left:
-                    left -= 1
-                    yield Unit(self.number, block), outcome
-
-
-def _do_all(
-    plan: Plan, out: Path, engine: Engine, on_progress: OnProgress, on_stage: Callable[[str], None]
-) -> list[_Part]:
-    """Do units until there are enough episodes, all of whose files are as they were written.
+    Returns:
+        Whether no unit of the plan is missing: `join_plan` can join it.
 
     Raises:
-        PlanError: they never are; or one of `_do_units`.
+        RobocasError: as `run_plan`.
     """
-    damaged: dict[Unit, list[int]] = {}
+    check_plan(plan)
+    output = OutputFolder(out, KIND)  # not entered: shards run at the same time
+    if not (out / PLAN).exists():
+        if not is_empty(out):
+            raise PlanError("not the folder of a plan", where=out, expected=PLAN, fix="Choose another --out.")
+        write_json(make_folder(out) / PLAN, plan_record(plan), sync=True)
+    check_plan_record(out, plan)
+    progress = Progress(plan, out)
+    if next(progress.missing(shard), None) is not None:
+        with _opened(open_executor) as executor:
+            _do_units(progress, output, executor, callbacks, shard)
+    progress.read()
+    return next(progress.missing(), None) is None
+
+
+def join_plan(out: Path, *, jobs: int = 1, say: Callable[[str], None] = lambda text: None) -> dict[str, Any]:
+    """Join the episodes of a plan whose work units are done.
+
+    Returns:
+        The content of ``report.json``.
+
+    Raises:
+        PlanError: units are missing, files are damaged, or this machine has other versions.
+        RobocasError: another run writes into ``out``.
+    """
+    plan = read_plan(out)
+    check_plan_record(out, plan)
+    with locked_folder(out):
+        progress = Progress(plan, out)
+        if not has_moved(out):
+            for unit, seeds in damaged_episodes(plan, out, progress.chosen()).items():
+                progress.forget(unit, seeds)
+        missing = [f"{unit.folder(plan, out).relative_to(out)}" for unit in progress.missing()]
+        if missing:
+            found, fix = f"{count_of(len(missing), 'unit')}, {missing[0]} first", "robocas plan run does them."
+            raise PlanError("work units are missing", where=out, found=found, fix=fix)
+        return join(plan, out, progress.chosen(), jobs=jobs, say=say)
+
+
+@contextmanager
+def _opened(open_executor: Callable[[], Executor]) -> Iterator[Executor]:
+    executor = open_executor()
+    try:
+        yield executor
+    finally:
+        executor.close()
+
+
+def _make_episodes(plan: Plan, output: OutputFolder, executor: Executor, callbacks: Callbacks) -> Progress:
+    """Do units until there are enough episodes, whose files have the sizes that they were written with."""
+    out = output.path
+    progress = Progress(plan, out)
     for _ in range(_ROUNDS):
-        parts = [_Part(plan, number) for number in range(len(plan.parts))]
-        _do_units(plan, out, engine, parts, on_progress)
-        damaged = {} if has_begun(out) else _damaged(plan, out, parts)
+        _do_units(progress, output, executor, callbacks)
+        damaged = {} if has_moved(out) else damaged_episodes(plan, out, progress.chosen())
         if not damaged:
-            return parts
-        count = sum(map(len, damaged.values()))
-        on_stage(f"{count_of(count, 'episode')} again: their files are not what was written")
+            return progress
+        callbacks.stage(f"{count_of(sum(map(len, damaged.values())), 'episode')} again: their files are damaged")
         for unit, seeds in damaged.items():
-            unit.forget(plan, out, seeds)
+            progress.forget(unit, seeds)
     unit = min(damaged)
-    where, fix = unit.folder(plan, out), "Look at the disk; then --resume."
-    found = f"seed {damaged[unit][0]}, made {_ROUNDS} times"
+    found, fix = f"seed {damaged[unit][0]}, made {_ROUNDS} times", "Check the disk; then run the command again."
+    where = unit.folder(plan, out)
     raise PlanError("files don't keep the sizes that they were written with", where=where, found=found, fix=fix)
 
 
-def _damaged(plan: Plan, out: Path, parts: Sequence[_Part]) -> dict[Unit, list[int]]:
-    """Seeds of units whose files have other sizes than they had, as those of a disk with errors may."""
-    found: dict[Unit, list[int]] = {}
-    for part in parts:
-        for unit, outcome in part.chosen():
-            if Task(unit.part, outcome.seed, unit.folder(plan, out)).size() != outcome.size:
-                found.setdefault(unit, []).append(outcome.seed)
-    return found
-
-
-def _do_units(plan: Plan, out: Path, engine: Engine, parts: Sequence[_Part], on_progress: OnProgress) -> None:
-    under_way: dict[Future[list[Outcome]], Unit] = {}
-    done: SimpleQueue[Future[list[Outcome]]] = SimpleQueue()  # not `concurrent.futures.wait`: see `Pool`
-    said = -math.inf
+def _do_units(
+    progress: Progress, output: OutputFolder, executor: Executor, callbacks: Callbacks, shard: Shard | None = None
+) -> None:
+    """Do the units that are needed; which ones these are is seen as seeds fail."""
+    running: dict[Any, Sequence[Unit]] = {}
+    failures = _JobFailures(progress.plan, output.path)
+    shown = -math.inf
     while True:
-        for part in parts:
-            while part.wants_more() and len(under_way) < _AHEAD * engine.slots:
-                unit = part.next()
-                if unit.is_done(plan, out):
-                    part.take(unit, unit.result(plan, out), out)
-                else:
-                    future = engine.submit(unit)
-                    under_way[future] = unit
-                    future.add_done_callback(done.put)
-        pause = max(_LOOK, len(under_way) / _LOOKS)  # each look reads as many files
-        if not under_way or time.monotonic() > said + pause:
-            check_there(out / PLAN, PlanError)
-            for part in parts:
-                part.write_tally(out)
-            on_progress(_counts(plan, out, parts, under_way))
-            said = time.monotonic()
-        if not under_way:
+        busy = {unit for units in running.values() for unit in units}
+        free = executor.jobs - len(running)
+        waiting = (unit for unit in progress.missing(shard) if unit not in busy)
+        groups = _grouped(list(islice(waiting, free * executor.units_per_job)), free)
+        running |= zip(executor.submit(groups), groups, strict=False) if groups else {}
+        if time.monotonic() > shown:
+            output.check_exists()
+            progress.read()
+            progress.check_failures()
+            status = status_of(progress)
+            callbacks.progress(status)
+            shown = time.monotonic() + max(_LOOK, sum(part.tried for part in status.parts) / _LOOKS)
+        if next(progress.missing(shard), None) is None:
+            callbacks.progress(status_of(progress))
             return
-        for future in _some_done(done):
-            unit = under_way.pop(future)
-            parts[unit.part].take(unit, future.result(), out)
+        for job in executor.ended(list(running), _LOOK):
+            for unit in running.pop(job):
+                if not progress.add(unit):
+                    failures.add(unit, executor.log_of(job))
+                    break  # the job was at this unit
+        progress.check_failures()
 
 
-def _some_done(done: SimpleQueue[Future[Any]]) -> Iterator[Future[Any]]:
-    """What is done by now; waits a moment for the first."""
-    with suppress(Empty):
-        with deferred_interrupts():
-            first = done.get(timeout=_WAIT)
-        yield first
-        while True:
-            yield done.get_nowait()
+def _grouped(units: Sequence[Unit], jobs: int) -> list[Sequence[Unit]]:
+    """Divide units among jobs that are free."""
+    size = math.ceil(len(units) / jobs) if jobs else 1
+    return [units[first : first + size] for first in range(0, len(units), size or 1)]
 
 
-def _counts(plan: Plan, out: Path, parts: Sequence[_Part], under_way: Mapping[Any, Unit]) -> list[int]:
-    counts = [part.good for part in parts]
-    for unit in under_way.values():
-        counts[unit.part] += sum(outcome.success for outcome in outcomes(unit.folder(plan, out)).values())
-    return [min(count, one.episodes) for count, one in zip(counts, plan.parts, strict=True)]
+class _JobFailures:
+    """Counts the jobs that ended before their unit was complete, as after a kill or the loss of a node."""
+
+    def __init__(self, plan: Plan, out: Path) -> None:
+        self._plan, self._out = plan, out
+        self._count: dict[Unit, tuple[int, int]] = {}  # failures in a row, at so many seeds
+
+    def add(self, unit: Unit, log: str) -> None:
+        """Count a job.
+
+        Raises:
+            PlanError: so many ended in a row, without another seed of the unit.
+        """
+        seeds = len(unit.partial_outcomes(self._plan, self._out))
+        before, seeds_before = self._count.get(unit, (0, -1))
+        count = before + 1 if seeds == seeds_before else 1
+        self._count[unit] = count, seeds
+        if count >= _TRIES:
+            where, fix = unit.folder(self._plan, self._out), f"See {log or 'the log of the job'}; is memory short?"
+            raise PlanError("the jobs of this unit die", where=where, found=f"{count} in a row", fix=fix)

@@ -1,77 +1,75 @@
-"""Units of work: blocks of a part's seeds, and what the folder says of them.
+"""Work units: blocks of a part's seeds, and their files.
 
-``OUT/units/PART/BLOCK`` belongs to one unit, which nobody else writes into: its ledger has a line a seed, and its
-other files are episodes that wait to be joined. A unit that is done says so in ``done.json``.
+`OUT/units/PART/BLOCK/SEED/` has the episode of a seed and `outcome.json`. Its files are written into a temporary
+folder, which is renamed when they are complete. So a unit may be done twice, even at the same time: the first folder of
+a seed is kept, and another one has the same content. `seeds.jsonl` has the outcomes of a complete unit, a line each.
 """
 
 from __future__ import annotations
 
+import os
+import secrets
 import shutil
 from collections.abc import Collection, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import Field, TypeAdapter, ValidationError
 
+from robocas_ms3.core.documents import JSON_LIMIT, DocumentError, read_bytes
+from robocas_ms3.core.files import flush_to_disk, make_folder
 from robocas_ms3.core.ledger import Ledger
+from robocas_ms3.core.strict import validate_json
 from robocas_ms3.datasets.schema import episode_folder
 from robocas_ms3.demos.recordings.seeds import GREATEST_SEED
+from robocas_ms3.plans.folder import UNITS
 from robocas_ms3.plans.plan import Plan
 
-PLAN, REPORT = "plan.json", "report.json"
-UNITS, LEDGER, DEATHS, DONE = "units", "seeds.jsonl", "deaths.jsonl", "done.json"
-CLAIMS = Path("slurm", "claims")
-"""Folder in the plan's, of the claims that jobs of Slurm have on units."""
-DRIVER = ".driver"
-"""Claim in the plan's folder, of who runs it."""
-EPISODES = "episodes"
-"""Folder of a unit with its rendered episodes."""
-
-
-Seed = Annotated[int, Field(ge=0, le=GREATEST_SEED)]
+OUTCOME, OUTCOMES = "outcome.json", "seeds.jsonl"
 Count = Annotated[int, Field(ge=0, le=10**15)]
 Seconds = Annotated[float, Field(ge=0, le=1e12)]
 
 
-@dataclass(frozen=True, order=True)
-class Unit:
-    """A block of a part's seeds."""
+@dataclass(frozen=True)
+class Outcome:
+    """Outcome of a seed.
 
-    part: int
-    block: int
+    Attributes:
+        seed: the seed.
+        success: whether there is an episode.
+        steps: its length in control steps.
+        failures: ``stage: reason`` of each attempt that failed.
+        deaths: ``stage: reason`` of each process that died, or was killed for a limit, at this seed.
+        record_seconds, render_seconds: CPU time, of the processes that made it.
+        size: bytes of its files, without ``outcome.json``.
+        at: when it was complete, s since 1970, by the clock of the machine that made it.
+    """
 
-    def seeds(self, plan: Plan) -> range:
-        """The seeds."""
-        size = plan.block_of(self.part)
-        first = plan.parts[self.part].seed + self.block * size
-        return range(first, first + size)
+    seed: Annotated[int, Field(ge=0, le=GREATEST_SEED)]
+    success: bool
+    steps: Count = 0
+    failures: list[str] = field(default_factory=list)
+    deaths: list[str] = field(default_factory=list)
+    record_seconds: Seconds = 0.0
+    render_seconds: Seconds = 0.0
+    size: Count = 0
+    at: Seconds = 0.0
 
-    def is_done(self, plan: Plan, out: Path) -> bool:
-        """Whether all its seeds are; a line of the ledger that was damaged since is done again."""
-        folder = self.folder(plan, out)
-        return (folder / DONE).is_file() and outcomes(folder).keys() >= set(self.seeds(plan))
 
-    def result(self, plan: Plan, out: Path) -> list[Outcome]:
-        """What came of it, when it is done; in the order of the seeds."""
-        found = outcomes(self.folder(plan, out))
-        return [found[seed] for seed in self.seeds(plan)]
-
-    def folder(self, plan: Plan, out: Path) -> Path:
-        """Where its files lie."""
-        return out / UNITS / f"{plan.parts[self.part].name}" / f"{self.block:05d}"
-
-    def forget(self, plan: Plan, out: Path, seeds: Collection[int]) -> None:
-        """Forget what came of some seeds, which are then done again; nobody may be at the unit."""
-        folder = self.folder(plan, out)
-        (folder / DONE).unlink(missing_ok=True)
-        lines = ledger(folder)
-        lines.rewrite(outcome for outcome in lines.read() if outcome.seed not in seeds)
+_OUTCOME: TypeAdapter[Outcome] = TypeAdapter(Outcome)
 
 
 @dataclass(frozen=True)
-class Task:
-    """A seed of a part, and the folder of its unit."""
+class SeedFiles:
+    """Files of one seed.
+
+    Attributes:
+        part: number of its part in the plan.
+        seed: the seed.
+        folder: of the files.
+    """
 
     part: int
     seed: int
@@ -79,85 +77,107 @@ class Task:
 
     @property
     def layout(self) -> Path:
-        """Its layout."""
-        return self.folder / f"seed_{self.seed:010d}.npy"
+        """File of its layout."""
+        return self.folder / "layout.npy"
 
     @property
     def recording(self) -> Path:
-        """Its recorded episode."""
-        return self.folder / f"seed_{self.seed:010d}.h5"
+        """File of its recorded episode; a JSON file is next to it."""
+        return self.folder / "recording.h5"
 
     @property
     def episode(self) -> Path:
-        """Its rendered episode."""
-        return self.folder / EPISODES / f"{self.seed:010d}" / episode_folder(0)
+        """Folder of its rendered episode."""
+        return self.folder / episode_folder(0)
 
     def size(self) -> int:
-        """Bytes of all its files."""
-        files = [*self.folder.glob(f"seed_{self.seed:010d}.*"), *self.episode.rglob("*")]
-        return sum(path.stat().st_size for path in files if path.is_file())
+        """Return the bytes of all files but the outcome."""
+        return sum(path.stat().st_size for path in self.folder.rglob("*") if path.is_file() and path.name != OUTCOME)
 
-    def clear(self) -> None:
-        """Delete its files: of a seed without a line in the ledger they may not be whole, after a power cut."""
-        for path in self.folder.glob(f"seed_{self.seed:010d}.*"):
-            path.unlink()
-        shutil.rmtree(self.episode.parent, ignore_errors=True)
+    def outcome(self) -> Outcome | None:
+        """Read the outcome; None: the seed is not done, or its file is damaged."""
+        try:
+            return validate_json(_OUTCOME, read_bytes(self.folder / OUTCOME, JSON_LIMIT))
+        except (OSError, DocumentError, ValidationError):
+            return None
 
+    def write(self, outcome: Outcome) -> None:
+        """Write the outcome."""
+        (self.folder / OUTCOME).write_bytes(_OUTCOME.dump_json(outcome))
 
-@dataclass(frozen=True)
-class Outcome:
-    """What came of a seed.
-
-    Attributes:
-        seed: it.
-        success: whether there is an episode.
-        steps: its length in control steps.
-        failures: ``stage: reason`` of each attempt that failed.
-        record_seconds, render_seconds: CPU time, of the processes that did it.
-        size: bytes of its files.
-        at: when it was done, s since 1970, of the machine that did it.
-    """
-
-    seed: Seed
-    success: bool
-    steps: Count = 0
-    failures: list[str] = field(default_factory=list)
-    record_seconds: Seconds = 0.0
-    render_seconds: Seconds = 0.0
-    size: Count = 0
-    at: Seconds = 0.0
+    @contextmanager
+    def temporary(self) -> Iterator[SeedFiles]:
+        """Yield files in a temporary folder; on success it is renamed to this folder, unless that exists already."""
+        tmp = make_folder(self.folder.with_name(f".{self.folder.name}.{secrets.token_hex(8)}.tmp"))
+        try:
+            yield SeedFiles(self.part, self.seed, tmp)
+            flush_to_disk(tmp)  # a folder that survives a power cut has complete files
+            if self.folder.is_dir() and self.outcome() is None:
+                shutil.rmtree(self.folder)  # a disk error has damaged it
+            try:
+                tmp.rename(self.folder)
+            except OSError:
+                if self.outcome() is None:
+                    raise
+        finally:
+            shutil.rmtree(tmp, ignore_errors=True)
 
 
-@dataclass(frozen=True)
-class Death:
-    """A process that ended at a seed, and why."""
+@dataclass(frozen=True, order=True)
+class Unit:
+    """A work unit: a block of a part's seeds."""
 
-    seed: Seed
-    stage: str
-    why: str
+    part: int
+    block: int
+
+    def seeds(self, plan: Plan) -> range:
+        """Return its seeds."""
+        size = plan.block_of(self.part)
+        first = plan.parts[self.part].seed + self.block * size
+        return range(first, first + size)
+
+    def folder(self, plan: Plan, out: Path) -> Path:
+        """Return its folder."""
+        return out / UNITS / plan.name_of(self.part) / f"{self.block:05d}"
+
+    def files(self, plan: Plan, out: Path, seed: int) -> SeedFiles:
+        """Return the files of one of its seeds."""
+        return SeedFiles(self.part, seed, self.folder(plan, out) / f"{seed:010d}")
+
+    def outcomes(self, plan: Plan, out: Path) -> list[Outcome] | None:
+        """Read the outcomes of all its seeds, in order; None: it is not complete."""
+        try:
+            found = {outcome.seed: outcome for outcome in _outcomes(self.folder(plan, out)).read()}
+        except (OSError, DocumentError):
+            return None
+        seeds = self.seeds(plan)
+        return [found[seed] for seed in seeds] if found.keys() >= set(seeds) else None
+
+    def partial_outcomes(self, plan: Plan, out: Path) -> list[Outcome]:
+        """Read the outcomes of the seeds that are done of a unit that is not complete."""
+        found = (self.files(plan, out, seed).outcome() for seed in self.seeds(plan))
+        return [outcome for outcome in found if outcome is not None]
+
+    def complete(self, plan: Plan, out: Path) -> None:
+        """Write ``seeds.jsonl``, once all seeds are done."""
+        outcomes = self.partial_outcomes(plan, out)
+        if len(outcomes) == len(self.seeds(plan)):
+            _outcomes(self.folder(plan, out)).rewrite(outcomes)
+
+    def forget(self, plan: Plan, out: Path, seeds: Collection[int]) -> None:
+        """Delete some seeds, which are then done again."""
+        (self.folder(plan, out) / OUTCOMES).unlink(missing_ok=True)
+        for seed in seeds:
+            shutil.rmtree(self.files(plan, out, seed).folder, ignore_errors=True)
 
 
-def ledger(folder: Path) -> Ledger[Outcome]:
-    """The unit's."""
-    return Ledger(folder / LEDGER, Outcome)
+def started_blocks(plan: Plan, out: Path, part: int) -> list[int]:
+    """Return the blocks of a part that have a folder, in order."""
+    names: list[str] = []
+    with suppress(FileNotFoundError):
+        names = os.listdir(out / UNITS / plan.name_of(part))  # asks an NFS server; whether a file exists may not
+    return sorted(int(name) for name in names if name.isascii() and name.isdecimal())
 
 
-def deaths(folder: Path) -> Ledger[Death]:
-    """The unit's."""
-    return Ledger(folder / DEATHS, Death)
-
-
-def outcomes(folder: Path) -> dict[int, Outcome]:
-    """Seed -> what came of it, as far as the unit got; of a line written twice the first counts."""
-    found: dict[int, Outcome] = {}
-    for outcome in ledger(folder).read():
-        found.setdefault(outcome.seed, outcome)
-    return found
-
-
-def begun(plan: Plan, out: Path, part: int) -> Iterator[Unit]:
-    """Units of a part that have a folder, in order."""
-    folder = out / UNITS / f"{plan.parts[part].name}"
-    for path in sorted(folder.glob("[0-9]*")):
-        if path.name.isdecimal():
-            yield Unit(part, int(path.name))
+def _outcomes(folder: Path) -> Ledger[Outcome]:
+    return Ledger(folder / OUTCOMES, Outcome)

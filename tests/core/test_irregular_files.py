@@ -15,9 +15,8 @@ from robocas_ms3.core.ledger import Ledger
 from robocas_ms3.core.paths import builtin_packs_dir
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
-from robocas_ms3.plans.claims import claimed, lease_of, refuse_claimed
-from robocas_ms3.plans.driver import refuse_other, who_runs
-from robocas_ms3.plans.tally import Tally
+from robocas_ms3.plans.folder import PLAN, read_plan
+from robocas_ms3.plans.units import OUTCOME, Outcome, SeedFiles
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -62,20 +61,10 @@ def test_results(tmp_path, name, kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_files_of_plans(tmp_path, kind):
-    assert Tally.read(replace_file(tmp_path / "tally.json", kind)) == Tally()
+    replace_file(tmp_path / OUTCOME, kind)
+    assert SeedFiles(0, 1, tmp_path).outcome() is None
     with pytest.raises(DocumentError):
-        Ledger(replace_file(tmp_path / "ledger.jsonl", kind), Tally).lines()
-
-
-@pytest.mark.parametrize("kind", ["pipe", "device"])
-def test_claims(tmp_path, kind):
-    path = tmp_path / "units" / "0"
-    claim = replace_file(path.with_name("0.1"), kind)
-    for read in (lambda: lease_of(claim), lambda: refuse_claimed(tmp_path), lambda: refuse_other(path)):
-        with pytest.raises(PlanError) as error:
-            read()
-        assert error.value.where == claim
-    with pytest.raises(PlanError), claimed(path):
-        pass
+        Ledger(replace_file(tmp_path / "ledger.jsonl", kind), Outcome).lines()
+    replace_file(tmp_path / PLAN, kind)
     with pytest.raises(PlanError):
-        who_runs(path)
+        read_plan(tmp_path)

@@ -26,13 +26,10 @@ from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
 from robocas_ms3.evaluation.report.page import page
 from robocas_ms3.evaluation.tables import markdown
-from robocas_ms3.plans import units
-from robocas_ms3.plans.begun import check_plan_of, content_of, read_plan
-from robocas_ms3.plans.driver import RUN as DRIVER_RUN
-from robocas_ms3.plans.driver import current_run, wait_for_killed
-from robocas_ms3.plans.plan import load_plan, shipped_plans
-from robocas_ms3.plans.status import status
-from robocas_ms3.plans.tally import Tally, tally_path
+from robocas_ms3.plans.folder import PLAN, check_plan_record, plan_record, read_plan
+from robocas_ms3.plans.load import load_plan, shipped_plans
+from robocas_ms3.plans.status import read_status
+from robocas_ms3.plans.units import OUTCOME, OUTCOMES, Outcome, Unit
 
 MOST = 40  # changes of a file that are tried: the same ones each time
 
@@ -122,33 +119,24 @@ def test_a_protocol_s_numbers_are_bounded(tmp_path):
 
 def test_files_of_a_plan(tmp_path):
     plan, out = load_plan(next(iter(shipped_plans()))), tmp_path / "plan"
-    unit = units.Unit(0, 0)
-    folder = unit.folder(plan, out)
-    folder.mkdir(parents=True)
-    outcomes = [units.Outcome(seed, True, 10, ["a: b"], 1.0, 1.0, 5, 1e9) for seed in unit.seeds(plan)]
-    (out / units.PLAN).write_text(json.dumps(content_of(plan)))
-    units.ledger(folder).append(outcomes)
-    units.deaths(folder).append([units.Death(1, "a", "b")])
-    (folder / units.DONE).write_text("{}")
-    tally = Tally()
-    tally.add(0, outcomes)
-    tally.write(tally_path(out, plan.parts[0].name))
-    (out / DRIVER_RUN).write_text(json.dumps({"run": "abc", "lingers": 0.0}))
+    complete, started = Unit(0, 0), Unit(0, 1)
+    for unit in (complete, started):
+        for seed in unit.seeds(plan):
+            with unit.files(plan, out, seed).temporary() as files:
+                files.write(Outcome(seed, True, 10, ["a: b"], ["c: d"], 1.0, 1.0, 5, 1e9))
+    complete.complete(plan, out)
+    (out / PLAN).write_text(json.dumps(plan_record(plan)))
 
     def read():
-        assert status(out).as_json()
-        unit.is_done(plan, out)
-        units.deaths(folder).read()
-        check_plan_of(out, read_plan(out))
-        current_run(out)
-        wait_for_killed(out)
+        assert read_status(out).as_json()
+        check_plan_record(out, read_plan(out))
 
     read()
-    assert refused(read, out / units.PLAN, content_of(plan), most=25)
-    for path in (folder / units.LEDGER, folder / units.DEATHS):  # damaged lines are left out
-        refused(read, path, json.loads(path.read_text().splitlines()[0]), line=True, most=20)
-    for path in (tally_path(out, plan.parts[0].name), out / DRIVER_RUN):  # what is damaged is counted again
-        refused(read, path, json.loads(path.read_text()), most=20)
+    assert refused(read, out / PLAN, plan_record(plan), most=25)
+    path = complete.folder(plan, out) / OUTCOMES  # damaged files are left out
+    refused(read, path, json.loads(path.read_text().splitlines()[0]), line=True, most=20)
+    path = started.files(plan, out, started.seeds(plan)[0]).folder / OUTCOME
+    refused(read, path, json.loads(path.read_text()), most=20)
 
 
 def test_files_of_a_generation(tmp_path):

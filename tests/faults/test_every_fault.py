@@ -31,7 +31,7 @@ from robocas_ms3.evaluation.protocol import load_protocol
 
 pytestmark = pytest.mark.faults
 COMMANDS = ("generate", "convert", "plan run", "eval")
-_CONTINUES = ("generate",)  # without a flag
+_CONTINUES = ("generate", "plan run")
 KILLS = int(os.environ.get("ROBOCAS_FAULT_KILLS", "20"))
 SEED = int(os.environ.get("ROBOCAS_FAULT_SEED", "0")) or random.SystemRandom().randrange(10**6)
 PLAN = """\
@@ -274,7 +274,7 @@ def stopped_half_way(command, out, log):
 CUT = {
     "generate": ("episodes/seed_*.h5", "episodes/seed_*.json"),
     "convert": ("episode_*/episode_info.npz", "episode_*/base_camera/rgb/0001.png", "episode_*/scene.json"),
-    "plan run": ("units/*/*/seeds.jsonl",),
+    "plan run": ("units/*/*/*/outcome.json",),
     "eval": ("episodes.jsonl",),
 }
 

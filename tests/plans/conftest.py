@@ -1,13 +1,10 @@
 import pytest
-from plan_stages import PLAN, stages
-
-from robocas_ms3.plans.engines.local import LocalEngine
-from robocas_ms3.plans.run import run_plan
+from plan_stages import run_here
 
 
 @pytest.fixture(scope="session")
 def undisturbed(tmp_path_factory):
-    """The made-up plan as this machine makes it in one slot, to compare with; nobody may change it."""
+    """The made-up plan as one job on this machine makes it, to compare with; nobody may change it."""
     out = tmp_path_factory.mktemp("plan") / "out"
-    run_plan(PLAN, out, lambda plan, out: LocalEngine(plan, out, 1, stages=stages()), jobs=1)
+    run_here(out)
     return out

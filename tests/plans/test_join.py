@@ -5,15 +5,11 @@ import shutil
 
 import h5py
 import pytest
-from plan_stages import PLAN, assert_same, stages
+from plan_stages import PLAN, assert_same, run_here
 
 from robocas_ms3.core.errors import PlanError
-from robocas_ms3.plans.engines.local import LocalEngine
-from robocas_ms3.plans.run import run_plan
-
-
-def run(out):
-    return run_plan(PLAN, out, lambda plan, out: LocalEngine(plan, out, 1, stages=stages()), resume=True)
+from robocas_ms3.plans.run import Callbacks
+from robocas_ms3.plans.units import Unit
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +18,7 @@ def done(tmp_path_factory):
     out = tmp_path_factory.mktemp("done") / "out"
     with pytest.MonkeyPatch.context() as patch, pytest.raises(ZeroDivisionError):
         patch.setattr("robocas_ms3.plans.run.join", lambda *_, **__: 1 / 0)
-        run(out)
+        run_here(out)
     return out
 
 
@@ -38,9 +34,9 @@ def out(done, tmp_path):
 def test_a_file_that_a_power_cut_left_empty_is_joined_again(undisturbed, out, name):
     (out / name).parent.mkdir(parents=True, exist_ok=True)
     (out / name).write_bytes(b"")
-    run(out)
+    run_here(out)
     assert_same(undisturbed, out)
-    assert not list((out / "units").rglob("seed_*"))
+    assert not list((out / "units").rglob("*.h5"))
 
 
 @pytest.mark.parametrize(
@@ -51,16 +47,16 @@ def test_what_was_cut_off_while_joining_is_joined_again(undisturbed, out, monkey
     with monkeypatch.context() as patch, pytest.raises(ZeroDivisionError):
         patch.setattr("robocas_ms3.plans.join._report", lambda *_: {"x": 1})
         patch.setattr("robocas_ms3.plans.join.flush_to_disk", lambda path: (out / "demos").exists() and 1 / 0)
-        run(out)
+        run_here(out)
     os.truncate(out / name, (out / name).stat().st_size // 2)
-    run(out)
+    run_here(out)
     assert_same(undisturbed, out)
 
 
 def test_a_report_that_is_damaged_after_all_is_deleted_is_made_again(undisturbed, tmp_path):
     out = shutil.copytree(undisturbed, tmp_path / "out")
     (out / "report.json").write_bytes(b"")
-    assert run(out)["episodes"] == 7
+    assert run_here(out)["episodes"] == 7
     assert_same(undisturbed, out)
 
 
@@ -68,8 +64,8 @@ def test_what_is_damaged_and_has_no_sources_any_more_is_an_error(undisturbed, tm
     out = shutil.copytree(undisturbed, tmp_path / "out")
     (out / "report.json").unlink()
     os.truncate(out / "demos/b/trajectory.h5", 2000)
-    with pytest.raises(PlanError, match=r"demos/b/trajectory.h5: this is not whole, .* seed_0000000003.h5 is gone"):
-        run(out)
+    with pytest.raises(PlanError, match=r"demos/b/trajectory.h5: .*0000000003/recording.h5 is gone"):
+        run_here(out)
 
 
 def test_nothing_is_deleted_where_the_disk_does_not_keep_what_is_joined(out, monkeypatch):
@@ -77,21 +73,23 @@ def test_nothing_is_deleted_where_the_disk_does_not_keep_what_is_joined(out, mon
         with h5py.File(path, "w"):
             shutil.copy(shards[0].with_suffix(".json"), path.with_suffix(".json"))
 
-    before = {path for path in (out / "units").rglob("seed_*")}
+    before = {path for path in (out / "units").rglob("*.h5")}
     monkeypatch.setattr("robocas_ms3.plans.join.merge", without_one)
     with pytest.raises(PlanError, match="demos/a/trajectory.h5: this is not what was written .found other episodes"):
-        run(out)
-    assert before == {path for path in (out / "units").rglob("seed_*")}
+        run_here(out)
+    assert before == {path for path in (out / "units").rglob("*.h5")}
     assert not (out / "report.json").exists()
 
 
 def test_what_is_left_of_a_finished_plan_is_not_deleted_for_damaged_demonstrations(undisturbed, tmp_path, monkeypatch):
     out = shutil.copytree(undisturbed, tmp_path / "out")
-    (out / "units" / "a" / "00000" / "seed_0000000010.h5").write_bytes(b"left")
+    left = Unit(0, 0).files(PLAN, out, 10).recording
+    left.parent.mkdir()
+    left.write_bytes(b"left")
     os.truncate(out / "demos/a/trajectory.h5", 0)
     with pytest.raises(PlanError, match="can't be joined again"):
-        run(out)
-    assert (out / "units" / "a" / "00000" / "seed_0000000010.h5").exists()
+        run_here(out)
+    assert left.exists()
 
 
 def test_all_that_is_joined_is_on_the_disk_before_it_has_its_name(out, monkeypatch):
@@ -105,12 +103,12 @@ def test_all_that_is_joined_is_on_the_disk_before_it_has_its_name(out, monkeypat
         replace(old, new)
 
     monkeypatch.setattr("os.replace", note)
-    run(out)
+    run_here(out)
     assert set(named) >= {"trajectory.h5", "trajectory.json", "conversion.json", "scene.json", "report.json"}
 
 
 def test_nothing_is_joined_twice(undisturbed, tmp_path):
     out = shutil.copytree(undisturbed, tmp_path / "out")
     said = []
-    run_plan(PLAN, out, lambda plan, out: LocalEngine(plan, out, 1, stages=stages()), resume=True, on_stage=said.append)
+    run_here(out, callbacks=Callbacks(stage=said.append))
     assert said == []

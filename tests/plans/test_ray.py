@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-from functools import partial
 from pathlib import Path
 from threading import Thread
 
@@ -15,41 +14,55 @@ import pytest
 
 ray = pytest.importorskip("ray", reason="needs the ray extra: plans on a cluster of Ray are NOT tested")
 
-from plan_stages import PLAN, MadeUp, assert_same, render, stages
+from plan_stages import PLAN, MadeUp, assert_same, open_worker, render, run_here
 from ray.cluster_utils import Cluster
 
 from robocas_ms3.core.errors import MissingExtraError, PlanError
-from robocas_ms3.plans.engines import ray as engine
-from robocas_ms3.plans.engines.ray import RayEngine
-from robocas_ms3.plans.engines.ray_cluster import RayOptions, read_options
+from robocas_ms3.plans.executors import Setting, check_executor, open_executor
+from robocas_ms3.plans.executors.ray import RayExecutor, do_units
+from robocas_ms3.plans.executors.ray_cluster import RayOptions
 from robocas_ms3.plans.run import run_plan
-from robocas_ms3.plans.slot import Stages
 from robocas_ms3.plans.units import Unit
+from robocas_ms3.plans.worker import UnitWorker
 
 SUPPORT = Path(__file__).resolve().parents[1] / "support"
 
-LEASE = 4.0
-
 
 class Slow(MadeUp):
-    """Takes its time for an episode, and notes of which unit it was, and when."""
+    """Takes its time for an episode."""
 
-    def __init__(self, notes, seconds, plan):
-        super().__init__(plan)
-        self.notes, self.seconds = notes, seconds
-
-    def run(self, task):
-        begun = time.time()
-        time.sleep(self.seconds)
-        made = super().run(task)
-        with (self.notes / f"{os.getpid()}.jsonl").open("a") as file:
-            file.write(json.dumps([task.folder.name, task.part, begun, time.time()]) + "\n")
-        return made
+    def run(self, files):
+        time.sleep(1.0)
+        return super().run(files)
 
 
-def slow_stages(notes, seconds=1.0):
-    notes.mkdir()
-    return Stages(partial(Slow, notes, seconds), render)
+class Lacking(MadeUp):
+    """Meets the same at every seed."""
+
+    def run(self, files):
+        raise MissingExtraError("nothing to record with")
+
+
+class Deadly(MadeUp):
+    """Kills the task at the second seed."""
+
+    def run(self, files):
+        if files.seed == 11:
+            os.kill(os.getppid(), signal.SIGKILL)
+            time.sleep(60)
+        return super().run(files)
+
+
+def open_slow(plan, out):
+    return UnitWorker(plan, out, Slow, render)
+
+
+def open_lacking(plan, out):
+    return UnitWorker(plan, out, Lacking, render)
+
+
+def open_deadly(plan, out):
+    return UnitWorker(plan, out, Deadly, render)
 
 
 @pytest.fixture(scope="module")
@@ -72,20 +85,12 @@ def cluster(tmp_path_factory):
     os.environ |= before
 
 
-@pytest.fixture(autouse=True)
-def quickly(monkeypatch):
-    """Moments instead of half minutes."""
-    monkeypatch.setattr(engine, "LEASE", LEASE)
-    monkeypatch.setattr(engine, "ENDING", 2.0)
-    monkeypatch.setattr(engine, "_BEAT", 0.5)
-
-
 @pytest.fixture
-def slots(cluster):
-    """Two nodes, whatever a test did to them; gives the processes of the actors."""
+def tasks(cluster):
+    """Two nodes, whatever a test did to them; gives the processes that do units."""
     while len([node for node in ray_nodes(cluster) if node["Alive"]]) < 2:
         cluster.second = cluster.add_node(num_cpus=1)
-    return lambda: [found for found in psutil.process_iter() if _name(found).startswith("ray::RaySlot")]
+    return lambda: [found for found in psutil.process_iter() if _name(found).startswith(("ray::do_", "ray::send_"))]
 
 
 def ray_nodes(cluster):
@@ -103,9 +108,9 @@ def _name(process):
         return ""
 
 
-def run(cluster, out, gather, stages, jobs=2, **more):
-    options = {"address": cluster.address, "gather": "yes" if gather else "no"}
-    return run_plan(PLAN, out, lambda plan, out: RayEngine(plan, out, jobs, options, stages), **more)
+def run(cluster, out, gather, open_worker=open_worker, jobs=2):
+    options = {"address": cluster.address, "gather": "yes" if gather else "no", "units_per_job": "1"}
+    return run_plan(PLAN, out, lambda: RayExecutor(Setting(PLAN, out, jobs, options, open_worker)))
 
 
 def once(out, happen):
@@ -113,7 +118,7 @@ def once(out, happen):
 
     def wait():
         until = time.monotonic() + 60
-        while not any(path.stat().st_size for path in (out / "units").glob("*/*/seeds.jsonl")):
+        while not list((out / "units").glob("*/*/[0-9]*")):
             assert time.monotonic() < until
             time.sleep(0.05)
         happen()
@@ -124,7 +129,7 @@ def once(out, happen):
 
 
 def homes():
-    """Folders that actors have on this machine."""
+    """Temporary folders of tasks on this machine."""
     return list(Path(os.environ["TMPDIR"]).glob("robocas-ray-*"))
 
 
@@ -132,83 +137,50 @@ GATHER = pytest.mark.parametrize("gather", [False, True], ids=["shared", "gather
 
 
 @GATHER
-def test_two_nodes_make_what_this_process_makes(cluster, slots, undisturbed, tmp_path, gather):
-    run(cluster, tmp_path / "out", gather, stages())
+def test_two_nodes_make_what_this_process_makes(cluster, tasks, undisturbed, tmp_path, gather):
+    run(cluster, tmp_path / "out", gather)
     assert_same(undisturbed, tmp_path / "out")
-    assert slots() == []
+    assert tasks() == []
     assert homes() == []
 
 
 @GATHER
-def test_an_actor_that_is_killed_costs_nothing(cluster, slots, undisturbed, tmp_path, gather):
+def test_a_task_that_is_killed_costs_nothing(cluster, tasks, undisturbed, tmp_path, gather):
     out, killed = tmp_path / "out", []
 
     def kill():
-        for process in slots()[:1]:
+        for process in tasks()[:1]:
             process.kill()
             killed.append(process.pid)
 
     thread = once(out, kill)
-    run(cluster, out, gather, slow_stages(tmp_path / "notes"))
+    run(cluster, out, gather, open_slow)
     thread.join()
     assert killed
     assert_same(undisturbed, out)
-    assert_one_at_a_time(tmp_path / "notes")
 
 
 @GATHER
-def test_a_node_that_is_lost_costs_nothing(cluster, slots, undisturbed, tmp_path, gather):
-    out, lost = tmp_path / "out", []
-
-    def lose():
-        on_it = [found.pid for found in slots() if found.ppid() == raylet(cluster).pid]
-        cluster.remove_node(cluster.second, allow_graceful=False)
-        lost.extend(on_it)
-
-    thread = once(out, lose)
-    run(cluster, out, gather, slow_stages(tmp_path / "notes"))
+def test_a_node_that_is_lost_costs_nothing(cluster, tasks, undisturbed, tmp_path, gather):
+    out = tmp_path / "out"
+    thread = once(out, lambda: cluster.remove_node(cluster.second, allow_graceful=False))
+    run(cluster, out, gather, open_slow)
     thread.join()
-    assert lost
     assert_same(undisturbed, out)
-    assert_one_at_a_time(tmp_path / "notes")
 
 
-def test_an_actor_that_is_cut_off_and_lives_ends_before_another_is_at_its_unit(
-    cluster, slots, undisturbed, tmp_path, monkeypatch
-):
-    """Its node is frozen, so that the cluster gives it up; it goes on, until its lease is over."""
+def test_a_task_that_is_cut_off_and_lives_does_no_harm(cluster, tasks, undisturbed, tmp_path):
+    """Its node is frozen, so that the cluster gives it up; the task goes on, while another one does its units."""
     out, node = tmp_path / "out", raylet(cluster)
-    doomed, at_loss, at_return = [], [], []
-    again, end = RayEngine._again, engine._Actor.end
-
-    def living():
-        return [process.pid for process in doomed if _name(process)]  # a zombie has none
-
-    def note_return(self, job, error):
-        at_return.append(living())
-        again(self, job, error)
-
-    def note_loss(actor):
-        at_loss.append(living())
-        end(actor)
-
-    def cut_off():
-        doomed.extend(found for found in slots() if found.ppid() == node.pid)
-        node.suspend()
-
-    monkeypatch.setattr(RayEngine, "_again", note_return)
-    monkeypatch.setattr(engine._Actor, "end", note_loss)
-    thread = once(out, cut_off)
+    thread = once(out, node.suspend)
     try:
-        run(cluster, out, False, slow_stages(tmp_path / "notes", 5.0))
+        run(cluster, out, False, open_slow)
         thread.join()
-        assert at_loss[0] == [process.pid for process in doomed] != []  # it lived when it was given up
-        assert at_return == [[]]  # and did not when its unit was handed on
     finally:
         node.resume()
         cluster.remove_node(cluster.second, allow_graceful=False)
+    run_here(out)
     assert_same(undisturbed, out)
-    assert_one_at_a_time(tmp_path / "notes")
 
 
 def raylet(cluster):
@@ -216,92 +188,61 @@ def raylet(cluster):
     return psutil.Process(process.process.pid)
 
 
-def assert_one_at_a_time(notes):
-    spans = {}
-    for path in notes.iterdir():
-        for folder, part, begun, ended in map(json.loads, path.read_text().splitlines()):
-            spans.setdefault((part, folder), []).append((begun, ended))
-    for found in spans.values():
-        found.sort()
-        assert all(before[1] <= after[0] for before, after in zip(found, found[1:], strict=False))
-
-
 def test_options_are_read_or_refused():
-    assert read_options({"num_gpus": "0.25", "gather": "yes", "address": "10.0.0.1:6379"}) == RayOptions(
+    assert RayOptions.read({"num_gpus": "0.25", "gather": "yes", "address": "10.0.0.1:6379"}) == RayOptions(
         num_gpus=0.25, gather=True, address="10.0.0.1:6379"
     )
-    with pytest.raises(PlanError, match="expected address, num_cpus, num_gpus, gather, found .'cpus'"):
-        read_options({"cpus": "2"})
-    with pytest.raises(PlanError, match="num_cpus"):
-        read_options({"num_cpus": "0"})
-    with pytest.raises(PlanError, match="gather"):
-        read_options({"gather": "perhaps"})
+    for options in ({"cpus": "2"}, {"num_cpus": "0"}, {"gather": "perhaps"}):
+        with pytest.raises(PlanError) as error:
+            check_executor("ray", options)
+        assert str(error.value.where).startswith("--executor-option")
 
 
-def test_a_cluster_that_is_not_there_is_said(tmp_path):
-    with pytest.raises(PlanError, match="no cluster of Ray answers"):
-        RayEngine(PLAN, tmp_path, 1, {"address": "127.0.0.1:1"})
-    with pytest.raises(PlanError, match="Ray's client can't do this"):
-        RayEngine(PLAN, tmp_path, 1, {"address": "ray://127.0.0.1:1"})
+@pytest.mark.parametrize("address", ["127.0.0.1:1", "ray://127.0.0.1:1"])
+def test_a_cluster_that_is_not_there_is_an_error(tmp_path, address):
+    with pytest.raises(PlanError, match=address):
+        open_executor("ray", Setting(PLAN, tmp_path, options={"address": address}))
 
 
 @GATHER
-def test_an_error_of_all_seeds_ends_the_plan_in_one_line(cluster, slots, tmp_path, gather):
-    with pytest.raises(MissingExtraError, match="nothing to record with"):
-        run(cluster, tmp_path / "out", gather, Stages(Lacking, render))
-    assert slots() == []
+def test_an_error_of_all_seeds_ends_the_plan(cluster, tasks, tmp_path, gather):
+    with pytest.raises(MissingExtraError):
+        run(cluster, tmp_path / "out", gather, open_lacking)
+    assert tasks() == []
 
 
-class Lacking(MadeUp):
-    """Meets the same at every seed."""
-
-    def run(self, task):
-        raise MissingExtraError("nothing to record with")
-
-
-def test_a_unit_that_goes_on_killing_its_actors_ends_the_plan(cluster, slots, tmp_path):
-    with pytest.raises(PlanError, match="the actors of Ray that were at this unit died .found 3 times"):
-        run(cluster, tmp_path / "out", True, Stages(Deadly, render), jobs=1)
-    assert slots() == []
+@GATHER
+def test_a_unit_that_goes_on_killing_its_tasks_ends_the_plan(cluster, tasks, tmp_path, gather):
+    with pytest.raises(PlanError, match="the jobs of this unit die") as error:
+        run(cluster, tmp_path / "out", gather, open_deadly, jobs=1)
+    assert error.value.where == Unit(0, 0).folder(PLAN, tmp_path / "out")
+    assert tasks() == []
 
 
-class Deadly(MadeUp):
-    """Kills the actor at the second seed."""
-
-    def run(self, task):
-        if task.seed == 11:
-            os.kill(os.getppid(), signal.SIGKILL)
-            time.sleep(60)
-        return super().run(task)
-
-
-def test_nodes_that_do_not_see_the_folder_are_said(cluster, slots, tmp_path):
-    ray_engine = RayEngine(PLAN, tmp_path / "elsewhere", 1, {"address": cluster.address}, stages())
-    try:
-        assert ray_engine.lingers == LEASE + 2.0
-        with pytest.raises(PlanError, match="does not see the folder.*gather=yes"):
-            ray_engine.submit(Unit(0, 0)).result(timeout=60)
-    finally:
-        ray_engine.close()
+def test_a_node_that_does_not_see_the_folder_is_an_error(tmp_path, monkeypatch):
+    monkeypatch.setattr("robocas_ms3.plans.executors.ray._APPEARS", 0.0)
+    sent = do_units(PLAN, tmp_path / "elsewhere", [Unit(0, 0)], open_worker)
+    with pytest.raises(PlanError, match="gather=yes"):
+        sent.reraise()
 
 
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGKILL])
 @pytest.mark.parametrize("own", [False, True], ids=["a cluster", "one of its own"])
-def test_ended_it_leaves_no_process_and_goes_on_later(cluster, slots, undisturbed, tmp_path, ending, own):
+def test_ended_it_leaves_no_process_and_continues_later(cluster, tasks, undisturbed, tmp_path, ending, own):
     out = tmp_path / "out"
     options = {} if own else {"address": cluster.address}
     here = [sys.executable, __file__, str(out), json.dumps(options)]
     before = {found.pid for found in psutil.process_iter()}
     process = subprocess.Popen(here, start_new_session=True, stderr=subprocess.DEVNULL)
     once(out, lambda: process.send_signal(ending)).join()
+    process.wait(60)
     ended = time.monotonic()
-    process.wait()
     # Ray's own agents, which work on nothing, look but once a minute or so whether who started them was killed
     idle = AGENTS if ending == signal.SIGKILL else set()
-    while slots() or (own and {_name(one).partition(" ")[0] for one in _of_ray(before)} - idle):
-        assert time.monotonic() < ended + (3 if ending == signal.SIGINT else 30), slots()
+    while tasks() or (own and {_name(one).partition(" ")[0] for one in _of_ray(before)} - idle):
+        assert time.monotonic() < ended + 30, tasks()
         time.sleep(0.05)
-    run(cluster, out, False, stages(), resume=True)
+    run(cluster, out, False)
     assert_same(undisturbed, out)
 
 
@@ -316,4 +257,5 @@ def _of_ray(before):
 
 if __name__ == "__main__":
     sys.path.insert(0, str(SUPPORT))
-    run_plan(PLAN, Path(sys.argv[1]), lambda plan, out: RayEngine(plan, out, 2, json.loads(sys.argv[2]), stages()))
+    setting = Setting(PLAN, Path(sys.argv[1]), 2, json.loads(sys.argv[2]), open_worker)
+    run_plan(PLAN, setting.out, lambda: RayExecutor(setting))

@@ -67,11 +67,11 @@ class Command:
         patterns = {
             "generate": "episodes/seed_*.h5",
             "convert": "episode_*",
-            "plan run": "units/*/*/seeds.jsonl",
+            "plan run": "units/*/*/*/outcome.json",
             "eval": "episodes.jsonl",
         }
         found = list(out.glob(patterns[self.name])) + list(out.glob("trajectory.h5")) * EPISODES
-        if self.name in ("plan run", "eval"):
+        if self.name == "eval":
             return sum(path.read_bytes().count(b"\n") for path in found if path.name != "trajectory.h5")
         return len(found)
 
@@ -110,7 +110,7 @@ def readable(command, out):
     if command.name == "eval":
         lines = (out / "episodes.jsonl").read_bytes().splitlines(keepends=True)
         return sum(bool(json.loads(line)) for line in lines if line.endswith(b"\n"))
-    folders = sorted(out.glob("episode_*" if command.name == "convert" else "units/*/*/episodes/*/episode_*"))
+    folders = sorted(out.glob("episode_*" if command.name == "convert" else "units/*/*/[0-9]*/episode_*"))
     for folder in folders:
         assert find_damaged(folder, Pictures(size=(64, 48), depth=False)) is None, folder
     return len(folders)

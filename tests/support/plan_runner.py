@@ -4,15 +4,6 @@ if __name__ == "__main__":
     import sys
     from pathlib import Path
 
-    from plan_stages import PLAN, stages
+    from plan_stages import run_here
 
-    from robocas_ms3.plans.engines.local import LocalEngine
-    from robocas_ms3.plans.run import run_plan
-
-    run_plan(
-        PLAN,
-        Path(sys.argv[1]),
-        lambda plan, out: LocalEngine(plan, out, 2, stages=stages()),
-        jobs=1,
-        resume=True,
-    )
+    run_here(Path(sys.argv[1]), jobs=2)

@@ -11,11 +11,13 @@ import time
 from synthetic import RayCaster, write_trajectory
 
 from robocas_ms3.core.errors import DatasetError, MissingExtraError, RobocasError
-from robocas_ms3.core.files import replacing_folder
+from robocas_ms3.plans.executors import Setting
+from robocas_ms3.plans.executors.local import LocalExecutor
 from robocas_ms3.plans.plan import PartConfig, Plan
-from robocas_ms3.plans.render import Renders
-from robocas_ms3.plans.slot import Stages
-from robocas_ms3.plans.units import ledger
+from robocas_ms3.plans.render import Renderer
+from robocas_ms3.plans.run import run_plan
+from robocas_ms3.plans.units import Unit
+from robocas_ms3.plans.worker import UnitWorker
 
 FAULTS = "faults.json"
 """Seed -> what happens at each of its tries, the first ones first; nothing more where the list ends."""
@@ -27,8 +29,8 @@ class MadeUp:
     def __init__(self, plan):
         self.plan = plan
 
-    def run(self, task):
-        fault = _fault(task)
+    def run(self, files):
+        fault = _fault(files)
         if fault == "crash":
             os.kill(os.getpid(), signal.SIGSEGV)
         elif fault == "hang":
@@ -47,41 +49,44 @@ class MadeUp:
             raise DatasetError("this recording is damaged")
         elif fault == "fail":
             return {"success": False, "failures": ["grasp: slipped"]}
-        if not task.recording.is_file():
-            with replacing_folder(task.folder / f".made_{task.seed}") as folder:
-                made = write_trajectory(folder / task.recording.name, seeds=(task.seed,))
-                os.replace(made.with_suffix(".json"), task.recording.with_suffix(".json"))
-                os.replace(made, task.recording)
-            os.rmdir(task.folder / f".made_{task.seed}")
+        write_trajectory(files.recording, seeds=(files.seed,))
         return {"success": True, "steps": 22}
 
     def close(self):
         pass
 
 
-def _fault(task):
-    out = task.folder.parents[2]
+def _fault(files):
+    out = files.folder.parents[3]
     path = out.with_name(f"{out.name}-{FAULTS}")
-    tries = out.with_name(f"{out.name}-tries-{task.seed}")
+    tries = out.with_name(f"{out.name}-tries-{files.seed}")
     if not path.is_file():
         return None
-    planned = json.loads(path.read_text()).get(str(task.seed), [])
+    planned = json.loads(path.read_text()).get(str(files.seed), [])
     with tries.open("a") as file:
-        file.write("x")
-    number = tries.stat().st_size - 1
+        file.write(f"{os.getpid()} ")
+    number = len(tries.read_text().split()) - 1
     return planned[number] if number < len(planned) else None
 
 
 def render(plan):
-    return Renders(plan, RayCaster)
+    return Renderer(plan, RayCaster)
 
 
 def cannot_begin(plan):
     raise OSError("no such device\nat all")
 
 
-def stages():
-    return Stages(MadeUp, render)
+def open_worker(plan, out):
+    """A worker whose episodes are made up."""
+    return UnitWorker(plan, out, MadeUp, render)
+
+
+def run_here(out, plan=None, jobs=1, open_worker=open_worker, **more):
+    """Run the made-up plan on this machine."""
+    plan = plan or PLAN
+    setting = Setting(plan, out, jobs, open_worker=open_worker)
+    return run_plan(plan, out, lambda: LocalExecutor(setting), **more)
 
 
 PLAN = Plan.model_validate(
@@ -116,11 +121,21 @@ def products(out):
 
 
 def assert_same(one, other):
-    """See that two plans made the same, byte for byte, and that the second did nothing twice and left nothing half."""
+    """See that two plans made the same, byte for byte, and that the second left nothing but its outcomes."""
     assert products(one) == products(other) != set()
     assert not [path for path in products(one) if not filecmp.cmp(one / path, other / path, shallow=False)]
-    for folder in (other / "units").glob("*/*"):
-        seeds = [outcome.seed for outcome in ledger(folder).read()]
-        assert len(set(seeds)) == len(seeds)
-        assert (folder / "done.json").is_file()
-        assert not list(folder.glob(".*"))
+    assert {path.name for path in (other / "units").glob("*/*/*")} == {"seeds.jsonl"}
+
+
+def deaths_of(out, plan=PLAN):
+    """(seed, what its process died of) in units that are complete."""
+    units = [Unit(part, block) for part in range(len(plan.parts)) for block in range(9)]
+    found = (unit.outcomes(plan, out) for unit in units)
+    return [(one.seed, death) for outcomes in found if outcomes for one in outcomes for death in one.deaths]
+
+
+def seeds_done(out):
+    """How many seeds are done."""
+    units = {path.parent for path in out.glob("units/*/*/seeds.jsonl")}
+    whole = sum(len((unit / "seeds.jsonl").read_text().splitlines()) for unit in units)
+    return whole + sum(path.parent.parent not in units for path in out.glob("units/*/*/*/outcome.json"))

@@ -1,20 +1,20 @@
 """The made-up plan by submitit's jobs, in this process or as a program: `python slurm_runs.py OUT OPTIONS_AS_JSON`."""
 
 import json
-import os
 import subprocess
 import sys
 import time
 from pathlib import Path
 
 import psutil
-from plan_stages import PLAN
+from plan_stages import PLAN, open_worker
 
-from robocas_ms3.plans.engines.slurm import SlurmEngine
+from robocas_ms3.plans.executors import Setting
+from robocas_ms3.plans.executors.slurm import SlurmExecutor
 from robocas_ms3.plans.run import run_plan
 
-LOCAL = {"executor": "local", "lease": "6"}
-SLURM = {"executor": "slurm", "lease": "6", "time": "10", "mem_gb": "1"}
+LOCAL = {"cluster": "local"}
+SLURM = {"cluster": "slurm", "time": "10", "mem_gb": "1"}
 NO_SLURM = "no Slurm answers here: scripts/slurm_here.sh starts one"
 
 
@@ -25,15 +25,13 @@ def slurm_answers():
         return False
 
 
-def run(out, options, plan=PLAN, jobs=2, **more):
-    def open_slurm(plan, out):
-        return SlurmEngine(plan, out, jobs, options, stages="plan_stages:stages")
-
-    return run_plan(plan, out, open_slurm, jobs=1, **more)
+def run(out, options, jobs=2):
+    setting = Setting(PLAN, out, jobs, options, open_worker)
+    return run_plan(PLAN, out, lambda: SlurmExecutor(setting))
 
 
 def start(out, options, **more):
-    """The same by another process, which goes on where one stopped."""
+    """The same by another process."""
     return subprocess.Popen([sys.executable, __file__, str(out), json.dumps(options)], text=True, **more)
 
 
@@ -42,13 +40,6 @@ def wait_for(what, seconds=120):
     while not what():
         assert time.monotonic() < until
         time.sleep(0.05)
-
-
-def assert_done_once(out):
-    """Nobody did again what another had done."""
-    for folder in (out / "units").glob("*/*"):
-        lines = [json.loads(line)["seed"] for line in (folder / "seeds.jsonl").read_text().splitlines()]
-        assert sorted(set(lines)) == sorted(lines)
 
 
 def processes_of(out):
@@ -61,16 +52,12 @@ def processes_of(out):
     return found
 
 
-def holds(process, out, seed):
-    """Whether a job has the claim on the unit of a seed."""
-    claims = out / "slurm" / "claims" / ("a" if seed >= 10 else "b")
-    return any(path.read_text().split()[1:2] == [str(process.pid)] for path in claims.glob("00000.*"))
-
-
-def stages_in_jobs(monkeypatch):
-    path = [os.path.dirname(__file__), *filter(None, [os.environ.get("PYTHONPATH")])]
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(path))
+def job_at(out, seed):
+    """The process of the job that hangs at a seed, once it does."""
+    tries = out.with_name(f"{out.name}-tries-{seed}")
+    wait_for(lambda: tries.exists() and tries.read_text().endswith(" "))
+    return psutil.Process(int(tries.read_text().split()[-1])).parent()
 
 
 if __name__ == "__main__":
-    run(Path(sys.argv[1]), json.loads(sys.argv[2]), resume=True)
+    run(Path(sys.argv[1]), json.loads(sys.argv[2]))

@@ -1,13 +1,12 @@
-"""Runs a plan of pick episodes by each engine and compares what they made; started by check_engines.sh.
+"""Runs a plan of pick episodes by each executor and compares what they made; started by check_executors.sh.
 
-python check_engines.py [--episodes 40] [--seed 0] [--jobs 2] [--kill] [--out FOLDER]
+python check_executors.py [--episodes 40] [--seed 0] [--jobs 2] [--kill] [--out FOLDER]
 """
 
 from __future__ import annotations
 
 import argparse
 import filecmp
-import json
 import os
 import secrets
 import shutil
@@ -24,7 +23,7 @@ from pathlib import Path
 
 PRODUCTS = ("demos", "datasets", "statistics", "report.json")
 PLAN = """\
-description: pick episodes, to compare engines
+description: pick episodes, to compare executors
 parts:
   - {{task: pick, episodes: {episodes}, seed: {seed}}}
 formats: [robocas, lerobot]
@@ -58,7 +57,7 @@ class Run:
         try:
             while process.poll() is None:
                 time.sleep(0.5)
-                if self.kill and self.killed == "-" and lines(out) >= wait_for:
+                if self.kill and self.killed == "-" and seeds_done(out) >= wait_for:
                     self.killed = self.kill()
         finally:
             if process.poll() is None:
@@ -69,24 +68,17 @@ class Run:
             self.wrong.append(f"ended with {process.returncode}")
         if self.kill and self.killed == "-":
             self.wrong.append("ended before anything was killed")
-        self.wrong += doubled(out)
+        self.wrong += left_behind(out)
 
 
-def lines(out: Path) -> int:
-    """How many seeds are done."""
-    return sum(len(path.read_text().splitlines()) for path in out.glob("units/*/*/seeds.jsonl"))
+def seeds_done(out: Path) -> int:
+    """Return how many seeds are done, or a few less."""
+    return len(list(out.glob("units/*/*/*/outcome.json")))
 
 
-def doubled(out: Path) -> list[str]:
-    """What is wrong with the units: seeds that are there twice, what is left half written."""
-    found = []
-    for folder in out.glob("units/*/*"):
-        ledger = folder / "seeds.jsonl"
-        seeds = [json.loads(line)["seed"] for line in ledger.read_text().splitlines()] if ledger.is_file() else []
-        if len(set(seeds)) != len(seeds):
-            found.append(f"{folder}: a seed twice")
-        found += [f"{path}: left behind" for path in folder.glob(".*")]
-    return found
+def left_behind(out: Path) -> list[str]:
+    """Return what a finished plan should have deleted of its units."""
+    return [f"{path}: left behind" for path in out.glob("units/*/*/*") if path.name != "seeds.jsonl"]
 
 
 def differences(one: Path, other: Path) -> list[str]:
@@ -198,7 +190,7 @@ def kill_job() -> str:
 
 def main() -> int:
     """Run all, print the table."""
-    parser = argparse.ArgumentParser(prog="check_engines.sh")
+    parser = argparse.ArgumentParser(prog="check_executors.sh")
     parser.add_argument("--episodes", type=int, default=40)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=2)
@@ -206,7 +198,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, help="keeps what was made")
     parser.add_argument("--from", dest="start", type=Path, default=Path.cwd(), help=argparse.SUPPRESS)
     words = parser.parse_args()
-    out = (words.start / words.out).resolve() if words.out else Path(tempfile.mkdtemp(prefix="robocas-engines-"))
+    out = (words.start / words.out).resolve() if words.out else Path(tempfile.mkdtemp(prefix="robocas-executors-"))
     try:
         return compare(out, words.episodes, words.seed, words.jobs, words.kill)
     finally:
@@ -217,11 +209,11 @@ def main() -> int:
 def on_ray(address: str, gather: str = "no") -> list[str]:
     """Return the options of a run on a cluster of Ray."""
     options = ["--executor-option", f"address={address}", "--executor-option", f"gather={gather}"]
-    return ["--on", "ray", *options]
+    return ["--executor", "ray", *options]
 
 
 def compare(out: Path, episodes: int, seed: int, jobs: int, kill: bool) -> int:
-    """Run the plan by each engine into a folder; 1: what they made is not the same."""
+    """Run the plan by each executor into a folder; 1: what they made is not the same."""
     out.mkdir(parents=True, exist_ok=True)
     if any(out.iterdir()):
         sys.exit(f"{out}: there is something in it")
@@ -237,13 +229,13 @@ def compare(out: Path, episodes: int, seed: int, jobs: int, kill: bool) -> int:
         runs.append(run)
 
     do(Run("local", []))
-    slurm = ["--on", "slurm", "--executor-option", "units_per_job=2"]
+    slurm = ["--executor", "slurm", "--executor-option", "units_per_job=2"]
     if shutil.which("sinfo") and subprocess.run(["sinfo"], capture_output=True, check=False).returncode == 0:
         do(Run("slurm", slurm))
         if kill:
             do(Run("slurm, a job killed", slurm, kill=kill_job))
     else:
-        do(Run("slurm by submitit alone", [*slurm, "--executor-option", "executor=local"]))
+        do(Run("slurm by submitit alone", [*slurm, "--executor-option", "cluster=local"]))
     with cluster(-(-jobs // 2)) as (address, _):
         do(Run("ray", on_ray(address)))
         do(Run("ray, gather", on_ray(address, "yes")))
@@ -253,7 +245,7 @@ def compare(out: Path, episodes: int, seed: int, jobs: int, kill: bool) -> int:
             do(Run(name, on_ray(address, gather), kill=second.kill))
     count = len(files(out / "local" / MADE))
     print(f"\n{episodes} pick episodes from seed {seed}, {jobs} jobs, {count} files\n")
-    print("| engine | wall, s | killed | same bytes |\n|---|---|---|---|")
+    print("| executor | wall, s | killed | same bytes |\n|---|---|---|---|")
     for run in runs:
         print(f"| {run.name} | {run.seconds:.0f} | {run.killed} | {'no' if run.wrong else 'yes'} |")
     for run in runs:

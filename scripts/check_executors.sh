@@ -1,15 +1,15 @@
 #!/usr/bin/env bash
-# One plan of pick episodes with pictures by each engine: this machine, Slurm, a Ray cluster of two nodes on this machine, the
+# One plan of pick episodes with pictures by each executor: this machine, Slurm, a Ray cluster of two nodes on this machine, the
 # same with files gathered by the driver. Compares all that the runs made byte for byte, prints a table, ends with 1 on any
 # difference. With --kill each also runs while the processes of a job, or a node, are killed.
 #
-#     bash scripts/check_engines.sh [--episodes 40] [--seed 0] [--jobs 2] [--kill] [--out FOLDER]
+#     bash scripts/check_executors.sh [--episodes 40] [--seed 0] [--jobs 2] [--kill] [--out FOLDER]
 #
 # Where no Slurm answers, scripts/slurm_here.sh starts one for as long as this takes (root; Debian, Ubuntu); where that can't
 # be, jobs are processes that submitit starts, and the table says so. FOLDER keeps what was made; a Slurm of several
 # machines needs one that all of them see. Needs a render device.
 #
-# ROBOCAS_ENGINES_VENV  environment to use as it is, with the extras slurm and ray (default: one is made by scripts/setup.sh in
+# ROBOCAS_EXECUTORS_VENV  environment to use as it is, with the extras slurm and ray (default: one is made by scripts/setup.sh in
 #                       a temporary folder, which takes minutes and gigabytes, and deleted in the end)
 set -euo pipefail
 for word in "$@"; do
@@ -19,7 +19,7 @@ for word in "$@"; do
 done
 here=$PWD
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
-say() { printf 'engines: %s\n' "$*"; }
+say() { printf 'executors: %s\n' "$*"; }
 
 made=""
 slurm_is_ours=0
@@ -30,7 +30,7 @@ clean_up() {
 trap clean_up EXIT
 trap 'exit 130' INT TERM
 
-venv=${ROBOCAS_ENGINES_VENV:-}
+venv=${ROBOCAS_EXECUTORS_VENV:-}
 if [ -z "$venv" ]; then
     made=$(mktemp -d)
     venv=$made/venv
@@ -52,4 +52,4 @@ if ! timeout 10 sinfo --noheader >/dev/null 2>&1; then
 fi
 
 export PYTHONPATH="$PWD${PYTHONPATH:+:$PYTHONPATH}" PYTHONWARNINGS=ignore OMP_NUM_THREADS=${OMP_NUM_THREADS:-1}
-"$python" scripts/check_engines.py --from "$here" "$@"
+"$python" scripts/check_executors.py --from "$here" "$@"

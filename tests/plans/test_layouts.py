@@ -7,9 +7,8 @@ from plan_stages import PLAN
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.plans.join import LAYOUTS, join
-from robocas_ms3.plans.layouts import LayoutMaker
-from robocas_ms3.plans.record import Records
-from robocas_ms3.plans.units import Outcome, Task, Unit
+from robocas_ms3.plans.record import LayoutMaker, Recorder
+from robocas_ms3.plans.units import Outcome, Unit
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.frozen import FrozenLayouts
 from robocas_ms3.scenes.model import SceneModel
@@ -19,18 +18,17 @@ ALONE = PLAN.model_copy(update={"stages": ["layouts"], "parts": PLAN.parts[:1]})
 
 
 @pytest.fixture
-def task(tmp_path):
-    unit = Unit(0, 0)
-    unit.folder(ALONE, tmp_path).mkdir(parents=True)
-    return Task(0, 11, unit.folder(ALONE, tmp_path))
+def files(tmp_path):
+    files = Unit(0, 0).files(ALONE, tmp_path, 11)
+    files.folder.mkdir(parents=True)
+    return files
 
 
-def test_layouts_alone_are_made_and_joined(task, tmp_path):
-    found = Records(ALONE).run(task)
+def test_layouts_alone_are_made_and_joined(files, tmp_path):
+    found = Recorder(ALONE).run(files)
     assert (found["success"], set(found)) == (True, {"success", "record_seconds"})
-    assert [path.name for path in task.folder.iterdir()] == [task.layout.name]
-    outcome = Outcome(11, True, size=task.size())
-    report = join(ALONE, tmp_path, {0: [(Unit(0, 0), outcome)]}, jobs=1, say=lambda text: None)
+    assert [path.name for path in files.folder.iterdir()] == [files.layout.name]
+    report = join(ALONE, tmp_path, {0: [(Unit(0, 0), Outcome(11, True, size=files.size()))]})
     assert report["parts"]["a"]["seeds"] == [11]
     pack = load_pack("builtin")
     kept = FrozenLayouts(tmp_path / LAYOUTS / "a.npy", pack.objects)(11, 11)
@@ -40,10 +38,10 @@ def test_layouts_alone_are_made_and_joined(task, tmp_path):
     assert not (tmp_path / "demos").exists()
 
 
-def test_a_seed_without_a_layout_is_one_that_failed(task, monkeypatch):
-    def nothing(self, task):
+def test_a_seed_without_a_layout_is_one_that_failed(files, monkeypatch):
+    def nothing(self, files):
         raise LayoutError("no room for all objects")
 
     monkeypatch.setattr(LayoutMaker, "write", nothing)
-    found = Records(ALONE).run(task)
+    found = Recorder(ALONE).run(files)
     assert (found["success"], found["failures"]) == (False, ["layout: no room for all objects"])

@@ -1,8 +1,7 @@
 """Plans as files: what is wrong with one is a line; the shipped ones are whole."""
 
 import errno
-import time
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import pytest
 from plan_stages import MadeUp
@@ -10,15 +9,10 @@ from plan_stages import MadeUp
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import ConfigError, ExtensionError, MissingExtraError, PlanError
 from robocas_ms3.core.files import write_json
-from robocas_ms3.plans.begun import check_plan_of, content_of
-from robocas_ms3.plans.checks import check_plan
-from robocas_ms3.plans.opening import opening
-from robocas_ms3.plans.plan import load_plan, most_seeds, shipped_plans
-from robocas_ms3.plans.record import settings_of
-from robocas_ms3.plans.render import Renders
-from robocas_ms3.plans.status import PartStatus, _seconds_left, status
-from robocas_ms3.plans.tally import Tally, tally_path
-from robocas_ms3.plans.units import LEDGER, PLAN, Outcome, Task, Unit, ledger
+from robocas_ms3.plans.folder import PLAN, check_plan_record, plan_record
+from robocas_ms3.plans.load import check_plan, load_plan, most_seeds, opening_part, recording_settings, shipped_plans
+from robocas_ms3.plans.render import Renderer
+from robocas_ms3.plans.units import SeedFiles
 
 GOOD = "parts:\n  - {task: pick, episodes: 3}\n"
 
@@ -97,18 +91,16 @@ def test_a_pack_that_was_changed_is_noticed(written, tmp_path):
     (pack / "manifest.json").write_text("{}")
     plan = load_plan(path)
     assert plan.packs.keys() == {str(pack), "builtin"}
-    write_json(out / PLAN, content_of(plan))
-    check_plan_of(out, load_plan(path))
-    with opening(plan, 0):
+    write_json(out / PLAN, plan_record(plan))
+    check_plan_record(out, load_plan(path))
+    with opening_part(plan, 0):
         pass
     (pack / "manifest.json").write_text("{ }")
-    with pytest.raises(PlanError, match="begun with another plan .found packs\..*mine: "):
-        check_plan_of(out, load_plan(path))
-    with (
-        pytest.raises(PlanError, match=f"{pack}: this pack is not the one that the plan was begun with"),
-        opening(plan, 0),
-    ):
+    with pytest.raises(PlanError, match=r"packs\..*mine: "):
+        check_plan_record(out, load_plan(path))
+    with pytest.raises(PlanError) as error, opening_part(plan, 0):
         pass
+    assert error.value.where == str(pack)
     path.write_text(f"{path.read_text()}packs: {{{pack}: 12ab}}\n")
     with pytest.raises(PlanError, match="expected a manifest of sha256 12ab"):
         load_plan(path)
@@ -120,7 +112,7 @@ def test_a_pack_that_was_changed_is_noticed(written, tmp_path):
         (
             ConfigError("no such thing"),
             PlanError,
-            "part a: what this part needs can't be opened .found ConfigError: no",
+            "part a: .*found ConfigError: no",
         ),
         (RuntimeError("no device\nat all"), PlanError, "found RuntimeError: no device at all"),
         (OSError("can't be read"), PlanError, "found OSError: can't be read"),
@@ -133,10 +125,11 @@ def test_what_fails_while_a_part_is_opened_ends_the_run(written, tmp_path, error
         raise error
 
     plan = load_plan(written("embeddings: false\nparts:\n  - {task: pick, episodes: 3, name: a}\n"))
-    task = Task(0, 7, tmp_path)
-    MadeUp(plan).run(task)
+    files = SeedFiles(0, 7, tmp_path / "a" / "b" / "c" / "d")
+    files.folder.mkdir(parents=True)
+    MadeUp(plan).run(files)
     with pytest.raises(raised, match=match) as found:
-        Renders(plan, fail).run(task)
+        Renderer(plan, fail).run(files)
     assert "\n" not in str(found.value)
 
 
@@ -190,66 +183,13 @@ def test_a_misspelt_plan_names_the_nearest(capsys):
     )
 
 
-def test_status_is_read_from_the_folder_alone(written, tmp_path, capsys):
-    out = tmp_path / "out"
-    plan = load_plan(written("block: 4\nparts:\n  - {task: pick, episodes: 6, name: a}\n"))
-    assert run(["plan", "status", str(out)]) == 1
-    assert "no plan was begun here" in capsys.readouterr().err
-    folders = [Unit(0, block).folder(plan, out) for block in (0, 1)]
-    for folder in folders:
-        folder.mkdir(parents=True)
-    (out / PLAN).write_text('{"versions": {}, "plan": ' + plan.model_dump_json() + "}")
-    assert status(out).seconds_left is None
-    good = [Outcome(seed, True, 100, [], 1.0, 3.0, 10**6, at=1000.0 + 2 * seed) for seed in (0, 1, 3)]
-    ledger(folders[0]).append([*good[:2], Outcome(2, False, failures=["a: b", "record: SIGSEGV"], record_seconds=2.0)])
-    ledger(folders[1]).append([Outcome(5, True, 100, [], 1.0, 3.0, 10**6, at=1010.0)])
-    found = status(out)
-    (part,) = found.parts
-    assert (part.done, part.wanted, part.tried, part.failed) == (3, 6, 4, {"record: SIGSEGV": 1})
-    assert (part.record_seconds, part.render_seconds, part.bytes) == (round(5 / 3, 2), 3.0, 3 * 10**6)
-    assert found.episodes_an_hour == 720.0  # two in the 10 s after the first
-    assert found.seconds_left == 15.0
-    assert run(["plan", "status", str(out)]) == 0
-    assert "3 of 6" in capsys.readouterr().out
-
-    tally = Tally()  # as `robocas plan run` notes units that are done: their ledgers are not read any more
-    tally.add(0, ledger(folders[0]).read())
-    tally.write(tally_path(out, "a"))
-    (folders[0] / LEDGER).unlink()
-    assert asdict(status(out)) | {"idle_seconds": 0} == asdict(found) | {"idle_seconds": 0}
-    tally_path(out, "a").write_text('{"blocks": [0], "tried": "x"}')
-    assert status(out).parts[0].tried == 1  # a damaged one is none
-
-
-def test_status_shows_reasons_with_brackets(written, tmp_path, capsys):
-    out = tmp_path / "out"
-    plan = load_plan(written("block: 4\nparts:\n  - {task: pick, episodes: 6, name: a}\n"))
-    folder = Unit(0, 0).folder(plan, out)
-    folder.mkdir(parents=True)
-    write_json(out / PLAN, content_of(plan))
-    ledger(folder).append([Outcome(0, False, failures=["record: KeyError: [/red]"])])
-    assert run(["plan", "status", str(out)]) == 0
-    assert "[/red] x1" in capsys.readouterr().out
-
-
-def test_what_is_left_costs_what_its_part_costs():
-    def part(name, wanted, done, seconds):
-        return PartStatus(name, wanted, done, done, {}, seconds, 0.0, 0)
-
-    parts = [part("pick", 10, 10, 2.0), part("search", 5, 1, 20.0), part("select", 3, 0, 0.0)]
-    # of late: ten picks and a search, 40 CPU s in 20 s; left: four searches, and three of a mean of 40 / 11
-    left = 4 * 20.0 + 3 * 40.0 / 11
-    assert _seconds_left(parts, [0] * 10 + [1], 20.0) == pytest.approx(left / 2)
-    assert _seconds_left(parts, [], 0.0) is None
-    free = [part("a", 10, 4, 0.0)]  # nothing says what they cost
-    assert _seconds_left(free, [0, 0], 4.0) == pytest.approx(12.0)
-
-
 def test_a_recording_s_settings_are_the_plan_s(written):
     text = "rate: 10\ncontrol_freq: 20\nrecording: {noisy_trials: 0, max_attempts: 3}\n"
-    settings = settings_of(load_plan(written(GOOD + text)), 0)
+    settings = recording_settings(load_plan(written(GOOD + text)), 0)
     assert (settings.replay_rate, settings.noisy_trials, settings.max_attempts) == (10, 0, 3)
-    assert settings == replace(settings_of(load_plan(written(GOOD)), 0), replay_rate=10, noisy_trials=0, max_attempts=3)
+    assert settings == replace(
+        recording_settings(load_plan(written(GOOD)), 0), replay_rate=10, noisy_trials=0, max_attempts=3
+    )
 
 
 def test_a_recording_s_settings_are_checked_before_it_begins(written):
@@ -259,29 +199,16 @@ def test_a_recording_s_settings_are_checked_before_it_begins(written):
         check_plan(load_plan(written(GOOD + "recording: {max_attempts: 0}\nembeddings: false\n")))
 
 
-def test_a_tally_keeps_the_times_of_ten_minutes(tmp_path):
-    tally = Tally()
-    for block, at in enumerate((0.0, 500.0, 1000.0, 1150.0)):
-        tally.add(block, [Outcome(block, True, at=at)])
-    tally.write(tmp_path / "tally.json")
-    tally = Tally.read(tmp_path / "tally.json")
-    assert tally.times == [1000.0, 1150.0]
-    assert (tally.good, tally.blocks) == (4, {0, 1, 2, 3})
-
-
-def test_a_clock_that_is_a_day_ahead_wipes_no_times(tmp_path):
-    now, tally = time.time(), Tally()
-    for block, at in enumerate((now - 100, now + 86400, now)):
-        tally.add(block, [Outcome(block, True, at=at)])
-    tally.write(tmp_path / "tally.json")
-    assert Tally.read(tmp_path / "tally.json").times == [now - 100, now]
-    assert tally.good == 3
-
-
-def test_a_wrong_option_of_an_engine_costs_nothing_that_is_there(tmp_path, capsys):
+def test_a_wrong_option_of_an_executor_costs_nothing_that_exists(tmp_path, capsys):
     out = tmp_path / "out"
     out.mkdir()
     (out / PLAN).write_text('{"versions": {}, "plan": {}}')
     assert run(["plan", "run", "tiny", "--out", str(out), "--overwrite", "--executor-option", "partition=cpu"]) == 1
-    assert "no options of the engine local" in capsys.readouterr().err
+    assert "--executor-option" in capsys.readouterr().err
     assert (out / PLAN).is_file()
+
+
+@pytest.mark.parametrize("words", [["--overwrite"], ["--executor", "ray"]])
+def test_a_shard_only_continues_on_this_machine(tmp_path, words):
+    assert run(["plan", "run", "tiny", "--out", str(tmp_path / "out"), "--shard", "0/2", *words]) == 1
+    assert not (tmp_path / "out").exists()

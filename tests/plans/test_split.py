@@ -7,7 +7,7 @@ from plan_stages import PLAN
 
 from robocas_ms3.datasets.manage import splitting
 from robocas_ms3.datasets.sources.split import SPLIT_RULE
-from robocas_ms3.plans import sides
+from robocas_ms3.plans import split as splits
 from robocas_ms3.plans.plan import Plan
 
 COUNTS = (20, 5, 10)
@@ -32,22 +32,22 @@ def of(monkeypatch):
         task = {n: "select" if 20 <= n < 25 else "pick" for n in numbers}
         return {"seed": {n: str(7 * n) for n in numbers}, "target": {n: str(n % 4) for n in numbers}, "task": task}[by]
 
-    monkeypatch.setattr(sides, "groups_of", groups)
-    monkeypatch.setattr(sides, "Dataset", lambda root: root)
-    return lambda plan: sides.sides_of(plan, "somewhere")
+    monkeypatch.setattr(splits, "groups_of", groups)
+    monkeypatch.setattr(splits, "Dataset", lambda root: root)
+    return lambda plan: splits.split_of(plan, "somewhere")
 
 
 def test_without_a_word_it_is_what_conversions_do(of):
     plan = plan_of(None, None, None)
-    assert of(plan) == sides.split_by_seed({n: 7 * n for n in range(35)})
+    assert of(plan) == splits.split_by_seed({n: 7 * n for n in range(35)})
     assert len(of(plan)[1]) == 4  # round(3.5)
-    assert sides.rule_of(plan) == SPLIT_RULE
+    assert splits.rule_of(plan) == SPLIT_RULE
 
 
 def test_a_part_may_validate_as_a_whole(of):
     plan = plan_of("train", "val", "train")
     assert of(plan) == ([*range(20), *range(25, 35)], [*range(20, 25)])
-    assert sides.rule_of(plan) == "a: train; b: val; c: train"
+    assert splits.rule_of(plan) == "a: train; b: val; c: train"
 
 
 def test_other_parts_go_by_the_rule(of):
@@ -57,7 +57,7 @@ def test_other_parts_go_by_the_rule(of):
     assert set(range(20, 25)) < set(val)
     free = set(val) - set(range(20, 25))
     assert {n % 4 for n in free}.isdisjoint({n % 4 for n in train})  # a target is on one side
-    assert sides.rule_of(plan) == f"b: val; {splitting.Share(0.2, 'target').rule}"
+    assert splits.rule_of(plan) == f"b: val; {splitting.Share(0.2, 'target').rule}"
 
 
 def test_all_of_one_kind_train(of, caplog):
@@ -67,4 +67,4 @@ def test_all_of_one_kind_train(of, caplog):
     )  # parts of pick alone are free
     train, val = of(plan)
     assert (len(train), val) == (30, [*range(20, 25)])
-    assert "all episodes are of one task, and train" in caplog.text
+    assert "all episodes have one task" in caplog.text

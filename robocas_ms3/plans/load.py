@@ -1,0 +1,211 @@
+"""Plans are read from YAML, and checked before any work begins."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from robocas_ms3.assets.pack import MANIFEST, pack_folders, sha256
+from robocas_ms3.core.documents import DocumentError, load_yaml
+from robocas_ms3.core.errors import MissingExtraError, PlanError, RobocasError
+from robocas_ms3.core.paths import plans_dir
+from robocas_ms3.core.strict import nearest, parse
+from robocas_ms3.demos.episode import EpisodeSettings
+from robocas_ms3.demos.recordings.seeds import GREATEST_SEED
+from robocas_ms3.plans.plan import PartConfig, Plan
+from robocas_ms3.scenes.config import load_config_of, shipped_configs
+from robocas_ms3.scenes.task_specs import TASKS
+
+_FURNITURE_PACK = "builtin"
+
+
+def shipped_plans() -> dict[str, Path]:
+    """Return name -> file of the bundled plans."""
+    return {path.stem: path for path in sorted(plans_dir().glob("*.yaml"))}
+
+
+def load_plan(plan: str | Path) -> Plan:
+    """Read a plan, and complete its parts by their configurations, names and hashes of packs.
+
+    Args:
+        plan: name of a bundled plan, or a YAML file.
+
+    Raises:
+        PlanError: there is no such plan, or a key or value is invalid.
+        ConfigError: a configuration is invalid.
+    """
+    path = _find(plan)
+    try:
+        data = load_yaml(path)
+    except (OSError, DocumentError) as error:
+        raise PlanError("this plan can't be read", where=path, found=error) from error
+    loaded = parse(Plan, data, PlanError, where=path, about="not a valid plan")
+    try:
+        loaded.pictures.chosen()
+    except RobocasError as error:
+        raise PlanError("not a valid plan: pictures", where=path, found=error) from error
+    parts, scenes = [], []
+    for number, config in enumerate(loaded.parts):
+        part, scene = _completed(config, number, path)
+        parts.append(part)
+        scenes.append(scene)
+    _check_names(parts, path)
+    _check_seeds(parts, scenes, loaded.block, path)
+    packs = sorted({_FURNITURE_PACK, *(part.pack for part in parts)})
+    found = {pack: digest for pack in packs if (digest := _digest(pack))}
+    check_packs(loaded, found)
+    return loaded.model_copy(update={"parts": parts, "packs": found})
+
+
+def most_seeds(episodes: int, block: int) -> int:
+    """Return how many seeds a part may try before the run ends because too few succeed."""
+    return episodes + max(20, 3 * episodes) + 2 * block  # the last work units are done whole
+
+
+def check_packs(plan: Plan, packs: Iterable[str]) -> None:
+    """Check that packs, and that of the furniture, are those that a plan was loaded with.
+
+    Raises:
+        PlanError: a pack has changed, or differs on this machine.
+    """
+    for pack in {_FURNITURE_PACK, *packs}:
+        expected, found = plan.packs.get(pack), _digest(pack)
+        if expected and found and found != expected:
+            what, fix = "this pack differs from the one that the plan started with", "Use that pack, or --overwrite."
+            hashes = f"a manifest of sha256 {expected[:12]}...", f"{found[:12]}..."
+            raise PlanError(what, where=pack, expected=hashes[0], found=hashes[1], fix=fix)
+
+
+def check_plan(plan: Plan) -> None:
+    """Check that this machine can record, render and join a plan: errors that would come after days of work.
+
+    Raises:
+        RobocasError: a rate, a size or a pack is invalid, or an extra is missing.
+    """
+    from robocas_ms3.demos.checks import check_arguments
+    from robocas_ms3.demos.recordings.motion import sample_stride
+
+    for number, part in enumerate(plan.parts):
+        check_arguments(recording_settings(plan, number), episodes=part.episodes, first_seed=part.seed, jobs=1)
+    if plan.makes_datasets:
+        sample_stride(plan.control_freq, plan.rate)
+        if plan.embeddings:
+            from robocas_ms3.scenes.language.embed import TextEmbedder
+
+            TextEmbedder()  # raises if something is missing; loads nothing
+        if "lerobot" in plan.formats:
+            _check_lerobot(plan)
+    if "statistics" in plan.stages and find_spec("matplotlib") is None:
+        fix = 'In the clone: pip install -e ".[plots]", or leave the stage out.'
+        raise MissingExtraError("statistics are drawn with matplotlib", fix=fix)
+
+
+def recording_settings(plan: Plan, part: int) -> EpisodeSettings:
+    """Return how a part's episodes are recorded."""
+    config = plan.parts[part]
+    assert config.config is not None  # set by `load_plan`
+    rate = int(plan.rate) if plan.rate == int(plan.rate) else 5  # episodes are checked at the dataset's rate
+    chosen = {"control_freq": plan.control_freq, "replay_rate": rate, **plan.recording.chosen()}
+    return EpisodeSettings(config.task, config.config, config.pack, **chosen)
+
+
+@contextmanager
+def opening_part(plan: Plan, part: int) -> Iterator[None]:
+    """Open an environment, or whatever else all seeds of a part share: an error there is no seed's fault.
+
+    Raises:
+        PlanError: it can't be opened on this machine, or the part's pack differs here.
+        MissingExtraError: an extra is missing.
+        OSError: an error of the disk or the system.
+    """
+    config = plan.parts[part]
+    try:
+        check_packs(plan, [config.pack])
+        yield
+    except (PlanError, MissingExtraError):
+        raise
+    except Exception as error:
+        if isinstance(error, OSError) and error.errno:
+            raise
+        found, fix = " ".join(f"{type(error).__name__}: {error}".split()), "Repair it, and run the command again."
+        raise PlanError("this part can't be opened", where=f"part {config.name}", found=found, fix=fix) from error
+
+
+def _check_lerobot(plan: Plan) -> None:
+    from robocas_ms3.datasets.lerobot.schema import require_extra, whole_rate
+
+    require_extra()
+    whole_rate(plan.rate)
+    width, height = plan.pictures.size
+    if width % 2 or height % 2:
+        expected, found = "even width and height", f"{width} x {height}"
+        raise PlanError("videos need even sizes", where="pictures.size", expected=expected, found=found)
+
+
+def _completed(part: PartConfig, number: int, path: Path) -> tuple[PartConfig, Any]:
+    """Return a part with its configuration, pack and name; and what its scenes depend on."""
+    if part.task not in TASKS:
+        where, expected, fix = f"{path}, parts.{number}", ", ".join(TASKS), nearest(part.task, list(TASKS))
+        raise PlanError("no such task", where=where, expected=expected, found=repr(part.task), fix=fix)
+    spec = TASKS[part.task]
+    name, config = part.config or spec.default_config, part.config or spec.default_config
+    if isinstance(config, str) and (path.parent / config).is_file():
+        config = path.parent / config
+    loaded = load_config_of(spec, config)
+    shipped = isinstance(config, str) and config in shipped_configs()  # a file may change until the next run
+    stem, pack = Path(name).stem if isinstance(name, str) else part.task, _pack(part.pack, path.parent)
+    completed = {
+        "config": name if shipped else loaded.model_dump(mode="json"),
+        "pack": pack,
+        "name": part.name or re.sub(r"[^\w-]+", "-", f"{number:02d}-{stem}")[:60],
+    }
+    return part.model_copy(update=completed), (part.task, loaded, pack)
+
+
+def _pack(name: str, folder: Path) -> str:
+    """Return a pack's name, or the absolute path of its folder, relative to the plan's or the working directory."""
+    if name in pack_folders():
+        return name
+    return next((str(path.resolve()) for path in (folder / name, Path(name)) if path.is_dir()), name)
+
+
+def _digest(pack: str) -> str:
+    """Return the hash of a pack's manifest, which has those of its files; empty where there is no such pack."""
+    path = pack_folders().get(pack, Path(pack)) / MANIFEST
+    return sha256(path) if path.is_file() else ""
+
+
+def _check_names(parts: Sequence[PartConfig], path: Path) -> None:
+    names = [part.name for part in parts]
+    twice = sorted({str(name) for name in names if names.count(name) > 1})
+    if twice:
+        raise PlanError("parts of one name", where=path, found=", ".join(twice), fix="Give them a name each.")
+
+
+def _check_seeds(parts: Sequence[PartConfig], scenes: Sequence[Any], block: int, path: Path) -> None:
+    """Check that no two parts may try the same seed of a scene: a dataset has no episode twice."""
+    for number, part in enumerate(parts):
+        where, most = f"{path}, parts.{number}.seed", most_seeds(part.episodes, block)
+        if part.seed + most > GREATEST_SEED:
+            expected = f"<= {GREATEST_SEED - most}"
+            raise PlanError(f"seeds end at {GREATEST_SEED}", where=where, expected=expected, found=part.seed)
+        for other, scene in zip(parts[:number], scenes, strict=False):
+            first, last = sorted((part, other), key=lambda each: each.seed)
+            end = first.seed + most_seeds(first.episodes, block)
+            if scenes[number] == scene and last.seed < end:
+                expected, found = f"one of the two from {end} on", f"{part.seed}, and {other.seed} of {other.name}"
+                raise PlanError("two parts may try the same seeds", where=where, expected=expected, found=found)
+
+
+def _find(plan: str | Path) -> Path:
+    shipped, path = shipped_plans(), Path(plan)
+    if str(plan) in shipped:
+        return shipped[str(plan)]
+    if path.suffix in {".yaml", ".yml"} and path.is_file():
+        return path
+    expected, fix = f"a YAML file, or one of {', '.join(shipped)}", nearest(str(plan), shipped)
+    raise PlanError("no such plan", where=plan, expected=expected, fix=fix)

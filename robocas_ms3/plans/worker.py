@@ -1,0 +1,153 @@
+"""Does work units: records the episode of each seed and renders it at once, in processes that may die."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import CancelledError
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from robocas_ms3.core.errors import (
+    DatasetError,
+    LayoutError,
+    PlanError,
+    PlanningFailed,
+    RobocasError,
+    SimulationError,
+    WorkerCrashed,
+    WorkerStartError,
+)
+from robocas_ms3.core.files import remove
+from robocas_ms3.core.outputs import sweep
+from robocas_ms3.core.workers import Limits, Worker, WorkerPool
+from robocas_ms3.plans.folder import check_plan_record
+from robocas_ms3.plans.plan import Plan
+from robocas_ms3.plans.units import Outcome, SeedFiles, Unit
+
+TRIES = 2
+"""How often a seed is tried whose process dies, before it is left out."""
+_OF_A_SEED = (LayoutError, PlanningFailed, SimulationError, DatasetError)  # other errors of ours affect all seeds
+OpenStage = Callable[[Plan], Worker[SeedFiles, dict[str, Any]]]
+
+
+def open_recorder(plan: Plan) -> Worker[SeedFiles, dict[str, Any]]:
+    """Return what records episodes, in its process."""
+    from robocas_ms3.plans.record import Recorder
+
+    return Recorder(plan)
+
+
+def open_renderer(plan: Plan) -> Worker[SeedFiles, dict[str, Any]]:
+    """Return what renders recorded episodes, in its process."""
+    from robocas_ms3.plans.render import Renderer
+
+    return Renderer(plan)
+
+
+class UnitWorker:
+    """Does one work unit after the other, by two processes that are kept from unit to unit.
+
+    One process records an episode, the other one renders it: a process with a renderer can't fork, as planning does.
+
+    Args:
+        plan: the plan of the units.
+        out: the output folder of the plan.
+        record, render: open what does each stage, in its process.
+    """
+
+    def __init__(
+        self, plan: Plan, out: Path, record: OpenStage = open_recorder, render: OpenStage = open_renderer
+    ) -> None:
+        self._plan, self._out = plan, out
+        limits = plan.limits
+        self._record = _open_process(record, plan, Limits(limits.record_seconds, limits.memory_gb))
+        self._render = _open_process(render, plan, Limits(limits.render_seconds, limits.memory_gb))
+
+    def do(self, unit: Unit) -> None:
+        """Do the seeds of a unit that are not done.
+
+        Raises:
+            RobocasError: an error that every seed would meet.
+            OSError: an error of the disk or the system.
+        """
+        for _ in self.seeds(unit):
+            pass
+
+    def seeds(self, unit: Unit) -> Iterator[SeedFiles]:
+        """Do the seeds of a unit that are not done; yield the files of each, which are complete."""
+        if unit.outcomes(self._plan, self._out) is not None:
+            return
+        for seed in unit.seeds(self._plan):
+            files = unit.files(self._plan, self._out, seed)
+            if files.outcome() is None:
+                check_plan_record(self._out, self._plan)
+                with files.temporary() as tmp:
+                    outcome = self._outcome(tmp)
+                    if not outcome.success:
+                        for path in tmp.folder.iterdir():
+                            remove(path)
+                    tmp.write(outcome)
+                    check_plan_record(self._out, self._plan)  # --overwrite may have started another plan
+                yield files
+        unit.complete(self._plan, self._out)
+
+    def _outcome(self, files: SeedFiles) -> Outcome:
+        deaths = list[str]()
+        result = self._survive(self._record, "record", files, deaths)
+        if result["success"] and self._plan.makes_datasets:
+            result |= self._survive(self._render, "render", files, deaths)
+        size = files.size() if result["success"] else 0
+        return Outcome(seed=files.seed, at=time.time(), size=size, deaths=deaths, **result)
+
+    def _survive(
+        self, process: WorkerPool[SeedFiles, dict[str, Any]], stage: str, files: SeedFiles, deaths: list[str]
+    ) -> dict[str, Any]:
+        """Do a stage of an episode; retry it when its process dies, up to `TRIES`."""
+        for _ in range(TRIES):
+            try:
+                return process.run(files)
+            except WorkerStartError as failed:  # would affect every seed
+                raise PlanError("a process could not start", found=failed) from failed
+            except WorkerCrashed as crash:
+                reason = f"{crash.found}"
+            except Exception as error:
+                if not _is_of_a_seed(error):
+                    raise
+                reason = f"{type(error).__name__}: {error}".splitlines()[0][:200]
+            deaths.append(f"{stage}: {reason}")
+            sweep(files.folder)
+        return {"success": False, "failures": [deaths[-1]]}
+
+    def stop(self) -> None:
+        """Kill the processes; `do` in another thread raises `CancelledError`."""
+        self._record.stop()
+        self._render.stop()
+
+    def close(self) -> None:
+        """End the processes."""
+        self.stop()
+        self._record.close()
+        self._render.close()
+
+
+def _open_process(stage: OpenStage, plan: Plan, limits: Limits) -> WorkerPool[SeedFiles, dict[str, Any]]:
+    return WorkerPool(partial(_open_stage, stage, plan), 1, limits=limits, retries=0)
+
+
+def _open_stage(stage: OpenStage, plan: Plan) -> Worker[SeedFiles, dict[str, Any]]:
+    try:
+        return stage(plan)
+    except Exception as error:  # would affect every seed
+        raise PlanError("a process could not start", found=error) from error
+
+
+def _is_of_a_seed(error: Exception) -> bool:
+    """Whether an error is due to a seed: its scene or files, a bug that it has found, memory that was missing.
+
+    Errors of the disk, the system or the installation are not: all seeds of a machine would be left out.
+    """
+    if isinstance(error, RobocasError):
+        return isinstance(error, _OF_A_SEED)
+    return not isinstance(error, CancelledError | OSError)

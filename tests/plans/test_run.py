@@ -1,0 +1,355 @@
+"""Plans over made-up episodes: the dataset follows from the plan, whoever does the units and whatever fails."""
+
+import json
+import os
+import signal
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+
+import psutil
+import pytest
+from faults import running
+from plan_stages import (
+    PLAN,
+    MadeUp,
+    assert_same,
+    cannot_begin,
+    deaths_of,
+    open_worker,
+    plan_faults,
+    run_here,
+    seeds_done,
+)
+
+from robocas_ms3.core.errors import MissingExtraError, OutputExistsError, PlanError, RobocasError
+from robocas_ms3.datasets.checks.dataset import validate
+from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.demos.recordings.reading import TrajectoryFile
+from robocas_ms3.demos.recordings.versions import versions
+from robocas_ms3.plans.executors import Setting
+from robocas_ms3.plans.executors.local import LocalExecutor
+from robocas_ms3.plans.progress import Shard
+from robocas_ms3.plans.run import Callbacks, join_plan, run_shard
+from robocas_ms3.plans.status import read_status
+from robocas_ms3.plans.units import Outcome, Unit
+from robocas_ms3.plans.worker import UnitWorker
+
+SUPPORT = Path(__file__).resolve().parents[1] / "support"
+
+
+def shard(out, text, plan=PLAN):
+    return run_shard(plan, out, lambda: LocalExecutor(Setting(plan, out, open_worker=open_worker)), Shard.parse(text))
+
+
+def test_a_plan_makes_demonstrations_and_one_dataset_of_all_parts(undisturbed):
+    report = json.loads((undisturbed / "report.json").read_text())
+    assert report["episodes"] == 7
+    assert report["parts"]["a"]["seeds"] == [10, 11, 12, 13, 14]
+    assert report["parts"]["b"]["seeds"] == [3, 4]
+    dataset = Dataset(undisturbed / "datasets" / "robocas")
+    assert dataset.numbers == list(range(7))
+    assert [dataset.entry(number)["seed"] for number in range(7)] == [10, 11, 12, 13, 14, 3, 4]
+    assert validate(dataset.root).violations == []
+    with TrajectoryFile(undisturbed / "demos" / "a" / "trajectory.h5") as file:
+        assert [entry["episode_seed"] for entry in file.episodes] == [10, 11, 12, 13, 14]
+    for number, (part, place) in enumerate([("a", i) for i in range(5)] + [("b", 0), ("b", 1)]):
+        # where its recording is now, not the file of one seed that it was rendered from
+        trajectory = f"demos/{part}/trajectory.h5"
+        entry, source = dataset.entry(number), dataset.episode(number).scene["source"]
+        assert (entry["trajectory"], entry["trajectory_episode"]) == (trajectory, place)
+        assert (source["trajectory"], source["episode_id"]) == (trajectory, place)
+        with TrajectoryFile(undisturbed / trajectory) as file:
+            assert file.episodes[place]["episode_seed"] == entry["seed"]
+    assert not list((undisturbed / "units").rglob("*.h5"))  # nothing is kept twice
+
+
+def test_the_lerobot_dataset_has_the_version_of_the_plan(tmp_path):
+    plan = PLAN.model_copy(update={"formats": ["robocas", "lerobot"], "lerobot_version": "2.1"})
+    run_here(tmp_path / "out", plan)
+    info = json.loads((tmp_path / "out" / "datasets" / "lerobot" / "meta" / "info.json").read_text())
+    assert (info["codebase_version"], info["total_episodes"]) == ("v2.1", 7)
+
+
+def test_more_jobs_make_the_same(undisturbed, tmp_path):
+    run_here(tmp_path / "out", jobs=2)
+    assert_same(undisturbed, tmp_path / "out")
+
+
+def test_shards_in_any_order_make_the_same(undisturbed, tmp_path):
+    out = tmp_path / "out"
+    assert not shard(out, "1/2")
+    assert not (out / "units" / "a" / "00000").exists()
+    with pytest.raises(PlanError, match="work units are missing") as error:
+        join_plan(out)
+    assert error.value.where == out
+    assert shard(out, "0/2")
+    assert not (out / "datasets").exists()
+    assert join_plan(out)["episodes"] == 7
+    assert_same(undisturbed, out)
+
+
+@pytest.mark.parametrize("text", ["3/2", "2/2", "1", "-1/2", "1/0", "a/b", "1/2/3"])
+def test_an_invalid_shard_is_refused(text):
+    with pytest.raises(PlanError):
+        Shard.parse(text)
+
+
+def test_two_shards_may_be_the_same_at_the_same_time(undisturbed, tmp_path):
+    out = tmp_path / "out"
+    with ThreadPoolExecutor(2) as threads:
+        assert list(threads.map(lambda text: shard(out, text), ["0/1", "0/1"])) == [True, True]
+    join_plan(out)
+    assert_same(undisturbed, out)
+
+
+def test_the_first_folder_of_a_seed_is_kept(tmp_path):
+    files = Unit(0, 0).files(PLAN, tmp_path, 10)
+    with files.temporary() as late, files.temporary() as first:
+        for tmp in (late, first):
+            tmp.recording.write_text("late" if tmp is late else "first")
+            tmp.write(Outcome(10, True))
+    assert files.recording.read_text() == "first"
+    assert [path.name for path in files.folder.parent.iterdir()] == [files.folder.name]
+
+
+def test_a_seed_whose_outcome_is_damaged_is_done_again(undisturbed, tmp_path):
+    out = tmp_path / "out"
+    shard(out, "0/2")
+    unit = Unit(0, 0)
+    (unit.folder(PLAN, out) / "seeds.jsonl").unlink()
+    os.truncate(unit.files(PLAN, out, 11).folder / "outcome.json", 20)
+    run_here(out)
+    assert_same(undisturbed, out)
+
+
+def test_a_process_that_dies_once_costs_nothing(undisturbed, tmp_path):
+    out = tmp_path / "out"
+    plan_faults(out, {10: ["crash"], 12: ["grow"], 13: ["bug"], 3: ["hang"]})
+    limits = PLAN.limits.model_copy(update={"record_seconds": 4, "memory_gb": 0.5})
+    run_here(out, PLAN.model_copy(update={"limits": limits}))
+    assert_same(undisturbed, out)
+    assert deaths_of(out) == [
+        (10, "record: SIGSEGV"),
+        (12, "record: too much memory"),
+        (13, "record: ValueError: a bug"),
+        (3, "record: too slow"),
+    ]
+
+
+def test_a_seed_that_kills_twice_is_left_out_and_another_takes_its_place(tmp_path):
+    out = tmp_path / "out"
+    plan_faults(out, {11: ["crash", "crash", "crash"], 12: ["fail"]})
+    report = run_here(out)
+    assert report["parts"]["a"]["seeds"] == [10, 13, 14, 15, 16]
+    found = read_status(out)
+    assert found.parts[0].failed == {"record: SIGSEGV": 1, "grasp: slipped": 1}
+    assert (found.parts[0].done, found.parts[0].wanted) == (5, 5)
+    assert found.finished
+    assert deaths_of(out) == [(11, "record: SIGSEGV")] * 2
+
+
+def test_an_error_of_all_seeds_ends_the_run_which_continues_later(undisturbed, tmp_path):
+    out = tmp_path / "out"
+    plan_faults(out, {13: ["refuse"]})
+    with pytest.raises(MissingExtraError):
+        run_here(out)
+    run_here(out)
+    assert_same(undisturbed, out)
+    before = (out / "report.json").stat().st_mtime_ns
+    run_here(out)  # nothing is left to do
+    assert (out / "report.json").stat().st_mtime_ns == before
+
+
+def test_a_system_without_another_process_is_no_seed_s_fault(undisturbed, tmp_path):
+    out = tmp_path / "out"
+    plan_faults(out, {12: ["limit"]})
+    with pytest.raises(RobocasError, match="can't start another process"):
+        run_here(out)
+    run_here(out)
+    assert deaths_of(out) == []
+    assert_same(undisturbed, out)
+
+
+def test_a_damaged_recording_is_a_seed_s_own(tmp_path):
+    plan_faults(tmp_path / "out", {11: ["damaged", "damaged"]})
+    assert run_here(tmp_path / "out")["parts"]["a"]["seeds"] == [10, 12, 13, 14, 15]
+
+
+def test_a_machine_that_cannot_open_a_part_does_no_seed(tmp_path):
+    plan = PLAN.model_copy(update={"parts": [PLAN.parts[0].model_copy(update={"pack": "mine"})]})
+    shard(tmp_path / "out", "4/5")
+    (tmp_path / "out" / "plan.json").write_text(
+        json.dumps({"plan": plan.model_dump(mode="json"), "versions": versions()})
+    )
+    worker = UnitWorker(plan, tmp_path / "out")
+    try:
+        with pytest.raises(PlanError) as error:
+            worker.do(Unit(0, 0))
+        assert error.value.where == "part a"
+    finally:
+        worker.close()
+    assert seeds_done(tmp_path / "out") == 0
+
+
+def test_hardly_any_success_is_an_error(tmp_path):
+    plan = PLAN.model_copy(update={"block": 8})
+    plan_faults(tmp_path / "out", {seed: ["fail"] for seed in range(200)})
+    with pytest.raises(PlanError) as error:
+        run_here(tmp_path / "out", plan)
+    assert error.value.found == "25 of 25, most of them: grasp: slipped"
+
+
+def test_episodes_whose_files_were_cut_off_are_made_again(undisturbed, tmp_path):
+    out, stages = tmp_path / "out", []
+    for text in ("0/2", "1/2"):
+        shard(out, text)
+    folders = [Unit(0, 0).files(PLAN, out, seed).folder for seed in (10, 11, 12)]
+    picture = sorted(folders[1].rglob("*.png"))[0]
+    for path, length in ((folders[0] / "recording.h5", 1000), (picture, 50), (folders[2] / "recording.json", 0)):
+        os.truncate(path, length)
+    with pytest.raises(PlanError, match="work units are missing"):
+        join_plan(out)
+    run_here(out, callbacks=Callbacks(stage=stages.append))
+    assert_same(undisturbed, out)
+
+
+def test_a_disk_that_damages_files_again_and_again_ends_the_run(tmp_path, monkeypatch):
+    monkeypatch.setattr("robocas_ms3.plans.run.damaged_episodes", lambda *_: {Unit(1, 0): [4]})
+    with pytest.raises(PlanError, match="files don't keep the sizes") as error:
+        run_here(tmp_path / "out")
+    assert error.value.where == Unit(1, 0).folder(PLAN, tmp_path / "out")
+    assert not (tmp_path / "out" / "datasets").exists()
+
+
+def test_a_folder_of_something_else_is_refused(tmp_path):
+    (tmp_path / "thesis").write_text("")
+    for flags in ({}, {"overwrite": True}):
+        with pytest.raises(OutputExistsError):
+            run_here(tmp_path, **flags)
+    with pytest.raises(PlanError):
+        shard(tmp_path, "0/2")
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis"]
+
+
+def test_another_plan_is_refused_unless_it_is_to_overwrite(tmp_path):
+    out = tmp_path / "out"
+    shard(out, "0/2")
+    other = PLAN.model_copy(update={"block": 4})
+    for start in (run_here, lambda out, plan: shard(out, "1/2", plan)):
+        with pytest.raises(RobocasError, match="block: 3 -> 4"):
+            start(out, other)
+    run_here(out, other, overwrite=True)
+    assert Unit(0, 1).seeds(other) == range(14, 18)
+    assert Unit(0, 1).outcomes(other, out) is not None
+
+
+def test_limits_and_the_description_may_change(undisturbed, tmp_path):
+    out = tmp_path / "out"
+    shard(out, "0/2")
+    limits = PLAN.limits.model_copy(update={"memory_gb": 3.0})
+    run_here(out, PLAN.model_copy(update={"limits": limits, "description": "another"}))
+    assert_same(undisturbed, out)
+    assert json.loads((out / "plan.json").read_text())["plan"]["limits"]["memory_gb"] == 3.0
+
+
+def test_a_machine_with_other_versions_does_no_unit(tmp_path):
+    out = tmp_path / "out"
+    shard(out, "4/5")
+    record = json.loads((out / "plan.json").read_text())
+    record["versions"]["sapien"] = "2.2.2"
+    (out / "plan.json").write_text(json.dumps(record))
+    worker = open_worker(PLAN, out)
+    for start in (lambda: worker.do(Unit(0, 0)), lambda: shard(out, "0/2"), lambda: join_plan(out)):
+        with pytest.raises(PlanError, match=r"versions\.sapien: .*2\.2\.2"):
+            start()
+    assert not (out / "units").exists()
+
+
+def test_a_worker_of_an_older_plan_keeps_nothing_in_the_folder_of_a_new_one(tmp_path):
+    out = tmp_path / "out"
+    shard(out, "4/5")
+    worker = open_worker(PLAN, out)
+    seeds = worker.seeds(Unit(0, 0))
+    next(seeds)
+    run_here(out, PLAN.model_copy(update={"block": 2}), overwrite=True)
+    with pytest.raises(PlanError):
+        next(seeds)
+    worker.close()
+    assert seeds_done(out) == 8
+
+
+def in_a_process(out):
+    """A run of two jobs, in a process of its own and a group of processes of their own."""
+    return running([sys.executable, SUPPORT / "plan_runner.py", out])
+
+
+def wait_until(what, process):
+    until = time.monotonic() + 60
+    while not what():
+        assert process.poll() is None, process.stderr.read()
+        assert time.monotonic() < until
+        time.sleep(0.02)
+
+
+def alive(group):
+    """The commands of the processes of a group that run: an orphan that ended may wait for long to be reaped."""
+    return [command for one in psutil.process_iter() if of_group(one, group) and (command := command_of(one))]
+
+
+def command_of(process):
+    with suppress(psutil.NoSuchProcess, psutil.ZombieProcess):
+        return process.cmdline()
+
+
+def of_group(process, group):
+    try:
+        return os.getpgid(process.pid) == group
+    except ProcessLookupError:
+        return False
+
+
+@pytest.mark.parametrize("seeds", [0, 2])
+def test_ctrl_c_ends_all_processes_and_blames_no_seed(undisturbed, tmp_path, seeds):
+    out = tmp_path / "out"
+    with in_a_process(out) as process:
+        wait_until(lambda: (out / "plan.json").is_file() and seeds_done(out) >= seeds, process)
+        time.sleep(0.3)  # processes that record or render are starting
+        os.killpg(process.pid, signal.SIGINT)
+        _, said = process.communicate(timeout=30)
+        assert process.returncode != 0
+        assert said.count("Traceback") <= 1  # the runner's own
+        assert "KeyboardInterrupt" in said
+        begun = time.monotonic()
+        while alive(process.pid):  # an ending one of Python's own, which keeps track of semaphores, is the last
+            assert time.monotonic() - begun < 30, alive(process.pid)
+    assert not list(out.glob("units/*/*/.*"))
+    run_here(out)
+    assert deaths_of(out) == []
+    assert_same(undisturbed, out)
+
+
+def test_a_process_that_cannot_begin_ends_the_run_and_blames_no_seed(tmp_path):
+    def open_worker(plan, out):
+        return UnitWorker(plan, out, MadeUp, cannot_begin)
+
+    with pytest.raises(PlanError) as error:
+        run_here(tmp_path / "out", open_worker=open_worker)
+    assert "no such device" in str(error.value)
+    assert seeds_done(tmp_path / "out") == 0
+
+
+def test_killed_at_any_moment_it_continues_and_ends_the_same(undisturbed, tmp_path):
+    out = tmp_path / "out"
+    for seeds in (0, 1, 4):
+        with in_a_process(out) as process:
+            wait_until(lambda seeds=seeds: (out / "plan.json").is_file() and seeds_done(out) >= seeds, process)
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+        assert not (out / "report.json").exists()
+    assert 4 <= seeds_done(out) < 8  # two units of three, one of two
+    run_here(out)
+    assert_same(undisturbed, out)
+    assert seeds_done(out) == 8
