@@ -63,6 +63,8 @@ class ImportGraspNet(_Making):
     """Make a pack from GraspNet-1Billion as downloaded: models/ and, if there, grasp_label/.
 
     Objects get the ids that the builtin pack uses for their stand-ins, so that a task configuration runs on either.
+
+    Example: robocas assets import-graspnet downloads/graspnet
     """
 
     root: Annotated[Path, tyro.conf.Positional]
@@ -75,7 +77,10 @@ class ImportGraspNet(_Making):
 
 @dataclass(kw_only=True)
 class ImportYCB(_Making):
-    """Make a pack from the YCB objects that ManiSkill downloads (python -m mani_skill.utils.download_asset ycb)."""
+    """Make a pack from the YCB objects that ManiSkill downloads (python -m mani_skill.utils.download_asset ycb).
+
+    Example: robocas assets import-ycb
+    """
 
     root: Annotated[Maybe[Path], tyro.conf.Positional] = None
     """ManiSkill's YCB folder. Default: where ManiSkill puts it."""
@@ -87,7 +92,10 @@ class ImportYCB(_Making):
 
 @dataclass(kw_only=True)
 class ImportPartNet(_Making):
-    """Make a pack of furniture from PartNet-Mobility models."""
+    """Make a pack of furniture from PartNet-Mobility models.
+
+    Example: robocas assets import-partnet downloads/7179 --annotations annotations
+    """
 
     models: Annotated[Several[Path], tyro.conf.Positional]
     """Folders of models, each with a mobility.urdf."""
@@ -101,7 +109,10 @@ class ImportPartNet(_Making):
 
 @dataclass(kw_only=True)
 class Build:
-    """Make the builtin pack anew from its formulas (for people who work on it, in a clone of the repository)."""
+    """Make the builtin pack again from its formulas; only in a clone of the repository.
+
+    Example: robocas assets build --ids plate --out packs/plate
+    """
 
     out: Maybe[Path] = None
     """Its folder. Default: where the package has it."""

@@ -20,12 +20,18 @@ from robocas_ms3.core.words import count_of, printable
 
 @dataclass
 class ListPacks:
-    """List the asset packs that are there."""
+    """List the installed asset packs.
+
+    Example: robocas assets list
+    """
 
 
 @dataclass
 class Info:
-    """Show what is in a pack: size, mass, hulls, grasps, repairs."""
+    """Print a table of the assets of a pack: size, mass, hulls, grasps, repairs.
+
+    Example: robocas assets info builtin
+    """
 
     pack: Annotated[str, tyro.conf.Positional]
     """Its name, or its folder."""
@@ -33,15 +39,17 @@ class Info:
 
 @dataclass
 class Verify:
-    """Check a pack's files and what the physics engine makes of its hulls; with --physics, every asset in simulation.
+    """Check the files of a pack and its collision hulls; with --physics, every asset in simulation.
 
-    Files against the manifest's hashes; hulls as they are cooked on a CPU, and as a GPU takes them.
+    Files are compared with the hashes of the manifest; hulls are cooked for CPU and GPU.
+
+    Example: robocas assets verify builtin
     """
 
     pack: Annotated[str, tyro.conf.Positional]
     """Its name, or its folder."""
     physics: bool = False
-    """Drop, grasp and shake every object, move every joint, and print the table of quality."""
+    """Drop, grasp and shake every object, move every joint, and print a table of the quality."""
     jobs: Maybe[int] = None
     """With --physics: processes. Default: one for each CPU core."""
     json: Maybe[Path] = None
@@ -50,7 +58,10 @@ class Verify:
 
 @dataclass
 class Sheet:
-    """Draw a contact sheet of a pack: looks, hulls, stable poses, best grasps."""
+    """Draw a contact sheet of a pack: appearance, hulls, stable poses, best grasps.
+
+    Example: robocas assets sheet builtin --ids plate mug
+    """
 
     pack: Annotated[str, tyro.conf.Positional]
     """Its name, or its folder."""

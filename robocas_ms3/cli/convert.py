@@ -19,43 +19,43 @@ from robocas_ms3.datasets.lerobot.variants import NEWEST, Version
 
 @dataclass
 class Convert:
-    """Write a dataset from a trajectory file made by ``robocas generate``; LeRobot's also from a RoboCAS dataset.
+    """Render a trajectory file of `robocas generate` into a dataset, or turn a RoboCAS dataset into a LeRobot dataset.
 
-    Formats of other packages are named by --to as well; docs/extending.md.
+    Example: robocas convert demos/pick/trajectory.h5 --out datasets/pick --jobs 2
     """
 
     trajectory: Annotated[Path, tyro.conf.Positional]
-    """F.h5, with F.json beside it, which is rendered; for --to lerobot also the folder of a RoboCAS dataset, whose
-    pictures are taken."""
+    """F.h5, with F.json next to it. With --to lerobot also the folder of a RoboCAS dataset, whose images are used."""
     out: Path
     """Folder of the dataset."""
     to: str = "robocas"
-    """Format of the dataset: robocas, lerobot (needs the extra 'lerobot'), or another package's."""
+    """Format of the dataset: robocas, lerobot (needs the extra 'lerobot'), or one of another package."""
     lerobot_version: Version = NEWEST
-    """What reads the LeRobot dataset: 0.6: LeRobot 0.6 and later (format v3.0, language columns, depth as video);
-    0.5: LeRobot 0.4.4 to 0.5.1 (v3.0, subtask_index); 2.1: readers of format v2.1, as openpi and GR00T."""
+    """Reader of the LeRobot dataset. 0.6: LeRobot 0.6 and later (format v3.0, language columns, depth as video);
+    0.5: LeRobot 0.4.4 to 0.5.1 (v3.0, subtask_index); 2.1: readers of format v2.1, such as openpi and GR00T."""
     codec: Literal["h264", "av1"] = "h264"
-    """Of lerobot's videos; AV1 takes half the space."""
+    """Codec of the videos of a LeRobot dataset; AV1 takes half the space."""
     rate: Maybe[float] = None
-    """Steps a second; must divide the control frequency. Default: 5, or that of the RoboCAS dataset."""
+    """Steps per second; must divide the control frequency. Default: 5, or the rate of the RoboCAS dataset."""
     embeddings: bool = True
-    """Embed instruction and sub-goals (needs the extra 'language'; lerobot has none)."""
+    """Embed instruction and sub-goals (needs the extra 'language'; not for lerobot)."""
     video: bool = True
-    """Write a video of each episode and a contact sheet into OUT/preview, of at most 20 episodes (not for lerobot)."""
+    """Write a video of each episode and a contact sheet into OUT/preview, if there are at most 20 episodes (not for
+    lerobot)."""
     all_videos: bool = False
-    """Write them of more than 20 episodes as well."""
+    """Write videos and contact sheet of more than 20 episodes too."""
     cameras: tuple[Literal["base_camera", "gripper_camera", "static_camera"], ...] = (
         "base_camera",
         "gripper_camera",
         "static_camera",
     )
-    """Which cameras."""
+    """Cameras to render."""
     size: Maybe[tuple[int, int]] = None
-    """Width and height of the pictures; default: the cameras' own, 640 480."""
+    """Width and height of the images. Default: those of the cameras, 640 480."""
     depth: bool = True
-    """Store depth beside RGB."""
+    """Store depth in addition to RGB."""
     image_format: Literal["png", "jpg", "webp"] = "png"
-    """Of RGB; the loader released with RoboCAS opens png only. Not for lerobot, which has videos."""
+    """Format of RGB images; the loader released with RoboCAS opens png only. Not for lerobot, which stores videos."""
     include_failed: bool = False
     """Also convert episodes without success."""
     overwrite: bool = False
@@ -69,12 +69,12 @@ class Convert:
     jobs: int = 1
     """Processes that render."""
     episode_seconds: float = 3600.0
-    """Seconds an episode may take. One that takes longer, or more memory, or crashes, is begun again once, by another
-    process; then the others are written, and it is named in the end, as one is that can't be rendered or stored."""
+    """Seconds that an episode may take. An episode that takes longer, needs more memory or crashes its process is
+    retried once, then skipped and named at the end, like one that can't be rendered or stored."""
     memory_gb: float = 8.0
-    """GB of memory a process may use."""
+    """GB of memory that a process may use."""
     pack: Maybe[str] = None
-    """Name or folder of the objects' pack, instead of the one named there; a file can't choose a folder."""
+    """Object pack to use instead of the recorded one: its name, or its folder."""
 
 
 def main(cfg: Convert) -> int:

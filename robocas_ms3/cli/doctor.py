@@ -1,4 +1,4 @@
-"""``robocas doctor``: what of this machine works."""
+"""``robocas doctor``: check what works on this machine."""
 
 from __future__ import annotations
 
@@ -13,7 +13,10 @@ if TYPE_CHECKING:
 
 @dataclass
 class Doctor:
-    """Check versions, render device, physics, planner, assets and disk; exit code 1 if something needed fails."""
+    """Check versions, render device, physics, planner, assets and disk; exit code 1 if something required fails.
+
+    Example: robocas doctor
+    """
 
     json: bool = False
     """Print a machine-readable report."""

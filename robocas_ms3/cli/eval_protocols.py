@@ -14,7 +14,10 @@ from robocas_ms3.core.words import count_of
 
 @dataclass
 class Protocols:
-    """List the bundled protocols, and the configurations to train on that belong to them."""
+    """List the bundled protocols, and the configurations to train on that belong to them.
+
+    Example: robocas eval protocols
+    """
 
 
 @dataclass

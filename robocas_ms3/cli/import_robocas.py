@@ -17,24 +17,26 @@ if TYPE_CHECKING:
 
 @dataclass
 class ImportRobocas:
-    """Bring a dataset in upstream's format, made elsewhere, into this one's; without --out only say what is wrong.
+    """Repair a dataset in the format of RoboCAS-v0 and write it as a valid dataset; without --out only check it.
 
-    What can be put right is: types, missing arrays that follow from others, either name of a camera's pose, the turned
-    EEF frame. Episodes that can't are left out, and named. Exit code 1 where no episode can be taken.
+    Repairs: types, missing arrays that follow from others, either name of the pose of a camera, the turned EEF frame.
+    Episodes that can't be repaired are skipped and named. Exit code 1 if no episode is left.
+
+    Example: robocas import-robocas downloads/robocas --out datasets/robocas
     """
 
     dataset: Annotated[Path, tyro.conf.Positional]
-    """Folder of the dataset; nothing in it changes."""
+    """Folder of the dataset; it is not changed."""
     out: Maybe[Path] = None
     """Folder of the new dataset; episodes keep their numbers."""
     rate: Maybe[float] = None
-    """Its steps a second; default: what conversion.json says, 5 where there is none, as in upstream's."""
+    """Steps per second of the dataset. Default: as in conversion.json, without one 5, as RoboCAS-v0 has it."""
     turn_eef: bool = True
-    """Turn the EEF frame to ManiSkill's TCP where the gripper camera's place says that it is turned."""
+    """Turn the EEF frame to the TCP frame of ManiSkill if the pose of the gripper camera shows that it is turned."""
     embeddings: bool = False
-    """Embed instruction and sub-goals where that is missing (needs the extra 'language')."""
+    """Add missing embeddings of instruction and sub-goals (needs the extra 'language')."""
     link: bool = False
-    """Hard links to the pictures instead of copies."""
+    """Hard-link the images instead of copying them."""
     json: bool = False
     """Print a machine-readable report."""
     overwrite: bool = False

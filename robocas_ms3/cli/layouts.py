@@ -55,7 +55,10 @@ class Build:
 
 @dataclass
 class Info:
-    """List the banks that are there."""
+    """List the layout caches on this machine.
+
+    Example: robocas layouts info
+    """
 
     folder: Maybe[Path] = None
     """Folder of all banks. Default: in the cache."""

@@ -11,7 +11,10 @@ from robocas_ms3.core.words import count_of
 
 @dataclass
 class List:
-    """List the tasks, the shipped task configurations, the robots, the policies, the baselines and the asset packs."""
+    """List the tasks, bundled task configurations, robots, policies, baselines and asset packs.
+
+    Example: robocas list --json
+    """
 
     json: bool = False
     """Print a machine-readable list."""

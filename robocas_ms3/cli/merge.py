@@ -1,30 +1,28 @@
-"""``robocas merge``: write one dataset of several."""
+"""``robocas merge``: join datasets."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
-import tyro
+from robocas_ms3.cli.options import Folders
 
 
 @dataclass
 class Merge:
-    """Write a dataset of all episodes of others, in the order given, numbered anew; the split stays as it was."""
+    """Join datasets into one. Episodes are numbered in the given order and keep their side of the split.
 
-    datasets: Annotated[
-        tuple[Path, ...],
-        tyro.conf.Positional,
-        tyro.conf.arg(metavar="PATH [PATH ...]", help_behavior_hint="(required)"),  # tyro takes none, too: see `merge`
-    ]
-    """Folders of datasets of the same settings."""
+    Example: robocas merge datasets/pick datasets/search --out datasets/both
+    """
+
+    datasets: Folders
+    """Folders of datasets with the same settings."""
     out: Path
     """Folder of the new dataset."""
     skip_duplicates: bool = False
-    """Take a recording that is there several times once, instead of refusing."""
+    """Keep one copy of a recording that is in several datasets, instead of an error."""
     copy: bool = False
-    """Copy files, also where hard links would do."""
+    """Copy files instead of hard-linking them."""
     overwrite: bool = False
     """Replace the dataset that is there."""
     resume: bool = False

@@ -1,4 +1,4 @@
-"""``robocas replay``: run recorded episodes again."""
+"""``robocas replay``: replay recorded episodes."""
 
 from __future__ import annotations
 
@@ -14,13 +14,15 @@ from robocas_ms3.core.words import count_of
 
 @dataclass
 class Replay:
-    """Replay a trajectory file, by its actions or its states, or converted to another control mode.
+    """Replay a trajectory file: its actions, its states, or its actions in another control mode.
 
-    Exit code 1 when an episode does not succeed.
+    Exit code 1 if an episode does not succeed.
+
+    Example: robocas replay demos/pick --count 2
     """
 
     trajectory: Annotated[Path, tyro.conf.Positional]
-    """The HDF5 file, its JSON beside it; or the folder that `robocas generate` made."""
+    """F.h5, with F.json next to it, or the output folder of `robocas generate`."""
     control_mode: Annotated[Maybe[str], tyro.conf.arg(aliases=["-c"])] = None
     """Convert the actions: pd_joint_delta_pos, pd_ee_delta_pose or pd_ee_pose. Default: as recorded."""
     obs_mode: Annotated[str, tyro.conf.arg(aliases=["-o"])] = "none"
@@ -34,7 +36,7 @@ class Replay:
     allow_failure: bool = False
     """With --save: write failed episodes too."""
     pack: Maybe[str] = None
-    """Name or folder of the objects' pack, instead of the one named there; a file can't choose a folder."""
+    """Object pack to use instead of the recorded one: its name, or its folder."""
     overwrite: bool = False
     """Replace the file given by --save if it exists."""
 

@@ -1,4 +1,4 @@
-"""``robocas serve-policy``: let a policy answer over a socket."""
+"""``robocas serve-policy``: serve a policy over a socket."""
 
 from __future__ import annotations
 
@@ -14,18 +14,20 @@ from robocas_ms3.cli.options import Several
 
 @dataclass
 class ServePolicy:
-    """Let a policy act for evaluations elsewhere: robocas eval --policy ws://HOST:PORT. Ctrl-C ends it.
+    """Serve a policy to evaluations on other machines: robocas eval --policy ws://HOST:PORT. Ctrl-C ends it.
 
-    There is no password, and whoever can reach the port can ask: keep to loopback, and tunnel (ssh -L).
+    There is no password: everyone who reaches the port can use it. Keep the loopback address, and use ssh -L.
+
+    Example: robocas serve-policy runs/pick --port 8000
     """
 
     policy: Annotated[str, tyro.conf.Positional]
-    """As robocas eval has it: scripted, random, still, replay:TRAJECTORY.h5, a folder of robocas train, or
+    """Policy, as in robocas eval: scripted, random, still, replay:TRAJECTORY.h5, a folder of robocas train, or
     module:Class of your own."""
     host: str = "127.0.0.1"
-    """Address to listen on; 0.0.0.0: all of this machine's."""
+    """Address to listen on; 0.0.0.0: all addresses of this machine."""
     port: int = 8000
-    """0: any that is free, which is printed."""
+    """Port; 0: a free one, which is printed."""
     protocol: Several[Path] = ()
     """Folders of your own protocols, for policies that read an episode's configuration, such as scripted. Clients may
     choose among these and the shipped ones."""

@@ -13,12 +13,14 @@ from robocas_ms3.cli.options import Maybe, Several
 
 @dataclass
 class Split:
-    """Split a dataset into several, or into training and validation anew.
+    """Split a dataset into several, or choose its training and validation episodes again.
 
-    --out-train T --out-val V: its two sides as datasets. --parts 0.8 0.2 --out O: datasets O/part_0, O/part_1, ... of
-    these shares. --by task --out O: one dataset for each task (or target). --in-place --val-share 0.2: only
-    data_info.json is written, no episode is touched; without --val-share it is rebuilt from the episodes on disk, and
-    every episode keeps its side.
+    - --out-train T --out-val V: training and validation episodes as two datasets
+    - --parts 0.8 0.2 --out O: datasets O/part_0, O/part_1, ... with these fractions
+    - --by task --out O: one dataset per task (or target)
+    - --in-place --val-share 0.2: write only data_info.json; without --val-share, rebuild it from the episodes on disk
+
+    Example: robocas split datasets/pick --out-train datasets/train --out-val datasets/val
     """
 
     dataset: Annotated[Path, tyro.conf.Positional]
@@ -28,17 +30,17 @@ class Split:
     out_val: Maybe[Path] = None
     """Folder of the validation episodes."""
     parts: Several[float] = ()
-    """Shares of the parts; they sum to 1."""
+    """Fractions of the parts; they sum to 1."""
     out: Maybe[Path] = None
-    """Folder of the parts' folders."""
+    """Folder for the folders of the parts."""
     in_place: bool = False
-    """Write only data_info.json anew."""
+    """Write only data_info.json."""
     val_share: Maybe[float] = None
-    """Choose training and validation anew, with this share to validate; default: every episode keeps its side."""
+    """Choose training and validation again, with this fraction for validation. Default: each episode keeps its side."""
     by: Maybe[Literal["seed", "target", "task"]] = None
-    """What is never cut: episodes of one seed (default), target object or task."""
+    """Episodes that stay together: of one seed (default), target object or task."""
     copy: bool = False
-    """Copy files, also where hard links would do."""
+    """Copy files instead of hard-linking them."""
     overwrite: bool = False
     """Replace datasets that are there."""
     resume: bool = False

@@ -1,4 +1,4 @@
-"""``robocas stats``: count what is in a dataset."""
+"""``robocas stats``: write statistics of a dataset."""
 
 from __future__ import annotations
 
@@ -14,16 +14,19 @@ from robocas_ms3.core.words import count_of
 
 @dataclass
 class Stats:
-    """Count what is in a dataset: lengths, objects, layouts, instructions, actions, sub-goals. Pictures and JSON."""
+    """Write statistics of a dataset as plots and JSON: lengths, objects, layouts, instructions, actions, sub-goals.
+
+    Example: robocas stats datasets/pick
+    """
 
     path: Annotated[Path, tyro.conf.Positional]
-    """Folder of a RoboCAS dataset, or trajectory.h5 (its failed episodes too)."""
+    """Folder of a RoboCAS dataset, or a trajectory.h5, whose failed episodes count too."""
     out: Maybe[Path] = None
-    """Folder to write to; default: DATASET/preview/stats, or TRAJECTORY_stats beside a trajectory."""
+    """Output folder. Default: DATASET/preview/stats, or TRAJECTORY_stats next to a trajectory."""
     json: bool = False
-    """Print the JSON; files are written only if --out says where."""
+    """Print the JSON; files are written only with --out."""
     rate: Maybe[float] = None
-    """Steps a second of a trajectory; default 5. A dataset has its own."""
+    """Steps per second, for a trajectory. Default: 5."""
 
 
 def main(cfg: Stats) -> int:

@@ -23,21 +23,23 @@ if TYPE_CHECKING:
 
 @dataclass
 class Validate:
-    """Check a RoboCAS or LeRobot dataset, or another package's, and list every violation; exit code 1 if there is any.
+    """Check a dataset of any format and list every violation of the format; exit code 1 if there is one.
 
-    With --replay also play every episode's own 7-D actions open loop in its rebuilt scene, and say how many succeed
-    again and how far the gripper strays. That changes the exit code only with --min-share.
+    With --replay, each episode is also replayed open loop from its 7-D actions in its rebuilt scene. The report says
+    how many succeed again and how far the gripper deviates. This changes the exit code only with --min-share.
+
+    Example: robocas validate datasets/pick --replay
     """
 
     dataset: Annotated[Path, tyro.conf.Positional]
     """Folder of the dataset."""
     replay: bool = False
-    """Play the actions too (RoboCAS folders; simulated, not rendered)."""
+    """Replay the actions too (RoboCAS folders; simulated, not rendered)."""
     min_share: Maybe[float] = None
-    """With --replay: exit code 1 where a smaller share of a task's episodes succeeds again (0 to 1), or where
-    none of them could be tried."""
+    """With --replay: exit code 1 if a smaller fraction of the episodes of a task succeeds again (0 to 1), or if none of
+    them could be replayed."""
     pack: Maybe[str] = None
-    """With --replay: name or folder of the objects' pack, instead of the one named there."""
+    """With --replay: object pack to use instead of the recorded one: its name, or its folder."""
     json: bool = False
     """Print a machine-readable report."""
 

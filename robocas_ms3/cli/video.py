@@ -1,4 +1,4 @@
-"""``robocas video``: film a dataset."""
+"""``robocas video``: write videos of a dataset."""
 
 from __future__ import annotations
 
@@ -13,18 +13,21 @@ from robocas_ms3.cli.options import Maybe, Several
 
 @dataclass
 class Video:
-    """Write videos and a contact sheet of a dataset."""
+    """Write videos and a contact sheet of a dataset.
+
+    Example: robocas video datasets/pick --episodes 0 3 --kind depth
+    """
 
     dataset: Annotated[Path, tyro.conf.Positional]
     """Folder of the dataset."""
     out: Maybe[Path] = None
-    """Folder to write to; default: DATASET/preview."""
+    """Folder to write to; Default: DATASET/preview."""
     episodes: Several[int] = ()
-    """Numbers of episodes; default: all."""
+    """Numbers of the episodes. Default: all."""
     kind: Literal["rgb", "depth"] = "rgb"
-    """What to show; depth is shown in colours."""
+    """Images to show; depth is shown in colours."""
     speed: float = 1.0
-    """1 is real time."""
+    """Playback speed; 1: real time."""
 
 
 def main(cfg: Video) -> int:

@@ -1,4 +1,4 @@
-"""``robocas view``: look at a dataset or a recording in a browser."""
+"""``robocas view``: show a dataset or a recording in a browser."""
 
 from __future__ import annotations
 
@@ -14,20 +14,23 @@ from robocas_ms3.core.words import count_of
 
 @dataclass
 class View:
-    """Look at a trajectory file, a RoboCAS folder or a LeRobot folder in a browser; docs/view.md."""
+    """Show a trajectory file, a RoboCAS folder or a LeRobot folder in a browser; docs/view.md.
+
+    Example: robocas view datasets/pick
+    """
 
     path: Annotated[Path, tyro.conf.Positional]
-    """trajectory.h5 (its JSON beside it), or the folder of a dataset."""
+    """trajectory.h5 (with trajectory.json next to it), or the folder of a dataset."""
     port: int = 0
     """Port of 127.0.0.1 to serve at; 0 takes a free one."""
     open: bool = True
     """Open the page in the default browser."""
     static: Maybe[Path] = None
-    """Write a folder that opens from disk instead of serving: this one."""
+    """Write the page into this folder, which opens from disk, instead of serving it."""
     episodes: Several[int] = ()
-    """With --static: numbers of the episodes to write; default: all."""
+    """With --static: numbers of the episodes to write. Default: all."""
     width: int = 480
-    """With --static: width of the pictures, pixels."""
+    """With --static: width of the images, pixels."""
     depth: bool = True
     """With --static: write depth too."""
     overwrite: bool = False
