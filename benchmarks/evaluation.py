@@ -23,9 +23,10 @@ from numpy.typing import NDArray
 
 import robocas_ms3
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
-from robocas_ms3.evaluation.protocol import load_protocol
-from robocas_ms3.evaluation.rollout import Rollouts, Rules
-from robocas_ms3.evaluation.stage import make_env, start_of
+from robocas_ms3.evaluation.protocol import Episode, load_protocol
+from robocas_ms3.evaluation.rollout import rollout
+from robocas_ms3.evaluation.session import EvaluationSession
+from robocas_ms3.evaluation.settings import EvaluationSettings
 from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.scenes.task_specs import TASKS
 
@@ -94,11 +95,12 @@ def main(args: Args) -> None:
             sim_config={"control_freq": RATE},
             max_episode_steps=10**9,
         )
-        ours = make_env(protocol, Waving.spec, episodes[0], args.envs, backend="processes")
+        settings = EvaluationSettings(num_envs=args.envs, backend="processes")
+        ours = EvaluationSession(protocol, Waving(), settings)
         spent: dict[str, list[float]] = {"bare": [], "evaluation": []}
         for _ in range(args.turns):
             spent["bare"].append(alone(bare, [one.seed for one in episodes], args.steps))
-            spent["evaluation"].append(evaluated(ours, [start_of(protocol, one) for one in episodes], args.steps))
+            spent["evaluation"].append(evaluated(ours, episodes, args.steps))
         per_step = {name: 1000 * float(np.median(turns)) / args.steps / args.envs for name, turns in spent.items()}
         cases[task] = {
             **{f"{name}, cpu ms a step": round(value, 3) for name, value in per_step.items()},
@@ -121,12 +123,13 @@ def alone(env: Any, seeds: list[int], steps: int) -> float:
     return cpu(env) - before
 
 
-def evaluated(env: Any, starts: list[EpisodeSpec], steps: int) -> float:
+def evaluated(session: EvaluationSession, episodes: list[Episode], steps: int) -> float:
     """CPU seconds of the evaluation's loop from the first step on."""
-    policy = Counting(env)
-    ended = list(Rollouts(env, policy, Rules(steps, ends_on=()), 1 / RATE, refill=True).play(starts))
-    assert [one.steps for one in ended] == [steps] * len(starts)
-    return cpu(env) - policy.before
+    batch = session.open(episodes[0], len(episodes), steps)
+    policy = Counting(batch.env)
+    ended = list(rollout(batch, policy, [session.episode_spec(one) for one in episodes]))
+    assert [one.steps for one in ended] == [steps] * len(episodes)
+    return cpu(batch.env) - policy.before
 
 
 class Counting(Waving):

@@ -93,12 +93,14 @@ def run(cfg: Run) -> int:
     shard = shard_of(cfg.shard)
     check_policy(cfg.policy)
     protocol = load_protocol(cfg.protocol or "ms3-v1")
-    from robocas_ms3.evaluation.run import Settings, evaluate
+    from robocas_ms3.evaluation.session import EvaluationSession, evaluate
+    from robocas_ms3.evaluation.settings import EvaluationSettings
 
     use_one_torch_thread()
     name = re.sub(r"[^\w.-]+", "_", cfg.policy) + ("_weld" if cfg.weld else "")
     out = cfg.out or (Path("eval") / protocol.rules.name / name).absolute()
-    settings = Settings(
+    settings = EvaluationSettings(
+        policy_name=cfg.policy,
         num_envs=cfg.envs,
         backend=cfg.backend,
         workers=cfg.workers,
@@ -112,10 +114,8 @@ def run(cfg: Run) -> int:
     succeeded = played = 0
     with open_policy(cfg.policy) as policy, bar("episodes played") as shown:
         try:
-            again, begun = cfg.retry_errors, shown.start
-            for outcome in evaluate(
-                protocol, policy, cfg.policy, out, settings, resume=cfg.resume, again=again, on_start=begun
-            ):
+            session, retry = EvaluationSession(protocol, policy, settings), cfg.retry_errors
+            for outcome in evaluate(session, out, resume=cfg.resume, retry_errors=retry, on_start=shown.start):
                 played += 1
                 succeeded += outcome.success
                 shown.advance()

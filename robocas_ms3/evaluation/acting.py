@@ -23,9 +23,8 @@ from robocas_ms3.demos.takeover import Takeover
 from robocas_ms3.evaluation.policies import open_policy
 from robocas_ms3.evaluation.policy import EpisodeSpec, Policy, PolicySpec
 from robocas_ms3.evaluation.protocol import load_protocol
-from robocas_ms3.evaluation.rollout import Rollouts, Rules
-from robocas_ms3.evaluation.stage import looks
-from robocas_ms3.evaluation.stepping import UPSTREAM_HZ, PolicyStepping, control_mode
+from robocas_ms3.evaluation.rollout import EndConditions, EpisodeBatch, rollout
+from robocas_ms3.evaluation.stepping import UPSTREAM_HZ, PolicyStepping, env_kwargs
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.task_specs import TASKS
 from robocas_ms3.tasks.vector import NumpyVectorEnv, RoboCASVectorEnv
@@ -47,7 +46,7 @@ def check_acting(settings: EpisodeSettings) -> str:
         RobocasError: there is no such policy, it speaks another way, or wants to see where nothing can be rendered.
     """
     with open_policy(settings.after_policy) as policy:
-        load_protocol(PROTOCOL).rules.refuse(policy.spec)
+        load_protocol(PROTOCOL).rules.check_policy(policy.spec)
         if policy.spec.cameras:
             require_renderer()
         return str(getattr(policy, "describe", dict)().get("weights", ""))
@@ -87,18 +86,17 @@ class Player:
     def run(self, seed: int) -> Takeover:
         """What the policy leaves in the scene of a seed."""
         settings, steps = self._settings, steps_of(seed, self._settings.after_steps)
-        rules = Rules(steps, ends_on=("success", "fail"))
-        rollouts = Rollouts(self._vector, self._policy, rules, 1 / UPSTREAM_HZ, refill=False)
+        batch = EpisodeBatch(self._vector, self._policy.spec, EndConditions(steps), 1 / UPSTREAM_HZ, refill=False)
         try:
             self._vector.reset(seed=[seed])
-            (played,) = rollouts.play([self._start(seed)])
+            (played,) = rollout(batch, self._policy, [self._start(seed)])
         except LayoutError:
             return Takeover(seed, settings.after_policy, 0, {}, 1.0, "no_layout")
         if played.error:
             _log.warning("seed %d: %s", seed, played.error)
         refused = "policy_failed" if played.error else _over(played.at_end)
         state = {kind: _of_one_env(of) for kind, of in self._base.get_state_dict().items() if kind != "controller"}
-        gripper = 1.0 if self._env.told_open else -1.0
+        gripper = 1.0 if self._env.gripper_open else -1.0
         return Takeover(seed, settings.after_policy, played.steps, state, gripper, refused)
 
     def close(self) -> None:
@@ -122,21 +120,17 @@ class Player:
 
 
 def _make_env(settings: EpisodeSettings, spec: PolicySpec) -> PolicyStepping:
-    """One env in this process, as `stage.make_env` makes many in others."""
+    """One env in this process, as `EvaluationSession` opens several in other processes."""
     env = gym.make(
         TASKS[settings.task].env_id,
         config=settings.config,
         layouts=settings.layouts,
         pack=settings.pack,
         robot_uids=settings.robot,
-        control_mode=control_mode(spec.convention),
-        reward_mode="none",
         sim_backend="physx_cpu",
-        sim_config={"control_freq": UPSTREAM_HZ},
-        max_episode_steps=10**9,
-        **looks(spec),
+        **env_kwargs(spec, UPSTREAM_HZ),
     )
-    return PolicyStepping(env, spec.convention, spec.reference, "upstream", look_every=spec.look_every)
+    return PolicyStepping(env, spec, "upstream")
 
 
 def _over(at_end: dict[str, bool]) -> str:

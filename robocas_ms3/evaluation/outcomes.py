@@ -1,15 +1,26 @@
-"""What came of one episode, as results keep it."""
+"""The outcome of one episode, as results record it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
-from pydantic import AfterValidator, Field, ValidatorFunctionWrapHandler, WrapValidator
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    NonNegativeInt,
+    ValidationError,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
+)
 
+from robocas_ms3.core.strict import mistakes
 from robocas_ms3.core.words import printable
-from robocas_ms3.evaluation.orders import check_order, order_of
 from robocas_ms3.evaluation.protocol import Episode
 from robocas_ms3.scenes.task_specs import STAGES as STAGES_ON_THE_WAY
 from robocas_ms3.scenes.task_specs import TASKS
@@ -30,6 +41,38 @@ Number = Annotated[float, Field(ge=-1e12, le=1e12), WrapValidator(_as_written)]
 """Whole if the file has it whole: what is written again says the same."""
 Measure = Annotated[float, Field(ge=0, le=1e12), WrapValidator(_as_written)]
 Count = Annotated[int, Field(ge=0, le=10**12)]
+
+
+class _Move(BaseModel):
+    model_config = ConfigDict(strict=True, extra="allow")
+
+    object: str
+    step: NonNegativeInt
+    needed: bool
+    in_order: bool
+
+
+class _Order(BaseModel):
+    model_config = ConfigDict(strict=True, extra="allow")
+
+    moved: list[_Move]
+    needed: list[str]
+    left: NonNegativeInt
+    score: Annotated[float, Field(ge=0, le=1)] | None
+
+
+def check_order(order: dict[str, Any]) -> dict[str, Any]:
+    """Return what `retrieval_order` returned, as it is.
+
+    Raises:
+        ValueError: a key is missing, or a value is of another type or out of range.
+    """
+    try:
+        _Order.model_validate(order)
+    except ValidationError as error:
+        wrong = mistakes(error, _Order)[0]
+        raise ValueError(f"{wrong.what}, expected {wrong.expected}, found {wrong.found}") from error
+    return order
 
 
 @dataclass(frozen=True)
@@ -54,7 +97,7 @@ class Outcome:
         measures: ``path_length`` m, ``contact_impulse`` N s, ``disturbed_most``, ``fallen``; ``welds`` with the weld.
         inference_ms: clock time of the policy a step.
         p_vis: share of the target that is seen from above.
-        retrieval: in tasks with obstacles to clear: what was moved before the target, see `orders.order_of`.
+        retrieval: in tasks with obstacles to clear: what was moved before the target, see `retrieval_order`.
     """
 
     episode: Count
@@ -82,7 +125,7 @@ class Outcome:
         flags, held_at, order = played.flags, played.flags.get("target_grasped"), None
         if played.retrieval is not None:
             cleared = flags.get("obstacles_cleared") is not None
-            order = order_of(played.retrieval, objects, held_at, cleared=cleared)
+            order = retrieval_order(played.retrieval, objects, held_at, cleared=cleared)
         return cls(
             episode=episode.episode,
             task=episode.task,
@@ -129,3 +172,70 @@ def failure_stage(flags: dict[str, int | None], error: str = "", order: Sequence
     came = [number for number, stage in enumerate(stages) if flags[stage] is not None]
     following = came[-1] + 1 if came else 0
     return stages[following] if following < len(stages) else "placed"
+
+
+def retrieval_order(
+    kept: NDArray[np.integer], objects: Sequence[str], held_at: int | None, *, cleared: bool
+) -> dict[str, Any]:
+    """What a result says of an episode's order.
+
+    Args:
+        kept: (K, 3) of `metrics.RetrievalOrder.read`.
+        objects: ids by slot.
+        held_at: policy step after which the target was first held; None: it never was.
+        cleared: whether the obstacles had been cleared before.
+
+    Returns:
+        ``moved``, what was moved before the target: ``object``, ``step``, ``needed``, ``in_order`` each, by step;
+        ``needed``: ids; ``left``: how many of these had not been moved when the target was taken from a heap that was
+        not cleared; ``score``: how many were needed and moved in order, of all that were moved or left; 1 where nothing
+        was; None where the target was never held.
+    """
+    order = [slot for slot in np.argsort(kept[:, 0], kind="stable").tolist() if kept[slot, 0]]
+    moved = [
+        {
+            "object": objects[slot],
+            "step": int(kept[slot, 0]),
+            "needed": bool(kept[slot, 1]),
+            "in_order": bool(kept[slot, 2]),
+        }
+        for slot in order
+    ]
+    left = 0 if cleared or held_at is None else int(((kept[:, 0] == 0) & (kept[:, 1] == 1)).sum())
+    right, of = int(kept[:, 2].sum()), len(moved) + left
+    score = None if held_at is None else 1.0 if of == 0 else round(right / of, 4)
+    wanted = [objects[slot] for slot in np.flatnonzero(kept[:, 1]).tolist()]
+    return {"moved": moved, "needed": wanted, "left": left, "score": score}
+
+
+class RetrievalSummary(NamedTuple):
+    """Of several episodes, those in which the target was held.
+
+    Attributes:
+        held: how many these are.
+        score: mean of theirs.
+        moved: mean number of objects moved before the target.
+        needed: share of these that were needed.
+        left: mean number that was left in the way.
+    """
+
+    held: int
+    score: float
+    moved: float
+    needed: float
+    left: float
+
+
+def summarize_retrieval(found: Iterable[dict[str, Any] | None]) -> RetrievalSummary | None:
+    """Sum up `retrieval_order` several episodes; None: the target was held in none."""
+    held = [one for one in found if one is not None and one["score"] is not None]
+    if not held:
+        return None
+    moved = [move for one in held for move in one["moved"]]
+    return RetrievalSummary(
+        held=len(held),
+        score=sum(one["score"] for one in held) / len(held),
+        moved=len(moved) / len(held),
+        needed=sum(move["needed"] for move in moved) / max(len(moved), 1),
+        left=sum(one["left"] for one in held) / len(held),
+    )

@@ -141,6 +141,24 @@ class Policy(Protocol):
         ...
 
 
+class ExternalPolicy:
+    """Stand for the policy of an external loop, which calls `EvaluationSession.reset` and `step`.
+
+    Args:
+        spec: what the policy sees, and what its actions mean.
+    """
+
+    def __init__(self, spec: PolicySpec) -> None:
+        self.spec = spec
+
+    def reset(self, starts: list[EpisodeSpec]) -> None:
+        """Do nothing: the external loop resets its policy."""
+
+    def act(self, observations: Observations) -> NDArray[np.floating]:
+        """Raise an error: the external loop chooses the actions."""
+        raise EvaluationError("this policy has no actions", where="ExternalPolicy", fix="Call reset and step.")
+
+
 def policy_spec_values(spec: PolicySpec) -> dict[str, Any]:
     """JSON values of what is declared; of looks only if there are fewer than steps, as who reads it may be older."""
     said = {**vars(spec), "cameras": {name: list(size) for name, size in spec.cameras.items()}}

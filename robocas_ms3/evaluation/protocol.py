@@ -88,8 +88,8 @@ class Protocol(StrictModel):
         ends = [self.max_steps, None if seconds is None else round(seconds * rate)]
         return min((steps for steps in ends if steps is not None), default=None)
 
-    def refuse(self, spec: PolicySpec) -> None:
-        """See that a policy can be evaluated by this.
+    def check_policy(self, spec: PolicySpec) -> None:
+        """Check that a policy can be evaluated by this protocol.
 
         Raises:
             EvaluationError: its actions or its rate are others.

@@ -1,4 +1,4 @@
-"""A policy plays a list of episodes in several envs at a time; one loop, whatever the backend."""
+"""Run episodes in several envs at a time: one loop for every backend."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import EvaluationError, PolicyFailed
 from robocas_ms3.evaluation.actions import CONVENTIONS
+from robocas_ms3.evaluation.metrics import MEASURES, read_sum
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, Policy, PolicySpec, policy_code, privileged
-from robocas_ms3.evaluation.tracking import MEASURES, summed
 from robocas_ms3.scenes.language.embed import TextEmbedder
 
 NOT_FINITE = "the policy's action is not finite"
@@ -22,19 +22,19 @@ _WELDS = "welds"  # of `weld`, where there is one
 
 @dataclass
 class Rollout:
-    """What came of an episode.
+    """An episode that runs or has ended.
 
     Attributes:
-        start: which one.
+        start: the episode, and its env.
         steps: policy steps.
         seconds: of the scene's time.
         flags: by name of a stage or rule, the policy step after which it first held, from 1 on; None: never.
         flag_seconds: the same in the scene's seconds.
-        at_end: whether it held after the last step.
-        measures: sums and extremes (`tracking`).
-        retrieval: (K, 3) of search, see `retrieval.Retrieval.read`.
-        inference_seconds: clock time the policy took, its share of each batch.
-        error: why it was broken off, as by a policy that failed; empty: it was not.
+        at_end: whether it held after the last step, by name.
+        measures: sums and extremes (`metrics`).
+        retrieval: (K, 3) in search, see `metrics.RetrievalOrder.read`.
+        inference_seconds: clock time of the policy: of each batch the time per env.
+        error: why it was ended early, such as a policy that failed; empty: it was not.
     """
 
     start: EpisodeSpec
@@ -50,13 +50,13 @@ class Rollout:
 
 
 @dataclass(frozen=True)
-class Rules:
+class EndConditions:
     """When an episode ends.
 
     Attributes:
         max_steps: policy steps.
         ends_on: flags at which it ends at once, such as ``success`` and ``fail``.
-        max_v0_steps: it ends when upstream's success has held that often; None: that ends nothing.
+        max_v0_steps: number of policy steps with the success of RoboCAS-v0 at which it ends; None: never.
     """
 
     max_steps: int
@@ -73,19 +73,20 @@ class EpisodeBatch:
         env: vector environment (`make_vec`, NumPy arrays, no automatic resets) whose envs take actions of the policy's
             convention (`stepping.PolicyStepping`).
         spec: what the policy sees, and what its actions mean.
-        rules: when an episode ends.
+        ends: when an episode ends.
         control_dt: simulated time of a control step, s.
         refill: whether an env can be reset while others run. In a GPU's batch all envs are reset together.
 
     Attributes:
+        env: the vector environment.
         obs: last observation of the environment, arrays (N, ...).
         running: by env, the episode that it runs. An entry with an ``error`` ends at the next step.
-        size: numbers of an action.
+        action_size: number of values of an action.
     """
 
-    def __init__(self, env: Any, spec: PolicySpec, rules: Rules, control_dt: float, *, refill: bool) -> None:
-        self._env, self._spec, self._rules, self._dt, self.refill = env, spec, rules, control_dt, refill
-        self.size = CONVENTIONS[spec.convention].size
+    def __init__(self, env: Any, spec: PolicySpec, ends: EndConditions, control_dt: float, *, refill: bool) -> None:
+        self.env, self._spec, self._ends, self._dt, self.refill = env, spec, ends, control_dt, refill
+        self.action_size = CONVENTIONS[spec.convention].size
         self.num_envs: int = env.num_envs
         self.running: dict[int, Rollout] = {}
         self.obs: Any = None
@@ -108,16 +109,16 @@ class EpisodeBatch:
         starts = [replace(start, env=env) for env, start in pairs]
         self.running.update({start.env: Rollout(start) for start in starts})
         if self.refill:
-            self.obs, info = self._env.reset(seed=seeds, options={"env_idx": np.array(envs)})
+            self.obs, info = self.env.reset(seed=seeds, options={"env_idx": np.array(envs)})
         else:  # a batch is reset as a whole, with the objects of these seeds
             rest = [seeds[0]] * (self.num_envs - len(seeds))
-            self.obs, info = self._env.reset(seed=seeds + rest, options={"reconfigure": True})
+            self.obs, info = self.env.reset(seed=seeds + rest, options={"reconfigure": True})
         self._info = info
         if not self._flags:
             self._flags = [name for name, value in info.items() if _is_flag(value)]
             self._held = np.zeros((len(self._flags), self.num_envs), dtype=bool)
         self._held[:, envs] = False
-        self._note()
+        self._record_flags()
         return starts
 
     def observe(self, envs: list[int]) -> Observations:
@@ -148,10 +149,10 @@ class EpisodeBatch:
             yield self._end(env)
         if not self.running:
             return
-        self.obs, _, _, _, self._info = self._env.step(actions)
+        self.obs, _, _, _, self._info = self.env.step(actions)
         for played in self.running.values():
             played.steps += 1
-        self._note()
+        self._record_flags()
         for env in [env for env, played in self.running.items() if self._is_over(played)]:
             yield self._end(env)
 
@@ -171,15 +172,15 @@ class EpisodeBatch:
             played.at_end[name] = bool(info[name][env])
             played.flags.setdefault(name, None)
             played.flag_seconds.setdefault(name, None)
-        played.measures = {name: round(float(summed(info, name)[env]), 4) for name in MEASURES}
+        played.measures = {name: round(float(read_sum(info, name)[env]), 4) for name in MEASURES}
         if _WELDS in info:
             played.measures[_WELDS] = float(info[_WELDS][env])
         if "retrieval" in info:
             played.retrieval = info["retrieval"][env].copy()
         return played
 
-    def _note(self) -> None:
-        """Write down which flags hold for the first time."""
+    def _record_flags(self) -> None:
+        """Record which flags hold for the first time."""
         new = np.array([self._info[name] for name in self._flags]) & ~self._held
         if not new.any():
             return
@@ -193,80 +194,74 @@ class EpisodeBatch:
         return float(self._info["elapsed_steps"][env]) * self._dt
 
     def _is_over(self, played: Rollout) -> bool:
-        rules, info, env = self._rules, self._info, played.start.env
-        v0 = rules.max_v0_steps is not None and summed(info, "v0_steps")[env] >= rules.max_v0_steps
-        return v0 or played.steps >= rules.max_steps or any(info[name][env] for name in rules.ends_on if name in info)
+        ends, info, env = self._ends, self._info, played.start.env
+        v0 = ends.max_v0_steps is not None and read_sum(info, "v0_steps")[env] >= ends.max_v0_steps
+        return v0 or played.steps >= ends.max_steps or any(info[name][env] for name in ends.ends_on if name in info)
 
 
-class Rollouts:
-    """Plays episodes in a vector environment with a policy.
+def rollout(batch: EpisodeBatch, policy: Policy, episodes: Sequence[EpisodeSpec]) -> Iterator[Rollout]:
+    """Run episodes with a policy.
 
-    In processes an env that is done begins the next episode at once; in a GPU's batch, where objects are built for all
-    envs together, it waits, masked, until all are done.
+    In processes an env whose episode has ended starts the next one at once. In a GPU batch, where the objects of all
+    envs are built together, it waits until all episodes of the batch have ended.
 
     Args:
-        env: see `EpisodeBatch`.
-        policy: that acts.
-        rules: when an episode ends.
-        control_dt: simulated time of a control step, s.
-        refill: see `EpisodeBatch`.
+        batch: envs in which no episode runs.
+        policy: chooses the actions.
+        episodes: to run; their ``env`` is set here.
+
+    Yields:
+        Each episode as it ends, in any order.
     """
+    waiting, chunks = list(reversed(episodes)), dict[int, list[NDArray[np.floating]]]()
+    while waiting or batch.running:
+        free = [env for env in range(batch.num_envs) if env not in batch.running]
+        if waiting and free and (batch.refill or not batch.running):
+            starts = batch.start([(env, waiting.pop()) for env in free[: len(waiting)]])
+            chunks.update({start.env: [] for start in starts})
+            with policy_code(policy):
+                policy.reset(starts)
+        _request_actions(batch, policy, chunks)
+        actions = np.zeros((batch.num_envs, batch.action_size), np.float32)
+        for env, running in batch.running.items():
+            if not running.error:
+                actions[env] = chunks[env].pop(0)
+        yield from batch.step(actions)
 
-    def __init__(self, env: Any, policy: Policy, rules: Rules, control_dt: float, *, refill: bool) -> None:
-        self._batch = EpisodeBatch(env, policy.spec, rules, control_dt, refill=refill)
-        self._policy = policy
-        self._chunks: dict[int, list[NDArray[np.floating]]] = {}
-        self.lost = self._batch.lost
 
-    def play(self, episodes: Sequence[EpisodeSpec]) -> Iterator[Rollout]:
-        """Play episodes; each is given as it ends, in any order. Their ``env`` is set here."""
-        waiting, batch = list(reversed(episodes)), self._batch
-        while waiting or batch.running:
-            free = [env for env in range(batch.num_envs) if env not in batch.running]
-            if waiting and free and (batch.refill or not batch.running):
-                starts = batch.start([(env, waiting.pop()) for env in free[: len(waiting)]])
-                self._chunks.update({start.env: [] for start in starts})
-                with policy_code(self._policy):
-                    self._policy.reset(starts)
-            self._ask()
-            actions = np.zeros((batch.num_envs, batch.size), np.float32)
-            for env, played in batch.running.items():
-                if not played.error:
-                    actions[env] = self._chunks[env].pop(0)
-            yield from batch.step(actions)
-
-    def _ask(self) -> None:
-        """See that every env that plays has an action."""
-        running = self._batch.running
-        envs = [env for env in running if not self._chunks[env]]
-        if not envs:
+def _request_actions(batch: EpisodeBatch, policy: Policy, chunks: dict[int, list[NDArray[np.floating]]]) -> None:
+    """Ask the policy for the actions of running envs that have none left; where it fails, set the episode's error."""
+    running = batch.running
+    envs = [env for env in running if not chunks[env]]
+    if not envs:
+        return
+    observations = batch.observe(envs)
+    started = time.perf_counter()
+    try:
+        with policy_code(policy):
+            result: Any = policy.act(observations)
+            actions = np.asarray(result, np.float32)
+    except PolicyFailed as failed:
+        for env in envs if failed.actions is None else failed.reasons:
+            running[env].error = failed.reasons.get(env, str(failed))
+        if failed.actions is None:
             return
-        seen = self._batch.observe(envs)
-        begun = time.perf_counter()
-        try:
-            with policy_code(self._policy):
-                acted: Any = self._policy.act(seen)
-                actions = np.asarray(acted, np.float32)
-        except PolicyFailed as failed:
-            acted = failed.actions
-            for env in envs if acted is None else failed.reasons:
-                running[env].error = failed.reasons.get(env, str(failed))
-            if acted is None:
-                return
-            actions = np.asarray(acted, np.float32)
-        spent = (time.perf_counter() - begun) / len(envs)
-        chunks = as_chunks(actions, len(envs), self._batch.size, where=type(self._policy).__name__)
-        every = self._policy.spec.look_every
-        if chunks.shape[1] > 1 and chunks.shape[1] % every:
-            what = "it would be asked for chunks without a look at pictures"
-            raise EvaluationError(
-                what, where=type(self._policy).__name__, expected=f"a multiple of {every} steps", found=chunks.shape[1]
-            )
-        for env, chunk in zip(envs, chunks, strict=True):
-            if not np.isfinite(chunk).all():
-                running[env].error = running[env].error or NOT_FINITE
-            self._chunks[env] = list(chunk)
-            running[env].inference_seconds += spent
+        actions = np.asarray(failed.actions, np.float32)
+    seconds = (time.perf_counter() - started) / len(envs)
+    new = as_chunks(actions, len(envs), batch.action_size, where=type(policy).__name__)
+    period = policy.spec.look_every
+    if new.shape[1] > 1 and new.shape[1] % period:
+        raise EvaluationError(
+            "the first observation of the next chunk would have no images",
+            where=type(policy).__name__,
+            expected=f"chunks of a multiple of {period} steps",
+            found=new.shape[1],
+        )
+    for env, chunk in zip(envs, new, strict=True):
+        if not np.isfinite(chunk).all():
+            running[env].error = running[env].error or NOT_FINITE
+        chunks[env] = list(chunk)
+        running[env].inference_seconds += seconds
 
 
 def as_chunks(actions: NDArray[np.float32], count: int, size: int, *, where: str) -> NDArray[np.float32]:

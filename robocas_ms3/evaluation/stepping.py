@@ -1,4 +1,4 @@
-"""The environment as policies act in it: their conventions in, an action a policy step, and what happened meanwhile."""
+"""The environment in which policies act: from their action conventions to control steps, and measures of each step."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.actions import CONVENTIONS, Motion
-from robocas_ms3.evaluation.policy import Reference
-from robocas_ms3.evaluation.tracking import Tracker
+from robocas_ms3.evaluation.metrics import EpisodeMetrics
+from robocas_ms3.evaluation.policy import CAMERAS, PolicySpec
 from robocas_ms3.evaluation.weld import Weld
 from robocas_ms3.robots.ee_deltas import to_ee_delta_action
 
@@ -22,36 +22,25 @@ UPSTREAM_HZ = 5
 # evaluation_v0.md: the gripper first, until it stands, 5 control steps at most; then the motion, 2 at most
 _GRIPPER_STEPS, _MOTION_STEPS = 5, 2
 _STANDS = 0.0005  # m that the gripper's width changes in a control step; velocities shiver where fingers press
+_UNUSED = 8  # pixels per side of cameras that the policy does not use, which are rendered all the same
 _NEAR, _TURNED, _SPIN = 0.02, np.deg2rad(5), np.deg2rad(3)  # m, rad, rad/s: where upstream's motion ends early
 
 
 class PolicyStepping(gym.Wrapper):
-    """Takes actions of a convention, a policy step each, and adds to ``info`` what happened (`tracking`).
-
-    Works on one env and on a batch of them.
+    """Executes the actions of a policy, and adds measures to ``info`` (`metrics`). Works on one env and on a batch.
 
     Args:
-        env: a RoboCAS environment in control mode `control_mode`.
-        convention: of the actions.
-        reference: what motions are relative to.
-        stepping: ``timed``: a step is one control step. ``upstream``: a step moves the gripper until it stands, then
-            the TCP, on a straight line, until it is there or 0.4 s are over. Envs of a batch that are there wait.
-        look_every: policy steps from one look at pictures to the next (`policy.PolicySpec`); others are black.
-        weld: whether what is lifted is welded to the hand (`weld`); one env on a CPU.
+        env: a RoboCAS environment made with `env_kwargs`.
+        spec: what the policy's actions mean, and how often it looks at images; those of other steps are black.
+        stepping: ``timed``: a policy step is one control step. ``upstream``: a policy step moves the gripper until it
+            stands, then the TCP on a straight line, until it is there or 0.4 s are over. Envs of a batch that have
+            finished wait.
+        weld: whether lifted objects are welded to the hand (`weld`); only with one env on a CPU.
     """
 
-    def __init__(
-        self,
-        env: gym.Env,
-        convention: str,
-        reference: Reference,
-        stepping: Stepping,
-        *,
-        look_every: int = 1,
-        weld: bool = False,
-    ) -> None:
+    def __init__(self, env: gym.Env, spec: PolicySpec, stepping: Stepping, *, weld: bool = False) -> None:
         super().__init__(env)
-        self._convention, self._reference, self._stepping = CONVENTIONS[convention], reference, stepping
+        self._convention, self._reference, self._stepping = CONVENTIONS[spec.convention], spec.reference, stepping
         self._base: Any = env.unwrapped
         count = self._base.num_envs
         bound = np.full(self._convention.size, np.inf, np.float32)
@@ -59,11 +48,11 @@ class PolicyStepping(gym.Wrapper):
         batched = np.tile(bound, (count, 1))
         self.action_space = gym.spaces.Box(-batched, batched) if count > 1 else self.single_action_space
         self.single_observation_space = self._base.single_observation_space
-        self._tracker = Tracker(self._base)
+        self._metrics = EpisodeMetrics(self._base)
         self._weld = Weld(self._base) if weld else None
-        self._told = np.ones(count, dtype=bool)  # whether each gripper was told to be open last
+        self._open = np.ones(count, dtype=bool)  # whether the last command of each gripper was to open
         self._width_change = np.zeros(count)  # m in the last control step
-        self._look_every, self._steps = look_every, np.zeros(count, dtype=np.int64)  # steps by env
+        self._image_period, self._steps = spec.look_every, np.zeros(count, dtype=np.int64)  # steps by env
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         """Reset; see ``BaseEnv``."""
@@ -71,23 +60,23 @@ class PolicyStepping(gym.Wrapper):
             self._weld.reset()
         obs, info = self.env.reset(**kwargs)
         envs = (kwargs.get("options") or {}).get("env_idx", slice(None))
-        self._tracker.reset(envs)
+        self._metrics.reset(envs)
         rows = envs if isinstance(envs, slice) else np.asarray(torch.as_tensor(envs).cpu())
-        self._told[rows], self._width_change[rows], self._steps[rows] = True, 0.0, 0
-        return obs, {**info, **self._happened(info)}
+        self._open[rows], self._width_change[rows], self._steps[rows] = True, 0.0, 0
+        return obs, {**info, **self._measures(info)}
 
     @property
-    def told_open(self) -> bool:
-        """Whether the first env's gripper was told to be open last."""
-        return bool(self._told[0])
+    def gripper_open(self) -> bool:
+        """Whether the last command of the first env's gripper was to open."""
+        return bool(self._open[0])
 
     def get_info(self) -> dict[str, Any]:
-        """What infos hold, such as workers share."""
+        """Return the info of the present state, whose entries workers share."""
         info = self._base.get_info()
-        return {**info, **self._happened(info)}
+        return {**info, **self._measures(info)}
 
     def step(self, action: Any) -> tuple[Any, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """One policy step.
+        """Execute one policy step.
 
         Args:
             action: (A,) or (N, A) of the convention.
@@ -105,23 +94,23 @@ class PolicyStepping(gym.Wrapper):
         finally:
             self._base.looks = True
         self._steps += 1
-        if (self._steps % self._look_every == 0).any() and isinstance(obs, dict) and "sensor_data" in obs:
+        if (self._steps % self._image_period == 0).any() and isinstance(obs, dict) and "sensor_data" in obs:
             obs = self._base.get_obs(info)
-        if self._weld and not self._told[0]:
-            self._weld.look()
-        self._tracker.end_step()
-        return (obs, *others, {**info, **self._happened(info)})
+        if self._weld and not self._open[0]:
+            self._weld.update()
+        self._metrics.end_step()
+        return (obs, *others, {**info, **self._measures(info)})
 
     def _act(self, actions: np.ndarray) -> tuple:
         if self._convention.read is None:
-            self._told = actions[:, 7] > 0
+            self._open = actions[:, 7] > 0
             return self._control(actions)
         motion = self._convention.read(actions)
         return self._timed(motion) if self._stepping == "timed" else self._upstream(motion)
 
-    def _happened(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
-        """What an info says besides, or otherwise."""
-        return {**self._tracker.read(), **(self._weld.read(info) if self._weld else {})}
+    def _measures(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
+        """Return the entries that are added to an info, or replaced."""
+        return {**self._metrics.read(), **(self._weld.read(info) if self._weld else {})}
 
     def _timed(self, motion: Motion) -> tuple:
         start = self._tcp() if self._reference == "tcp" else self._target()
@@ -130,7 +119,7 @@ class PolicyStepping(gym.Wrapper):
     def _upstream(self, motion: Motion) -> tuple:
         """Gripper, then motion; an env that is done with either waits."""
         result, here = None, self._target()
-        turned = motion.open != self._told
+        turned = motion.open != self._open
         for _ in range(_GRIPPER_STEPS):
             if not (turned | (self._width_change > _STANDS)).any():
                 break
@@ -145,7 +134,7 @@ class PolicyStepping(gym.Wrapper):
 
     def _go(self, position: np.ndarray, rotation: Rotation, opened: np.ndarray) -> tuple:
         """Send TCPs to poses in the arm's base frame, in one control step, as far as that can go."""
-        self._told = opened
+        self._open = opened
         at, turn = self._target()
         delta = to_ee_delta_action(turn.inv().apply(position - at), turn.inv() * rotation)
         size = np.linalg.norm(delta[:, 3:], axis=1, keepdims=True)
@@ -153,13 +142,13 @@ class PolicyStepping(gym.Wrapper):
         return self._control(np.concatenate([delta, np.where(opened, 1.0, -1.0)[:, None]], axis=1))
 
     def _control(self, actions: np.ndarray) -> tuple:
-        if self._weld and self._told[0]:
+        if self._weld and self._open[0]:
             self._weld.open()
         width = self._width() if self._stepping == "upstream" else 0.0
         result = self.env.step(torch.as_tensor(actions, dtype=torch.float32, device=self._base.device))
         if self._stepping == "upstream":
             self._width_change = np.abs(self._width() - width)
-        self._tracker.look(self._told)
+        self._metrics.update(self._open)
         return result
 
     def _tcp(self) -> tuple[np.ndarray, Rotation]:
@@ -180,8 +169,30 @@ class PolicyStepping(gym.Wrapper):
 
 
 def control_mode(convention: str) -> str:
-    """The control mode that actions of a convention are turned into."""
+    """Return the control mode into which actions of a convention are converted."""
     return "pd_joint_pos" if CONVENTIONS[convention].read is None else "pd_ee_delta_pose"
+
+
+def env_kwargs(spec: PolicySpec, rate: int, *, renders: bool = False) -> dict[str, Any]:
+    """Return keyword arguments of an environment that a policy acts in: control, observations, no end of its own.
+
+    Args:
+        spec: of the policy.
+        rate: control steps per second.
+        renders: whether the environment's ``render`` is used.
+    """
+    common = {
+        "control_mode": control_mode(spec.convention),
+        "reward_mode": "none",
+        "sim_config": {"control_freq": rate},
+        "max_episode_steps": 10**9,  # `rollout.EndConditions` end episodes
+    }
+    if not spec.cameras:
+        return {**common, "obs_mode": "state_dict", **({} if renders else {"render_backend": "none"})}
+    modes = ["rgb", *(["depth"] if spec.depth else []), *(["state_dict"] if spec.state else [])]
+    sizes = {name: spec.cameras.get(name, (_UNUSED, _UNUSED)) for name in CAMERAS}
+    cameras = {name: {"width": width, "height": height} for name, (width, height) in sizes.items()}
+    return {**common, "obs_mode": "+".join(modes), "sensor_configs": cameras}
 
 
 def _pose(pose: Pose) -> tuple[np.ndarray, Rotation]:

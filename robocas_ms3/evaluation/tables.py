@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections import Counter
 
 from robocas_ms3.core.words import count_of, in_markdown
-from robocas_ms3.evaluation.orders import orders
-from robocas_ms3.evaluation.outcomes import STAGES, Outcome
+from robocas_ms3.evaluation.outcomes import STAGES, Outcome, summarize_retrieval
 from robocas_ms3.evaluation.results import Result
 from robocas_ms3.evaluation.statistics import Share, success_by
 
@@ -95,7 +94,9 @@ def _splits(result: Result) -> list[str]:
 
 
 def _retrieval(result: Result) -> list[str]:
-    found = {config: orders(one.retrieval for one in group) for config, group in result.by("config").items()}
+    found = {
+        config: summarize_retrieval(one.retrieval for one in group) for config, group in result.by("config").items()
+    }
     if not any(found.values()):
         return []
     lines = ["", "## What was moved before the target", ""]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from contextlib import closing
+from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -19,9 +20,8 @@ from robocas_ms3.evaluation.policy import Policy
 from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.report.failed import VIDEOS, video_name
 from robocas_ms3.evaluation.results import Result
-from robocas_ms3.evaluation.rollout import Rollouts, Rules
-from robocas_ms3.evaluation.stage import make_env, object_ids, rate_of, start_of
-from robocas_ms3.evaluation.weld import refuse
+from robocas_ms3.evaluation.session import EvaluationSession
+from robocas_ms3.evaluation.settings import EvaluationSettings
 
 SIZE = (480, 360)  # pixels
 _FRAMES = 5  # a second of the scene
@@ -51,88 +51,74 @@ def _in_turn(lists: list[list[int]]) -> list[int]:
 
 
 def film(result: Result, protocol: LoadedProtocol, policy: Policy, episodes: Sequence[int]) -> Iterator[FailureVideo]:
-    """Play episodes again, in processes, and write a video of each into the result's ``videos``.
+    """Run episodes again, in processes, and write a video of each into the result's ``videos``.
 
     Raises:
         EvaluationError: the result is of another protocol.
         DatasetError: there is no render device.
     """
-    if result.run["protocol_hash"] != protocol.hash:
+    expected = result.run["protocol_hash"]
+    if expected != protocol.hash:
         raise EvaluationError(
-            "the result is of another protocol",
-            where=result.folder,
-            expected=result.run["protocol_hash"],
-            found=protocol.hash,
+            "the result is of another protocol", where=result.folder, expected=expected, found=protocol.hash
         )
-    protocol.rules.refuse(policy.spec)
-    if result.run["weld"]:
-        refuse(protocol.rules.stepping, "processes")
     require_renderer()
+    recorder = _VideoRecorder()
+    settings = EvaluationSettings(num_envs=1, backend="processes", weld=result.run["weld"], render_size=SIZE)
+    session = EvaluationSession(protocol, policy, settings, recorder.wrap)
+    recorder.period = max(1, round(session.rate / _FRAMES))
     make_folder(result.folder / VIDEOS)
-    for config in dict.fromkeys(protocol.episodes[number].config for number in episodes):
-        numbers = [number for number in episodes if protocol.episodes[number].config == config]
-        yield from _film(result, protocol, policy, numbers)
-
-
-def _film(result: Result, protocol: LoadedProtocol, policy: Policy, numbers: list[int]) -> Iterator[FailureVideo]:
-    rules, first = protocol.rules, protocol.episodes[numbers[0]]
-    rate = rate_of(protocol, policy.spec)
-    size = {"width": SIZE[0], "height": SIZE[1]}
-    watched = {"render_mode": "rgb_array", "human_render_camera_configs": size, "weld": result.run["weld"]}
-    made = make_env(protocol, policy.spec, first, 1, backend="processes", **watched)
-    env = _FilmedEnv(made, max(1, round(rate / _FRAMES)))
-    try:
-        for number in numbers:
-            episode, before = protocol.episodes[number], result.outcomes[number]
-            # as long as it was before, so that this is the same episode whatever ended it
-            ends = Rules(before.steps, tuple(rules.ends_on), rules.max_v0_steps)
-            path = result.folder / VIDEOS / video_name(number)
-            with replacing(path) as tmp, _writer(tmp, rate / env.every * _SPEED) as writer:
-                env.writer = writer
-                (played,) = Rollouts(env, policy, ends, 1 / rate, refill=True).play([start_of(protocol, episode)])
-            outcome = Outcome.of(played, episode, object_ids(protocol, episode))
+    with closing(session):
+        for number in sorted(episodes, key=lambda one: protocol.episodes[one].config):
+            before, path = result.outcomes[number], result.folder / VIDEOS / video_name(number)
+            # As long as the first time, so that it is the same episode whatever ended it.
+            with replacing(path) as tmp, _writer(tmp, session.rate / recorder.period * _SPEED) as recorder.writer:
+                (outcome,) = session.play([protocol.episodes[number]], before.steps)
             yield FailureVideo(path, outcome, outcome.without_clock() == before.without_clock())
-    finally:
-        env.close()
 
 
-@dataclass
-class _FilmedEnv:
-    """An environment that adds pictures to a video.
+class _VideoRecorder:
+    """A wrapper of a vector environment with one env; it adds images to a video, at the reset and every few steps.
 
     Attributes:
-        env: one env, as NumPy arrays.
-        every: how many policy steps a picture.
         writer: of the video.
+        period: number of policy steps per image.
     """
 
-    env: Any
-    every: int
-    writer: Any = None
-    num_envs: int = 1
-    _steps: int = field(default=0, init=False)
+    num_envs = 1
+
+    def __init__(self) -> None:
+        self._env: Any = None
+        self._steps = 0
+        self.writer: Any = None
+        self.period = 1
+
+    def wrap(self, env: Any) -> _VideoRecorder:
+        """Record this environment from now on."""
+        self._env = env
+        return self
 
     def reset(self, **kwargs: Any) -> Any:
-        """Reset, and look."""
+        """Reset, and add an image."""
         self._steps = 0
-        result = self.env.reset(**kwargs)
-        self._look()
+        result = self._env.reset(**kwargs)
+        self._add_image()
         return result
 
     def step(self, actions: Any) -> Any:
-        """One policy step, and a look every few."""
-        result = self.env.step(actions)
+        """Execute one policy step, and add an image every few."""
+        result = self._env.step(actions)
         self._steps += 1
-        if self._steps % self.every == 0:
-            self._look()
+        if self._steps % self.period == 0:
+            self._add_image()
         return result
 
     def close(self) -> None:
-        """End its process."""
-        self.env.close()
+        """Close the environment."""
+        self._env.close()
 
-    def _look(self) -> None:
-        self.writer.append_data(torch.as_tensor(self.env.render())[0].cpu().numpy())
+    def _add_image(self) -> None:
+        self.writer.append_data(torch.as_tensor(self._env.render())[0].cpu().numpy())
 
 
 def _writer(path: Path, fps: float) -> Any:

@@ -21,8 +21,8 @@ RAISED = 0.03  # m above where it stood (evaluation_v0.md)
 _STIFFNESS, _DAMPING = 1e8, 1e5
 
 
-def refuse(stepping: str, backend: str) -> None:
-    """See that there can be a weld.
+def check_weld(stepping: str, backend: str) -> None:
+    """Check that objects can be welded.
 
     Args:
         stepping: of the protocol.
@@ -58,15 +58,15 @@ class Weld:
 
     def __init__(self, env: Any) -> None:
         if env.gpu_sim_enabled:
-            refuse("upstream", "gpu")
+            check_weld("upstream", "gpu")
         self._env = env
         self._welded: tuple[Any, Any] | None = None  # body and drive
         self._count = 0
 
-    def look(self) -> None:
+    def update(self) -> None:
         """Weld what both fingers touch, if it is raised and nothing is welded.
 
-        To be called where upstream looks: after a policy step in which the gripper was told to close.
+        To be called after a policy step in which the gripper was commanded to close, as RoboCAS-v0 does.
         """
         if self._welded is not None:
             return
@@ -88,7 +88,7 @@ class Weld:
         self._welded = None
 
     def reset(self) -> None:
-        """Let go, and count from 0 on. To be called before a reset, which may do away with the objects."""
+        """Let go, and count from 0. To be called before a reset, which may remove the objects."""
         self.open()
         self._count = 0
 

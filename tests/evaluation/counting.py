@@ -7,7 +7,17 @@ from typing import Any
 import numpy as np
 
 from robocas_ms3.core.errors import WorkerDied
-from robocas_ms3.evaluation.tracking import SUMS
+from robocas_ms3.evaluation.metrics import SUMS
+from robocas_ms3.evaluation.policy import EpisodeSpec, Policy
+from robocas_ms3.evaluation.rollout import EndConditions, EpisodeBatch, Rollout, rollout
+
+
+def play(
+    env: Any, policy: Policy, episodes: list[EpisodeSpec], max_steps: int, *, refill: bool = True
+) -> list[Rollout]:
+    """Run episodes with a policy, 0.05 s per step."""
+    batch = EpisodeBatch(env, policy.spec, EndConditions(max_steps), 0.05, refill=refill)
+    return list(rollout(batch, policy, episodes))
 
 
 class Counting:

@@ -4,14 +4,13 @@ import sys
 
 import numpy as np
 import pytest
-from counting import Counting
+from counting import Counting, play
 
 from robocas_ms3.core.errors import EvaluationError, ExtensionError
 from robocas_ms3.evaluation.policies import make_policy, open_policy
 from robocas_ms3.evaluation.policies.plain import StillPolicy
 from robocas_ms3.evaluation.policies.scripted import BESIDE, beside
 from robocas_ms3.evaluation.policy import EpisodeSpec, PolicySpec, describe, policy_spec_values
-from robocas_ms3.evaluation.rollout import Rollouts, Rules
 
 GOOD = """
 import numpy as np
@@ -124,11 +123,7 @@ def test_an_error_of_the_policys_own_is_its_own(here):
 def test_a_policy_can_not_end_the_process(here, name):
     with pytest.raises(ExtensionError) as caught, open_policy(name) as policy:
         describe(policy)
-        list(
-            Rollouts(Counting(1), policy, Rules(3), 0.05, refill=True).play(
-                [EpisodeSpec(-1, 0, "pick", "", "", "", 2, "")]
-            )
-        )
+        play(Counting(1), policy, [EpisodeSpec(-1, 0, "pick", "", "", "", 2, "")], 3)
     assert str(caught.value.where).startswith("policy own_")
     assert str(here) in str(caught.value.found)
 

@@ -131,10 +131,10 @@ def test_an_episode_ends_by_actions_or_by_seconds_whichever_comes_first():
 
 def test_policies_that_do_not_fit_are_refused():
     rules = load_protocol("smoke").rules.model_copy(update={"rate_hz": 20, "conventions": ["robocas"]})
-    rules.refuse(PolicySpec(rate_hz=20))
+    rules.check_policy(PolicySpec(rate_hz=20))
     for spec, said in ((PolicySpec(rate_hz=10), "another rate"), (PolicySpec(convention="delta_euler"), "convention")):
         with pytest.raises(EvaluationError, match=said):
-            rules.refuse(spec)
+            rules.check_policy(spec)
 
 
 def test_rates_are_those_that_physics_can_be_stopped_at():

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from robocas_ms3.evaluation.orders import order_of, orders
-from robocas_ms3.evaluation.retrieval import Retrieval, needed
+from robocas_ms3.evaluation.metrics import RetrievalOrder, needed
+from robocas_ms3.evaluation.outcomes import retrieval_order, summarize_retrieval
 
 TARGET, LID, CUP, PEAR = range(4)
 NAMES = ("target", "lid", "cup", "pear")
@@ -17,7 +17,7 @@ OVER[0, LID, TARGET], OVER[0, CUP, LID], OVER[0, PEAR, CUP] = 0.5, 0.3, 0.05
 
 
 class Heap:
-    """What `Retrieval` asks of search's environment, for one env at 20 Hz."""
+    """What `RetrievalOrder` asks of search's environment, for one env at 20 Hz."""
 
     device, control_timestep = torch.device("cpu"), 0.05
 
@@ -38,13 +38,13 @@ class Heap:
 def kept_of(moves: dict[int, int], held_at: int = 1000, steps: int = 200) -> np.ndarray:
     """What is kept when objects move at these control steps, two of them a policy step."""
     heap: Any = Heap()
-    retrieval = Retrieval(heap)
+    retrieval = RetrievalOrder(heap)
     retrieval.reset(torch.tensor([0]))
     for step in range(1, steps + 1):
         heap.elapsed_steps += 1
         for slot, at in moves.items():
             heap.disturbed[0, slot] |= step == at
-        retrieval.look(heap.moment(held=step == held_at))
+        retrieval.update(heap.moment(held=step == held_at))
         if step % 2 == 0:
             retrieval.end_step()
     return retrieval.read()[0].numpy()
@@ -59,7 +59,7 @@ def test_what_lies_on_what_lies_on_the_target_is_needed():
 def test_from_the_top_down():
     kept = kept_of({CUP: 10, LID: 60, PEAR: 81})
     assert kept.tolist() == [[0, 0, 0], [30, 1, 1], [5, 1, 1], [41, 0, 0]]
-    found = order_of(kept, NAMES, held_at=90, cleared=True)
+    found = retrieval_order(kept, NAMES, held_at=90, cleared=True)
     assert [move["object"] for move in found["moved"]] == ["cup", "lid", "pear"]
     assert [move["needed"] for move in found["moved"]] == [True, True, False]
     assert (found["needed"], found["left"], found["score"]) == (["lid", "cup"], 0, 0.6667)
@@ -72,9 +72,9 @@ def test_what_is_pushed_as_one_moves_within_a_second(cup, in_order):
 
 def test_from_below_or_not_at_all():
     assert kept_of({LID: 20}).tolist()[LID] == [10, 1, 0]
-    found = order_of(kept_of({LID: 20}), NAMES, held_at=50, cleared=False)
+    found = retrieval_order(kept_of({LID: 20}), NAMES, held_at=50, cleared=False)
     assert (found["left"], found["score"]) == (1, 0.0)
-    assert order_of(kept_of({LID: 20}), NAMES, held_at=50, cleared=True)["left"] == 0
+    assert retrieval_order(kept_of({LID: 20}), NAMES, held_at=50, cleared=True)["left"] == 0
 
 
 def test_the_target_lies_over_nothing_that_waits_for_it(monkeypatch):
@@ -82,7 +82,7 @@ def test_the_target_lies_over_nothing_that_waits_for_it(monkeypatch):
     over = OVER.clone()
     over[0, TARGET, LID] = 0.4
     monkeypatch.setattr(Heap, "covering", lambda self, envs: over)
-    found = order_of(kept_of({CUP: 10, LID: 60}), NAMES, held_at=50, cleared=True)
+    found = retrieval_order(kept_of({CUP: 10, LID: 60}), NAMES, held_at=50, cleared=True)
     assert (found["needed"], found["left"], found["score"]) == (["lid", "cup"], 0, 1.0)
 
 
@@ -93,27 +93,27 @@ def test_a_second_is_a_second_wherever_it_begins(start):
 
 
 def test_what_moves_once_the_target_is_held_does_not_count():
-    found = order_of(kept_of({CUP: 10, LID: 60}, held_at=60), NAMES, held_at=30, cleared=True)
+    found = retrieval_order(kept_of({CUP: 10, LID: 60}, held_at=60), NAMES, held_at=30, cleared=True)
     assert [move["object"] for move in found["moved"]] == ["cup"]
 
 
 def test_a_target_that_was_never_held_has_no_order():
-    found = order_of(kept_of({CUP: 10}), NAMES, held_at=None, cleared=False)
+    found = retrieval_order(kept_of({CUP: 10}), NAMES, held_at=None, cleared=False)
     assert (found["score"], found["left"], len(found["moved"])) == (None, 0, 1)
     nothing = np.zeros((4, 3), np.int16)
-    assert order_of(nothing, NAMES, held_at=5, cleared=True)["score"] == 1.0
+    assert retrieval_order(nothing, NAMES, held_at=5, cleared=True)["score"] == 1.0
 
 
 def test_several_episodes_are_summed_up_where_the_target_was_held():
     episodes = [
-        order_of(kept_of({CUP: 10, LID: 60, PEAR: 81}), NAMES, held_at=90, cleared=True),
-        order_of(kept_of({LID: 20}), NAMES, held_at=50, cleared=False),
-        order_of(kept_of({CUP: 10}), NAMES, held_at=None, cleared=False),
+        retrieval_order(kept_of({CUP: 10, LID: 60, PEAR: 81}), NAMES, held_at=90, cleared=True),
+        retrieval_order(kept_of({LID: 20}), NAMES, held_at=50, cleared=False),
+        retrieval_order(kept_of({CUP: 10}), NAMES, held_at=None, cleared=False),
         None,
     ]
-    found = orders(episodes)
+    found = summarize_retrieval(episodes)
     assert found == (2, pytest.approx(0.33335), 2.0, 0.75, 0.5)
-    assert orders(episodes[2:]) is None
+    assert summarize_retrieval(episodes[2:]) is None
 
 
 def test_envs_begin_anew_on_their_own():
@@ -130,10 +130,10 @@ def test_envs_begin_anew_on_their_own():
             return SimpleNamespace(obstacles=torch.zeros(len(envs), 4, dtype=torch.bool))
 
     heap: Any = Two()
-    retrieval = Retrieval(heap)
+    retrieval = RetrievalOrder(heap)
     retrieval.reset(torch.tensor([0, 1]))
     heap.disturbed[:, CUP], heap.elapsed_steps[:] = True, 1
-    retrieval.look(heap.moment())
+    retrieval.update(heap.moment())
     retrieval.end_step()
     retrieval.reset(torch.tensor([1]))
     assert retrieval.read()[:, CUP].tolist() == [[1, 1, 1], [0, 1, 0]]

@@ -11,11 +11,12 @@ from counting import Dying
 from robocas_ms3.cli.main import run as cli
 from robocas_ms3.core.errors import DatasetError, EvaluationError, RobocasError, WorkerDied
 from robocas_ms3.core.locks import locked_folder
-from robocas_ms3.evaluation import results, run
+from robocas_ms3.evaluation import results, session
 from robocas_ms3.evaluation.policies import make_policy
 from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.protocol import load_protocol
-from robocas_ms3.evaluation.run import Settings, chosen, evaluate
+from robocas_ms3.evaluation.session import EvaluationSession, evaluate
+from robocas_ms3.evaluation.settings import EvaluationSettings, choose_episodes
 from robocas_ms3.evaluation.verify import problems
 
 
@@ -31,8 +32,8 @@ def short(tmp_path_factory):
 
 def play(folder, policy="random", *, protocol="smoke", resume=False, **settings) -> dict[int, dict]:
     made = make_policy(policy)
-    settings = Settings(backend="processes", **{"tasks": ("pick", "select"), **settings})
-    list(evaluate(load_protocol(protocol), made, policy, folder, settings, resume=resume))
+    settings = EvaluationSettings(policy, backend="processes", **{"tasks": ("pick", "select"), **settings})
+    list(evaluate(EvaluationSession(load_protocol(protocol), made, settings), folder, resume=resume))
     return {number: one.without_clock() for number, one in results.read(folder).outcomes.items()}
 
 
@@ -56,9 +57,10 @@ def test_outcomes_do_not_depend_on_how_many_envs_there_are_or_on_shards(alone, s
 
 @pytest.mark.slow
 def test_a_run_that_was_cut_off_goes_on_and_ends_the_same(alone, short, tmp_path):
-    protocol, settings = load_protocol(short), Settings(1, "processes", tasks=("pick", "select"))
+    settings = EvaluationSettings("random", 1, "processes", tasks=("pick", "select"))
     begun: list[int] = []
-    playing = evaluate(protocol, make_policy("random"), "random", tmp_path, settings, on_start=begun.append)
+    opened = EvaluationSession(load_protocol(short), make_policy("random"), settings)
+    playing = evaluate(opened, tmp_path, on_start=begun.append)
     next(playing)
     assert begun == [4]
     playing.close()
@@ -109,14 +111,14 @@ def test_a_policy_that_does_not_fit_is_refused_before_anything_is_written(tmp_pa
     assert not (tmp_path / "out").exists()
     rules = load_protocol("paper-v1").rules
     with pytest.raises(EvaluationError, match=r"another rate \(expected 5 Hz, found 10 Hz\)"):
-        rules.refuse(PolicySpec(reference="tcp", rate_hz=10))
+        rules.check_policy(PolicySpec(reference="tcp", rate_hz=10))
     with pytest.raises(
         EvaluationError, match=r"no such task \(expected pick, select, search, open_pick, found nothing"
     ):
         play(tmp_path / "out", tasks=("nothing",))
     with pytest.raises(EvaluationError, match=r"no such split \(expected test, found seen"):
         play(tmp_path / "out", split="seen")
-    with pytest.raises(EvaluationError, match="no episodes in this part"):
+    with pytest.raises(EvaluationError, match="no episodes in this shard"):
         play(tmp_path / "out", tasks=("pick",), shard=(90, 100))
 
 
@@ -124,11 +126,11 @@ def test_who_wants_to_see_needs_a_renderer(tmp_path, monkeypatch):
     def none() -> None:
         raise DatasetError("no render device")
 
-    monkeypatch.setattr(run, "require_renderer", none)
+    monkeypatch.setattr(session, "require_renderer", none)
     policy = make_policy("random")
     policy.spec = PolicySpec(reference="tcp", cameras={"base_camera": (8, 8)})
     with pytest.raises(DatasetError, match="no render device"):
-        next(evaluate(load_protocol("smoke"), policy, "random", tmp_path / "out", Settings(backend="processes")))
+        EvaluationSession(load_protocol("smoke"), policy, EvaluationSettings(backend="processes"))
     assert not (tmp_path / "out").exists()
 
 
@@ -138,11 +140,11 @@ def test_an_episode_that_ends_its_process_is_played_again_and_then_counts_as_fai
 ):
     protocol, made, deaths = load_protocol(short), [], [times]
 
-    def make_env(protocol, spec, first, count, **_):
+    def make_vec(env_id, count, **_):
         made.append(Dying(count, protocol.episodes[1].seed, deaths))
         return made[-1]
 
-    monkeypatch.setattr(run, "make_env", make_env)
+    monkeypatch.setattr(session, "make_vec", make_vec)
     found = play(tmp_path / "out", "still", protocol=short)
     assert sorted(found) == [0, 1, 2, 3]  # none is left out
     assert [number for number, one in found.items() if one["error"]] == ([1] if times == 2 else [])
@@ -150,7 +152,7 @@ def test_an_episode_that_ends_its_process_is_played_again_and_then_counts_as_fai
     assert (found[1]["failure_stage"] == "error") == (times == 2)
     assert found[0]["steps"] == 20  # from its beginning, whatever befell the other
     assert [record.getMessage() for record in caplog.records] == [
-        "episode 1: its process died: SIGSEGV; it is played again"
+        "episode 1: its process died: SIGSEGV; it is started again"
     ]
     assert all(env.closed for env in made)
     said = problems(results.read(tmp_path / "out"), protocol)
@@ -161,10 +163,10 @@ def test_an_episode_that_ends_its_process_is_played_again_and_then_counts_as_fai
 
 
 def test_a_process_that_dies_at_no_episode_ends_the_run(short, tmp_path, monkeypatch):
-    def make_env(protocol, spec, first, count, **_):
+    def make_vec(env_id, count, **_):
         raise WorkerDied("its process died", where="env 0", found="SIGSEGV")
 
-    monkeypatch.setattr(run, "make_env", make_env)
+    monkeypatch.setattr(session, "make_vec", make_vec)
     with pytest.raises(WorkerDied, match="env 0: its process died"):
         play(tmp_path / "out", "still", protocol=short)
 
@@ -174,7 +176,7 @@ def test_an_interrupted_run_says_how_it_goes_on(tmp_path, monkeypatch, capsys):
         raise KeyboardInterrupt
         yield
 
-    monkeypatch.setattr(run, "evaluate", interrupted)
+    monkeypatch.setattr(session, "evaluate", interrupted)
     assert cli(["eval", "--protocol", "smoke", "--policy", "still", "--out", str(tmp_path)]) == 130
     assert capsys.readouterr().err == "interrupted; the same command with --resume goes on\n"
 
@@ -186,12 +188,12 @@ def test_what_a_policy_can_not_want():
 
 
 def test_episodes_are_chosen_by_task_count_and_shard():
-    episodes = load_protocol("smoke").episodes
-    assert [one.episode for one in chosen(episodes, Settings(tasks=("search", "pick")))] == [0, 1, 4, 5]
-    assert [one.episode for one in chosen(episodes, Settings(episodes=1))] == [0, 2, 4, 6]
-    assert [one.episode for one in chosen(episodes, Settings(shard=(1, 3)))] == [1, 4, 7]
-    suite = load_protocol("objects-v1").episodes
-    new = chosen(suite, Settings(split="new", tasks=("pick",)))
+    smoke = load_protocol("smoke")
+    assert [one.episode for one in choose_episodes(smoke, EvaluationSettings(tasks=("search", "pick")))] == [0, 1, 4, 5]
+    assert [one.episode for one in choose_episodes(smoke, EvaluationSettings(episodes=1))] == [0, 2, 4, 6]
+    assert [one.episode for one in choose_episodes(smoke, EvaluationSettings(shard=(1, 3)))] == [1, 4, 7]
+    suite = load_protocol("objects-v1")
+    new = choose_episodes(suite, EvaluationSettings(split="new", tasks=("pick",)))
     assert [one.episode for one in new] == [*range(50, 100)]
 
 

@@ -12,8 +12,9 @@ import torch
 
 import robocas_ms3  # noqa: F401
 from robocas_ms3.core.errors import EvaluationError
+from robocas_ms3.evaluation.metrics import read_sum
+from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.stepping import PolicyStepping, control_mode
-from robocas_ms3.evaluation.tracking import summed
 from robocas_ms3.tasks.vector import make_vec
 
 needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device: unproven on a GPU")
@@ -29,7 +30,7 @@ def made(convention="robocas", reference="tcp", stepping="timed", rate=5) -> Pol
         sim_config={"control_freq": rate},
         max_episode_steps=10_000,
     )
-    stepped = PolicyStepping(env, convention, reference, stepping)
+    stepped = PolicyStepping(env, PolicySpec(convention, reference), stepping)
     stepped.reset(seed=3)
     return stepped
 
@@ -50,7 +51,7 @@ def test_a_slow_motion_ends_where_it_was_told_to(reference):
     for _ in range(5):
         *_, info = env.step(along(0.02))
     assert np.linalg.norm(tcp(env) - before) == pytest.approx(0.1, abs=0.004)
-    assert summed(info, "path_length") == pytest.approx(0.1, abs=0.004)
+    assert read_sum(info, "path_length") == pytest.approx(0.1, abs=0.004)
     env.close()
 
 
@@ -113,23 +114,23 @@ def test_what_happened_is_counted_from_the_reset_on():
     base.objects[slot].set_pose(robot_pose(above, pose))
     *_, info = env.step(along(0.0))
     assert bool(info["success_v0"])  # near the basket in xy, gripper open: upstream's rule asks for no more
-    assert summed(info, "v0_steps") == 1
+    assert read_sum(info, "v0_steps") == 1
     assert not bool(info["success"])
     other = next(i for i in range(len(base.objects)) if i != slot)
     pose = base.objects[other].pose.raw_pose.clone()
     base.objects[other].set_pose(robot_pose(torch.tensor([[3.0, 3.0, 0.05]]), pose))
     *_, info = env.step(along(0.0, gripper=0.0))
     assert not bool(info["success_v0"])
-    assert summed(info, "fallen") == 1
-    assert summed(info, "disturbed_most") >= 1
+    assert read_sum(info, "fallen") == 1
+    assert read_sum(info, "disturbed_most") >= 1
     base.objects[slot].set_pose(robot_pose(torch.tensor([[3.0, 2.0, 0.05]]), pose))
     *_, info = env.step(along(0.0))
     assert bool(info["fail"])
-    assert summed(info, "fallen") == 1  # others only
+    assert read_sum(info, "fallen") == 1  # others only
     env.reset(seed=3)
     *_, info = env.step(along(0.0))
-    assert [summed(info, name) for name in ("fallen", "disturbed_most", "v0_steps")] == [0, 0, 0]
-    assert summed(info, "path_length") < 0.002
+    assert [read_sum(info, name) for name in ("fallen", "disturbed_most", "v0_steps")] == [0, 0, 0]
+    assert read_sum(info, "path_length") < 0.002
     env.close()
 
 
@@ -161,7 +162,7 @@ def test_pictures_are_rendered_when_the_policy_looks(monkeypatch):
     rendered, capture = [], base.capture_sensor_data
     monkeypatch.setattr(base, "capture_sensor_data", lambda: (rendered.append(1), capture()))
     for every, looks in ((1, [1, 1, 1]), (2, [0, 1, 0])):
-        stepped = PolicyStepping(env, "robocas", "tcp", "upstream", look_every=every)
+        stepped = PolicyStepping(env, PolicySpec("robocas", "tcp", look_every=every), "upstream")
         for _ in range(2):  # a reset begins to count anew
             obs, _ = stepped.reset(seed=3)
             assert obs["sensor_data"]["base_camera"]["rgb"].any()
@@ -187,7 +188,7 @@ def test_each_of_several_envs_is_looked_at_in_its_own_steps(num_envs):
         auto_reset=False,
         ignore_terminations=True,
         record_metrics=False,
-        wrappers=[partial(PolicyStepping, convention="robocas", reference="tcp", stepping="upstream", look_every=3)],
+        wrappers=[partial(PolicyStepping, spec=PolicySpec("robocas", "tcp", look_every=3), stepping="upstream")],
         obs_mode="rgb",
         reward_mode="none",
         control_mode="pd_ee_delta_pose",

@@ -12,10 +12,12 @@ from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.comparison import comparison
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.policy import EpisodeSpec, PolicySpec, describe
+from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.remote.server import PolicyServer
 from robocas_ms3.evaluation.report import write_report
 from robocas_ms3.evaluation.rollout import Rollout
-from robocas_ms3.evaluation.run import about
+from robocas_ms3.evaluation.session import EvaluationSession
+from robocas_ms3.evaluation.settings import EvaluationSettings
 
 HOSTILE = "\x1b]0;t\x07\x9b\u202e<script>alert(1)</script>|`a`\n[b](http://c)"
 
@@ -56,13 +58,9 @@ def test_wants_of_a_policy_are_part_of_its_description():
     assert error.value.where.endswith("wants.rate_hz")
 
 
-def test_what_a_description_says_is_read_back_and_does_not_rename_the_policy(tmp_path, monkeypatch):
-    monkeypatch.setattr("robocas_ms3.evaluation.run.load_pack", lambda name: SimpleNamespace(root=tmp_path))
-    monkeypatch.setattr("robocas_ms3.evaluation.run.sha256", lambda path: "ab")
-    rules = SimpleNamespace(pack="builtin", pack_hash="ab", name="made_up")
-    protocol = SimpleNamespace(rules=rules, hash="cd")
-    settings = SimpleNamespace(weld=False, backend="processes")
-    run = about(protocol, Policy({"name": 5, "sizes": (1, 2), "note": HOSTILE}), "mine", settings)
+def test_what_a_description_says_is_read_back_and_does_not_rename_the_policy(tmp_path):
+    policy = Policy({"name": 5, "sizes": (1, 2), "note": HOSTILE})
+    run = EvaluationSession(load_protocol("smoke"), policy, EvaluationSettings("mine", backend="processes")).record
     results.begin(tmp_path / "out", run, resume=False)
     results.append(tmp_path / "out", outcome(0))
     assert results.read(tmp_path / "out").run["policy"]["name"] == "mine"

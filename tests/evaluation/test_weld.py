@@ -16,14 +16,16 @@ import robocas_ms3  # noqa: F401
 from robocas_ms3.cli.main import run as cli
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation import results, videos
+from robocas_ms3.evaluation.metrics import read_sum
 from robocas_ms3.evaluation.policies import make_policy
+from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.protocol import load_protocol
-from robocas_ms3.evaluation.run import Settings, evaluate
+from robocas_ms3.evaluation.session import EvaluationSession, evaluate
+from robocas_ms3.evaluation.settings import EvaluationSettings
 from robocas_ms3.evaluation.stepping import PolicyStepping, control_mode
-from robocas_ms3.evaluation.tracking import summed
 from robocas_ms3.evaluation.verify import problems
 from robocas_ms3.evaluation.videos import film
-from robocas_ms3.evaluation.weld import Weld, refuse
+from robocas_ms3.evaluation.weld import Weld, check_weld
 from robocas_ms3.robots.description import MOBILE_PANDA
 
 OPEN, CLOSE = 1.0, 0.0
@@ -48,7 +50,7 @@ def made(weld: bool = True, wrap: Any = lambda env: env, **kwargs: Any) -> Polic
         max_episode_steps=10_000,
         **kwargs,
     )
-    stepped = PolicyStepping(wrap(env), "robocas", "tcp", "upstream", weld=weld)
+    stepped = PolicyStepping(wrap(env), PolicySpec("robocas", "tcp"), "upstream", weld=weld)
     stepped.reset(seed=3)
     return stepped
 
@@ -104,7 +106,7 @@ def test_what_is_welded_keeps_its_pose_in_the_hand_whatever_arm_and_fingers_do()
     assert np.isfinite(target(env).linear_velocity).all()
     assert max(shifts) < 0.001  # m
     assert max(turns) < np.deg2rad(0.5)
-    assert summed(info, "path_length") > 1  # the arm did move
+    assert read_sum(info, "path_length") > 1  # the arm did move
     assert float(info["welds"]) == 1
     env.close()
 
@@ -169,7 +171,7 @@ def test_no_weld_outlives_a_reset(reconfiguration_freq):
     for _ in range(4):
         *_, info = env.step(np.array([0, 0, -0.08, 0, 0, 0, CLOSE]))
     assert float(info["welds"]) == 0
-    assert summed(info, "path_length") > 0.2
+    assert read_sum(info, "path_length") > 0.2
     shift = (base.object_poses - base.start_poses)[0, :, :3].norm(dim=-1)
     assert float(shift[base.present[0]].max()) < 0.005
     env.step(stay(OPEN))
@@ -186,14 +188,14 @@ def test_it_is_refused_where_it_does_not_belong(tmp_path, capsys):
     )
     assert not out.exists()
     with pytest.raises(EvaluationError, match=r"nothing can be welded on a GPU \(found gpu\)\. Pass --backend"):
-        refuse("upstream", "gpu")
+        check_weld("upstream", "gpu")
     with pytest.raises(EvaluationError, match="nothing can be welded on a GPU"):
         Weld(SimpleNamespace(gpu_sim_enabled=True))
 
 
 def play(folder, protocol, policy="random", **settings) -> dict[int, dict]:
-    settings = Settings(1, "processes", **{"tasks": ("pick",), "episodes": 2, **settings})
-    list(evaluate(load_protocol(protocol), make_policy(policy), policy, folder, settings))
+    settings = EvaluationSettings(policy, 1, "processes", **{"tasks": ("pick",), "episodes": 2, **settings})
+    list(evaluate(EvaluationSession(load_protocol(protocol), make_policy(policy), settings), folder))
     return {number: one.without_clock() for number, one in results.read(folder).outcomes.items()}
 
 

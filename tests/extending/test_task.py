@@ -127,13 +127,13 @@ def test_an_evaluation_measures_it_where_upstreams_rule_has_no_basket(site):
         "-c",
         MAKE
         + """
-from robocas_ms3.evaluation.tracking import Tracker
-tracker = Tracker(base)
+from robocas_ms3.evaluation.metrics import EpisodeMetrics
+metrics = EpisodeMetrics(base)
 for _ in range(3):
     env.step(hold)
-    tracker.look(np.array([True]))
-    tracker.end_step()
-read = tracker.read()
+    metrics.update(np.array([True]))
+    metrics.end_step()
+read = metrics.read()
 print(tuple(read["sums"].shape), bool(read["sums"][0, 4]), sorted(read))
 """,
     )

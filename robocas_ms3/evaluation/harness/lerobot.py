@@ -102,7 +102,7 @@ class RoboCASEnvConfig(EnvConfig):
             RobocasError: another process writes to a folder of the results.
         """
         from robocas_ms3.evaluation.harness.protocol_env import ProtocolVectorEnv
-        from robocas_ms3.evaluation.run import Settings
+        from robocas_ms3.evaluation.settings import EvaluationSettings
 
         protocol = load_protocol(self.protocol)
         tasks = _names(self.task or "", "env.task")
@@ -111,9 +111,11 @@ class RoboCASEnvConfig(EnvConfig):
             tasks = list(dict.fromkeys(episode.task for episode in episodes))
         envs: dict[str, dict[int, Any]] = {}
         for task in tasks:
-            settings = Settings(n_envs, cast("Backend", self.backend), tasks=(task,), split=self.split)
+            settings = EvaluationSettings(
+                self.policy_name, n_envs, cast("Backend", self.backend), tasks=(task,), split=self.split
+            )
             folder = None if self.results is None else Path(self.results).absolute() / task
-            made = ProtocolVectorEnv(protocol, self.spec, settings, folder=folder, name=self.policy_name)
+            made = ProtocolVectorEnv(protocol, self.spec, settings, folder=folder)
             envs[task] = {0: made}
         return envs
 

@@ -17,11 +17,11 @@ from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.locks import locked_folder
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.actions import CONVENTIONS
-from robocas_ms3.evaluation.harness.driven import DrivenEpisodes
 from robocas_ms3.evaluation.harness.proprioception import WIDTHS, Proprioception, depth_key
-from robocas_ms3.evaluation.policy import PolicySpec
+from robocas_ms3.evaluation.policy import ExternalPolicy, PolicySpec
 from robocas_ms3.evaluation.protocol import LoadedProtocol
-from robocas_ms3.evaluation.run import Settings, chosen
+from robocas_ms3.evaluation.session import EvaluationSession
+from robocas_ms3.evaluation.settings import EvaluationSettings, check_one_configuration
 from robocas_ms3.robots.table import find_robot
 
 
@@ -40,9 +40,8 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
     Args:
         protocol: whose episodes.
         spec: cameras, action convention and rate.
-        settings: ``tasks`` names the task; number of envs, where they run, split.
+        settings: ``tasks`` names the task; number of envs, where they run, split, name of the policy.
         folder: for a result that ``robocas eval report`` reads; None: none is written.
-        name: of the policy, in the result.
 
     Raises:
         EvaluationError: the protocol has no such task or split, the policy does not fit it, N > 1 and the task has
@@ -55,23 +54,17 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         self,
         protocol: LoadedProtocol,
         spec: PolicySpec,
-        settings: Settings,
+        settings: EvaluationSettings,
         *,
         folder: Path | None = None,
-        name: str = "external",
     ) -> None:
-        self._episodes = chosen(protocol.episodes, settings)
-        configs = list(dict.fromkeys(episode.config for episode in self._episodes))
-        if settings.num_envs > 1 and len(configs) > 1:
+        self._session = EvaluationSession(protocol, ExternalPolicy(spec), settings)
+        self._episodes = self._session.episodes
+        if settings.num_envs > 1:
             splits = ", ".join(dict.fromkeys(episode.split for episode in self._episodes))
-            fix = f"Choose one of the splits {splits}, or use one env."
-            where = protocol.rules.name
-            raise EvaluationError(
-                "several configurations in one batch", where=where, expected="one", found=", ".join(configs), fix=fix
-            )
-        self._driven = DrivenEpisodes(protocol, spec, settings, name)
+            check_one_configuration(protocol, self._episodes, f"Choose one of the splits {splits}, or use one env.")
         self._task = self._episodes[0].task
-        self._max_steps = self._driven.max_steps(self._task)
+        self._max_steps = self._session.max_steps(self._task)
         self._lock = ExitStack()
         self._folder, self._recorded = folder, set[int]()  # episodes that the result has
         if folder is not None:
@@ -79,14 +72,14 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
                 lock.enter_context(locked_folder(folder))
                 if (folder / results.OUTCOMES).exists():
                     raise EvaluationError("there is a result already", where=folder, fix="Choose another folder.")
-                results.begin(folder, self._driven.about, resume=False)
+                results.begin(folder, self._session.record, resume=False)
                 self._lock = lock.pop_all()  # held until `close`
         self._convention = CONVENTIONS[spec.convention]
         self._proprioception = Proprioception()
         self._spec, self._next = spec, 0
         count = self.num_envs = settings.num_envs
         self.render_mode = "rgb_array"
-        rate = self._driven.rate
+        rate = self._session.rate
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": rate, "autoreset_mode": AutoresetMode.DISABLED}
         self.single_observation_space = _space(spec)
         self.single_action_space = gym.spaces.Box(-np.inf, np.inf, (self._convention.size,), np.float32)
@@ -120,11 +113,11 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         indices = [int(one) % len(self._episodes) for one in seeds]
         self._next = indices[-1] + 1
         episodes = [self._episodes[index] for index in indices]
-        self._driven.reset([episode.episode for episode in episodes])
+        self._session.reset([episode.episode for episode in episodes])
         self.episodes = np.array([episode.episode for episode in episodes], np.int64)
         self._instructions = [episode.instruction for episode in episodes]
         self._grippers = [None] * self.num_envs
-        robot, obs = find_robot(self._driven.protocol.rules.robot), self._driven.obs
+        robot, obs = find_robot(self._session.protocol.rules.robot), self._session.observation
         for env in range(self.num_envs):
             self._proprioception.reset(env, obs, robot)
         for flags in (self._ended, self._success, self._truncated):
@@ -157,7 +150,7 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         if not self._obs:
             raise EvaluationError("no episode is running", fix="Call reset first.")
         if running:
-            self._driven.step(acts)
+            self._session.step(acts)
             for env, command in zip(running, self._commands(acts[running]), strict=True):
                 self._grippers[env] = command
             self._record(running)
@@ -186,7 +179,7 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the environment and unlock the folder of the result."""
-        self._driven.close()
+        self._session.close()
         self._lock.close()
 
     def _commands(self, actions: NDArray[np.float32]) -> list[float]:
@@ -199,7 +192,7 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
     def _record(self, envs: list[int]) -> None:
         """Take over the outcomes of episodes that have just ended in some of these envs."""
         for env in envs:
-            outcome = self._driven.outcomes.get(env)
+            outcome = self._session.outcomes.get(env)
             if outcome is None:
                 continue
             self._ended[env], self._success[env] = True, outcome.success
@@ -210,7 +203,7 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
 
     def _read(self, envs: list[int]) -> None:
         """Read the observations of envs."""
-        obs = self._driven.obs
+        obs = self._session.observation
         for env in envs:
             for name, values in self._proprioception.read(env, obs, self._grippers[env]).items():
                 self._obs[name][env] = values

@@ -15,12 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.evaluation.harness.driven import DrivenEpisodes
+from robocas_ms3.evaluation.metrics import MEASURES
 from robocas_ms3.evaluation.outcomes import STAGES
-from robocas_ms3.evaluation.policy import Observations
+from robocas_ms3.evaluation.policy import ExternalPolicy, Observations
 from robocas_ms3.evaluation.protocol import Episode, load_protocol
 from robocas_ms3.evaluation.remote.messages import actions_of, read_policy_spec
-from robocas_ms3.evaluation.tracking import MEASURES
+from robocas_ms3.evaluation.session import EvaluationSession
+from robocas_ms3.evaluation.settings import EvaluationSettings
 from robocas_ms3.robots.description import RobotDescription
 
 # How vla-eval calls what the numbers of an action mean, where it has a word for it.
@@ -58,9 +59,10 @@ class RoboCAS:
     ) -> None:
         said = {"cameras": dict(cameras or {}), "convention": convention, "reference": reference, "rate_hz": rate_hz}
         self._spec = read_policy_spec(said, "params")
-        self._driven = DrivenEpisodes(load_protocol(protocol), self._spec)
+        settings = EvaluationSettings(num_envs=1, backend="processes")
+        self._session = EvaluationSession(load_protocol(protocol), ExternalPolicy(self._spec), settings)
         self._of_config: dict[str, list[Episode]] = {}
-        for episode in self._driven.protocol.episodes:
+        for episode in self._session.protocol.episodes:
             self._of_config.setdefault(episode.config, []).append(episode)
         self._episode: Episode | None = None
         self._seen: Observations | None = None
@@ -81,8 +83,8 @@ class RoboCAS:
 
     def get_metadata(self) -> dict[str, Any]:
         """``max_steps`` is that of the longest task; those of others end by the protocol's rules."""
-        tasks = {episode.task for episode in self._driven.protocol.episodes}
-        return {"max_steps": max(self._driven.max_steps(task) for task in tasks)}
+        tasks = {episode.task for episode in self._session.protocol.episodes}
+        return {"max_steps": max(self._session.max_steps(task) for task in tasks)}
 
     def get_metric_keys(self) -> dict[str, str]:
         """What is averaged over episodes; the others stay with each of them."""
@@ -139,7 +141,7 @@ class RoboCAS:
             )
         episode = episodes[number]
         self._episode, self._recorder, self._begun = episode, recorder, time.monotonic()
-        self._seen = self._driven.reset([episode.episode])
+        self._seen = self._session.reset([episode.episode])
         self._record()
 
     async def apply_action(self, action: Mapping[str, Any]) -> None:
@@ -149,7 +151,7 @@ class RoboCAS:
             WireError: it is none of the convention.
         """
         actions = actions_of({"actions": action.get("actions", action.get("action"))}, self._spec.convention)
-        self._seen = self._driven.step(actions[None])
+        self._seen = self._session.step(actions[None])
         self._record()
 
     async def get_observation(self) -> dict[str, Any]:
@@ -176,7 +178,7 @@ class RoboCAS:
         Raises:
             EvaluationError: vla-eval ended it before the protocol does.
         """
-        outcome, episode = self._driven.outcomes.get(0), self._episode
+        outcome, episode = self._session.outcomes.get(0), self._episode
         if outcome is None or episode is None:
             raise EvaluationError(
                 "the run ended an episode before the protocol does",
@@ -188,12 +190,12 @@ class RoboCAS:
             **outcome.measures,
             **vars(outcome),
             "instruction": episode.instruction,
-            **{name: self._driven.about[name] for name in ("protocol", "protocol_hash", "versions")},
+            **{name: self._session.record[name] for name in ("protocol", "protocol_hash", "versions")},
         }
 
     def cleanup(self) -> None:
         """End the env's process."""
-        self._driven.close()
+        self._session.close()
 
     def render(self) -> NDArray[np.uint8] | None:
         """(H, W, 3) the first camera's picture; None: there is none."""

@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from robocas_ms3.core.words import count_of
-from robocas_ms3.evaluation.orders import orders
-from robocas_ms3.evaluation.outcomes import Outcome
+from robocas_ms3.evaluation.outcomes import Outcome, summarize_retrieval
 from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.report.background import measured_with
 from robocas_ms3.evaluation.report.failed import failed_episodes
@@ -171,7 +170,7 @@ def _hidden(result: Result) -> str:
 def _retrieval(result: Result) -> str:
     rows = []
     for config, outcomes in result.by("config").items():
-        found = orders(outcome.retrieval for outcome in outcomes)
+        found = summarize_retrieval(outcome.retrieval for outcome in outcomes)
         if found is not None:
             needed = f"{100 * found.needed:.0f} %"
             rows.append(

@@ -21,8 +21,7 @@ from lerobot.scripts.lerobot_eval import rollout
 
 from robocas_ms3.core.errors import EvaluationError, VectorEnvError
 from robocas_ms3.datasets.lerobot import schema
-from robocas_ms3.evaluation import results
-from robocas_ms3.evaluation.harness import driven
+from robocas_ms3.evaluation import results, session
 from robocas_ms3.evaluation.harness.lerobot import RoboCASEnvConfig
 
 HUB_FILE = Path(__file__).resolve().parents[3] / "examples" / "lerobot_hub" / "env.py"
@@ -38,7 +37,7 @@ SMALL = {
 
 @pytest.fixture
 def no_physics(made, monkeypatch):
-    monkeypatch.setattr(driven, "require_renderer", lambda: None)
+    monkeypatch.setattr(session, "require_renderer", lambda: None)
     return made
 
 

@@ -9,12 +9,12 @@ import pytest
 
 from robocas_ms3.core.errors import EvaluationError, RobocasError, VectorEnvError
 from robocas_ms3.core.locks import locked_folder
-from robocas_ms3.evaluation import results
-from robocas_ms3.evaluation.harness import driven
+from robocas_ms3.evaluation import results, session
 from robocas_ms3.evaluation.harness.protocol_env import ProtocolVectorEnv
 from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.protocol import load_protocol
-from robocas_ms3.evaluation.run import Settings, evaluate
+from robocas_ms3.evaluation.session import EvaluationSession, evaluate
+from robocas_ms3.evaluation.settings import EvaluationSettings
 
 SMOKE = load_protocol("smoke")
 WANTS = PolicySpec(reference="tcp", rate_hz=5, cameras={"base_camera": (6, 4)}, depth=True)
@@ -23,11 +23,11 @@ WANTS = PolicySpec(reference="tcp", rate_hz=5, cameras={"base_camera": (6, 4)}, 
 @pytest.fixture
 def make(made, monkeypatch):
     """Makes environments without physics, and closes them."""
-    monkeypatch.setattr(driven, "require_renderer", lambda: None)
+    monkeypatch.setattr(session, "require_renderer", lambda: None)
     opened = []
 
     def make(num_envs=2, task="pick", spec=WANTS, protocol=SMOKE, **kwargs):
-        settings = Settings(num_envs, "processes", tasks=(task,), split=kwargs.pop("split", ""))
+        settings = EvaluationSettings("mine", num_envs, "processes", tasks=(task,), split=kwargs.pop("split", ""))
         opened.append(ProtocolVectorEnv(protocol, spec, settings, **kwargs))
         return opened[-1]
 
@@ -128,7 +128,7 @@ def test_a_step_before_a_reset_is_refused(make):
 
 
 def test_outcomes_are_written_once_per_episode(make, tmp_path):
-    env = make(1, folder=tmp_path / "result", name="mine")
+    env = make(1, folder=tmp_path / "result")
     for _ in range(2):  # two passes over the two episodes
         for seed in (0, 1):
             env.reset(seed=seed)
@@ -173,7 +173,7 @@ def test_settings_that_do_not_fit_the_protocol_are_refused(make, kwargs, error, 
 
 def test_an_unknown_backend_is_refused(monkeypatch):
     with pytest.raises(VectorEnvError, match="no such backend"):
-        ProtocolVectorEnv(SMOKE, PolicySpec(rate_hz=5), Settings(1, "threads", tasks=("pick",)))  # pyright: ignore[reportArgumentType]
+        ProtocolVectorEnv(SMOKE, PolicySpec(rate_hz=5), EvaluationSettings("", 1, "threads", tasks=("pick",)))  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.slow
@@ -196,8 +196,8 @@ def test_real_episodes_have_the_outcomes_and_images_of_robocas_eval(needs_render
     rules = tmp_path / "short" / "protocol.yaml"
     rules.write_text(rules.read_text().replace("max_steps: null", "max_steps: 10"))
     protocol, policy = load_protocol(tmp_path / "short"), Down()
-    settings = Settings(2, "processes", workers=1, tasks=("search",))
-    list(evaluate(protocol, policy, "down", tmp_path / "ours", settings))
+    settings = EvaluationSettings("down", 2, "processes", workers=1, tasks=("search",))
+    list(evaluate(EvaluationSession(protocol, policy, settings), tmp_path / "ours"))
     env = ProtocolVectorEnv(protocol, spec, settings, folder=tmp_path / "theirs")
     obs, _ = env.reset(seed=2000)
     seen, done = [], np.zeros(2, bool)

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from robocas_ms3.core.paths import protocols_dir
+from robocas_ms3.evaluation.metrics import SUMS
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
-from robocas_ms3.evaluation.tracking import SUMS
 
 CAMERA = (6, 4)  # width, height
 LAYOUTS = "layouts/pick_table_scattered.npy"

@@ -18,7 +18,7 @@ from robocas_ms3.evaluation.protocol import Episode
 from robocas_ms3.evaluation.remote.client import RemotePolicy
 from robocas_ms3.evaluation.remote.connection import MAX_REPLY
 from robocas_ms3.evaluation.remote.wire import pack
-from robocas_ms3.evaluation.rollout import Rollouts, Rules
+from robocas_ms3.evaluation.rollout import EndConditions, EpisodeBatch, rollout
 
 GOOD = pack({"actions": np.zeros((1, 7))})
 
@@ -163,9 +163,9 @@ class Stumbling(Told):
 
 
 def play(policy, count=7, envs=2):
-    rules = Rules(max_steps=10)
+    batch = EpisodeBatch(StandIn(envs), policy.spec, EndConditions(10), 0.05, refill=True)
     starts = [a_start(-1, episode=number) for number in range(count)]
-    return {one.start.episode: one for one in Rollouts(StandIn(envs), policy, rules, 0.05, refill=True).play(starts)}
+    return {one.start.episode: one for one in rollout(batch, policy, starts)}
 
 
 def test_a_run_goes_on_where_a_policy_fails():

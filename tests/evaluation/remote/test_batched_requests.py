@@ -18,7 +18,7 @@ from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.remote.client import RemotePolicy
 from robocas_ms3.evaluation.remote.messages import batch_limit, message_bytes, observation_message
 from robocas_ms3.evaluation.remote.wire import MAX_BYTES, pack
-from robocas_ms3.evaluation.rollout import Rollouts, Rules
+from robocas_ms3.evaluation.rollout import EndConditions, EpisodeBatch, rollout
 
 GARBAGE = 1008
 
@@ -60,8 +60,8 @@ def play(policy):
     """Play eight episodes in three envs that end after different numbers of steps."""
     env = Recording([3, 4, 7])
     starts = [a_start(-1, episode=number, seed=number) for number in range(8)]
-    played = Rollouts(env, policy, Rules(9), 0.05, refill=True).play(starts)
-    return [replace(one, inference_seconds=0.0) for one in played], env.actions
+    batch = EpisodeBatch(env, policy.spec, EndConditions(9), 0.05, refill=True)
+    return [replace(one, inference_seconds=0.0) for one in rollout(batch, policy, starts)], env.actions
 
 
 def test_a_remote_run_is_equal_to_a_local_run_bit_for_bit():

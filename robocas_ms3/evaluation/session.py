@@ -1,0 +1,338 @@
+"""Run the episodes of a protocol: with a policy, or for an external loop that chooses the actions."""
+
+from __future__ import annotations
+
+import logging
+import platform
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from robocas_ms3.assets.pack import MANIFEST, load_pack, sha256
+from robocas_ms3.core.errors import EvaluationError, WorkerDied
+from robocas_ms3.core.locks import locked_folder
+from robocas_ms3.core.outputs import while_there
+from robocas_ms3.datasets.writing.render import require_renderer
+from robocas_ms3.evaluation import results
+from robocas_ms3.evaluation.outcomes import Outcome
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, Policy, describe
+from robocas_ms3.evaluation.protocol import Episode, LoadedProtocol
+from robocas_ms3.evaluation.rollout import NOT_FINITE, EndConditions, EpisodeBatch, Rollout, as_chunks, rollout
+from robocas_ms3.evaluation.settings import EvaluationSettings, check_one_configuration, choose_episodes
+from robocas_ms3.evaluation.stepping import UPSTREAM_HZ, PolicyStepping, env_kwargs
+from robocas_ms3.evaluation.weld import check_weld
+from robocas_ms3.scenes.frozen import FrozenLayouts
+from robocas_ms3.scenes.task_specs import TASKS
+from robocas_ms3.tasks.vector import make_vec
+from robocas_ms3.tasks.vector.backend import choose_backend
+
+MAX_STARTS = 2
+"""How often an episode is started whose process dies."""
+_log = logging.getLogger(__name__)
+
+
+class EvaluationSession:
+    """Runs episodes of a protocol, several at a time. Close it at the end.
+
+    `play` runs episodes with the policy. `reset` and `step` let an external loop run them; then each env has one
+    episode. Steps, ends and measures are the same. An environment stays open while the configuration of the episodes
+    stays the same.
+
+    Args:
+        protocol: whose episodes.
+        policy: the policy, or an `ExternalPolicy`.
+        settings: number of envs, where they run, and which episodes.
+        wrap_env: called with each vector environment that is opened; returns the one to use.
+
+    Attributes:
+        episodes: the episodes of the protocol that the settings choose.
+        rate: control steps per second; with upstream's steps, see `PolicyStepping`.
+        record: what a result says about the evaluation (`results.RunRecord`).
+        outcomes: by env, the outcome of each episode that has ended since the last `reset`.
+
+    Raises:
+        EvaluationError: the policy or the weld does not fit the protocol, the settings choose no episode, or the object
+            pack is not the protocol's.
+        DatasetError: the policy uses cameras, and there is no render device.
+    """
+
+    def __init__(
+        self,
+        protocol: LoadedProtocol,
+        policy: Policy,
+        settings: EvaluationSettings,
+        wrap_env: Callable[[Any], Any] = lambda env: env,
+    ) -> None:
+        self.protocol, self.policy, self.settings, self._wrap_env = protocol, policy, settings, wrap_env
+        rules, self.spec = protocol.rules, policy.spec
+        rules.check_policy(self.spec)
+        self.rate = UPSTREAM_HZ if rules.stepping == "upstream" else rules.rate(self.spec)
+        backend = choose_backend(settings.backend)
+        if settings.weld:
+            check_weld(rules.stepping, backend)
+        self.episodes = choose_episodes(protocol, settings)
+        if self.spec.cameras:
+            require_renderer()
+        self.record = self._record(backend)
+        self.outcomes: dict[int, Outcome] = {}
+        self._objects = load_pack(rules.pack).objects
+        self._refill = backend != "gpu"
+        self._env: Any = None
+        self._batch: EpisodeBatch | None = None
+        self._open_for: tuple[str, int, int] | None = None  # configuration, number of envs and of steps of `_batch`
+        self._current: list[Episode] = []  # by env, of an external loop
+        self._observed = 0.0  # clock time at which the external loop received the last observation, s
+
+    def max_steps(self, task: str) -> int:
+        """Return the maximum number of policy steps per episode of a task."""
+        steps = self.protocol.rules.steps(task, self.rate)
+        assert steps is not None  # `load_protocol` checks it
+        return steps
+
+    def episode_spec(self, episode: Episode) -> EpisodeSpec:
+        """Return what a policy gets to know about an episode; its env is not known yet."""
+        return EpisodeSpec(
+            env=-1,
+            episode=episode.episode,
+            task=episode.task,
+            config_file=str(self.protocol.config_file(episode.config)),
+            layouts_file=str(self.protocol.layouts_file(episode.config)),
+            pack=self.protocol.rules.pack,
+            seed=episode.seed,
+            instruction=episode.instruction,
+            robot=self.protocol.rules.robot,
+        )
+
+    def play(self, episodes: Sequence[Episode], max_steps: int | None = None) -> Iterator[Outcome]:
+        """Run episodes with the policy, configuration by configuration.
+
+        Args:
+            episodes: of the protocol.
+            max_steps: maximum number of policy steps per episode; None: the protocol's.
+
+        Yields:
+            The outcome of each episode, as it ends.
+
+        Raises:
+            WorkerDied: a process died in which no episode ran.
+        """
+        try:
+            for config in dict.fromkeys(episode.config for episode in episodes):
+                yield from self._play([one for one in episodes if one.config == config], max_steps)
+        except BaseException:
+            self.close()
+            raise
+
+    def reset(self, numbers: Sequence[int]) -> Observations:
+        """Start an episode in each env. Running episodes are dropped, without an outcome.
+
+        Args:
+            numbers: of the episodes in the protocol's list, one per env, all of one configuration.
+
+        Raises:
+            EvaluationError: there is no such episode, or the configurations differ.
+        """
+        where, known = self.protocol.rules.name, self.protocol.episodes
+        for number in numbers:
+            if not 0 <= number < len(known):
+                raise EvaluationError("no such episode", where=where, expected=f"0 to {len(known) - 1}", found=number)
+        count = self.settings.num_envs
+        if len(numbers) != count:
+            raise EvaluationError("wrong number of episodes", where=where, expected=count, found=len(numbers))
+        episodes = [known[number] for number in numbers]
+        check_one_configuration(self.protocol, episodes)
+        self._current, self.outcomes = episodes, {}
+        batch = self.open(episodes[0], count)
+        try:
+            batch.start([(env, self.episode_spec(episode)) for env, episode in enumerate(episodes)])
+        except Exception:
+            self.close()
+            raise
+        return self._observe(batch)
+
+    def step(self, actions: ArrayLike) -> Observations | None:
+        """Step the running episodes of `reset`.
+
+        Args:
+            actions: (N, A), or chunks (N, H, A), of which every step is executed. Rows of envs whose episode has ended
+                have no effect. An episode whose actions are not finite ends with an error.
+
+        Returns:
+            The observations of the envs with a running episode; None if all episodes have ended.
+
+        Raises:
+            EvaluationError: no episode runs, or the actions have another shape.
+            WorkerDied: a process of the environment died.
+        """
+        batch = self._batch
+        if batch is None or not batch.running:
+            raise EvaluationError("no episode is running", fix="Call reset first.")
+        chunks = as_chunks(np.asarray(actions, np.float32), batch.num_envs, batch.action_size, where="step")
+        seconds = (time.perf_counter() - self._observed) / len(batch.running)
+        for env, running in batch.running.items():
+            running.inference_seconds += seconds
+            if not np.isfinite(chunks[env]).all():
+                running.error = NOT_FINITE
+        try:
+            for step in range(chunks.shape[1]):
+                active = [env for env, running in batch.running.items() if not running.error]
+                rows = np.zeros((batch.num_envs, batch.action_size), np.float32)
+                rows[active] = chunks[active, step]
+                for ended in batch.step(rows):
+                    self.outcomes[ended.start.env] = self._outcome(ended, self._current[ended.start.env])
+                if not batch.running:
+                    return None
+        except Exception:
+            self.close()
+            raise
+        return self._observe(batch)
+
+    @property
+    def observation(self) -> dict[str, Any]:
+        """Last observation of the environment, arrays (N, ...)."""
+        assert self._batch is not None
+        return self._batch.obs
+
+    def open(self, episode: Episode, num_envs: int, max_steps: int | None = None) -> EpisodeBatch:
+        """Return envs for the episodes of a configuration; they are opened where needed.
+
+        Args:
+            episode: any episode of that configuration.
+            num_envs: number of envs.
+            max_steps: maximum number of policy steps per episode; None: the protocol's.
+        """
+        steps = self.max_steps(episode.task) if max_steps is None else max_steps
+        wanted, rules = (episode.config, num_envs, steps), self.protocol.rules
+        if self._batch is not None and self._open_for == wanted:
+            return self._batch
+        if self._open_for is None or self._open_for[:2] != wanted[:2]:
+            self.close()
+            self._env = self._wrap_env(self._make_env(episode, num_envs))
+        ends = EndConditions(steps, tuple(rules.ends_on), rules.max_v0_steps)
+        self._batch = EpisodeBatch(self._env, self.spec, ends, 1 / self.rate, refill=self._refill)
+        self._open_for = wanted
+        return self._batch
+
+    def close(self) -> None:
+        """Close the environment. A later call opens another one."""
+        env, self._env, self._batch, self._open_for = self._env, None, None, None
+        if env is not None:
+            env.close()
+
+    def _play(self, episodes: list[Episode], max_steps: int | None) -> Iterator[Outcome]:
+        """Run episodes of one configuration."""
+        left, deaths = {episode.episode: episode for episode in episodes}, Counter[int]()
+        while left:
+            batch = self.open(episodes[0], min(self.settings.num_envs, len(left)), max_steps)
+            try:
+                for ended in rollout(batch, self.policy, [self.episode_spec(episode) for episode in left.values()]):
+                    yield self._outcome(ended, left.pop(ended.start.episode))
+            except WorkerDied as error:
+                self.close()
+                lost = list(batch.lost(error.envs, f"its process died: {error.found}"))
+                if not lost:
+                    raise
+                for ended in lost:
+                    number = ended.start.episode
+                    deaths[number] += 1
+                    if deaths[number] < MAX_STARTS:
+                        _log.warning("episode %d: %s; it is started again", number, ended.error)
+                    else:
+                        yield self._outcome(ended, left.pop(number))
+
+    def _observe(self, batch: EpisodeBatch) -> Observations:
+        observations = batch.observe(sorted(batch.running))
+        self._observed = time.perf_counter()
+        return observations
+
+    def _outcome(self, ended: Rollout, episode: Episode) -> Outcome:
+        layouts = FrozenLayouts(self.protocol.layouts_file(episode.config), self._objects)
+        return Outcome.of(ended, episode, layouts(episode.seed, episode.seed).object_ids)
+
+    def _make_env(self, episode: Episode, num_envs: int) -> Any:
+        rules, settings = self.protocol.rules, self.settings
+        stepping = partial(PolicyStepping, spec=self.spec, stepping=rules.stepping, weld=settings.weld)
+        render: dict[str, Any] = {}
+        if settings.render_size is not None:
+            width, height = settings.render_size
+            render = {"render_mode": "rgb_array", "human_render_camera_configs": {"width": width, "height": height}}
+        return make_vec(
+            TASKS[episode.task].env_id,
+            num_envs,
+            arrays="numpy",
+            auto_reset=False,
+            ignore_terminations=True,
+            record_metrics=False,
+            wrappers=[stepping],
+            backend=settings.backend,
+            workers=settings.workers,
+            limits=settings.limits,
+            config=str(self.protocol.config_file(episode.config)),
+            layouts=str(self.protocol.layouts_file(episode.config)),
+            pack=rules.pack,
+            robot_uids=rules.robot,
+            **env_kwargs(self.spec, self.rate, renders=bool(render)),
+            **render,
+        )
+
+    def _record(self, backend: str) -> dict[str, Any]:
+        rules, name = self.protocol.rules, self.settings.policy_name
+        pack = sha256(load_pack(rules.pack).root / MANIFEST)
+        if pack != rules.pack_hash:
+            raise EvaluationError(
+                "the installed object pack is not the protocol's",
+                where=rules.name,
+                expected=rules.pack_hash,
+                found=pack,
+            )
+        return {
+            "protocol": rules.name,
+            "protocol_hash": self.protocol.hash,
+            "policy": {"name": name} | describe(self.policy) | {"name": name},  # a description may not rename it
+            "weld": self.settings.weld,
+            "backend": backend,
+            "versions": results.versions(),
+            "pack_hashes": {rules.pack: pack},
+            "machine": {"processor": platform.machine(), "python": platform.python_version()},
+        }
+
+
+def evaluate(
+    session: EvaluationSession,
+    folder: Path,
+    *,
+    resume: bool = False,
+    retry_errors: bool = False,
+    on_start: Callable[[int], None] = lambda count: None,
+) -> Iterator[Outcome]:
+    """Run the episodes that a result lacks, and write each outcome as its episode ends. The session is closed.
+
+    Args:
+        session: protocol, policy and episodes.
+        folder: of the result.
+        resume: whether to continue a result that exists.
+        retry_errors: whether to run episodes again that ended with an error.
+        on_start: called with the number of episodes to run.
+
+    Yields:
+        The outcome of each episode.
+
+    Raises:
+        EvaluationError: the result was measured with something else.
+        RobocasError: another process writes to the folder.
+    """
+    with locked_folder(folder), closing(session):
+        done = results.begin(folder, session.record, resume=resume, again=retry_errors)
+        left = [episode for episode in session.episodes if episode.episode not in done]
+        on_start(len(left))
+        for outcome in session.play(left):
+            with while_there(folder / results.RUN, EvaluationError):
+                results.append(folder, outcome)
+            yield outcome
