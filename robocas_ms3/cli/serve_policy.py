@@ -42,8 +42,8 @@ def main(cfg: ServePolicy) -> int:
     from robocas_ms3.evaluation.policies import open_policy
     from robocas_ms3.evaluation.protocol import load_protocol
     from robocas_ms3.evaluation.remote.address import strip_brackets
-    from robocas_ms3.evaluation.remote.metadata import LARGEST_BATCH
-    from robocas_ms3.evaluation.remote.served import ServedFiles
+    from robocas_ms3.evaluation.remote.answers import ServedFiles
+    from robocas_ms3.evaluation.remote.messages import LARGEST_BATCH
     from robocas_ms3.evaluation.remote.server import PolicyServer
 
     if not 0 <= cfg.port < 2**16:

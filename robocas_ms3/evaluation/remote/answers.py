@@ -4,31 +4,85 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import EvaluationError, PolicyFailed, RobocasError, WireError
+from robocas_ms3.core.paths import builtin_packs_dir, data_dir, protocols_dir
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, Policy, policy_code
 from robocas_ms3.evaluation.remote.messages import (
     ACTIONS,
     BATCH,
     ENV,
     ERROR,
+    FILE_NAME_PARTS,
+    PROMPT,
     RESET,
+    START,
     batch_of,
+    check_length,
     observations_of,
     one_line,
+    short_line,
     stack_observations,
-    start_of,
 )
-from robocas_ms3.evaluation.remote.served import ServedFiles
 from robocas_ms3.evaluation.remote.wire import unpack
 
 _LOG = logging.getLogger(__name__)
 _MAX_ENVS = 1024  # of all clients
+_LARGEST_NUMBER = 2**32 - 1  # of episodes and seeds
+
+
+@dataclass(frozen=True)
+class ServedFiles:
+    """Files and packs that clients may choose, by the names that messages have for them.
+
+    A message names a file by its protocol's folder, ``smoke/configs/pick.yaml``. No text of a message becomes a path.
+
+    Attributes:
+        configs: paths of configurations by name.
+        layouts: paths of layouts by name.
+        packs: names, or folders as protocols of the server have them.
+    """
+
+    configs: dict[str, str]
+    layouts: dict[str, str]
+    packs: frozenset[str]
+
+    @classmethod
+    def of(cls, protocols: Iterable[Path] = (), packs: Iterable[str] = ()) -> ServedFiles:
+        """Collect the files of shipped protocols, and of others.
+
+        Args:
+            protocols: folders of others.
+            packs: that these name.
+
+        Raises:
+            EvaluationError: two of them have one name.
+        """
+        folders = {folder.name: folder for folder in protocols_dir().iterdir()}
+        for folder in protocols:
+            if folder.resolve() != folders.setdefault(folder.name, folder).resolve():
+                what, fix = "two protocols have one name", "Rename the folder."
+                raise EvaluationError(what, where=folder, found=folders[folder.name], fix=fix)
+        installed = (builtin_packs_dir(), data_dir() / "packs")
+        names = {folder.name for parent in installed if parent.is_dir() for folder in parent.iterdir()}
+        configs, layouts = ("configs/*.yaml", "layouts/*.npy")
+        return cls(_named(folders.values(), configs), _named(folders.values(), layouts), frozenset({*names, *packs}))
+
+    def resolved(self, start: EpisodeSpec) -> EpisodeSpec:
+        """Return a client's start with paths of this machine; empty: files and packs that are not served."""
+        return replace(
+            start,
+            config_file=self.configs.get(start.config_file, ""),
+            layouts_file=self.layouts.get(start.layouts_file, ""),
+            pack=start.pack if start.pack in self.packs else "",
+        )
 
 
 class Answers:
@@ -86,7 +140,7 @@ class Answers:
             number, reset = self._env(message, envs)
             numbers.append(number)
             if reset:
-                starts.append(start_of(message, number, self._files))
+                starts.append(read_episode_spec(message, number, self._files))
         if len(set(numbers)) < len(numbers):
             raise WireError("invalid batch", where=ENV, expected="each env once", found=sorted(numbers))
         read = [observations_of(message, env, self._spec) for message, env in zip(messages, numbers, strict=True)]
@@ -150,3 +204,38 @@ def _chunks(acted: Any, count: int) -> NDArray[Any]:
 
 def _lines(failed: PolicyFailed) -> dict[int, str]:
     return {env: one_line(EvaluationError(why)) for env, why in failed.reasons.items()}
+
+
+def read_episode_spec(message: Mapping[str, Any], env: int, files: ServedFiles) -> EpisodeSpec:
+    """Return the episode that starts; of a client that does not say more, the instruction alone.
+
+    Args:
+        message: of the client.
+        env: of the policy.
+        files: that the client may choose.
+
+    Raises:
+        WireError: it is no start of an episode.
+    """
+    blank = EpisodeSpec(env, 0, "", "", "", "", 0, message.get(PROMPT, ""))
+    said = message.get(START, {})
+    if not isinstance(said, dict) or not said.keys() <= vars(blank).keys() - {"env"}:
+        raise WireError("no start of an episode", where=START, found=short_line(said))
+    for name, value in said.items():
+        if type(value) is not type(getattr(blank, name)):
+            raise WireError("no start of an episode", where=f"{START}.{name}", found=short_line(repr(value)))
+        if isinstance(value, int) and not 0 <= value <= _LARGEST_NUMBER:
+            expected = f"0 to {_LARGEST_NUMBER}"
+            raise WireError("number out of range", where=f"{START}.{name}", expected=expected, found=value)
+        if isinstance(value, str):
+            check_length(f"{START}.{name}", value)
+    return files.resolved(EpisodeSpec(**{**vars(blank), **said}))
+
+
+def _named(folders: Iterable[Path], pattern: str) -> dict[str, str]:
+    return {name: str(path) for folder in folders for path in folder.glob(pattern) for name in _names(path)}
+
+
+def _names(path: Path) -> tuple[str, str]:
+    """The name of a file in messages, and its path, which a client on the same machine may know."""
+    return "/".join(path.parts[-FILE_NAME_PARTS:]), str(path)

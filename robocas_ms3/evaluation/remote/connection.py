@@ -1,9 +1,13 @@
-"""Websocket connections of the client, in one event loop that runs in a thread of its own."""
+"""Websocket connections of the client, in an event loop that runs in its own thread; detection of dead peers.
+
+TCP keepalive is on for every connection, and websocket pings are sent where the other end answers them.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import os
+import socket as sockets
 import threading
 import time
 from collections.abc import Coroutine
@@ -15,10 +19,12 @@ from websockets.exceptions import WebSocketException
 
 from robocas_ms3.core.errors import EvaluationError, WireError
 from robocas_ms3.core.words import printable
-from robocas_ms3.evaluation.remote import keepalive
-from robocas_ms3.evaluation.remote.metadata import ServerMetadata, read_metadata
+from robocas_ms3.evaluation.remote.messages import ServerMetadata, read_metadata
 from robocas_ms3.evaluation.remote.wire import unpack
 
+PING_INTERVAL = 10.0  # s
+PING_TIMEOUT = 60.0  # s without an answer to a ping
+TCP_OPTIONS = {"TCP_KEEPIDLE": 30, "TCP_KEEPINTVL": 10, "TCP_KEEPCNT": 3}  # s, s, probes without an answer
 MAX_REPLY = 16 * 2**20  # bytes
 _RETRY_S = 0.2  # between attempts to connect
 _CLOSE_S = 1.0  # for a server's answer to a close frame
@@ -81,11 +87,11 @@ class Connection:
         """Abort the connection when the server does not answer a ping."""
         try:
             while True:
-                await asyncio.sleep(keepalive.PING_INTERVAL)
+                await asyncio.sleep(PING_INTERVAL)
                 answered = await self._socket.ping()
-                await asyncio.wait_for(answered, keepalive.PING_TIMEOUT)
+                await asyncio.wait_for(answered, PING_TIMEOUT)
         except asyncio.TimeoutError:
-            self._failure = f"no answer to a ping within {keepalive.PING_TIMEOUT:g} s"
+            self._failure = f"no answer to a ping within {PING_TIMEOUT:g} s"
             self._socket.transport.abort()
         except WebSocketException:  # closed
             pass
@@ -151,6 +157,23 @@ class AnswerTimer:
             answer.cancel()
 
 
+def enable_tcp_keepalive(connection: Any) -> None:
+    """Let the kernel close an idle websocket connection 60 s after the other machine stopped answering.
+
+    The other machine's kernel answers, so a process that is busy keeps its connections. The kernel sends no probes
+    while sent data are unacknowledged: pings and ``timeout_s`` detect a network that is lost then. ``TCP_USER_TIMEOUT``
+    is not set, as it also closes a connection to a server that reads no data for that time during inference.
+
+    Args:
+        connection: a connection of `websockets.asyncio`.
+    """
+    tcp = connection.transport.get_extra_info("socket")
+    tcp.setsockopt(sockets.SOL_SOCKET, sockets.SO_KEEPALIVE, 1)
+    for name, value in TCP_OPTIONS.items():
+        if hasattr(sockets, name):  # not on every system
+            tcp.setsockopt(sockets.IPPROTO_TCP, getattr(sockets, name), value)
+
+
 def run_in_loop(work: Coroutine[Any, Any, _T]) -> _T:
     """Run a coroutine in the thread of this process's event loop and return its result."""
     with _LOOP_LOCK:
@@ -193,7 +216,7 @@ async def _open(url: str) -> tuple[ClientConnection, str | bytes]:
         proxy=None,
     )
     try:
-        keepalive.enable_tcp_keepalive(socket)
+        enable_tcp_keepalive(socket)
         return socket, await socket.recv()
     except BaseException:
         socket.transport.abort()

@@ -1,7 +1,7 @@
 """Convert observations and actions to messages and back. Messages are plain maps, which `wire` packs.
 
-The first message of a server is its metadata (`metadata`). An observation is the map of one env, without an axis for
-envs; the answer is ``{"actions": (H, A)}``, or a text with the error, after which the server closes the connection.
+The first message of a server is its metadata (`ServerMetadata`). An observation is the map of one env, without an axis
+for envs; the answer is ``{"actions": (H, A)}``, or a text with the error, after which the server closes the connection.
 A batched request is ``{"batch": [observation, ...]}``; the answer is ``{"batch": [answer, ...]}`` in the same order,
 where an answer is ``{"actions": (H, A)}`` or ``{"error": text}``.
 """
@@ -11,7 +11,8 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,12 +20,11 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
 from robocas_ms3.core.errors import EvaluationError, RobocasError, WireError
+from robocas_ms3.core.paths import protocols_dir
 from robocas_ms3.core.strict import refusal
 from robocas_ms3.core.words import printable
 from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
-from robocas_ms3.evaluation.remote.metadata import LARGEST_BATCH
-from robocas_ms3.evaluation.remote.served import ServedFiles, name_of
 from robocas_ms3.evaluation.remote.wire import MAX_BYTES
 from robocas_ms3.robots.table import DEFAULT
 
@@ -35,10 +35,64 @@ ROBOT = {"qpos": 12, "tcp_in_base": 7, "gripper_width": 1}
 _LARGEST = 1e3  # m or rad: physics of what is beyond would be broken, and nobody means it
 _MAX_PIXELS = 4096  # a side
 _MAX_TEXT = 10_000  # characters
-_LARGEST_NUMBER = 2**32 - 1  # of episodes and seeds
 _LONGEST_LINE = 300  # characters
 _OTHER_BYTES = 8 * 2**20  # of a request, besides images
 _POLICY_SPEC = TypeAdapter(PolicySpec)
+WANTS, POLICY = "robocas_wants", "robocas_policy"
+MAX_BATCH, ANSWERS_PINGS = "robocas_max_batch", "robocas_answers_pings"
+DEFAULT_BATCH, LARGEST_BATCH = 64, 256  # envs
+_MAX_DESCRIPTION = 2**20  # characters of JSON
+FILE_NAME_PARTS = 3  # of a file's name in messages: folder of the protocol, folder in it, file
+
+
+@dataclass(frozen=True)
+class ServerMetadata:
+    """The metadata of a server. A plain openpi server announces none of them.
+
+    Attributes:
+        spec: what the policy declares, as a message has it; None: not announced.
+        policy: description of the policy, JSON values.
+        max_batch: number of envs that a batched request may have; None: no batched requests.
+        answers_pings: whether the server answers websocket pings during inference.
+    """
+
+    spec: Any = None
+    policy: Any = None
+    max_batch: int | None = None
+    answers_pings: bool = False
+
+    def message(self) -> dict[str, Any]:
+        """Return the message; `read_metadata` reads it."""
+        return {
+            WANTS: self.spec,
+            POLICY: self.policy,
+            MAX_BATCH: self.max_batch,
+            ANSWERS_PINGS: self.answers_pings,
+        }
+
+
+def read_metadata(message: Any, url: str) -> ServerMetadata:
+    """Read a server's metadata; keys of other packages are ignored.
+
+    Raises:
+        EvaluationError: a value is out of range.
+    """
+    said = message if isinstance(message, dict) else {}
+    max_batch, answers_pings = said.get(MAX_BATCH), said.get(ANSWERS_PINGS, False)
+    if max_batch is not None and not (type(max_batch) is int and max_batch >= 1):
+        raise EvaluationError(
+            f"invalid {MAX_BATCH}", where=url, expected="an integer above 0", found=short_line(repr(max_batch))
+        )
+    if not isinstance(answers_pings, bool):
+        raise EvaluationError(
+            f"invalid {ANSWERS_PINGS}", where=url, expected="a bool", found=short_line(repr(answers_pings))
+        )
+    policy = json.dumps(said.get(POLICY), default=str)
+    if len(policy) > _MAX_DESCRIPTION:
+        expected = f"{_MAX_DESCRIPTION} characters of JSON at most"
+        raise EvaluationError("policy description too long", where=url, expected=expected, found=len(policy))
+    limit = min(max_batch, LARGEST_BATCH) if max_batch else None
+    return ServerMetadata(said.get(WANTS), json.loads(policy), limit, answers_pings)
 
 
 def read_policy_spec(message: Any, where: object) -> PolicySpec:
@@ -50,7 +104,7 @@ def read_policy_spec(message: Any, where: object) -> PolicySpec:
     known = [field.name for field in fields(PolicySpec)]
     if not isinstance(message, dict) or not set(message) <= set(known):
         raise EvaluationError(
-            "invalid policy specification", where=where, expected=f"some of {known}", found=_line(message)
+            "invalid policy specification", where=where, expected=f"some of {known}", found=short_line(message)
         )
     try:
         spec = _POLICY_SPEC.validate_json(json.dumps(message), strict=True)
@@ -59,10 +113,10 @@ def read_policy_spec(message: Any, where: object) -> PolicySpec:
             error, _POLICY_SPEC, EvaluationError, where=where, about="invalid policy specification"
         ) from error
     except (TypeError, ValueError) as error:
-        raise EvaluationError("invalid policy specification", where=where, found=_line(error)) from error
+        raise EvaluationError("invalid policy specification", where=where, found=short_line(error)) from error
     sides = [side for size in spec.cameras.values() for side in size]
     if not all(1 <= side <= _MAX_PIXELS for side in sides) or not 0 < (spec.rate_hz or 1) < math.inf:
-        raise EvaluationError("invalid policy specification", where=where, found=_line(message))
+        raise EvaluationError("invalid policy specification", where=where, found=short_line(message))
     return spec
 
 
@@ -115,7 +169,7 @@ def observations_of(message: Mapping[str, Any], env: int, spec: PolicySpec) -> O
     prompt = message.get(PROMPT, "")
     if not isinstance(prompt, str):
         raise WireError("an instruction is no text", where=PROMPT, found=type(prompt).__name__)
-    _check_length(PROMPT, prompt)
+    check_length(PROMPT, prompt)
     sizes = {name: (height, width) for name, (width, height) in spec.cameras.items()}
     return Observations(
         envs=np.array([env]),
@@ -162,30 +216,15 @@ def stack_observations(observations: Sequence[Observations]) -> Observations:
     )
 
 
-def start_of(message: Mapping[str, Any], env: int, files: ServedFiles) -> EpisodeSpec:
-    """Return the episode that starts; of a client that does not say more, the instruction alone.
-
-    Args:
-        message: of the client.
-        env: of the policy.
-        files: that the client may choose.
-
-    Raises:
-        WireError: it is no start of an episode.
-    """
-    blank = EpisodeSpec(env, 0, "", "", "", "", 0, message.get(PROMPT, ""))
-    said = message.get(START, {})
-    if not isinstance(said, dict) or not said.keys() <= vars(blank).keys() - {"env"}:
-        raise WireError("no start of an episode", where=START, found=_line(said))
-    for name, value in said.items():
-        if type(value) is not type(getattr(blank, name)):
-            raise WireError("no start of an episode", where=f"{START}.{name}", found=_line(repr(value)))
-        if isinstance(value, int) and not 0 <= value <= _LARGEST_NUMBER:
-            expected = f"0 to {_LARGEST_NUMBER}"
-            raise WireError("number out of range", where=f"{START}.{name}", expected=expected, found=value)
-        if isinstance(value, str):
-            _check_length(f"{START}.{name}", value)
-    return files.resolved(EpisodeSpec(**{**vars(blank), **said}))
+def name_of(path: str) -> str:
+    """Return the name of a protocol's file in messages; its path if a shipped protocol has that name."""
+    parts = Path(path).parts
+    shipped = protocols_dir()
+    if len(parts) < FILE_NAME_PARTS or (
+        (shipped / parts[-FILE_NAME_PARTS]).exists() and not Path(path).is_relative_to(shipped)
+    ):
+        return path
+    return "/".join(parts[-FILE_NAME_PARTS:])
 
 
 def actions_of(reply: Any, convention: str) -> NDArray[np.float32]:
@@ -203,12 +242,14 @@ def actions_of(reply: Any, convention: str) -> NDArray[np.float32]:
     try:
         found = np.asarray(said)
     except ValueError as error:  # lists of different lengths
-        raise WireError("no actions", expected=f"(chunk, {size})", found=_line(error)) from error
+        raise WireError("no actions", expected=f"(chunk, {size})", found=short_line(error)) from error
     if found.dtype.kind not in "iuf" or found.ndim not in (1, 2) or found.shape[-1] != size or not found.size:
-        what = _line(reply) if said is None else f"{found.shape} {found.dtype}"
+        what = short_line(reply) if said is None else f"{found.shape} {found.dtype}"
         raise WireError("no actions", expected=f"(chunk, {size}) numbers", found=what)
     if not (np.abs(found.astype(np.float64)) <= _LARGEST).all():  # nor is what is not a number
-        raise WireError("an action beyond all measure", expected=f"{_LARGEST:g} at most", found=_line(found.tolist()))
+        raise WireError(
+            "an action beyond all measure", expected=f"{_LARGEST:g} at most", found=short_line(found.tolist())
+        )
     return found.reshape(-1, size).astype(np.float32)
 
 
@@ -253,10 +294,16 @@ def _image_bytes(spec: PolicySpec) -> int:
     return pixels * (5 if spec.depth else 3)
 
 
-def _check_length(where: str, text: str) -> None:
+def check_length(where: str, text: str) -> None:
+    """Check the length of a text of a client.
+
+    Raises:
+        WireError: it is too long.
+    """
     if len(text) > _MAX_TEXT:
         raise WireError("text too long", where=where, expected=f"{_MAX_TEXT} characters at most", found=len(text))
 
 
-def _line(text: object) -> str:
+def short_line(text: object) -> str:
+    """Return a value as a line of at most 200 characters, for an error message."""
     return " ".join(str(text).split())[:200]

@@ -8,7 +8,10 @@ import json
 import logging
 import threading
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import Executor, Future
+from functools import partial
+from queue import SimpleQueue
+from typing import Any
 
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
@@ -17,13 +20,16 @@ from websockets.http11 import Request, Response
 from robocas_ms3 import __version__
 from robocas_ms3.core.errors import EvaluationError, RobocasError, WireError
 from robocas_ms3.evaluation.policy import Policy, describe, policy_code, policy_spec_values
-from robocas_ms3.evaluation.remote import keepalive
+from robocas_ms3.evaluation.remote import connection
 from robocas_ms3.evaluation.remote.address import netloc, strip_brackets
-from robocas_ms3.evaluation.remote.answers import Answers
-from robocas_ms3.evaluation.remote.executor import CallerThreadExecutor
-from robocas_ms3.evaluation.remote.messages import batch_limit, message_bytes, one_line
-from robocas_ms3.evaluation.remote.metadata import DEFAULT_BATCH, ServerMetadata
-from robocas_ms3.evaluation.remote.served import ServedFiles
+from robocas_ms3.evaluation.remote.answers import Answers, ServedFiles
+from robocas_ms3.evaluation.remote.messages import (
+    DEFAULT_BATCH,
+    ServerMetadata,
+    batch_limit,
+    message_bytes,
+    one_line,
+)
 from robocas_ms3.evaluation.remote.wire import pack
 
 _LOG = logging.getLogger(__name__)
@@ -32,6 +38,42 @@ MAX_CONNECTIONS = 256
 _IDLE = 3600.0  # s without a message, after which a connection is closed
 _STOP_S = 5.0  # for the network's thread to end
 _FAILED, _GARBAGE, _FULL = 1011, 1008, 1013  # close codes
+
+
+class CallerThreadExecutor(Executor):
+    """Run submitted functions, one after another, in the thread that calls `run`.
+
+    So a policy stays in the thread that made it, and Ctrl-C reaches its code, while another thread does the
+    network's work. A submitted function that is cancelled before its turn is skipped.
+    """
+
+    def __init__(self) -> None:
+        self._calls: SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None] = SimpleQueue()
+        self._ended = False
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Add a function to the queue."""
+        future: Future[Any] = Future()
+        self._calls.put((future, partial(fn, *args, **kwargs)))
+        return future
+
+    def run(self) -> None:
+        """Run submitted functions until `shutdown`."""
+        while (item := self._calls.get()) is not None and not self._ended:
+            future, call = item
+            if not future.set_running_or_notify_cancel():
+                continue
+            try:
+                result = call()
+            except Exception as error:  # raised by future.result() in the waiting thread
+                future.set_exception(error)
+            else:
+                future.set_result(result)
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """End `run` after the function that it runs now."""
+        self._ended = True
+        self._calls.put(None)
 
 
 class PolicyServer:
@@ -113,8 +155,8 @@ class PolicyServer:
             compression=None,
             max_size=self._max_bytes,
             max_queue=1,
-            ping_interval=keepalive.PING_INTERVAL,
-            ping_timeout=keepalive.PING_TIMEOUT,
+            ping_interval=connection.PING_INTERVAL,
+            ping_timeout=connection.PING_TIMEOUT,
             close_timeout=1,
         )
         try:
@@ -131,7 +173,7 @@ class PolicyServer:
         if self._connections >= MAX_CONNECTIONS:
             return await client.close(_FULL, "too many clients")
         self._connections += 1
-        keepalive.enable_tcp_keepalive(client)
+        connection.enable_tcp_keepalive(client)
         envs: dict[int, int] = {}  # the client's to the policy's
         closed = asyncio.ensure_future(client.wait_closed())
         try:

@@ -19,7 +19,7 @@ from remote_ends import Told, a_start, serving, some_observations
 from websockets.sync.client import connect
 
 from robocas_ms3.core.errors import PolicyFailed
-from robocas_ms3.evaluation.remote import keepalive
+from robocas_ms3.evaluation.remote import connection
 from robocas_ms3.evaluation.remote.client import RemotePolicy
 from robocas_ms3.evaluation.remote.messages import observation_message
 from robocas_ms3.evaluation.remote.wire import pack, unpack
@@ -41,8 +41,8 @@ class Slow(Told):
 @pytest.fixture
 def fast_pings(monkeypatch):
     """Shorten the times of pings."""
-    monkeypatch.setattr(keepalive, "PING_INTERVAL", 0.2)
-    monkeypatch.setattr(keepalive, "PING_TIMEOUT", 1.0)
+    monkeypatch.setattr(connection, "PING_INTERVAL", 0.2)
+    monkeypatch.setattr(connection, "PING_TIMEOUT", 1.0)
 
 
 def test_a_slow_server_is_not_dropped_and_answers_health_checks(fast_pings):
@@ -148,11 +148,11 @@ import os, subprocess, sys, threading, time
 subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
 from remote_ends import a_start, some_observations, talking
 from robocas_ms3.core.errors import PolicyFailed
-from robocas_ms3.evaluation.remote import keepalive
+from robocas_ms3.evaluation.remote import connection
 from robocas_ms3.evaluation.remote.client import RemotePolicy
 from robocas_ms3.evaluation.remote.wire import pack
 
-keepalive.TCP_OPTIONS = {"TCP_KEEPIDLE": 1, "TCP_KEEPINTVL": 1, "TCP_KEEPCNT": 2}
+connection.TCP_OPTIONS = {"TCP_KEEPIDLE": 1, "TCP_KEEPINTVL": 1, "TCP_KEEPCNT": 2}
 
 def talk(socket):  # a plain openpi server, which answers no pings
     socket.send(pack({}))

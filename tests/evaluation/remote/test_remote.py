@@ -16,9 +16,9 @@ from robocas_ms3.core.errors import EvaluationError, PolicyFailed
 from robocas_ms3.evaluation.policies import make_policy
 from robocas_ms3.evaluation.policies.plain import RandomPolicy
 from robocas_ms3.evaluation.policy import PolicySpec
+from robocas_ms3.evaluation.remote.answers import ServedFiles, read_episode_spec
 from robocas_ms3.evaluation.remote.client import RemotePolicy
-from robocas_ms3.evaluation.remote.messages import observation_message, start_of
-from robocas_ms3.evaluation.remote.served import ServedFiles
+from robocas_ms3.evaluation.remote.messages import observation_message
 from robocas_ms3.evaluation.remote.wire import pack, unpack
 
 ALL = PolicySpec(cameras={"base_camera": CAMERA}, depth=True, state=True, rate_hz=10, reference="tcp")
@@ -119,7 +119,7 @@ def test_a_start_names_the_robot_where_it_is_another():
         start = replace(a_start(), robot=robot)
         message = observation_message(some_observations(0), 0, start, reset=True)
         assert message["start"].keys() & {"robot"} == keys
-        assert start_of(message, 0, ServedFiles.of()) == start
+        assert read_episode_spec(message, 0, ServedFiles.of()) == start
 
 
 def test_openpis_client_asks_our_server():

@@ -17,9 +17,9 @@ from websockets.sync.client import connect
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.policies.scripted import ScriptedPolicy
+from robocas_ms3.evaluation.remote.answers import ServedFiles
 from robocas_ms3.evaluation.remote.client import RemotePolicy
-from robocas_ms3.evaluation.remote.messages import observation_message
-from robocas_ms3.evaluation.remote.served import ServedFiles, name_of
+from robocas_ms3.evaluation.remote.messages import name_of, observation_message
 from robocas_ms3.evaluation.remote.wire import pack
 
 GARBAGE = 1008
