@@ -11,8 +11,7 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.formats import format_of
 from robocas_ms3.datasets.pictures.headers import read_picture_bytes
-from robocas_ms3.datasets.sources.episode import DEFAULT_RATE
-from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.datasets.sources.reader import DEFAULT_RATE, Dataset
 from robocas_ms3.viewer.content import PageContent
 from robocas_ms3.viewer.damage import attempt, rate_of, split_of, table
 from robocas_ms3.viewer.pictures import Picture, inside

@@ -65,7 +65,7 @@ def test_no_picture_is_read_back(trajectory, made_up_pictures, tmp_path, monkeyp
     def read(*_):
         raise AssertionError("a picture was read")
 
-    monkeypatch.setattr("robocas_ms3.datasets.sources.episode.read_picture", read)
+    monkeypatch.setattr("robocas_ms3.datasets.sources.reader.read_picture", read)
     assert converted(trajectory, tmp_path / "out") == 0
     assert shown(tmp_path / "out") == ["contact_sheet.png", "episode_0000000.mp4", "episode_0000001.mp4"]
 

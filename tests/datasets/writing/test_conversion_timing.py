@@ -96,7 +96,7 @@ def test_of_a_lerobot_dataset(trajectory, made, tmp_path, monkeypatch, clock):
     pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
     from robocas_ms3.datasets.lerobot import assemble, stage
     from robocas_ms3.datasets.lerobot.convert import convert_lerobot
-    from robocas_ms3.datasets.sources.episode import Episode
+    from robocas_ms3.datasets.sources.reader import Episode
 
     monkeypatch.setattr(stage.Encoder, "add", slow(stage.Encoder.add, clock, 0.5))
     monkeypatch.setattr(stage.pq, "write_table", slow(stage.pq.write_table, clock, 0.25))
