@@ -49,7 +49,7 @@ EXTRAS = {  # files that may import what an extra brings
     "robocas_ms3/datasets/lerobot/": "lerobot",
     "robocas_ms3/datasets/statistics/plots.py": "plots",
     "robocas_ms3/evaluation/remote/": "remote",
-    "robocas_ms3/evaluation/report/columns.py": "lerobot",
+    "robocas_ms3/evaluation/report/__init__.py": "lerobot",
     "robocas_ms3/plans/executors/ray": "ray",
     "robocas_ms3/plans/executors/slurm": "slurm",
     "asset_tools/": "assets",

@@ -80,8 +80,8 @@ def run(cfg: Run) -> int:
     from robocas_ms3.core.workers import Limits, use_one_torch_thread
     from robocas_ms3.evaluation.policies import check_policy, open_policy
     from robocas_ms3.evaluation.protocol import load_protocol
+    from robocas_ms3.evaluation.report.tables import markdown
     from robocas_ms3.evaluation.results import read
-    from robocas_ms3.evaluation.tables import markdown
 
     for name, number in (("envs", cfg.envs), ("episodes", cfg.episodes), ("workers", cfg.workers)):
         if number is not None:

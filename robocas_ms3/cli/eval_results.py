@@ -92,8 +92,8 @@ class Videos:
 def report(cfg: Report) -> int:
     """Run ``report``."""
     from robocas_ms3.cli.terminal import say, say_lines
+    from robocas_ms3.evaluation.report.tables import markdown
     from robocas_ms3.evaluation.results import read
-    from robocas_ms3.evaluation.tables import markdown
 
     check_folders(cfg.folders)
     result = read(*cfg.folders)
@@ -121,7 +121,7 @@ def merge(cfg: Merge) -> int:
 def compare(cfg: Compare) -> int:
     """Run ``compare``."""
     from robocas_ms3.cli.terminal import say_lines
-    from robocas_ms3.evaluation.comparison import comparison, comparison_of_splits
+    from robocas_ms3.evaluation.report.comparison import comparison, comparison_of_splits
     from robocas_ms3.evaluation.results import parts_of, read
 
     check_folders(cfg.folders)
@@ -173,7 +173,7 @@ def videos(cfg: Videos) -> int:
         fix = f"Name it yourself, if you trust it: --policy {name}"
         raise EvaluationError("this result is of a policy of somebody's own", where=cfg.folder, found=name, fix=fix)
     from robocas_ms3.core.workers import use_one_torch_thread
-    from robocas_ms3.evaluation.videos import failed_of_each_kind, film
+    from robocas_ms3.evaluation.report.videos import failed_of_each_kind, film
 
     use_one_torch_thread()
     numbers = failed_of_each_kind(result, cfg.count)

@@ -21,11 +21,11 @@ from robocas_ms3.demos.checks import check_same_run
 from robocas_ms3.demos.ledger import Ledger, count_by_stage
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
 from robocas_ms3.evaluation import results
-from robocas_ms3.evaluation.comparison import comparison
 from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
+from robocas_ms3.evaluation.report.comparison import comparison
 from robocas_ms3.evaluation.report.page import page
-from robocas_ms3.evaluation.tables import markdown
+from robocas_ms3.evaluation.report.tables import markdown
 from robocas_ms3.plans.folder import PLAN, check_plan_record, plan_record, read_plan
 from robocas_ms3.plans.load import load_plan, shipped_plans
 from robocas_ms3.plans.status import read_status

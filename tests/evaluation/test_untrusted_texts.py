@@ -9,12 +9,12 @@ from made_up_results import outcome, write
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation import results
-from robocas_ms3.evaluation.comparison import comparison
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.policy import EpisodeSpec, PolicySpec, describe
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.remote.server import PolicyServer
 from robocas_ms3.evaluation.report import write_report
+from robocas_ms3.evaluation.report.comparison import comparison
 from robocas_ms3.evaluation.rollout import Rollout
 from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings

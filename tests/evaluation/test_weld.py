@@ -20,11 +20,11 @@ from robocas_ms3.evaluation.metrics import read_sum
 from robocas_ms3.evaluation.policies import make_policy
 from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.report.videos import film
 from robocas_ms3.evaluation.session import EvaluationSession, evaluate
 from robocas_ms3.evaluation.settings import EvaluationSettings
 from robocas_ms3.evaluation.stepping import PolicyStepping, control_mode
 from robocas_ms3.evaluation.verify import problems
-from robocas_ms3.evaluation.videos import film
 from robocas_ms3.evaluation.weld import Weld, check_weld
 from robocas_ms3.robots.description import MOBILE_PANDA
 

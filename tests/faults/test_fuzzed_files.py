@@ -24,10 +24,10 @@ from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.datasets.writing.settings import ConversionSettings
 from robocas_ms3.evaluation import results
-from robocas_ms3.evaluation.comparison import comparison
 from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
+from robocas_ms3.evaluation.report.comparison import comparison
 from robocas_ms3.evaluation.report.page import page
-from robocas_ms3.evaluation.tables import markdown
+from robocas_ms3.evaluation.report.tables import markdown
 from robocas_ms3.scenes.bank import ABOUT, LayoutBank
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.frozen import FrozenLayouts, write_frozen

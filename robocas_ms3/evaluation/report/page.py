@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from html import escape
 from importlib.resources import files
@@ -12,14 +13,12 @@ import numpy as np
 from robocas_ms3.core.words import count_of
 from robocas_ms3.evaluation.outcomes import Outcome, summarize_retrieval
 from robocas_ms3.evaluation.protocol import LoadedProtocol
-from robocas_ms3.evaluation.report.background import measured_with
-from robocas_ms3.evaluation.report.failed import failed_episodes
-from robocas_ms3.evaluation.report.marks import axis, bar, rate, round_up, section, spread, table
-from robocas_ms3.evaluation.report.stages import FAILURES, failure_of, funnel_of
+from robocas_ms3.evaluation.report.failures import FAILURES, failed_episodes, failure_of, funnel_of
+from robocas_ms3.evaluation.report.html import axis, bar, facts, rate, round_up, section, spread, table
+from robocas_ms3.evaluation.report.tables import P_VIS_EDGES, WELDED, first_splits
+from robocas_ms3.evaluation.report.tables import title as title_of
 from robocas_ms3.evaluation.results import Result
 from robocas_ms3.evaluation.statistics import Share, share, success_by
-from robocas_ms3.evaluation.tables import P_VIS_EDGES, WELDED, first_splits
-from robocas_ms3.evaluation.tables import title as title_of
 
 
 def page(result: Result, folder: Path | None = None, protocol: LoadedProtocol | None = None) -> str:
@@ -44,7 +43,7 @@ def page(result: Result, folder: Path | None = None, protocol: LoadedProtocol | 
             _retrieval(result),
         ]
         parts += [_seconds(result), _care(result)]
-    parts += [measured_with(result, protocol), failed_episodes(result, folder)]
+    parts += [_measured_with(result, protocol), failed_episodes(result, folder)]
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
@@ -252,3 +251,42 @@ def _with_all(groups: dict[str, list[Outcome]]) -> list[tuple[str, list[Outcome]
     """The groups, and where there are several, all of them together."""
     every = [outcome for outcomes in groups.values() for outcome in outcomes]
     return [*groups.items(), *([("all together", every)] if len(groups) > 1 else [])]
+
+
+def _measured_with(result: Result, protocol: LoadedProtocol | None) -> str:
+    """A section of the page."""
+    run, policy = result.run, result.run["policy"]
+    pairs: list[tuple[str, object]] = [("protocol", run["protocol"]), ("its hash", run["protocol_hash"])]
+    if protocol is not None:
+        pairs += [("what it says", protocol.rules.description), ("its rules", _rules(protocol))]
+    pairs += [("policy", policy["name"])]
+    pairs += [(f"policy, {name}", _plain(value)) for name, value in policy.items() if name != "name"]
+    pairs += [
+        ("upstream's weld", "yes" if run["weld"] else "no"),
+        ("backend", run["backend"]),
+        ("versions", _plain(run["versions"])),
+    ]
+    pairs += [(f"pack {name}", value) for name, value in run["pack_hashes"].items()]
+    machines = {_plain(part["machine"]) for part in run.get("parts", [])} or {_plain(run.get("machine", {}))}
+    pairs += [("machine", machine) for machine in sorted(machines)]
+    parts = ""
+    if "parts" in run:
+        rows = [[escape(part["folder"]), str(part["episodes"])] for part in run["parts"]]
+        parts = table(("part", "episodes#"), rows)
+    return section("What it was measured with", "", facts(pairs) + parts)
+
+
+def _rules(protocol: LoadedProtocol) -> str:
+    kept = {"rate_hz", "stepping", "max_steps", "max_seconds", "ends_on", "max_v0_steps"}
+    rules = protocol.rules.model_dump(mode="json", include=kept)
+    return _plain({name: value for name, value in rules.items() if value is not None})
+
+
+def _plain(value: object) -> str:
+    """A dictionary as ``a 1, b 2``; anything else as JSON, strings as they are."""
+    if isinstance(value, dict):
+        return ", ".join(
+            f"{name} {_plain(inner) if not isinstance(inner, dict) else json.dumps(inner)}"
+            for name, inner in value.items()
+        )
+    return value if isinstance(value, str) else json.dumps(value)

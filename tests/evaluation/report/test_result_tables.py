@@ -3,7 +3,7 @@
 import pytest
 from made_up_results import outcome, write
 
-from robocas_ms3.evaluation.tables import markdown
+from robocas_ms3.evaluation.report.tables import markdown
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""The episodes that failed, for the page."""
+"""The stages of an episode by name, and the failed episodes, for the page."""
 
 from __future__ import annotations
 
@@ -7,11 +7,30 @@ from pathlib import Path
 
 from robocas_ms3.core.words import count_of
 from robocas_ms3.evaluation.outcomes import Outcome
-from robocas_ms3.evaluation.report.marks import section, table
-from robocas_ms3.evaluation.report.stages import failure_of
+from robocas_ms3.evaluation.report.html import section, table
 from robocas_ms3.evaluation.results import Result
+from robocas_ms3.scenes.task_specs import STAGES as ON_THE_WAY
+from robocas_ms3.scenes.task_specs import TASKS
 
 VIDEOS = "videos"
+STAGES = {
+    "furniture_opened": "furniture opened",
+    "reached_any": "an object touched (RA)",
+    "picked_any": "an object picked (PA)",
+    "obstacles_cleared": "obstacles cleared (CO)",
+    "reached_target": "target touched (RR)",
+    "target_grasped": "target grasped",
+    "target_lifted": "target lifted",
+    "target_in_basket": "target in basket",
+    "success": "success",
+}
+"""Of the funnels, in the order in which they are usually come to."""
+FAILURES = {
+    **{stage: said.split(" (")[0] for stage, said in STAGES.items() if stage != "success"},
+    "placed": "placed, at rest",
+    "error": "broken off",
+}
+"""What an episode did not come to (`outcomes.failure_stage`)."""
 
 
 def video_name(episode: int) -> str:
@@ -75,3 +94,20 @@ def _named(outcome: Outcome, folder: Path | None) -> str:
 
 def _options(values: set[str]) -> str:
     return "".join(f"<option>{escape(value)}</option>" for value in sorted(values))
+
+
+def funnel_of(task: str) -> dict[str, str]:
+    """What the stages of a task are called, in their order; those of another package's by their own names."""
+    row = TASKS.get(task)
+    if row is None or row.stages == ON_THE_WAY:
+        return STAGES
+    return {stage: STAGES.get(stage, _plain(stage)) for stage in (*row.stages, "success")}
+
+
+def failure_of(stage: str) -> str:
+    """What it is called that an episode did not come to this stage."""
+    return FAILURES.get(stage, _plain(stage))
+
+
+def _plain(stage: str) -> str:
+    return stage.replace("_", " ")

@@ -6,8 +6,8 @@ import pytest
 from made_up_results import outcome, write
 
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.evaluation.comparison import comparison, comparison_of_splits
 from robocas_ms3.evaluation.protocol import EPISODES, load_protocol, shipped_protocols
+from robocas_ms3.evaluation.report.comparison import comparison, comparison_of_splits
 from robocas_ms3.evaluation.statistics import holm, mcnemar
 
 

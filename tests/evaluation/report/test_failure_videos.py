@@ -11,7 +11,7 @@ from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.freeze import Plan, freeze
 from robocas_ms3.evaluation.policies.plain import RandomPolicy
 from robocas_ms3.evaluation.protocol import load_protocol
-from robocas_ms3.evaluation.videos import SIZE, failed_of_each_kind, film
+from robocas_ms3.evaluation.report.videos import SIZE, failed_of_each_kind, film
 
 
 def test_all_kinds_of_failures_have_their_turn(tmp_path):

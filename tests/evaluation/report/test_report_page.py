@@ -14,8 +14,8 @@ from robocas_ms3.cli.eval_results import Compare, Merge, Report, Verify, compare
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.report import PARQUET, write_report
-from robocas_ms3.evaluation.report.failed import video_name
-from robocas_ms3.evaluation.report.marks import round_up
+from robocas_ms3.evaluation.report.failures import video_name
+from robocas_ms3.evaluation.report.html import round_up
 from robocas_ms3.evaluation.report.page import page
 
 VOID = {"meta", "rect", "path"}  # of HTML, and those that SVG closes at once
