@@ -33,8 +33,7 @@ class Run:
     executor_option: Repeated[str] = ()
     """Set an option of Slurm or Ray, such as `--executor-option partition=cpu`; repeatable (docs/scale.md)."""
     shard: Maybe[str] = None
-    """K/N: do only every N-th work unit, from the K-th on (K = 0 ... N - 1), and do not join. All shards may run at
-    the same time, on machines that see the folder; `robocas plan join` then joins."""
+    """K/N, such as 0/4: do the work units whose number is K modulo N, and do not join; shards may run at once."""
     overwrite: bool = False
     """Replace the output folder if it exists."""
 

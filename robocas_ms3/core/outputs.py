@@ -25,8 +25,8 @@ from robocas_ms3.core.files import empty_folder, is_fixed, json_text, make_folde
 from robocas_ms3.core.locks import LOCK, locked_folder
 
 _LEFTOVERS = (".*.tmp*", ".*.old")  # of `files.replacing` and `files.replacing_folder` in a process that was killed
-# Files that do not count as content; a plan's run writes its own before it writes the record
-_HIDDEN = (LOCK, ".driver.*", *_LEFTOVERS)
+# Files that do not count as content
+_HIDDEN = (LOCK, *_LEFTOVERS)
 _SHOWN_CHANGES = 8
 _SHOWN_VALUE = 60  # characters
 

@@ -18,7 +18,7 @@ from plan_stages import PLAN, MadeUp, assert_same, open_worker, render, run_here
 from ray.cluster_utils import Cluster
 
 from robocas_ms3.core.errors import MissingExtraError, PlanError
-from robocas_ms3.plans.executors import Setting, check_executor, open_executor
+from robocas_ms3.plans.executors import Setting, check_executor, open_executor, read_options
 from robocas_ms3.plans.executors.ray import RayExecutor, do_units
 from robocas_ms3.plans.executors.ray_cluster import RayOptions
 from robocas_ms3.plans.run import run_plan
@@ -189,9 +189,9 @@ def raylet(cluster):
 
 
 def test_options_are_read_or_refused():
-    assert RayOptions.read({"num_gpus": "0.25", "gather": "yes", "address": "10.0.0.1:6379"}) == RayOptions(
-        num_gpus=0.25, gather=True, address="10.0.0.1:6379"
-    )
+    options = {"num_gpus": "0.25", "gather": "yes", "address": "10.0.0.1:6379"}
+    expected = RayOptions(num_gpus=0.25, gather=True, address="10.0.0.1:6379")
+    assert read_options("ray", RayOptions, options) == expected
     for options in ({"cpus": "2"}, {"num_cpus": "0"}, {"gather": "perhaps"}):
         with pytest.raises(PlanError) as error:
             check_executor("ray", options)

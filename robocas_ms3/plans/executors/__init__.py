@@ -7,11 +7,12 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 from robocas_ms3.core.errors import PlanError
 from robocas_ms3.core.exits import deferred_interrupts
 from robocas_ms3.core.extensions import load
+from robocas_ms3.core.strict import StrictModel, parse
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.units import Unit
 from robocas_ms3.plans.worker import UnitWorker
@@ -22,6 +23,7 @@ EXECUTORS = {
     "ray": "robocas_ms3.plans.executors.ray:RayExecutor",
 }
 """Name -> class; what it needs is imported when it is chosen."""
+Options = TypeVar("Options", bound=StrictModel)
 _WAIT = 0.2  # s until a signal is handled
 
 
@@ -91,17 +93,26 @@ def open_executor(name: str, setting: Setting) -> Executor:
     return load(EXECUTORS[name])(setting)
 
 
-def check_option_names(executor: str, options: Mapping[str, str], known: Sequence[str] = ()) -> None:
-    """Refuse options that an executor does not have.
+def read_options(executor: str, model: type[Options], options: Mapping[str, str]) -> Options:
+    """Read the values of ``--executor-option``.
 
     Raises:
-        PlanError: there is such an option.
+        PlanError: a name is unknown, or a value is invalid.
     """
-    unknown = sorted(set(options) - set(known))
-    if unknown:
-        expected = ", ".join(known) or "none"
-        what = f"unknown option of the executor {executor}"
-        raise PlanError(what, where="--executor-option", expected=expected, found=", ".join(unknown))
+    values = {name: _value(text) for name, text in options.items()}
+    about = f"not a valid option of the executor {executor}"
+    return parse(model, values, PlanError, where="--executor-option", about=about)
+
+
+def _value(text: str) -> Any:
+    if text in {"yes", "true", "no", "false"}:
+        return text in {"yes", "true"}
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
 
 
 def ended_futures(futures: Sequence[Future[None]], seconds: float) -> list[Future[None]]:

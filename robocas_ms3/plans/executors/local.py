@@ -6,7 +6,8 @@ import threading
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 
-from robocas_ms3.plans.executors import Setting, check_option_names, ended_futures
+from robocas_ms3.core.strict import StrictModel
+from robocas_ms3.plans.executors import Setting, ended_futures, read_options
 from robocas_ms3.plans.units import Unit
 
 
@@ -25,7 +26,7 @@ class LocalExecutor:
     @staticmethod
     def check(options: Mapping[str, str]) -> None:
         """Check that there are no options."""
-        check_option_names("local", options)
+        read_options("local", StrictModel, options)
 
     def submit(self, groups: Sequence[Sequence[Unit]]) -> list[Future[None]]:
         """Start a thread for each group."""

@@ -19,7 +19,7 @@ from robocas_ms3.core.errors import PlanError
 from robocas_ms3.core.exits import deferred_interrupts
 from robocas_ms3.core.files import ABANDONED, make_folder, write_json
 from robocas_ms3.core.sent_errors import SentError
-from robocas_ms3.plans.executors import Setting, ended_futures
+from robocas_ms3.plans.executors import Setting, ended_futures, read_options
 from robocas_ms3.plans.executors.ray_cluster import RayOptions, connect, require_ray
 from robocas_ms3.plans.folder import PLAN, read_plan_record
 from robocas_ms3.plans.plan import Plan
@@ -40,7 +40,7 @@ class RayExecutor:
     """See `executors.Executor`; a thread per task."""
 
     def __init__(self, setting: Setting) -> None:
-        self._options, self._setting = RayOptions.read(setting.options), setting
+        self._options, self._setting = read_options("ray", RayOptions, setting.options), setting
         self.jobs, self.units_per_job = setting.jobs, self._options.units_per_job
         self._out = setting.out.absolute()
         self._ray = require_ray()
@@ -54,7 +54,7 @@ class RayExecutor:
     def check(options: Mapping[str, str]) -> None:
         """Check the options, and that Ray is installed."""
         require_ray()
-        RayOptions.read(options)
+        read_options("ray", RayOptions, options)
 
     def submit(self, groups: Sequence[Sequence[Unit]]) -> list[Future[None]]:
         """Start a task for each group."""

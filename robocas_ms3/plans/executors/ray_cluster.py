@@ -6,15 +6,13 @@ import logging
 import math
 import os
 import socket
-from collections.abc import Mapping
 from importlib import import_module
 from typing import Annotated, Any
 
 from pydantic import Field
 
 from robocas_ms3.core.errors import MissingExtraError, PlanError
-from robocas_ms3.core.strict import StrictModel, parse
-from robocas_ms3.plans.executors import check_option_names
+from robocas_ms3.core.strict import StrictModel
 
 _TIMEOUT = 10.0  # s
 _log = logging.getLogger(__name__)
@@ -30,28 +28,6 @@ class RayOptions(StrictModel):
     num_gpus: Annotated[float, Field(ge=0)] = Field(default=0.0, description="of a task")
     units_per_job: Annotated[int, Field(ge=1)] = Field(default=4, description="that a task does one after the other")
     gather: bool = Field(default=False, description="nodes do not see the folder, and send their files")
-
-    @classmethod
-    def read(cls, options: Mapping[str, str]) -> RayOptions:
-        """Read the values of ``--executor-option``.
-
-        Raises:
-            PlanError: a name is unknown, or a value is invalid.
-        """
-        check_option_names("ray", options, tuple(cls.model_fields))
-        values = {name: value if name == "address" else _value(value) for name, value in options.items()}
-        return parse(cls, values, PlanError, where="--executor-option", about="not a valid option of Ray")
-
-
-def _value(text: str) -> Any:
-    if text in {"yes", "true", "no", "false"}:
-        return text in {"yes", "true"}
-    for kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            continue
-    return text
 
 
 def require_ray() -> Any:

@@ -21,8 +21,8 @@ from pydantic import Field
 
 from robocas_ms3.core.errors import MissingExtraError, PlanError
 from robocas_ms3.core.files import make_folder
-from robocas_ms3.core.strict import StrictModel, parse
-from robocas_ms3.plans.executors import Setting, check_option_names
+from robocas_ms3.core.strict import StrictModel
+from robocas_ms3.plans.executors import Setting, read_options
 from robocas_ms3.plans.executors.slurm_job import UnitsJob
 from robocas_ms3.plans.units import Unit
 
@@ -61,28 +61,25 @@ class SlurmOptions(StrictModel):
         default=None, description="of a job; None: the limit of its two processes, 2 x limits.memory_gb of the plan"
     )
     cpus_per_task: Annotated[int, Field(ge=1)] = 1
-    sbatch: dict[str, str] = Field(default={}, description="passed to sbatch")
 
-    @classmethod
-    def read(cls, options: Mapping[str, str]) -> SlurmOptions:
-        """Read the values of ``--executor-option``.
 
-        Raises:
-            PlanError: a name is unknown, or a value is invalid.
-        """
-        own = tuple(name for name in cls.model_fields if name != "sbatch")
-        check_option_names("slurm", options, own + SBATCH_OPTIONS)
-        values: dict[str, Any] = {name: _number(value) for name, value in options.items() if name in own}
-        sbatch = {name: value for name, value in options.items() if name in SBATCH_OPTIONS}
-        what = "not a valid option of Slurm"
-        return parse(cls, values | {"sbatch": sbatch}, PlanError, where="--executor-option", about=what)
+def read_slurm_options(options: Mapping[str, str]) -> tuple[SlurmOptions, dict[str, str]]:
+    """Read the values of ``--executor-option``; return those of sbatch apart.
+
+    Raises:
+        PlanError: a name is unknown, or a value is invalid.
+    """
+    own = {name: value for name, value in options.items() if name not in SBATCH_OPTIONS}
+    sbatch = {name: value for name, value in options.items() if name in SBATCH_OPTIONS}
+    return read_options("slurm", SlurmOptions, own), sbatch
 
 
 class SlurmExecutor:
     """See `executors.Executor`; the plan's folder has to be at the same path on all nodes."""
 
     def __init__(self, setting: Setting) -> None:
-        self._options, self._setting = SlurmOptions.read(setting.options), setting
+        self._setting = setting
+        self._options, self._sbatch = read_slurm_options(setting.options)
         self.jobs, self.units_per_job = setting.jobs, self._options.units_per_job
         self._out = setting.out.absolute()
         self._local = self._options.cluster == "local"
@@ -106,7 +103,7 @@ class SlurmExecutor:
     @staticmethod
     def check(options: Mapping[str, str]) -> None:
         """Check the options, and that Slurm is on this machine."""
-        if SlurmOptions.read(options).cluster == "slurm":
+        if read_slurm_options(options)[0].cluster == "slurm":
             _check_slurm()
 
     def _parameters(self) -> dict[str, Any]:
@@ -115,13 +112,13 @@ class SlurmExecutor:
         return {
             "job_name": self._name,
             "time": options.time,
-            "mem": None if "mem_per_cpu" in options.sbatch else f"{round(mem_gb * 1024)}MB",
+            "mem": None if "mem_per_cpu" in self._sbatch else f"{round(mem_gb * 1024)}MB",
             "cpus_per_task": options.cpus_per_task,
             "srun_args": [f"--cpus-per-task={options.cpus_per_task}"],  # srun does not read that of sbatch since 22.05
             "stderr_to_stdout": True,
             "wckey": None,
             "array_parallelism": self.jobs,
-            "additional_parameters": {"requeue": True, **{k: v == "true" or v for k, v in options.sbatch.items()}},
+            "additional_parameters": {"requeue": True, **{k: v == "true" or v for k, v in self._sbatch.items()}},
         }
 
     def submit(self, groups: Sequence[Sequence[Unit]]) -> list[Any]:
@@ -214,12 +211,3 @@ def _output(command: list[str]) -> str | None:
         ).stdout
     except (OSError, subprocess.SubprocessError):
         return None
-
-
-def _number(text: str) -> Any:
-    for kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            continue
-    return text
