@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from robocas_ms3.cli.interrupts import resumable
 from robocas_ms3.cli.options import Maybe, Repeated
 from robocas_ms3.core.words import count_of
 from robocas_ms3.robots.table import DEFAULT
@@ -79,16 +80,9 @@ class Generate:
     """Start again. Default: continue a run with the same settings, or add episodes to a finished one."""
 
 
+@resumable
 def main(cfg: Generate) -> int:
     """Run the command."""
-    try:
-        return run(cfg)
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt("the same command continues") from None
-
-
-def run(cfg: Generate) -> int:
-    """Generate, with a progress bar."""
     from robocas_ms3.scenes.config import load_task_config, shipped_configs
 
     name = cfg.config or TASKS[cfg.task].default_config

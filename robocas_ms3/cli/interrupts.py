@@ -9,13 +9,17 @@ import os
 import signal
 import sys
 import threading
+from collections.abc import Callable
+from functools import wraps
 from types import FrameType
+from typing import ParamSpec
 
 from robocas_ms3.core.exits import end_process, handle_interrupt
 
 INTERRUPTED = 130  # what a shell reports of a program that Ctrl-C ended
 _TERMINATED = 143  # and of one that `timeout`, `kill` or a batch system did
 _GRACE = 2.2  # s to end in: processes, files, policies
+_P = ParamSpec("_P")
 
 
 def heed_ctrl_c() -> None:
@@ -24,6 +28,19 @@ def heed_ctrl_c() -> None:
         handle_interrupt(_interrupt)
     if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
         signal.signal(signal.SIGTERM, _interrupt)
+
+
+def resumable(command: Callable[_P, int]) -> Callable[_P, int]:
+    """Decorate a command that continues its work when it is run again: Ctrl-C says so."""
+
+    @wraps(command)
+    def run(*args: _P.args, **kwargs: _P.kwargs) -> int:
+        try:
+            return command(*args, **kwargs)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt("the same command continues") from None
+
+    return run
 
 
 def leave(code: int) -> None:

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from robocas_ms3.cli.interrupts import resumable
 from robocas_ms3.cli.options import Maybe, Repeated
 from robocas_ms3.core.words import count_of
 
@@ -20,6 +21,8 @@ class Run:
     """Make the dataset of a plan, or continue: record, render, join. docs/scale.md.
 
     Ctrl-C or a crash loses no finished episode: the same command continues.
+
+    Example: robocas plan run tiny --out runs/tiny --jobs 2
     """
 
     plan: Annotated[str, tyro.conf.Positional]
@@ -40,7 +43,10 @@ class Run:
 
 @dataclass
 class Join:
-    """Join the episodes of a plan whose work units are done, as by `robocas plan run --shard`."""
+    """Join the episodes of a plan whose work units are done, as by `robocas plan run --shard`.
+
+    Example: robocas plan join runs/tiny
+    """
 
     out: Annotated[Path, tyro.conf.Positional]
     """Output folder of the plan."""
@@ -50,7 +56,10 @@ class Join:
 
 @dataclass
 class Status:
-    """Print the status of a plan, from any machine that sees its folder."""
+    """Print the status of a plan, from any machine that sees its folder.
+
+    Example: robocas plan status runs/tiny
+    """
 
     out: Annotated[Path, tyro.conf.Positional]
     """Output folder of the plan."""
@@ -60,36 +69,13 @@ class Status:
 
 @dataclass
 class List:
-    """List the bundled plans."""
+    """List the bundled plans.
+
+    Example: robocas plan list
+    """
 
 
-@dataclass
-class Plan:
-    """Make datasets of any size from a plan; docs/scale.md."""
-
-    command: (
-        Annotated[Run, tyro.conf.subcommand("run")]
-        | Annotated[Join, tyro.conf.subcommand("join")]
-        | Annotated[Status, tyro.conf.subcommand("status")]
-        | Annotated[List, tyro.conf.subcommand("list")]
-    )
-    """What to do."""
-
-
-def main(cfg: Plan) -> int:
-    """Run the command."""
-    if isinstance(cfg.command, Run):
-        try:
-            return run(cfg.command)
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt("the same command continues") from None
-    if isinstance(cfg.command, Join):
-        return join(cfg.command)
-    if isinstance(cfg.command, Status):
-        return show_status(cfg.command)
-    return list_plans()
-
-
+@resumable
 def run(command: Run) -> int:
     """Run ``run``."""
     from robocas_ms3.cli.plan_progress import PlanProgress
@@ -141,7 +127,7 @@ def join(command: Join) -> int:
     return 0
 
 
-def list_plans() -> int:
+def list_plans(cfg: List) -> int:
     """Run ``list``."""
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.plans.load import load_plan, shipped_plans
@@ -201,3 +187,7 @@ def _option(word: str) -> tuple[str, str]:
     if not (name and sign):
         raise PlanError("invalid option", where="--executor-option", expected="NAME=VALUE", found=word)
     return name, value
+
+
+DESCRIPTION = "Make datasets of any size from a plan; docs/scale.md."
+COMMANDS = {"run": run, "join": join, "status": show_status, "list": list_plans}

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from robocas_ms3.baselines.table import BASELINES
+from robocas_ms3.cli.interrupts import resumable
 from robocas_ms3.cli.options import Maybe, Repeated
 
 DESCRIPTION = """Train a baseline on demonstrations, for `robocas eval TASK --policy RUN`; docs/baselines.md.
@@ -132,6 +133,7 @@ COMMANDS = {
 DEFAULT = "small"
 
 
+@resumable
 def train(baseline: str, cfg: Training, data: Path | None) -> int:
     """Train a baseline, with a progress bar."""
     from robocas_ms3.baselines.runs import find_run
@@ -150,10 +152,7 @@ def train(baseline: str, cfg: Training, data: Path | None) -> int:
         first = os.environ.get("RANK", "0") == "0"  # one of several processes writes to the terminal
         said = Said(stepping.note, reading.at, step) if first else Said()
         options: dict[str, Any] = {"start": start, "device": cfg.device, "overwrite": cfg.overwrite}
-        try:
-            train_run(baseline, data, out.absolute(), changes_of(cfg), said=said, **options)
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt("the same command continues") from None
+        train_run(baseline, data, out.absolute(), changes_of(cfg), said=said, **options)
     if first:
         say(f"{out}: trained. Next: robocas eval TASK --policy {out} --protocol {'paper-v1' if data else 'P'}")
     return 0

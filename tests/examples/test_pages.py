@@ -80,8 +80,7 @@ def test_commands_are_ones_that_there_are(page, capsys):
 
 def help_of(words: list[str], capsys) -> str:
     """Help of the command that a command line starts with."""
-    with_commands = words[0] == "plan" or words[1:] and words[1] in getattr(cli.module_of(words[0]), "COMMANDS", ())
-    named = words[:2] if with_commands else words[:1]
+    named = words[:2] if words[1:] and words[1] in getattr(cli.module_of(words[0]), "COMMANDS", ()) else words[:1]
     if named == ["eval"]:
         named = ["eval", "run"]
     with pytest.raises(SystemExit) as caught:

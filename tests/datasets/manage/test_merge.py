@@ -271,12 +271,6 @@ def test_command(parts, tmp_path, capsys):
 def test_the_command_wants_datasets(tmp_path, capsys):
     assert run(["merge", "--out", str(tmp_path / "out")]) == 1
     assert "nothing to merge" in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        run(["merge", "--help"])
-    text = capsys.readouterr().out
-    assert "PATH [PATH ...]" in text
-    assert "[[PATH" not in text
-    assert "(default: )" not in text
 
 
 def test_a_merged_dataset_can_be_appended_to(parts, tmp_path):
