@@ -14,7 +14,7 @@ from typing import Any
 from tqdm import tqdm
 
 from robocas_ms3.core.exits import die_with_parent, end_process, exit_error
-from robocas_ms3.core.sent_errors import SentError
+from robocas_ms3.core.remote_errors import RemoteError
 from robocas_ms3.core.words import escape_log_lines, escape_tracebacks
 
 
@@ -39,7 +39,7 @@ def main(descriptor: int, parent: int) -> None:
 
 
 class _Server:
-    """Answers each message of the pool with a result or a `SentError`."""
+    """Answers each message of the pool with a result or a `RemoteError`."""
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
@@ -76,12 +76,12 @@ class _Server:
         try:
             answer = function(pickle.loads(message))
         except KeyboardInterrupt as error:  # of the code: the process ignores Ctrl-C
-            answer = SentError.of(exit_error(error, "a worker"), "a worker")
+            answer = RemoteError.of(exit_error(error, "a worker"), "a worker")
         except BaseException as error:  # noqa: BLE001  (it is raised again in the pool's process)
-            answer = SentError.of(error, "a worker")
+            answer = RemoteError.of(error, "a worker")
         try:
             self._connection.send(answer)
         except OSError:
             raise
         except Exception as error:  # the result can't be pickled
-            self._connection.send(SentError.of(error, "a worker"))
+            self._connection.send(RemoteError.of(error, "a worker"))

@@ -20,7 +20,7 @@ import cloudpickle
 import psutil
 
 from robocas_ms3.core.errors import RobocasError, WorkerCrashed, WorkerStartError
-from robocas_ms3.core.sent_errors import SentError
+from robocas_ms3.core.remote_errors import RemoteError
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -145,7 +145,7 @@ class WorkerProcess(Generic[Task, Result]):
             answer = self._connection.recv()
         except (EOFError, OSError) as error:
             raise self._crash() from error
-        if isinstance(answer, SentError):
+        if isinstance(answer, RemoteError):
             answer.reraise()
         return answer
 

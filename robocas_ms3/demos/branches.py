@@ -21,7 +21,7 @@ from multiprocessing.connection import Connection
 from typing import Any, NoReturn, TypeVar
 
 from robocas_ms3.core.errors import PlanningFailed
-from robocas_ms3.core.sent_errors import SentError
+from robocas_ms3.core.remote_errors import RemoteError
 from robocas_ms3.demos.backtracking import DeadEnd, Tally, turns
 from robocas_ms3.demos.forking import Child, ChildCrash, ChildGone, fork, set_up_child
 from robocas_ms3.planning.decisions import ONE_BY_ONE, Effort
@@ -66,7 +66,7 @@ class ForkedBranches:
             ended_well = False
         except BaseException as error:
             if self._pipe is not None:
-                self._say_and_leave(SentError.of(error, "a branch"))
+                self._say_and_leave(RemoteError.of(error, "a branch"))
             raise
         if self._pipe is not None:
             self._say_and_leave(ended_well)
@@ -163,10 +163,10 @@ class ForkedBranches:
 
         Raises:
             ChildCrash: it is gone (`ChildGone`), or says nothing.
-            BaseException: what it ended with, caused by a `SentTraceback`.
+            BaseException: what it ended with, caused by a `RemoteTraceback`.
         """
         answer, tally = child.hear(limit)
-        if isinstance(answer, SentError):
+        if isinstance(answer, RemoteError):
             answer.reraise()
         self._tally.adopt(tally)
         return answer
@@ -188,7 +188,7 @@ class ForkedBranches:
         except PlanningFailed as error:
             self._say_and_leave(error)
         except BaseException as error:
-            self._say_and_leave(SentError.of(error, "a branch"))
+            self._say_and_leave(RemoteError.of(error, "a branch"))
         assert self._pipe is not None
         try:
             self._pipe.send((score, self._tally))
@@ -196,13 +196,13 @@ class ForkedBranches:
         except (EOFError, ConnectionError):
             os._exit(0)
 
-    def _say_and_leave(self, answer: bool | PlanningFailed | SentError) -> NoReturn:
+    def _say_and_leave(self, answer: bool | PlanningFailed | RemoteError) -> NoReturn:
         assert self._pipe is not None
         try:
             self._end_all()
             self._pipe.send((answer, self._tally))
         except Exception:  # noqa: BLE001  (nobody listens)
-            if isinstance(answer, SentError):
+            if isinstance(answer, RemoteError):
                 _log.error("a branch failed\n%s", answer.traceback)
         finally:  # not even an interrupt leads back into the code that the parent runs too
             os._exit(0)

@@ -16,7 +16,7 @@ import pytest
 from branch_notes import Notes
 
 from robocas_ms3.core.errors import PlanningFailed, RobocasError
-from robocas_ms3.core.sent_errors import SentTraceback
+from robocas_ms3.core.remote_errors import RemoteTraceback
 from robocas_ms3.demos import branches
 from robocas_ms3.demos.branches import ForkedBranches
 from robocas_ms3.demos.forking import why_not_fork
@@ -244,7 +244,7 @@ def test_an_error_says_where_in_a_child_it_came_from():
 
     with pytest.raises(ZeroDivisionError) as caught:
         forked(decide)
-    assert isinstance(caught.value.__cause__, SentTraceback)
+    assert isinstance(caught.value.__cause__, RemoteTraceback)
     text = str(caught.value.__cause__)
     assert text.count("in divide") == 1
     assert text.count("Traceback") == 1
@@ -292,7 +292,7 @@ def test_an_interrupt_in_a_new_child_ends_the_run_not_its_siblings(monkeypatch):
     try:
         with pytest.raises(KeyboardInterrupt) as caught:
             forked(decide)
-        assert isinstance(caught.value.__cause__, SentTraceback)
+        assert isinstance(caught.value.__cause__, RemoteTraceback)
     finally:
         if os.getpid() != me:  # a child that takes itself for the root
             os._exit(1)
@@ -311,7 +311,7 @@ SLEEPER = """
 import os, sys, time
 from robocas_ms3.demos.branches import ForkedBranches
 from robocas_ms3.planning.decisions import Effort
-from robocas_ms3.core.sent_errors import SentTraceback
+from robocas_ms3.core.remote_errors import RemoteTraceback
 class Notes:
     exhausted = False
     def failed(self, error): pass

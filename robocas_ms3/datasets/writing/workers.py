@@ -14,7 +14,7 @@ from typing import Protocol
 
 from robocas_ms3.core.errors import DatasetError, IncompleteError, MissingExtraError, RobocasError
 from robocas_ms3.core.outputs import check_there
-from robocas_ms3.core.sent_errors import SentError
+from robocas_ms3.core.remote_errors import RemoteError
 from robocas_ms3.core.words import count_of
 from robocas_ms3.core.workers import NO_LIMITS, WorkerPool, use_one_torch_thread
 from robocas_ms3.datasets.schema import episode_folder
@@ -134,7 +134,7 @@ class _Failure:
     """An episode that could not be written."""
 
     episode: str
-    sent: SentError
+    sent: RemoteError
 
     @property
     def reason(self) -> str:
@@ -146,7 +146,7 @@ class _Failure:
 def _death(task: Task, why: str) -> _Failure:
     episode = episode_folder(task[0])
     error = DatasetError(f"its process died twice: {why}", where=episode)
-    return _Failure(episode, SentError.of(error, "a worker"))
+    return _Failure(episode, RemoteError.of(error, "a worker"))
 
 
 def _incomplete(failures: list[_Failure], job: WriteJob) -> IncompleteError:
@@ -179,7 +179,7 @@ class _EpisodeWorker:
             if _is_shared(error):
                 raise
             self.close()
-            return _Failure(episode_folder(number), SentError.of(error, "a worker"))
+            return _Failure(episode_folder(number), RemoteError.of(error, "a worker"))
 
     def close(self) -> None:
         given, self._given = self._given, None

@@ -18,7 +18,7 @@ from typing import Any
 from robocas_ms3.core.errors import PlanError
 from robocas_ms3.core.exits import deferred_interrupts
 from robocas_ms3.core.files import ABANDONED, make_folder, write_json
-from robocas_ms3.core.sent_errors import SentError
+from robocas_ms3.core.remote_errors import RemoteError
 from robocas_ms3.plans.executors import Setting, ended_futures, read_options
 from robocas_ms3.plans.executors.ray_cluster import RayOptions, connect, require_ray
 from robocas_ms3.plans.folder import PLAN, read_plan_record
@@ -110,7 +110,7 @@ class RayExecutor:
     def _messages(self, task: Any) -> Iterator[Piece]:
         for reference in task:
             message = self._ray.get(reference)
-            if isinstance(message, SentError):
+            if isinstance(message, RemoteError):
                 message.reraise()
             yield message
 
@@ -145,7 +145,7 @@ class Piece:
     data: bytes
 
 
-def do_units(plan: Plan, out: Path, units: Sequence[Unit], open_worker: OpenWorker) -> SentError | None:
+def do_units(plan: Plan, out: Path, units: Sequence[Unit], open_worker: OpenWorker) -> RemoteError | None:
     """Do units in the plan's folder, as a task; return an error that every seed would meet."""
     node = socket.gethostname()
     worker = open_worker(plan, out)
@@ -156,7 +156,7 @@ def do_units(plan: Plan, out: Path, units: Sequence[Unit], open_worker: OpenWork
         for unit in units:
             worker.do(unit)
     except Exception as error:
-        return SentError.of(error, f"a task on {node}")
+        return RemoteError.of(error, f"a task on {node}")
     finally:
         worker.close()
     return None
@@ -168,7 +168,7 @@ def send_units(
     units: Sequence[Unit],
     done: Sequence[Sequence[Outcome]],
     open_worker: OpenWorker,
-) -> Iterator[Piece | SentError]:
+) -> Iterator[Piece | RemoteError]:
     """Do units in a temporary folder of the node, as a task, and send the files seed by seed.
 
     Args:
@@ -191,7 +191,7 @@ def send_units(
                 for files in worker.seeds(unit):
                     yield from _pieces(unit, files)
         except Exception as error:
-            yield SentError.of(error, f"a task on {socket.gethostname()}")
+            yield RemoteError.of(error, f"a task on {socket.gethostname()}")
         finally:
             worker.close()
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from robocas_ms3.core.sent_errors import SentError
+from robocas_ms3.core.remote_errors import RemoteError
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.units import Unit
 from robocas_ms3.plans.worker import UnitWorker
@@ -32,7 +32,7 @@ class UnitsJob:
     units: tuple[Unit, ...]
     open_worker: Callable[[Plan, Path], UnitWorker]
 
-    def __call__(self) -> SentError | None:
+    def __call__(self) -> RemoteError | None:
         """Do the units; return an error that every seed would meet."""
         signal.signal(signal.SIGTERM, _exit)  # submitit would ignore it, and Slurm wait for 30 s
         worker = self.open_worker(self.plan, self.out)
@@ -43,7 +43,7 @@ class UnitsJob:
         try:
             thread.submit(self._do, worker).result()
         except Exception as error:
-            return SentError.of(error, "a job")
+            return RemoteError.of(error, "a job")
         finally:
             worker.close()
         return None

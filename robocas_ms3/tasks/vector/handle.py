@@ -98,7 +98,7 @@ class WorkerHandle:
             raise self._died() from error
 
     def receive(self) -> Any:
-        """The answer to what was asked last; None where there is nothing to say, a `SentError` if an env failed.
+        """The answer to what was asked last; None where there is nothing to say, a `RemoteError` if an env failed.
 
         Raises:
             WorkerDied: the process is no more.

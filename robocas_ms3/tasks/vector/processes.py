@@ -17,7 +17,7 @@ from mani_skill.utils.common import torch_clone_dict
 from mani_skill.utils.registration import REGISTERED_ENVS
 
 from robocas_ms3.core.errors import VectorEnvError, WorkerDied
-from robocas_ms3.core.sent_errors import SentError
+from robocas_ms3.core.remote_errors import RemoteError
 from robocas_ms3.core.workers import NO_LIMITS, Limits
 from robocas_ms3.tasks.seeds import following_seeds
 from robocas_ms3.tasks.vector.block import Block, nest, open_memory
@@ -200,7 +200,7 @@ class ProcessEnv(gym.Env):
             self.close()
             raise
         for answer in answers:
-            if isinstance(answer, SentError):
+            if isinstance(answer, RemoteError):
                 answer.reraise()
         return answers
 

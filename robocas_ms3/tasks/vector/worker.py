@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import LayoutError, VectorEnvError
 from robocas_ms3.core.exits import end_process
-from robocas_ms3.core.sent_errors import SentError
+from robocas_ms3.core.remote_errors import RemoteError
 from robocas_ms3.core.words import escape_log_lines, escape_tracebacks
 from robocas_ms3.core.workers import use_one_torch_thread
 from robocas_ms3.tasks.vector.block import Block, Field, Path, leaves, space_fields
@@ -87,7 +87,7 @@ class _Worker:
         """Send what was found, with the number of the message; of None there is nothing to say."""
         self.connection.send_bytes(self.number + (b"" if found is None else pickle.dumps(found)))
 
-    def each(self, envs: Iterable[int], act: Callable[[int], None]) -> SentError | None:
+    def each(self, envs: Iterable[int], act: Callable[[int], None]) -> RemoteError | None:
         """Do something with each environment; the first error, after which the others have their turn all the same.
 
         So what becomes of an environment does not depend on which others are in its process.
@@ -102,7 +102,7 @@ class _Worker:
             self.at_work[env] = False
         return failed
 
-    def start(self, message: bytes) -> EnvDescription | SentError:
+    def start(self, message: bytes) -> EnvDescription | RemoteError:
         """Make what was ordered."""
         try:
             order: Order = pickle.loads(message).fn
@@ -136,7 +136,7 @@ class _Worker:
         self.rest: dict[int, bytes] = {}  # pickled infos for which the shared memory has no place, by their paths
 
     def obey(self, command: Share | Reset | Call | None) -> Any:
-        """Do as told, None: step. What is to be answered: a `SentError`, results of a call, `rest`, or None."""
+        """Do as told, None: step. What is to be answered: a `RemoteError`, results of a call, `rest`, or None."""
         if isinstance(command, Share):
             return self.share(command)
         results: dict[int, Any] = {}
@@ -230,6 +230,6 @@ def _describe(env: gym.Env) -> EnvDescription:
     return EnvDescription(observations, actions, tuple(fields), env.render_mode, dict(env.metadata))
 
 
-def _failed(where: str, error: BaseException) -> SentError:
+def _failed(where: str, error: BaseException) -> RemoteError:
     """An error of an environment; what is none of an `Exception` must not end the starter."""
-    return SentError.of(error, where, sendable=Exception, otherwise=VectorEnvError)
+    return RemoteError.of(error, where, sendable=Exception, otherwise=VectorEnvError)

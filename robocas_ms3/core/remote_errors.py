@@ -1,0 +1,69 @@
+"""Errors that one process sends to another, with their tracebacks."""
+
+from __future__ import annotations
+
+import pickle
+from contextlib import suppress
+from dataclasses import dataclass
+from traceback import format_exception
+from typing import NoReturn
+
+from robocas_ms3.core.exits import exit_error
+
+
+@dataclass(frozen=True)
+class RemoteError:
+    """An error in a form that can be pickled.
+
+    Attributes:
+        error: the error, or another with its message where it can't be pickled.
+        where: the process that raised it, such as "a branch".
+        traceback: the text of its traceback there.
+    """
+
+    error: BaseException
+    where: str
+    traceback: str
+
+    @classmethod
+    def of(
+        cls,
+        error: BaseException,
+        where: str,
+        *,
+        sendable: type[BaseException] = BaseException,
+        otherwise: type[Exception] = RuntimeError,
+    ) -> RemoteError:
+        """Return an error in this form.
+
+        Args:
+            error: the error.
+            where: name of this process; an error from another process keeps the name of that one.
+            sendable: type of the errors that are sent as they are, if they can be pickled.
+            otherwise: type of the error that replaces all others.
+        """
+        if isinstance(error, SystemExit):  # would end the receiving process without a message
+            error = exit_error(error, where).with_traceback(error.__traceback__)
+        cause = error.__cause__
+        place = cause.args if isinstance(cause, RemoteTraceback) else (where, "".join(format_exception(error)))
+        with suppress(Exception):  # any error of pickling it
+            if isinstance(error, sendable) and type(pickle.loads(pickle.dumps(error))) is type(error):
+                return cls(error, *place)
+        return cls(otherwise(f"{type(error).__name__}: {error}"), *place)
+
+    def reraise(self) -> NoReturn:
+        """Raise the error in this process."""
+        raise self.with_traceback()
+
+    def with_traceback(self) -> BaseException:
+        """Return the error with a `RemoteTraceback` as its cause."""
+        self.error.__cause__ = RemoteTraceback(self.where, self.traceback)
+        return self.error
+
+
+class RemoteTraceback(Exception):  # noqa: N818  (the cause of an error, as in `concurrent.futures`)
+    """The text of a traceback in another process; tracebacks can't be pickled."""
+
+    def __str__(self) -> str:
+        where, text = self.args
+        return f"in {where}:\n{text}"
