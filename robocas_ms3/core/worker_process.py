@@ -191,6 +191,8 @@ def exceeds_memory(pid: int, memory_gb: float, *, forks: bool = True) -> bool:
 
 def kill_tree(process: subprocess.Popen[bytes]) -> None:
     """Kill a process and what it forked, which must not go on writing files, and wait for its end."""
+    if process.poll() is not None:
+        return  # another process may have its id by now
     with suppress(psutil.Error):
         for forked in psutil.Process(process.pid).children(recursive=True):
             forked.kill()
