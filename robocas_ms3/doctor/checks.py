@@ -1,12 +1,13 @@
 """The checks of ``robocas doctor``.
 
-They import nothing that may be broken: versions are read from metadata, everything else is tried in a child process
+They import nothing that may be broken: versions are read from metadata, everything else runs in a child process
 (``probes.py``), so that a crash is a finding.
 """
 
 from __future__ import annotations
 
 import os
+import platform
 import shutil
 import signal
 import subprocess
@@ -20,29 +21,29 @@ from pathlib import Path
 from typing import Literal
 
 from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
 from packaging.version import Version
 
 from robocas_ms3.core import paths
 from robocas_ms3.doctor.probes import ABSENT
 
 DISTRIBUTION = "robocas-ms3"
-PYTHONS = ((3, 10), (3, 14))  # from, below
 PROBE_SECONDS = 120
 PROBES = Path(__file__).with_name("probes.py")
 GIGABYTE = 1e9
 LEAST_DISK, ENOUGH_DISK = 1.0, 10.0  # GB; a converted episode of pick takes about 0.1
 
-# Extra -> what it is for. lerobot-env, slurm and ray have no row: setup.sh does not install them into the package's own
-# environment, where installing lerobot-env would replace torch and numpy.
+# Purpose of each extra. lerobot-env, slurm and ray are left out: setup.sh does not install them into the environment of
+# the package, where lerobot-env would replace torch and numpy.
 EXTRAS = {
-    "language": "sentence embeddings in datasets, and policies that read words",
-    "train": "training baselines, and playing what they learned",
+    "language": "sentence embeddings in datasets, and language-conditioned policies",
+    "train": "training baselines and running the trained policies",
     "lerobot": "LeRobot datasets",
     "assets": "making asset packs",
     "remote": "policies over a socket",
-    "plots": "pictures of robocas stats",
+    "plots": "plots of robocas stats",
 }
-# Packages worth a row of their own; the others share one.
+# Packages with a row of their own; the others share one.
 NAMED = ("numpy", "torch", "mani-skill", "sapien", "python-fcl", "gymnasium")
 
 RENDERER_FIX = (
@@ -53,13 +54,13 @@ RENDERER_FIX = (
 
 @dataclass(frozen=True)
 class Finding:
-    """What one check found.
+    """Result of a check.
 
     Attributes:
-        name: what was looked at.
-        status: ``ok``; ``fail``: something needed does not work; ``limited``: something optional does not.
-        found: what is there.
-        fix: what to do about it; empty when ok.
+        name: of the thing that was checked.
+        status: ``ok``; ``fail``: something required does not work; ``limited``: something optional does not.
+        found: version, device or reason.
+        fix: what to do; empty if ``ok``.
     """
 
     name: str
@@ -87,15 +88,18 @@ def examine() -> list[Finding]:
 
 
 def check_python() -> list[Finding]:
-    """Whether this Python is one the dependencies are built for."""
-    found = ".".join(map(str, sys.version_info[:3]))
-    if PYTHONS[0] <= sys.version_info[:2] < PYTHONS[1]:
-        return [Finding("python", "ok", found)]
-    return [Finding("python", "fail", found, "Use Python 3.10, 3.11, 3.12 or 3.13.")]
+    """Check that the package supports this version of Python."""
+    try:
+        supported = SpecifierSet(metadata.metadata(DISTRIBUTION)["Requires-Python"])
+    except metadata.PackageNotFoundError:
+        supported = SpecifierSet()
+    if supported.contains(platform.python_version(), prereleases=True):
+        return [Finding("python", "ok", platform.python_version())]
+    return [Finding("python", "fail", platform.python_version(), f"Use Python {supported}.")]
 
 
 def check_packages() -> list[Finding]:
-    """Compare the installed version of each required package with this package's metadata."""
+    """Check the installed version of each required package."""
     wanted = {_key(item.name): item for item in requirements(DISTRIBUTION)}
     if not wanted:
         return [Finding(DISTRIBUTION, "fail", "not installed", "Run bash scripts/setup.sh, or pip install -e .")]
@@ -106,11 +110,7 @@ def check_packages() -> list[Finding]:
 
 
 def check_package(wanted: Requirement) -> Finding:
-    """Whether a package is there in a version that fits.
-
-    Args:
-        wanted: name and versions.
-    """
+    """Check that a package is installed in a supported version."""
     name = _key(wanted.name)
     fix = f"pip install '{wanted.name}{wanted.specifier}'"
     try:
@@ -124,11 +124,7 @@ def check_package(wanted: Requirement) -> Finding:
 
 
 def check_extra(extra: str) -> Finding:
-    """Whether the packages of an extra are there; they are optional.
-
-    Args:
-        extra: name of the extra.
-    """
+    """Check that the packages of an extra are installed; they are optional."""
     findings = [check_package(item) for item in requirements(DISTRIBUTION, extra)]
     name, bad = f"extra {extra}", [finding for finding in findings if finding.status != "ok"]
     if not findings or bad:
@@ -138,26 +134,26 @@ def check_extra(extra: str) -> Finding:
 
 
 def check_folders() -> list[Finding]:
-    """Whether caches can be written (needed: the robot's files are made there) and packs be imported (optional)."""
+    """Check that the folders of caches (required: files of the robot) and of imported packs (optional) are writable."""
     cache = check_writable("cache folder", paths.cache_dir(), paths.CACHE, required=True)
     if cache.status == "ok" and not os.environ.get(paths.CACHE) and paths.cache_dir() == paths.temporary_cache():
-        found = f"{cache.found}, as the user's can't be written to"
-        cache = Finding(cache.name, "limited", found, f"Set ${paths.CACHE} to a folder that stays.")
+        found = f"{cache.found}: the cache folder of the user is not writable"
+        cache = Finding(cache.name, "limited", found, f"Set ${paths.CACHE} to a permanent folder.")
     return [cache, check_writable("data folder", paths.data_dir(), paths.DATA, required=False)]
 
 
 def check_writable(name: str, folder: Path, variable: str, *, required: bool) -> Finding:
-    """Whether a folder, or the nearest one above it that exists, can be written to: tried, as root may be refused too.
+    """Check that a file can be created in a folder, or in its nearest parent that exists.
 
     Args:
-        name: for the report.
-        folder: need not exist.
-        variable: environment variable that puts it elsewhere.
-        required: whether anything needs it.
+        name: name in the report.
+        folder: may not exist yet.
+        variable: environment variable that sets the folder.
+        required: whether a folder that is not writable is a failure.
     """
-    there = next((parent for parent in (folder, *folder.parents) if parent.exists()), Path("/"))
+    existing = next((parent for parent in (folder, *folder.parents) if parent.exists()), Path("/"))
     try:
-        with tempfile.TemporaryDirectory(dir=there):
+        with tempfile.TemporaryDirectory(dir=existing):
             return Finding(name, "ok", str(folder))
     except OSError as error:
         found = f"{folder}: can't be written ({error.strerror})"
@@ -166,11 +162,7 @@ def check_writable(name: str, folder: Path, variable: str, *, required: bool) ->
 
 
 def check_disk(folder: Path) -> Finding:
-    """Free space where outputs go by default.
-
-    Args:
-        folder: the one to look at.
-    """
+    """Check the free space of the disk of a folder."""
     free = shutil.disk_usage(folder).free / GIGABYTE
     found = f"{free:.1f} GB free in {folder}"
     if free < LEAST_DISK:
@@ -181,13 +173,13 @@ def check_disk(folder: Path) -> Finding:
 
 
 def probe(name: str, trial: str, *, fix: str, required: bool = True) -> Finding:
-    """Try something in a child process.
+    """Run a probe in a child process.
 
     Args:
-        name: for the report.
-        trial: name of the probe.
-        fix: what to do when it fails.
-        required: whether everything else hangs on it.
+        name: name in the report.
+        trial: name of the probe, see `probes.PROBES`.
+        fix: what to do if it fails.
+        required: whether a failure is ``fail`` instead of ``limited``.
     """
     bad: Literal["fail", "limited"] = "fail" if required else "limited"
     try:
@@ -202,16 +194,16 @@ def probe(name: str, trial: str, *, fix: str, required: bool = True) -> Finding:
     if done.returncode == ABSENT:
         return Finding(name, "ok", f"not used: {said[-1] if said else 'absent'}")
     if done.returncode < 0:
-        return Finding(name, bad, f"crashed ({_signal_name(-done.returncode)})", fix)
+        return Finding(name, bad, f"crashed ({signal.strsignal(-done.returncode) or -done.returncode})", fix)
     return Finding(name, bad, said[-1] if said else f"exit code {done.returncode}", fix)
 
 
 def requirements(distribution: str, extra: str = "") -> Iterator[Requirement]:
-    """What an installed distribution asks for on this Python; nothing when it is not installed.
+    """Yield the requirements of an installed distribution on this Python.
 
     Args:
-        distribution: its name.
-        extra: only what this extra adds.
+        distribution: name; one that is not installed has no requirements.
+        extra: yield only what this extra adds.
     """
     try:
         lines = metadata.requires(distribution) or []
@@ -237,10 +229,3 @@ def _reinstall(package: str) -> str:
 
 def _key(name: str) -> str:
     return name.lower().replace("_", "-")
-
-
-def _signal_name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return f"signal {number}"

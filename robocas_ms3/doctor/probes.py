@@ -1,7 +1,7 @@
-"""Small trials of things that may crash the process that tries them; run as a file, in a process of its own.
+"""Probes of libraries that may crash; this file runs as a program, in a process of its own.
 
-``python probes.py NAME`` prints one line that says what works, and exits with 0. Otherwise the last line on stderr says
-why not, and the exit code is 1; 3 stands for "there is no such thing here", which is no failure.
+``python probes.py NAME`` prints one line on what works and exits with 0. Otherwise the last line on stderr is the
+reason, and the exit code is 1, or 3 if the machine lacks the device, which is no failure.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ ABSENT = 3
 
 
 class MissingDevice(Exception):
-    """The machine lacks what was to be tried."""
+    """The machine lacks the device of a probe."""
 
 
 def render() -> str:
-    """Open the render device that SAPIEN would take: its name."""
+    """Open the render device that SAPIEN chooses; return its name."""
     from sapien import render as sapien_render
 
     return sapien_render.RenderSystem().device.name
@@ -64,7 +64,7 @@ def physx_cuda() -> str:
 
 
 def planner() -> str:
-    """Generate the robot's files, construct the planner, plan a short motion."""
+    """Generate the files of the robot, construct the planner, plan a short motion."""
     import numpy as np
 
     from robocas_ms3.planning.rrt_connect import RRTConnectPlanner
