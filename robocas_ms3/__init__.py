@@ -21,5 +21,9 @@ def __getattr__(name: str) -> object:
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
-# At the end, as modules of other packages that are loaded here may import this one.
-_import_module("robocas_ms3.registration").register_envs()
+try:
+    _import_module("gymnasium")
+except ImportError:  # a broken gymnasium or numpy, which `robocas doctor` must survive to report it
+    pass
+else:  # at the end, as modules of other packages that are loaded here may import this one
+    _import_module("robocas_ms3.registration").register_envs()
