@@ -10,7 +10,7 @@ import torch
 from torch import nn
 from torch.utils.data import DataLoader, WeightedRandomSampler
 
-from robocas_ms3.datasets import RoboCASDataset
+from robocas_ms3.datasets import RoboCASDataset, SampleOptions
 
 OBSERVED, CHUNK, STEPS = 2, 4, 20
 
@@ -38,13 +38,15 @@ if __name__ == "__main__":
     torch.manual_seed(0)
     data = RoboCASDataset(
         sys.argv[1],
-        split="train",
-        observation_horizon=OBSERVED,
-        action_horizon=CHUNK,
-        size=(160, 128),
-        state=("ee_pos", "ee_orn", "gripper_width"),
-        subgoals=True,
-        normalize=True,
+        SampleOptions(
+            split="train",
+            observation_horizon=OBSERVED,
+            action_horizon=CHUNK,
+            size=(160, 128),
+            state=("ee_pos", "ee_orn", "gripper_width"),
+            subgoals=True,
+            normalize=True,
+        ),
     )
     print(f"{len(data.episodes)} episodes, {len(data)} samples, first: {data[0]['instruction']}")
     sampler = WeightedRandomSampler(data.weights().tolist(), 8 * STEPS)  # each kind of sub-goal equally often

@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from robocas_ms3.datasets.training.options import SampleOptions
     from robocas_ms3.datasets.training.torch_dataset import RoboCASDataset
 
-__all__ = ["RoboCASDataset"]
+__all__ = ["RoboCASDataset", "SampleOptions"]
 
 
 def __getattr__(name: str) -> Any:

@@ -15,6 +15,7 @@ from robocas_ms3.core.extensions import Registry
 from robocas_ms3.datasets import RoboCASDataset, formats
 from robocas_ms3.datasets.formats import format_of, open_source
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
+from robocas_ms3.datasets.training.options import SampleOptions
 from robocas_ms3.datasets.writing import convert as conversion
 from robocas_ms3.datasets.writing.settings import ConversionSettings
 
@@ -48,7 +49,9 @@ def test_it_is_three_files_and_known_by_them(both):
 
 
 def test_it_trains_as_a_robocas_folder_does(both):
-    ours, theirs = (RoboCASDataset(root, split="all", size=None, depth=True, subgoals=True) for root in both[::-1])
+    ours, theirs = (
+        RoboCASDataset(root, SampleOptions(split="all", size=None, depth=True, subgoals=True)) for root in both[::-1]
+    )
     assert len(theirs) == len(ours) > 0
     for one, other in zip(ours, theirs, strict=True):
         for key, value in one.items():

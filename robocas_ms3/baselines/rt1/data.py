@@ -13,6 +13,7 @@ from robocas_ms3.baselines.fits import check_fits
 from robocas_ms3.baselines.rt1.config import RT1Config
 from robocas_ms3.datasets.actions import ActionScale
 from robocas_ms3.datasets.formats import open_source
+from robocas_ms3.datasets.training.options import SampleOptions
 from robocas_ms3.datasets.training.sample_arrays import read_episode
 from robocas_ms3.datasets.training.torch_dataset import RoboCASDataset
 
@@ -51,11 +52,13 @@ class RT1Samples(torch.utils.data.Dataset):
         check_bases(source, source.split(split))
         self._data = RoboCASDataset(
             folder,
-            split=split,
-            observation_horizon=config.frames,
-            cameras=config.cameras,
-            size=config.picture,
-            embedding=True,
+            SampleOptions(
+                split=split,
+                observation_horizon=config.frames,
+                cameras=config.cameras,
+                size=config.picture,
+                embedding=True,
+            ),
         )
         self._lengths, self._terminate = source.lengths, config.terminate_steps
         self.episodes = len(self._data.episodes)

@@ -6,9 +6,9 @@ What upstream's training loader computes, and what it leaves open: docs/training
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,22 +16,12 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError, EmptySplitError
 from robocas_ms3.core.words import count_of
-from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.actions import ActionScale
 from robocas_ms3.datasets.formats import open_source
-from robocas_ms3.datasets.sources.protocol import Side
+from robocas_ms3.datasets.training.options import SampleOptions
 from robocas_ms3.datasets.training.sample_arrays import check_holds, read_episode, type_index
 from robocas_ms3.datasets.training.sample_pictures import PictureStack
 from robocas_ms3.datasets.training.sampling import SampleIndex, balancing_weights
-from robocas_ms3.datasets.training.windows import Padding, Window
-
-UPSTREAM_CAMERAS = ("base_camera", "gripper_camera")
-UPSTREAM_SIZE = (320, 256)
-"""Width and height in pixels."""
-STATE_KEYS = tuple(
-    spec.name for spec in schema.EPISODE_INFO if spec.shape[:1] == ("T",) and spec.dtype != "str" and not spec.embedding
-)
-"""Arrays that ``state`` may be made of."""
 
 
 class RoboCASDataset(torch.utils.data.Dataset):
@@ -59,23 +49,8 @@ class RoboCASDataset(torch.utils.data.Dataset):
 
     Args:
         path: a RoboCAS folder, a LeRobot folder of ours, one of another format, or ``trajectory.h5``.
-        split: ``train`` or ``val`` by ``data_info.json``, or ``all``.
-        observation_horizon: steps looked back on, the present one included; upstream's RT-1: 6, RoboFlamingo: 11.
-        action_horizon: actions from the present step on; upstream: 1.
-        padding: beyond an episode's ends: ``hold``, ``zero`` or ``drop``, see ``windows.Window``.
-        cameras: names, in the order of their stack; empty: no pictures.
-        size: width and height to scale pictures to; None: as they are.
-        depth: whether to give depth too.
-        float_images: RGB as float32 in 0..1 instead of uint8.
-        state: arrays of the schema to give as ``state``, see ``STATE_KEYS``.
-        embedding: whether to give embeddings of the texts.
-        subgoals: whether to give sub-goals.
-        normalize: whether to map motion from ``action_space`` to [-1, 1], clipped.
-        action_space: in place of that of ``data_info.json``, in its form; a trajectory file is read whole without one.
-        rate_hz: of a trajectory's samples; default 5.
-        include_failed: also a trajectory's episodes without success.
+        options: what the samples hold.
         transform: called with each sample; has to be picklable where workers are spawned.
-        cached_episodes: of how many the arrays are kept, in each worker.
 
     Raises:
         DatasetError: nothing there, an empty split, a wrong option, something asked for that the dataset does not hold.
@@ -84,46 +59,25 @@ class RoboCASDataset(torch.utils.data.Dataset):
     def __init__(
         self,
         path: Path | str,
+        options: SampleOptions | None = None,
         *,
-        split: Side = "train",
-        observation_horizon: int = 6,
-        action_horizon: int = 1,
-        padding: Padding = "hold",
-        cameras: Sequence[str] = UPSTREAM_CAMERAS,
-        size: tuple[int, int] | None = UPSTREAM_SIZE,
-        depth: bool = False,
-        float_images: bool = False,
-        state: Sequence[str] = (),
-        embedding: bool = False,
-        subgoals: bool = False,
-        normalize: bool = False,
-        action_space: Mapping[str, Any] | None = None,
-        rate_hz: float | None = None,
-        include_failed: bool = False,
         transform: Callable[[dict[str, Any]], Any] | None = None,
-        cached_episodes: int = 64,
     ) -> None:
-        self.window = Window(observation_horizon, action_horizon, padding)
-        self.cameras, self.size, self.depth, self.float_images = tuple(cameras), size, depth, float_images
-        self.state, self.embedding, self.subgoals = tuple(state), embedding, subgoals
-        self.transform = transform
-        _check_choice("split", split, get_args(Side))
-        for key in self.state:
-            _check_choice("state", key, STATE_KEYS)
-        if size is not None and (len(size) != 2 or min(size) < 1):
-            raise DatasetError("no such size", where="size", expected="width and height >= 1", found=size)
-        self.source = open_source(path, rate_hz=rate_hz, include_failed=include_failed)
+        self.options = options = options or SampleOptions()
+        self.window, self.transform = options.window, transform
+        cameras = tuple(options.cameras)
+        self.source = open_source(path, rate_hz=options.rate_hz, include_failed=options.include_failed)
         self.rate_hz = self.source.rate_hz
         """Steps a second."""
-        check_holds(self.source, self.cameras, depth=depth, embedding=embedding)
-        self._pictures = PictureStack(self.cameras, size, float_images)
-        self.episodes: list[int] = self.source.split(split)
+        check_holds(self.source, cameras, depth=options.depth, embedding=options.embedding)
+        self._pictures = PictureStack(cameras, options.size, options.float_images)
+        self.episodes: list[int] = self.source.split(options.split)
         """Numbers of the split's episodes, sorted."""
         if not self.episodes:
             raise EmptySplitError(
                 "this split holds no episodes",
                 where=path,
-                expected=f"some in {split}",
+                expected=f"some in {options.split}",
                 found=f"{len(self.source.lengths)} in all",
                 fix='Add seeds, or pass split="all".',
             )
@@ -131,7 +85,7 @@ class RoboCASDataset(torch.utils.data.Dataset):
         self._index = SampleIndex(samples)
         if not len(self._index):
             longest = max(self.source.lengths[number] for number in self.episodes)
-            needed = observation_horizon + action_horizon if padding == "drop" else 2
+            needed = self.window.observation + self.window.action if self.window.padding == "drop" else 2
             raise DatasetError(
                 "no episode is long enough",
                 where=path,
@@ -142,9 +96,9 @@ class RoboCASDataset(torch.utils.data.Dataset):
         self._stages = np.concatenate([self._stages_of(number, steps) for number, steps in samples.items()])
         self.scale: ActionScale | None = None
         """How actions are normalised; None: they are not."""
-        if normalize:
-            self.scale = ActionScale.of(self.source.action_space() if action_space is None else action_space, path)
-        self._cached_episodes = max(1, cached_episodes)
+        if options.normalize:
+            space = self.source.action_space() if options.action_space is None else options.action_space
+            self.scale = ActionScale.of(space, path)
         self._cache: OrderedDict[int, dict[str, Any]] = OrderedDict()
 
     def _stages_of(self, number: int, steps: range) -> NDArray[np.int8]:
@@ -214,14 +168,14 @@ class RoboCASDataset(torch.utils.data.Dataset):
             if key in episode:
                 sample[key] = self._rows(episode[key], observed, nothing=-1 if key == "subgoal_type" else 0)
         sample["instruction"] = episode["instruction"]
-        if self.embedding:
+        if self.options.embedding:
             sample["language_embedding"] = torch.from_numpy(episode["language_embedding"].copy())
-        if self.subgoals:
+        if self.options.subgoals:
             sample["subgoal"] = episode["texts"][step]
-        if self.cameras:
+        if self.options.cameras:
             zero = self.window.padding == "zero"
             sample["rgb"] = self._pictures.read(episode["pictures"], observed, "rgb", zero=zero)
-            if self.depth:
+            if self.options.depth:
                 sample["depth"] = self._pictures.read(episode["pictures"], observed, "depth", zero=zero)
         return sample if self.transform is None else self.transform(sample)
 
@@ -248,19 +202,17 @@ class RoboCASDataset(torch.utils.data.Dataset):
         if number in self._cache:
             self._cache.move_to_end(number)
             return self._cache[number]
-        made = read_episode(self.source, number, self.state, embedding=self.embedding, subgoals=self.subgoals)
-        if self.cameras:
+        wanted = self.options
+        made = read_episode(
+            self.source, number, tuple(wanted.state), embedding=wanted.embedding, subgoals=wanted.subgoals
+        )
+        if self.options.cameras:
             made["pictures"] = self.source.episode(number)
         self._cache[number] = made
-        if len(self._cache) > self._cached_episodes:
+        if len(self._cache) > max(1, self.options.cached_episodes):
             self._cache.popitem(last=False)
         return made
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave the cache behind."""
         return {**self.__dict__, "_cache": OrderedDict()}
-
-
-def _check_choice(where: str, found: object, known: Sequence[str]) -> None:
-    if found not in known:
-        raise DatasetError("no such choice", where=where, expected=f"one of {', '.join(known)}", found=found)

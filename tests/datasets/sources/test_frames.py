@@ -16,6 +16,7 @@ from robocas_ms3.datasets.lerobot import reader, video
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.pictures.video import write_video
 from robocas_ms3.datasets.sources.protocol import shots
+from robocas_ms3.datasets.training.options import SampleOptions
 from robocas_ms3.datasets.training.torch_dataset import RoboCASDataset
 from robocas_ms3.datasets.writing.settings import ConversionSettings
 
@@ -110,7 +111,9 @@ def test_a_conversion_that_fails_leaves_no_video_open(lerobot, tmp_path, runs, m
 
 @pytest.mark.parametrize("padding", ["hold", "zero"])
 def test_a_window_of_steps_opens_each_video_once(lerobot, runs, padding):
-    dataset = RoboCASDataset(lerobot, split="all", observation_horizon=4, size=None, depth=True, padding=padding)
+    dataset = RoboCASDataset(
+        lerobot, SampleOptions(split="all", observation_horizon=4, size=None, depth=True, padding=padding)
+    )
     for step, steps in ((5, [2, 3, 4, 5]), (1, [0, 0, 0, 1])):
         sample = dataset[dataset.index(1, step)]
         assert len(runs) == 4  # two cameras, RGB and depth
@@ -118,7 +121,7 @@ def test_a_window_of_steps_opens_each_video_once(lerobot, runs, padding):
         episode = open_source(lerobot).episode(1)
         for row, of in enumerate(steps):
             there = padding == "hold" or bool(sample["observation_mask"][row])
-            for place, camera in enumerate(dataset.cameras):
+            for place, camera in enumerate(dataset.options.cameras):
                 rgb = episode.rgb(camera, of).transpose(2, 0, 1) * there
                 np.testing.assert_array_equal(sample["rgb"][row, place], rgb)
                 depth = episode.depth(camera, of).astype(np.float32) / 1000 * there

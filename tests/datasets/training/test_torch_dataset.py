@@ -22,8 +22,8 @@ from torch.utils.data import DataLoader, WeightedRandomSampler
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import RoboCASDataset
 from robocas_ms3.datasets.actions import ActionScale, episode_actions
+from robocas_ms3.datasets.training.options import SampleOptions, Window
 from robocas_ms3.datasets.training.sampling import SampleIndex, balancing_weights
-from robocas_ms3.datasets.training.windows import Window
 from robocas_ms3.demos.recordings.motion import Motion
 from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.table import PANDA
@@ -78,12 +78,14 @@ def naive_sample(root, number, t, horizon, chunk, padding):
 def test_every_element_is_the_naive_loaders(made, horizon, chunk, padding):
     data = RoboCASDataset(
         made,
-        split="all",
-        observation_horizon=horizon,
-        action_horizon=chunk,
-        padding=padding,
-        size=SMALL,
-        state=("ee_pos", "ee_orn", "gripper_width"),
+        SampleOptions(
+            split="all",
+            observation_horizon=horizon,
+            action_horizon=chunk,
+            padding=padding,
+            size=SMALL,
+            state=("ee_pos", "ee_orn", "gripper_width"),
+        ),
     )
     where = [data.locate(index) for index in range(len(data))]
     steps = range(horizon - 1, 7 - chunk) if padding == "drop" else range(6)  # T is 7: states 0, 4, .. 20, 22
@@ -103,7 +105,7 @@ def test_what_is_held_is_the_nearest_gripper_command(dataset):
     arrays = dict(np.load(file))
     arrays["gripper_status"] = np.array([False, True, True, True, True, True, True])
     np.savez(file, **arrays)
-    data = RoboCASDataset(dataset, split="all", cameras=(), observation_horizon=3, action_horizon=3)
+    data = RoboCASDataset(dataset, SampleOptions(split="all", cameras=(), observation_horizon=3, action_horizon=3))
     assert data[data.index(1, 0)]["action"][:, 6].tolist() == [0, 0, 1, 1, 1]
     assert data[data.index(1, 5)]["action"][:, 6].tolist() == [1, 1, 1, 1, 1]
     assert data[data.index(1, 5)]["action_mask"].tolist() == [True, True, True, False, False]
@@ -138,8 +140,8 @@ def test_scale_maps_the_range_to_one_and_clips():
 
 
 def test_normalised_by_the_overviews_ranges(made):
-    plain = RoboCASDataset(made, split="all", cameras=(), observation_horizon=1)
-    scaled = RoboCASDataset(made, split="all", cameras=(), observation_horizon=1, normalize=True)
+    plain = RoboCASDataset(made, SampleOptions(split="all", cameras=(), observation_horizon=1))
+    scaled = RoboCASDataset(made, SampleOptions(split="all", cameras=(), observation_horizon=1, normalize=True))
     space = json.loads((made / "data_info.json").read_text())["action_space"]
     for raw, seen in zip((plain[i]["action"][0] for i in range(len(plain))), scaled, strict=True):
         for axis in range(6):
@@ -152,11 +154,11 @@ def test_normalised_by_the_overviews_ranges(made):
 
 def test_depth_pictures_as_they_are_and_floats(made):
     options = dict(split="all", observation_horizon=2, cameras=("static_camera",), depth=True)
-    whole = RoboCASDataset(made, size=None, **options)[3]
+    whole = RoboCASDataset(made, SampleOptions(size=None, **options))[3]
     shot = np.asarray(Image.open(made / "episode_0000000/static_camera/depth/0003.png"))
     assert whole["depth"].shape == (2, 1, 48, 64)
     assert np.allclose(whole["depth"][1, 0], shot / 1000.0)
-    small = RoboCASDataset(made, size=SMALL, float_images=True, **options)[3]
+    small = RoboCASDataset(made, SampleOptions(size=SMALL, float_images=True, **options))[3]
     blocks = shot.reshape(24, 2, 32, 2).transpose(0, 2, 1, 3).reshape(24, 32, 4) / 1000.0
     one_of_its_pixels = np.abs(blocks - small["depth"][1, 0].numpy()[..., None]).min(-1) < 1e-6
     assert one_of_its_pixels.all()  # no distance is made up
@@ -167,7 +169,9 @@ def test_depth_pictures_as_they_are_and_floats(made):
 
 
 def test_words_and_subgoals(made):
-    data = RoboCASDataset(made, split="all", cameras=(), observation_horizon=3, embedding=True, subgoals=True)
+    data = RoboCASDataset(
+        made, SampleOptions(split="all", cameras=(), observation_horizon=3, embedding=True, subgoals=True)
+    )
     info = np.load(made / "episode_0000001/episode_info.npz")
     sample = data[data.index(1, 1)]
     assert sample["instruction"] == str(info["language_goal"])
@@ -202,7 +206,7 @@ def test_dropped_samples_are_those_with_padding(horizon, chunk, length):
 
 
 def test_weights_draw_all_stages_alike(made):
-    data = RoboCASDataset(made, split="all", cameras=(), observation_horizon=1, subgoals=True)
+    data = RoboCASDataset(made, SampleOptions(split="all", cameras=(), observation_horizon=1, subgoals=True))
     weights = data.weights()
     assert data.stages.tolist() == [2, 2, 2, 3, 3, 3] * 2
     assert balancing_weights(np.array([0, 0, 0, 5])).tolist() == pytest.approx([1 / 6, 1 / 6, 1 / 6, 1 / 2])
@@ -214,12 +218,14 @@ def test_weights_draw_all_stages_alike(made):
 
 def test_split_is_the_overviews(dataset):
     info = json.loads((dataset / "data_info.json").read_text())
-    parts = [RoboCASDataset(dataset, split=side, cameras=()).episodes for side in ("train", "val", "all")]
+    parts = [
+        RoboCASDataset(dataset, SampleOptions(split=side, cameras=())).episodes for side in ("train", "val", "all")
+    ]
     assert parts == [info["train_eps"], info["val_eps"], [0, 1]]
     info["val_eps"] = []
     (dataset / "data_info.json").write_text(json.dumps(info))
     with pytest.raises(DatasetError, match="this split holds no episodes.*some in val"):
-        RoboCASDataset(dataset, split="val")
+        RoboCASDataset(dataset, SampleOptions(split="val"))
 
 
 def test_opening_reads_the_overview_only(made, tmp_path):
@@ -227,7 +233,9 @@ def test_opening_reads_the_overview_only(made, tmp_path):
         (tmp_path / name).write_bytes((made / name).read_bytes())
     for number in (0, 1):
         (tmp_path / f"episode_{number:07d}").mkdir()
-    data = RoboCASDataset(tmp_path, split="all", depth=True, embedding=True, subgoals=True, normalize=True)
+    data = RoboCASDataset(
+        tmp_path, SampleOptions(split="all", depth=True, embedding=True, subgoals=True, normalize=True)
+    )
     assert len(data) == 12
     assert data.weights().sum() == pytest.approx(1)
     with pytest.raises(DatasetError, match="this episode can't be read"):
@@ -235,7 +243,7 @@ def test_opening_reads_the_overview_only(made, tmp_path):
 
 
 def test_workers_see_what_one_process_sees(made):
-    data = RoboCASDataset(made, split="all", size=SMALL, subgoals=True)
+    data = RoboCASDataset(made, SampleOptions(split="all", size=SMALL, subgoals=True))
     before = len(os.listdir("/proc/self/fd"))
     alone = list(DataLoader(data, batch_size=5))
     assert len(os.listdir("/proc/self/fd")) == before  # nothing stays open
@@ -257,7 +265,7 @@ def test_a_lerobot_folder_gives_the_same_samples(made, tmp_path):
     convert_lerobot(ConversionSettings(made, tmp_path / "lerobot"))
     state = ("ee_pos", "robot_joints")
     ours, theirs = (
-        RoboCASDataset(root, split="all", size=None, depth=True, subgoals=True, state=state)
+        RoboCASDataset(root, SampleOptions(split="all", size=None, depth=True, subgoals=True, state=state))
         for root in (made, tmp_path / "lerobot")
     )
     assert len(ours) == len(theirs) > 0
@@ -274,12 +282,12 @@ def test_a_lerobot_folder_gives_the_same_samples(made, tmp_path):
     (table,) = (tmp_path / "lerobot" / "data").rglob("*.parquet")
     table.write_bytes(table.read_bytes()[:100])
     with pytest.raises(DatasetError, match="file-000.parquet: this table can't be read"):
-        RoboCASDataset(tmp_path / "lerobot", split="all", cameras=())
+        RoboCASDataset(tmp_path / "lerobot", SampleOptions(split="all", cameras=()))
 
 
 @pytest.mark.slow
 def test_spawned_workers(trajectory):
-    data = RoboCASDataset(trajectory, split="all", cameras=())
+    data = RoboCASDataset(trajectory, SampleOptions(split="all", cameras=()))
     loader = DataLoader(data, batch_size=4, num_workers=1, multiprocessing_context="spawn")
     assert torch.equal(torch.cat([batch["action"] for batch in loader]), torch.stack([item["action"] for item in data]))
 
@@ -288,8 +296,8 @@ def test_trajectories_give_what_their_conversion_gives(made, trajectory):
     keys = ("robot_joints", "arm_joint_vel", "gripper_width", "agv_pose", "gripper_status")
     options = dict(cameras=(), observation_horizon=3, action_horizon=4, state=keys, subgoals=True)
     for side in ("train", "val", "all"):
-        folder = RoboCASDataset(made, split=side, **options)
-        file = RoboCASDataset(trajectory, split=side, **options)
+        folder = RoboCASDataset(made, SampleOptions(split=side, **options))
+        file = RoboCASDataset(trajectory, SampleOptions(split=side, **options))
         assert (len(folder), folder.episodes) == (len(file), file.episodes)
         assert np.array_equal(folder.stages, file.stages)
         for one, other in zip(folder, file, strict=True):
@@ -301,11 +309,13 @@ def test_trajectories_give_what_their_conversion_gives(made, trajectory):
 
 
 def test_trajectories_at_another_rate_and_with_failures(trajectory):
-    data = RoboCASDataset(trajectory, split="all", cameras=(), rate_hz=10, include_failed=True, normalize=True)
+    data = RoboCASDataset(
+        trajectory, SampleOptions(split="all", cameras=(), rate_hz=10, include_failed=True, normalize=True)
+    )
     assert len(data) == 3 * 11  # 22 control steps in pairs
     assert float(data[0]["action"][:, :6].abs().max()) <= 1
     with pytest.raises(DatasetError, match="the rate must divide"):
-        RoboCASDataset(trajectory, cameras=(), rate_hz=3)
+        RoboCASDataset(trajectory, SampleOptions(cameras=(), rate_hz=3))
 
 
 def test_trajectories_of_end_effector_actions(trajectory, tmp_path):
@@ -319,7 +329,11 @@ def test_trajectories_of_end_effector_actions(trajectory, tmp_path):
             del group["actions"]
             group["actions"] = actions
     options = dict(split="all", cameras=(), state=("gripper_status",))
-    for one, other in zip(RoboCASDataset(trajectory, **options), RoboCASDataset(path, **options), strict=True):
+    for one, other in zip(
+        RoboCASDataset(trajectory, SampleOptions(**options)),
+        RoboCASDataset(path, SampleOptions(**options)),
+        strict=True,
+    ):
         assert torch.equal(one["action"], other["action"])
 
 
@@ -333,7 +347,7 @@ def test_trajectories_of_end_effector_actions(trajectory, tmp_path):
 )
 def test_trajectories_hold_no_pictures(trajectory, options, message):
     with pytest.raises(DatasetError, match=message):
-        RoboCASDataset(trajectory, **options)
+        RoboCASDataset(trajectory, SampleOptions(**options))
 
 
 def test_forward_kinematics_by_hand():
@@ -368,11 +382,11 @@ def test_forward_kinematics_by_hand():
 )
 def test_wrong_options(made, options, message):
     with pytest.raises(DatasetError, match=message):
-        RoboCASDataset(made, **options)
+        RoboCASDataset(made, SampleOptions(**options))
 
 
 def first_item(root, **options):
-    return RoboCASDataset(root, split="all", observation_horizon=1, **options)[0]
+    return RoboCASDataset(root, SampleOptions(split="all", observation_horizon=1, **options))[0]
 
 
 def test_damaged_pictures(dataset):
@@ -408,7 +422,7 @@ def test_damaged_arrays(dataset, change, message):
 
 def test_datasets_made_elsewhere(dataset):
     options = dict(split="all", cameras=(), state=("agv_pose", "gripper_width"))
-    before = list(RoboCASDataset(dataset, **options))
+    before = list(RoboCASDataset(dataset, SampleOptions(**options)))
     for file in dataset.glob("*/episode_info.npz"):
         arrays = dict(np.load(file))
         for key in ("rel_pos", "rel_orn", "agv_pose", "rel_agv_pose"):
@@ -417,7 +431,7 @@ def test_datasets_made_elsewhere(dataset):
         arrays["gripper_width"] = arrays["gripper_width"].astype(np.float64)[:, None]
         np.savez(file, **arrays)
     (dataset / "conversion.json").unlink()
-    for one, other in zip(before, RoboCASDataset(dataset, **options), strict=True):
+    for one, other in zip(before, RoboCASDataset(dataset, SampleOptions(**options)), strict=True):
         assert torch.allclose(one["action"], other["action"], atol=1e-6)
         assert torch.allclose(one["state"], other["state"], atol=1e-6)
 
@@ -426,7 +440,7 @@ def test_missing_pieces(dataset, tmp_path):
     with pytest.raises(DatasetError, match="no dataset here"):
         RoboCASDataset(tmp_path / "nothing")
     with pytest.raises(DatasetError, match="no such trajectory file"):
-        RoboCASDataset(tmp_path / "nothing.h5", cameras=())
+        RoboCASDataset(tmp_path / "nothing.h5", SampleOptions(cameras=()))
     info = json.loads((dataset / "data_info.json").read_text())
     for change, message in (
         (dict(ep_length={"0": 7}), "episodes of unknown length.*1"),
@@ -435,10 +449,10 @@ def test_missing_pieces(dataset, tmp_path):
     ):
         (dataset / "data_info.json").write_text(json.dumps({**info, **change}))
         with pytest.raises(DatasetError, match=message):
-            [RoboCASDataset(dataset, split=side, cameras=()) for side in ("train", "val")]
+            [RoboCASDataset(dataset, SampleOptions(split=side, cameras=())) for side in ("train", "val")]
     (dataset / "data_info.json").write_text(json.dumps({k: v for k, v in info.items() if k != "step_goals"}))
     with pytest.raises(DatasetError, match="no sub-goals are known"):
-        RoboCASDataset(dataset, cameras=()).weights()
+        RoboCASDataset(dataset, SampleOptions(cameras=())).weights()
     (dataset / "data_info.json").write_text("{")
     with pytest.raises(DatasetError, match="damaged"):
         RoboCASDataset(dataset)
@@ -449,7 +463,7 @@ def test_settings_that_are_damaged(dataset, change):
     path = dataset / "conversion.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
     with pytest.raises(DatasetError, match=r"conversion\.json: these settings are damaged"):
-        RoboCASDataset(dataset, cameras=())
+        RoboCASDataset(dataset, SampleOptions(cameras=()))
 
 
 def test_the_documentations_code_runs(made, tmp_path, monkeypatch):
