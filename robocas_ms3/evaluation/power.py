@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.optimize import root_scalar
-from scipy.stats import binom, norm
+from scipy.stats import binom
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.statistics import Comparison
@@ -54,32 +54,13 @@ def smallest_paired_difference(n: int, discordant: float, *, power: float = 0.8,
     def missing(difference: float) -> float:
         return power - mcnemar_power(n, difference, max(difference, discordant), alpha=alpha)
 
-    _check({"n": n}, "discordant", discordant, power, alpha)
+    if n < 1:
+        raise EvaluationError("no episodes", where="n", expected="1 or more", found=n)
+    if not 0 <= discordant <= 1:
+        raise EvaluationError("no share of episodes", where="discordant", expected="0..1", found=discordant)
+    if not 0 < alpha < power < 1:
+        raise EvaluationError("no power", where="power", expected="0 < alpha < power < 1", found=f"{alpha=}, {power=}")
     return None if missing(1.0) > 0 else float(root_scalar(missing, bracket=(0.0, 1.0)).root)
-
-
-def smallest_unpaired_difference(
-    n_a: int, n_b: int, rate: float, *, power: float = 0.8, alpha: float = 0.05
-) -> float | None:
-    """The smallest difference of rates around ``rate`` that runs over different scenes show with probability ``power``.
-
-    By the arcsine transformation (Cohen, Statistical Power Analysis, 1988, ch. 6): phi = 2 arcsin(sqrt(rate)) has the
-    variance 1/n at every rate, so runs are told apart when their phi are h = (z_alpha/2 + z_power) sqrt(1/n_a + 1/n_b)
-    apart; rates at phi +- h/2 differ by sin(phi) sin(h/2). None where n is too small for any.
-
-    Args:
-        n_a: episodes of one run.
-        n_b: episodes of the other.
-        rate: between the two, 0..1.
-        power: probability, 0..1.
-        alpha: of the two-sided test.
-    """
-    _check({"n_a": n_a, "n_b": n_b}, "rate", rate, power, alpha)
-    h = float(norm.isf(alpha / 2) + norm.ppf(power)) * np.sqrt(1 / n_a + 1 / n_b)
-    if h > np.pi:
-        return None
-    phi = np.clip(2 * np.arcsin(np.sqrt(rate)), h / 2, np.pi - h / 2)  # neither rate beyond 0 or 1
-    return float(np.sin(phi) * np.sin(h / 2))
 
 
 def too_few(comparison: Comparison, *, alpha: float = 0.05, power: float = 0.8) -> str | None:
@@ -101,13 +82,3 @@ def too_few(comparison: Comparison, *, alpha: float = 0.05, power: float = 0.8) 
     )
     count = "1 episode shows" if c.n == 1 else f"{c.n} episodes show"
     return f"not told apart: {count} {what_shows} ({100 * power:g} % power)"
-
-
-def _check(counts: dict[str, int], name: str, share: float, power: float, alpha: float) -> None:
-    for where, n in counts.items():
-        if n < 1:
-            raise EvaluationError("no episodes", where=where, expected="1 or more", found=n)
-    if not 0 <= share <= 1:
-        raise EvaluationError("no share of episodes", where=name, expected="0..1", found=share)
-    if not 0 < alpha < power < 1:
-        raise EvaluationError("no power", where="power", expected="0 < alpha < power < 1", found=f"{alpha=}, {power=}")

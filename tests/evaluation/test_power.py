@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from math import factorial, sin
+from math import factorial
 
 import pytest
 from hypothesis import given
@@ -10,7 +10,6 @@ from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.power import (
     mcnemar_power,
     smallest_paired_difference,
-    smallest_unpaired_difference,
     too_few,
 )
 from robocas_ms3.evaluation.statistics import compare_counts, mcnemar
@@ -47,20 +46,6 @@ def test_the_smallest_difference_has_the_power_asked_for(n, discordant):
     assert mcnemar_power(n, found, max(found, discordant)) == pytest.approx(0.8, abs=1e-6)
 
 
-@pytest.mark.parametrize(("n", "h"), [(392, 0.2), (63, 0.5), (25, 0.8)])  # Cohen (1988), table 6.4.1: 5 %, 80 %
-def test_unpaired_difference_of_the_table(n, h):
-    # around one half, rates that are h apart differ by sin(h / 2); the table rounds n
-    assert smallest_unpaired_difference(n, n, 0.5) == pytest.approx(sin(h / 2), rel=0.5 / n)
-
-
-@given(st.integers(4, 500), st.integers(4, 500), st.floats(0, 1))
-def test_unpaired_difference_has_its_laws(n_a, n_b, rate):
-    found = smallest_unpaired_difference(n_a, n_b, rate)
-    assert found is not None and 0 < found <= 1
-    assert smallest_unpaired_difference(n_b, n_a, 1 - rate) == pytest.approx(found)
-    assert smallest_unpaired_difference(n_a + 1, n_b, 0.5) < smallest_unpaired_difference(n_a, n_b, 0.5)
-
-
 def test_a_warning_says_what_would_show():
     assert too_few(compare_counts(20, 8, 5, 7)) == (
         "not told apart: 40 episodes show differences of 26 points or more (80 % power)"
@@ -86,7 +71,6 @@ def test_differences_that_show_are_greater_than_those_warned_of(n):
         (lambda: smallest_paired_difference(9, -0.2), "discordant: "),
         (lambda: smallest_paired_difference(9, 0.2, power=80), "alpha < power < 1"),
         (lambda: smallest_paired_difference(9, 0.2, power=0.01), "alpha < power < 1"),
-        (lambda: smallest_unpaired_difference(9, 9, 30), "rate: "),
         (lambda: mcnemar_power(9, 0.3, 0.2), "difference <= discordant"),
     ],
 )
