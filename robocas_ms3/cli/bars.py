@@ -1,6 +1,6 @@
-"""How far a command is: a bar on a terminal that appears when there is something to do, so that an error is one line.
+"""Progress of a command: a bar on a terminal, which appears with the first work so that an early error is one line.
 
-Where stderr is no terminal, such as a log, there are lines instead: the first, one a minute, and the last.
+If stderr is not a terminal, such as a log, there are lines instead: the first, one per minute, and the last.
 """
 
 from __future__ import annotations
@@ -18,53 +18,53 @@ EVERY = 60.0  # s between two lines of a log
 
 
 class Log:
-    """Lines on stderr, the first at once, then no more than one a minute.
+    """Lines on stderr: the first at once, then at most one per minute.
 
     Args:
-        quiet: leave out the first and the last.
+        quiet: omit the first and the last line.
     """
 
     def __init__(self, *, quiet: bool = False) -> None:
-        self._begun = time.monotonic()
-        self._next = self._begun + (EVERY if quiet else 0.0)
+        self._start = time.monotonic()
+        self._next = self._start + (EVERY if quiet else 0.0)
         self._quiet = quiet
         self._text = ""
 
     def tell(self, text: str, about: str = "", *, last: bool = False) -> None:
-        """Write a line if it is time for one.
+        """Write a line if one is due.
 
         Args:
-            text: how far it is.
-            about: how fast it goes.
-            last: write it now, unless the last line was just this.
+            text: the progress.
+            about: speed and time left.
+            last: write it now, unless the previous line was the same.
         """
         now = time.monotonic()
         due = not self._quiet and text != self._text if last else now >= self._next
         if due:
             self._next, self._text = now + EVERY, text
-            after = f"after {span(now - self._begun)}" if now - self._begun >= 1 else ""
+            after = f"after {span(now - self._start)}" if now - self._start >= 1 else ""
             tell(", ".join(filter(None, (text, about, after))))
 
 
 class Bar:
-    """How far one thing is; its methods are callbacks of what does the work.
+    """Progress of one task; its methods are callbacks of the work.
 
     Args:
-        description: of what.
-        progress: rich's; none where stderr is no terminal.
-        quiet: say nothing in a log of what is over within a minute.
+        description: name of the task.
+        progress: a `rich.progress.Progress`; None if stderr is not a terminal.
+        quiet: write no line to a log within the first minute.
     """
 
     def __init__(self, description: str, progress: Any, *, quiet: bool) -> None:
         self._description, self._progress, self._quiet = description, progress, quiet
         self._log: Log | None = None  # until there is something to do
-        self._begun, self._done, self._there, self._count, self._about = 0.0, 0, 0, 0, ""
+        self._start, self._done, self._there, self._count, self._about = 0.0, 0, 0, 0, ""
 
     def start(self, count: int, there: int = 0) -> None:
-        """Show it, for so many, of which so many were there before; nothing where there is nothing to do."""
+        """Show the bar for ``count`` items, ``there`` of which were done before; nothing for 0 items."""
         if not count:
             return
-        self._begun, self._done, self._there, self._count = time.monotonic(), there, there, count
+        self._start, self._done, self._there, self._count = time.monotonic(), there, there, count
         self._log = Log(quiet=self._quiet)
         if self._progress:
             self._progress.add_task(self._description, total=count)
@@ -72,11 +72,11 @@ class Bar:
         self._show()
 
     def advance(self, *_: object) -> None:
-        """One more is done."""
+        """Count one more item as done."""
         self.at(self._done + 1, self._count)
 
     def at(self, done: int, count: int) -> None:
-        """So many of all are done. Where it was not started, it starts with these: how long they took is not known."""
+        """Set the number of items that are done. The first call starts a bar; its items do not count for the speed."""
         if not self._count:
             self.start(count, there=done)
         elif done != self._done:
@@ -84,18 +84,18 @@ class Bar:
             self._show()
 
     def next_of(self, count: int) -> None:
-        """One more of all is done."""
+        """Count one more item of ``count`` as done."""
         self.at(self._done + 1, count)
 
     def note(self, text: str) -> None:
-        """Write a line above it."""
+        """Write a line above the bar."""
         if self._progress:
             self._progress.console.print(printable(text), soft_wrap=True)
         else:
             tell(text)
 
     def stop(self) -> None:
-        """End it, with how far it came."""
+        """Remove the bar, or write the last line."""
         self._show(last=True)
         if self._progress and self._log is not None:  # else it prints an empty line
             self._progress.stop()
@@ -103,8 +103,8 @@ class Bar:
     def _show(self, *, last: bool = False) -> None:
         if self._log is None:
             return
-        if not last:  # how fast it goes is known at the moments when one is done
-            self._about = speed(self._done, self._count, self._there, time.monotonic() - self._begun)
+        if not last:  # the speed is known when an item is done
+            self._about = speed(self._done, self._count, self._there, time.monotonic() - self._start)
         if self._progress:
             self._progress.update(self._progress.task_ids[0], completed=self._done, about=self._about)
         else:
@@ -112,13 +112,13 @@ class Bar:
 
 
 def speed(done: float, count: float, there: float, seconds: float) -> str:
-    """How fast it goes and how long it will take: ``1.5 s each, 7 min left``; nothing before one more is done.
+    """Return speed and time left, such as ``1.5 s each, 7 min left``; empty before the first new item is done.
 
     Args:
-        done: so many are done.
-        count: of so many.
-        there: so many of them had been done before.
-        seconds: what the others took.
+        done: items that are done.
+        count: all items.
+        there: items that were done before.
+        seconds: time that the others took.
     """
     if done <= there or seconds <= 0:
         return ""
@@ -128,7 +128,7 @@ def speed(done: float, count: float, there: float, seconds: float) -> str:
 
 
 def span(seconds: float) -> str:
-    """``45 s``, ``6 min``, ``3 h 20 min``, ``2.1 days``."""
+    """Format a duration: ``45 s``, ``6 min``, ``3 h 20 min``, ``2.1 days``."""
     minutes = round(seconds / 60)
     if seconds < 59.5:
         return f"{seconds:.0f} s"
@@ -138,7 +138,7 @@ def span(seconds: float) -> str:
 
 
 def columns() -> tuple[Any, ...]:
-    """Columns of a bar: of what, how many, how long it has taken, how fast it goes and how long it will take."""
+    """Return the columns of a bar: description, bar, count, time elapsed, speed and time left."""
     from rich.progress import BarColumn, MofNCompleteColumn, ProgressColumn, TextColumn, TimeElapsedColumn
     from rich.text import Text
 
@@ -160,11 +160,11 @@ def columns() -> tuple[Any, ...]:
 
 @contextmanager
 def bar(description: str, *, transient: bool = False) -> Iterator[Bar]:
-    """Yield a bar, and end it.
+    """Yield a progress bar.
 
     Args:
-        description: of what.
-        transient: it goes when it is done; in a log there is nothing of it that is over within a minute.
+        description: name of the task.
+        transient: remove the bar at the end, and write nothing to a log within the first minute.
     """
     shown = Bar(description, _progress(transient), quiet=transient)
     try:
@@ -175,14 +175,14 @@ def bar(description: str, *, transient: bool = False) -> Iterator[Bar]:
 
 @contextmanager
 def working(text: str) -> Iterator[None]:
-    """Show on a terminal that something is going on, of which nobody knows how far it is."""
+    """Show a spinner on a terminal, for work of unknown length."""
     terminal = terminal_of_stderr()
     with terminal.status(text) if terminal else nullcontext():
         yield
 
 
 def _progress(transient: bool) -> Any:
-    """Of rich; none where stderr is no terminal."""
+    """Return a progress display of rich; None if stderr is not a terminal."""
     terminal = terminal_of_stderr()
     if terminal is None:
         return None

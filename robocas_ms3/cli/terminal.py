@@ -1,4 +1,4 @@
-"""Text on the terminal: what comes from data is shown as it is, and never moves the cursor or changes colours."""
+"""Text on the terminal. Control characters in data are shown as escapes: they never move the cursor or set colours."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from robocas_ms3.core.words import printable
 if TYPE_CHECKING:
     from rich.console import Console
 
-_PIPED_WIDTH = 200  # of a terminal's 80 columns names would be broken, and no search would find them
+_PIPED_WIDTH = 200  # with 80 columns long names would be broken, and no search would find them
 
 
 def console(**options: Any) -> Console:
-    """Return a console that shows control characters as escapes and takes no text for markup.
+    """Return a console that shows control characters as escapes and does not interpret markup.
 
     Args:
-        options: those of rich's console.
+        options: options of `rich.console.Console`.
     """
     return _printable_console()(**{"markup": False, "emoji": False, "highlight": False, **options})
 
 
 def table_console() -> Console:
-    """Return a console as wide as the terminal; into a pipe or a file as wide as our tables need."""
+    """Return a console for tables: as wide as the terminal, or 200 columns in a pipe or a file."""
     made = console()
     return made if made.is_terminal else console(width=_PIPED_WIDTH)
 
 
 def terminal_of_stderr() -> Console | None:
-    """Return a console of stderr if that is a terminal that can move its cursor; FORCE_COLOR makes none of a log."""
+    """Return a console of stderr if it is a terminal that can move its cursor; FORCE_COLOR does not count."""
     if not sys.stderr.isatty():
         return None
     made = console(stderr=True)
@@ -44,7 +44,7 @@ def say(text: str) -> None:
 
 
 def say_lines(text: str) -> None:
-    """Print lines on stdout. Data in them must not bring its own line breaks."""
+    """Print lines on stdout. Data in them must have no line breaks of its own."""
     console().print(text, soft_wrap=True)
 
 

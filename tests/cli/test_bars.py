@@ -4,7 +4,6 @@ import os
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -128,10 +127,3 @@ def test_speed():
     assert bars.speed(40, 20, 0, 10) == "4.0 a second"
     assert bars.speed(5, 10, 5, 60) == bars.speed(5, 10, 0, 0) == ""
     assert bars.speed(9, 1000, 0, 900) == "100.0 s each, 27 h 32 min left"
-
-
-def test_no_command_has_a_bar_of_its_own():
-    """All of them use the one helper; a plan has several, and uses its words."""
-    for path in sorted(Path(bars.__file__).parent.glob("*.py")):
-        own = re.findall(r"rich\.progress|\btrack\(|\btqdm\b|stderr=True", path.read_text())
-        assert not own or path.name in ("bars.py", "plan_progress.py", "terminal.py"), path.name
