@@ -84,11 +84,6 @@ def handle_interrupt(handler: Handler) -> None:
     _command.install(handler)
 
 
-def was_interrupted() -> bool:
-    """Return whether a ``KeyboardInterrupt`` may come from a signal: no, as long as a command waits for the first."""
-    return not _command.waits()
-
-
 @contextmanager
 def deferred_interrupts(*, second_ends: bool = True) -> Iterator[None]:
     """Handle a SIGINT or SIGTERM that comes inside afterwards, once.
@@ -151,7 +146,7 @@ def no_exit(source: str) -> Iterator[None]:
     try:
         yield
     except (SystemExit, KeyboardInterrupt) as error:
-        if isinstance(error, KeyboardInterrupt) and was_interrupted():
+        if isinstance(error, KeyboardInterrupt) and not _command.waits():  # it may come from a signal
             raise
         raise exit_error(error, source) from error
 
