@@ -58,7 +58,7 @@ def main(cfg: Show) -> int:
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.core.files import make_folder, replacing
     from robocas_ms3.scenes.task_specs import TASKS
-    from robocas_ms3.tasks.transfer import TransferEnv
+    from robocas_ms3.tasks.base import RoboCASEnv
 
     shader = {"shader_pack": cfg.shader}
     env = gym.make(
@@ -71,7 +71,7 @@ def main(cfg: Show) -> int:
         human_render_camera_configs=shader,
     )
     base_env = env.unwrapped
-    assert isinstance(base_env, TransferEnv)
+    assert isinstance(base_env, RoboCASEnv)
     if not base_env.scene.can_render():
         raise RobocasError(
             "no render device", fix="Run scripts/setup.sh, or install a Vulkan driver; see robocas doctor."

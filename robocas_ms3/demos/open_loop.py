@@ -14,7 +14,7 @@ from robocas_ms3.demos.recordings.environment import RecordedEnv
 from robocas_ms3.demos.recordings.motion import Array
 from robocas_ms3.robots.ee_deltas import to_ee_delta_action
 from robocas_ms3.scenes.layout import Layout
-from robocas_ms3.tasks.transfer import TransferEnv
+from robocas_ms3.tasks.base import RoboCASEnv
 
 CONTROL_MODE = "pd_ee_delta_pose"
 SETTLE_SECONDS = 1.0  # after the last action, held still: what was let go comes to rest
@@ -87,10 +87,10 @@ class OpenLoop:
         self.success, self.clipped, self._gripper = False, 0, 1.0
 
     @property
-    def env(self) -> TransferEnv:
+    def env(self) -> RoboCASEnv:
         """The environment under its wrappers."""
         env = self._env.unwrapped
-        assert isinstance(env, TransferEnv)
+        assert isinstance(env, RoboCASEnv)
         return env
 
     def reset(self, seed: int, options: dict[str, Any] | None = None) -> None:

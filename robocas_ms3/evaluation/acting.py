@@ -106,7 +106,7 @@ class Player:
 
     def _start(self, seed: int) -> EpisodeSpec:
         settings = self._settings
-        words = self._base.instruction().text
+        words = self._base.instructions.of(0).text
         return EpisodeSpec(
             -1, 0, settings.task, self._config, settings.layouts, settings.pack, seed, words, robot=settings.robot
         )

@@ -35,7 +35,7 @@ from robocas_ms3.scenes.config import TaskConfig, load_task_config, shipped_conf
 from robocas_ms3.scenes.frozen import write_frozen
 from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.scenes.task_specs import TASKS
-from robocas_ms3.tasks.transfer import TransferEnv
+from robocas_ms3.tasks.base import RoboCASEnv
 
 NO_PLAN = "no plan of a protocol"
 _WRONG = 300  # stream of the object that a wrong instruction names
@@ -177,7 +177,7 @@ def _write_config(config: TaskConfig, path: Path) -> None:
 
 def _scenes(
     part: Part, config: TaskConfig, pack: str, layouts: str | Path | None
-) -> Iterator[tuple[int, Layout, TransferEnv]]:
+) -> Iterator[tuple[int, Layout, RoboCASEnv]]:
     env = gym.make(
         TASKS[config.task].env_id,
         config=config,
@@ -188,7 +188,7 @@ def _scenes(
     )
     try:
         base = env.unwrapped
-        assert isinstance(base, TransferEnv)
+        assert isinstance(base, RoboCASEnv)
         seed, found = part.first_seed, 0
         while found < part.count:
             try:
@@ -203,7 +203,7 @@ def _scenes(
         env.close()
 
 
-def _episode(number: int, part: Part, seed: int, layout: Layout, env: TransferEnv) -> Episode:
+def _episode(number: int, part: Part, seed: int, layout: Layout, env: RoboCASEnv) -> Episode:
     share = float(layout.visible_shares[layout.target])
     return Episode(
         episode=number,
@@ -217,13 +217,13 @@ def _episode(number: int, part: Part, seed: int, layout: Layout, env: TransferEn
     )
 
 
-def _said(part: Part, env: TransferEnv, seed: int) -> str:
+def _said(part: Part, env: RoboCASEnv, seed: int) -> str:
     if part.words == "empty":
         return ""
     if part.words == "asked":
-        return env.instruction().text
-    others = sorted(env.names() - {env.target_asset().asset.name})
+        return env.instructions.of(0).text
+    others = sorted(env.instructions.names(0) - {env.target_asset().asset.name})
     if not others:
         raise EvaluationError("no other object whose name would be wrong", where=f"{part.file}, seed {seed}")
     rng = np.random.default_rng([seed, _WRONG])
-    return env.instruction(name=others[int(rng.integers(len(others)))]).text
+    return env.instructions.choose(0, others[int(rng.integers(len(others)))]).text

@@ -10,9 +10,10 @@ from torch import Tensor
 
 from robocas_ms3.core.arrays import as_float, as_tensor, choose, greater, length, native, none
 from robocas_ms3.tasks import terms
+from robocas_ms3.tasks.base import RoboCASEnv
 from robocas_ms3.tasks.bodies import link_poses
+from robocas_ms3.tasks.goals import Moment
 from robocas_ms3.tasks.search import ENVS_AT_ONCE, RoboCASSearchEnv
-from robocas_ms3.tasks.transfer import Moment, TransferEnv
 
 V0_RADIUS = 0.1  # m between the origins of target and basket in xy: upstream's success
 V0_STEPS = 5  # policy steps like that after which upstream's episode ends
@@ -37,7 +38,7 @@ class EpisodeMetrics:
         env: a RoboCAS environment, which has been reset.
     """
 
-    def __init__(self, env: TransferEnv) -> None:
+    def __init__(self, env: RoboCASEnv) -> None:
         self._env = env
         self._sums = native(torch.zeros(env.num_envs, len(SUMS), device=env.device))
         self._near = native(torch.zeros(env.num_envs, dtype=torch.bool, device=env.device))
@@ -71,7 +72,7 @@ class EpisodeMetrics:
             impulse = length(moment.forces).sum((1, 2)) * env.control_timestep
             sums[:, _IMPULSE] += impulse
             sums[:, _DISTURBED] = greater(sums[:, _DISTURBED], as_float(moment.disturbed.sum(1)))
-            sums[:, _FALLEN] = greater(sums[:, _FALLEN], as_float(env.fallen().sum(1)))
+            sums[:, _FALLEN] = greater(sums[:, _FALLEN], as_float(env.success_check.fallen().sum(1)))
             target = terms.of_target(moment.objects[..., :2], native(env.target_slot))
             if moment.basket is not None:  # otherwise that rule never holds
                 self._near = length(target - moment.basket[:, :2]) <= V0_RADIUS

@@ -11,7 +11,7 @@ import numpy as np
 
 from robocas_ms3.planning.protocol import Array, Trajectory
 from robocas_ms3.planning.seconds import Seconds
-from robocas_ms3.tasks.transfer import TransferEnv
+from robocas_ms3.tasks.base import RoboCASEnv
 
 OPEN, CLOSED = 1.0, -1.0
 
@@ -61,10 +61,10 @@ class Executor:
     rehearse: Callable[[], None] = lambda: None
 
     @property
-    def base_env(self) -> TransferEnv:
+    def base_env(self) -> RoboCASEnv:
         """The environment under its wrappers."""
         env = self.env.unwrapped
-        assert isinstance(env, TransferEnv)
+        assert isinstance(env, RoboCASEnv)
         return env
 
     @property

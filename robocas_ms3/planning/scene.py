@@ -13,7 +13,7 @@ from robocas_ms3.assets.kinematics import link_poses
 from robocas_ms3.assets.pack import Part
 from robocas_ms3.core.poses import from_wxyz, inverse, transform
 from robocas_ms3.planning.protocol import Array, Obstacle, Shape
-from robocas_ms3.tasks.transfer import TransferEnv
+from robocas_ms3.tasks.base import RoboCASEnv
 
 # Upstream's: samples of the meshes at 5 mm, none farther than 1.5 m from the robot
 SPACING = 0.005
@@ -51,7 +51,7 @@ class PlanningScene:
     Bodies (`obstacles`) are for planners, clouds (`obstacles_in_base`) for whatever reasons about surfaces.
     """
 
-    def __init__(self, env: TransferEnv) -> None:
+    def __init__(self, env: RoboCASEnv) -> None:
         self.env = env
 
     def _bodies(

@@ -22,7 +22,7 @@ class TaskSpec:
     Attributes:
         name: short name, as in ``robocas generate pick``.
         env_id: gymnasium id.
-        env: its class, a `tasks.scene.SceneEnv` whose ``SPEC`` is this.
+        env: its class, a `tasks.base.RoboCASEnv` whose ``SPEC`` is this.
         default_config: task configuration used when none is given: name of a shipped one, or path of a YAML file.
         target: how its target is chosen, a `scenes.targets.TargetRule`.
         solver: its scripted policy, a function of an `Arm` that tries once.

@@ -1,46 +1,378 @@
-"""What all RoboCAS environments share: a step, the state, what is in the gripper, observations."""
+"""The environment of all tasks: the scene of a task configuration, whose target has to end up at a goal."""
 
 from __future__ import annotations
 
-from typing import Any, cast
+from pathlib import Path
+from typing import Any, ClassVar, cast
 
 import numpy as np
+import sapien
 import torch
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
+from mani_skill.render.utils import can_render
+from mani_skill.sensors.camera import CameraConfig
+from mani_skill.utils import sapien_utils
+from mani_skill.utils.structs import Actor
+from mani_skill.utils.structs.types import SceneConfig, SimConfig
 
-from robocas_ms3.assets.pack import LoadedObject
-from robocas_ms3.core.arrays import as_tensor, native, none
-from robocas_ms3.tasks import terms
-from robocas_ms3.tasks.bodies import link_poses
-from robocas_ms3.tasks.scene import SceneEnv
+from robocas_ms3.assets.pack import VISUALS, LoadedObject, VisualLevel, load_pack
+from robocas_ms3.assets.physics import CONTACT_OFFSET
+from robocas_ms3.core.arrays import as_tensor, native
+from robocas_ms3.core.errors import ConfigError, RobocasError
+from robocas_ms3.core.extensions import load
+from robocas_ms3.robots.agent import MobileManipulator
+from robocas_ms3.robots.table import DEFAULT, find_robot
+from robocas_ms3.scenes import build
+from robocas_ms3.scenes.bank import layout_bank
+from robocas_ms3.scenes.config import TaskConfig, load_config_of
+from robocas_ms3.scenes.layout import Array, Layout
+from robocas_ms3.scenes.model import SceneModel
+from robocas_ms3.scenes.source import LayoutSource
+from robocas_ms3.scenes.task_specs import SIM_FREQ, STANDARD_FREQ, TaskSpec
+from robocas_ms3.tasks import cameras, rewards, terms
+from robocas_ms3.tasks.bodies import Bodies, link_poses
+from robocas_ms3.tasks.contacts import Contacts
+from robocas_ms3.tasks.dense import DENSE, DenseReward
+from robocas_ms3.tasks.engine_errors import EngineErrors
+from robocas_ms3.tasks.goals import Goal, InBasket, Moment
+from robocas_ms3.tasks.gpu_memory import gpu_memory
+from robocas_ms3.tasks.instructions import Instructions
+from robocas_ms3.tasks.observations import privileged_observations
+from robocas_ms3.tasks.renderer import keep_renderer
+from robocas_ms3.tasks.seeds import EpisodeSeeds
+from robocas_ms3.tasks.starts import place
+from robocas_ms3.tasks.success import SuccessCheck
+from robocas_ms3.tasks.vector.backend import check_one_process
+
+STAGES = ("reached_any", "picked_any", "reached_target", "target_grasped", "target_lifted", "target_in_basket")
+# with a renderer what is left of a scene holds 8 MB until it is collected, without one 0.5 MB
+_RESETS_PER_COLLECTION, _RESETS_PER_COLLECTION_STATE_ONLY = 20, 30
 
 
-class RoboCASEnv(SceneEnv):
-    """Base of the RoboCAS environments; see `SceneEnv` for its arguments.
+class RoboCASEnv(BaseEnv):
+    """Base of all tasks: move the target to the ``GOAL``, which is the basket unless a task says otherwise.
+
+    A task is a subclass with a ``SPEC``, which overrides ``evaluate``, ``compute_dense_reward`` and
+    ``privileged_observations`` where it adds something. N envs, K object slots. Every env has its own objects and
+    target. A single env is rebuilt at each reset. Several envs, on a GPU, draw their objects once, and each reset draws
+    a new layout and target (``reconfiguration_freq`` changes either).
+
+    Args:
+        config: name, path or content of a task configuration; default: the task's own.
+        pack: name or folder of the pack that objects come from.
+        furniture_pack: the same for room, furniture and basket.
+        visual_level: ``fast`` or ``full`` meshes to render.
+        layouts: folder of the layout bank; default: in the cache, filled as layouts are asked for; None: no bank,
+            every layout is sampled again (the same ones, only slower); a file of frozen ones (`scenes.frozen`); or a
+            function that gives the layout of an objects seed and a seed.
+        seeds: least and greatest seed that unseeded resets draw from, such as those of a bank built ahead; default: any
+            seed, with several envs 0 to 99, those of frozen layouts.
+        robot_uids: name of the robot in `robots.table`.
+        num_envs: see ``BaseEnv``.
+        reconfiguration_freq: see ``BaseEnv``; default 1 for one env, 0 for several.
+        kwargs: passed to ``BaseEnv``.
+
+    Raises:
+        VectorEnvError: there are several envs and no GPU.
+        ExtensionError: there is no such robot, or it can't be loaded.
+        ConfigError: an argument is invalid.
 
     Attributes:
-        looks: whether an observation shows what the cameras see; otherwise its pictures are black, and nothing is
+        looks: whether an observation shows what the cameras see; otherwise its images are black, and nothing is
             rendered.
+        present: (N, K) bool, which object slots are in use.
+        target_slot: (N,) slot of the target.
+        is_target: (N, K) bool, the same as flags.
+        start_poses: (N, K, 7) poses of the objects at the start of the episode.
+        basket_at_start: (N, 7) pose of the basket then.
     """
 
+    SPEC: ClassVar[TaskSpec]
+    STAGES: ClassVar[tuple[str, ...]] = STAGES
+    GOAL: ClassVar[type[Goal]] = InBasket
+    REWARDS: ClassVar[rewards.RewardTable] = rewards.TRANSFER
+    SUPPORTED_REWARD_MODES = ("sparse", *DENSE, "none")  # the first is the default
+
+    agent: MobileManipulator
     looks = True
+
+    def __init__(
+        self,
+        *args: Any,
+        config: str | Path | dict | TaskConfig | None = None,
+        pack: str | Path = "builtin",
+        furniture_pack: str | Path = "builtin",
+        visual_level: VisualLevel = "fast",
+        layouts: str | Path | LayoutSource | None = "auto",
+        seeds: tuple[int, int] | None = None,
+        robot_uids: str | None = DEFAULT,
+        num_envs: int = 1,
+        reconfiguration_freq: int | None = None,
+        **kwargs: Any,
+    ) -> None:
+        check_one_process(num_envs, kwargs.get("sim_backend", "auto"))
+        _check_rendering(visual_level, kwargs.get("render_backend"), kwargs.get("obs_mode"))
+        self.task_config = load_config_of(self.SPEC, config)
+        self.robot_spec = find_robot(robot_uids, where="robot_uids")
+        load(self.robot_spec.agent)  # registers it with ManiSkill
+        robot = self.robot_spec.description
+        self.model = SceneModel.load(self.task_config, load_pack(pack), load_pack(furniture_pack), robot=robot)
+        self._visual_level: VisualLevel = visual_level
+        self._resets = 0
+        self._engine_errors: EngineErrors | None = None
+        if reconfiguration_freq is None:
+            reconfiguration_freq = 1 if num_envs == 1 else 0
+        bank, stay = layout_bank(self.model, layouts), reconfiguration_freq == 0
+        self.seeds = EpisodeSeeds(self, num_envs, bank, seed_range=seeds, objects_stay=stay)
+        self.instructions = Instructions(self)
+        self.dense_reward = DenseReward(self, self.REWARDS)
+        frequency = {"num_envs": num_envs, "reconfiguration_freq": reconfiguration_freq}
+        super().__init__(*args, robot_uids=robot.uid, **frequency, **kwargs)
+
+    @property
+    def _default_sim_config(self) -> SimConfig:
+        distractors = self.task_config.randomisation.distractors
+        objects = self.task_config.objects.count + (distractors.count[1] if distractors else 0)
+        return SimConfig(
+            sim_freq=SIM_FREQ,
+            control_freq=STANDARD_FREQ,
+            spacing=10,
+            scene_config=SceneConfig(contact_offset=CONTACT_OFFSET),
+            gpu_memory_config=gpu_memory(self.num_envs, objects),
+        )
+
+    # ------------------------------------------------------------------ cameras
+
+    @property
+    def _default_human_render_camera_configs(self) -> CameraConfig:
+        eye, target = self.overview()
+        pose = sapien_utils.look_at(eye.tolist(), target.tolist())
+        return CameraConfig("render_camera", pose, 640, 480, np.pi / 3, 0.01, 20)
+
+    def overview(self) -> tuple[Array, Array]:
+        """Return a viewpoint of the task and the point to look at, (3,) each, world, m."""
+        return cameras.over_the_shoulder(self.model)
+
+    def _setup_sensors(self, options: dict) -> None:
+        super()._setup_sensors(options)
+        sensors: dict[str, Any] = dict(self._sensors)
+        cameras = [sensors[name].camera for name in sorted(sensors)]
+        build.shift_cameras(cameras, self.task_config, self.scene_seeds)
+
+    # ------------------------------------------------------------------ scene
+
+    @property
+    def scene_seeds(self) -> list[int]:
+        """The seed of each env's looks, which stay until the scene is rebuilt."""
+        assert self._episode_seed is not None
+        return [int(seed) for seed in self._episode_seed]
+
+    def _reconfigure(self, options: dict | None = None) -> None:
+        """Rebuild the scene; see ``BaseEnv``. If a seed has no layout, the old scene stays."""
+        assert self._episode_seed is not None
+        self.seeds.choose_objects(self._episode_seed, on_gpu=self._sim_device.is_cuda())
+        super()._reconfigure(options)
+
+    def _clear(self) -> None:
+        """Drop the scene. ManiSkill collects garbage each time, 0.14 s; on a CPU this does so only now and then."""
+        self._resets += 1
+        renders = can_render(self.backend.render_device)
+        every = _RESETS_PER_COLLECTION if renders else _RESETS_PER_COLLECTION_STATE_ONLY
+        if self._resets % every == 0 or self.num_envs > 1 or self._sim_device.is_cuda():
+            super()._clear()
+            return
+        self._close_viewer()
+        self.agent = None  # pyright: ignore[reportAttributeAccessIssue]
+        self._sensors, self._human_render_cameras, self._hidden_objects = {}, {}, []
+        self.scene = None  # pyright: ignore[reportAttributeAccessIssue]
+
+    def close(self) -> None:
+        """Close the environment and free what it held."""
+        self._resets = -1
+        if self._engine_errors is not None:
+            self._engine_errors.close()
+            self._engine_errors = None
+        super().close()
+
+    def _setup_scene(self) -> None:
+        keep_renderer(self.backend.render_device)
+        super()._setup_scene()
+
+    def _load_agent(self, options: dict, *args: Any, **kwargs: Any) -> None:
+        super()._load_agent(options, sapien.Pose(self.model.robot_pose))
+        if self.task_config.static_camera == "overview":
+            eye, target = cameras.static_camera(self.overview())
+            self.agent.static_camera_pose = sapien_utils.look_at(eye.tolist(), target.tolist()).sp
+
+    def _load_scene(self, options: dict) -> None:
+        self.fixtures = build.build_fixtures(self.scene, self.model, self._visual_level, self.scene_seeds)
+        assets, ids = self.model.object_pack.objects, self.seeds.object_ids
+        self.object_assets: list[list[LoadedObject]] = [[assets[i] for i in row] for row in ids]
+        slots = len(ids[0])
+        self.objects: list[Actor] = [
+            build.build_object_slot(self.scene, slot, [row[slot] for row in self.object_assets], self._visual_level)
+            for slot in range(slots)
+        ]
+        if self.task_config.leaves_slots_empty:
+            build.build_parking(self.scene, slots)
+        facts = [[asset.asset for asset in row] for row in self.object_assets]
+        self._centers_of_mass = self._floats([[fact.center_of_mass for fact in row] for row in facts])
+        self.extents = self._floats([[fact.extents for fact in row] for row in facts])
+        self.start_poses = torch.zeros(self.num_envs, slots, 7, device=self.device)
+        self.present = torch.ones(self.num_envs, slots, dtype=torch.bool, device=self.device)
+        self.target_slot = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
+        self.is_target = torch.zeros_like(self.present)
+        self.target_extents = torch.zeros(self.num_envs, 3, device=self.device)
+        self.basket_at_start = torch.zeros(self.num_envs, 7, device=self.device)
+        self.goal = self.GOAL(self)
+        self.success_check = SuccessCheck(self, self.STAGES)
+
+    def _floats(self, values: Any) -> torch.Tensor:
+        return torch.tensor(values, dtype=torch.float32, device=self.device)
+
+    def _load_lighting(self, options: dict) -> None:
+        shadow = self.task_config.lights.shadow or self.enable_shadow
+        build.build_lights(self.scene, self.task_config, self.scene_seeds, shadow=shadow)
+
+    def _after_reconfigure(self, options: dict) -> None:
+        super()._after_reconfigure(options)
+        if self.gpu_sim_enabled and self._engine_errors is None:
+            self._engine_errors = EngineErrors()
+        self.bodies = Bodies(self.scene, self.agent.robot, self.objects, self.fixtures.basket)
+        gripper = [self.agent.finger1_link, self.agent.finger2_link, self.agent.hand_link]
+        self.gripper_contacts = Contacts(self.scene, gripper, self.objects)
+
+    # ------------------------------------------------------------------ reset
+
+    def reset(self, seed: int | list[int] | None = None, options: dict | None = None) -> tuple[Any, dict]:
+        """Reset; see ``BaseEnv``. The same seed gives the same layout, whichever envs are reset.
+
+        Args:
+            seed: of each env. With several envs a single one is the first env's, and the others take those after it,
+                within the range if it is of the range.
+            options: of ``BaseEnv``, but not ``reset_to_env_states``.
+
+        Raises:
+            LayoutError: there is no layout for a seed that was asked for, or for many that were drawn.
+            RobocasError: ``reset_to_env_states`` was given.
+        """
+        if options and "reset_to_env_states" in options:
+            fix = "Reset with the seed of the recorded episode, then call set_state_dict."
+            raise RobocasError("a state lacks objects, target and stages", where="reset_to_env_states", fix=fix)
+        envs = list(range(self.num_envs))
+        if options and "env_idx" in options:  # a list, or an array as of ManiSkill's wrapper for Stable-Baselines3
+            index = options["env_idx"]
+            index = index if isinstance(index, torch.Tensor) else torch.as_tensor(index, device=self.device)
+            index = index.nonzero()[:, 0] if index.dtype == torch.bool else index
+            options, envs = {**options, "env_idx": index}, index.tolist() if self.num_envs > 1 else envs
+        reset_scene = super().reset
+        return self.seeds.reset(lambda seed: reset_scene(seed, options), seed, envs)
+
+    def _set_episode_rng(self, seed: Any, env_idx: torch.Tensor) -> None:
+        """Seed the episodes of some envs and no others; ManiSkill's own forgets the others' seeds."""
+        index = env_idx.cpu().numpy()
+        if seed is not None:
+            seed = self.seeds.within_range(seed)
+        if seed is None or self._batched_episode_rng is None or len(index) == self.num_envs:
+            super()._set_episode_rng(seed, env_idx)
+        else:
+            if len(seed) == 1 and len(index) > 1:
+                seed = np.concatenate([seed, np.random.RandomState(seed[0]).randint(2**31, size=len(index) - 1)])
+            self._episode_seed[index] = seed
+            self._batched_episode_rng[index] = BatchedRNG.from_seeds(seed, backend=self._batched_rng_backend)
+        for i in index:
+            self.seeds.layout_seeds[i] = self.seeds.draw(i) if seed is None else self._episode_seed[i]
+
+    def _clear_sim_state(self) -> None:
+        """Stop everything in the envs that are being reset, on a GPU in two writes."""
+        if not self.gpu_sim_enabled:
+            super()._clear_sim_state()
+            return
+        self.bodies.stop(self.scene._reset_mask.nonzero()[:, 0])
+        self.scene._gpu_apply_all()
+        self.scene._gpu_fetch_all()
+
+    def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
+        if self._engine_errors is not None:
+            self._engine_errors.check()
+        place(self, self.seeds.find_starts(env_idx.cpu().numpy()), env_idx)
+        self.success_check.reset(env_idx)
+        self.instructions.reset(env_idx)
+        self.dense_reward.reset(env_idx)
+
+    def layout(self, env: int = 0) -> Layout:
+        """Return the layout of an env's episode."""
+        return self.seeds.layout(env)
 
     # ------------------------------------------------------------------ state
 
     def get_state_dict(self) -> dict:
-        """The state, in ManiSkill's form, from one read of all bodies, with all that what follows hangs on.
-
-        ``controller`` holds the targets that the next actions start from (`RobotController.targets`).
-        """
+        """Return the state in ManiSkill's form, from one read of all bodies, and `state_beside_bodies`."""
         return {**self.bodies.split(self.bodies.read().clone()), **self.state_beside_bodies()}
 
     def state_beside_bodies(self) -> dict:
-        """What `get_state_dict` holds but for poses and velocities."""
-        return {"controller": self.agent.controller_targets()}
+        """Return what a state holds besides poses and velocities.
+
+        ``controller`` holds the targets that the next actions start from (`RobotController.targets`), ``task`` the
+        ``stages`` reached so far, (N, stages) bool.
+        """
+        stages = self.success_check.reached.T.clone()
+        return {"controller": self.agent.controller_targets(), "task": {"stages": stages}}
 
     def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None) -> None:
-        """Set the state. Where it has no targets, the next action starts from where the robot is."""
+        """Set the state. Without targets, the next action starts from where the robot is; without stages, they stay.
+
+        The next step's dense reward is as that after a reset.
+        """
         super().set_state_dict(state, cast("torch.Tensor", env_idx))
         self.agent.set_controller_targets(state.get("controller"), env_idx)
+        envs = slice(None) if env_idx is None else env_idx
+        self.success_check.restore(state.get("task", {}).get("stages"), envs)
+        self.dense_reward.reset(envs)
+
+    @property
+    def object_states(self) -> torch.Tensor:
+        """(N, K, 13) poses of the objects, linear and angular velocities (`bodies.BODY`); don't write to it."""
+        return self.bodies.objects(self.bodies.read())
+
+    @property
+    def object_poses(self) -> torch.Tensor:
+        """(N, K, 7) poses of the objects in the world: position m, quaternion wxyz."""
+        return self.object_states[..., :7].clone()
+
+    @property
+    def basket_pose(self) -> torch.Tensor:
+        """(N, 7) pose of the basket in the world, where the scene has one; don't write to it."""
+        pose = self.bodies.basket(self.bodies.read())
+        assert pose is not None, "there is no basket in this scene"
+        return pose
+
+    def tcp_in_world(self) -> Any:
+        """(N, 7) pose of the TCP in the world, native (`arrays`)."""
+        return native(link_poses(self.scene, [self.agent.tcp]))[:, 0]
+
+    def centers(self, objects: Any) -> Any:
+        """(N, K, 3) m, centres of mass of the objects in the world, from states (N, K, 13); native (`arrays`)."""
+        return objects[..., :3] + terms.rotate(objects[..., 3:7], native(self._centers_of_mass))
+
+    def target_center(self, objects: Any) -> Any:
+        """(N, 3) m, the target's centre of mass in the world, from states (N, K, 13); native (`arrays`)."""
+        slot = native(self.target_slot)
+        target, center = terms.of_target(objects, slot), terms.of_target(native(self._centers_of_mass), slot)
+        return target[:, :3] + terms.rotate(target[:, 3:7], center)
+
+    def target_asset(self, env: int = 0) -> LoadedObject:
+        """The target's asset in one env."""
+        return self.object_assets[env][int(self.target_slot[env])]
+
+    def gripper_forces(self) -> torch.Tensor:
+        """(N, 3, K, 3) N: force of each object on left finger, right finger and hand, world frame."""
+        return as_tensor(self.gripper_contacts.forces())
+
+    def grasped(self) -> torch.Tensor:
+        """(N, K) bool: which objects both fingers hold right now."""
+        return as_tensor(self.success_check.grasped(self.gripper_contacts.forces()))
 
     # ------------------------------------------------------------------ step
 
@@ -67,87 +399,88 @@ class RoboCASEnv(SceneEnv):
         info, self._last_obs = self.get_info(), {}
         return {}, torch.zeros(1), info["success"] | info["fail"], torch.zeros(1, dtype=torch.bool), info
 
-    # ------------------------------------------------------------------ state
+    def evaluate(self) -> dict[str, torch.Tensor]:
+        """Return stages, success and fail of each env, (N,) bool each; ``disturbed`` (N,) int. Don't write to them.
+
+        The stages stay true until the reset: ``reached_any`` (the gripper touched any object), ``picked_any`` (both
+        fingers held any object >= 3 cm above where it stood), ``reached_target``, ``target_grasped``, ``target_lifted``
+        (as ``picked_any``, of the target), and that of the goal, ``target_in_basket``. ``success`` is of this moment:
+        the target was lifted, now is at rest in the basket's inner volume, untouched by the gripper, and the basket
+        stands (moved <= 0.1 m, tilted <= 20 deg). So is ``fail``: the target is or falls more than 5 cm below what it
+        stood on, out of basket and gripper, or the basket has fallen (10 cm lower, or tilted by 60 deg). Other goals
+        may do without the lift, and have measures of their own. ``disturbed`` counts the objects other than the target
+        that are more than 3 cm from where they stood, or have fallen over (30 deg), relative to the door or drawer that
+        they are on.
+        """
+        return self.success_check.check()
 
     @property
-    def object_states(self) -> torch.Tensor:
-        """(N, K, 13) poses of the objects, linear and angular velocities (`bodies.BODY`); don't write to it."""
-        return self._objects_in(self.bodies.read())
+    def moment(self) -> Moment:
+        """What `evaluate` found last; the same object as before where nothing has changed since."""
+        return self.success_check.moment
 
-    @property
-    def object_poses(self) -> torch.Tensor:
-        """(N, K, 7) poses of the objects in the world: position m, quaternion wxyz."""
-        return self.object_states[..., :7].clone()
+    def target_measures(self) -> dict[str, torch.Tensor]:
+        """Return what has to hold at the same moment for success, besides the lift: (N,) bool each."""
+        return self.success_check.measures()
 
-    @property
-    def basket_pose(self) -> torch.Tensor:
-        """(N, 7) pose of the basket in the world, where the scene has one; don't write to it."""
-        return self._basket_in(self.bodies.read())
+    # ------------------------------------------------------------------ observations
 
-    def _objects_in(self, state: torch.Tensor) -> torch.Tensor:
-        return self.bodies.of_actors(state)[:, self._object_rows]
-
-    def _basket_in(self, state: torch.Tensor) -> torch.Tensor:
-        assert self._basket_row is not None, "there is no basket in this scene"
-        return self.bodies.of_actors(state)[:, self._basket_row, :7]
-
-    def _native_basket(self, state: torch.Tensor) -> Any:
-        """(N, 7) pose of the basket, native (`arrays`), from the state of all bodies; None where there is none."""
-        return None if self._basket_row is None else native(self._basket_in(state))
-
-    def centers(self, objects: Any) -> Any:
-        """(N, K, 3) m, centres of mass of the objects in the world, from states (N, K, 13); native (`arrays`)."""
-        return objects[..., :3] + terms.rotate(objects[..., 3:7], native(self._centers_of_mass))
-
-    def target_center(self, objects: Any) -> Any:
-        """(N, 3) m, the target's centre of mass in the world, from states (N, K, 13); native (`arrays`)."""
-        slot = native(self.target_slot)
-        target, center = terms.of_target(objects, slot), terms.of_target(native(self._centers_of_mass), slot)
-        return target[:, :3] + terms.rotate(target[:, 3:7], center)
-
-    def tcp_in_world(self) -> Any:
-        """(N, 7) pose of the TCP in the world, native (`arrays`)."""
-        return native(link_poses(self.scene, [self.agent.tcp]))[:, 0]
-
-    def target_asset(self, env: int = 0) -> LoadedObject:
-        """The target's asset in one env."""
-        return self.object_assets[env][int(self.target_slot[env])]
-
-    def gripper_forces(self) -> torch.Tensor:
-        """(N, 3, K, 3) N: force of each object on left finger, right finger and hand, world frame."""
-        return as_tensor(self._gripper_contacts.forces())
-
-    def grasped(self) -> torch.Tensor:
-        """(N, K) bool: which objects both fingers hold right now."""
-        return as_tensor(self._grasped_by(self._gripper_contacts.forces()))
-
-    def _grasped_by(self, forces: Any) -> Any:
-        """`grasped` from the gripper's forces, both native (`arrays`)."""
-        pressed = terms.pressed(forces[:, 0], forces[:, 1])
-        if none(pressed):  # as most of the time: no need to ask in which direction
-            return pressed
-        finger = native(link_poses(self.scene, [self.agent.finger1_link]))[:, 0]
-        # the left finger opens along its own +y
-        opening = terms.rotate(finger[:, 3:], native(self._sideways))
-        return terms.finger_grasps(forces[:, 0], forces[:, 1], opening)
+    def get_language_instruction(self) -> list[str]:
+        """Return the text of each env's instruction."""
+        return [self.instructions.of(env).text for env in range(self.num_envs)]
 
     def _get_obs_extra(self, info: dict) -> dict[str, torch.Tensor]:
-        """``tcp_pose`` (N, 7) in the world; before it, in state modes, what only a simulator knows."""
-        told = self.obs_mode_struct.state or self.obs_mode_struct.state_dict
-        return {**(self._privileged() if told else {}), "tcp_pose": as_tensor(self.tcp_in_world())}
+        """``tcp_pose`` (N, 7) in the world; before it, in state modes, the privileged observations."""
+        mode = self.obs_mode_struct
+        privileged = self.privileged_observations() if mode.state or mode.state_dict else {}
+        return {**privileged, "tcp_pose": as_tensor(self.tcp_in_world())}
+
+    def privileged_observations(self) -> dict[str, torch.Tensor]:
+        """Return what only a simulator knows, (N, D) each; the order is that of the flat state."""
+        return privileged_observations(self)
 
     def _get_obs_sensor_data(self, apply_texture_transforms: bool = True) -> dict:
-        """Pictures by camera and kind; see ``BaseEnv``."""
+        """Return images by camera and kind; see ``BaseEnv``."""
         last = self._last_obs.get("sensor_data") if isinstance(self._last_obs, dict) else None
-        if self.looks or last is None:  # None: not of pictures, but of points made of them
+        if self.looks or last is None:  # None: point clouds, made of images
             return super()._get_obs_sensor_data(apply_texture_transforms)
         return {camera: {kind: torch.zeros_like(of) for kind, of in kinds.items()} for camera, kinds in last.items()}
 
-    def _privileged(self) -> dict[str, torch.Tensor]:
-        """What only a simulator knows, (N, D) each; see docs/rl.md."""
-        basket = {} if self._basket_row is None else {"basket_pose": self.basket_pose}
-        return {
-            "object_poses": torch.where(self.present[..., None], self.object_states[..., :7], 0.0).flatten(1),
-            "target": self._is_target.float(),
-            **basket,
-        }
+    # ------------------------------------------------------------------ rewards
+
+    def get_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
+        """Return the reward (N,) of the env's mode, and remember the action.
+
+        ``normalized_dense`` is in [0, 1]: 1 on success and only then, 0 on ``fail``, else what `rewards` makes of the
+        table ``REWARDS``. ``dense`` is this times the table's total. ``progress`` is how much the first has changed
+        since the last step; a first step pays nothing.
+        """
+        if self._reward_mode == "progress":
+            reward = self.dense_reward.gain(self.compute_normalized_dense_reward(obs, action, info))
+        else:
+            reward = super().get_reward(obs, action, info)
+        if self._reward_mode in DENSE and action is not None:
+            self.dense_reward.remember(action)
+        return reward
+
+    def compute_sparse_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
+        """Return 1 (N,) float32 where the task has succeeded at this moment, else 0."""
+        return info["success"].float()
+
+    def compute_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
+        """Return the reward (N,) float32 in [0, ``REWARDS.total``]; add ``reward_terms`` to the last step's info."""
+        stage, found = self.dense_reward.of_goal()
+        return self.dense_reward.weigh(stage, found, action, info)
+
+    def compute_normalized_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
+        """Return the reward (N,) float32 in [0, 1]; see `compute_dense_reward`."""
+        return self.compute_dense_reward(obs, action, info) / self.REWARDS.total
+
+
+def _check_rendering(visual_level: str, render_backend: str | None, obs_mode: str | None) -> None:
+    if visual_level not in VISUALS:
+        found = visual_level
+        raise ConfigError("no such visual_level", where="visual_level", expected=f"one of {list(VISUALS)}", found=found)
+    if render_backend == "none" and obs_mode not in {None, "none", "state", "state_dict"}:
+        found, fix = f'"none", with obs_mode={obs_mode!r}', "Leave render_backend out."
+        raise ConfigError("images need a renderer", where="render_backend", found=found, fix=fix)

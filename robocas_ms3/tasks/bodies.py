@@ -1,4 +1,4 @@
-"""Where everything that can move is, and how fast: read from a scene at once, not actor by actor."""
+"""Poses and velocities of everything that can move: read from a scene at once, not actor by actor."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 from mani_skill.envs.scene import ManiSkillScene
-from mani_skill.utils.structs import Articulation, Link
+from mani_skill.utils.structs import Actor, Articulation, Link
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import RobocasError
@@ -26,24 +26,33 @@ class Bodies:
 
     First come the A actors that can move, ``BODY`` numbers each, then of each articulation its root, qpos and qvel.
 
-    On a CPU that is one call of SAPIEN's, and what came of it is kept while the scene's bytes stay the same, so it is
-    never out of date. On a GPU it is gathered anew from the buffers each time.
+    On a CPU that is one call of SAPIEN's, and its result is kept while the scene's bytes stay the same, so it is
+    never out of date. On a GPU it is gathered from the buffers each time.
 
     Args:
         scene: ready to be simulated.
         robot: what `others` leaves out.
+        objects: the actors that `objects` reads, built one after the other.
+        basket: the actor that `basket` reads, if there is one.
 
     Raises:
         RobocasError: this version of SAPIEN packs states otherwise.
     """
 
-    def __init__(self, scene: ManiSkillScene, robot: Articulation) -> None:
+    def __init__(
+        self, scene: ManiSkillScene, robot: Articulation, objects: Sequence[Actor] = (), basket: Actor | None = None
+    ) -> None:
         self._scene = scene
         self._px: Any = scene.px
         registry = scene.state_dict_registry
         self._actors = [actor for actor in registry.actors.values() if actor.px_body_type != "static"]
         self._articulations = list(registry.articulations.values())
         self.actors = [actor.name for actor in self._actors]
+        rows = [self.actors.index(actor.name) for actor in objects]
+        first = rows[0] if rows else 0
+        assert rows == list(range(first, first + len(rows))), "the objects are built one after the other"
+        self._objects = slice(first, first + len(rows))
+        self._basket = None if basket is None else self.actors.index(basket.name)
         sizes = [BODY + 2 * articulation.max_dof for articulation in self._articulations]
         ends = len(self._actors) * BODY + np.cumsum(sizes)
         self._columns: dict[str, dict[str, slice]] = {
@@ -83,6 +92,14 @@ class Bodies:
         count = len(self._actors)
         return state[:, : count * BODY].view(-1, count, BODY)
 
+    def objects(self, state: torch.Tensor) -> torch.Tensor:
+        """(N, K, 13) the objects' part of a state (N, D); a view."""
+        return self.of_actors(state)[:, self._objects]
+
+    def basket(self, state: torch.Tensor) -> torch.Tensor | None:
+        """(N, 7) the basket's pose in a state (N, D), a view; None where there is no basket."""
+        return None if self._basket is None else self.of_actors(state)[:, self._basket, :7]
+
     def split(self, states: _Batch) -> dict[str, dict[str, _Batch]]:
         """Name the parts of states (..., D), as ManiSkill does: ``{"actors": {name: (..., 13)}, ...}``; all views."""
         return {
@@ -110,21 +127,20 @@ class Bodies:
         start = starts[robot._objs[0]]
         return np.array(order), slice(4 * start, 4 * (start + BODY + _PACKED_PER_JOINT * robot.max_dof))
 
-    def put_actors(self, envs: torch.Tensor, actors: slice, poses: torch.Tensor) -> None:
-        """Put some actors of some envs somewhere at once, on a GPU; `ManiSkillScene._gpu_apply_all` tells PhysX.
+    def put_objects(self, envs: torch.Tensor, poses: torch.Tensor) -> None:
+        """Put the objects of some envs somewhere at once, on a GPU; `ManiSkillScene._gpu_apply_all` tells PhysX.
 
         Args:
             envs: (E,) indices.
-            actors: which of ``actors``.
-            poses: (E, A, 7) in the world.
+            poses: (E, K, 7) in the world.
         """
         if self._scene.parallel_in_single_scene:
             poses = poses.clone()
             poses[..., :3] += self._scene.scene_offsets[envs, None]
-        self._px.cuda_rigid_body_data.torch()[self._rows[envs, actors], :7] = poses
+        self._px.cuda_rigid_body_data.torch()[self._rows[envs, self._objects], :7] = poses
 
     def stop(self, envs: torch.Tensor) -> None:
-        """Take all velocities from some envs (E,) at once, on a GPU; see `put_actors`."""
+        """Take all velocities from some envs (E,) at once, on a GPU; see `put_objects`."""
         self._px.cuda_rigid_body_data.torch()[self._rows[envs].flatten(), 7:BODY] = 0.0
         for articulation in self._articulations:
             self._px.cuda_articulation_qvel.torch()[articulation._data_index[envs], : articulation.max_dof] = 0.0

@@ -1,4 +1,4 @@
-"""Where targets have to end up: terms of which a task picks one (`TransferEnv.GOAL`); the basket is the benchmark's.
+"""Where targets have to end up, one goal per task (`RoboCASEnv.GOAL`); that of the benchmark is the basket.
 
 N envs, K objects; all arrays native (`arrays`). ``basket`` is the pose (N, 7) of the scene's basket in the world; None
 where it has none.
@@ -13,7 +13,6 @@ import torch
 
 from robocas_ms3.core.arrays import every, native
 from robocas_ms3.tasks import rewards, terms
-from robocas_ms3.tasks.base import RoboCASEnv
 
 _RIM = 0.05  # m around the basket's inside that still count as over it for a target that falls
 _DROP_HEIGHT, _LOWERING = 0.1, 0.25  # m above the basket's rim: where a carry leads; from where on lowering counts
@@ -22,7 +21,7 @@ _LIFT = 0.03  # m, that of `terms.lifted`
 
 
 class Moment(NamedTuple):
-    """What `TransferEnv.evaluate` found last.
+    """What `RoboCASEnv.evaluate` found last.
 
     Attributes:
         objects: (N, K, 13) their states.
@@ -44,66 +43,64 @@ class Moment(NamedTuple):
 
 
 class Goal(ABC):
-    """A goal of one environment, made when its scene is.
+    """A goal of one environment, made when its scene is. Only ``holds`` is needed for sparse rewards.
 
     Args:
-        env: the environment.
+        env: the `base.RoboCASEnv`.
     """
 
     NAME: ClassVar[str]
     """Of its measure, ``in_basket``; the stage is ``target_in_basket``."""
     LIFTS: ClassVar[bool] = True
     """Whether the target must have been lifted for success."""
+    TOWARDS: ClassVar[str] = "target_to_goal"
+    """Name of the observation of the way from the target's centre of mass to `point`."""
 
-    def __init__(self, env: RoboCASEnv) -> None:
+    def __init__(self, env: Any) -> None:
         self.env = env
 
     @abstractmethod
     def holds(self, centers: Any, basket: Any) -> Any:
-        """(N,) or (N, K) bool: which objects are there, from their centres of mass (N, 3) or (N, K, 3) in the world."""
+        """Return which objects are at the goal, (N,) or (N, K), from their centres of mass (N, 3) or (N, K, 3)."""
 
     def measures(self, basket: Any) -> dict[str, Any]:
-        """What else has to hold at the moment of success: (N,) bool each."""
+        """Return what else has to hold at the moment of success: (N,) bool each."""
         return {}
 
     def lost(self, basket: Any, measures: dict[str, Any]) -> Any:
-        """(N,) bool, in which envs the goal itself can't be reached any more; None: in none."""
+        """Return in which envs (N,) the goal itself can't be reached any more; None: in none."""
         return None
 
     def catches(self, positions: Any, basket: Any) -> Any:
-        """(N,) bool: which targets at (N, 3) m may lie or fall lower than where they stood; None: none may."""
+        """Return which targets at (N, 3) m may be lower than where they stood, (N,) bool; None: none may."""
         return None
 
-
-class DenseGoal(Goal):
-    """A goal that also says how near it is, as `learning.LearningEnv` needs it."""
-
-    TOWARDS: ClassVar[str] = "target_to_goal"
-    """Name of the observation of the way from the target's centre of mass to `point`."""
-
-    @abstractmethod
     def point(self, basket: Any) -> Any:
-        """(N, 3) m, where the target's centre of mass is to be brought, in the world."""
+        """Return where the target's centre of mass is to be brought, (N, 3) m in the world; None: not at one point."""
+        return None
 
-    @abstractmethod
     def progress(self, now: Moment, brought: Any, table: rewards.RewardTable) -> tuple[Any, dict[str, Any]]:
-        """How far dense rewards have come.
+        """Return how far an episode is, for dense rewards.
 
         Args:
-            now: what `TransferEnv.evaluate` found.
+            now: what `RoboCASEnv.evaluate` found.
             brought: (N,) bool, whether the target has been lifted.
             table: the task's.
 
         Returns:
             Stages (N,) of the table, and the terms that count in them by name, (N,) in [0, 1] each.
+
+        Raises:
+            NotImplementedError: the goal has no dense rewards; its task lists none in ``SUPPORTED_REWARD_MODES``.
         """
+        raise NotImplementedError(f"{type(self).__name__} has no dense rewards")
 
     def penalties(self, now: Moment) -> dict[str, Any]:
-        """Penalties of dense rewards by name, (N,) in [0, 1] each."""
+        """Return penalties of dense rewards by name, (N,) in [0, 1] each."""
         return {}
 
 
-class InBasket(DenseGoal):
+class InBasket(Goal):
     """The target's centre of mass is in the basket's inner volume, and the basket stands.
 
     Lost where the basket has fallen: 10 cm lower, or tilted by 60 deg.
@@ -112,7 +109,7 @@ class InBasket(DenseGoal):
     NAME = "in_basket"
     TOWARDS = "target_to_drop"
 
-    def __init__(self, env: RoboCASEnv) -> None:
+    def __init__(self, env: Any) -> None:
         super().__init__(env)
         assert env.model.basket is not None, "the scene has no basket"
         inner = env.model.basket.asset.inner

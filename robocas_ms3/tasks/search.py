@@ -11,26 +11,26 @@ from robocas_ms3.core.arrays import as_tensor, native, none
 from robocas_ms3.scenes.targets import selection_camera
 from robocas_ms3.scenes.task_specs import SEARCH
 from robocas_ms3.tasks import occlusion, rewards, terms
-from robocas_ms3.tasks.learning import DENSE, LearningEnv
+from robocas_ms3.tasks.base import STAGES, RoboCASEnv
+from robocas_ms3.tasks.dense import DENSE
 from robocas_ms3.tasks.schedule import PeriodicSchedule
-from robocas_ms3.tasks.transfer import STAGES
 
 # of each object's surface; hidden shares are then off ray casting by 0.03 on average, 0.08 at the 95th percentile
 _POINTS = 512
-LOOKS_PER_SECOND = 5  # at what is cleared
+MEASUREMENTS_PER_SECOND = 5  # of the clutter
 ENVS_AT_ONCE = 512  # whose clutter is measured: a quarter of a GB with 15 objects each
 
 
-class RoboCASSearchEnv(LearningEnv):
+class RoboCASSearchEnv(RoboCASEnv):
     """Search: the target is hidden in part (p_vis from above below ``target.max_visible_share``, where one is given).
 
     The stages add ``obstacles_cleared``: to the camera above that p_vis is measured with, at most a fifth of the target
-    is hidden, and fewer than two other objects stick out next to it (`occlusion.clutter`). It is looked at five times a
-    second. What counts is the heap while the target lies in it: from the moment the gripper has held the target,
+    is hidden, and fewer than two other objects stick out next to it (`occlusion.clutter`). This is measured five times
+    per second. What counts is the heap while the target is in it: from the moment the gripper has held the target,
     nothing is cleared any more, so pulling or dragging it out from under the heap does not reach this stage.
 
-    ``cleared_at_reset`` (N,) bool says that the target lay clear from the beginning: then the stage says nothing of
-    what was done.
+    ``cleared_at_reset`` (N,) bool says that the target was clear from the beginning: then the stage says nothing about
+    the policy.
     """
 
     SPEC = SEARCH
@@ -45,41 +45,39 @@ class RoboCASSearchEnv(LearningEnv):
         self._radii = torch.linalg.vector_norm(self._surface_points, dim=-2).amax(dim=-1)
         eye = selection_camera(self.model).pose[:3, 3]
         self._eye = torch.as_tensor(eye, dtype=torch.float32, device=self.device)
-        self._looked: _Look | None = None
-        self._schedule = PeriodicSchedule(self.num_envs, self._look_period, self.device)
+        self._schedule = PeriodicSchedule(self.num_envs, self._measure_period, self.device)
+        self._measured: _Measured | None = None
+        flags = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+        self._cleared_at_reset, self._measure_now, self._just_reset = flags, flags.clone(), flags.clone()
+        self.hidden_share = torch.zeros(self.num_envs, device=self.device)
+        self._obstacles = torch.zeros_like(self.present)
+        self._push_point = torch.zeros(self.num_envs, 3, device=self.device)
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         super()._initialize_episode(env_idx, options)
-        if not hasattr(self, "hidden_share"):
-            self.hidden_share = torch.zeros(self.num_envs, device=self.device)
-            self._cleared_at_reset = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
-            self._obstacles = torch.zeros_like(self.present)
-            self._push_point = torch.zeros(self.num_envs, 3, device=self.device)
-            self._look_again = torch.zeros_like(self._cleared_at_reset)  # whatever the time
-            self._begins = torch.zeros_like(self._cleared_at_reset)
-        self._looked = None
+        self._measured = None
         self._schedule.reset(env_idx.cpu().numpy())
-        self._begins[env_idx] = True
-        self._look_again[env_idx] = True
+        self._just_reset[env_idx] = True
+        self._measure_now[env_idx] = True
 
     def state_beside_bodies(self) -> dict:
-        """See `TransferEnv`; ``task`` also holds ``cleared_at_reset`` and ``hidden_share``, (N, 1) each."""
+        """See `RoboCASEnv`; ``task`` also holds ``cleared_at_reset`` and ``hidden_share``, (N, 1) each."""
         state = super().state_beside_bodies()
-        kept = {"cleared_at_reset": self._cleared_at_reset, "hidden_share": self.hidden_share}
-        return {**state, "task": {**state["task"], **{name: value[:, None].clone() for name, value in kept.items()}}}
+        own = {"cleared_at_reset": self._cleared_at_reset, "hidden_share": self.hidden_share}
+        return {**state, "task": {**state["task"], **{name: value[:, None].clone() for name, value in own.items()}}}
 
     def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None) -> None:
-        """Set the state; see `RoboCASEnv`. A heap that is not cleared is looked at anew, at once."""
+        """Set the state; see `RoboCASEnv`. A heap that is not cleared is measured again at once."""
         super().set_state_dict(state, env_idx)
         envs = slice(None) if env_idx is None else env_idx
         self._schedule.every_step(slice(None) if env_idx is None else env_idx.cpu().numpy())
-        self._looked = None  # else what follows would hang on what was before
-        self._begins[envs], self._look_again[envs] = False, True
+        self._measured = None  # else later results would depend on what was before
+        self._just_reset[envs], self._measure_now[envs] = False, True
         self._cleared_at_reset = self._cleared_at_reset.clone()  # infos hold it
         own = {"cleared_at_reset": self._cleared_at_reset, "hidden_share": self.hidden_share}
-        for name, kept in state.get("task", {}).items():
+        for name, value in state.get("task", {}).items():
             if name in own:
-                own[name][envs] = torch.as_tensor(kept).to(own[name]).reshape(-1)
+                own[name][envs] = torch.as_tensor(value).to(own[name]).reshape(-1)
 
     def clutter(self, envs: Any = slice(None)) -> occlusion.Clutter:
         """What hides and surrounds the targets of some envs right now."""
@@ -92,56 +90,52 @@ class RoboCASSearchEnv(LearningEnv):
         return occlusion.covering(points, self.present[envs], self._eye)
 
     def evaluate(self) -> dict[str, torch.Tensor]:
-        """See `TransferEnv`; ``cleared_at_reset`` besides."""
-        found = super().evaluate()
-        self._cleared_at_reset = torch.where(self._begins, found["obstacles_cleared"], self._cleared_at_reset)
-        self._begins = torch.zeros_like(self._begins)
-        return {**found, "cleared_at_reset": self._cleared_at_reset}
-
-    def _known_by(self, forces: Any) -> object:
-        known = super()._known_by(forces)
-        waits = self._looked is None or self._looked.others != self.bodies.others
-        return None if waits and not none(self._due()) else known
+        """Return what `RoboCASEnv.evaluate` does, ``obstacles_cleared`` and ``cleared_at_reset``."""
+        found, measured = super().evaluate(), self._measured
+        unchanged = measured is not None and measured.others is not None and measured.others == self.bodies.others
+        if not unchanged and not none(due := self._due()):
+            moment = self.moment
+            in_heap = (
+                terms.of_target(moment.objects[..., 2], native(self.target_slot)) > self.success_check.fallen_below
+            )
+            cleared = native(self._measure(as_tensor(due), as_tensor(moment.objects[..., :7])))
+            found["obstacles_cleared"] = self.success_check.reach("obstacles_cleared", cleared & in_heap & due)
+        cleared_at_reset = torch.where(self._just_reset, found["obstacles_cleared"], self._cleared_at_reset)
+        self._cleared_at_reset, self._just_reset = cleared_at_reset, torch.zeros_like(self._just_reset)
+        return {**found, "cleared_at_reset": cleared_at_reset}
 
     def _before_control_step(self) -> None:
         super()._before_control_step()
         self._schedule.advance()
 
     @property
-    def _look_period(self) -> int:
-        """Control steps from one look at the clutter to the next."""
-        return max(1, self.control_freq // LOOKS_PER_SECOND)
+    def _measure_period(self) -> int:
+        """Control steps from one measurement of the clutter to the next."""
+        return max(1, self.control_freq // MEASUREMENTS_PER_SECOND)
 
     def _due(self) -> Any:
-        """(N,) bool, native: whose clutter is looked at in this step."""
-        settled = native(self._stages["target_grasped"]) | native(self._stages["obstacles_cleared"])
-        return ((native(self.elapsed_steps) % self._look_period == 0) | native(self._look_again)) & ~settled
+        """(N,) bool, native: whose clutter is measured in this step."""
+        stages = self.success_check.stages
+        settled = native(stages["target_grasped"]) | native(stages["obstacles_cleared"])
+        return ((native(self.elapsed_steps) % self._measure_period == 0) | native(self._measure_now)) & ~settled
 
-    def _task_stages(self, objects: Any, held: Any) -> dict[str, Any]:
-        """``obstacles_cleared``, (N,) bool, of this moment; nothing in steps in which no env is looked at."""
-        due = self._due() & ~held
-        if none(due):
-            return {}
-        lies = terms.of_target(objects[..., 2], native(self.target_slot)) > self._surface - terms.FALLEN
-        return {"obstacles_cleared": native(self._look(as_tensor(due), as_tensor(objects[..., :7]))) & lies & due}
-
-    def _look(self, due: torch.Tensor, poses: torch.Tensor) -> torch.Tensor:
+    def _measure(self, due: torch.Tensor, poses: torch.Tensor) -> torch.Tensor:
         """(N,) bool, which of the envs that are due are cleared; keeps their hidden shares and obstacles.
 
         Args:
             due: (N,) bool.
             poses: (N, K, 7) of the objects.
         """
-        others, looked = self.bodies.others, self._looked
-        if others is not None and looked is not None:  # on a CPU it is known whether anything has moved
-            still = looked.others == others or not self._moved(poses, looked.poses)
+        others, measured = self.bodies.others, self._measured
+        if others is not None and measured is not None:  # on a CPU it is known whether anything has moved
+            still = measured.others == others or not self._moved(poses, measured.poses)
             if still:
-                self._looked = looked._replace(others=others)
-                return looked.cleared
+                self._measured = measured._replace(others=others)
+                return measured.cleared
         cleared = torch.zeros_like(due)
-        # on a GPU some envs more than are due, as finding these would wait for it; what is found of them is not taken
-        looked_at = self._schedule.due() if self.gpu_sim_enabled else due.nonzero()[:, 0]
-        for envs in looked_at.split(ENVS_AT_ONCE):
+        # on a GPU more envs than are due, as finding these would wait for it; what is found of the others is dropped
+        envs_to_measure = self._schedule.due() if self.gpu_sim_enabled else due.nonzero()[:, 0]
+        for envs in envs_to_measure.split(ENVS_AT_ONCE):
             found, taken = self.clutter(envs), due[envs]
             cleared[envs] = found.cleared & taken
             self.hidden_share[envs] = torch.where(taken, found.hidden_share, self.hidden_share[envs])
@@ -150,30 +144,31 @@ class RoboCASSearchEnv(LearningEnv):
                 points = occlusion.surface_points(poses[envs], self._surface_points[envs])
                 push_point = occlusion.push_point(points, found.obstacles, self.target_slot[envs])
                 self._push_point[envs] = torch.where(taken[:, None], push_point, self._push_point[envs])
-        self._looked, self._look_again = _Look(others, poses, cleared), self._look_again & ~due
+        self._measured, self._measure_now = _Measured(others, poses, cleared), self._measure_now & ~due
         return cleared
 
     def _moved(self, poses: torch.Tensor, before: torch.Tensor) -> bool:
         return bool(occlusion.moved_near(poses, before, self._radii, self.target_slot, self._eye).any())
 
-    def _progress(self) -> tuple[Any, dict[str, Any]]:
-        """As of `LearningEnv`; before the target may be grasped it has to be cleared, or must have been held."""
-        stage, found = super()._progress()
-        settled = native(self._stages["obstacles_cleared"]) | native(self._stages["target_grasped"])
+    def compute_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
+        """Return the reward; see `RoboCASEnv`. Before the target may be grasped, it has to be cleared or held once."""
+        stage, found = self.dense_reward.of_goal()
+        stages = self.success_check.stages
+        settled = native(stages["obstacles_cleared"]) | native(stages["target_grasped"])
         covered = (stage == self.REWARDS.index("grasp")) & ~settled
-        if none(covered):
-            return stage, found
-        found["push_point"] = rewards.closeness(self.tcp_in_world()[:, :3], native(self._push_point))
-        found["clear"] = rewards.uncovered(native(self.hidden_share), native(self._obstacles.sum(dim=1)))
-        return rewards.furthest(stage, [(covered, self.REWARDS.index("clear"))]), found
+        if not none(covered):
+            found["push_point"] = rewards.closeness(self.tcp_in_world()[:, :3], native(self._push_point))
+            found["clear"] = rewards.uncovered(native(self.hidden_share), native(self._obstacles.sum(dim=1)))
+            stage = rewards.furthest(stage, [(covered, self.REWARDS.index("clear"))])
+        return self.dense_reward.weigh(stage, found, action, info)
 
-    def _privileged(self) -> dict[str, torch.Tensor]:
-        """As of `LearningEnv`, and ``hidden_share`` (N, 1) at the last look; there is none once the target was held."""
-        return {**super()._privileged(), "hidden_share": self.hidden_share[:, None].clone()}
+    def privileged_observations(self) -> dict[str, torch.Tensor]:
+        """Return those of `RoboCASEnv`, and ``hidden_share`` (N, 1), as last measured before the target was held."""
+        return {**super().privileged_observations(), "hidden_share": self.hidden_share[:, None].clone()}
 
 
-class _Look(NamedTuple):
-    """The last look at the clutter.
+class _Measured(NamedTuple):
+    """The last measurement of the clutter.
 
     Attributes:
         others: all but the robot as it was then, on a CPU.
@@ -187,5 +182,5 @@ class _Look(NamedTuple):
 
 
 def _sample(points: np.ndarray) -> np.ndarray:
-    """``_POINTS`` of points (P, 3), evenly from the first to the last; some repeat where there are fewer."""
+    """Return ``_POINTS`` of points (P, 3), evenly from the first to the last; some repeat where there are fewer."""
     return points[np.linspace(0, len(points) - 1, _POINTS).round().astype(int)]

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 
-from robocas_ms3.core.arrays import native
+from robocas_ms3.core.arrays import as_tensor, native
 from robocas_ms3.scenes.task_specs import SELECT
 from robocas_ms3.tasks import terms
-from robocas_ms3.tasks.learning import LearningEnv
+from robocas_ms3.tasks.base import RoboCASEnv
 
 
-class RoboCASSelectEnv(LearningEnv):
+class RoboCASSelectEnv(RoboCASEnv):
     """Select: "the nearest soap", "the second soda can from the left", seen from the robot. The others are wrong.
 
     The relation is clear: what it compares differs from every other such object by at least 3 cm. Success asks for the
-    named one alone: none of the others may lie in the basket too.
+    named one alone: none of the others may be in the basket too.
     """
 
     SPEC = SELECT
@@ -26,8 +24,17 @@ class RoboCASSelectEnv(LearningEnv):
         names = [[asset.asset.name for asset in row] for row in self.object_assets]
         self._kinds = torch.tensor([[row.index(name) for name in row] for row in names], device=self.device)
 
-    def _target_measures(self, touched: Any, objects: Any, basket: Any) -> dict[str, Any]:
-        """As of `TransferEnv`, and ``others_out``: no other object of the target's name is in the basket."""
-        inside = self.goal.holds(self.centers(objects), basket)
+    def evaluate(self) -> dict[str, torch.Tensor]:
+        """Return what `RoboCASEnv.evaluate` does; ``success`` also asks that no object of the target's name is in."""
+        found = super().evaluate()
+        return {**found, "success": found["success"] & self._others_out()}
+
+    def target_measures(self) -> dict[str, torch.Tensor]:
+        """Return those of `RoboCASEnv`, and ``others_out``: no other object of the target's name is in the basket."""
+        return {**super().target_measures(), "others_out": self._others_out()}
+
+    def _others_out(self) -> torch.Tensor:
+        """(N,) bool."""
+        inside = self.goal.holds(self.centers(native(self.object_states)), native(self.basket_pose))
         others_in = terms.another_of_its_kind(inside, native(self._kinds), native(self.target_slot))
-        return {**super()._target_measures(touched, objects, basket), "others_out": ~others_in}
+        return as_tensor(~others_in)

@@ -15,6 +15,7 @@ from robocas_ms3.robots.agent import MobileManipulator
 from robocas_ms3.robots.combined import RobotController
 from robocas_ms3.tasks import base
 from robocas_ms3.tasks.bodies import Bodies
+from robocas_ms3.tasks.seeds import EpisodeSeeds
 from robocas_ms3.tasks.starts import Starts
 
 MODE = "pd_joint_pos"
@@ -78,13 +79,13 @@ def test_a_missing_fetch(batch, singles, monkeypatch):
 
 @pytest.mark.parametrize("field", ["object_poses", "targets", "present"])
 def test_a_cpu_tensor_mixed_in(batch, monkeypatch, field):
-    gather = type(batch.unwrapped)._find_starts
+    gather = EpisodeSeeds.find_starts
 
-    def mixed(env: Any, envs: Any) -> Starts:
-        starts = gather(env, envs)
+    def mixed(seeds: Any, envs: Any) -> Starts:
+        starts = gather(seeds, envs)
         return Starts(**{**starts.__dict__, field: getattr(starts, field).cpu()})
 
-    monkeypatch.setattr(type(batch.unwrapped), "_find_starts", mixed)
+    monkeypatch.setattr(EpisodeSeeds, "find_starts", mixed)
     with pytest.raises(RuntimeError, match="same device"):
         batch.reset(seed=0)
 
@@ -102,8 +103,8 @@ def test_a_controller_reset_of_all_envs(batch, monkeypatch):
 
 
 def test_swapped_objects(batch, singles, monkeypatch):
-    put = Bodies.put_actors
-    monkeypatch.setattr(Bodies, "put_actors", lambda self, envs, *rest: put(self, envs.flip(0), *rest))
+    put = Bodies.put_objects
+    monkeypatch.setattr(Bodies, "put_objects", lambda self, envs, *rest: put(self, envs.flip(0), *rest))
     with pytest.raises(AssertionError, match="objects after the reset"):
         check(batch, singles)
 

@@ -174,9 +174,9 @@ def test_heaps_are_tried_by_this_engine_and_resets_gather_what_stays(tmp_path):
         render_backend="none",
     )
     env: Any = made.unwrapped
-    assert env._tabled is not None
-    assert not env._table.pairs(State.UNTRIED)
-    tried = {state: len(env._table.pairs(state)) for state in (State.STAYS, State.MOVES)}
+    assert env.seeds.tabled is not None
+    assert not env.seeds.table.pairs(State.UNTRIED)
+    tried = {state: len(env.seeds.table.pairs(state)) for state in (State.STAYS, State.MOVES)}
     assert sum(tried.values()) == count * count
     assert tried[State.MOVES] <= count, tried
     for _ in range(5):

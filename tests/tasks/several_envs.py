@@ -17,11 +17,11 @@ def several(folder, monkeypatch, num_envs=4, **arguments) -> tuple[RoboCASPickEn
         index = torch.as_tensor((options or {}).get("env_idx", range(num_envs)))
         env._set_episode_rng(seed, index)
         if (options or {}).get("reconfigure"):
-            env._choose_objects()
+            env.seeds.choose_objects(env._episode_seed, on_gpu=True)
             env._set_episode_rng(env._episode_seed, index)
-        env._found.clear()
+        env.seeds.forget_layouts(index.numpy())
         env.layouts = [env.layout(i) for i in index.tolist()]
-        asked.append([(int(env._objects_seeds[i]), int(env._layout_seeds[i])) for i in index])
+        asked.append([(int(env.seeds.objects_seeds[i]), int(env.seeds.layout_seeds[i])) for i in index])
         return {}, {}
 
     def makes(env, *args, num_envs, **rest):

@@ -12,13 +12,13 @@ import torch
 
 import robocas_ms3  # noqa: F401
 from robocas_ms3 import tasks
-from robocas_ms3.tasks import TASKS, base, goals, learning, open_pick, search, transfer
+from robocas_ms3.tasks import TASKS, base, dense, goals, observations, open_pick, search, success
 
 ENVS = 3
 PER_ENV = (
-    *("present", "target_slot", "start_poses", "basket_at_start", "_centers_of_mass", "_extents", "_is_target"),
-    *("_target_extents", "hidden_share", "_cleared_at_reset", "_obstacles", "_surface_points", "_radii", "_kinds"),
-    *("_elapsed_steps", "_push_point", "_look_again", "_begins"),
+    *("present", "target_slot", "start_poses", "basket_at_start", "_centers_of_mass", "extents", "is_target"),
+    *("target_extents", "hidden_share", "_cleared_at_reset", "_obstacles", "_surface_points", "_radii", "_kinds"),
+    *("_elapsed_steps", "_push_point", "_measure_now", "_just_reset"),
 )
 
 
@@ -31,16 +31,17 @@ def several(env: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in PER_ENV:
         if hasattr(env, name):
             setattr(env, name, repeated(getattr(env, name)))
-    env._reached = env._reached.repeat(1, ENVS)
-    env._stages = dict(zip(env.STAGES, env._reached, strict=True))
-    if env._last_action is not None:
-        env._last_action = env._last_action.repeat(ENVS, 1)
-    env.num_envs, env._last, env._looked = ENVS, None, None
+    env.num_envs, reached = ENVS, env.success_check.reached
+    env.success_check = success.SuccessCheck(env, env.STAGES)
+    env.success_check.restore(reached.T.repeat(ENVS, 1), slice(None))
+    if env.dense_reward.last_action is not None:
+        env.dense_reward.last_action = env.dense_reward.last_action.repeat(ENVS, 1)
+    env._measured = None
     bodies, state = env.bodies, env.bodies.read().repeat(ENVS, 1)
-    env.bodies = SimpleNamespace(others=None, read=lambda: state, of_actors=bodies.of_actors)
-    forces = torch.from_numpy(env._gripper_contacts.forces())
-    env._gripper_contacts = SimpleNamespace(forces=lambda still=None: repeated(forces))
-    for module in (base, goals, transfer, learning, search, open_pick, tasks.select):
+    env.bodies = SimpleNamespace(others=None, read=lambda: state, objects=bodies.objects, basket=bodies.basket)
+    forces = torch.from_numpy(env.gripper_contacts.forces())
+    env.gripper_contacts = SimpleNamespace(forces=lambda still=None: repeated(forces))
+    for module in (base, dense, goals, observations, success, search, open_pick, tasks.select):
         if hasattr(module, "native"):
             monkeypatch.setattr(module, "native", lambda tensor: tensor)
         if hasattr(module, "link_poses"):
@@ -65,7 +66,7 @@ def test_several_envs_alike_are_found_alike(name, monkeypatch):
     rest = np.append(env.agent.robot.get_qpos()[0, 3:10].numpy(), 1.0).astype(np.float32)
     for _ in range(4):
         _, reward, *_, info = made.step(rest)
-    told = env._privileged()
+    told = env.privileged_observations()
     several(env, monkeypatch)
     found = env.get_info()
     rewards = env.get_reward({}, torch.as_tensor(rest).repeat(ENVS, 1), found)
@@ -76,6 +77,6 @@ def test_several_envs_alike_are_found_alike(name, monkeypatch):
             assert torch.equal(found[key], repeated(value)), key
             compared.add(key)
     assert {*env.STAGES, "success", "fail", "disturbed"} <= compared
-    for key, value in env._privileged().items():
+    for key, value in env.privileged_observations().items():
         torch.testing.assert_close(value, repeated(told[key]), atol=1e-5, rtol=0, msg=key)
     made.close()

@@ -31,6 +31,7 @@ def bodies() -> Bodies:
     robot = SimpleNamespace(max_dof=JOINTS, _data_index=torch.tensor([4, 0, 2]))
     robot.qpos, robot.qvel = torch.rand(ENVS, JOINTS), torch.rand(ENVS, JOINTS)
     made._articulations = [robot]
+    made._objects = slice(0, ACTORS)
     made._rows = torch.tensor([[5, 7, 0], [19, 3, 1], [8, 6, 2]])
     return made
 
@@ -38,7 +39,7 @@ def bodies() -> Bodies:
 def test_actors_are_put_into_their_envs_and_no_others_move(bodies):
     buffer = bodies._px.cuda_rigid_body_data.values
     before, poses = buffer.clone(), torch.rand(2, ACTORS, 7)
-    bodies.put_actors(torch.tensor([2, 0]), slice(0, ACTORS), poses)
+    bodies.put_objects(torch.tensor([2, 0]), poses)
     read = bodies.of_actors(bodies.read())
     assert torch.allclose(read[[2, 0], :, :7], poses, atol=1e-5)  # where they are asked for, whatever a scene's offset
     assert torch.allclose(buffer[[8, 6], 1], poses[0, :, 1] + 10)  # the third env stands 10 m aside

@@ -48,7 +48,7 @@ def test_it_is_opened_from_the_configured_share_on(name):
         qpos = furniture.get_qpos()
         qpos[:, index] = factor * share * max(base.model.opened_joint.limits, key=abs)
         furniture.set_qpos(qpos)
-        assert bool(base.task_stages()["furniture_opened"][0]) is opened
+        assert bool(base.furniture_opened()[0]) is opened
     env.close()
 
 
@@ -184,7 +184,7 @@ def test_a_pull_opens_by_contact_and_leaves_the_handle(tmp_path):
         assert set(touched) == {part.handle.link}  # and nothing else in the scene
         assert touched[part.handle.link] < 0.002
         assert part.position(arm) == pytest.approx(0.95 * part.end, abs=0.01)
-        assert bool(arm.env.task_stages()["furniture_opened"][0])
+        assert bool(arm.env.furniture_opened()[0])
         # the gripper is open and off the handle
         bar = part.in_base(arm, np.array([part.position(arm)]))[0] @ part.hold
         assert (np.linalg.inv(bar) @ arm.scene.tcp_in_base)[2, 3] < -0.05

@@ -70,7 +70,7 @@ def test_what_follows_is_what_followed(env):
 def test_stages_come_back_too(env):
     base = env.unwrapped
     env.reset(seed=0)
-    base._reached[0, 0] = True
+    base.success_check.reached[0, 0] = True
     kept = base.get_state_dict()
     env.reset(seed=0)
     assert not base.evaluate()[base.STAGES[0]]

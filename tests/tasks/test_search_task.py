@@ -13,7 +13,7 @@ import robocas_ms3.tasks  # noqa: F401
 from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.tasks import occlusion
-from robocas_ms3.tasks.search import LOOKS_PER_SECOND
+from robocas_ms3.tasks.search import MEASUREMENTS_PER_SECOND
 
 pytestmark = pytest.mark.slow
 
@@ -31,7 +31,7 @@ def env():
 def hold(env) -> bool:
     """Step until the heap has been looked at again, with the arm held still; give `obstacles_cleared`."""
     qpos = env.unwrapped.agent.robot.get_qpos()[0, 3:10].numpy()
-    for _ in range(env.unwrapped.control_freq // LOOKS_PER_SECOND):
+    for _ in range(env.unwrapped.control_freq // MEASUREMENTS_PER_SECOND):
         *_, info = env.step(np.append(qpos, 1.0).astype(np.float32))
     return bool(info["obstacles_cleared"][0])
 
@@ -125,7 +125,7 @@ def test_a_restored_heap_is_looked_at_at_once(env):
 def test_a_target_that_was_pulled_out_has_not_been_cleared(env):
     env.reset(seed=covered_seed(env))
     base = env.unwrapped
-    base._stages["target_grasped"][:] = True  # and let go of since: dragged out, not cleared
+    base.success_check.stages["target_grasped"][:] = True  # and let go of since: dragged out, not cleared
     take_away_the_others(base)
     assert not hold(env)
 

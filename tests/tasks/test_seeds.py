@@ -13,25 +13,23 @@ from robocas_ms3 import tasks
 from robocas_ms3.core.errors import ConfigError, LayoutError, RobocasError
 from robocas_ms3.scenes import source
 from robocas_ms3.scenes.config import load_task_config
-from robocas_ms3.tasks.seeds import SEVERAL_ENVS_SEEDS, SeededEnv
+from robocas_ms3.tasks.base import RoboCASEnv
+from robocas_ms3.tasks.seeds import SEVERAL_ENVS_SEEDS, EpisodeSeeds
 
 STATE_ONLY = {"render_backend": "none", "control_mode": "pd_joint_pos", "obs_mode": "none"}
 
 
-class FourEnvs(SeededEnv):
+class FourEnvs(RoboCASEnv):
     """Four envs' seeds and layouts, and nothing else of an environment."""
 
-    def __init__(self, seed_range=None, layouts=None) -> None:
+    def __init__(self, seed_range=None) -> None:
         self.num_envs, self._enhanced_determinism, self._batched_rng_backend = 4, False, "numpy:random_state"
-        self._resets_seeded, self._seed_range, self._made = True, seed_range, True
-        self._layouts, self._failed, self._other_seeds, self._found, self._own = layouts, {}, 2, {}, {}
-        self._table = self._tabled = None
-        self._layout_seeds, self._objects_seeds = np.zeros(4, dtype=np.int64), np.zeros(4, dtype=np.int64)
         self._episode_seed, self._batched_episode_rng = None, None
+        self.seeds = EpisodeSeeds(self, 4, Mock(), seed_range=seed_range, objects_stay=True)
+        self.seeds.first_reset = False
 
     def seed(self, seeds, envs=(0, 1, 2, 3)) -> None:
-        self._resets_seeded = seeds is not None
-        self._set_episode_rng(seeds, torch.tensor(envs))
+        self.seeds.reset(lambda seeds: self._set_episode_rng(seeds, torch.tensor(envs)), seeds, envs)
 
 
 def states(env: FourEnvs) -> list[tuple]:
@@ -43,35 +41,35 @@ def states(env: FourEnvs) -> list[tuple]:
 def test_every_env_has_the_layout_of_its_seed():
     env = FourEnvs()
     env.seed([7, 8, 9, 10])
-    assert env._layout_seeds.tolist() == [7, 8, 9, 10]
+    assert env.seeds.layout_seeds.tolist() == [7, 8, 9, 10]
 
 
 @pytest.mark.parametrize("seeds", [[20, 21], None])
 def test_a_partial_reset_leaves_the_other_envs_alone(seeds):
     env = FourEnvs()
     env.seed([7, 8, 9, 10])
-    before, layouts = states(env), env._layout_seeds.copy()
+    before, layouts = states(env), env.seeds.layout_seeds.copy()
     env.seed(seeds, envs=(1, 3))
     after = states(env)
     for other in (0, 2):
         assert after[other] == before[other]
-        assert env._layout_seeds[other] == layouts[other]
+        assert env.seeds.layout_seeds[other] == layouts[other]
         assert env._episode_seed[other] == layouts[other]
     for reset in (1, 3):
         assert after[reset] != before[reset]
-        assert env._layout_seeds[reset] != layouts[reset]
+        assert env.seeds.layout_seeds[reset] != layouts[reset]
     if seeds:
-        assert env._layout_seeds[[1, 3]].tolist() == seeds
+        assert env.seeds.layout_seeds[[1, 3]].tolist() == seeds
 
 
 def test_unseeded_resets_draw_from_the_given_range():
     env = FourEnvs(seed_range=(100, 109))
     env.seed([7, 8, 9, 10])  # asked for: taken as they are
-    assert env._layout_seeds.tolist() == [7, 8, 9, 10]
+    assert env.seeds.layout_seeds.tolist() == [7, 8, 9, 10]
     seen = set()
     for _ in range(30):
         env.seed(None)
-        seen |= set(env._layout_seeds.tolist())
+        seen |= set(env.seeds.layout_seeds.tolist())
     assert seen == set(range(100, 110))
 
 
@@ -82,19 +80,19 @@ def test_an_unseeded_reset_of_one_env_draws_its_episode_seed_from_the_range():
     seen = set()
     for _ in range(8):
         env.reset()
-        assert env.unwrapped._episode_seed.tolist() == env.unwrapped._layout_seeds.tolist()
+        assert env.unwrapped._episode_seed.tolist() == env.unwrapped.seeds.layout_seeds.tolist()
         seen |= set(env.unwrapped._episode_seed.tolist())
     assert seen == {3, 4}
     env.close()
 
 
 def test_a_range_that_is_none():
-    with pytest.raises(ConfigError, match="seeds are a range"):
+    with pytest.raises(ConfigError, match="invalid range of seeds"):
         gym.make("RoboCASPick-v1", seeds=(4, 3), **STATE_ONLY)
 
 
 def test_one_seed_for_several_envs_is_the_first_ones_and_the_others_follow_within_the_range(monkeypatch):
-    monkeypatch.setattr(tasks.scene, "layout_bank", lambda model, folder: Thing)
+    monkeypatch.setattr(tasks.base, "layout_bank", lambda model, folder: Thing)
     env, asked = several(None, monkeypatch, seeds=(10, 13))
     env.reset(seed=12)
     assert [seed for _, seed in asked[-1]] == [12, 13, 10, 11]
@@ -112,7 +110,7 @@ def test_only_the_seed_that_was_asked_for_must_have_a_layout(monkeypatch):
             raise LayoutError("none", where="layout")
         return Thing(objects, seed)
 
-    monkeypatch.setattr(tasks.scene, "layout_bank", lambda model, folder: layouts)
+    monkeypatch.setattr(tasks.base, "layout_bank", lambda model, folder: layouts)
     env, asked = several(None, monkeypatch, seeds=(10, 13))
     env.reset(seed=10)
     drawn = [seed for _, seed in asked[-1]]
@@ -133,10 +131,10 @@ def test_states_are_no_way_to_reset():
 
 def test_several_envs_draw_from_a_range_without_being_told_and_beyond_it_share_objects(monkeypatch):
     low, high = SEVERAL_ENVS_SEEDS
-    monkeypatch.setattr(tasks.scene, "layout_bank", lambda model, folder: Thing)
+    monkeypatch.setattr(tasks.base, "layout_bank", lambda model, folder: Thing)
     env, asked = several(None, monkeypatch, num_envs=high - low + 3)
     assert asked[0] == [(i, i) for i in [*range(low, high + 1), low, low + 1]]
-    assert env._object_ids[0] == env._object_ids[high - low + 1] != env._object_ids[1]
+    assert env.seeds.object_ids[0] == env.seeds.object_ids[high - low + 1] != env.seeds.object_ids[1]
     env.reset()
     assert all(low <= seed <= high for _, seed in asked[-1])
     env.reset(list(range(1000, 1000 + env.num_envs)))
@@ -159,7 +157,7 @@ def without(*pairs):
 def test_an_unseeded_reset_goes_on_to_a_seed_that_has_a_layout(monkeypatch, caplog):
     bad = [(objects, seed) for objects in (1, 2) for seed in range(100) if seed % 2 and seed != objects]
     source, asked = without(*bad)
-    monkeypatch.setattr(tasks.scene, "layout_bank", lambda model, folder: source)
+    monkeypatch.setattr(tasks.base, "layout_bank", lambda model, folder: source)
     env, chosen = several(None, monkeypatch)
     for _ in range(30):
         env.reset()
@@ -175,7 +173,7 @@ def test_an_unseeded_reset_goes_on_to_a_seed_that_has_a_layout(monkeypatch, capl
 
 def test_that_there_is_no_layout_at_all_is_said_soon(monkeypatch):
     source, asked = without(*((seed, seed) for seed in range(100)))
-    monkeypatch.setattr(tasks.scene, "layout_bank", lambda model, folder: source)
+    monkeypatch.setattr(tasks.base, "layout_bank", lambda model, folder: source)
     with pytest.raises(LayoutError, match="no object qualifies"):
         several(None, monkeypatch)
     assert len(asked) <= 3
@@ -197,7 +195,7 @@ def test_one_env_starts_over_with_another_seed_unless_it_was_asked_for(monkeypat
     env.reset()
     base = env.unwrapped
     assert len(failed) == 2 and base._episode_seed[0] not in failed
-    assert base._episode_seed[0] == base._objects_seeds[0] == base._layout_seeds[0]
+    assert base._episode_seed[0] == base.seeds.objects_seeds[0] == base.seeds.layout_seeds[0]
     with pytest.raises(LayoutError):
         env.reset(seed=5)
     env.reset(seed=6)
@@ -209,10 +207,10 @@ def test_a_refused_reset_leaves_the_only_env_as_it_was(monkeypatch):
     base = env.unwrapped
     env.reset(seed=3)
     before, said, state = base.layout().object_poses, base.get_language_instruction(), env.unwrapped.get_state()
-    monkeypatch.setattr(base, "_layouts", Mock(side_effect=LayoutError("no object qualifies as the target")))
+    monkeypatch.setattr(base.seeds, "layouts", Mock(side_effect=LayoutError("no object qualifies as the target")))
     with pytest.raises(LayoutError):
         env.reset(seed=5)
-    assert base._layout_seeds.tolist() == [3]
+    assert base.seeds.layout_seeds.tolist() == [3]
     np.testing.assert_array_equal(base.layout().object_poses, before)
     assert base.get_language_instruction() == said
     assert torch.equal(base.get_state(), state)

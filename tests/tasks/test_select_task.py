@@ -107,7 +107,7 @@ def test_the_wrong_instance_in_the_basket_spoils_it():
         base.objects[slot].set_pose(Pose.create_from_pq(inside, base.objects[slot].pose.q))
 
     put(target)
-    base._stages["target_lifted"][:] = True
+    base.success_check.stages["target_lifted"][:] = True
     for actor in base.objects:
         actor.set_linear_velocity(torch.zeros(1, 3))
     assert bool(base.evaluate()["success"][0])

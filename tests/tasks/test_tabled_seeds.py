@@ -50,8 +50,7 @@ def test_several_envs_reset_from_a_table_built_for_them(tabled, monkeypatch):
     env, asked = several(tabled, monkeypatch, seeds=(0, 1))
     everyone = np.arange(4)
     one_by_one = Starts.of([env.layout(i) for i in range(4)], "cpu")
-    assert_same(env._find_starts(everyone), one_by_one)
-    assert not env._found  # read when they are asked for
+    assert_same(env.seeds.find_starts(everyone), one_by_one)
     assert asked == [[(0, 0), (1, 1), (0, 0), (1, 1)]]
     for _ in range(20):
         env.reset()
@@ -59,41 +58,41 @@ def test_several_envs_reset_from_a_table_built_for_them(tabled, monkeypatch):
     assert all([objects for objects, _ in one] == [0, 1, 0, 1] for one in asked)
     env.reset(options={"env_idx": torch.tensor([2])})
     assert [objects for objects, _ in asked[-1]] == [0]
-    assert_same(env._find_starts(np.array([2])), Starts.of([env.layout(2)], "cpu"))
-    assert env.layouts[0].object_ids == env._object_ids[2] == env._object_ids[0] != env._object_ids[1]
+    assert_same(env.seeds.find_starts(np.array([2])), Starts.of([env.layout(2)], "cpu"))
+    assert env.layouts[0].object_ids == env.seeds.object_ids[2] == env.seeds.object_ids[0] != env.seeds.object_ids[1]
 
 
 def test_what_moves_where_it_would_run_is_drawn_no_more_and_an_error_where_it_is_asked_for(tabled, monkeypatch):
     env, _ = several(tabled, monkeypatch, num_envs=2, seeds=(0, 2))
-    layouts: Any = env._layouts
+    layouts: Any = env.seeds.layouts
     layouts.mark_table("gpu", {(0, 1): State.MOVES, (1, 1): State.MOVES, (1, 2): State.STAYS})
     env, _ = several(tabled, monkeypatch, num_envs=2, seeds=(0, 2))
-    assert env._objects_seeds.tolist() == [0, 1]  # env 1 keeps its objects, and begins with another layout of them
+    assert env.seeds.objects_seeds.tolist() == [0, 1]  # env 1 keeps its objects, and begins with another layout of them
     for _ in range(20):
         env.reset()
-        assert env._find_starts(np.arange(2)).targets.shape == (2,)
-        assert 1 not in env._layout_seeds
+        assert env.seeds.find_starts(np.arange(2)).targets.shape == (2,)
+        assert 1 not in env.seeds.layout_seeds
     with pytest.raises(LayoutError, match="objects seed 0, seed 1: objects move as soon as this engine runs"):
         env.reset(seed=[1, 0])
 
 
 def test_many_layouts_may_move_and_all_of_some_objects(tabled, monkeypatch, caplog):
     env, _ = several(tabled, monkeypatch, num_envs=2, seeds=(0, 2))
-    layouts: Any = env._layouts
+    layouts: Any = env.seeds.layouts
     layouts.mark_table("gpu", {pair: State.MOVES for pair in [(0, 0), (0, 2), (1, 0), (1, 1), (1, 2)]})
     for _ in range(10):
         env, _ = several(tabled, monkeypatch, num_envs=2, seeds=(0, 1))
-        assert env._objects_seeds.tolist() == [0, 0]
+        assert env.seeds.objects_seeds.tolist() == [0, 0]
         for _ in range(10):
             env._set_episode_rng(None, torch.tensor([0, 1]))
-            assert env._find_starts(np.arange(2)).targets.shape == (2,)
-            assert env._layout_seeds.tolist() == [1, 1]
+            assert env.seeds.find_starts(np.arange(2)).targets.shape == (2,)
+            assert env.seeds.layout_seeds.tolist() == [1, 1]
     assert not [record for record in caplog.records if record.levelname == "WARNING"]
 
 
 def test_a_reset_that_is_refused_leaves_the_envs_as_they_were(tabled, monkeypatch):
     env, _ = several(tabled, monkeypatch, num_envs=2, seeds=(0, 2))
-    layouts: Any = env._layouts
+    layouts: Any = env.seeds.layouts
     layouts.mark_table("gpu", {(0, 1): State.MOVES})
     env, _ = several(tabled, monkeypatch, num_envs=2, seeds=(0, 2))
     env.reset(seed=[2, 0])
@@ -101,7 +100,7 @@ def test_a_reset_that_is_refused_leaves_the_envs_as_they_were(tabled, monkeypatc
     for _ in range(3):
         with pytest.raises(LayoutError):
             env.reset(seed=[1, 2])
-    assert env._layout_seeds.tolist() == [2, 0]
+    assert env.seeds.layout_seeds.tolist() == [2, 0]
     np.testing.assert_array_equal([env.layout(i).object_poses for i in range(2)], before)
     layouts.mark_table("gpu", {(0, 1): State.STAYS})
     env.reset(options={"reconfigure": True}, seed=[0, 1])
@@ -114,21 +113,21 @@ def test_where_a_table_lacks_layouts_the_bank_makes_them(built, tmp_path, monkey
     table.rename(table.with_name("table-gpu.npy"))
     env, _ = several(tmp_path, monkeypatch, num_envs=2, seeds=(0, 1))
     env.reset(seed=[1, 7])
-    assert env._table is not None
-    assert env._table.state((1, 7)) == State.LACKING
-    found = env._find_starts(np.array([0, 1]))
-    assert_same(found, Starts.of([env._layouts(0, 1), env._layouts(1, 7)], "cpu"))
+    assert env.seeds.table is not None
+    assert env.seeds.table.state((1, 7)) == State.LACKING
+    found = env.seeds.find_starts(np.array([0, 1]))
+    assert_same(found, Starts.of([env.seeds.layouts(0, 1), env.seeds.layouts(1, 7)], "cpu"))
 
 
 def test_one_env_that_keeps_its_objects_resets_from_a_table(built, monkeypatch):
     monkeypatch.setattr(source, "sample_layout", None)
     made = gym.make("RoboCASPick-v1", layouts=built, reconfiguration_freq=0, seeds=(0, 2), **STATE_ONLY)
     env: Any = made.unwrapped
-    assert env._tabled is not None
-    monkeypatch.setattr(env._tabled, "gather", gather := Mock(wraps=env._tabled.gather))
+    assert env.seeds.tabled is not None
+    monkeypatch.setattr(env.seeds.tabled, "gather", gather := Mock(wraps=env.seeds.tabled.gather))
     for seed in (2, 0):
         made.reset(seed=seed)
-        wanted = bank.read_layout(env._layouts.path(env._objects_seeds[0], seed))
+        wanted = bank.read_layout(env.seeds.layouts.path(env.seeds.objects_seeds[0], seed))
         torch.testing.assert_close(env.object_poses, Starts.of([wanted], "cpu").object_poses, atol=1e-6, rtol=0)
         assert int(env.target_slot) == wanted.target
     assert gather.call_count == 2

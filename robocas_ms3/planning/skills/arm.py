@@ -15,7 +15,7 @@ from robocas_ms3.planning.protocol import Array, Planner, Trajectory
 from robocas_ms3.planning.reachability import Reachability
 from robocas_ms3.planning.scene import PlanningScene
 from robocas_ms3.robots.description import RobotDescription
-from robocas_ms3.tasks.transfer import TransferEnv
+from robocas_ms3.tasks.base import RoboCASEnv
 
 T = TypeVar("T")
 OPEN_SECONDS, CLOSE_SECONDS = 0.50, 0.50  # a dataset at 5 Hz may give either command 0.2 s later
@@ -82,7 +82,7 @@ class Arm:
         self.choose(range(TRIES), lambda _: 0.0)
 
     @property
-    def env(self) -> TransferEnv:
+    def env(self) -> RoboCASEnv:
         """The environment under its wrappers: control mode ``pd_joint_pos``, one env."""
         return self.executor.base_env
 

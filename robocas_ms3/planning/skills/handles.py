@@ -20,6 +20,7 @@ from robocas_ms3.planning.skills.retreating import plan_step_back
 from robocas_ms3.planning.timing import through, timed
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.scenes.grasping import HALF_TURN
+from robocas_ms3.tasks.open_pick import RoboCASOpenPickEnv
 
 PULLS = 3  # with a new hold each, where one doesn't open far enough
 COMFORT = 0.15  # of the way from where it counts as opened to where a pull ends at most
@@ -55,9 +56,16 @@ def open_part(arm: Arm) -> None:
     part = Part.of(arm)
     for _ in range(PULLS):
         pull(arm, part)
-        if arm.env.task_stages()["furniture_opened"][0]:
+        if is_opened(arm):
             return
     raise PlanningFailed("pull", "not_far_enough")
+
+
+def is_opened(arm: Arm) -> bool:
+    """Return whether the task's door or drawer is open far enough now."""
+    env = arm.env
+    assert isinstance(env, RoboCASOpenPickEnv)
+    return bool(env.furniture_opened()[0])
 
 
 def pull(arm: Arm, part: Part) -> None:

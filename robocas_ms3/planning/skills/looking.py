@@ -99,7 +99,7 @@ def _shift(arm: Arm) -> Array:
         return np.eye(4)
     # numbered as in the environment's `_setup_sensors`
     number = sorted(config.uid for config in arm.env.agent._sensor_configs).index(CAMERA)
-    return draw_camera_shift(by, number, arm.env._scene_seeds[0])
+    return draw_camera_shift(by, number, arm.env.scene_seeds[0])
 
 
 def _camera_config(arm: Arm) -> CameraConfig:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from robocas_ms3.planning.skills.arm import Arm
+from robocas_ms3.planning.skills.handles import is_opened
 from robocas_ms3.planning.skills.stance import open_from_reach
 from robocas_ms3.planning.solvers import pick
 from robocas_ms3.scenes.language.templates import subgoal
@@ -14,7 +15,7 @@ def attempt(arm: Arm) -> None:
     Raises:
         PlanningFailed: with the stage that could not be done.
     """
-    if not arm.env.task_stages()["furniture_opened"][0]:
+    if not is_opened(arm):
         words = arm.env.target_asset().asset.name, arm.env.task_config.support
         arm.executor.label(**subgoal("operate the target", *words))
         open_from_reach(arm)

@@ -24,6 +24,7 @@ from robocas_ms3.core.exits import end_process
 from robocas_ms3.core.remote_errors import RemoteError
 from robocas_ms3.core.words import escape_log_lines, escape_tracebacks
 from robocas_ms3.core.workers import use_one_torch_thread
+from robocas_ms3.tasks.base import RoboCASEnv
 from robocas_ms3.tasks.vector.block import Block, Field, Path, leaves, space_fields
 from robocas_ms3.tasks.vector.handle import LEAVE, NUMBER, STEP, name_envs
 from robocas_ms3.tasks.vector.messages import Call, EnvDescription, Order, Reset, Row, Share
@@ -120,9 +121,9 @@ class _Worker:
         if env > 0:  # ManiSkill makes each with the first one's seed
             base._set_main_rng([FIRST_SEED + env])
             if base.reconfiguration_freq == 0:  # its scene stays
-                base._made = False  # nobody asked for this seed either: `SeededEnv`
+                if isinstance(base, RoboCASEnv):
+                    base.seeds.first_reset = True  # nobody asked for this seed either
                 base.reset(seed=[FIRST_SEED + env], options={"reconfigure": True})
-                base._made = True
         for wrap in order.wrappers:
             made = self.envs[env] = wrap(made)
 

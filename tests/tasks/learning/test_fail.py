@@ -39,7 +39,7 @@ def test_a_basket_below_the_support_is_no_pit():
     env.reset(seed=0)
     base: Any = env.unwrapped
     inside = base.basket_pose[0, :3]
-    assert inside[2] < base._surface - 0.1  # it stands on the floor
+    assert inside[2] < base.success_check.surface - 0.1  # it stands on the floor
     for height, failed in ((0.0, False), (0.3, False)):  # in it; on its way down
         put(target_of(base), inside + torch.tensor([0.1, 0, height]))
         assert bool(base.get_info()["fail"]) is failed

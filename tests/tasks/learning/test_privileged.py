@@ -12,9 +12,9 @@ from learning_envs import STATE_ONLY, held_still, put, reward_now, target_of
 
 import robocas_ms3  # noqa: F401
 from robocas_ms3.core.arrays import as_tensor
-from robocas_ms3.tasks import TASKS, goals, learning, open_pick, search
+from robocas_ms3.tasks import TASKS, dense, goals, observations, open_pick, search
 from robocas_ms3.tasks import base as tasks_base
-from robocas_ms3.tasks.transfer import Moment
+from robocas_ms3.tasks.goals import Moment
 
 
 def test_observations_are_seen_from_the_tcp(env):
@@ -55,7 +55,7 @@ def test_tasks_add_what_is_theirs(env_id, names):
     else:
         assert obs["extra"]["opened_share"].item() == pytest.approx(0, abs=1e-3)
         furniture, joint = base._opening
-        handle = base._handle_in_world()[0].copy()
+        handle = base.handle_in_world()[0].copy()
         shut = reward_now(base)
         qpos = furniture.get_qpos().clone()
         qpos[:, joint] = base.model.opened_position / 2
@@ -63,7 +63,7 @@ def test_tasks_add_what_is_theirs(env_id, names):
         half = reward_now(base)
         assert (shut[1]["open"], half[1]["open"]) == pytest.approx((0, 0.5), abs=1e-3)
         assert half[0] > shut[0]
-        assert np.linalg.norm(base._handle_in_world()[0] - handle) > 0.1  # it moves with the door
+        assert np.linalg.norm(base.handle_in_world()[0] - handle) > 0.1  # it moves with the door
         qpos[:, joint] = base.model.opened_position * 1.01
         furniture.set_qpos(qpos)
         assert reward_now(base)[0] > 4 / 14
@@ -79,15 +79,15 @@ def test_tensors_as_on_a_gpu_give_what_arrays_give(task, monkeypatch):
     env.step(action[0].numpy())
     action = action + 0.1
     info = base.get_info()
-    expected, seen = base.compute_dense_reward({}, action, info), base._privileged()
-    for module in (tasks_base, goals, learning, search, open_pick):
+    expected, seen = base.compute_dense_reward({}, action, info), base.privileged_observations()
+    for module in (tasks_base, dense, goals, observations, search, open_pick):
         monkeypatch.setattr(module, "native", lambda tensor: tensor)
-    base._moment = Moment(*map(as_tensor, base._moment))
+    base.success_check.moment = Moment(*map(as_tensor, base.success_check.moment))
     again = {name: value for name, value in info.items() if name != "reward_terms"}
     assert torch.allclose(base.compute_dense_reward({}, action, again), expected, atol=1e-6)
     for name, term in again["reward_terms"].items():
         assert (type(term), term.dtype) == (torch.Tensor, torch.float32)
         assert torch.allclose(term, info["reward_terms"][name], atol=1e-6)
-    for name, value in base._privileged().items():
+    for name, value in base.privileged_observations().items():
         assert torch.allclose(value, seen[name], atol=1e-6)
     env.close()

@@ -20,7 +20,7 @@ def test_sparse_stays_the_default_and_costs_nothing_else():
     env.reset(seed=0)
     *_, info = env.step(held_still(env))
     assert "reward_terms" not in info
-    assert env.unwrapped._last_action is None
+    assert env.unwrapped.dense_reward.last_action is None
     env.close()
 
 
@@ -59,7 +59,7 @@ def test_progress_sums_up_to_the_way_gone_and_swaying_earns_nothing():
         action[1] += 0.5 * np.sin(2 * np.pi * min(k, 60) / 20)  # three times towards the table and back
         _, reward, *_, info = env.step(action)
         rewards.append(reward.item())
-        levels.append(base._last_level.item())
+        levels.append(base.dense_reward.last_level.item())
     assert rewards[0] == 0
     assert np.sum(rewards) == pytest.approx(levels[-1] - levels[0], abs=1e-5)
     assert np.ptp(levels) > 0.004  # it did come and go
@@ -100,7 +100,7 @@ def test_a_target_thrown_into_the_basket_unlifted_earns_no_more_than_reaching(en
 def test_success_is_exactly_one_and_a_shifted_basket_keeps_it_below(env):
     env.reset(seed=0)
     base = env.unwrapped
-    base._stages["target_lifted"][:] = True
+    base.success_check.stages["target_lifted"][:] = True
     put(target_of(base), base.basket_pose[0, :3] + torch.tensor([0, 0, 0.02]))
     assert reward_now(base)[0] == 1.0
     basket, target = base.fixtures.basket, target_of(base)
@@ -118,7 +118,7 @@ def test_a_tipped_basket_is_not_above_what_lies_beside_it(env):
     base = env.unwrapped
     basket, target, at = base.fixtures.basket, target_of(base), base.basket_pose[0, :3].clone()
     height = target.pose.p[0, 2]
-    base._stages["target_lifted"][:] = True
+    base.success_check.stages["target_lifted"][:] = True
     for axis in range(1, 3):
         for way in (-1, 1):
             turned = torch.zeros(1, 4)

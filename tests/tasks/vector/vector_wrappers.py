@@ -70,14 +70,14 @@ class LacksLayouts(gym.Wrapper):
     def __init__(self, env):
         super().__init__(env)
         self.times = 0
-        base, layouts = env.unwrapped, env.unwrapped._layouts
+        base, layouts = env.unwrapped, env.unwrapped.seeds.layouts
 
         def fussy(objects, seed):
             if seed == 5:
                 raise LayoutError("no object qualifies as the target", where="layout")
             return layouts(objects, seed)
 
-        base._layouts = fussy
+        base.seeds.layouts = fussy
 
     def reset(self, *, seed=None, options=None):
         if seed is None and self.unwrapped._main_seed[0] == options.get("draws_none_after"):

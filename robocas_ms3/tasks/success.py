@@ -1,0 +1,179 @@
+"""Stages, success and failure of the envs: what `RoboCASEnv.evaluate` returns, but for what single tasks add."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import reduce
+from operator import and_
+from typing import Any
+
+import torch
+from mani_skill.utils.structs import Articulation
+
+from robocas_ms3.assets.manifest import BODY
+from robocas_ms3.core.arrays import as_tensor, count_up, native, none
+from robocas_ms3.tasks import terms
+from robocas_ms3.tasks.bodies import link_poses
+from robocas_ms3.tasks.goals import Moment
+
+
+class SuccessCheck:
+    """Checks stages, success and failure of all envs, and keeps the stages reached since the reset.
+
+    On a CPU, the last result is returned again while nothing has moved or touches the gripper.
+
+    Args:
+        env: the `base.RoboCASEnv`, whose scene is loaded.
+        stages: names, in the order of the recorded states.
+
+    Attributes:
+        reached: (stages, N) bool.
+        stages: its rows by name; views.
+        moment: what the last check found; the same object as before where nothing has changed since.
+        surface: height of what objects stand on, m.
+        fallen_below: height below which an object counts as fallen off it, m.
+    """
+
+    moment: Moment
+
+    def __init__(self, env: Any, stages: Sequence[str]) -> None:
+        self._env = env
+        self.reached = torch.zeros(len(stages), env.num_envs, dtype=torch.bool, device=env.device)
+        self.stages = dict(zip(stages, self.reached, strict=True))
+        self._last: tuple[object, dict[str, torch.Tensor]] | None = None
+        shut = env.model.support_motion(opened=False)
+        self._support_shut = torch.as_tensor(shut, dtype=torch.float32, device=env.device)
+        self._sideways = torch.tensor([[0.0, 1.0, 0.0]], device=env.device)
+        self.surface = float(env.model.support_pose[2, 3]) + env.model.region.z
+        self.fallen_below = self.surface - terms.FALLEN
+
+    def reset(self, envs: torch.Tensor) -> None:
+        """Forget the stages of some envs (E,)."""
+        self.reached[:, envs] = False
+        self._last = None
+
+    def restore(self, reached: Any, envs: Any) -> None:
+        """Set the stages (E, stages) of some envs; None leaves them as they are."""
+        if reached is not None:
+            reached = torch.as_tensor(reached, dtype=torch.bool, device=self.reached.device)
+            self.reached[:, envs] = reached.reshape(-1, len(self.reached)).T
+        self._last = None
+
+    def reach(self, stage: str, now: Any) -> torch.Tensor:
+        """Note which envs are at a stage now, (N,) bool, native (`arrays`); return which have reached it, (N,) bool."""
+        row = native(self.stages[stage])
+        row |= now
+        return self.stages[stage].clone()
+
+    def check(self) -> dict[str, torch.Tensor]:
+        """Return stages, ``success`` and ``fail`` (N,) bool and ``disturbed`` (N,) int; don't write to them."""
+        env = self._env
+        state = env.bodies.read()
+        forces = env.gripper_contacts.forces(env.bodies.others)
+        depends_on = self._dependencies(forces)
+        if self._last is not None and depends_on is not None and self._last[0] == depends_on:
+            return dict(self._last[1])
+        # right after a reset the engine still reports the contacts of before
+        forces = forces * native(env.elapsed_steps > 0)[:, None, None, None]
+        found = self._check(forces, *self._objects_and_basket(state))
+        self._last = self._dependencies(forces), found
+        return dict(found)
+
+    def _dependencies(self, forces: Any) -> object:
+        """Return what the next result depends on, on a CPU while nothing touches the gripper; None: unknown."""
+        others = self._env.bodies.others
+        return None if others is None or forces.any() else (others, native(self.reached).tobytes())
+
+    def _check(self, forces: Any, objects: Any, basket: Any) -> dict[str, torch.Tensor]:
+        """Check from forces (N, 3, K, 3), states (N, K, 13) and the basket's pose (N, 7) or None, all native."""
+        env = self._env
+        slot, goal = native(env.target_slot), env.goal
+        grasped, touched = self.grasped(forces), terms.touched(forces)
+        lifted = terms.lifted(objects[..., 2], native(env.start_poses)[..., 2], grasped)
+        measures = self._measures(touched, objects, basket)
+        held = terms.of_target(grasped, slot)
+        now = {
+            "reached_any": touched.any(1),
+            "picked_any": lifted.any(1),
+            "reached_target": terms.of_target(touched, slot),
+            "target_grasped": held,
+            "target_lifted": terms.of_target(lifted, slot),
+            f"target_{goal.NAME}": measures[goal.NAME],
+        }
+        for stage, flags in now.items():
+            if stage in self.stages:
+                self.reach(stage, flags)
+        success = reduce(and_, measures.values())
+        if goal.LIFTS:
+            success = native(self.stages["target_lifted"]) & success
+        fail = self._has_failed(measures, objects, basket)
+        stages = dict(zip(self.stages, self.reached.clone(), strict=True))
+        disturbed = self._disturbed(objects[..., :7])
+        self.moment = Moment(objects, basket, held, now["reached_target"], measures[goal.NAME], disturbed, forces)
+        flags = {"success": as_tensor(success), "fail": as_tensor(fail)}
+        return {**stages, **flags, "disturbed": as_tensor(disturbed.sum(1))}
+
+    def grasped(self, forces: Any) -> Any:
+        """Return which objects (N, K) both fingers hold, from forces (N, 3, K, 3) N on the gripper; native."""
+        pressed = terms.pressed(forces[:, 0], forces[:, 1])
+        if none(pressed):  # as most of the time: no need to ask in which direction
+            return pressed
+        finger = native(link_poses(self._env.scene, [self._env.agent.finger1_link]))[:, 0]
+        # the left finger opens along its own +y
+        opening = terms.rotate(finger[:, 3:], native(self._sideways))
+        return terms.finger_grasps(forces[:, 0], forces[:, 1], opening)
+
+    def measures(self) -> dict[str, torch.Tensor]:
+        """Return what has to hold at the same moment for success, besides the lift: (N,) bool each."""
+        touched = terms.touched(self._env.gripper_contacts.forces())
+        found = self._measures(touched, *self._objects_and_basket(self._env.bodies.read()))
+        return {name: as_tensor(measure) for name, measure in found.items()}
+
+    def _objects_and_basket(self, state: torch.Tensor) -> tuple[Any, Any]:
+        """States of the objects (N, K, 13) and pose of the basket (N, 7) or None, native, from that of all bodies."""
+        basket = self._env.bodies.basket(state)
+        return native(self._env.bodies.objects(state)), None if basket is None else native(basket)
+
+    def _measures(self, touched: Any, objects: Any, basket: Any) -> dict[str, Any]:
+        """`measures`, native, from which objects the gripper touches (N, K), their states and the basket's pose."""
+        goal, slot = self._env.goal, native(self._env.target_slot)
+        target = terms.of_target(objects, slot)
+        return {
+            goal.NAME: goal.holds(self._env.target_center(objects), basket),
+            "untouched": ~terms.of_target(touched, slot),
+            "at_rest": terms.at_rest(target[:, 7:10], target[:, 10:]),
+            **goal.measures(basket),
+        }
+
+    def fallen(self) -> Any:
+        """Return which other objects (N, K) lay 5 cm below the surface in `moment`, outside of the goal; native.
+
+        The target is carried to the goal, and if it falls, that is ``fail``.
+        """
+        env, objects = self._env, self.moment.objects
+        low = (objects[..., 2] < self.fallen_below) & native(env.present & ~env.is_target)
+        if none(low):  # as nearly always
+            return low
+        return low & ~env.goal.holds(env.centers(objects), self.moment.basket)
+
+    def _has_failed(self, measures: dict[str, Any], objects: Any, basket: Any) -> Any:
+        """(N,) bool of ``fail``, native, from the measures, states (N, K, 13) and the basket's pose."""
+        goal, slot = self._env.goal, native(self._env.target_slot)
+        height = terms.of_target(objects[..., 2], slot)
+        low, lost = height < self.fallen_below, goal.lost(basket, measures)
+        if lost is None and none(low):  # as nearly always
+            return low
+        caught = goal.catches(terms.of_target(objects[..., :3], slot), basket)
+        fell = terms.fell_off(height, self.surface, low & False if caught is None else caught, ~measures["untouched"])
+        return fell if lost is None else fell | lost
+
+    def _disturbed(self, poses: Any) -> Any:
+        """(N, K) bool: which objects other than the target no longer stand as they stood, from poses (N, K, 7)."""
+        env, undo = self._env, None
+        support = env.fixtures.furniture[env.task_config.surface.furniture]
+        if isinstance(support, Articulation) and env.model.support_link:
+            links = [support.links_map[name] for name in (BODY, env.model.support_link)]
+            body, part = native(link_poses(env.scene, links)).swapaxes(0, 1)
+            undo = terms.way_back(body, part, native(self._support_shut))
+        moved = terms.disturbed(poses, native(env.start_poses), undo) & native(env.present)
+        return moved & (count_up(moved.shape[1], moved) != native(env.target_slot)[:, None])
