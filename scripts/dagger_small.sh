@@ -28,7 +28,7 @@ mkdir -p "$out"
 timed "$robocas" generate "$task" --config "${task}_upstream_eval" -n "$episodes" --seed "$seed" --jobs "$jobs" \
     --after-policy "$from/run" --after-steps "${acts[@]}" --out "$out/demos"
 timed "$robocas" convert "$out/demos/trajectory.h5" --out "$out/parts" --size 512 384 --no-depth --no-video \
-    --cameras base_camera gripper_camera --jobs "$jobs" --resume
-timed "$robocas" merge "$from/data" "$out/parts" --out "$out/data" --resume
+    --cameras base_camera gripper_camera --jobs "$jobs"
+timed "$robocas" merge "$from/data" "$out/parts" --out "$out/data"
 timed "$robocas" train small --data "$out/data" --out "$out/run" --start "$from/run" --steps "$steps"
 timed "$robocas" eval "$task" --policy "$out/run" --protocol paper-v1 --out "$out/eval" --envs "$jobs" --resume

@@ -51,9 +51,9 @@ for part in "${parts[@]}"; do
     timed "$robocas" generate "$of" --config "$config" -n "$share" --seed $((seed + offset)) --jobs "$jobs" \
         --max-attempts "$attempts" ${first:+--after-policy "$first" --after-steps 15 50} --out "$out/demos/$name"
     timed "$robocas" convert "$out/demos/$name/trajectory.h5" --out "$out/parts/$name" --size 512 384 --no-depth --no-video \
-        --cameras base_camera gripper_camera --jobs "$jobs" --resume
+        --cameras base_camera gripper_camera --jobs "$jobs"
     data+=("$out/parts/$name")
 done
-timed "$robocas" merge "${data[@]}" --out "$out/data" --resume
+timed "$robocas" merge "${data[@]}" --out "$out/data"
 timed "$robocas" train small --data "$out/data" --out "$out/run" --steps "$steps" ${start:+--start "$start"}
 timed "$robocas" eval "$played" --policy "$out/run" --protocol paper-v1 --out "$out/eval" --envs "$jobs" --resume

@@ -59,9 +59,7 @@ class Convert:
     include_failed: bool = False
     """Also convert episodes without success."""
     overwrite: bool = False
-    """Replace the dataset that is there."""
-    resume: bool = False
-    """Go on with a conversion that was interrupted."""
+    """Start again. Default: continue a conversion with the same settings that was interrupted."""
     append: bool = False
     """Add to the dataset that is there; its episodes keep their numbers."""
     leave_out: bool = False
@@ -85,16 +83,15 @@ def main(cfg: Convert) -> int:
     except KeyboardInterrupt:
         if not cfg.out.is_dir():
             raise
-        how = "the same command" if cfg.append else "--resume" + (" in place of --overwrite" if cfg.overwrite else "")
-        raise KeyboardInterrupt(f"{how} goes on") from None
+        how = "the same command" + (" without --overwrite" if cfg.overwrite else "")
+        raise KeyboardInterrupt(f"{how} continues") from None
 
 
 def _check(cfg: Convert) -> None:
     from robocas_ms3.core.errors import DatasetError
 
-    ways = [flag for flag in ("overwrite", "resume", "append") if getattr(cfg, flag)]
-    if cfg.overwrite and len(ways) > 1:
-        found = " ".join(f"--{flag}" for flag in ways)
+    if cfg.overwrite and cfg.append:
+        found = "--overwrite --append"
         raise DatasetError("these exclude each other", where="convert", expected="one of them", found=found)
     if cfg.all_videos and not cfg.video:
         raise DatasetError(
@@ -152,7 +149,6 @@ def _convert(cfg: Convert) -> int:
         include_failed=cfg.include_failed,
         pack=cfg.pack,
         overwrite=cfg.overwrite,
-        resume=cfg.resume,
         append=cfg.append,
         leave_out=cfg.leave_out,
         embeddings=cfg.embeddings,

@@ -40,9 +40,7 @@ class ImportRobocas:
     json: bool = False
     """Print a machine-readable report."""
     overwrite: bool = False
-    """Replace the dataset that is there."""
-    resume: bool = False
-    """Go on with an import that was interrupted."""
+    """Start again. Default: continue an import of the same inputs that was interrupted."""
 
 
 def main(cfg: ImportRobocas) -> int:
@@ -51,15 +49,15 @@ def main(cfg: ImportRobocas) -> int:
 
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.terminal import say, say_lines
-    from robocas_ms3.core.outputs import claim_output
+    from robocas_ms3.core.outputs import OutputFolder
     from robocas_ms3.core.words import count_of
     from robocas_ms3.datasets.manage.importing import import_robocas
     from robocas_ms3.datasets.manage.survey import survey
-    from robocas_ms3.datasets.writing.output import check_apart
+    from robocas_ms3.datasets.writing.output import DATASET, check_apart
 
     if cfg.out is not None:
         check_apart(cfg.out, [cfg.dataset])
-        claim_output(cfg.out, resume=cfg.resume or cfg.overwrite)  # before minutes of reading
+        OutputFolder(cfg.out, DATASET, overwrite=cfg.overwrite).read()  # before minutes of reading
     embed = None
     if cfg.embeddings:
         from robocas_ms3.scenes.language.embed import TextEmbedder
@@ -80,7 +78,6 @@ def main(cfg: ImportRobocas) -> int:
             link=cfg.link,
             embed=embed,
             overwrite=cfg.overwrite,
-            resume=cfg.resume,
             on_start=shown.start,
             on_episode=shown.advance,
         )

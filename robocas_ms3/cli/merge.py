@@ -24,9 +24,7 @@ class Merge:
     copy: bool = False
     """Copy files instead of hard-linking them."""
     overwrite: bool = False
-    """Replace the dataset that is there."""
-    resume: bool = False
-    """Go on with a merge that was interrupted."""
+    """Start again. Default: continue a merge of the same inputs that was interrupted."""
 
 
 def main(cfg: Merge) -> int:
@@ -43,7 +41,6 @@ def main(cfg: Merge) -> int:
             skip_duplicates=cfg.skip_duplicates,
             link=not cfg.copy,
             overwrite=cfg.overwrite,
-            resume=cfg.resume,
             on_start=shown.start,
             on_episode=shown.advance,
         )

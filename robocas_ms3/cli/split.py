@@ -42,9 +42,7 @@ class Split:
     copy: bool = False
     """Copy files instead of hard-linking them."""
     overwrite: bool = False
-    """Replace datasets that are there."""
-    resume: bool = False
-    """Go on with a split that was interrupted."""
+    """Start again. Default: continue a split of the same inputs that was interrupted."""
 
 
 def main(cfg: Split) -> int:
@@ -69,7 +67,6 @@ def main(cfg: Split) -> int:
             share=share,
             link=not cfg.copy,
             overwrite=cfg.overwrite,
-            resume=cfg.resume,
             on_start=shown.start,
             on_episode=shown.advance,
         )

@@ -42,7 +42,7 @@ class FolderKind:
         key: a key that this command's record has, and the record of no other command.
         marks: other paths inside by which such a folder is known. Without a record it can't be continued, but it may
             be overwritten.
-        upgrade: returns a record of an older version with the keys of today.
+        upgrade: returns a record as its settings are compared, such as one of an older version with defaults.
     """
 
     command: str
@@ -70,7 +70,7 @@ class OutputFolder:
 
     Attributes:
         path: of the folder.
-        recorded: content of the record, upgraded; None: the run starts from nothing.
+        recorded: content of the record; None: the run starts from nothing.
         has_lock: whether the folder is locked: False on a file system without locks.
 
     Raises:
@@ -129,9 +129,8 @@ class OutputFolder:
         if self.recorded is None:
             return
         now = json.loads(json_text(settings, self.path))
-        changes = [
-            change for key, value in now.items() for change in setting_changes(self.recorded.get(key), value, key)
-        ]
+        before = self._kind.upgrade(self.recorded)
+        changes = [change for key, value in now.items() for change in setting_changes(before.get(key), value, key)]
         if changes:
             more = len(changes) - _SHOWN_CHANGES
             found = "; ".join(changes[:_SHOWN_CHANGES]) + (f"; {more} more" if more > 0 else "")
@@ -183,7 +182,7 @@ class OutputFolder:
             if not self._overwrite and self._has_results():
                 what, fix = "there are no recorded settings to continue with", "Pass --overwrite to start again."
                 raise OutputExistsError(what, where=self._record_path(), fix=fix)
-        return None if record is None or self._overwrite or not self._has_results() else self._kind.upgrade(record)
+        return None if self._overwrite or not self._has_results() else record
 
     def _load(self) -> dict[str, Any] | None:
         try:

@@ -117,7 +117,7 @@ def open_result(
     text = json_text({**_BEFORE, **run}, folder / RUN, error=EvaluationError)
     parse_json(_RunRecord, text, EvaluationError, where=folder / RUN, about="this evaluation can't be recorded")
     with OutputFolder(folder, OUTPUT, _settings_of(run), overwrite=overwrite) as output:
-        output.start(run if output.recorded is None else load_json(folder / RUN))
+        output.start(output.recorded or run)
         outcomes = _outcomes(folder)
         if retry_errors and any(one.error for one in outcomes.values()):
             outcomes = {number: one for number, one in outcomes.items() if not one.error}

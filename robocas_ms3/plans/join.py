@@ -231,7 +231,7 @@ def _convert_lerobot(plan: Plan, robocas: Path, out: Path, jobs: int) -> None:
     limits = Limits(plan.limits.render_seconds, plan.limits.memory_gb)
     jobs = min(jobs, os.cpu_count() or 1)  # those of a plan may be a cluster's
     version = plan.lerobot_version
-    convert_lerobot(ConversionSettings(robocas, out, resume=True, jobs=jobs, limits=limits, lerobot_version=version))
+    convert_lerobot(ConversionSettings(robocas, out, jobs=jobs, limits=limits, lerobot_version=version))
 
 
 def _write_statistics(out: Path) -> None:

@@ -31,7 +31,7 @@ from robocas_ms3.evaluation.protocol import load_protocol
 
 pytestmark = pytest.mark.faults
 COMMANDS = ("generate", "convert", "plan run", "eval")
-_CONTINUES = ("generate", "plan run")
+_CONTINUES = ("generate", "convert", "plan run")  # without a flag
 KILLS = int(os.environ.get("ROBOCAS_FAULT_KILLS", "20"))
 SEED = int(os.environ.get("ROBOCAS_FAULT_SEED", "0")) or random.SystemRandom().randrange(10**6)
 PLAN = """\

@@ -39,14 +39,14 @@ def test_a_conversion_leaves_out_what_ends_its_process_twice_and_goes_on_later(b
     made = {"embeddings": False, "open_renderer": RayCaster, "pictures": Pictures(size=(64, 48))}
     convert(ConversionSettings(trajectory, tmp_path / "whole", **made))
     log = befalls(1, "crash", 2)
-    with pytest.raises(IncompleteError, match=r"out: .*\(found episode_0000001: its.*: SIGSEGV\).*--resume") as error:
+    with pytest.raises(IncompleteError, match=r"out: .*\(found episode_0000001: its.*: SIGSEGV\)") as error:
         convert(ConversionSettings(trajectory, tmp_path / "out", jobs=2, limits=Limits(60, 4), **made))
     assert "\n" not in str(error.value)
     assert sorted(key for _, key in begun(log)) == ["0", "1", "1", "2"]
     there = sorted(path.name for path in (tmp_path / "out").iterdir())
     assert there == ["conversion.json", "data_info.json", "episode_0000000", "episode_0000002"]
     assert validate(tmp_path / "out").violations == []
-    convert(ConversionSettings(trajectory, tmp_path / "out", resume=True, **made))
+    convert(ConversionSettings(trajectory, tmp_path / "out", **made))
     assert files_of(tmp_path / "out") == files_of(tmp_path / "whole")
 
 

@@ -6,14 +6,14 @@ from pathlib import Path
 from dying import die_at
 from synthetic import RayCaster
 
-from robocas_ms3.core import files
+from robocas_ms3.core import files, outputs
 from robocas_ms3.datasets.lerobot import assemble, convert, stage, table_writing, video
 from robocas_ms3.datasets.writing.settings import ConversionSettings
 
 PLACES = {  # moment -> (module, name of the function or method's owner and it, which call is the last)
     "frame": (video.Encoder, "add", 50),  # in the second episode
     "part": (files, "_move_in", 2),
-    "plan": (convert, "write_json", 1),
+    "plan": (outputs, "write_json", 1),
     "join": (video.Joiner, "add", 7),
     "table": (table_writing.RollingTable, "add", 4),
     "overview": (assemble, "write_json", 2),

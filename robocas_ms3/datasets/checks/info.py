@@ -23,7 +23,7 @@ RANGE_TOLERANCE = 1e-4
 def read_info(root: Path) -> JsonObject:
     """Read the overview."""
     unfinished = (root / schema.CONVERSION_FILE).is_file()
-    return read_object(root, FILE, missing=NO_FILE + (": not finished, convert with --resume" if unfinished else ""))
+    return read_object(root, FILE, missing=NO_FILE + (": not finished, convert again" if unfinished else ""))
 
 
 def check_info(overview: JsonObject, episodes: Mapping[int, EpisodeContent]) -> Iterator[Violation]:

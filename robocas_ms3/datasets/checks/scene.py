@@ -97,7 +97,7 @@ def check_ledger(settings: Settings, episodes: Mapping[int, EpisodeContent]) -> 
 def _way_back(entry: Any) -> str:
     """How to get a missing episode, where its entry says which recording it is of."""
     file = entry.get("trajectory") if isinstance(entry, dict) else None
-    return f" (convert {file} again with --append or --resume)" if file else ""
+    return f" (convert {file} again, or with --append)" if file else ""
 
 
 def _told_apart(content: EpisodeContent, entry: Mapping[str, Any], rate_hz: float | None) -> Iterator[Violation]:

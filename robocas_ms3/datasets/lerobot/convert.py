@@ -12,15 +12,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from robocas_ms3.core.errors import DatasetError, IncompleteError
-from robocas_ms3.core.files import flush_to_disk, make_folder, naming, remove, write_json
-from robocas_ms3.core.locks import locked_folder
-from robocas_ms3.core.outputs import claim_output, kept_if_begun, sweep, while_there
-from robocas_ms3.datasets.lerobot.plan import PARTS, PLAN, check_resume, only, plan_of
+from robocas_ms3.core.errors import IncompleteError
+from robocas_ms3.core.files import flush_to_disk, make_folder, naming, remove
+from robocas_ms3.core.outputs import OutputFolder, sweep
+from robocas_ms3.datasets.lerobot.plan import OUTPUT, PARTS, check_episodes, only, plan_of
 from robocas_ms3.datasets.lerobot.schema import CONTENT, INFO_FILE, STAGING, Limits, require_extra, whole_rate
 from robocas_ms3.datasets.lerobot.variants import Variant, find_variant
 from robocas_ms3.datasets.writing.inputs import open_input
-from robocas_ms3.datasets.writing.output import check_overwrite
 from robocas_ms3.datasets.writing.settings import Conversion, ConversionSettings, WrittenEpisode
 from robocas_ms3.datasets.writing.workers import WriteJob, write_missing
 
@@ -28,7 +26,7 @@ FILE_LIMITS = Limits()
 """Sizes of files: LeRobot's."""
 _JOINED = ".joined"
 _FOLDERS = (*CONTENT, STAGING, "meta")  # meta comes last: where it is, the dataset is whole
-_FIX = "--resume tries again; with --leave-out too, the others make the dataset where that fails."
+_FIX = "The same command tries again; with --leave-out, the others make the dataset where that fails."
 _log = logging.getLogger(__name__)
 
 
@@ -40,8 +38,8 @@ def convert_lerobot(
 ) -> Conversion:
     """Write a LeRobot dataset.
 
-    Episodes are written one by one into ``out/.parts`` and joined at the end, without encoding again. A conversion that
-    is killed continues with ``resume``, with the same result; until it is done there is no ``meta`` folder.
+    Episodes are written one by one into ``out/.parts`` and joined at the end, without encoding again. Called
+    again after a kill, it continues, with the same result; until it is done there is no ``meta`` folder.
 
     Args:
         settings: what is converted, and how; with ``leave_out`` the dataset is joined without the episodes that can't
@@ -52,8 +50,9 @@ def convert_lerobot(
     Raises:
         DatasetError: no such version, the input is unusable, nothing to convert, no render device, or a rate
             that LeRobot does not have.
-        IncompleteError: episodes can't be written; all others are, and ``resume`` tries again.
-        OutputExistsError: ``out`` is not empty and no flag is set.
+        IncompleteError: episodes can't be written; all others are, and the same call tries again.
+        OutputExistsError: ``out`` is a dataset of other settings, versions or episodes, or none.
+        RobocasError: another conversion is running.
         MissingExtraError: the ``lerobot`` extra is not installed.
     """
     require_extra()
@@ -62,36 +61,29 @@ def convert_lerobot(
     with closing(open_input(settings)) as given:
         fps = whole_rate(given.source.rate_hz)
         plan = plan_of(given, fps, settings.codec, variant.version)
-        with locked_folder(out):
-            # Everything that may fail comes before the output is touched.
-            claim_output(out, resume=settings.resume or settings.overwrite)
-            if settings.resume:
-                check_resume(out, plan)
-            elif settings.overwrite:
-                check_overwrite(out, (INFO_FILE, PARTS), "a LeRobot dataset")
+        recorded_settings = {key: plan[key] for key in ("settings", "made_with")}
+        with OutputFolder(out, OUTPUT, recorded_settings, overwrite=settings.overwrite) as output:
+            check_episodes(output, plan)  # everything that may fail comes before the output is touched
             if settings.needs_device:
                 from robocas_ms3.datasets.writing.render import require_renderer
 
                 require_renderer()
-            claim_output(out, overwrite=settings.overwrite and not settings.resume, resume=True)
             written: list[WrittenEpisode] = []
             joining = 0.0
-            if not (out / INFO_FILE).is_file():
-                parts = make_folder(out / PARTS)
-                with while_there(parts / PLAN, DatasetError), kept_if_begun(out, parts):
-                    _sweep(out)
-                    write_json(parts / PLAN, plan)
-                    job = _missing(settings, variant, plan)
-                    if on_start:
-                        on_start(len(job.tasks))
-                    written, incomplete = write_missing(job, on_episode)
-                    if incomplete and not settings.leave_out:
-                        raise incomplete
-                    if incomplete:
-                        _log.warning("%s", incomplete)
-                    staged = time.perf_counter()
-                    plan = _join(out, plan, fps, incomplete)
-                    joining = time.perf_counter() - staged
+            if output.recorded is None or not (out / INFO_FILE).is_file():
+                output.start(plan)
+                _sweep(out)
+                job = _missing(settings, variant, plan)
+                if on_start:
+                    on_start(len(job.tasks))
+                written, incomplete = write_missing(job, output, on_episode)
+                if incomplete and not settings.leave_out:
+                    raise incomplete
+                if incomplete:
+                    _log.warning("%s", incomplete)
+                staged = time.perf_counter()
+                plan = _join(out, plan, fps, incomplete)
+                joining = time.perf_counter() - staged
             for name in (PARTS, _JOINED):
                 shutil.rmtree(out / name, ignore_errors=True)
     return Conversion(written, len(plan["episodes"]) - len(written), time.perf_counter() - start, joining)
@@ -108,7 +100,7 @@ def _missing(settings: ConversionSettings, variant: Variant, plan: dict[str, Any
             shutil.rmtree(folder)
     missing = [(i, e["source"]) for i, e in enumerate(entries) if not part_folder(parts, i).is_dir()]
     writer = PartWriter(parts, settings.codec, variant)
-    return WriteJob(settings, writer, missing, parts / PLAN, len(missing) < len(entries), _FIX)
+    return WriteJob(settings, writer, missing, len(missing) < len(entries), _FIX)
 
 
 def _join(out: Path, plan: dict[str, Any], fps: int, incomplete: IncompleteError | None) -> dict[str, Any]:

@@ -4,24 +4,30 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
-from robocas_ms3.core.documents import load_json
-from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.outputs import check_same, is_taken
+from robocas_ms3.core.errors import DatasetError, OutputExistsError
+from robocas_ms3.core.outputs import FolderKind, OutputFolder
 from robocas_ms3.core.strict import parse
 from robocas_ms3.core.words import count_of
 from robocas_ms3.datasets.lerobot.records import ConversionRecord
 from robocas_ms3.datasets.lerobot.schema import CONVERSION_FILE, INFO_FILE
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.datasets.writing.inputs import ConversionInput
-from robocas_ms3.datasets.writing.plan import LEFT_OUT, check_versions
+from robocas_ms3.datasets.writing.output import with_versions
+from robocas_ms3.datasets.writing.plan import LEFT_OUT
 from robocas_ms3.demos.recordings.versions import versions
 
 PARTS = ".parts"
 """Folder of the episodes done so far; gone when the dataset is there."""
 PLAN = "plan.json"
+OUTPUT = FolderKind(
+    "robocas convert --to lerobot",
+    (f"{PARTS}/{PLAN}", CONVERSION_FILE),
+    "settings",
+    marks=(INFO_FILE, PARTS),
+    upgrade=with_versions,
+)
 
 
 def plan_of(given: ConversionInput, fps: int, codec: str, version: str) -> dict[str, Any]:
@@ -68,40 +74,21 @@ def only(plan: Mapping[str, Any], indices: Sequence[int], reasons: Mapping[int, 
     return {**plan, **sides, "episodes": [episodes[index] for index in indices], LEFT_OUT: left_out}
 
 
-def check_resume(out: Path, plan: dict[str, Any]) -> None:
-    """Go on with the same conversion only.
+def check_episodes(output: OutputFolder, plan: Mapping[str, Any]) -> None:
+    """Check that a dataset that is continued is of the same episodes.
 
     Raises:
-        DatasetError: another one was begun in ``out``, or something else is there.
+        OutputExistsError: it is of others.
+        DatasetError: its record is damaged.
     """
-    if not is_taken(out):
+    if output.recorded is None:
         return
-    path = out / CONVERSION_FILE if (out / INFO_FILE).is_file() else out / PARTS / PLAN
-    try:
-        before = load_json(path)
-    except (OSError, ValueError) as error:
-        if (out / PARTS).is_dir() and not any((out / PARTS).glob("episode_*")):
-            return  # killed before it wrote what it was to do
-        what = "can't resume: no conversion to LeRobot was begun here"
-        raise DatasetError(what, where=path, fix="Pass --overwrite.") from error
-    parse(ConversionRecord, before, DatasetError, where=path)
-    check_same(
-        before.get("settings", {}),
-        plan["settings"],
-        "can't resume with other settings",
-        where=path,
-        fix="Pass --overwrite, or the settings of before.",
-        error=DatasetError,
-    )
-    check_versions(path, before, "resume", "Install those, or pass --overwrite.")
-    if not _are_same(before, plan):
-        raise DatasetError(
-            "can't resume: these episodes are not what was begun here",
-            where=path,
-            expected=f"{count_of(len(before.get('episodes', [])), 'episode')}",
-            found=f"{len(plan['episodes'])}",
-            fix="Pass --overwrite to begin again.",
-        )
+    parse(ConversionRecord, output.recorded, DatasetError, where=output.path)
+    if not _are_same(output.recorded, plan):
+        recorded = output.recorded.get("episodes", [])
+        what, expected = "a dataset of other episodes", count_of(len(recorded), "episode")
+        found, fix = f"{len(plan['episodes'])}", "Choose another folder, or pass --overwrite to start again."
+        raise OutputExistsError(what, where=output.path, expected=expected, found=found, fix=fix)
 
 
 def _are_same(before: Mapping[str, Any], plan: Mapping[str, Any]) -> bool:

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import robocas_ms3
 from robocas_ms3.core.files import replacing_folder
-from robocas_ms3.core.outputs import claim_output
+from robocas_ms3.core.outputs import OutputFolder
 from robocas_ms3.core.words import count_of
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.manage.input_check import check_episodes
 from robocas_ms3.datasets.manage.parts import Part
 from robocas_ms3.datasets.writing.info import write_info
-from robocas_ms3.datasets.writing.output import Placer, begun_output, check_apart
+from robocas_ms3.datasets.writing.output import DATASET, Placer, check_apart, dataset_output, settings_of
 from robocas_ms3.datasets.writing.plan import SETTINGS
 
 Side = Literal["train", "val"]
@@ -57,24 +57,23 @@ class Assembly:
         return f"{self.out}: {count_of(self.episodes, 'episode')}{kept}, {linked}"
 
 
-def check_before(outs: Iterable[Path], members: Sequence[Member], *, go_on: bool) -> None:
-    """Refuse outputs that are there and episodes that are damaged, before anything is written.
+def check_before(outs: Mapping[Path, Sequence[Member]], split_rule: str, *, overwrite: bool) -> None:
+    """Refuse outputs that can't be written and episodes that are damaged, before anything is written.
 
     Args:
-        outs: folders that will be written.
-        members: all of their episodes.
-        go_on: whether outputs may be there.
+        outs: folder -> its episodes.
+        split_rule, overwrite: see `assemble`.
 
     Raises:
         DatasetError: an output is an input, or an episode is damaged.
-        OutputExistsError: an output is there.
+        OutputExistsError: an output is another dataset, or none.
     """
     numbers: dict[Path, tuple[Part, list[int]]] = {}
-    for member in members:
+    for member in (member for members in outs.values() for member in members):
         numbers.setdefault(member.part.root, (member.part, []))[1].append(member.number)
-    for out in outs:
+    for out, members in outs.items():
         check_apart(out, list(numbers))
-        claim_output(out, resume=go_on)
+        OutputFolder(out, DATASET, settings_of(_record(members, split_rule)), overwrite=overwrite).read()
     for part, chosen in numbers.values():
         check_episodes(part, chosen)
 
@@ -86,13 +85,12 @@ def assemble(
     split_rule: str,
     link: bool = True,
     overwrite: bool = False,
-    resume: bool = False,
     on_start: OnStart | None = None,
     on_episode: OnEpisode | None = None,
 ) -> Assembly:
     """Write a dataset of these episodes, in this order, numbered from 0; `check_before` has seen them.
 
-    Killed at any moment, it goes on with ``resume``, and ends as if it had not been. Hard links share the files with
+    Called again after a kill at any moment, it continues, with the same result. Hard links share the files with
     the datasets they are from: nothing in this package changes a file in place, an editor may.
 
     Args:
@@ -100,17 +98,16 @@ def assemble(
         members: at least one; all of the same settings.
         split_rule: how their sides were chosen, for ``conversion.json``.
         link: hard links where the file system allows; else copies.
-        overwrite: replace a dataset that is there.
-        resume: keep the episodes that are there.
+        overwrite: start again, and replace a dataset that exists.
         on_start: called with the number of episodes to write.
         on_episode: called with the number of each, when it is there.
 
     Raises:
-        DatasetError: the output is an input, or something else was begun there.
-        OutputExistsError: ``out`` is not empty and neither flag is set.
+        DatasetError: the output is an input.
+        OutputExistsError: ``out`` is another dataset, or none.
     """
     inputs = list(dict.fromkeys(member.part.root for member in members))
-    with begun_output(out, _plan(members, split_rule), inputs=inputs, overwrite=overwrite, resume=resume):
+    with dataset_output(out, _record(members, split_rule), inputs=inputs, overwrite=overwrite):
         placer = Placer(link)
         missing = [n for n in range(len(members)) if not (out / schema.episode_folder(n)).is_dir()]
         if on_start:
@@ -126,7 +123,7 @@ def assemble(
     return Assembly(out, len(members), len(members) - len(missing), placer.linked, placer.copied)
 
 
-def _plan(members: Sequence[Member], split_rule: str) -> dict[str, Any]:
+def _record(members: Sequence[Member], split_rule: str) -> dict[str, Any]:
     settings = members[0].part.settings
     return {
         "format": "robocas",

@@ -27,7 +27,7 @@ from robocas_ms3.datasets.sources.records import EpisodesRecord
 from robocas_ms3.datasets.sources.tolerant import SPECS, EpisodeArrays
 from robocas_ms3.datasets.writing.episode_folder import write_cameras
 from robocas_ms3.datasets.writing.info import write_info
-from robocas_ms3.datasets.writing.output import Placer, begun_output
+from robocas_ms3.datasets.writing.output import Placer, dataset_output
 from robocas_ms3.datasets.writing.plan import dataset_settings
 
 Embed = Callable[[list[str]], NDArray[np.float32]]
@@ -42,28 +42,26 @@ def import_robocas(
     link: bool = False,
     embed: Embed | None = None,
     overwrite: bool = False,
-    resume: bool = False,
     on_start: Callable[[int], None] | None = None,
     on_episode: Callable[[int], None] | None = None,
 ) -> int:
     """Write a dataset of the episodes that can be taken; they keep their numbers. Gives how many were there already.
 
-    Pictures are copied or linked, arrays and camera files written anew; nothing of upstream's folder changes. Killed at
-    any moment, it goes on with ``resume``.
+    Pictures are copied or linked, arrays and camera files written anew; nothing of upstream's folder changes. Called
+    again after a kill at any moment, it continues.
 
     Args:
         surveyed: of `survey.survey`.
         out: folder of the new dataset; ``import_report.json`` goes there too.
         link: hard links to the pictures where the file system allows; else copies.
         embed: texts -> (N, 384), for episodes without embeddings; None: these stay without, and so do all.
-        overwrite: replace a dataset that is there.
-        resume: go on with what was begun.
+        overwrite: start again, and replace a dataset that exists.
         on_start: called with the number of episodes to write.
         on_episode: called with the number of each.
 
     Raises:
-        DatasetError: nothing can be taken, or the output is the input or something else was begun there.
-        OutputExistsError: ``out`` is not empty and neither flag is set.
+        DatasetError: nothing can be taken, or the output is the input.
+        OutputExistsError: ``out`` is another dataset, or none.
     """
     if not surveyed.taken or surveyed.pictures is None:
         raise DatasetError(
@@ -76,7 +74,7 @@ def import_robocas(
     info, _ = read_info(dataset)
     embedded = surveyed.embeddings or embed is not None
     plan = _plan(dataset, surveyed, embedded)
-    with begun_output(out, plan, inputs=[surveyed.root], overwrite=overwrite, resume=resume):
+    with dataset_output(out, plan, inputs=[surveyed.root], overwrite=overwrite):
         placer = Placer(link)
         missing = [n for n in surveyed.taken if not (out / schema.episode_folder(n)).is_dir()]
         if on_start:

@@ -30,7 +30,6 @@ def merge(
     skip_duplicates: bool = False,
     link: bool = True,
     overwrite: bool = False,
-    resume: bool = False,
     on_start: OnStart | None = None,
     on_episode: OnEpisode | None = None,
 ) -> MergeResult:
@@ -40,11 +39,11 @@ def merge(
         roots: the datasets, of the same schema version and settings.
         out: folder of the new one.
         skip_duplicates: take an episode that is there already once, instead of refusing.
-        link, overwrite, resume, on_start, on_episode: see `assemble`.
+        link, overwrite, on_start, on_episode: see `assemble`.
 
     Raises:
         DatasetError: they do not fit together, are not finished, or an episode is damaged.
-        OutputExistsError: ``out`` is not empty and neither flag is set.
+        OutputExistsError: ``out`` is another dataset, or none.
     """
     if not roots:
         raise DatasetError("nothing to merge", expected="folders of datasets", fix="robocas merge A B --out C")
@@ -71,14 +70,13 @@ def merge(
             found=f"{len(duplicates)}: {shown(pairs, 4)}",
             fix="Pass --skip-duplicates to take each once.",
         )
-    check_before([out], members, go_on=overwrite or resume)
+    check_before({out: members}, SPLIT_RULE, overwrite=overwrite)
     written = assemble(
         out,
         members,
         split_rule=SPLIT_RULE,
         link=link,
         overwrite=overwrite,
-        resume=resume,
         on_start=on_start,
         on_episode=on_episode,
     )

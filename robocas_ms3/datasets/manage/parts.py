@@ -84,7 +84,7 @@ def check_whole(dataset: Dataset) -> None:
     path = dataset.root / schema.DATA_INFO_FILE
     if not dataset.info:
         raise DatasetError(
-            "this dataset is not finished", where=path, found="no file", fix="Run robocas convert --resume first."
+            "this dataset is not finished", where=path, found="no file", fix="Run the same robocas convert again first."
         )
     listed = [number for side in dataset.sides for number in side]
     if sorted(listed) != dataset.numbers:

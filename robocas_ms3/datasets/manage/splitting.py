@@ -184,7 +184,6 @@ def write_parts(
     share: Share | None,
     link: bool = True,
     overwrite: bool = False,
-    resume: bool = False,
     on_start: OnStart | None = None,
     on_episode: OnEpisode | None = None,
 ) -> list[Assembly]:
@@ -194,13 +193,13 @@ def write_parts(
         part: the dataset that is split.
         pieces: output -> training and validation episodes of ``part``.
         share: how the sides were chosen; None: as they were.
-        link, overwrite, resume: see `assemble`.
+        link, overwrite: see `assemble`.
         on_start: called with the number of episodes of all pieces.
         on_episode: called after each.
 
     Raises:
-        DatasetError: an output would be empty, is the input, or something else was begun there; an episode is damaged.
-        OutputExistsError: one is not empty and neither flag is set.
+        DatasetError: an output would be empty, or is the input; an episode is damaged.
+        OutputExistsError: an output is another dataset, or none.
     """
     for out, sides in pieces.items():
         if not any(sides):
@@ -210,12 +209,11 @@ def write_parts(
     for out, (train, val) in pieces.items():
         side_of: dict[int, Side] = {**dict.fromkeys(train, "train"), **dict.fromkeys(val, "val")}
         members[out] = [Member(part, name, number, side_of[number]) for number in sorted(side_of)]
-    everything = [member for chosen in members.values() for member in chosen]
-    check_before(members, everything, go_on=overwrite or resume)
-    if on_start:
-        on_start(len(everything))
     rule = share.rule if share else KEEP_RULE
-    write = partial(assemble, split_rule=rule, link=link, overwrite=overwrite, resume=resume, on_episode=on_episode)
+    check_before(members, rule, overwrite=overwrite)
+    if on_start:
+        on_start(sum(map(len, members.values())))
+    write = partial(assemble, split_rule=rule, link=link, overwrite=overwrite, on_episode=on_episode)
     return [write(out, chosen) for out, chosen in members.items()]
 
 

@@ -271,7 +271,8 @@ class Dataset(EpisodeSource):
         where = self.root / schema.DATA_INFO_FILE
         if not self.info:
             if self.settings:
-                raise DatasetError("this dataset is not finished", where=self.root, fix="Convert with --resume.")
+                fix = "Run the same robocas convert again."
+                raise DatasetError("this dataset is not finished", where=self.root, fix=fix)
             raise no_dataset(self.root, f"a folder with {schema.DATA_INFO_FILE}, or a trajectory.h5")
         try:
             missing = [key for key in ("ep_length", "train_eps", "val_eps") if key not in self.info]

@@ -6,14 +6,13 @@ import logging
 import shutil
 import time
 from collections.abc import Callable, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.files import make_folder, write_json
-from robocas_ms3.core.locks import locked_folder
-from robocas_ms3.core.outputs import claim_output, kept_if_begun, sweep, while_there
+from robocas_ms3.core.files import write_json
+from robocas_ms3.core.outputs import OutputFolder, sweep
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.preview import FEW, finish_previews, on_sheet
 from robocas_ms3.datasets.sources.protocol import EpisodeSource
@@ -21,21 +20,19 @@ from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.episode_folder import FolderWriter, TextVectors, find_damaged
 from robocas_ms3.datasets.writing.info import add_failures, write_info
 from robocas_ms3.datasets.writing.inputs import ConversionInput, open_trajectory
-from robocas_ms3.datasets.writing.output import check_overwrite
+from robocas_ms3.datasets.writing.output import DATASET
 from robocas_ms3.datasets.writing.plan import (
-    Plan,
-    appended_plan,
     dataset_settings,
-    new_plan,
+    plan_episodes,
     planned_sides,
-    resumed_plan,
     still_missing,
     without_unwritten,
 )
 from robocas_ms3.datasets.writing.settings import Conversion, ConversionSettings, WrittenEpisode
 from robocas_ms3.datasets.writing.workers import WriteJob, write_missing
+from robocas_ms3.demos.recordings.versions import versions
 
-_FIX = "The dataset is complete without, and valid; --resume tries again, --leave-out takes it as it is."
+_FIX = "The dataset is complete without, and valid; the same command tries again, --leave-out takes it as it is."
 _log = logging.getLogger(__name__)
 
 
@@ -47,7 +44,7 @@ def convert(
 ) -> Conversion:
     """Write a RoboCAS dataset from a trajectory file. A ``failures.jsonl`` in the file's folder is copied.
 
-    A conversion that is killed continues with ``resume`` (or the same ``append`` again), with the same result.
+    Called again after a kill at any moment, it continues, with the same result.
     An episode that can't be written does not end the others: at the end there is a dataset of the others, and an error.
     Warns if the open-loop check of the actions was made at another rate than that of the dataset.
 
@@ -57,26 +54,29 @@ def convert(
         on_episode: called after each.
 
     Raises:
-        DatasetError: the input is unusable, nothing to convert, no render device, another conversion is running.
+        DatasetError: the input is unusable, nothing to convert, no render device.
         IncompleteError: episodes can't be written; the dataset is complete without, ``left_out`` in its
-            ``conversion.json`` says why, and ``resume`` tries again.
-        OutputExistsError: ``out`` is not empty and no flag is set.
+            ``conversion.json`` says why, and the same call tries again.
+        OutputExistsError: ``out`` is no dataset, or one of other settings or versions, or, without ``append``, of other
+            recordings.
+        RobocasError: another conversion is running.
         MissingExtraError: embeddings are wanted and the ``language`` extra is not installed.
     """
     start, out = time.perf_counter(), settings.out
-    with closing(open_trajectory(settings)) as source, locked_folder(out):  # it numbers after what is there
+    with ExitStack() as stack:
+        source = stack.enter_context(closing(open_trajectory(settings)))
+        stored = dataset_settings(source.rate_hz, settings.pictures, settings.embeddings)
+        recorded_settings = {**stored, "made_with": versions()}
+        output = stack.enter_context(OutputFolder(out, DATASET, recorded_settings, overwrite=settings.overwrite))
         # Everything that may fail comes before the output is touched.
-        claim_output(out, resume=settings.resume or settings.append or settings.overwrite)
         entries = ConversionInput(source, settings.pictures, settings.include_failed).entries()
-        plan = _plan(settings, entries, dataset_settings(source.rate_hz, settings.pictures, settings.embeddings))
+        plan = plan_episodes(output, entries, stored, append=settings.append)
         if settings.needs_device:
             from robocas_ms3.datasets.writing.render import require_renderer
 
             require_renderer()
         embed = TextVectors(embed_texts(source, entries)) if settings.embeddings else None
-        claim_output(out, overwrite=settings.overwrite and not (settings.resume or settings.append), resume=True)
-        make_folder(out)
-        sweep(out)
+        output.start(plan.content)
         sweep(out / schema.PREVIEW_FOLDER)
         before = _split_before(out)
         for folder in (out / schema.episode_folder(number) for number, _ in plan.tasks):
@@ -89,21 +89,19 @@ def convert(
         sheet = None
         if settings.previews or (settings.previews is None and len(plan.tasks) <= FEW):
             sheet = on_sheet(map(int, plan.content["episodes"]))
-        mark, continued = out / schema.CONVERSION_FILE, len(missing) < len(plan.tasks)
-        job = WriteJob(settings, FolderWriter(out, embed, sheet), missing, mark, continued, _FIX)
-        with while_there(mark, DatasetError), kept_if_begun(out):
-            write_json(mark, plan.content)
-            try:
-                written, incomplete = write_missing(job, on_episode)
-            finally:
-                for folder in (out, out / schema.PREVIEW_FOLDER):
-                    sweep(folder)  # left by workers that died; others wrote it again
-            if incomplete:
-                write_json(mark, without_unwritten(out, plan, incomplete.reasons))
-            add_failures(settings.source.parent, out, source.file.env_info)
-            write_info(out, planned_sides(plan.content, before))
-            if sheet is not None:
-                finish_previews(out, {episode.number: episode.row for episode in written if episode.row is not None})
+        continued = len(missing) < len(plan.tasks)
+        job = WriteJob(settings, FolderWriter(out, embed, sheet), missing, continued, _FIX)
+        try:
+            written, incomplete = write_missing(job, output, on_episode)
+        finally:
+            for folder in (out, out / schema.PREVIEW_FOLDER):
+                sweep(folder)  # left by workers that died; others wrote it again
+        if incomplete:
+            write_json(out / schema.CONVERSION_FILE, without_unwritten(out, plan, incomplete.reasons))
+        add_failures(settings.source.parent, out, source.file.env_info)
+        write_info(out, planned_sides(plan.content, before))
+        if sheet is not None:
+            finish_previews(out, {episode.number: episode.row for episode in written if episode.row is not None})
         if incomplete and not settings.leave_out:
             raise incomplete
         if incomplete:
@@ -112,16 +110,6 @@ def convert(
             _log.warning("%s: %s are still missing: convert that with --append", out, " and ".join(left))
     kept = len(plan.tasks) - len(missing)
     return Conversion(written, kept, time.perf_counter() - start, previews=sheet is not None)
-
-
-def _plan(settings: ConversionSettings, entries: list[dict[str, Any]], stored: dict[str, Any]) -> Plan:
-    if settings.append:
-        return appended_plan(settings.out, entries, stored)
-    if settings.resume:
-        return resumed_plan(settings.out, entries, stored)
-    if settings.overwrite:
-        check_overwrite(settings.out)
-    return new_plan(entries, stored)
 
 
 def _split_before(out: Path) -> tuple[list[int], list[int]]:

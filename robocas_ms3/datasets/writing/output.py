@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,16 +11,24 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from robocas_ms3.core import outputs
-from robocas_ms3.core.documents import check_regular, load_json
+from robocas_ms3.core.documents import check_regular
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.files import make_folder, write_json
-from robocas_ms3.core.locks import locked_folder
-from robocas_ms3.core.outputs import claim_output, is_taken, kept_if_begun, sweep
+from robocas_ms3.core.outputs import FolderKind, OutputFolder
 from robocas_ms3.datasets import schema
+from robocas_ms3.demos.recordings.versions import versions
 
 MARKS = (schema.CONVERSION_FILE, schema.DATA_INFO_FILE)
 """A folder with one of these is a RoboCAS dataset, whole or not."""
+
+
+def with_versions(record: dict[str, Any]) -> dict[str, Any]:
+    """Return a record with the versions of today where it does not name them all, as of merged datasets."""
+    now, made_with = versions(), record.get("made_with")
+    is_whole = isinstance(made_with, dict) and now.keys() <= made_with.keys()
+    return record if is_whole else {**record, "made_with": now}
+
+
+DATASET = FolderKind("robocas convert", (schema.CONVERSION_FILE,), "rate_hz", marks=MARKS, upgrade=with_versions)
 _NO_LINKS = {errno.EXDEV, errno.EPERM, errno.EACCES, errno.EMLINK, errno.EOPNOTSUPP, errno.ENOSYS}
 
 
@@ -67,47 +74,30 @@ class Placer:
 
 
 @contextmanager
-def begun_output(
-    out: Path, plan: Mapping[str, Any], *, inputs: Sequence[Path], overwrite: bool, resume: bool
-) -> Iterator[Path]:
-    """Claim and lock a dataset's folder and write ``conversion.json``, which says what will be in it.
-
-    If what is done inside fails before there is an episode, the folder goes again; otherwise ``resume`` goes on.
+def dataset_output(
+    out: Path, record: Mapping[str, Any], *, inputs: Sequence[Path], overwrite: bool
+) -> Iterator[OutputFolder]:
+    """Start or continue a dataset that is written from other datasets.
 
     Args:
-        out: the folder.
-        plan: content of ``conversion.json``.
+        out: its folder.
+        record: content of ``conversion.json``, which has to match to continue, whatever the versions.
         inputs: datasets that are read, which ``out`` may not touch.
-        overwrite: replace a dataset that is there.
-        resume: go on with what was begun by the same plan.
+        overwrite: start again, and replace a dataset that exists.
 
     Raises:
-        OutputExistsError: ``out`` is not empty and neither flag is set.
-        DatasetError: it is an input, or what is there is no dataset or another one.
+        OutputExistsError: ``out`` is another dataset, or none.
+        DatasetError: ``out`` is an input.
     """
-    plan = json.loads(json.dumps(plan))
     check_apart(out, inputs)
-    with locked_folder(out):
-        claim_output(out, resume=resume or overwrite)
-        if resume:
-            _check_begun(out, plan)
-        elif overwrite:
-            check_overwrite(out)
-        claim_output(out, overwrite=overwrite and not resume, resume=True)
-        make_folder(out)
-        with kept_if_begun(out):
-            sweep(out)
-            write_json(out / schema.CONVERSION_FILE, plan)
-            yield out
+    with OutputFolder(out, DATASET, settings_of(record), overwrite=overwrite) as output:
+        output.start(record)
+        yield output
 
 
-def check_overwrite(out: Path, marks: Sequence[str] = MARKS, what: str = "a dataset") -> None:
-    """Delete datasets only; see `outputs.check_overwrite`.
-
-    Raises:
-        DatasetError: it holds something else.
-    """
-    outputs.check_overwrite(out, marks, what, DatasetError)
+def settings_of(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what has to match in ``conversion.json`` to continue a dataset made of others: all but the versions."""
+    return {key: value for key, value in record.items() if key != "made_with"}
 
 
 def check_apart(out: Path, inputs: Sequence[Path]) -> None:
@@ -120,25 +110,3 @@ def check_apart(out: Path, inputs: Sequence[Path]) -> None:
     for path in (path.resolve() for path in inputs):
         if path == target or path in target.parents or target in path.parents:
             raise DatasetError("the output is an input, or one is in the other", where=out, fix="Choose another --out.")
-
-
-def _check_begun(out: Path, plan: Mapping[str, Any]) -> None:
-    if not is_taken(out):
-        return
-    path = out / schema.CONVERSION_FILE
-    try:
-        before = load_json(path)
-    except (OSError, ValueError) as error:
-        raise DatasetError("can't resume: nothing was begun here", where=path, fix="Pass --overwrite.") from error
-    if not isinstance(before, dict):
-        raise DatasetError(
-            "can't resume: this JSON is damaged", where=path, expected="an object", fix="Pass --overwrite."
-        )
-    different = sorted(key for key in plan if key != "made_with" and before.get(key) != plan[key])
-    if different:
-        raise DatasetError(
-            "can't resume: something else was begun here",
-            where=path,
-            found=f"other {', '.join(different)}",
-            fix="Pass --overwrite, or the inputs and options of before.",
-        )

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from robocas_ms3.core.documents import load_json
-from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.outputs import check_same, is_taken
+from robocas_ms3.core.errors import DatasetError, OutputExistsError
+from robocas_ms3.core.outputs import OutputFolder
 from robocas_ms3.core.strict import parse
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.stored import Pictures
@@ -58,44 +57,30 @@ def dataset_settings(rate_hz: float, pictures: Pictures, embeddings: bool) -> di
     return settings.model_dump()
 
 
-def new_plan(entries: Entries, settings: dict[str, Any]) -> Plan:
-    """Number a source's episodes from 0 on."""
-    return _extended(header(settings), {}, entries, first=0)
+def plan_episodes(output: OutputFolder, entries: Entries, settings: dict[str, Any], *, append: bool) -> Plan:
+    """Number a source's episodes: from 0, or as recorded, new ones after the episodes of the dataset.
 
-
-def resumed_plan(out: Path, entries: Entries, settings: dict[str, Any]) -> Plan:
-    """Go on with what was begun; where nothing was, begin.
-
-    Raises:
-        DatasetError: another conversion was begun there.
-    """
-    if not is_taken(out):
-        return new_plan(entries, settings)
-    before = _read(out, missing="can't resume: no conversion was begun here", fix="Pass --overwrite.")
-    _check_settings(out, before, settings, "resume", "Pass --overwrite, or the settings of before.")
-    check_versions(out / schema.CONVERSION_FILE, before, "resume", "Install those, or pass --overwrite.")
-    content, known, new = _divided(before, entries)
-    if new:
-        raise DatasetError(
-            "can't resume: these recordings are not what was begun here",
-            where=out / schema.CONVERSION_FILE,
-            found=f"{len(new)} of {len(entries)} are new",
-            fix="Pass --append to add them, --overwrite to begin again.",
-        )
-    return Plan(content, known)
-
-
-def appended_plan(out: Path, entries: Entries, settings: dict[str, Any]) -> Plan:
-    """Number what is new after what is there; what is there already keeps its number.
+    Args:
+        output: folder of the dataset.
+        entries: recordings to convert.
+        settings: of the dataset.
+        append: whether recordings may be new to a dataset that exists.
 
     Raises:
-        DatasetError: there is no dataset of ours, or of other settings.
+        OutputExistsError: some are new to the dataset that is continued.
+        DatasetError: there is no dataset to append to, or its ``conversion.json`` is damaged.
     """
-    before = _read(out, missing="no dataset to append to", fix="Convert without --append first.")
-    _check_settings(out, before, settings, "append", "Pass the settings of before.")
-    fix = "Install those, or convert into another folder and robocas merge the two."
-    check_versions(out / schema.CONVERSION_FILE, before, "append", fix)
-    content, known, new = _divided(before, entries)
+    path, recorded = output.path / schema.CONVERSION_FILE, output.recorded
+    if recorded is None:
+        if append:
+            raise DatasetError("no dataset to append to", where=path, fix="Convert without --append first.")
+        return _extended(header(settings), {}, entries, first=0)
+    schema.check_version(recorded.get("schema_version", 1), path)
+    parse(ConversionRecord, recorded, DatasetError, where=path)
+    content, known, new = _divided({**recorded, "episodes": recorded.get("episodes", {})}, entries)
+    if new and not append:
+        found, fix = f"{len(new)} of {len(entries)} are new", "Pass --append to add them, --overwrite to start again."
+        raise OutputExistsError("a dataset of other recordings", where=path, found=found, fix=fix)
     first = max(map(int, [*content["episodes"], *content.get(LEFT_OUT, {})]), default=-1) + 1
     plan = _extended(content, content["episodes"], new, first)
     return Plan(plan.content, [*known, *plan.tasks])
@@ -180,29 +165,6 @@ def _spans(numbers: list[int]) -> str:
     return ", ".join(f"{first}-{last}" if first < last else str(first) for first, last in spans)
 
 
-def _check_settings(out: Path, before: Mapping[str, Any], settings: Mapping[str, Any], verb: str, fix: str) -> None:
-    now = {key: settings[key] for key in SETTINGS}
-    what, where = f"can't {verb} with other settings", out / schema.CONVERSION_FILE
-    check_same(before, now, what, where=where, fix=fix, error=DatasetError)
-
-
-def check_versions(path: Path, before: Mapping[str, Any], verb: str, fix: str) -> None:
-    """See that what goes on was begun by the versions that are installed.
-
-    Args:
-        path: of what says so.
-        before: its content; what is older, or not of a conversion, names no others, and is not looked at.
-        verb: what is not done where they differ.
-        fix: for who reads the error.
-
-    Raises:
-        DatasetError: they differ.
-    """
-    made_with, now = before.get("made_with"), versions()
-    if isinstance(made_with, dict) and now.keys() <= made_with.keys():
-        check_same(made_with, now, f"can't {verb} with other versions", where=path, fix=fix, error=DatasetError)
-
-
 def header(settings: Mapping[str, Any], split_rule: str = SPLIT_RULE) -> dict[str, Any]:
     """What ``conversion.json`` says of a dataset as a whole."""
     return {
@@ -222,15 +184,3 @@ def _extended(head: Mapping[str, Any], episodes: Mapping[str, Any], entries: Ent
 
 def _without_source(entry: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in entry.items() if key != "source"}
-
-
-def _read(out: Path, missing: str, fix: str) -> dict[str, Any]:
-    path = out / schema.CONVERSION_FILE
-    try:
-        content = load_json(path)
-    except (OSError, ValueError) as error:
-        raise DatasetError(missing, where=path, fix=fix) from error
-    if isinstance(content, dict):
-        schema.check_version(content.get("schema_version", 1), path)
-    parse(ConversionRecord, content, DatasetError, where=path)
-    return {**content, "episodes": content.get("episodes", {})}

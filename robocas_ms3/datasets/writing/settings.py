@@ -34,7 +34,6 @@ class ConversionSettings:
         include_failed: also convert episodes without success.
         pack: name or folder of the object pack, instead of the one that the trajectory names.
         overwrite: replace what is in ``out``.
-        resume: keep the episodes that are in ``out``.
         append: add to the dataset in ``out``. Its episodes keep their numbers and their side of the split, and
             recordings that it has already are not added again. RoboCAS folders only.
         leave_out: warn of episodes that can't be written instead of raising an error.
@@ -57,7 +56,6 @@ class ConversionSettings:
     include_failed: bool = False
     pack: str | Path | None = None
     overwrite: bool = False
-    resume: bool = False
     append: bool = False
     leave_out: bool = False
     embeddings: bool = True
@@ -150,7 +148,7 @@ class Conversion:
 
     Attributes:
         episodes: the new ones, by number.
-        kept: number of episodes of the source that were there already (``resume``, ``append``).
+        kept: number of episodes of the source that were there already.
         seconds: wall-clock time.
         joining: seconds for the steps after the last episode, of these.
         previews: whether previews were made.

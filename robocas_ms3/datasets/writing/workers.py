@@ -9,11 +9,10 @@ from collections.abc import Callable, Generator, Iterator
 from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Protocol
 
 from robocas_ms3.core.errors import DatasetError, IncompleteError, MissingExtraError, RobocasError
-from robocas_ms3.core.outputs import check_there
+from robocas_ms3.core.outputs import OutputFolder
 from robocas_ms3.core.remote_errors import RemoteError
 from robocas_ms3.core.words import count_of
 from robocas_ms3.core.workers import NO_LIMITS, WorkerPool, use_one_torch_thread
@@ -54,7 +53,6 @@ class WriteJob:
         settings: of the conversion.
         writer: of the format.
         tasks: the episodes.
-        mark: a file that is there as long as the output folder is.
         continued: whether there are episodes already.
         fix: how to go on if episodes can't be written.
     """
@@ -62,18 +60,17 @@ class WriteJob:
     settings: ConversionSettings
     writer: EpisodeWriter
     tasks: list[Task]
-    mark: Path
     continued: bool
     fix: str
 
 
 def write_missing(
-    job: WriteJob, on_episode: Callable[[WrittenEpisode], None] | None
+    job: WriteJob, output: OutputFolder, on_episode: Callable[[WrittenEpisode], None] | None
 ) -> tuple[list[WrittenEpisode], IncompleteError | None]:
     """Write episodes; return them by number, and an error that names those that can't be written.
 
     Raises:
-        DatasetError: the output folder is gone.
+        RobocasError: somebody removed the output folder.
         Exception: an error that all episodes share.
     """
     written: list[WrittenEpisode] = []
@@ -81,7 +78,7 @@ def write_missing(
     try:
         with closing(write_episodes(job)) as episodes:
             for episode in episodes:
-                check_there(job.mark, DatasetError)
+                output.check_exists()
                 written.append(episode)
                 if on_episode:
                     on_episode(episode)

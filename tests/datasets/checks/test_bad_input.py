@@ -144,7 +144,7 @@ def test_a_full_disk_ends_a_merge_which_goes_on_later(small_disk, tmp_path, caps
     assert left == ["conversion.json", *(f"episode_{n:07d}" for n in range(len(left) - 1))]
     assert 1 < len(left) < 5
     grow(small_disk)
-    assert run(["merge", *map(str, parts), "--out", str(out), "--resume"]) == 0
+    assert run(["merge", *map(str, parts), "--out", str(out)]) == 0
     merge(parts, tmp_path / "whole")
     assert files_of(out) == files_of(tmp_path / "whole")
 
@@ -158,7 +158,7 @@ def test_a_full_disk_ends_a_conversion_which_goes_on_later(small_disk, tmp_path)
     assert left == ["conversion.json", *(f"episode_{n:07d}" for n in range(len(left) - 1))]
     assert 1 < len(left) < 6
     grow(small_disk)
-    convert(ConversionSettings(trajectory, out, embeddings=False, resume=True, open_renderer=RayCaster))
+    convert(ConversionSettings(trajectory, out, embeddings=False, open_renderer=RayCaster))
     convert(ConversionSettings(trajectory, tmp_path / "whole", embeddings=False, open_renderer=RayCaster))
     assert files_of(out) == files_of(tmp_path / "whole")
 
@@ -186,6 +186,6 @@ def test_a_disk_that_is_full_at_any_file(made, tmp_path, monkeypatch, moment):
             else:
                 assert {path.name for path in out.iterdir()} == {"conversion.json", "episode_0000000"}
                 assert files_of(out / "episode_0000000") == files_of(made / "episode_0000000")
-    merge([made], out, link=False, resume=True)
+    merge([made], out, link=False)
     assert validate(out).violations == []
     assert read(out / "data_info.json") == read(made / "data_info.json")

@@ -218,18 +218,17 @@ def test_an_output_that_exists_is_left_alone(trajectory, tmp_path):
     out = tmp_path / "out"
     convert(trajectory, out)
     before = files_of(out)
-    with pytest.raises(OutputExistsError, match="--resume to go on, --overwrite to replace"):
+    with pytest.raises(OutputExistsError) as error:
         convert(trajectory, out, codec="av1")
-    with pytest.raises(DatasetError, match="can't resume with other settings .expected codec h264, found codec av1"):
-        convert(trajectory, out, codec="av1", resume=True)
-    with pytest.raises(DatasetError, match="expected lerobot_version 0.6, found lerobot_version 2.1"):
-        convert(trajectory, out, lerobot_version="2.1", resume=True)
-    with pytest.raises(DatasetError, match="these episodes are not what was begun here"):
-        convert(trajectory, out, include_failed=True, resume=True)
+    assert error.value.found == 'settings.codec: "h264" -> "av1"'
+    with pytest.raises(OutputExistsError, match='settings.lerobot_version: "0.6" -> "2.1"'):
+        convert(trajectory, out, lerobot_version="2.1")
+    with pytest.raises(OutputExistsError, match="other episodes"):
+        convert(trajectory, out, include_failed=True)
     with pytest.raises(DatasetError):
         convert(tmp_path / "missing.h5", out, overwrite=True)
     assert files_of(out) == before
-    done = convert(trajectory, out, resume=True)
+    done = convert(trajectory, out)
     assert (done.episodes, done.kept) == ([], 2)
     assert files_of(out) == before
     convert(trajectory, out, overwrite=True, include_failed=True)
@@ -239,10 +238,9 @@ def test_an_output_that_exists_is_left_alone(trajectory, tmp_path):
 def test_overwrite_deletes_lerobot_datasets_only(trajectory, made, tmp_path):
     (tmp_path / "thesis.tex").write_text("years of work")
     for folder in (tmp_path, made):
-        with pytest.raises(DatasetError, match="refusing to overwrite what is not a LeRobot dataset"):
-            convert(trajectory, folder, overwrite=True)
-        with pytest.raises(DatasetError, match="no conversion to LeRobot was begun here"):
-            convert(trajectory, folder, resume=True)
+        for overwrite in (False, True):
+            with pytest.raises(OutputExistsError):
+                convert(trajectory, folder, overwrite=overwrite)
     assert (tmp_path / "thesis.tex").exists()
     with locked_folder(tmp_path / "out"), pytest.raises(RobocasError, match="another process is writing here"):
         convert(trajectory, tmp_path / "out")
@@ -300,4 +298,4 @@ def test_from_the_command_line(made, tmp_path, capsys):
     assert "2 episodes, 14 steps" in capsys.readouterr().out
     assert LeRobotDataset(tmp_path / "out").cameras == ("static_camera",)
     assert main.run(command) == 1
-    assert "the output exists already" in capsys.readouterr().err
+    assert "written with other settings" in capsys.readouterr().err

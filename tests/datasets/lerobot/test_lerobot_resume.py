@@ -15,7 +15,7 @@ from synthetic import RayCaster
 pytest.importorskip("av", reason="needs the extra 'lerobot'")
 pq = pytest.importorskip("pyarrow.parquet", reason="needs the extra 'lerobot'")
 
-from robocas_ms3.core.errors import DatasetError, IncompleteError
+from robocas_ms3.core.errors import DatasetError, IncompleteError, OutputExistsError
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check import check_lerobot
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
@@ -40,7 +40,7 @@ def test_an_episode_with_an_error_is_converted_on_resume(trajectory, lerobot, tm
         convert_lerobot(ConversionSettings(trajectory, out, open_renderer=Breaking))
     assert {path.name for path in out.iterdir()} == {".parts"}
     assert not (out / ".parts" / "episode_0000001").exists()
-    done = convert(trajectory, out, resume=True)
+    done = convert(trajectory, out)
     assert (done.kept, [e.number for e in done.episodes]) == (1, [1])
     assert files_of(out) == files_of(lerobot)
 
@@ -52,8 +52,8 @@ def test_resuming_with_other_package_versions_is_refused(lerobot, trajectory, tm
     about = json.loads(path.read_text())
     about["made_with"]["sapien"] = "2.2.2"
     path.write_text(json.dumps(about))
-    with pytest.raises(DatasetError, match="can't resume with other versions .expected sapien 2.2.2"):
-        convert(trajectory, out, resume=True)
+    with pytest.raises(OutputExistsError, match='made_with.sapien: "2.2.2" -> '):
+        convert(trajectory, out)
 
 
 def test_a_repaired_recording_is_converted_on_resume(lerobot, trajectory, tmp_path):
@@ -65,7 +65,7 @@ def test_a_repaired_recording_is_converted_on_resume(lerobot, trajectory, tmp_pa
     with pytest.raises(IncompleteError, match="found episode_0000001: .*traj_2: this episode is damaged"):
         convert(broken, out)
     shutil.copy(trajectory, broken)
-    convert(broken, out, resume=True)
+    convert(broken, out)
     assert files_of(out) == files_of(lerobot)
 
 
@@ -82,16 +82,16 @@ def test_an_imported_folder_can_be_resumed(dataset, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         convert(imported, out, on_episode=stop)
     assert {path.name for path in out.iterdir()} == {".parts"}
-    done = convert(imported, out, resume=True)
+    done = convert(imported, out)
     assert (done.kept, [e.number for e in done.episodes]) == (1, [1])
     convert(imported, whole)
     assert files_of(out) == files_of(whole)
     marks = [f"arrays {arrays_fingerprint(Dataset(imported).episode(number).arrays)}" for number in (0, 1)]
     assert [entry["recording"] for entry in LeRobotDataset(out).settings["episodes"]] == marks
-    assert convert(imported, out, resume=True).kept == 2
-    with pytest.raises(DatasetError, match="these episodes are not what was begun here"):
+    assert convert(imported, out).kept == 2
+    with pytest.raises(OutputExistsError, match="other episodes"):
         shutil.rmtree(imported / "episode_0000001")
-        convert(imported, out, resume=True)
+        convert(imported, out)
 
 
 @pytest.mark.parametrize("moment", ["frame", "part", "plan", "join", "table", "overview", "rename", "joined", "sweep"])
@@ -109,6 +109,6 @@ def test_a_killed_and_resumed_conversion_gives_the_same_bytes(trajectory, lerobo
     assert done.returncode == -signal.SIGKILL, done.stderr
     if (out / schema.INFO_FILE).exists():
         assert check_lerobot(out) == []
-    convert(trajectory, out, resume=True)
+    convert(trajectory, out)
     assert files_of(out) == files_of(lerobot)
     assert {path.name for path in out.iterdir()} == {"meta", "data", "videos", ".annotate_staging"}

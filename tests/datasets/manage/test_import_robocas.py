@@ -506,7 +506,7 @@ def test_killed_and_resumed_is_as_if_never_killed(four, tmp_path, moment):
     whole, out = tmp_path / "whole", tmp_path / "out"
     assert run(["import-robocas", str(four), "--out", str(whole)]) == 0
     die(moment, "import-robocas", four, "--out", out)
-    assert run(["import-robocas", str(four), "--out", str(out), "--resume"]) == 0
+    assert run(["import-robocas", str(four), "--out", str(out)]) == 0
     assert files_of(out) == files_of(whole)
 
 
@@ -523,8 +523,10 @@ def test_command(four, tmp_path, capsys):
     assert report == read(out / "import_report.json")
     picture = "episode_0000001/base_camera/rgb/0003.png"
     assert (root / picture).stat().st_ino == (out / picture).stat().st_ino
-    assert run(["import-robocas", str(root), "--out", str(out)]) == 1
-    assert "the output exists already" in capsys.readouterr().err
+    assert run(["import-robocas", str(root), "--out", str(out)]) == 0
+    assert "3 episodes, 3 kept" in capsys.readouterr().out
+    assert run(["import-robocas", str(root), "--out", str(out), "--rate", "10"]) == 1
+    assert "rate_hz: 5.0 -> 10.0" in capsys.readouterr().err
 
 
 def test_numbers_in_short():

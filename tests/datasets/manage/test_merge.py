@@ -143,7 +143,7 @@ def test_unfinished_datasets(parts, tmp_path):
     shutil.rmtree(part / "episode_0000001")
     fails("not the episodes on disk .found 1 missing", [part], tmp_path / "out")
     (part / "data_info.json").unlink()
-    fails("this dataset is not finished.*convert --resume", [part], tmp_path / "out")
+    fails("this dataset is not finished", [part], tmp_path / "out")
     other = spoiled(parts[1], tmp_path)
     edit(other / "conversion.json", lambda c: c["episodes"].pop("1"))
     fails("these episodes are not listed .found 1", [other], tmp_path / "out")
@@ -195,9 +195,8 @@ def test_what_is_overwritten_stays_where_an_input_is_damaged(parts, tmp_path):
     merge([parts[1]], tmp_path / "out")
     before = files_of(tmp_path / "out")
     (part / "episode_0000000" / "static_camera" / "rgb" / "0000.png").unlink()
-    for flag in ("overwrite", "resume"):
-        with pytest.raises(DatasetError, match="this episode is damaged"):
-            merge([part], tmp_path / "out", **{flag: True})
+    with pytest.raises(DatasetError, match="this episode is damaged"):
+        merge([part], tmp_path / "out", overwrite=True)
     assert files_of(tmp_path / "out") == before
 
 
@@ -233,17 +232,17 @@ def test_the_output(parts, tmp_path):
             merge([a, b], out, overwrite=True)
     assert files_of(a) == before
     merge([a], tmp_path / "out")
-    with pytest.raises(OutputExistsError):
+    assert merge([a], tmp_path / "out").written.kept == 2
+    with pytest.raises(OutputExistsError) as error:
         merge([a, b], tmp_path / "out")
-    with pytest.raises(DatasetError, match="can't resume: something else was begun here .found other episodes"):
-        merge([a, b], tmp_path / "out", resume=True)
+    assert error.value.where == tmp_path / "out" / "conversion.json"
     merge([a, b], tmp_path / "out", overwrite=True)
     assert len(Dataset(tmp_path / "out").numbers) == 4
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("years of work")
-    for flag in ("overwrite", "resume"):
-        with pytest.raises(DatasetError):
-            merge([a, b], tmp_path / "mine", **{flag: True})
+    for overwrite in (False, True):
+        with pytest.raises(OutputExistsError):
+            merge([a, b], tmp_path / "mine", overwrite=overwrite)
     assert (tmp_path / "mine" / "thesis.tex").exists()
     with locked_folder(tmp_path / "locked"), pytest.raises(RobocasError, match="another process is writing here"):
         merge([a], tmp_path / "locked")
@@ -255,7 +254,7 @@ def test_killed_and_resumed_is_as_if_never_killed(parts, tmp_path, moment):
     assert run(["merge", *map(str, parts), "--out", str(whole)]) == 0
     die(moment, "merge", *parts, "--out", out)
     assert not (out / "data_info.json").exists()
-    assert run(["merge", *map(str, parts), "--out", str(out), "--resume"]) == 0
+    assert run(["merge", *map(str, parts), "--out", str(out)]) == 0
     assert files_of(out) == files_of(whole)
     assert validate(out).violations == []
 

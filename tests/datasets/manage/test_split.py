@@ -105,10 +105,10 @@ def test_parts_and_back(six, tmp_path, capsys):
         validates = read(root / "data_info.json")["val_eps"]
         seeds.append({ledger[str(number)]["seed"] for number in validates})
     assert seeds[0] == seeds[1]
-    assert run(words) == 1
-    assert "the output exists already" in capsys.readouterr().err
+    assert run(["split", str(six), "--parts", "0.3", "0.7", "--out", str(tmp_path / "parts")]) == 1
+    assert "written with other settings" in capsys.readouterr().err
     shutil.rmtree(parts[1])
-    assert run([*words, "--resume"]) == 0
+    assert run(words) == 0
 
 
 def test_by_target_and_task(six, tmp_path):

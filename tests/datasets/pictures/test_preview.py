@@ -121,9 +121,7 @@ def test_a_killed_run_leaves_nothing_half_written(trajectory, tmp_path):
     command = [sys.executable, SUPPORT / "dying.py", "picture", trajectory, out, "previews"]
     assert subprocess.run(command, check=False).returncode == -signal.SIGKILL
     assert [name for name in shown(out) if not name.startswith(".")] == ["episode_0000000.mp4"]
-    settings = ConversionSettings(
-        trajectory, out, embeddings=False, open_renderer=RayCaster, resume=True, previews=None
-    )
+    settings = ConversionSettings(trajectory, out, embeddings=False, open_renderer=RayCaster, previews=None)
     conversion.convert(settings)
     assert shown(out) == ["contact_sheet.png", "episode_0000000.mp4", "episode_0000001.mp4"]
 

@@ -76,7 +76,6 @@ def test_a_broken_recording(many, tmp_path, how):
     with pytest.raises(IncompleteError, match=r"out: 1 episode could not.*found episode_0000003: .*traj_3") as error:
         run(trajectory, out)
     assert "\n" not in str(error.value)
-    assert "--resume" in str(error.value)
     assert validate(out).violations == []
     expected, found = files_of(whole), files_of(out)
     different = {name for name in expected if name not in found or found[name] != expected[name]}
@@ -86,7 +85,7 @@ def test_a_broken_recording(many, tmp_path, how):
     assert said["left_out"]["3"]["why"] in str(error.value)
     for side, sides in zip(("train", "val"), Dataset(whole).sides, strict=True):
         assert Dataset(out).split(side) == [number for number in sides if number != 3]
-    run(write_trajectory(trajectory, seeds=SEEDS, steps=16), out, resume=True)  # mended
+    run(write_trajectory(trajectory, seeds=SEEDS, steps=16), out)  # mended
     assert files_of(out) == files_of(whole)
 
 
@@ -97,7 +96,7 @@ def test_an_episode_that_cannot_be_shown_or_stored(many, tmp_path, source, jobs)
         run(trajectory, tmp_path / "out", open_renderer=source, jobs=jobs)
     assert validate(tmp_path / "out").violations == []
     assert len(Dataset(tmp_path / "out").numbers) == len(SEEDS) - 1
-    run(trajectory, tmp_path / "out", resume=True)
+    run(trajectory, tmp_path / "out")
     assert files_of(tmp_path / "out") == files_of(whole)
 
 
@@ -109,12 +108,12 @@ def test_the_only_one_of_its_side(many, tmp_path):
     class OfVal(Breaking):
         seed = SEEDS[val]
 
-    for resume in (False, True):
+    for _ in range(2):
         with pytest.raises(IncompleteError, match=f"episode_{val:07d}"):
-            run(trajectory, tmp_path / "out", open_renderer=OfVal, resume=resume)
+            run(trajectory, tmp_path / "out", open_renderer=OfVal)
         assert validate(tmp_path / "out").violations == []
         assert Dataset(tmp_path / "out").sides[1] == []
-    run(trajectory, tmp_path / "out", resume=True)
+    run(trajectory, tmp_path / "out")
     assert files_of(tmp_path / "out") == files_of(whole)
 
 
@@ -128,7 +127,7 @@ def test_others_are_appended_meanwhile(many, tmp_path):
     ledger = json.loads((tmp_path / "out" / "conversion.json").read_text())
     assert list(ledger["left_out"]) == [str(number) for number in range(1, 14, 2)]
     assert [ledger["episodes"][number]["seed"] for number in ("12", "14", "15")] == [22, 50, 51]
-    done = run(trajectory, tmp_path / "out", resume=True)
+    done = run(trajectory, tmp_path / "out")
     assert [episode.number for episode in done.episodes] == list(range(1, 14, 2))
     assert validate(tmp_path / "out").violations == []
     ledger = json.loads((tmp_path / "out" / "conversion.json").read_text())
@@ -175,13 +174,12 @@ def test_the_command(many, tmp_path, monkeypatch, capsys, to):
     assert run_command(command) == 1
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
     assert "1 episode could not be written (found episode_0000003: cube: no such object). " in line
-    assert "--resume" in line
     assert "--leave-out" in line
-    assert run_command([*command, "--resume", "--leave-out"]) == 0
+    assert run_command([*command, "--leave-out"]) == 0
     assert run_command(["validate", str(out)]) == 0
     assert "13 episodes" in capsys.readouterr().out
     monkeypatch.setattr(owner, name, render_by(RayCaster, whole))
-    assert run_command([*command, "--resume"]) == 0
+    assert run_command(command) == 0
     assert run_command(["validate", str(out)]) == 0
     count = 14 if to == "robocas" else 13  # LeRobot's numbers have no gap that it could fill
     assert f"{count} episodes" in capsys.readouterr().out

@@ -86,7 +86,7 @@ def test_of_a_robocas_dataset(trajectory, tmp_path, monkeypatch, clock):
     assert done.seconds == expected.total
     assert [episode.timing.load for episode in done.episodes] == [8, 3]
     again = conversion.convert(
-        ConversionSettings(trajectory, tmp_path / "out", embeddings=False, open_renderer=RayCaster, resume=True)
+        ConversionSettings(trajectory, tmp_path / "out", embeddings=False, open_renderer=RayCaster)
     )
     assert again.timing == Timing()
 

@@ -136,14 +136,13 @@ def test_resume_keeps_what_is_there(trajectory, tmp_path):
         path.rmdir() if path.is_dir() else path.unlink()
     (out / "episode_0000001").rmdir()
     kept = (out / "episode_0000000" / "episode_info.npz").stat().st_mtime_ns
-    done = run(trajectory, out, resume=True)
+    done = run(trajectory, out)
     assert (done.kept, [e.number for e in done.episodes]) == (1, [1])
     assert files_of(out) == before
     assert (out / "episode_0000000" / "episode_info.npz").stat().st_mtime_ns == kept
-    with pytest.raises(
-        DatasetError, match="can't resume with other settings .expected rate_hz 5.0, found rate_hz 10.0"
-    ):
-        run(trajectory, out, resume=True, rate_hz=10)
+    with pytest.raises(OutputExistsError) as error:
+        run(trajectory, out, rate_hz=10)
+    assert error.value.found == "rate_hz: 5.0 -> 10.0"
     assert files_of(out) == before
 
 
@@ -151,7 +150,7 @@ def test_an_output_that_exists_is_left_alone(trajectory, tmp_path):
     out = tmp_path / "out"
     run(trajectory, out)
     before = files_of(out)
-    with pytest.raises(OutputExistsError, match="--resume to go on, --overwrite to replace"):
+    with pytest.raises(OutputExistsError):
         run(trajectory, out, rate_hz=10)
     with pytest.raises(DatasetError):
         run(tmp_path / "missing.h5", out, overwrite=True)
@@ -162,7 +161,7 @@ def test_an_output_that_exists_is_left_alone(trajectory, tmp_path):
 
 def test_overwrite_deletes_datasets_only(trajectory, tmp_path):
     (tmp_path / "thesis.tex").write_text("years of work")
-    with pytest.raises(DatasetError, match="refusing to overwrite what is not a dataset"):
+    with pytest.raises(OutputExistsError):
         run(trajectory, tmp_path, overwrite=True)
     assert (tmp_path / "thesis.tex").exists()
 
@@ -199,8 +198,9 @@ def test_a_folder_that_is_not_writable(trajectory, tmp_path):
 
 def test_a_folder_that_vanishes(trajectory, tmp_path):
     out = tmp_path / "out"
-    with pytest.raises(DatasetError, match=r"out: the output folder is gone.*\(expected conversion.json\)"):
+    with pytest.raises(RobocasError) as error:
         run(trajectory, out, on_episode=lambda episode: shutil.rmtree(out))
+    assert error.value.where == out
 
 
 def test_a_file_where_a_folder_should_be(trajectory, tmp_path):
@@ -281,7 +281,7 @@ def test_append_wants_a_dataset_of_the_same_settings(trajectory, tmp_path):
         run(trajectory, tmp_path / "none", append=True)
     run(trajectory, tmp_path / "out")
     before = files_of(tmp_path / "out")
-    with pytest.raises(DatasetError, match="can't append with other settings .expected rate_hz 5.0, found rate_hz 10"):
+    with pytest.raises(OutputExistsError):
         run(trajectory, tmp_path / "out", append=True, rate_hz=10)
     assert files_of(tmp_path / "out") == before
 
@@ -293,13 +293,13 @@ def test_with_other_versions_it_does_not_go_on(trajectory, tmp_path):
     about["made_with"]["sapien"] = "2.2.2"
     (out / "conversion.json").write_text(json.dumps(about))
     before = files_of(out)
-    for source, how in ((trajectory, "resume"), (more, "append")):
-        with pytest.raises(DatasetError, match=f"can't {how} with other versions .expected sapien 2.2.2, found sapien"):
-            run(source, out, **{how: True})
+    for source, append in ((trajectory, False), (more, True)):
+        with pytest.raises(OutputExistsError, match='made_with.sapien: "2.2.2" -> '):
+            run(source, out, append=append)
         assert files_of(out) == before
     about["made_with"] = {"robocas_ms3": "0.1.0"}  # older ones said no more
     (out / "conversion.json").write_text(json.dumps(about))
-    assert run(trajectory, out, resume=True).kept == 2
+    assert run(trajectory, out).kept == 2
     assert len(run(more, out, append=True).episodes) == 1
 
 
@@ -319,11 +319,11 @@ def test_killed_and_resumed_is_as_if_never_killed(trajectory, tmp_path, moment):
     ]
     done = subprocess.run(command, check=False, capture_output=True, text=True)
     assert done.returncode == -signal.SIGKILL, done.stderr
-    run(trajectory, out, resume=True)
+    run(trajectory, out)
     assert files_of(out) == files_of(tmp_path / "whole")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "whole"]
     with pytest.raises(DatasetError, match="no successful"):
-        run(write_trajectory(tmp_path / "failed.h5", failed=(0, 1, 2)), out, resume=True)
+        run(write_trajectory(tmp_path / "failed.h5", failed=(0, 1, 2)), out)
 
 
 def test_two_conversions_into_one_folder_are_refused(trajectory, tmp_path):

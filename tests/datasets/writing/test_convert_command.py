@@ -34,7 +34,7 @@ def test_the_parts_of_the_time_come_last(trajectory, made_up_pictures, tmp_path,
     assert re.fullmatch(
         r"episodes written: 0 of 2\nepisodes written: 2 of 2, .+\n", printed.err
     )  # no bar, no blank line
-    assert run([*command, "--resume"]) == 0
+    assert run(command) == 0
     assert re.fullmatch(r".*: 0 episodes, 2 kept\n", capsys.readouterr().out)
 
 
@@ -129,7 +129,6 @@ def test_only_the_recordings_that_are_converted_count(tmp_path, caplog):
     ("flags", "said"),
     [
         ("--append --overwrite", "expected one of them, found --overwrite --append"),
-        ("--resume --overwrite", "expected one of them, found --overwrite --resume"),
         ("--jobs 0", "expected 1 or more, found 0"),
         ("--cameras base_camera base_camera", "expected each once, found base_camera base_camera"),
     ],
@@ -144,9 +143,8 @@ def test_flags_that_make_no_sense(made, trajectory, capsys, flags, said):
 @pytest.mark.parametrize(
     ("flags", "said"),
     [
-        ((), "; --resume goes on"),
-        (("--overwrite",), "; --resume in place of --overwrite goes on"),
-        (("--append",), "; the same command goes on"),
+        ((), "; the same command continues"),
+        (("--overwrite",), "; the same command without --overwrite continues"),
     ],
 )
 def test_an_interrupted_conversion_says_how_to_go_on(monkeypatch, tmp_path, capsys, flags, said):
@@ -169,11 +167,11 @@ def test_one_is_no_plural(made_up_pictures, tmp_path, capsys):
     (out / "data_info.json").unlink()
     assert run(["validate", str(out)]) == 1
     assert capsys.readouterr().out.splitlines() == [
-        "data_info.json: expected this file, found no file: not finished, convert with --resume",
+        "data_info.json: expected this file, found no file: not finished, convert again",
         f"{out}: 1 episode, 7 steps, 1 violation",
     ]
     assert run(["stats", str(out)]) == 1
-    assert capsys.readouterr().err == f"error: {out}: this dataset is not finished. Convert with --resume.\n"
+    assert capsys.readouterr().err.startswith(f"error: {out}: this dataset is not finished")
 
 
 @pytest.mark.parametrize(
@@ -190,7 +188,7 @@ def test_shares_that_make_no_sense(made, capsys, flags, said):
 
 
 def test_what_another_trajectory_left_missing_is_said(tmp_path, caplog):
-    """--append of b was killed; --resume of a can't make b's episodes."""
+    """--append of b was killed; converting a again can't make b's episodes."""
     a, b = (write_trajectory(tmp_path / f"{n}.h5", seeds=seeds) for n, seeds in (("a", (1, 2)), ("b", (3, 4, 5))))
     out = tmp_path / "out"
     options = {"embeddings": False, "open_renderer": RayCaster}
@@ -199,10 +197,10 @@ def test_what_another_trajectory_left_missing_is_said(tmp_path, caplog):
     for number in (2, 4):
         shutil.rmtree(out / f"episode_000000{number}")
     assert caplog.records == []
-    conversion.convert(ConversionSettings(a, out, resume=True, **options))
+    conversion.convert(ConversionSettings(a, out, **options))
     said = [record.getMessage() for record in caplog.records]
     assert said == [f"{out}: episodes 2, 4 of b.h5 are still missing: convert that with --append"]
-    hint = "found no folder (convert b.h5 again with --append or --resume)"
+    hint = "found no folder (convert b.h5 again, or with --append)"
     assert [str(v) for v in validate(out).violations] == [
         f"conversion.json, episodes.{number}: expected the episodes on disk, {hint}" for number in (2, 4)
     ]

@@ -1,4 +1,4 @@
-"""Files that are cut off between two runs: --resume writes their episode again, robocas validate names them."""
+"""Files that are cut off between two runs: the next run writes their episode again, robocas validate names them."""
 
 import shutil
 
@@ -50,7 +50,7 @@ def test_its_episode_is_written_again(whole, trajectory, tmp_path, caplog, name,
     path = out / "episode_0000001" / name
     harm(path, left)
     assert any(name.rpartition("/")[2] in str(violation) for violation in validate(out).violations)
-    done = run(trajectory, out, resume=True)
+    done = run(trajectory, out)
     assert (done.kept, [episode.number for episode in done.episodes]) == (1, [1])
     assert f"{path}: cut off, or gone" in caplog.text
     assert files_of(out) == files_of(whole)
@@ -73,9 +73,9 @@ def test_a_split_that_is_cut_off_is_made_anew_if_one_wants(whole, trajectory, tm
     shutil.copytree(whole, out)
     harm(out / "data_info.json", 0.5)
     with pytest.raises(DatasetError, match="data_info.json: the split can't be read.*Delete it"):
-        run(trajectory, out, resume=True)
+        run(trajectory, out)
     (out / "data_info.json").unlink()
-    run(trajectory, out, resume=True)
+    run(trajectory, out)
     assert files_of(out) == files_of(whole)
 
 
@@ -92,9 +92,7 @@ def test_parts_of_a_lerobot_dataset(trajectory, tmp_path, monkeypatch, name):
         patch.setattr(lerobot, "_join", killed)
         lerobot.convert_lerobot(ConversionSettings(trajectory, tmp_path / "out", open_renderer=RayCaster))
     harm(tmp_path / "out" / ".parts" / "episode_0000001" / name, 0.5)
-    done = lerobot.convert_lerobot(
-        ConversionSettings(trajectory, tmp_path / "out", open_renderer=RayCaster, resume=True)
-    )
+    done = lerobot.convert_lerobot(ConversionSettings(trajectory, tmp_path / "out", open_renderer=RayCaster))
     assert (done.kept, [episode.number for episode in done.episodes]) == (1, [1])
     lerobot.convert_lerobot(ConversionSettings(trajectory, tmp_path / "whole", open_renderer=RayCaster))
     assert files_of(tmp_path / "out") == files_of(tmp_path / "whole")

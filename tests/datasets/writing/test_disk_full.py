@@ -106,7 +106,7 @@ def test_a_conversion(trajectory, made_up_pictures, tmp_path, monkeypatch, capsy
     assert left == (["conversion.json", *(f"episode_{n:07d}" for n in range(episodes))] if episodes else [])
     assert [path.name for path in tmp_path.iterdir()] == (["out"] if episodes else [])
     assert files_of(trajectory.parent) == source
-    assert run([*command, "--resume"]) == 0
+    assert run(command) == 0
     assert validate(out).violations == []
     command[3] = str(tmp_path / "whole")
     assert run(command) == 0
@@ -151,7 +151,7 @@ def test_a_conversion_to_lerobot(made, tmp_path, monkeypatch, capsys, moment, la
     assert left == ([*(f"episode_{n:07d}" for n in range(parts)), "plan.json"] if parts else [])
     assert not (out / "meta").exists()
     assert files_of(made) == source
-    assert run([*command, "--resume"]) == 0
+    assert run(command) == 0
     command[5] = str(tmp_path / "whole")
     assert run(command) == 0
     assert files_of(out) == files_of(tmp_path / "whole")

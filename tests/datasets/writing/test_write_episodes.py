@@ -42,7 +42,7 @@ def file(tmp_path_factory):
 def job(file, tmp_path):
     def make(writer, numbers, continued=False, **settings):
         settings = ConversionSettings(file, tmp_path / "out", open_renderer=RayCaster, **settings)
-        return WriteJob(settings, writer, [(number, number + 10) for number in numbers], file, continued, "Repair it.")
+        return WriteJob(settings, writer, [(number, number + 10) for number in numbers], continued, "Repair it.")
 
     return make
 
