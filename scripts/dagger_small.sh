@@ -31,4 +31,4 @@ timed "$robocas" convert "$out/demos/trajectory.h5" --out "$out/parts" --size 51
     --cameras base_camera gripper_camera --jobs "$jobs"
 timed "$robocas" merge "$from/data" "$out/parts" --out "$out/data"
 timed "$robocas" train small --data "$out/data" --out "$out/run" --start "$from/run" --steps "$steps"
-timed "$robocas" eval "$task" --policy "$out/run" --protocol paper-v1 --out "$out/eval" --envs "$jobs" --resume
+timed "$robocas" eval "$task" --policy "$out/run" --protocol paper-v1 --out "$out/eval" --envs "$jobs"

@@ -56,4 +56,4 @@ for part in "${parts[@]}"; do
 done
 timed "$robocas" merge "${data[@]}" --out "$out/data"
 timed "$robocas" train small --data "$out/data" --out "$out/run" --steps "$steps" ${start:+--start "$start"}
-timed "$robocas" eval "$played" --policy "$out/run" --protocol paper-v1 --out "$out/eval" --envs "$jobs" --resume
+timed "$robocas" eval "$played" --policy "$out/run" --protocol paper-v1 --out "$out/eval" --envs "$jobs"

@@ -44,5 +44,5 @@ for what in "${whats[@]}"; do
             ;;
     esac
     timed "$robocas" train small --data "$data" --out "$out/run" --steps "$steps" "${more[@]}"
-    timed "$robocas" eval pick --policy "$out/run" --protocol paper-v1 --episodes "$episodes" --out "$out/eval" --envs "$jobs" --resume
+    timed "$robocas" eval pick --policy "$out/run" --protocol paper-v1 --episodes "$episodes" --out "$out/eval" --envs "$jobs"
 done

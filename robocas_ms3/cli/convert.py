@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from robocas_ms3.datasets.formats import Format
     from robocas_ms3.datasets.writing.settings import Conversion
 
+from robocas_ms3.cli.interrupts import resumable
 from robocas_ms3.cli.options import Maybe
 from robocas_ms3.datasets.lerobot.variants import NEWEST, Version
 
@@ -75,16 +76,11 @@ class Convert:
     """Object pack to use instead of the recorded one: its name, or its folder."""
 
 
+@resumable
 def main(cfg: Convert) -> int:
     """Convert, with a progress bar; gives the exit code."""
     _check(cfg)
-    try:
-        return _convert(cfg)
-    except KeyboardInterrupt:
-        if not cfg.out.is_dir():
-            raise
-        how = "the same command" + (" without --overwrite" if cfg.overwrite else "")
-        raise KeyboardInterrupt(f"{how} continues") from None
+    return _convert(cfg)
 
 
 def _check(cfg: Convert) -> None:

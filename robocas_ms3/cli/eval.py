@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 import tyro
 
 from robocas_ms3.cli import eval_protocols, eval_results
+from robocas_ms3.cli.interrupts import resumable
 from robocas_ms3.cli.options import Maybe, Several, Word
 
 DESCRIPTION = """Measure a policy by a protocol, and work with results.
@@ -35,10 +36,10 @@ class Run:
     """Name of a bundled protocol, or its folder. Default: ms3-v1."""
     out: Maybe[Path] = None
     """Folder to write to. Default: eval/PROTOCOL/POLICY, with the weld eval/PROTOCOL/POLICY_weld."""
-    resume: bool = False
-    """Go on with a result that is there."""
+    overwrite: bool = False
+    """Start again. Default: continue a result with the same settings, or add episodes to it."""
     retry_errors: bool = False
-    """With --resume: play episodes again that an error broke off, such as a server that was gone."""
+    """Run episodes again that ended with an error, such as a server that was gone."""
     envs: int = 2
     """Envs at a time; the outcome does not depend on it."""
     workers: Maybe[int] = None
@@ -61,6 +62,7 @@ class Run:
     protocols with upstream's steps (paper-v1), in processes; never to be compared with results without."""
 
 
+@resumable
 def run(cfg: Run) -> int:
     """Play the episodes that the result does not have yet."""
     from robocas_ms3.core.errors import EvaluationError
@@ -88,8 +90,6 @@ def run(cfg: Run) -> int:
             check_number(name, number, 1)
     check_number("step_seconds", cfg.step_seconds, 1)
     check_number("memory_gb", cfg.memory_gb, 0.1)
-    if cfg.retry_errors and not cfg.resume:
-        raise EvaluationError("there is nothing to retry", where="--retry-errors", fix="Pass --resume too.")
     shard = shard_of(cfg.shard)
     check_policy(cfg.policy)
     protocol = load_protocol(cfg.protocol or "ms3-v1")
@@ -113,18 +113,15 @@ def run(cfg: Run) -> int:
     )
     succeeded = played = 0
     with open_policy(cfg.policy) as policy, bar("episodes played") as shown:
-        try:
-            session, retry = EvaluationSession(protocol, policy, settings), cfg.retry_errors
-            for outcome in evaluate(session, out, resume=cfg.resume, retry_errors=retry, on_start=shown.start):
-                played += 1
-                succeeded += outcome.success
-                shown.advance()
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt("the same command with --resume goes on") from None
+        session, retry = EvaluationSession(protocol, policy, settings), cfg.retry_errors
+        for outcome in evaluate(session, out, overwrite=cfg.overwrite, retry_errors=retry, on_start=shown.start):
+            played += 1
+            succeeded += outcome.success
+            shown.advance()
     result = read(out)
     say_lines(markdown(result))
     broken = result.broken_off()
-    fix = f", {broken} broken off by an error (--resume --retry-errors plays them again)" if broken else ""
+    fix = f", {broken} broken off by an error (--retry-errors runs them again)" if broken else ""
     there = count_of(len(result.outcomes), "episode")
     say(f"{count_of(played, 'episode')} played, {succeeded} succeeded; {out}: {there}{fix}")
     write_pages(result, out, cfg.protocol)

@@ -31,14 +31,18 @@ def heed_ctrl_c() -> None:
 
 
 def resumable(command: Callable[_P, int]) -> Callable[_P, int]:
-    """Decorate a command that continues its work when it is run again: Ctrl-C says so."""
+    """Decorate a command that continues its work when it is run again: Ctrl-C says so.
+
+    With ``overwrite`` in its settings, it continues without that.
+    """
 
     @wraps(command)
     def run(*args: _P.args, **kwargs: _P.kwargs) -> int:
         try:
             return command(*args, **kwargs)
         except KeyboardInterrupt:
-            raise KeyboardInterrupt("the same command continues") from None
+            without = " without --overwrite" if any(getattr(cfg, "overwrite", False) for cfg in args) else ""
+            raise KeyboardInterrupt(f"the same command{without} continues") from None
 
     return run
 

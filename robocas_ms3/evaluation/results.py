@@ -21,9 +21,9 @@ from pydantic import BaseModel, ConfigDict
 
 from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.core.files import json_text, make_folder, replacing_folder, write_json
+from robocas_ms3.core.files import json_text, replacing_folder, write_json
 from robocas_ms3.core.ledger import Ledger
-from robocas_ms3.core.outputs import FolderKind, OutputFolder, check_replaceable, check_run
+from robocas_ms3.core.outputs import FolderKind, OutputFolder, check_replaceable
 from robocas_ms3.core.strict import parse, parse_json
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.statistics import Share, share
@@ -123,48 +123,6 @@ def open_result(
             outcomes = {number: one for number, one in outcomes.items() if not one.error}
             _ledger(folder).rewrite(outcomes.values())
         yield outcomes
-
-
-def begin(folder: Path, run: dict[str, Any], *, resume: bool, again: bool = False) -> dict[int, Outcome]:
-    """Begin a result, or go on with it.
-
-    Args:
-        folder: of the result.
-        run: what it is measured with.
-        resume: whether to go on with one that is there.
-        again: whether to drop episodes that were broken off by an error, so that they are played again.
-
-    Returns:
-        What is there already.
-
-    Raises:
-        EvaluationError: it was measured with something else, the folder is no evaluation's, or ``run`` has a value that
-            `read` would refuse.
-    """
-    path = folder / RUN
-    text = json_text({**_BEFORE, **run}, path, error=EvaluationError)
-    parse_json(_RunRecord, text, EvaluationError, where=path, about="this evaluation can't be recorded")
-    check_run(path, "protocol_hash", "eval", EvaluationError)
-    make_folder(folder)
-    if not (folder / OUTCOMES).is_file():  # without an episode it is of nothing yet
-        write_json(path, run)
-        return {}
-    if not path.is_file():
-        raise EvaluationError("episodes of nobody knows what", where=folder, expected=RUN, fix="Choose another --out.")
-    before = _read_run(folder)
-    if not resume:
-        raise EvaluationError(
-            "there is a result already", where=folder, fix="Pass --resume to go on, or another --out."
-        )
-    for key, value in run.items():
-        if _telling(key, before.get(key)) != _telling(key, value):
-            expected, found = _differing(before.get(key), value)
-            raise EvaluationError(f"can't go on with another {key}", where=folder, expected=expected, found=found)
-    outcomes = _outcomes(folder)
-    if again and any(one.error for one in outcomes.values()):
-        outcomes = {number: one for number, one in outcomes.items() if not one.error}
-        _ledger(folder).rewrite(outcomes.values())
-    return outcomes
 
 
 def append(folder: Path, outcome: Outcome) -> None:

@@ -17,8 +17,6 @@ from numpy.typing import ArrayLike
 
 from robocas_ms3.assets.pack import MANIFEST, load_pack, sha256
 from robocas_ms3.core.errors import EvaluationError, WorkerDied
-from robocas_ms3.core.locks import locked_folder
-from robocas_ms3.core.outputs import while_there
 from robocas_ms3.datasets.writing.render import require_renderer
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.outcomes import Outcome
@@ -308,16 +306,18 @@ def evaluate(
     session: EvaluationSession,
     folder: Path,
     *,
-    resume: bool = False,
+    overwrite: bool = False,
     retry_errors: bool = False,
     on_start: Callable[[int], None] = lambda count: None,
 ) -> Iterator[Outcome]:
-    """Run the episodes that a result lacks, and write each outcome as its episode ends. The session is closed.
+    """Start or continue a result: run the episodes that it lacks, and write each outcome as its episode ends.
+
+    The session is closed.
 
     Args:
         session: protocol, policy and episodes.
         folder: of the result.
-        resume: whether to continue a result that exists.
+        overwrite: whether to start again, and replace a result that exists.
         retry_errors: whether to run episodes again that ended with an error.
         on_start: called with the number of episodes to run.
 
@@ -325,14 +325,13 @@ def evaluate(
         The outcome of each episode.
 
     Raises:
-        EvaluationError: the result was measured with something else.
-        RobocasError: another process writes to the folder.
+        OutputExistsError: the result was measured with something else.
+        RobocasError: another process writes to the folder, or somebody removed it.
     """
-    with locked_folder(folder), closing(session):
-        done = results.begin(folder, session.record, resume=resume, again=retry_errors)
+    opened = results.open_result(folder, session.record, overwrite=overwrite, retry_errors=retry_errors)
+    with closing(session), opened as done:
         left = [episode for episode in session.episodes if episode.episode not in done]
         on_start(len(left))
         for outcome in session.play(left):
-            with while_there(folder / results.RUN, EvaluationError):
-                results.append(folder, outcome)
+            results.append(folder, outcome)
             yield outcome

@@ -9,7 +9,7 @@ import pytest
 from counting import Dying
 
 from robocas_ms3.cli.main import run as cli
-from robocas_ms3.core.errors import DatasetError, EvaluationError, RobocasError, WorkerDied
+from robocas_ms3.core.errors import DatasetError, EvaluationError, OutputExistsError, RobocasError, WorkerDied
 from robocas_ms3.core.locks import locked_folder
 from robocas_ms3.evaluation import results, session
 from robocas_ms3.evaluation.policies import make_policy
@@ -30,10 +30,10 @@ def short(tmp_path_factory):
     return folder
 
 
-def play(folder, policy="random", *, protocol="smoke", resume=False, **settings) -> dict[int, dict]:
+def play(folder, policy="random", *, protocol="smoke", **settings) -> dict[int, dict]:
     made = make_policy(policy)
     settings = EvaluationSettings(policy, backend="processes", **{"tasks": ("pick", "select"), **settings})
-    list(evaluate(EvaluationSession(load_protocol(protocol), made, settings), folder, resume=resume))
+    list(evaluate(EvaluationSession(load_protocol(protocol), made, settings), folder))
     return {number: one.without_clock() for number, one in results.read(folder).outcomes.items()}
 
 
@@ -66,11 +66,9 @@ def test_a_run_that_was_cut_off_goes_on_and_ends_the_same(alone, short, tmp_path
     playing.close()
     path = tmp_path / "episodes.jsonl"
     path.write_text(path.read_text() + path.read_text()[:100])  # and killed while it wrote
-    with pytest.raises(EvaluationError, match="there is a result already"):
-        play(tmp_path, protocol=short)
-    with pytest.raises(EvaluationError, match="can't go on with another policy"):
-        play(tmp_path, "still", protocol=short, resume=True)
-    assert play(tmp_path, protocol=short, resume=True, num_envs=2) == alone
+    with pytest.raises(OutputExistsError, match="policy.name"):
+        play(tmp_path, "still", protocol=short)
+    assert play(tmp_path, protocol=short, num_envs=2) == alone
 
 
 @pytest.mark.slow
@@ -158,7 +156,7 @@ def test_an_episode_that_ends_its_process_is_played_again_and_then_counts_as_fai
     said = problems(results.read(tmp_path / "out"), protocol)
     assert not [one for one in said if one.startswith("episode 1:") and times == 2]
     if times == 2:
-        play(tmp_path / "out", "still", protocol=short, resume=True)  # it stays as it is
+        play(tmp_path / "out", "still", protocol=short)  # it stays as it is
         assert results.read(tmp_path / "out").broken_off() == 1
 
 
@@ -178,7 +176,7 @@ def test_an_interrupted_run_says_how_it_goes_on(tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(session, "evaluate", interrupted)
     assert cli(["eval", "--protocol", "smoke", "--policy", "still", "--out", str(tmp_path)]) == 130
-    assert capsys.readouterr().err == "interrupted; the same command with --resume goes on\n"
+    assert capsys.readouterr().err == "interrupted; the same command continues\n"
 
 
 def test_what_a_policy_can_not_want():

@@ -61,10 +61,11 @@ def test_wants_of_a_policy_are_part_of_its_description():
 def test_what_a_description_says_is_read_back_and_does_not_rename_the_policy(tmp_path):
     policy = Policy({"name": 5, "sizes": (1, 2), "note": HOSTILE})
     run = EvaluationSession(load_protocol("smoke"), policy, EvaluationSettings("mine", backend="processes")).record
-    results.begin(tmp_path / "out", run, resume=False)
-    results.append(tmp_path / "out", outcome(0))
+    with results.open_result(tmp_path / "out", run):
+        results.append(tmp_path / "out", outcome(0))
     assert results.read(tmp_path / "out").run["policy"]["name"] == "mine"
-    assert results.begin(tmp_path / "out", run, resume=True)  # what was written is what is asked for again
+    with results.open_result(tmp_path / "out", run) as done:  # what was written is what is asked for again
+        assert list(done) == [0]
 
 
 def test_an_error_text_of_a_policy_is_read_back(tmp_path):

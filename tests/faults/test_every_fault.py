@@ -31,7 +31,6 @@ from robocas_ms3.evaluation.protocol import load_protocol
 
 pytestmark = pytest.mark.faults
 COMMANDS = ("generate", "convert", "plan run", "eval")
-_CONTINUES = ("generate", "convert", "plan run")  # without a flag
 KILLS = int(os.environ.get("ROBOCAS_FAULT_KILLS", "20"))
 SEED = int(os.environ.get("ROBOCAS_FAULT_SEED", "0")) or random.SystemRandom().randrange(10**6)
 PLAN = """\
@@ -42,10 +41,6 @@ embeddings: false
 block: 2
 limits: {record_seconds: 45, render_seconds: 600, memory_gb: 1.5}
 """
-
-
-def again(command):
-    return () if command.name in _CONTINUES else ("--resume",)
 
 
 @pytest.fixture(scope="session")
@@ -132,7 +127,7 @@ def test_a_task_whose_process(command, undisturbed, tmp_path, row, fault, times)
         assert code == 1
         assert "episode_0000001: its process died twice: SIGSEGV" in said
         assert command.finished(out) == EPISODES - 1
-        succeed([*words, *again(command)])
+        succeed(words)
         row.judge(expected, content(command, out))
         return
     assert code == 0, said[-2000:]
@@ -153,7 +148,7 @@ def test_kill_9_of_all_at_random_moments(command, undisturbed, tmp_path, row):
     row.note = f"seed {SEED}"
     while True:
         started = time.monotonic()
-        with running(command.line(out, 2, *again(command)), {"log": str(log)}) as process:
+        with running(command.line(out, 2), {"log": str(log)}) as process:
             kill = row.injected < KILLS
             try:
                 _, said = process.communicate(timeout=chance.uniform(0, 1.1 * whole) if kill else PATIENCE)
@@ -188,7 +183,7 @@ def test_ctrl_c(command, undisturbed, tmp_path, row, times):
     assert process.returncode == 130
     assert len(lines_of(said)) == 1, said
     resumed = time.monotonic()
-    succeed(command.line(out, 2, *again(command)), {"log": str(log)})
+    succeed(command.line(out, 2), {"log": str(log)})
     row.seconds = [round(when - resumed, 1) for when, _ in begun(log) if when > resumed][:1]
     row.judge(undisturbed(command)[0], content(command, out))
 
@@ -203,7 +198,7 @@ set +e
 df --output=avail "$0/disk" >"$0/room"
 cp -r "$0/disk/out" "$0/full"
 mount -o remount,"$AGAIN" "$0/disk" || exit 9
-"$@" $RESUME 2>"$0/said_after"; echo $? >"$0/code_after"
+"$@" 2>"$0/said_after"; echo $? >"$0/code_after"
 cp -r "$0/disk/out" "$0/out"
 """
 
@@ -215,7 +210,7 @@ def test_a_full_disk(command, undisturbed, tmp_path, row):
     row.command, row.injected = command.name, 1
     size = {"generate": "500k", "convert": "3m", "plan run": "3500k", "eval": "8k"}[command.name]
     words = ["unshare", "-rm", "sh", "-c", ROOM, str(tmp_path), str(tmp_path), size]
-    env = {**environment(), "AGAIN": "size=1g", "RESUME": "".join(again(command))}
+    env = {**environment(), "AGAIN": "size=1g"}
     line = command.line(tmp_path / "disk" / "out", 2)
     subprocess.run([*words, *line], env=env, check=True, timeout=PATIENCE, stdout=subprocess.DEVNULL)
     said = (tmp_path / "said").read_text()
@@ -249,7 +244,7 @@ def test_an_output_folder_that(command, undisturbed, tmp_path, row, how):
     assert is_one_line(said), said[-2000:]
     if not vanishes:
         make_writable(out, yes=True)
-        succeed(command.line(out, 2, *again(command)))
+        succeed(command.line(out, 2))
         row.judge(undisturbed(command)[0], content(command, out))
 
 
@@ -289,7 +284,7 @@ def test_a_file_of_a_run_that_was_cut_off(commands, undisturbed, tmp_path, row, 
         cut(path)
         row.injected += 1
     assert row.injected
-    succeed(command.line(out, 2, *again(command)))
+    succeed(command.line(out, 2))
     row.judge(undisturbed(command)[0], content(command, out))
 
 
@@ -313,7 +308,7 @@ def test_two_runs_into_one_folder(command, undisturbed, tmp_path, row):
     log, out = tmp_path / "log", tmp_path / "out"
     with running(command.line(out, 2), {"log": str(log)}) as process:
         wait_until(lambda: begun(log), process)
-        code, said = run(command.line(out, 2, *again(command)))
+        code, said = run(command.line(out, 2))
         assert code == 1
         assert is_one_line(said) and "another process is writing here" in said, said[-2000:]
         assert process.wait(PATIENCE) == 0
@@ -328,7 +323,7 @@ def test_another_version(commands, tmp_path, row, name):
     log, out = tmp_path / "log", tmp_path / "out"
     stopped_half_way(command, out, log)
     before = command.finished(out)
-    code, said = run(command.line(out, 2, *again(command)), {"versions": {"sapien": "2.2.2"}})
+    code, said = run(command.line(out, 2), {"versions": {"sapien": "2.2.2"}})
     assert code == 1, said[-2000:]
     assert is_one_line(said) and "2.2.2" in said, said[-2000:]
     assert command.finished(out) == before

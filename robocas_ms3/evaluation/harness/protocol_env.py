@@ -14,7 +14,6 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.core.locks import locked_folder
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.harness.proprioception import WIDTHS, Proprioception, depth_key
@@ -69,10 +68,8 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         self._folder, self._recorded = folder, set[int]()  # episodes that the result has
         if folder is not None:
             with ExitStack() as lock:
-                lock.enter_context(locked_folder(folder))
-                if (folder / results.OUTCOMES).exists():
+                if lock.enter_context(results.open_result(folder, self._session.record)):
                     raise EvaluationError("there is a result already", where=folder, fix="Choose another folder.")
-                results.begin(folder, self._session.record, resume=False)
                 self._lock = lock.pop_all()  # held until `close`
         self._convention = CONVENTIONS[spec.convention]
         self._proprioception = Proprioception()
