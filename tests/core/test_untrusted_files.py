@@ -71,7 +71,8 @@ def test_results_of_an_evaluation(tmp_path, name):
         assert markdown(found)
         assert page(found)
         assert comparison([found, found])
-        assert results.begin(root, run, resume=True)
+        with results.open_result(root, run) as done:
+            assert done
 
     read()
     whole = json.loads((root / name).read_text().splitlines()[0])
