@@ -27,7 +27,7 @@ from robocas_ms3.demos.workers import generate_seeds, shard_name
 from robocas_ms3.planning.seconds import Seconds
 
 RUN = "run.json"
-_OUTPUT = FolderKind("robocas generate", (RUN,), "settings", upgrade=upgrade_run)
+OUTPUT = FolderKind("robocas generate", (RUN,), "settings", upgrade=upgrade_run)
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def generate(
     run = {"settings": asdict(settings), "first_seed": first_seed, "versions": versions()}
     if weights:
         run[WEIGHTS] = weights
-    with OutputFolder(out, _OUTPUT, run, overwrite=overwrite) as output:
+    with OutputFolder(out, OUTPUT, run, overwrite=overwrite) as output:
         output.start(run)
         return _generate_in(output, settings, episodes, first_seed, jobs, fork, limits, on_start, on_result, players)
 

@@ -209,7 +209,7 @@ def _telling(key: str, value: Any) -> Any:
         key == "policy"
         and isinstance(value, dict)
         and value.get("server")
-        and value.get("name", "").startswith(_ADDRESSES)
+        and str(value.get("name")).startswith(_ADDRESSES)
     ):
         return {name: said for name, said in value.items() if name != "name"}
     return value

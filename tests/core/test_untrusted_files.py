@@ -12,12 +12,14 @@ from synthetic import write_trajectory
 
 from robocas_ms3.core.documents import DocumentError
 from robocas_ms3.core.errors import RobocasError, TrainingError
+from robocas_ms3.core.outputs import OutputFolder
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.provenance import recorded_scene, recording_entry
 from robocas_ms3.datasets.sources.trajectory import TrajectorySource
 from robocas_ms3.datasets.statistics.collect import collect
-from robocas_ms3.datasets.writing.plan import dataset_settings, resumed_plan
-from robocas_ms3.demos.checks import check_same_run
+from robocas_ms3.datasets.writing.output import DATASET
+from robocas_ms3.datasets.writing.plan import dataset_settings, plan_episodes
+from robocas_ms3.demos.generate import OUTPUT
 from robocas_ms3.demos.ledger import Ledger, count_by_stage
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
 from robocas_ms3.evaluation import results
@@ -71,8 +73,7 @@ def test_results_of_an_evaluation(tmp_path, name):
         assert markdown(found)
         assert page(found)
         assert comparison([found, found])
-        with results.open_result(root, run) as done:
-            assert done
+        OutputFolder(root, results.OUTPUT, run).read()
 
     read()
     whole = json.loads((root / name).read_text().splitlines()[0])
@@ -144,10 +145,10 @@ def test_files_of_a_generation(tmp_path):
     run = {"env_id": "x", "settings": {"task": "pick", "control_freq": 20}, "versions": {"a": "1"}, "seed": 0}
     path = tmp_path / "run.json"
     path.write_text(json.dumps(run))
-    assert refused(lambda: check_same_run(path, run), path, run)
     ledger = Ledger(tmp_path / "failures.jsonl")
     failure = {"seed": 1, "attempt": 0, "stage": "a", "reason": "b", "seconds": 1.0}
     ledger.path.write_text(json.dumps(failure) + "\n")
+    assert refused(lambda: OutputFolder(tmp_path, OUTPUT, run).read(), path, run)
     refused(lambda: (ledger.by_seed(), count_by_stage(ledger.read())), ledger.path, failure, line=True)
     for changes in ({"attempt": -2}, {"seed": 2**62}, {"seconds": 1e308}, {"seconds": True}):
         ledger.path.write_text(json.dumps({**failure, **changes}) + "\n")
@@ -174,12 +175,18 @@ def test_the_json_of_a_trajectory(tmp_path):
     assert refused(read, path.with_suffix(".json"), whole, most=25)
 
 
-def test_the_settings_of_a_conversion_that_is_resumed(tmp_path):
+def test_the_settings_of_a_conversion_that_continues(tmp_path):
     entry = {"trajectory": "F.h5", "trajectory_episode": 0, "seed": 3, "success": True, "recording": "ab", "source": 0}
     settings = dataset_settings(5, Pictures(), False)
-    (tmp_path / "conversion.json").write_text("{}")
+    (tmp_path / "episode_0000000").write_text("an episode")
     whole = {"schema_version": 2, "made_with": {}, **settings, "episodes": {"0": entry}}
-    assert refused(lambda: resumed_plan(tmp_path, [entry], settings), tmp_path / "conversion.json", whole)
+
+    def read():
+        output = OutputFolder(tmp_path, DATASET, settings)
+        output.read()
+        plan_episodes(output, [entry], settings, append=False)
+
+    assert refused(read, tmp_path / "conversion.json", whole)
 
 
 torch = pytest.importorskip("torch", reason="needs torch")
