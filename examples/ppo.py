@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 import tyro
 
-from robocas_ms3.baselines.session import Said, train_run
+from robocas_ms3.baselines.training.session import Progress, train_run
 
 
 @dataclass
@@ -38,7 +38,7 @@ def main(args: Args) -> None:
     torch.set_num_threads(1)
     train = {"seed": args.seed, "steps": args.steps, "batch_size": args.batch}
     more = {"envs": args.envs, "workers": args.workers, "layouts": args.layouts, "trials": args.trials}
-    train_run("ppo", None, args.out, {**more, "train": train}, overwrite=True, said=Said(note=print))
+    train_run("ppo", None, args.out, {**more, "train": train}, overwrite=True, progress=Progress(note=print))
 
 
 if __name__ == "__main__":

@@ -1,1 +1,1 @@
-"""Policies that learn from demonstrations: a folder each, one trainer, and runs that `robocas eval` measures."""
+"""Policies that are trained: a folder per baseline, `training` for the trainer, `chunks` for what several predict."""

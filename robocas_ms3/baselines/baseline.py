@@ -1,8 +1,9 @@
-"""What a baseline is to the trainer and to the evaluation, and what all of them are trained with."""
+"""Interfaces of a baseline, and the settings that baselines share."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Protocol
 
@@ -16,29 +17,45 @@ Precision = Literal["auto", "fp32", "bf16"]
 Split = Literal["train", "val"]
 Batch = dict[str, torch.Tensor]
 OnRead = Callable[[int, int], None]
-Share = Annotated[float, Field(ge=0, lt=1)]
+"""Called with the number of episodes read, and of all."""
+Fraction = Annotated[float, Field(ge=0, lt=1)]
+
+
+@dataclass
+class Progress:
+    """Functions that a training reports to.
+
+    Attributes:
+        note: called with a line of text.
+        read: called with the number of episodes read, and of all.
+        step: called with the number of steps done, and of all.
+    """
+
+    note: Callable[[str], None] = lambda text: None
+    read: OnRead = lambda done, total: None
+    step: Callable[[int, int], None] = lambda done, total: None
 
 
 class TrainSettings(StrictModel):
-    """How a baseline is trained.
+    """Settings of supervised training.
 
     Attributes:
         steps: of the optimiser.
-        batch_size: samples a step, of all processes together.
-        learning_rate: AdamW's, after the warm-up.
-        min_learning_rate: what the schedule falls to.
-        weight_decay: AdamW's, on matrices and kernels; not on biases and norms.
-        betas: AdamW's, decay of the means of gradients and of their squares.
-        warmup_steps: in which the learning rate rises from 0.
-        schedule: ``cosine`` falls once over all steps, ``restarts`` again and again, ``constant`` does not.
-        restart_epochs, restart_factor: first period of ``restarts`` in epochs, and what each is longer than the last.
-        clip_norm: of the gradient; 0: it is not clipped.
-        ema: decay of the average of the weights that policies act with, at its slowest; 0: the last weights.
-        seed: of everything random.
+        batch_size: samples per step, of all processes together.
+        learning_rate: of AdamW, after the warm-up.
+        min_learning_rate: at the end of the schedule.
+        weight_decay: of AdamW, on matrices and kernels; not on biases and norms.
+        betas: of AdamW.
+        warmup_steps: over which the learning rate rises from 0.
+        schedule: ``cosine`` falls once over all steps, ``restarts`` repeatedly, ``constant`` does not.
+        restart_epochs, restart_factor: first period of ``restarts`` in epochs, and the growth of each next one.
+        clip_norm: largest norm of the gradient; 0: no clipping.
+        ema: decay of the exponential moving average of the weights, with which policies act; 0: no average.
+        seed: of all random numbers.
         precision: of the forward pass. auto: bf16 on processors and GPUs that multiply it fast, else fp32.
-        workers: processes that read samples; 0: this one.
+        workers: processes that read samples; 0: none besides this one.
         log_every, check_every, save_every: steps between lines of the log, validations and checkpoints.
-        check_samples: of the validation split at most, the same each time.
+        check_samples: most samples of the validation split, the same ones each time.
     """
 
     steps: int = Field(default=20_000, ge=1, le=10**9)
@@ -46,7 +63,7 @@ class TrainSettings(StrictModel):
     learning_rate: float = Field(default=1e-3, gt=0)
     min_learning_rate: float = Field(default=0.0, ge=0)
     weight_decay: float = Field(default=1e-4, ge=0)
-    betas: tuple[Share, Share] = (0.9, 0.95)
+    betas: tuple[Fraction, Fraction] = (0.9, 0.95)
     warmup_steps: int = Field(default=200, ge=0)
     schedule: Literal["cosine", "constant", "restarts"] = "cosine"
     restart_epochs: float = Field(default=20, gt=0)
@@ -63,20 +80,20 @@ class TrainSettings(StrictModel):
 
 
 class BaselineConfig(StrictModel):
-    """What a baseline's configuration has at least."""
+    """Base of the configuration of a baseline that learns from demonstrations."""
 
     train: TrainSettings = TrainSettings()
 
 
-class TrialSettings(StrictModel):
-    """How a baseline that learns by trying is trained.
+class RLSettings(StrictModel):
+    """Settings of reinforcement learning.
 
     Attributes:
-        steps: of all environments together; as many more as the last update has.
+        steps: of all environments together; rounded up to whole updates.
         batch_size: steps between updates, of all environments together.
         learning_rate: of the optimiser.
-        clip_norm: of the gradient; 0: it is not clipped.
-        seed: of everything random but the environments.
+        clip_norm: largest norm of the gradient; 0: no clipping.
+        seed: of all random numbers but those of the environments.
         precision: of the forward pass.
         save_every: steps between checkpoints.
     """
@@ -90,18 +107,18 @@ class TrialSettings(StrictModel):
     save_every: int = Field(default=5000, ge=1)
 
 
-class TrialConfig(StrictModel):
-    """What the configuration of a baseline that learns by trying has at least."""
+class RLConfig(StrictModel):
+    """Base of the configuration of a baseline that learns in simulation."""
 
-    train: TrialSettings = TrialSettings()
+    train: RLSettings = RLSettings()
 
 
 class Samples(Protocol):
-    """Training samples, map-style.
+    """Training samples, as a map-style dataset that returns whole batches.
 
     Attributes:
-        facts: JSON values that the model and the policy need to know of the data: normalisation, rate, cameras.
-        episodes: how many episodes they are of.
+        facts: JSON values that the network and the policy need: normalisation, rate, cameras.
+        episodes: number of episodes.
     """
 
     facts: dict[str, Any]
@@ -110,18 +127,18 @@ class Samples(Protocol):
     def __len__(self) -> int: ...
 
     def __getitems__(self, indices: list[int]) -> Batch:
-        """A whole batch."""
+        """Return a batch."""
         ...
 
 
-class Trials(Protocol):
-    """What a baseline learns in that learns by trying.
+class Environments(Protocol):
+    """Environments of a baseline that learns in simulation.
 
     Attributes:
-        name: for people.
+        name: of the scenes, for the record of the run.
         hash: of the scenes.
-        facts: JSON values that the model and the policy need to know.
-        episodes: how many different ones there are.
+        facts: JSON values that the network and the policy need.
+        episodes: number of different episodes.
     """
 
     name: str
@@ -130,95 +147,67 @@ class Trials(Protocol):
     episodes: int
 
     def __len__(self) -> int:
-        """Steps to be taken."""
+        """Return the number of steps to take."""
         ...
 
     def close(self) -> None:
-        """End what they run in."""
+        """Close the environments and their processes."""
         ...
 
 
-class Training(Protocol):
-    """A run that takes the steps that are left, and keeps checkpoints, weights and metrics in its folder.
+class AnyBaseline(Protocol):
+    """What every baseline has.
 
     Attributes:
-        step: steps taken.
-    """
-
-    step: int
-
-    def parameters(self) -> Iterator[torch.nn.Parameter]:
-        """Of the network."""
-        ...
-
-    def train(self, on_step: Callable[[int, int], None]) -> None:
-        """Take all steps that are left; what there is to call with the steps done and all steps."""
-        ...
-
-
-class _Kind(Protocol):
-    """A kind of policy that can be trained.
-
-    Attributes:
-        name: as the command line has it.
-        version: of its weights and inputs; another one can't be gone on with.
-        about: a line for people.
+        name: on the command line.
+        version: of weights and inputs; runs of other versions can be neither continued nor used.
+        about: a line for `robocas list`.
+        Config: model of its configuration.
     """
 
     name: str
     version: int
     about: str
+    Config: type[BaselineConfig] | type[RLConfig]
+
+    def model(self, config: Any, facts: dict[str, Any]) -> torch.nn.Module:
+        """Build the network."""
+        ...
 
     def policy(self, config: Any, facts: dict[str, Any], model: Any) -> Policy:
-        """What acts by a trained network."""
+        """Return a policy that acts with a trained network."""
         ...
 
 
-class Baseline(_Kind, Protocol):
-    """One that learns from data.
+class Baseline(AnyBaseline, Protocol):
+    """A baseline that learns from demonstrations.
 
-    Attributes:
-        Config: form of its configuration.
+    The network's ``forward(batch)`` returns metrics by name: means over the batch (), ``loss`` among them. A metric
+    of only some samples is a sum and the number of these samples (2,).
     """
 
-    Config: type[BaselineConfig]
-
     def data(self, config: Any, folder: Path, split: Split, on_read: OnRead) -> Samples:
-        """Samples of a dataset's split.
+        """Read the samples of a split.
 
         Args:
             config: of the baseline.
             folder: the dataset, a file or a folder.
-            split: of it.
-            on_read: called with how many episodes were read, and how many will be, by what reads them now.
+            split: of the dataset.
+            on_read: reports progress.
 
         Raises:
-            DatasetError: it does not hold what the baseline is trained with, or the split holds no episodes.
-        """
-        ...
-
-    def model(self, config: Any, facts: dict[str, Any]) -> torch.nn.Module:
-        """The network.
-
-        Its ``forward(batch)`` gives metrics by name: means over the batch (), ``loss`` among them, and for what not all
-        of its samples tell, a sum and how many did (2,).
+            DatasetError: the dataset lacks what the baseline needs, or the split holds no episodes.
         """
         ...
 
 
-class TrialBaseline(_Kind, Protocol):
-    """One that learns by trying, with a trainer of its own.
+class RLBaseline(AnyBaseline, Protocol):
+    """A baseline that learns in simulation, with a training loop of its own and without ``data``."""
 
-    Attributes:
-        Config: form of its configuration.
-        trials: (configuration, ``cpu`` or ``cuda``) to what it learns in.
-        training: (configuration, trials, `OutputFolder`, `RunRecord`, accelerator, start=, on_note=) to a `Training`.
-    """
+    def environments(self, config: Any, device: str) -> Environments:
+        """Create the environments on ``cpu`` or ``cuda``."""
+        ...
 
-    Config: type[TrialConfig]
-    trials: Callable[..., Trials]
-    training: Callable[..., Training]
-
-    def model(self, config: Any, facts: dict[str, Any]) -> torch.nn.Module:
-        """The network."""
+    def train(self, run: Any, model: Any, config: Any, environments: Any) -> None:
+        """Train until all steps are done, into a `RunFolder`; see `train_ppo`."""
         ...

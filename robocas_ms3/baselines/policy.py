@@ -1,31 +1,33 @@
-"""A run's folder as a policy: ``robocas eval pick --policy RUN``."""
+"""The folder of a training run as a policy: ``robocas eval pick --policy RUN``."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from robocas_ms3.baselines.runs import RUN, SHIPPED, WEIGHTS, RunRecord, hash_of_weights, read_run
-from robocas_ms3.baselines.table import find_baseline
+from robocas_ms3.baselines.registry import find_baseline
+from robocas_ms3.baselines.training.record import BUNDLED, RUN, WEIGHTS, RunRecord, hash_weights, read_run
 from robocas_ms3.core.errors import TrainingError
 from robocas_ms3.core.strict import parse
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, Policy, PolicySpec
 
 
 def shipped_small() -> RunPolicy:
-    """The policy ``small``: trained on pick, see docs/baselines.md."""
-    return RunPolicy(SHIPPED / "small")
+    """Return the policy ``small`` with the bundled weights, see docs/baselines.md."""
+    return RunPolicy(BUNDLED / "small")
 
 
 class RunPolicy:
-    """What a run has learned.
+    """The policy of a run.
 
     Args:
         folder: of the run.
         device: ``auto`` (a GPU if there is one), ``cpu`` or ``cuda``.
 
     Raises:
-        TrainingError: it is no run, has no weights yet, or is of another version.
+        TrainingError: the folder is no run, has no weights yet, or is of another version.
     """
 
     def __init__(self, folder: Path, device: str = "auto") -> None:
@@ -33,7 +35,7 @@ class RunPolicy:
         baseline = find_baseline(record.baseline, where=folder / RUN)
         import torch
 
-        from robocas_ms3.baselines import checkpoints
+        from robocas_ms3.baselines.training import checkpoints
 
         if record.version != baseline.version:
             raise TrainingError(
@@ -47,35 +49,46 @@ class RunPolicy:
         chosen = device if device != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
         expected = {"baseline": record.baseline, "version": str(record.version), "dataset": record.data.hash}
         tensors, about = checkpoints.load(folder / WEIGHTS, expected)
-        with checkpoints.facts_of(folder / RUN):
+        with _damaged_facts(folder / RUN):
             model = baseline.model(config, record.facts)
-        checkpoints.put_in(model, tensors, folder / WEIGHTS)
+        checkpoints.load_weights(model, tensors, folder / WEIGHTS)
         model = model.to(chosen).eval()
-        with checkpoints.facts_of(folder / RUN):
+        with _damaged_facts(folder / RUN):
             self._policy: Policy = baseline.policy(config, record.facts, model)
-        step = checkpoints.step_of(about, folder / WEIGHTS)
-        self._about = {**_about(record, step), "weights": hash_of_weights(folder)}
+        step = checkpoints.read_step(about, folder / WEIGHTS)
+        self._about = {**_describe(record, step), "weights": hash_weights(folder)}
 
     @property
     def spec(self) -> PolicySpec:
-        """What it declares of itself."""
+        """Observations and actions of the policy."""
         return self._policy.spec
 
     def describe(self) -> dict[str, Any]:
-        """What a result says of it: what was trained, on what, how long."""
+        """Return what results record about the policy: baseline, data, steps and weights."""
         more = getattr(self._policy, "describe", dict)
         return {**self._about, **more()}
 
     def reset(self, starts: list[EpisodeSpec]) -> None:
-        """Begin episodes."""
+        """Start episodes."""
         self._policy.reset(starts)
 
     def act(self, observations: Observations) -> Any:
-        """Actions, or chunks of them."""
+        """Return actions, or chunks of them."""
         return self._policy.act(observations)
 
 
-def _about(record: RunRecord, step: int) -> dict[str, Any]:
+@contextmanager
+def _damaged_facts(path: Path) -> Iterator[None]:
+    """Turn errors of building a network or policy from damaged facts into one that names their file."""
+    try:
+        yield
+    except (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError) as error:
+        found = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        what = "no network can be built from this configuration and these facts"
+        raise TrainingError(what, where=path, found=found) from error
+
+
+def _describe(record: RunRecord, step: int) -> dict[str, Any]:
     return {
         "baseline": record.baseline,
         "version": record.version,

@@ -46,7 +46,7 @@ def collect() -> dict[str, list[dict[str, Any]]]:
         ConfigError: a shipped configuration is damaged.
     """
     from robocas_ms3.assets.pack import load_pack, pack_folders
-    from robocas_ms3.baselines.table import BASELINES
+    from robocas_ms3.baselines.registry import BASELINES
     from robocas_ms3.core.errors import AssetError
     from robocas_ms3.core.extensions import package_of
     from robocas_ms3.evaluation.policies import POLICIES

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from robocas_ms3.baselines.table import BASELINES
+from robocas_ms3.baselines.registry import BASELINES
 from robocas_ms3.cli.interrupts import resumable
 from robocas_ms3.cli.options import Maybe, Repeated
 
@@ -136,8 +136,8 @@ DEFAULT = "small"
 @resumable
 def train(baseline: str, cfg: Training, data: Path | None) -> int:
     """Train a baseline, with a progress bar."""
-    from robocas_ms3.baselines.runs import find_run
-    from robocas_ms3.baselines.session import Said, train_run
+    from robocas_ms3.baselines.training.record import find_run
+    from robocas_ms3.baselines.training.session import Progress, train_run
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.terminal import say
 
@@ -150,9 +150,9 @@ def train(baseline: str, cfg: Training, data: Path | None) -> int:
             stepping.at(done, of)
 
         first = os.environ.get("RANK", "0") == "0"  # one of several processes writes to the terminal
-        said = Said(stepping.note, reading.at, step) if first else Said()
+        progress = Progress(stepping.note, reading.at, step) if first else Progress()
         options: dict[str, Any] = {"start": start, "device": cfg.device, "overwrite": cfg.overwrite}
-        train_run(baseline, data, out.absolute(), changes_of(cfg), said=said, **options)
+        train_run(baseline, data, out.absolute(), changes_of(cfg), progress=progress, **options)
     if first:
         say(f"{out}: trained. Next: robocas eval TASK --policy {out} --protocol {'paper-v1' if data else 'P'}")
     return 0
@@ -167,7 +167,7 @@ def _default_out(baseline: str, data: Path | None) -> Path:
 
 def changes_of(cfg: Training) -> dict[str, Any]:
     """Return the configuration values of the file and of the options; options win."""
-    from robocas_ms3.baselines.begin import merged
+    from robocas_ms3.baselines.training.session import merge_configs
     from robocas_ms3.core.documents import load_yaml
     from robocas_ms3.core.errors import TrainingError
     from robocas_ms3.scenes.config.overrides import parse_override
@@ -184,8 +184,8 @@ def changes_of(cfg: Training) -> dict[str, Any]:
             raise TrainingError("no configuration", where=cfg.config, expected="a mapping", found=type(read).__name__)
         found = read
     for text in cfg.set:
-        found = merged(found, parse_override(text, TrainingError, "train.seed=1"))
+        found = merge_configs(found, parse_override(text, TrainingError, "train.seed=1"))
     for key in ("steps", "batch_size", "seed"):
         if (value := getattr(cfg, key)) is not None:
-            found = merged(found, {"train": {key: value}})
+            found = merge_configs(found, {"train": {key: value}})
     return found

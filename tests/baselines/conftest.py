@@ -8,8 +8,8 @@ import yaml
 from made_up_baseline import MadeUp
 from made_up_dataset import made_up_dataset
 
-from robocas_ms3.baselines.session import train_run
-from robocas_ms3.baselines.table import BASELINES
+from robocas_ms3.baselines.registry import BASELINES
+from robocas_ms3.baselines.training.session import train_run
 from robocas_ms3.cli.main import run
 from robocas_ms3.cli.train import COMMANDS, other
 

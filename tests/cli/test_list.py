@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from robocas_ms3.baselines.table import BASELINES
+from robocas_ms3.baselines.registry import BASELINES
 from robocas_ms3.cli.list import List, collect, main
 from robocas_ms3.core.paths import data_dir
 from robocas_ms3.scenes.config import load_task_config, shipped_configs

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from made_up_baseline import MadeUp
 
-from robocas_ms3.baselines.table import BASELINES
+from robocas_ms3.baselines.registry import BASELINES
 from robocas_ms3.cli.main import run
 from robocas_ms3.cli.train import COMMANDS, Training, changes_of, other
 from robocas_ms3.core.errors import TrainingError

@@ -193,11 +193,11 @@ torch = pytest.importorskip("torch", reason="needs torch")
 
 
 def test_a_training_run_and_its_checkpoint(tmp_path):
-    from robocas_ms3.baselines import checkpoints
     from robocas_ms3.baselines.policy import RunPolicy
-    from robocas_ms3.baselines.runs import SHIPPED, read_run
+    from robocas_ms3.baselines.training import checkpoints
+    from robocas_ms3.baselines.training.record import BUNDLED, read_run
 
-    root = shutil.copytree(SHIPPED / "small", tmp_path / "run")
+    root = shutil.copytree(BUNDLED / "small", tmp_path / "run")
     whole = json.loads((root / "run.json").read_text())
     assert refused(lambda: read_run(root), root / "run.json", whole)
     facts = whole["facts"]
@@ -212,8 +212,8 @@ def test_a_training_run_and_its_checkpoint(tmp_path):
         RunPolicy(root, "cpu")
     for step in ("", "x", "-1", "nan", "1e308", "9" * 5000):
         with pytest.raises(TrainingError) as error:
-            checkpoints.step_of({"step": step}, root)
+            checkpoints.read_step({"step": step}, root)
         assert len(str(error.value)) < 500
     with pytest.raises(TrainingError):
-        checkpoints.step_of({}, root)
-    assert checkpoints.step_of({"step": "12"}, root) == 12
+        checkpoints.read_step({}, root)
+    assert checkpoints.read_step({"step": "12"}, root) == 12

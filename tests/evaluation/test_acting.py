@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 import pytest
 
-from robocas_ms3.baselines.runs import SHIPPED, hash_of_weights
+from robocas_ms3.baselines.training.record import BUNDLED, hash_weights
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.datasets.checks.replay import replay_dataset
 from robocas_ms3.datasets.pictures.stored import Pictures
@@ -65,7 +65,7 @@ def test_a_policy_that_speaks_otherwise_than_the_protocol_is_refused():
 
 def test_weights_of_what_acts_have_a_hash():
     assert check_acting(settings("random", (5, 60))) == ""
-    assert check_acting(settings("small", (5, 60))) == hash_of_weights(SHIPPED / "small")
+    assert check_acting(settings("small", (5, 60))) == hash_weights(BUNDLED / "small")
 
 
 @pytest.mark.parametrize("player", [("random", (12, 12))], indirect=True)

@@ -7,7 +7,7 @@ import pytest
 from rt1_sizes import SIZES
 
 from robocas_ms3.baselines.policy import RunPolicy
-from robocas_ms3.baselines.session import Said, train_run
+from robocas_ms3.baselines.training.session import Progress, train_run
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations
 
 VIEW = {"rendered": [64, 48], "size": [64, 48]}
@@ -23,14 +23,14 @@ def stop_at(step):
         if done == step:
             raise KeyboardInterrupt
 
-    return Said(step=look)
+    return Progress(step=look)
 
 
 def check(dataset, tmp_path, name, precision, device):
     out = tmp_path / "run"
     changes = {**CHANGES[name], "train": {**TRAIN, "precision": precision}}
     with pytest.raises(KeyboardInterrupt):
-        train_run(name, dataset, out, changes, device=device, said=stop_at(3))
+        train_run(name, dataset, out, changes, device=device, progress=stop_at(3))
     record = train_run(name, dataset, out, device=device)
     assert (record.device, record.resumed) == (device, [])
     rows = (out / "metrics.csv").read_text().splitlines()

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 
 from robocas_ms3.baselines.baseline import BaselineConfig, TrainSettings
-from robocas_ms3.baselines.session import Said, train_run
-from robocas_ms3.baselines.table import BASELINES
+from robocas_ms3.baselines.registry import BASELINES
+from robocas_ms3.baselines.training.session import Progress, train_run
 from robocas_ms3.core.errors import DatasetError, EmptySplitError
 from robocas_ms3.evaluation.policy import PolicySpec
 
@@ -101,7 +101,7 @@ def crash_at(step):
         if done == step:
             raise RuntimeError("gone")
 
-    return Said(step=look)
+    return Progress(step=look)
 
 
 if __name__ == "__main__":
@@ -109,6 +109,6 @@ if __name__ == "__main__":
     data, out = map(Path, sys.argv[1:])
     train_run("made-up", data, out / "whole", device="cpu")
     try:
-        train_run("made-up", data, out / "again", device="cpu", said=crash_at(17))
+        train_run("made-up", data, out / "again", device="cpu", progress=crash_at(17))
     except RuntimeError:
         train_run("made-up", data, out / "again", device="cpu")

@@ -1,4 +1,4 @@
-"""What tests of runs do to them, and compare of them."""
+"""Changes to training runs, and comparisons of them."""
 
 import csv
 import json
@@ -6,21 +6,24 @@ import json
 import torch
 from safetensors.torch import load_file
 
-from robocas_ms3.baselines.session import Said
+from robocas_ms3.baselines.training.session import Progress
 
 
 def stop_at(step, error):
-    def look(done, of):
+    """Progress that raises an error at a step."""
+
+    def report(done, total):
         if done == step:
             raise error
 
-    return Said(step=look)
+    return Progress(step=report)
 
 
-def lines(folder):
-    """Lines of the log, but for the clock's column."""
+def read_log(folder, split=None):
+    """Lines of the log without the column of the clock."""
     with (folder / "metrics.csv").open() as file:
-        return [{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(file)]
+        rows = [{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(file)]
+    return [row for row in rows if split in (None, row["split"])]
 
 
 def assert_same(one, other):
@@ -28,11 +31,16 @@ def assert_same(one, other):
         first, second = load_file(one / name), load_file(other / name)
         assert first.keys() == second.keys()
         assert all(torch.equal(first[key], second[key]) for key in first), name
-    assert lines(one) == lines(other)
+    assert read_log(one) == read_log(other)
     first, second = ((folder / "metrics.csv").read_text().partition("\n")[0] for folder in (one, other))
     assert first == second
 
 
-def say(run, **values):
+def assert_finite(folder):
+    for name in ("weights", "checkpoint"):
+        assert all(tensor.isfinite().all() for tensor in load_file(folder / f"{name}.safetensors").values())
+
+
+def change_record(run, **values):
     path = run / "run.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), **values}))

@@ -13,7 +13,7 @@ from robocas_ms3.baselines.baseline import OnRead, Split
 from robocas_ms3.baselines.bc_state.config import BcStateConfig
 from robocas_ms3.baselines.bc_state.data import StateSamples, inputs
 from robocas_ms3.baselines.bc_state.model import BcStateModel
-from robocas_ms3.baselines.chunk_policy import ChunkPolicy
+from robocas_ms3.baselines.chunks.policy import ChunkPolicy
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.poses import from_wxyz
 from robocas_ms3.evaluation.policy import Observations, PolicySpec
@@ -23,7 +23,7 @@ class BcState:
     """See `Baseline`."""
 
     name, version = "bc-state", 1
-    about = "what only a simulator knows; chunks of poses by residual layers"
+    about = "privileged state of the simulator; chunks of poses by residual layers"
     Config = BcStateConfig
 
     def data(self, config: BcStateConfig, folder: Path, split: Split, on_read: OnRead) -> StateSamples:
@@ -43,7 +43,7 @@ class BcState:
             one = slice(row, row + 1)
             told = inputs(seen.state[one], from_wxyz(seen.tcp_in_base[one]), seen.gripper_width.reshape(-1)[one])
             if told.shape[1] != size:
-                what, fix = "other scenes than it was trained in", "Evaluate it in the task and scenes of its data."
+                what, fix = "the policy was trained in other scenes", "Evaluate it in the task and scenes of its data."
                 raise EvaluationError(what, where="bc-state", expected=f"{size} numbers", found=told.shape[1], fix=fix)
             with torch.inference_mode():
                 return model.act(torch.from_numpy(told).to(device))[0].cpu().numpy()

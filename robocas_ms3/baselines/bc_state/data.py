@@ -15,10 +15,10 @@ import torch
 from numpy.typing import NDArray
 
 from robocas_ms3.baselines.baseline import Batch, OnRead, Split
-from robocas_ms3.baselines.bases import check_stands
 from robocas_ms3.baselines.bc_state.config import BcStateConfig
-from robocas_ms3.baselines.chunks import encode, next_keys, spread, state_of
-from robocas_ms3.baselines.runs import hash_of
+from robocas_ms3.baselines.chunks.poses import encode, next_keys, spread, state_of
+from robocas_ms3.baselines.dataset_checks import check_base_stands
+from robocas_ms3.baselines.training.record import hash_dataset
 from robocas_ms3.core.documents import DAMAGED
 from robocas_ms3.core.errors import DatasetError, EmptySplitError
 from robocas_ms3.core.files import replacing
@@ -115,7 +115,7 @@ def _kept(path: Path, rate_hz: float) -> Path:
     """Where it is kept, named by all that it follows from; runs that make it at once write the same."""
     digest = hashlib.sha256(f"{_VERSION} {rate_hz!r}\n".encode())
     for file in (path, path.with_suffix(".json")):  # states; environment, seeds, options of resets
-        digest.update(f"{hash_of(file) if file.is_file() else None}\n".encode())
+        digest.update(f"{hash_dataset(file) if file.is_file() else None}\n".encode())
     for package in _PACKAGES:
         digest.update(f"{package} {versions()[package]}\n".encode())
     return cache_dir() / "bc-state" / f"{digest.hexdigest()[:32]}.npz"
@@ -135,7 +135,7 @@ def _ask(path: Path, rate_hz: float, on_read: OnRead) -> dict[str, NDArray[Any]]
                 samples = sample_states(recording.control_steps, stride)
                 motion = recording.motion(samples)
                 driven = np.diff(motion.qpos[:, RobotDescription.base_slice], axis=0)
-                check_stands(driven, f"{path}, episode {recording.episode_id}")
+                check_base_stands(driven, f"{path}, episode {recording.episode_id}")
                 if env is None:
                     env = file.env.make(obs_mode="state_dict", render_backend="none", reward_mode="none")
                 env.reset(seed=recording.seed, options=dict(recording.reset_options))

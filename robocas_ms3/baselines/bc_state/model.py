@@ -9,8 +9,8 @@ from torch import nn
 
 from robocas_ms3.baselines.baseline import Batch
 from robocas_ms3.baselines.bc_state.config import BcStateConfig
-from robocas_ms3.baselines.chunk_loss import chunk_losses
-from robocas_ms3.baselines.chunks import ROW, Scale
+from robocas_ms3.baselines.chunks.loss import chunk_losses
+from robocas_ms3.baselines.chunks.poses import ROW, Scale
 
 
 class BcStateModel(nn.Module):

@@ -22,7 +22,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from robocas_ms3.baselines.bases import check_stands
+from robocas_ms3.baselines.dataset_checks import check_base_stands
 from robocas_ms3.baselines.lerobot.observations import (
     ACTION,
     DIMENSIONS,
@@ -114,7 +114,7 @@ def _columns(
             raise DatasetError("a number that is none", where=f"{path}: {key}, row {row}", found=values[row].tolist())
     ends = np.flatnonzero(np.diff(table["episode_index"].to_numpy())) + 1
     for motion in np.split(said["action.base"], ends):
-        check_stands(motion, path)
+        check_base_stands(motion, path)
     state = said[STATE]
     found = {STATE: state_of(state[:, :3], state[:, 3:7], state[:, 7:14], state[:, 14:15]), ACTION: said[ACTION]}
     if vectors is not None:

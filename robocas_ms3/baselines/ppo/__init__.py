@@ -1,4 +1,4 @@
-"""`ppo`: learns by trying, from dense rewards and what only a simulator knows. No demonstrations."""
+"""`ppo`: reinforcement learning from dense rewards and privileged state, without demonstrations."""
 
 from __future__ import annotations
 
@@ -6,26 +6,33 @@ from typing import Any
 
 from robocas_ms3.baselines.ppo.agent import Agent
 from robocas_ms3.baselines.ppo.config import PpoConfig
+from robocas_ms3.baselines.ppo.environments import PpoEnvironments
 from robocas_ms3.baselines.ppo.policy import PpoPolicy
-from robocas_ms3.baselines.ppo.training import PpoTraining
-from robocas_ms3.baselines.ppo.trials import EnvTrials
+from robocas_ms3.baselines.ppo.train import train_ppo
+from robocas_ms3.baselines.training.run_folder import RunFolder
 
 
 class Ppo:
-    """See `TrialBaseline`."""
+    """See `RLBaseline`."""
 
     name, version = "ppo", 1
-    about = "learns by trying, from dense rewards and what only a simulator knows; no data"
+    about = "reinforcement learning from dense rewards and privileged state; no data"
     Config = PpoConfig
-    trials = EnvTrials
-    training = PpoTraining
+
+    def environments(self, config: PpoConfig, device: str) -> PpoEnvironments:
+        """Create the environments on ``cpu`` or ``cuda``."""
+        return PpoEnvironments(config, device)
 
     def model(self, config: PpoConfig, facts: dict[str, Any]) -> Agent:
-        """Policy and value."""
+        """Build the networks of policy and value."""
         return Agent(facts["observed"], facts["acted"], config.width)
 
+    def train(self, run: RunFolder, model: Agent, config: PpoConfig, environments: PpoEnvironments) -> None:
+        """Train until all steps are done."""
+        train_ppo(run, model, config, environments)
+
     def policy(self, config: PpoConfig, facts: dict[str, Any], model: Agent) -> PpoPolicy:
-        """What acts by it, without noise."""
+        """Return the policy, which acts without noise."""
         return PpoPolicy(facts, model)
 
 

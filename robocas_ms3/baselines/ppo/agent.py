@@ -1,4 +1,4 @@
-"""Policy and value of what is observed, normalised by what was observed before."""
+"""Policy and value networks, on observations normalised by their running statistics."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from torch.distributions import Normal
 
 
 class Agent(nn.Module):
-    """Two networks of two layers, and what observations are like.
+    """Two networks of two layers, and the statistics of the observations.
 
     Args:
-        observed: numbers of an observation.
-        acted: numbers of an action.
+        observed: size of an observation.
+        acted: size of an action.
         width: of the layers.
     """
 
@@ -29,29 +29,29 @@ class Agent(nn.Module):
         self.log_std = nn.Parameter(torch.full((acted,), -0.7))
 
     @torch.no_grad()
-    def see(self, obs: torch.Tensor) -> None:
-        """Learn what observations (N, O) are like."""
+    def update_statistics(self, obs: torch.Tensor) -> None:
+        """Add observations (N, O) to the running mean and mean square."""
         self.count += len(obs)
         share = (len(obs) / self.count).float()
         self.mean += share * (obs.mean(dim=0) - self.mean)
         self.square += share * ((obs**2).mean(dim=0) - self.square)
 
-    def normal(self, obs: torch.Tensor) -> torch.Tensor:
-        """(N, O) observations in deviations from their mean, 5 at most."""
+    def normalize(self, obs: torch.Tensor) -> torch.Tensor:
+        """Return observations (N, O) with mean 0 and deviation 1, clipped to [-5, 5]."""
         deviation = (self.square - self.mean**2).clamp(min=1e-6).sqrt()
         return ((obs - self.mean) / deviation).clamp(-5, 5)
 
-    def policy(self, seen: torch.Tensor) -> Normal:
-        """Of actions (N, A), for normalised observations."""
-        return Normal(self.actor(seen), self.log_std.exp())
+    def policy(self, normalized: torch.Tensor) -> Normal:
+        """Return the distribution of actions (N, A) for normalised observations."""
+        return Normal(self.actor(normalized), self.log_std.exp())
 
-    def value(self, seen: torch.Tensor) -> torch.Tensor:
-        """(N,) of normalised observations."""
-        return self.critic(seen)[:, 0]
+    def value(self, normalized: torch.Tensor) -> torch.Tensor:
+        """Return values (N,) of normalised observations."""
+        return self.critic(normalized)[:, 0]
 
     def best(self, obs: torch.Tensor) -> torch.Tensor:
-        """(N, A) actions without noise, for observations as they are."""
-        return self.actor(self.normal(obs))
+        """Return actions (N, A) without noise for observations that are not normalised."""
+        return self.actor(self.normalize(obs))
 
 
 def _layers(inputs: int, width: int, outputs: int, gain: float) -> nn.Sequential:

@@ -1,4 +1,4 @@
-"""What `ppo` has learned, as a policy."""
+"""The policy of `ppo`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from robocas_ms3.baselines.ppo.agent import Agent
-from robocas_ms3.baselines.ppo.trials import arm_action, seen
+from robocas_ms3.baselines.ppo.environments import expand_action, join_observation
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.robots.ee_deltas import POSITION_SCALE, ROTATION_SCALE
@@ -18,34 +18,36 @@ _SCALE = np.array([POSITION_SCALE] * 3 + [ROTATION_SCALE] * 3 + [1.0])
 
 
 class PpoPolicy:
-    """Acts without noise, in the convention that ``pd_ee_delta_pose`` stands for.
+    """Acts without noise, in the convention of ``pd_ee_delta_pose``.
 
     Args:
-        facts: of its trials.
-        agent: what was learned.
+        facts: of the environments.
+        agent: trained.
     """
 
     def __init__(self, facts: dict[str, Any], agent: Agent) -> None:
-        # it turns about one axis alone, about which Euler angles and rotation vectors are the same
+        # Rotations are about one axis, where Euler angles and rotation vectors are the same
         self.spec = PolicySpec(
             "delta_axis_angle", reference="target", rate_hz=facts["rate_hz"], state=True, language="none"
         )
         self._agent, self._size = agent, facts["observed"]
 
     def reset(self, starts: list[EpisodeSpec]) -> None:
-        """Nothing is kept of an episode."""
+        """Do nothing: the policy keeps no state."""
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
-        """(E, 7) motions.
+        """Return actions (E, 7).
 
         Raises:
-            EvaluationError: the scenes hold another number of things than those it learned in.
+            EvaluationError: the scenes hold another number of objects than those of the training.
         """
         assert observations.state is not None
-        obs = seen(observations.qpos, observations.tcp_in_base, observations.gripper_width, observations.state)
+        obs = join_observation(
+            observations.qpos, observations.tcp_in_base, observations.gripper_width, observations.state
+        )
         if obs.shape[1] != self._size:
-            what, fix = "other scenes than it was trained in", "Evaluate it in the task and scenes of its trials."
+            what, fix = "the policy was trained in other scenes", "Evaluate it in the task and scenes of its training."
             raise EvaluationError(what, where="ppo", expected=f"{self._size} numbers", found=obs.shape[1], fix=fix)
         with torch.inference_mode():
-            action = arm_action(self._agent.best(obs.to(self._agent.mean.device)))
+            action = expand_action(self._agent.best(obs.to(self._agent.mean.device)))
         return action.double().cpu().numpy() * _SCALE

@@ -1,4 +1,4 @@
-"""What comes of trying: steps with their advantages, and how episodes ended."""
+"""Rollouts with advantages, and the outcomes of episodes."""
 
 from __future__ import annotations
 
@@ -12,107 +12,106 @@ from gymnasium.vector import VectorEnv
 from robocas_ms3.baselines.ppo.agent import Agent
 from robocas_ms3.baselines.ppo.config import PpoConfig
 
-OUTCOMES = ("return", "held", "lifted", "success")  # of an episode; but for the first, at its end
-_EPISODES = 100  # the last, that are told of
+OUTCOMES = ("return", "held", "lifted", "success")  # of an episode; all but the return at its end
+_LAST_EPISODES = 100  # that are averaged in the log
 
 
 @dataclass(frozen=True)
-class Tried:
+class Rollout:
     """Steps of all environments, B in all.
 
     Attributes:
-        obs: (B, O) as they are.
-        seen: (B, O) as the policy saw them.
+        obs: (B, O) observations.
+        normalized: (B, O) observations as the policy got them.
         action: (B, A).
         log_prob: (B,) of the actions.
         advantage: (B,).
-        returns: (B,) what the value should have been.
+        returns: (B,) targets of the value.
     """
 
     obs: torch.Tensor
-    seen: torch.Tensor
+    normalized: torch.Tensor
     action: torch.Tensor
     log_prob: torch.Tensor
     advantage: torch.Tensor
     returns: torch.Tensor
 
 
-class Rollouts:
-    """Steps environments with a policy and its noise, and keeps what came of the last episodes.
+class RolloutCollector:
+    """Steps environments with a policy and its noise, and keeps the outcomes of the last episodes.
 
     Args:
-        envs: to try in; each begins with another layout, and goes on with the next ones.
+        envs: each starts with another layout.
         agent: that acts.
         config: see `PpoConfig`.
-        played: episodes that were played before; what came of the last of them, (n, 4) `OUTCOMES`.
+        episodes: number of episodes played before.
+        outcomes: (n, 4) `OUTCOMES` of the last of these.
+
+    Attributes:
+        episodes: number of episodes played.
     """
 
-    def __init__(self, envs: VectorEnv, agent: Agent, config: PpoConfig, played: tuple[int, torch.Tensor]) -> None:
+    def __init__(self, envs: VectorEnv, agent: Agent, config: PpoConfig, episodes: int, outcomes: torch.Tensor) -> None:
+        self.episodes = episodes
         self._envs, self._agent, self._config = envs, agent, config
-        self.played, last = played
-        self.episodes: deque[list[float]] = deque(last.tolist(), maxlen=_EPISODES)
-        first = config.train.seed * config.envs + self.played
+        self._outcomes: deque[list[float]] = deque(outcomes.tolist(), maxlen=_LAST_EPISODES)
+        first = config.train.seed * config.envs + episodes
         self._obs: torch.Tensor = envs.reset(seed=first % config.layouts)[0]
 
+    def last_outcomes(self) -> torch.Tensor:
+        """Return the (n, 4) `OUTCOMES` of the last episodes."""
+        return torch.tensor(list(self._outcomes)).reshape(-1, len(OUTCOMES))
+
     @torch.no_grad()
-    def collect(self) -> Tried:
-        """Take `batch_size` steps, or as many less as environments don't share."""
+    def collect(self) -> Rollout:
+        """Take the steps of one update."""
         agent, config = self._agent, self._config
         steps = []
-        for _ in range(steps_of(config)):
+        for _ in range(steps_per_env(config)):
             obs = self._obs
-            seen = agent.normal(obs)
-            policy = agent.policy(seen)
+            normalized = agent.normalize(obs)
+            policy = agent.policy(normalized)
             action = policy.sample()
-            self._obs, reward, _, over, info = self._envs.step(action)  # pyright: ignore[reportArgumentType]
-            # time was up, and nothing else: what would have come next still counts
-            following = agent.value(agent.normal(info.get("final_observation", self._obs)))
+            self._obs, reward, _, truncated, info = self._envs.step(action)  # pyright: ignore[reportArgumentType]
+            # Episodes end by truncation alone, so the value of the observation after it counts
+            next_value = agent.value(agent.normalize(info.get("final_observation", self._obs)))
             log_prob = policy.log_prob(action).sum(-1)
-            steps.append((obs, seen, action, log_prob, reward, agent.value(seen), following, over))
+            value = agent.value(normalized)
+            steps.append((obs, normalized, action, log_prob, reward, value, next_value, truncated))
             if "final_info" in info:
-                ended = outcomes(info)
-                self.episodes.extend(ended.tolist())
-                self.played += len(ended)
-        obs, seen, action, log_prob, reward, value, following, over = (
+                ended = read_outcomes(info)
+                self._outcomes.extend(ended.tolist())
+                self.episodes += len(ended)
+        obs, normalized, action, log_prob, reward, value, next_value, truncated = (
             torch.stack(part) for part in zip(*steps, strict=True)
         )
-        advantage = advantages(reward, value, following, over, config.gamma, config.trace)
-        parts = (obs, seen, action, log_prob, advantage, advantage + value)
-        return Tried(*(part.flatten(0, 1) for part in parts))
+        deltas = reward + config.gamma * next_value - value
+        advantage = advantages(deltas, truncated, config.gamma * config.trace)
+        parts = (obs, normalized, action, log_prob, advantage, advantage + value)
+        return Rollout(*(part.flatten(0, 1) for part in parts))
 
 
-def steps_of(config: PpoConfig) -> int:
-    """Steps of each environment between updates."""
+def steps_per_env(config: PpoConfig) -> int:
+    """Return the number of steps of each environment between updates."""
     return max(config.train.batch_size // config.envs, 1)
 
 
-def advantages(
-    reward: torch.Tensor,
-    value: torch.Tensor,
-    following: torch.Tensor,
-    over: torch.Tensor,
-    gamma: float,
-    trace: float,
-) -> torch.Tensor:
-    """(T, N) generalised advantages (Schulman et al. 2016).
+def advantages(deltas: torch.Tensor, truncated: torch.Tensor, decay: float) -> torch.Tensor:
+    """Return generalised advantages (T, N) (Schulman et al. 2016).
 
     Args:
-        reward: (T, N) of steps.
-        value: (T, N) of what was seen before them.
-        following: (T, N) of what was seen after them, in the same episode.
-        over: (T, N) whether the episode's time was up after them.
-        gamma: discount.
-        trace: lambda.
+        deltas: (T, N) temporal differences.
+        truncated: (T, N) whether the episode ended after the step.
+        decay: discount times lambda.
     """
-    delta = reward + gamma * following - value
-    found, last = torch.zeros_like(delta), torch.zeros_like(delta[0])
-    for t in reversed(range(len(delta))):
-        last = found[t] = delta[t] + gamma * trace * ~over[t] * last
+    found, last = torch.zeros_like(deltas), torch.zeros_like(deltas[0])
+    for t in reversed(range(len(deltas))):
+        last = found[t] = deltas[t] + decay * ~truncated[t] * last
     return found
 
 
-def outcomes(info: dict[str, Any]) -> torch.Tensor:
-    """(n, 4) `OUTCOMES` of the episodes that have just ended."""
+def read_outcomes(info: dict[str, Any]) -> torch.Tensor:
+    """Return the (n, 4) `OUTCOMES` of the episodes that have just ended."""
     final = info["final_info"]
     held = final["reward_terms"]["grasp"] == 1
     parts = [final["episode"]["return"], held, final["target_lifted"], final["success"]]

@@ -16,7 +16,7 @@ class RT1:
     """See `Baseline`."""
 
     name, version = "rt1", 1
-    about = "the paper's RT-1: base and gripper camera, language; tokens of actions by a causal transformer"
+    about = "RT-1 of the paper: base and gripper camera, language; action tokens by a transformer"
     Config = RT1Config
 
     def data(self, config: RT1Config, folder: Path, split: Split, on_read: OnRead) -> RT1Samples:

@@ -11,7 +11,7 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from robocas_ms3.baselines.baseline import BaselineConfig, Share, TrainSettings
+from robocas_ms3.baselines.baseline import BaselineConfig, Fraction, TrainSettings
 from robocas_ms3.evaluation.policy import CAMERAS
 
 _IMAGENET_STD = (0.229, 0.224, 0.225)
@@ -30,7 +30,7 @@ class RT1Train(TrainSettings):
     learning_rate: float = Field(default=1e-4, gt=0)
     min_learning_rate: float = Field(default=1e-5, ge=0)
     weight_decay: float = Field(default=0.01, ge=0)
-    betas: tuple[Share, Share] = (0.9, 0.999)  # AdamW's own, as nothing else is said
+    betas: tuple[Fraction, Fraction] = (0.9, 0.999)  # AdamW's own, as nothing else is said
     warmup_steps: int = Field(default=0, ge=0)
     schedule: Literal["cosine", "constant", "restarts"] = "restarts"
     restart_epochs: float = Field(default=20, gt=0)

@@ -8,8 +8,7 @@ from typing import Any
 import torch
 
 from robocas_ms3.baselines.baseline import Batch, OnRead, Split
-from robocas_ms3.baselines.bases import check_bases, check_tcp
-from robocas_ms3.baselines.fits import check_fits
+from robocas_ms3.baselines.dataset_checks import DatasetNeeds, check_dataset
 from robocas_ms3.baselines.rt1.config import RT1Config
 from robocas_ms3.datasets.actions import ActionScale
 from robocas_ms3.datasets.formats import open_source
@@ -46,10 +45,8 @@ class RT1Samples(torch.utils.data.Dataset):
 
     def __init__(self, config: RT1Config, folder: Path, split: Split, on_read: OnRead = lambda done, of: None) -> None:
         source = open_source(folder)
-        check_fits(source, "rt1", config.cameras, config.rate_hz, other_cameras='--set cameras="[base_camera]"')
-        for number in source.split(split)[:1]:
-            check_tcp(source, number)
-        check_bases(source, source.split(split))
+        needs = DatasetNeeds("rt1", config.cameras, config.rate_hz, True, '--set cameras="[base_camera]"')
+        check_dataset(source, source.split(split), needs)
         self._data = RoboCASDataset(
             folder,
             SampleOptions(

@@ -8,8 +8,8 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
+from robocas_ms3.baselines.registry import need_extra
 from robocas_ms3.baselines.rt1.config import RT1Config
-from robocas_ms3.baselines.table import need_extra
 from robocas_ms3.scenes.language.embed import DIMENSIONS
 
 _SQUARE_PADDED = (5, 18)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.baselines.baseline import OnRead, Split
-from robocas_ms3.baselines.chunk_policy import ChunkPolicy
+from robocas_ms3.baselines.chunks.policy import ChunkPolicy
 from robocas_ms3.baselines.small.config import SmallConfig
 from robocas_ms3.baselines.small.data import SmallSamples
 from robocas_ms3.baselines.small.model import SmallModel

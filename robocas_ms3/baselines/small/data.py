@@ -19,9 +19,8 @@ import torch
 from numpy.typing import NDArray
 
 from robocas_ms3.baselines.baseline import Batch, OnRead, Split
-from robocas_ms3.baselines.bases import check_bases, check_tcp
-from robocas_ms3.baselines.chunks import encode, next_keys, spread, state_of
-from robocas_ms3.baselines.fits import check_fits
+from robocas_ms3.baselines.chunks.poses import encode, next_keys, spread, state_of
+from robocas_ms3.baselines.dataset_checks import DatasetNeeds, check_dataset
 from robocas_ms3.baselines.small.config import SmallConfig, View
 from robocas_ms3.baselines.small.pointing import places_of
 from robocas_ms3.baselines.small.standing import Standing, calibration, looks_alike, seen_from, standing
@@ -58,22 +57,14 @@ class SmallSamples:
         on_read: OnRead = lambda done, of: None,
     ) -> None:
         source = open_source(path)
-        check_fits(
-            source,
-            "small",
-            list(config.views),
-            config.rate_hz,
-            language=config.language,
-            other_cameras="--set views.CAMERA=null",
-            without_language="--set language=false",
-        )
+        options = "--set views.CAMERA=null", "--set language=false"
         numbers = source.split(split)
+        needs = DatasetNeeds("small", list(config.views), config.rate_hz, config.language, *options)
+        check_dataset(source, numbers, needs)
         self.episodes = len(numbers)
         if not numbers:
             fix = "Add episodes: a tenth of them validates."
             raise EmptySplitError("this split holds no episodes", where=path, expected=f"some in {split}", fix=fix)
-        check_tcp(source, numbers[0])
-        check_bases(source, numbers)
         seen = source.episode(numbers[0])
         first_pictures = {camera: seen.rgb(camera, 0) for camera in config.views}
         sizes = {camera: (picture.shape[1], picture.shape[0]) for camera, picture in first_pictures.items()}

@@ -13,9 +13,9 @@ from typing import Any
 import torch
 from torch import nn
 
-from robocas_ms3.baselines.metrics import mean
 from robocas_ms3.baselines.small.config import View
 from robocas_ms3.baselines.small.pointing import CELL, NOWHERE, cells_of
+from robocas_ms3.baselines.training.metrics import mean_of_sum
 
 SAID = 7
 """Numbers that are said of a point: coarse and fine coordinates, and how sure the pointer is."""
@@ -98,7 +98,7 @@ class Lift(nn.Module):
         found = self.height(torch.cat([what, asked.detach()], dim=2))[..., 0].float()
         low = found * self._heights[1] + self._heights[0] - heights.nan_to_num(0.0)
         wrong = (offsets - meant).abs().sum(dim=-1) + low.abs() / _FINE
-        return mean(torch.stack([(wrong * shown).sum(), shown.sum()]))
+        return mean_of_sum(torch.stack([(wrong * shown).sum(), shown.sum()]))
 
 
 def _turned(turns: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:

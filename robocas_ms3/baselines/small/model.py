@@ -16,12 +16,12 @@ from torch import nn
 from torch.nn import functional as F
 
 from robocas_ms3.baselines.baseline import Batch
-from robocas_ms3.baselines.chunk_loss import chunk_losses
-from robocas_ms3.baselines.chunks import ROW, Scale
-from robocas_ms3.baselines.metrics import mean
+from robocas_ms3.baselines.chunks.loss import chunk_losses
+from robocas_ms3.baselines.chunks.poses import ROW, Scale
 from robocas_ms3.baselines.small.config import SmallConfig, View
 from robocas_ms3.baselines.small.lifting import FAR, SAID, Lift, heights_of, tcp_of
 from robocas_ms3.baselines.small.pointing import CELL, NOWHERE, Pointer, cells_of, pointing_losses
+from robocas_ms3.baselines.training.metrics import mean_of_sum
 
 _WORDS, _STATE = 384, 10
 Maps = dict[str, tuple[torch.Tensor, torch.Tensor]]
@@ -160,7 +160,7 @@ class SmallModel(nn.Module):
                 logits = eye.pointer.logits(fine, asked + came.state.detach()[:, None])
             standing = cells_of(others, view)[:, None].where(alike, NOWHERE)
             more, named = pointing_losses(logits, standing, columns)
-            pointing = self.config.point_weight * mean(loss) + self.config.name_weight * mean(more)
+            pointing = self.config.point_weight * mean_of_sum(loss) + self.config.name_weight * mean_of_sum(more)
             found["loss"] = found["loss"] + pointing
             found |= {f"{camera}_point": loss, f"{camera}_found": right}
             found |= {f"{camera}_name": more, f"{camera}_named": named}

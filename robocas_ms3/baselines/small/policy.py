@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from robocas_ms3.baselines.chunk_policy import ChunkPolicy
-from robocas_ms3.baselines.chunks import state_of
+from robocas_ms3.baselines.chunks.policy import ChunkPolicy
+from robocas_ms3.baselines.chunks.poses import state_of
 from robocas_ms3.baselines.small.config import SmallConfig
 from robocas_ms3.baselines.small.data import looked_at
 from robocas_ms3.baselines.small.model import SmallModel

@@ -87,5 +87,5 @@ def test_other_scenes_in_play():
         gripper_width=np.array([[0.08]]),
         state=np.zeros((1, 5)),
     )
-    with pytest.raises(EvaluationError, match=r"other scenes than it was trained in \(expected 13 numbers, found 15"):
+    with pytest.raises(EvaluationError, match="expected 13 numbers, found 15"):
         policy.act(seen)

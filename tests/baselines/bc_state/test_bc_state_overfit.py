@@ -9,7 +9,7 @@ from robocas_ms3.baselines.bc_state import BASELINE, data
 from robocas_ms3.baselines.bc_state.config import BcStateConfig
 from robocas_ms3.baselines.bc_state.data import StateSamples
 from robocas_ms3.baselines.policy import RunPolicy
-from robocas_ms3.baselines.session import train_run
+from robocas_ms3.baselines.training.session import train_run
 from robocas_ms3.core.poses import inverse, to_wxyz
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations

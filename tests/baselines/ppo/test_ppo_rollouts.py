@@ -1,29 +1,39 @@
 """Advantages and outcomes, worked out by hand."""
 
 import torch
+from made_up_envs import LeftOrRight
 
+from robocas_ms3.baselines.ppo.agent import Agent
 from robocas_ms3.baselines.ppo.config import PpoConfig
-from robocas_ms3.baselines.ppo.rollouts import advantages, outcomes, steps_of
+from robocas_ms3.baselines.ppo.rollouts import (
+    OUTCOMES,
+    RolloutCollector,
+    advantages,
+    read_outcomes,
+    steps_per_env,
+)
 
 
 def test_advantages():
-    # deltas: 1 + 0.5 * 4 - 2 = 1 and 0 + 0.5 * 2 - 4 = -3 and 2 + 0.5 * 0 - 2 = 0; traces of 0.5 * 0.5
-    column = [[1.0], [0.0], [2.0]], [[2.0], [4.0], [2.0]], [[4.0], [2.0], [0.0]]
-    reward, value, following = map(torch.tensor, column)
-    never = torch.zeros(3, 1, dtype=torch.bool)
-    assert advantages(reward, value, following, never, 0.5, 0.5).flatten().tolist() == [0.25, -3.0, 0.0]
+    """An episode's end stops the sum; 0.25 is discount times lambda."""
+    deltas = torch.tensor([[1.0, 0.0, 0.0], [-3.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
+    truncated = torch.zeros(3, 3, dtype=torch.bool)
+    truncated[0, 1] = True
+    assert advantages(deltas, truncated, 0.25).T.tolist() == [[0.25, -3.0, 0.0], [0.0, 1.0, 0.0], [0.25, 1.0, 0.0]]
 
 
-def test_what_comes_after_an_end_counts_for_nothing_before_it():
-    reward, value, following = torch.zeros(2, 2), torch.zeros(2, 2), torch.zeros(2, 2)
-    reward[1] = 1.0
-    over = torch.tensor([[True, False], [False, False]])
-    assert advantages(reward, value, following, over, 0.5, 0.5).tolist() == [[0.0, 0.25], [1.0, 1.0]]
-
-
-def test_what_was_to_come_when_time_was_up_counts():
-    reward, value, following = torch.zeros(1, 1), torch.zeros(1, 1), torch.full((1, 1), 3.0)
-    assert advantages(reward, value, following, torch.ones(1, 1, dtype=torch.bool), 0.5, 0.9).item() == 1.5
+def test_the_value_after_a_truncation_counts():
+    """Episodes end when their time is up, so their last steps have a future."""
+    config = PpoConfig(envs=1, gamma=0.5, trace=0.0, train={"batch_size": LeftOrRight.STEPS})
+    agent = Agent(1, 1, 4)
+    torch.nn.init.zeros_(agent.critic[-1].weight)
+    torch.nn.init.constant_(agent.critic[-1].bias, 3.0)
+    collector = RolloutCollector(LeftOrRight(1), agent, config, 0, torch.empty(0, len(OUTCOMES)))
+    rollout = collector.collect()
+    reward = (rollout.obs * rollout.action)[:, 0].clamp(-1, 1)
+    torch.testing.assert_close(rollout.advantage, reward + 0.5 * 3 - 3)
+    assert collector.episodes == 1
+    assert collector.last_outcomes()[0, 0] == reward.sum()
 
 
 def test_outcomes_are_those_of_the_envs_that_ended():
@@ -34,11 +44,11 @@ def test_outcomes_are_those_of_the_envs_that_ended():
         "success": torch.tensor([False, False, False]),
     }
     info = {"final_info": final, "_final_info": torch.tensor([True, False, True])}
-    assert outcomes(info).tolist() == [[4.0, 1.0, 1.0, 0.0], [1.0, 1.0, 0.0, 0.0]]
+    assert read_outcomes(info).tolist() == [[4.0, 1.0, 1.0, 0.0], [1.0, 1.0, 0.0, 0.0]]
 
 
 def test_steps_are_shared():
     default = PpoConfig()
-    assert steps_of(default) == 512 // 8
+    assert steps_per_env(default) == 512 // 8
     few = PpoConfig(envs=8, train=default.train.model_copy(update={"batch_size": 4}))
-    assert steps_of(few) == 1
+    assert steps_per_env(few) == 1

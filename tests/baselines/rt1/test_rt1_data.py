@@ -13,7 +13,7 @@ from torch.utils.data import DataLoader
 from robocas_ms3.baselines.rt1 import BASELINE
 from robocas_ms3.baselines.rt1.config import RT1Config
 from robocas_ms3.baselines.rt1.policy import scaled
-from robocas_ms3.baselines.session import train_run
+from robocas_ms3.baselines.training.session import train_run
 from robocas_ms3.core.errors import DatasetError, TrainingError
 from robocas_ms3.core.strict import parse
 from robocas_ms3.datasets.formats import open_source
@@ -141,7 +141,7 @@ def test_it_goes_on_to_the_bit(folder, tmp_path):
     changes = {**RT1Config(**SIZES).model_dump(), "train": few}
     train_run("rt1", folder, tmp_path / "whole", changes, device="cpu")
     with pytest.raises(RuntimeError):
-        train_run("rt1", folder, tmp_path / "again", changes, device="cpu", said=stop_at(3, RuntimeError("gone")))
+        train_run("rt1", folder, tmp_path / "again", changes, device="cpu", progress=stop_at(3, RuntimeError("gone")))
     train_run("rt1", folder, tmp_path / "again", device="cpu")
     assert_same(tmp_path / "whole", tmp_path / "again")
 

@@ -3,9 +3,9 @@
 import numpy as np
 import torch
 
-from robocas_ms3.baselines.metrics import mean
 from robocas_ms3.baselines.small.config import View
 from robocas_ms3.baselines.small.pointing import NOWHERE, Pointer, cells_of, places_of, pointing_losses
+from robocas_ms3.baselines.training.metrics import mean_of_sum
 
 INTRINSIC = np.array([64.0, 64.0, 32.0, 24.0])  # of 64 x 48 pictures: 0.5 m to the side at 1 m is at the edge
 WHOLE = View(rendered=(64, 48), size=(64, 48))  # 8 x 6 cells
@@ -83,6 +83,6 @@ def test_a_pointer_learns_to_find_what_is_asked_for():
         logits = pointer.logits(maps, torch.nn.functional.one_hot(asked, 4).float())
         loss, found = pointing_losses(logits, cells.gather(1, asked)[..., None], 8)
         optimizer.zero_grad()
-        mean(loss).backward()
+        mean_of_sum(loss).backward()
         optimizer.step()
-    assert mean(found) == 1.0
+    assert mean_of_sum(found) == 1.0

@@ -3,47 +3,47 @@
 import numpy as np
 import pytest
 
-from robocas_ms3.baselines.runs import WEIGHTS, hash_of, hash_of_weights
+from robocas_ms3.baselines.training.record import WEIGHTS, hash_dataset, hash_weights
 from robocas_ms3.core.errors import TrainingError
 
 
 def test_a_trajectory_is_both_of_its_files(tmp_path):
     path = tmp_path / "trajectory.h5"
     path.write_text("states")
-    alone = hash_of(path)
+    alone = hash_dataset(path)
     path.with_suffix(".json").write_text("seeds")
-    assert hash_of(path) != alone
+    assert hash_dataset(path) != alone
     path.with_suffix(".json").write_text("other seeds")
-    assert len({alone, hash_of(path)}) == 2
+    assert len({alone, hash_dataset(path)}) == 2
 
 
 def test_a_folder_is_its_arrays_and_sizes_of_pictures(tmp_path):
     for name, text in (("data_info.json", "{}"), ("episode_0/rgb/0.png", "abc"), ("preview/0.png", "a")):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
-    before = hash_of(tmp_path)
+    before = hash_dataset(tmp_path)
     (tmp_path / "preview/0.png").write_text("bcd")
-    assert hash_of(tmp_path) == before
+    assert hash_dataset(tmp_path) == before
     (tmp_path / "episode_0/rgb/0.png").write_text("abcd")
-    longer = hash_of(tmp_path)
+    longer = hash_dataset(tmp_path)
     (tmp_path / "data_info.json").write_text("[]")
-    assert len({before, longer, hash_of(tmp_path)}) == 3
+    assert len({before, longer, hash_dataset(tmp_path)}) == 3
 
 
 def test_where_cameras_look_from_is_part_of_a_folder(tmp_path):
     hashes = set()
     for at in (0.1, 0.2):
         np.save(tmp_path / "cam_pos_wrt_ee.npy", np.full((4, 4), at))
-        hashes.add(hash_of(tmp_path))
+        hashes.add(hash_dataset(tmp_path))
     assert len(hashes) == 2
 
 
 def test_nothing_is_no_dataset(tmp_path):
     with pytest.raises(TrainingError, match="no dataset here"):
-        hash_of(tmp_path / "nowhere")
+        hash_dataset(tmp_path / "nowhere")
 
 
 def test_weights(tmp_path):
-    assert hash_of_weights(tmp_path) == ""
+    assert hash_weights(tmp_path) == ""
     (tmp_path / WEIGHTS).write_bytes(b"")
-    assert hash_of_weights(tmp_path) == "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"  # of nothing
+    assert hash_weights(tmp_path) == "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"  # of nothing

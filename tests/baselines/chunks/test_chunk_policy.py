@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from robocas_ms3.baselines.chunk_policy import ChunkPolicy
+from robocas_ms3.baselines.chunks.policy import ChunkPolicy
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 
 STAY = [0, 0, 0, 1, 0, 0, 0, 1, 0, 1.0]

@@ -10,9 +10,9 @@ from rt1_sizes import SIZES
 from small_sizes import TINY
 from synthetic import write_trajectory
 
-from robocas_ms3.baselines.bases import check_stands, check_tcp
 from robocas_ms3.baselines.bc_state.config import BcStateConfig
 from robocas_ms3.baselines.bc_state.data import StateSamples
+from robocas_ms3.baselines.dataset_checks import check_base_stands, check_tcp_frame
 from robocas_ms3.baselines.rt1 import BASELINE as RT1
 from robocas_ms3.baselines.rt1.config import RT1Config
 from robocas_ms3.baselines.small import BASELINE as SMALL
@@ -24,8 +24,8 @@ from robocas_ms3.datasets.formats import open_source
 def test_a_base_that_trembles_stands():
     motion = np.zeros((200, 3), np.float32)
     motion[::2], motion[1::2] = 1e-4, -1e-4
-    check_stands(motion, "here")
-    check_stands(motion[:0], "here")
+    check_base_stands(motion, "here")
+    check_base_stands(motion[:0], "here")
 
 
 @pytest.mark.parametrize("column", [0, 1, 2])
@@ -33,8 +33,8 @@ def test_a_base_that_trembles_stands():
 def test_a_base_that_drives_at_once_or_slowly(column, rows):
     motion = np.zeros((len(rows), 3))
     motion[:, column] = rows
-    with pytest.raises(DatasetError, match="here: the base drives, which 7 numbers.*without base_motion"):
-        check_stands(motion, "here")
+    with pytest.raises(DatasetError, match="here: the base drives"):
+        check_base_stands(motion, "here")
 
 
 LEARNERS = {"rt1": (RT1, RT1Config(**SIZES)), "small": (SMALL, SmallConfig(**TINY))}
@@ -63,10 +63,10 @@ def test_without_a_gripper_camera_the_scene_tells_whose_actions_they_are(folder,
     copy = shutil.copytree(folder, tmp_path / "dataset")
     said = json.loads((copy / "conversion.json").read_text())
     (copy / "conversion.json").write_text(json.dumps({**said, "cameras": ["base_camera"]}))
-    check_tcp(open_source(copy), 0)
+    check_tcp_frame(open_source(copy), 0)
     (copy / "episode_0000000" / "scene.json").unlink()
-    with pytest.raises(DatasetError, match="episode_0000000: nothing tells in which frame.*import-robocas"):
-        check_tcp(open_source(copy), 0)
+    with pytest.raises(DatasetError, match="episode_0000000: the frame of the actions.*import-robocas"):
+        check_tcp_frame(open_source(copy), 0)
 
 
 def driven(folder, tmp_path, side):

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.baselines.chunks import Scale, decode, encode, next_keys, spread
+from robocas_ms3.baselines.chunks.poses import Scale, decode, encode, next_keys, spread
 
 
 def track(seed, length):

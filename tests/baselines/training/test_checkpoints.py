@@ -6,7 +6,7 @@ import resource
 import pytest
 import torch
 
-from robocas_ms3.baselines import checkpoints
+from robocas_ms3.baselines.training import checkpoints
 from robocas_ms3.core.errors import TrainingError
 
 ABOUT = {"baseline": "x", "version": "1", "dataset": "d"}
@@ -37,7 +37,7 @@ def test_the_same_is_the_same_file(tmp_path):
 def test_of_something_else(tmp_path, key):
     path = tmp_path / "c.safetensors"
     checkpoints.save(path, {"a": torch.zeros(1)}, ABOUT)
-    with pytest.raises(TrainingError, match=f"of another {key}"):
+    with pytest.raises(TrainingError, match=f"another {key}"):
         checkpoints.load(path, {**ABOUT, key: "other"})
 
 
@@ -96,7 +96,7 @@ def test_without_room_the_one_before_stays(tmp_path, little_room):
 )
 def test_weights_of_another_model(tensors, found):
     with pytest.raises(TrainingError, match=found):
-        checkpoints.put_in(torch.nn.Linear(3, 2), tensors, "w")
+        checkpoints.load_weights(torch.nn.Linear(3, 2), tensors, "w")
 
 
 def test_an_optimizer_goes_on():
@@ -118,6 +118,6 @@ def test_an_optimizer_goes_on():
         step(other, theirs, number)
     third, of_third = made()
     third.load_state_dict(other.state_dict())
-    checkpoints.put_in_optimizer(of_third, checkpoints.optimizer_tensors(theirs))
+    checkpoints.load_optimizer(of_third, checkpoints.optimizer_tensors(theirs))
     step(third, of_third, 2)
     assert torch.equal(one.weight, third.weight)

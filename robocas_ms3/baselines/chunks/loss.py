@@ -11,7 +11,7 @@ import torch
 from torch.nn import functional as F
 
 from robocas_ms3.baselines.baseline import Batch
-from robocas_ms3.baselines.chunks import Scale
+from robocas_ms3.baselines.chunks.poses import Scale
 
 NEAR = 0.05
 """m; of what is called near in the log."""

@@ -5,20 +5,20 @@ from pathlib import Path
 
 import pytest
 
-from robocas_ms3.baselines.begin import find_start
 from robocas_ms3.baselines.policy import RunPolicy
-from robocas_ms3.baselines.runs import CHECKPOINT, SHIPPED, read_run
 from robocas_ms3.baselines.small import BASELINE
+from robocas_ms3.baselines.training.initial_weights import load_initial_weights
+from robocas_ms3.baselines.training.record import BUNDLED, CHECKPOINT, read_run
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import TrainingError
 from robocas_ms3.evaluation.policies import make_policy
 
 
 def test_they_are_small_and_of_this_version():
-    record = read_run(SHIPPED / "small")
+    record = read_run(BUNDLED / "small")
     assert (record.baseline, record.version) == ("small", BASELINE.version)
-    assert sum(path.stat().st_size for path in SHIPPED.rglob("*")) < 10e6
-    assert not (SHIPPED / "small" / CHECKPOINT).exists()
+    assert sum(path.stat().st_size for path in BUNDLED.rglob("*")) < 10e6
+    assert not (BUNDLED / "small" / CHECKPOINT).exists()
 
 
 def test_they_are_a_policy_by_name():
@@ -31,14 +31,14 @@ def test_they_are_a_policy_by_name():
 def test_they_are_a_start_by_name_as_they_are_a_policy(tmp_path, monkeypatch):
     """Also where a folder is called so, which a longer path names."""
     monkeypatch.chdir(tmp_path)
-    begun = find_start(BASELINE, Path("small"), None, tmp_path / "out")
-    assert begun is not None and begun.weights
-    assert begun.record == read_run(SHIPPED / "small")
+    begun = load_initial_weights(BASELINE, Path("small"), None, tmp_path / "out")
+    assert begun is not None and begun.tensors
+    assert begun.record == read_run(BUNDLED / "small")
     Path("small").mkdir()
-    again = find_start(BASELINE, Path("small"), None, tmp_path / "out")
+    again = load_initial_weights(BASELINE, Path("small"), None, tmp_path / "out")
     assert again is not None and again.name == begun.name
     with pytest.raises(TrainingError, match="no run of robocas train"):
-        find_start(BASELINE, tmp_path / "small", None, tmp_path / "out")
+        load_initial_weights(BASELINE, tmp_path / "small", None, tmp_path / "out")
 
 
 @pytest.mark.slow

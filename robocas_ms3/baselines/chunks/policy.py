@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.baselines.chunks import decode
+from robocas_ms3.baselines.chunks.poses import decode
 from robocas_ms3.core.poses import Array, from_wxyz
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 

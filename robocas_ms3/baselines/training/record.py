@@ -1,17 +1,18 @@
-"""A run's folder: what was trained, on what, how it went, and the weights.
+"""Files of a training run, and its record ``run.json``.
 
 ::
 
-    run.json                 baseline and its version, configuration, facts and hash of the data, versions, device
-    metrics.csv              a line every so many steps, of training and of validation
+    run.json                 baseline and version, configuration, facts and hash of the data, package versions, device
+    metrics.csv              lines of training and validation
     tensorboard/             the same
-    checkpoint.safetensors   all that it takes to go on: see `checkpoints`
-    weights.safetensors      what a policy acts with
+    checkpoint.safetensors   the state of the training, see `checkpoints`
+    weights.safetensors      weights of the policy
 """
 
 from __future__ import annotations
 
 import hashlib
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,19 +20,20 @@ from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import TrainingError
 from robocas_ms3.core.strict import StrictModel, parse
 
-RUN, METRICS, BOARD = "run.json", "metrics.csv", "tensorboard"
+RUN, METRICS, TENSORBOARD = "run.json", "metrics.csv", "tensorboard"
 CHECKPOINT, WEIGHTS = "checkpoint.safetensors", "weights.safetensors"
-SHIPPED = Path(__file__).parents[1] / "data" / "runs"
-"""Runs that come with the package, without what it takes to go on with them."""
+BUNDLED = Path(__file__).parents[2] / "data" / "runs"
+"""Runs with bundled weights, which have no checkpoints."""
+_PACKAGES = ("robocas-ms3", "torch", "accelerate", "safetensors", "transformers", "numpy")
 _BLOCK = 1 << 20
 
 
 class DataRecord(StrictModel):
-    """What a run was trained on.
+    """The data of a run.
 
     Attributes:
-        name: of the folder or file.
-        hash: see `hash_of`.
+        name: of the folder, the file or the scenes.
+        hash: see `hash_dataset`.
         episodes, samples: of the training split.
     """
 
@@ -47,14 +49,14 @@ class RunRecord(StrictModel):
     Attributes:
         kind: always this.
         baseline, version: what was trained.
-        config: its configuration, whole.
+        config: its whole configuration.
         facts: of the data, see `Samples`.
-        data: it was trained on.
+        data: that it was trained on.
         versions: of packages.
-        device, precision: it was trained on and in; another may round otherwise.
-        threads: of the processor it was trained on; as many add up in the same order. 0: a GPU, or not known.
-        resumed: lines on where it went on with others of these.
-        start: the run whose weights it began with: its folder's name and their hash; empty: none.
+        device, precision: of the training; others round differently.
+        threads: of the CPU; as many add in the same order. 0: a GPU, or not known.
+        resumed: lines on continuations with another device, precision or number of threads.
+        start: the run whose weights it started from: folder name and hash; empty: random weights.
     """
 
     kind: Literal["robocas training run"] = "robocas training run"
@@ -72,15 +74,12 @@ class RunRecord(StrictModel):
 
 
 def find_run(run: Path) -> Path:
-    """The folder of a run; one that comes with the package goes by its name, as where policies are named.
-
-    A folder of that name is meant by a path of more parts.
-    """
-    return SHIPPED / run if len(run.parts) == 1 and (SHIPPED / run).is_dir() else run
+    """Return the folder of a run: a single name is that of bundled weights, if there are such."""
+    return BUNDLED / run if len(run.parts) == 1 and (BUNDLED / run).is_dir() else run
 
 
 def read_run(folder: Path) -> RunRecord:
-    """The record of a run.
+    """Read the record of a run.
 
     Raises:
         TrainingError: there is none, or it is damaged.
@@ -90,28 +89,39 @@ def read_run(folder: Path) -> RunRecord:
         fix = "Name the --out of a `robocas train`."
         raise TrainingError("no run of robocas train", where=folder, expected=RUN, fix=fix)
     try:
-        found = load_json(path)
+        record = load_json(path)
     except ValueError as error:
         raise TrainingError("not readable", where=path, found=error) from error
-    if not isinstance(found, dict) or found.get("kind") != RunRecord.model_fields["kind"].default:
+    if not isinstance(record, dict) or record.get("kind") != RunRecord.model_fields["kind"].default:
         raise TrainingError("no run of robocas train", where=path, expected="kind robocas training run")
-    return parse(RunRecord, found, TrainingError, where=path)
+    return parse(RunRecord, record, TrainingError, where=path)
 
 
-def hash_of(data: Path) -> str:
-    """A hash (SHA-256) of a dataset.
+def package_versions() -> dict[str, str]:
+    """Return the versions of the installed packages that results depend on."""
+    versions = {}
+    for name in _PACKAGES:
+        try:
+            versions[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return versions
 
-    Of a trajectory its bytes and those of the JSON beside it; of a folder its overviews, arrays, calibrations, and
-    pictures' sizes.
+
+def hash_dataset(data: Path) -> str:
+    """Return a SHA-256 hash of a dataset.
+
+    Hashed are the bytes of a trajectory and of the JSON next to it; of a folder the JSON files, tables, arrays and the
+    sizes of all files.
 
     Raises:
         TrainingError: there is nothing.
     """
     digest = hashlib.sha256()
     if data.is_file():
-        _take(digest, data)
-        if (beside := data.with_suffix(".json")).is_file():
-            _take(digest, beside)
+        _hash_file(digest, data)
+        if (description := data.with_suffix(".json")).is_file():
+            _hash_file(digest, description)
     elif data.is_dir():
         for path in sorted(path for path in data.rglob("*") if path.is_file()):
             name = path.relative_to(data).as_posix()
@@ -119,22 +129,22 @@ def hash_of(data: Path) -> str:
                 continue
             digest.update(f"{name} {path.stat().st_size}\n".encode())
             if path.suffix in {".json", ".npz", ".npy", ".parquet"}:
-                _take(digest, path)
+                _hash_file(digest, path)
     else:
         raise TrainingError("no dataset here", where=data, expected="a dataset's folder or trajectory.h5")
     return digest.hexdigest()
 
 
-def hash_of_weights(folder: Path) -> str:
-    """A hash (SHA-256) of what a run acts with; empty: there is nothing yet."""
+def hash_weights(folder: Path) -> str:
+    """Return a SHA-256 hash of the weights of a run; empty: there are none yet."""
     path, digest = folder / WEIGHTS, hashlib.sha256()
     if not path.is_file():
         return ""
-    _take(digest, path)
+    _hash_file(digest, path)
     return digest.hexdigest()
 
 
-def _take(digest: Any, path: Path) -> None:
+def _hash_file(digest: Any, path: Path) -> None:
     with path.open("rb") as file:
         while block := file.read(_BLOCK):
             digest.update(block)

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from robocas_ms3.baselines.chunk_loss import chunk_losses
-from robocas_ms3.baselines.chunks import Scale
+from robocas_ms3.baselines.chunks.loss import chunk_losses
+from robocas_ms3.baselines.chunks.poses import Scale
 
 ONE = Scale([0.0] * 9, [1.0] * 9)
 

@@ -1,4 +1,4 @@
-"""What a run computes on, and how exactly."""
+"""The device of a run and its precision."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4  # of malloc.h
 
 
 def make_accelerator(device: str, precision: Precision) -> Accelerator:
-    """What a run computes on.
+    """Return accelerate's accelerator for a device.
 
     Args:
         device: ``auto`` (a GPU if there is one), ``cpu`` or ``cuda``.
@@ -31,12 +31,12 @@ def make_accelerator(device: str, precision: Precision) -> Accelerator:
         raise TrainingError("there is no GPU that torch can use", where="--device", found="cuda", fix="--device cpu")
     cpu = device == "cpu" or not torch.cuda.is_available()
     if cpu:
-        _keep_memory()
-    if AcceleratorState._shared_state and AcceleratorState().num_processes == 1:  # of a run before, in this process
+        _keep_freed_memory()
+    if AcceleratorState._shared_state and AcceleratorState().num_processes == 1:  # of an earlier run in this process
         AcceleratorState._reset_state(reset_partial_state=True)
     if precision == "auto":
-        fast = _cpu_has_bf16() if cpu else torch.cuda.is_bf16_supported(including_emulation=False)
-        precision = "bf16" if fast else "fp32"
+        is_fast = _cpu_has_bf16() if cpu else torch.cuda.is_bf16_supported(including_emulation=False)
+        precision = "bf16" if is_fast else "fp32"
     return Accelerator(
         cpu=cpu,
         mixed_precision="bf16" if precision == "bf16" else "no",
@@ -44,8 +44,13 @@ def make_accelerator(device: str, precision: Precision) -> Accelerator:
     )
 
 
-def _keep_memory() -> None:
-    """Let glibc keep what is freed: else each step asks the system for pages anew, a tenth of its time."""
+def count_threads(accelerator: Accelerator) -> int:
+    """Return the number of threads that torch uses on a CPU; 0 on a GPU."""
+    return torch.get_num_threads() if accelerator.device.type == "cpu" else 0
+
+
+def _keep_freed_memory() -> None:
+    """Let glibc keep freed memory: to get pages from the system at each step takes a tenth of its time."""
     with suppress(OSError, AttributeError):  # another C library
         libc = ctypes.CDLL(None)
         libc.mallopt(_M_MMAP_MAX, 0)
@@ -53,6 +58,6 @@ def _keep_memory() -> None:
 
 
 def _cpu_has_bf16() -> bool:
-    """Whether the processor multiplies bf16 by itself; where it does not, bf16 is slower than fp32."""
+    """Return whether the processor has bf16 instructions; without them bf16 is slower than fp32."""
     cpu: Any = torch.cpu
     return any(getattr(cpu, name, bool)() for name in ("_is_avx512_bf16_supported", "_is_amx_tile_supported"))

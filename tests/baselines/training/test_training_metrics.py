@@ -4,7 +4,7 @@ import math
 
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from robocas_ms3.baselines.log import MetricsLog
+from robocas_ms3.baselines.training.metrics import MetricsLog
 
 HEAD = "step,split,epoch,seconds,learning_rate,loss\n"
 

@@ -6,7 +6,7 @@ from collections import Counter
 import pytest
 
 from robocas_ms3.baselines.baseline import TrainSettings
-from robocas_ms3.baselines.schedule import Batches, epochs_at, learning_rate
+from robocas_ms3.baselines.training.schedule import Batches, epoch_at, learning_rate
 
 
 def settings(**values):
@@ -28,7 +28,7 @@ def test_batches_follow_from_seed_and_step():
 
 def test_processes_share_a_batch():
     whole = list(Batches(10, settings(steps=3, batch_size=4)))
-    parts = [list(Batches(10, settings(steps=3, batch_size=4), part=(number, 2))) for number in (0, 1)]
+    parts = [list(Batches(10, settings(steps=3, batch_size=4), process=(number, 2))) for number in (0, 1)]
     assert [sorted(one + other) for one, other in zip(*parts, strict=True)] == [sorted(batch) for batch in whole]
 
 
@@ -52,7 +52,7 @@ def test_restarts_by_hand():
         learning_rate=1.0,
         min_learning_rate=0.1,
     )
-    assert epochs_at(10, 10, chosen) == 2
+    assert epoch_at(10, 10, chosen) == 2
     for step, expected in ((0, 1.0), (5, 0.55), (10, 1.0), (20, 0.55), (30, 1.0), (50, 0.55)):
         assert learning_rate(step, 10, chosen) == pytest.approx(expected)
     assert learning_rate(9, 10, chosen) == pytest.approx(0.1 + 0.9 * (1 + math.cos(0.9 * math.pi)) / 2)

@@ -1,4 +1,4 @@
-"""The baselines by name, each imported when it is asked for; other packages bring theirs as entry points."""
+"""The baselines by name, each imported when it is used; other packages add theirs by entry points."""
 
 from __future__ import annotations
 
@@ -12,50 +12,48 @@ from robocas_ms3.core.exits import no_exit
 from robocas_ms3.core.extensions import Registry
 
 if TYPE_CHECKING:
-    from robocas_ms3.baselines.baseline import Baseline  # which imports torch
+    from robocas_ms3.baselines.baseline import Baseline, RLBaseline  # which import torch
 
 GROUP = "robocas_ms3.baselines"
 
 
 @dataclass(frozen=True)
 class Builtin:
-    """Gives a baseline of this package.
+    """Imports a baseline of this package.
 
     Attributes:
-        folder: beside this file.
-        about: its own ``about``, for who does not import it.
+        folder: next to this file.
+        about: the baseline's own ``about``, for listings that do not import it.
     """
 
     folder: str
     about: str
 
-    def __call__(self) -> Baseline:
-        """The baseline."""
+    def __call__(self) -> Baseline | RLBaseline:
+        """Return the baseline."""
         return import_module(f"robocas_ms3.baselines.{self.folder}").BASELINE
 
 
-BASELINES: Registry[Callable[[], Baseline]] = Registry(
+BASELINES: Registry[Callable[[], Baseline | RLBaseline]] = Registry(
     "baseline",
     GROUP,
     Callable,
     {
         "small": Builtin("small", "base and gripper camera, language; chunks of poses by a small transformer"),
-        "bc-state": Builtin("bc_state", "what only a simulator knows; chunks of poses by residual layers"),
-        "rt1": Builtin(
-            "rt1", "the paper's RT-1: base and gripper camera, language; tokens of actions by a causal transformer"
-        ),
-        "ppo": Builtin("ppo", "learns by trying, from dense rewards and what only a simulator knows; no data"),
+        "bc-state": Builtin("bc_state", "privileged state of the simulator; chunks of poses by residual layers"),
+        "rt1": Builtin("rt1", "RT-1 of the paper: base and gripper camera, language; action tokens by a transformer"),
+        "ppo": Builtin("ppo", "reinforcement learning from dense rewards and privileged state; no data"),
     },
 )
-"""By name, what gives it."""
+"""Functions that return a baseline, by its name."""
 
 
-def find_baseline(name: str, *, where: object = "") -> Baseline:
-    """The baseline of a name.
+def find_baseline(name: str, *, where: object = "") -> Baseline | RLBaseline:
+    """Return the baseline of a name.
 
     Raises:
         TrainingError: there is none.
-        MissingExtraError: of the ``train`` extra is not installed what weights are read by.
+        MissingExtraError: the ``train`` extra is not installed.
     """
     if name not in BASELINES:
         from robocas_ms3.core.strict import nearest  # imports pydantic, which `robocas --help` does not need
@@ -69,10 +67,10 @@ def find_baseline(name: str, *, where: object = "") -> Baseline:
 
 
 def need_extra(*modules: str) -> None:
-    """See that modules of the ``train`` extra are installed.
+    """Check that modules of the ``train`` extra are installed.
 
     Raises:
-        MissingExtraError: one is not.
+        MissingExtraError: one is missing.
     """
     for module in modules:
         try:

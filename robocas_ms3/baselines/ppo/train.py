@@ -1,0 +1,173 @@
+"""Proximal policy optimisation (Schulman et al. 2017) into the folder of a run."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import nn
+
+from robocas_ms3.baselines.ppo.agent import Agent
+from robocas_ms3.baselines.ppo.config import PpoConfig
+from robocas_ms3.baselines.ppo.environments import FIRST_TEST_SEED, PpoEnvironments
+from robocas_ms3.baselines.ppo.rollouts import OUTCOMES, Rollout, RolloutCollector, read_outcomes, steps_per_env
+from robocas_ms3.baselines.training import checkpoints
+from robocas_ms3.baselines.training.checkpoints import Checkpoint, with_prefix
+from robocas_ms3.baselines.training.run_folder import RunFolder
+from robocas_ms3.core.errors import TrainingError
+from robocas_ms3.core.exits import deferred_interrupts
+
+
+def train_ppo(run: RunFolder, agent: Agent, config: PpoConfig, environments: PpoEnvironments) -> None:
+    """Train an agent until all steps are done, then test it without noise in other layouts.
+
+    A run that continues has the weights, the optimiser, the observation statistics, the last episodes and the random
+    states of the last update. Its environments start anew, with the layouts after those that were played, so it does
+    not repeat an uninterrupted run to the bit.
+
+    Args:
+        run: folder of the run.
+        agent: to train, on its device.
+        config: see `PpoConfig`.
+        environments: to train in.
+
+    Raises:
+        TrainingError: there are several processes, the loss or the gradient is NaN or infinite, or the checkpoint is
+            of something else.
+        RobocasError: somebody removed the folder.
+        KeyboardInterrupt: Ctrl-C; finished updates are saved.
+    """
+    if run.accelerator.num_processes > 1:
+        found, fix = f"{run.accelerator.num_processes} processes", "Run it without `accelerate launch`."
+        raise TrainingError("ppo trains in one process", where=run.record.baseline, found=found, fix=fix)
+    settings = config.train
+    checkpoint = run.load_checkpoint()
+    state = _TrainingState(agent, config)
+    if checkpoint is not None:
+        state.restore(checkpoint)
+        run.repair_weights(state.step, agent.state_dict())
+    run.start(state.step, agent, f"{len(environments)} steps in {environments.episodes} layouts")
+
+    def log(split: str, outcomes: torch.Tensor, metrics: dict[str, float]) -> None:
+        epoch = state.episodes / config.layouts
+        means = dict(zip(OUTCOMES, outcomes.mean(dim=0).tolist(), strict=True))
+        run.log(state.step, split, {**means, **metrics}, epoch=epoch, learning_rate=settings.learning_rate)
+
+    def save() -> None:
+        run.save(state.step, state.tensors(), agent.state_dict())
+
+    run.progress.step(min(state.step, settings.steps), settings.steps)
+    saved_step = state.step
+    collector = None
+    try:
+        while state.step < settings.steps:
+            collector = collector or RolloutCollector(environments.envs, agent, config, state.episodes, state.outcomes)
+            rollout = collector.collect()
+            with deferred_interrupts():  # after an update everything is as a checkpoint has it
+                losses = update(agent, state.optimizer, rollout, config)
+                state.step += config.envs * steps_per_env(config)
+                _check_finite(run, losses, state.step)
+                state.episodes, state.outcomes = collector.episodes, collector.last_outcomes()
+                log("train", state.outcomes, {"noise": agent.log_std.exp().mean().item(), **losses})
+                is_last = state.step >= settings.steps
+                if is_last or state.step // settings.save_every > saved_step // settings.save_every:
+                    save()
+                    saved_step = state.step
+            run.progress.step(min(state.step, settings.steps), settings.steps)
+        if config.trials and not state.is_tested:
+            outcomes = evaluate_agent(agent, environments, config.trials)
+            with deferred_interrupts(second_ends=False):
+                log("val", outcomes, {"noise": 0.0})
+                state.is_tested = True
+                save()
+            mean_return, *rates = outcomes.mean(dim=0).tolist()
+            text = ", ".join(f"{name} {rate:.0%}" for name, rate in zip(OUTCOMES[1:], rates, strict=True))
+            run.progress.note(f"test without noise, {len(outcomes)} other layouts: return {mean_return:.2f}, {text}")
+    except KeyboardInterrupt:
+        if state.step > saved_step:
+            save()
+        raise
+
+
+def update(agent: Agent, optimizer: torch.optim.Optimizer, rollout: Rollout, config: PpoConfig) -> dict[str, float]:
+    """Improve an agent by a rollout; returns means of its losses, its entropy and the norm of the gradient."""
+    agent.update_statistics(rollout.obs)
+    tensors = rollout.normalized, rollout.action, rollout.log_prob, rollout.advantage, rollout.returns
+    metrics = []
+    for _ in range(config.epochs):
+        for rows in torch.randperm(len(rollout.normalized)).chunk(config.minibatches):
+            obs, action, log_prob, advantage, returns = (tensor[rows] for tensor in tensors)
+            advantage = (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-8)
+            policy = agent.policy(obs)
+            ratio = (policy.log_prob(action).sum(-1) - log_prob).exp()
+            gain = torch.min(ratio * advantage, ratio.clamp(1 - config.clip, 1 + config.clip) * advantage).mean()
+            error = (agent.value(obs) - returns).square().mean()
+            entropy = policy.entropy().sum(-1).mean()
+            optimizer.zero_grad()
+            (error / 2 - gain - config.entropy * entropy).backward()
+            norm = nn.utils.clip_grad_norm_(agent.parameters(), config.train.clip_norm or float("inf"))
+            optimizer.step()
+            metrics.append(torch.stack([error, -gain, entropy, norm]).detach())
+    value, gain, entropy, norm = torch.stack(metrics).mean(dim=0).tolist()
+    return {"value_loss": value, "policy_loss": gain, "entropy": entropy, "gradient": norm}
+
+
+@torch.inference_mode()
+def evaluate_agent(agent: Agent, environments: PpoEnvironments, count: int) -> torch.Tensor:
+    """Return the (count, 4) `OUTCOMES` of episodes without noise, in layouts that the agent was not trained on."""
+    envs = environments.make(count, FIRST_TEST_SEED, FIRST_TEST_SEED + count - 1)
+    try:
+        obs, info = envs.reset(seed=FIRST_TEST_SEED)
+        while "final_info" not in info:  # all end at the same step
+            obs, _, _, _, info = envs.step(agent.best(obs))  # pyright: ignore[reportArgumentType]
+    finally:
+        envs.close()
+    return read_outcomes(info)
+
+
+class _TrainingState:
+    """Agent, optimiser, and counts of a training.
+
+    Attributes:
+        step: number of steps done, of all environments together.
+        episodes: number of episodes played.
+        outcomes: (n, 4) `OUTCOMES` of the last episodes.
+        is_tested: whether the test at the end is done.
+    """
+
+    def __init__(self, agent: Agent, config: PpoConfig) -> None:
+        self.optimizer = torch.optim.Adam(agent.parameters(), lr=config.train.learning_rate, eps=1e-5)
+        self.step, self.episodes, self.is_tested = 0, 0, False
+        self.outcomes = torch.empty(0, len(OUTCOMES))
+        self._agent = agent
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """Return the tensors of a checkpoint."""
+        tensors = {
+            **with_prefix("model.", self._agent.state_dict()),
+            **with_prefix("optimizer.", checkpoints.optimizer_tensors(self.optimizer)),
+            "episodes.played": torch.tensor(self.episodes),
+            "episodes.last": self.outcomes,
+            "tried_out": torch.tensor(self.is_tested),
+            "random.cpu": torch.get_rng_state(),
+        }
+        if self._agent.mean.is_cuda:
+            tensors["random.cuda"] = torch.cuda.get_rng_state()
+        return tensors
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Restore a checkpoint."""
+        tensors = checkpoint.tensors
+        checkpoints.load_weights(self._agent, checkpoint.part("model."), checkpoint.path)
+        checkpoints.load_optimizer(self.optimizer, checkpoint.part("optimizer."))
+        self.episodes, self.outcomes = int(tensors["episodes.played"]), tensors["episodes.last"]
+        self.step, self.is_tested = checkpoint.step, bool(tensors["tried_out"])
+        torch.set_rng_state(tensors["random.cpu"])
+        if "random.cuda" in tensors and self._agent.mean.is_cuda:
+            torch.cuda.set_rng_state(tensors["random.cuda"])
+
+
+def _check_finite(run: RunFolder, losses: dict[str, float], step: int) -> None:
+    wrong = [name for name, value in losses.items() if not math.isfinite(value)]
+    if wrong:
+        raise run.error(f"the {'gradient' if wrong == ['gradient'] else 'loss'} is NaN or infinite", step)

@@ -1,0 +1,208 @@
+"""A network in supervised training, with its optimiser, the average of its weights, and its metrics."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from accelerate import Accelerator
+from torch.optim.swa_utils import AveragedModel
+
+from robocas_ms3.baselines.baseline import Batch, TrainSettings
+from robocas_ms3.baselines.training import checkpoints
+from robocas_ms3.baselines.training.checkpoints import Checkpoint, with_prefix
+from robocas_ms3.baselines.training.metrics import means_of_sums, sum_of_batch
+from robocas_ms3.core.errors import TrainingError
+
+
+class NotFiniteError(Exception):
+    """A loss or gradient is NaN or infinite.
+
+    Args:
+        name: which of the two.
+        step: number of the step.
+    """
+
+    def __init__(self, name: str, step: int) -> None:
+        super().__init__(f"the {name} is NaN or infinite")
+        self.step = step
+
+
+class Learner:
+    """Takes optimiser steps, averages weights and metrics, and saves and restores all of that.
+
+    Args:
+        model: on the device of the accelerator.
+        settings: of the training.
+        accelerator: of the run.
+        checkpoint: to continue from.
+
+    Attributes:
+        step: number of steps done.
+    """
+
+    def __init__(
+        self, model: torch.nn.Module, settings: TrainSettings, accelerator: Accelerator, checkpoint: Checkpoint | None
+    ) -> None:
+        self.step = 0
+        self._settings, self._accelerator = settings, accelerator
+        self._bare = model
+        self._average = AveragedModel(model, multi_avg_fn=self._update_average) if settings.ema else None
+        self._sums: dict[str, torch.Tensor] = {}  # of metrics since the last line of the log
+        self._norms = torch.zeros((), dtype=torch.float64, device=accelerator.device)  # sum of all gradients' norms
+        if checkpoint is None:
+            torch.manual_seed(settings.seed + 1 + accelerator.process_index)
+        else:
+            self._restore(checkpoint)
+        optimizer = torch.optim.AdamW(_parameter_groups(model, settings.weight_decay), lr=1.0, betas=settings.betas)
+        self._model, self._optimizer = accelerator.prepare(model, optimizer)
+        if (
+            checkpoint is not None
+        ):  # not before: `prepare` moves the optimiser's counts to the GPU, which steps wait for
+            checkpoints.load_optimizer(self._optimizer, checkpoint.part("optimizer."))
+
+    def update(self, batch: Batch, learning_rate: float) -> None:
+        """Take a step of the optimiser.
+
+        Raises:
+            NotFiniteError: the loss or the gradient is NaN or infinite. On a GPU `take_means` raises it.
+        """
+        for group in self._optimizer.param_groups:
+            group["lr"] = learning_rate
+        self._model.train()
+        with self._accelerator.autocast():
+            metrics = self._model(batch)
+        self._accelerator.backward(metrics["loss"])
+        clip_norm = self._settings.clip_norm or math.inf
+        norm: Any = self._accelerator.clip_grad_norm_(self._model.parameters(), clip_norm)
+        if norm.device.type == "cpu":  # on a GPU the check would wait for the step
+            self.check_finite(self.step + 1, loss=metrics["loss"].detach(), gradient=norm)
+        self._norms += norm.detach()
+        self._optimizer.step()
+        self._optimizer.zero_grad()
+        self.step += 1
+        if self._average is not None:
+            self._average.update_parameters(self._bare)
+        self._sums = {name: self._sums.get(name, 0.0) + sum_of_batch(value, 1) for name, value in metrics.items()}
+
+    def take_means(self) -> dict[str, float]:
+        """Return the means of the metrics since the last call, over all processes.
+
+        Raises:
+            NotFiniteError: the loss or a gradient was NaN or infinite.
+        """
+        means = means_of_sums(self._reduce(self._sums))
+        self._sums = {}
+        self.check_finite(self.step, loss=means["loss"], gradient=self._norms)
+        return means
+
+    @torch.no_grad()
+    def evaluate(self, batches: Iterable[tuple[int, Batch]]) -> dict[str, float]:
+        """Return the means of the metrics of the averaged weights; random states stay as they are.
+
+        Args:
+            batches: of this process, with the number of samples in each.
+        """
+        model = self._acting_model().eval()
+        device = self._accelerator.device
+        sums: dict[str, torch.Tensor] = {}
+        with torch.random.fork_rng([device] if device.type == "cuda" else []), self._accelerator.autocast():
+            torch.manual_seed(self._settings.seed)
+            for size, batch in batches:
+                for name, value in model(batch).items():
+                    sums[name] = sum_of_batch(value, size) + sums.get(name, 0.0)
+        return means_of_sums(self._reduce(sums))
+
+    def check_finite(self, step: int, **values: torch.Tensor | float) -> None:
+        """Check that values of a step are finite.
+
+        Raises:
+            NotFiniteError: one is not.
+        """
+        for name, value in values.items():
+            if not math.isfinite(value):
+                raise NotFiniteError(name, step)
+
+    def weights(self) -> dict[str, torch.Tensor]:
+        """Return the weights that a policy acts with."""
+        return self._acting_model().state_dict()
+
+    def state(self) -> dict[str, torch.Tensor] | None:
+        """Return the tensors of a checkpoint; all processes have to call this.
+
+        None: some are NaN or infinite. Then the next `take_means` ends the run, and the last checkpoint stays.
+        """
+        random, sums = self._random_states(), self._reduce(self._sums)
+        if any(not torch.isfinite(value).all() for value in (*self._sums.values(), self._norms)):
+            return None
+        average = {} if self._average is None else with_prefix("average.", self._average.state_dict())
+        return {
+            **with_prefix("model.", self._bare.state_dict()),
+            **average,
+            **with_prefix("optimizer.", checkpoints.optimizer_tensors(self._optimizer)),
+            **with_prefix("sums.", sums),
+            **with_prefix("random.", random),
+        }
+
+    def _restore(self, checkpoint: Checkpoint) -> None:
+        """Restore all but the optimiser."""
+        checkpoints.load_weights(self._bare, checkpoint.part("model."), checkpoint.path)
+        if self._average is not None:
+            checkpoints.load_weights(self._average, checkpoint.part("average."), checkpoint.path)
+        is_main = float(self._accelerator.is_main_process)  # the sums are those of all processes
+        device = self._accelerator.device
+        self._sums = {name: is_main * value.to(device) for name, value in checkpoint.part("sums.").items()}
+        self._restore_random(checkpoint.part("random."), checkpoint.path)
+        self.step = checkpoint.step
+
+    def _acting_model(self) -> torch.nn.Module:
+        return self._average.module if self._average is not None else self._bare
+
+    def _update_average(self, average: Any, now: Any, _: Any) -> None:
+        """Update the average of the weights: fast at first, as it starts with random ones."""
+        decay = min(self._settings.ema, (self.step + 1) / (self.step + 10))
+        torch._foreach_lerp_(average, now, 1 - decay)  # pyright: ignore[reportPrivateImportUsage]
+
+    def _reduce(self, sums: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """Return the sums over all processes."""
+        if not sums:
+            return {}
+        reduced: Any = self._accelerator.reduce(torch.stack(list(sums.values())), "sum")
+        return dict(zip(sums, reduced, strict=True))
+
+    def _random_states(self) -> dict[str, torch.Tensor]:
+        """Return the states of the random generators of all processes, by ``cpu.N`` or ``cuda.N``."""
+        states, device = {"cpu": torch.get_rng_state()}, self._accelerator.device
+        if device.type == "cuda":
+            states["cuda"] = torch.cuda.get_rng_state()
+        gathered: dict[str, Any] = {
+            kind: self._accelerator.gather(state[None].to(device)) for kind, state in states.items()
+        }
+        return {f"{kind}.{number}": state for kind, rows in gathered.items() for number, state in enumerate(rows)}
+
+    def _restore_random(self, states: dict[str, torch.Tensor], where: Path) -> None:
+        processes = sum(name.startswith("cpu.") for name in states)
+        if processes != self._accelerator.num_processes:
+            raise TrainingError(
+                "a run continues in as many processes as it started with",
+                where=where,
+                expected=processes,
+                found=self._accelerator.num_processes,
+                fix=f"accelerate launch --num_processes {processes}, or train anew with --overwrite.",
+            )
+        number = self._accelerator.process_index
+        torch.set_rng_state(states[f"cpu.{number}"])
+        if f"cuda.{number}" in states and self._accelerator.device.type == "cuda":
+            torch.cuda.set_rng_state(states[f"cuda.{number}"])
+
+
+def _parameter_groups(model: torch.nn.Module, decay: float) -> list[dict[str, Any]]:
+    """Return parameters with weight decay, matrices and kernels, and those without."""
+    parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
+    return [
+        {"params": [parameter for parameter in parameters if parameter.ndim > 1], "weight_decay": decay},
+        {"params": [parameter for parameter in parameters if parameter.ndim <= 1], "weight_decay": 0.0},
+    ]

@@ -1,0 +1,153 @@
+"""Metrics of batches, their means, and their log: ``metrics.csv`` and TensorBoard's files."""
+
+from __future__ import annotations
+
+import csv
+import math
+import shutil
+import time
+from collections.abc import Mapping
+from io import TextIOWrapper
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from robocas_ms3.baselines.training.record import METRICS, TENSORBOARD
+from robocas_ms3.core.files import make_folder, naming, open_for_append, replacing
+
+_FIRST_COLUMNS = ("step", "split", "epoch", "seconds", "learning_rate")
+
+
+def mean_of_sum(sum_and_count: torch.Tensor) -> torch.Tensor:
+    """Return the mean () of a sum and a count (2,); 0 for a count of 0."""
+    return sum_and_count[0] / sum_and_count[1].clamp(min=1)
+
+
+def sum_of_batch(metric: torch.Tensor, samples: int) -> torch.Tensor:
+    """Return a sum and a count (2,) float64 of a metric of a batch: its mean (), or already a sum and a count (2,)."""
+    metric = metric.detach().double()
+    return metric if metric.ndim else torch.stack([metric * samples, torch.full_like(metric, samples)])
+
+
+def means_of_sums(sums: Mapping[str, torch.Tensor]) -> dict[str, float]:
+    """Return means by name; NaN for a count of 0."""
+    return {name: float(mean_of_sum(value)) if value[1] else math.nan for name, value in sums.items()}
+
+
+class MetricsLog:
+    """Appends lines to ``metrics.csv`` and events to ``tensorboard/``.
+
+    Args:
+        folder: of the run.
+        step: of the checkpoint; later lines, of a training that was killed, are removed.
+
+    Attributes:
+        seconds: of training up to that step.
+    """
+
+    def __init__(self, folder: Path, step: int) -> None:
+        self.seconds = 0.0
+        self._path = folder / METRICS
+        self._columns: list[str] = []
+        self._written: set[tuple[int, str]] = set()
+        if self._path.is_file():
+            self._remove_lines_after(step)
+        if not step:
+            shutil.rmtree(folder / TENSORBOARD, ignore_errors=True)
+        self._tensorboard = TensorBoardWriter(folder / TENSORBOARD, step + 1 if step else 0)
+
+    def has(self, step: int, split: str) -> bool:
+        """Return whether a line was written before this run continued."""
+        return (step, split) in self._written
+
+    def add(self, step: int, split: str, about: Mapping[str, float], metrics: Mapping[str, float]) -> None:
+        """Write a line.
+
+        Args:
+            step: number of steps done.
+            split: ``train`` (means since the last line) or ``val``.
+            about: epoch, seconds and learning rate.
+            metrics: by name.
+        """
+        row = {"step": step, "split": split, **about, **metrics}
+        is_first = not self._columns
+        if is_first:
+            self._columns = [*_FIRST_COLUMNS, *metrics]
+        with naming(self._path), TextIOWrapper(open_for_append(self._path), "utf-8", newline="") as file:
+            writer = csv.DictWriter(file, self._columns, extrasaction="ignore", lineterminator="\n")
+            if is_first:
+                writer.writeheader()
+            writer.writerow({key: f"{value:.6g}" if isinstance(value, float) else value for key, value in row.items()})
+        shown = {**metrics, "learning_rate": about["learning_rate"]}
+        self._tensorboard.add(step, {f"{split}/{key}": value for key, value in shown.items() if math.isfinite(value)})
+
+    def close(self) -> None:
+        """Close the files."""
+        self._tensorboard.close()
+
+    def _remove_lines_after(self, step: int) -> None:
+        with self._path.open(newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+        whole = [row for row in rows if None not in row.values()]  # a kill may have cut off the last line
+        kept = [row for row in whole if _number(row["step"], math.inf) <= step]
+        self._written = {(int(row["step"]), row["split"]) for row in kept}
+        self._columns = list(rows[0]) if rows else []
+        if kept:
+            self.seconds = _number(kept[-1]["seconds"], 0.0)
+        with replacing(self._path) as tmp, tmp.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, self._columns, extrasaction="ignore", lineterminator="\n")
+            if self._columns:
+                writer.writeheader()
+            writer.writerows(kept)
+
+
+class TensorBoardWriter:
+    """Writes TensorBoard events without a thread, so that a full disk is an error of the training.
+
+    TensorBoard's own writer would print a traceback from its thread, and the training would fail later.
+
+    Args:
+        folder: of the files; a new one is added.
+        first: step from which on events of earlier files are hidden; 0: none are.
+    """
+
+    def __init__(self, folder: Path, first: int = 0) -> None:
+        from tensorboard.compat.proto import event_pb2, summary_pb2
+        from tensorboard.summary.writer.record_writer import RecordWriter
+
+        self._events: Any = event_pb2
+        self._summaries: Any = summary_pb2
+        make_folder(folder)
+        # TensorBoard reads the files in the order of their names
+        self._path = folder / f"events.out.tfevents.{int(time.time()):010d}.{len(list(folder.iterdir())):04d}"
+        with naming(self._path):
+            self._records: Any = RecordWriter(self._path.open("xb"))
+        self._write(file_version="brain.Event:2")
+        if first:
+            log = self._events.SessionLog
+            self._write(step=first, session_log=log(status=log.START))
+
+    def add(self, step: int, values: Mapping[str, float]) -> None:
+        """Write values by name."""
+        summary = self._summaries.Summary
+        scalars = [summary.Value(tag=name, simple_value=value) for name, value in values.items()]
+        self._write(step=step, summary=summary(value=scalars))
+
+    def close(self) -> None:
+        """Close the file."""
+        with naming(self._path):
+            self._records.close()
+
+    def _write(self, **event: Any) -> None:
+        with naming(self._path):
+            self._records.write(self._events.Event(wall_time=time.time(), **event).SerializeToString())
+            self._records.flush()
+
+
+def _number(text: Any, default: float) -> float:
+    """Return the number in a field, which a kill may have cut off."""
+    try:
+        return float(text)
+    except (TypeError, ValueError):
+        return default

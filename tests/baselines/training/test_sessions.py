@@ -1,0 +1,330 @@
+"""Training runs: interrupted and continued to the bit, and refused if they are of something else."""
+
+import errno
+import json
+import os
+import shutil
+import socket
+import subprocess
+import sys
+from contextlib import suppress
+from pathlib import Path
+from types import SimpleNamespace
+
+import made_up_baseline
+import pytest
+import torch
+from made_up_runs import assert_finite, assert_same, change_record, read_log, stop_at
+from safetensors.torch import load_file
+
+from robocas_ms3.baselines.policy import RunPolicy
+from robocas_ms3.baselines.training import checkpoints, devices
+from robocas_ms3.baselines.training.learner import Learner
+from robocas_ms3.baselines.training.session import Progress, merge_configs, train_run
+from robocas_ms3.cli.main import run
+from robocas_ms3.core.errors import DatasetError, ExtensionError, OutputExistsError, RobocasError, TrainingError
+from robocas_ms3.evaluation.policies import make_policy
+
+
+def test_files_of_a_run(whole):
+    assert {path.name for path in whole.iterdir()} == {
+        *("run.json", "metrics.csv", "tensorboard", "checkpoint.safetensors", "weights.safetensors")
+    }
+    record = json.loads((whole / "run.json").read_text())
+    assert (record["baseline"], record["data"]["episodes"], record["data"]["samples"]) == ("made-up", 3, 30)
+    assert record["config"]["train"]["steps"] == 40 and record["facts"] == {"inputs": 3}
+    assert {"torch", "numpy", "robocas-ms3"} <= record["versions"].keys()
+    assert record["threads"] == torch.get_num_threads()
+    assert {path.stat().st_mode & 0o777 for path in whole.glob("*.safetensors")} == {0o644}  # for everybody to read
+
+
+def test_metrics_of_a_run(whole):
+    train, val = read_log(whole, "train"), read_log(whole, "val")
+    assert [row["step"] for row in train] == [str(step) for step in range(4, 41, 4)]
+    assert [row["step"] for row in val] == ["20", "40"]
+    assert float(val[-1]["loss"]) < float(train[0]["loss"])
+    assert float(train[0]["double"]) == pytest.approx(2 * float(train[0]["loss"]), rel=1e-4)
+    x = made_up_baseline.MadeUpSamples(-1, -1).x[:, 0]
+    assert float(val[-1]["high"]) == pytest.approx(x[x > 0].mean().item(), rel=1e-5)  # of the samples that have it
+    assert list((whole / "tensorboard").iterdir())
+
+
+@pytest.mark.parametrize(
+    ("step", "error", "continued_at"),
+    [*((step, KeyboardInterrupt, step) for step in (1, 17, 20, 39)), (5, RuntimeError, 0), (31, RuntimeError, 30)],
+)
+def test_a_run_that_was_stopped_continues_to_the_bit(whole, data, tmp_path, step, error, continued_at):
+    """Ctrl-C loses nothing, a crash the steps after the last checkpoint."""
+    out, steps = tmp_path / "again", []
+    with pytest.raises(error):
+        train_run("made-up", data, out, device="cpu", progress=stop_at(step, error("stopped")))
+    train_run("made-up", data, out, device="cpu", progress=Progress(step=lambda done, total: steps.append(done)))
+    assert steps[0] == continued_at
+    assert_same(whole, out)
+
+
+@pytest.mark.parametrize("name", ["weights.safetensors", "checkpoint.safetensors"])
+@pytest.mark.parametrize("step", [20, 40])
+def test_a_checkpoint_without_room_on_the_disk_is_written_later(whole, data, tmp_path, monkeypatch, name, step):
+    save = checkpoints.save
+
+    def full(path, tensors, about):
+        if path.name == name and about["step"] == str(step):
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        save(path, tensors, about)
+
+    out = tmp_path / "again"
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoints, "save", full)
+        with pytest.raises(OSError, match=name):
+            train_run("made-up", data, out, device="cpu")
+    train_run("made-up", data, out, device="cpu")
+    assert_same(whole, out)
+
+
+@pytest.mark.parametrize("damage", [Path.unlink, lambda path: path.write_bytes(b"\xff" * 100)])
+def test_weights_are_repaired_from_the_checkpoint(whole, data, damage):
+    before = (whole / "weights.safetensors").read_bytes()
+    damage(whole / "weights.safetensors")
+    with pytest.raises(TrainingError):
+        RunPolicy(whole)
+    train_run("made-up", data, whole, device="cpu")
+    assert (whole / "weights.safetensors").read_bytes() == before
+
+
+@pytest.mark.parametrize("room", [0, 4, 8, 16])
+def test_a_full_disk_is_an_error_and_loses_nothing(whole, data, small_disk, capsys, room):
+    """A real one, with room for so many kB: it is full at the record, the log, the curves or a checkpoint."""
+    out = small_disk / "run"
+    words = ["train", "made-up", "--data", str(data), "--out", str(out), "--device", "cpu"]
+    filler = small_disk / "filler"
+    with suppress(OSError), filler.open("wb", buffering=0) as file:
+        while True:
+            file.write(bytes(4096))
+    os.truncate(filler, filler.stat().st_size // 4096 * 4096 - 1024 * room)
+    assert run(words) == 1
+    output = capsys.readouterr().err
+    assert output.splitlines()[-1].startswith("error: ") and "No space left on device" in output
+    assert "Traceback" not in output
+    filler.unlink()
+    assert run(words) == 0
+    assert_same(whole, out)
+
+
+@pytest.mark.parametrize("step", [20, 40])
+def test_an_interrupted_validation_is_repeated(whole, data, tmp_path, monkeypatch, step):
+    evaluate = Learner.evaluate
+
+    def interrupted(self, batches):
+        if self.step == step:
+            raise KeyboardInterrupt
+        return evaluate(self, batches)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Learner, "evaluate", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            train_run("made-up", data, tmp_path / "again", device="cpu")
+    assert str(step) not in {row["step"] for row in read_log(tmp_path / "again", "val")}
+    train_run("made-up", data, tmp_path / "again", device="cpu")
+    assert_same(whole, tmp_path / "again")
+
+
+def test_a_finished_run_stays_as_it_is(whole, data):
+    before = (whole / "weights.safetensors").read_bytes()
+    train_run("made-up", data, whole, device="cpu")
+    assert (whole / "weights.safetensors").read_bytes() == before
+
+
+def test_seeds_differ(whole, data, tmp_path):
+    train_run("made-up", data, tmp_path / "other", {"train": {"seed": 1}}, device="cpu")
+    first, second = (load_file(folder / "weights.safetensors") for folder in (whole, tmp_path / "other"))
+    assert not torch.equal(first["net.0.weight"], second["net.0.weight"])
+
+
+def test_no_such_baseline(data, tmp_path):
+    with pytest.raises(TrainingError, match="small"):
+        train_run("smal", data, tmp_path / "run")
+
+
+def test_no_data(made_up, tmp_path):
+    with pytest.raises(TrainingError) as caught:
+        train_run("made-up", tmp_path / "none.h5", tmp_path / "run", device="cpu")
+    assert caught.value.where == tmp_path / "none.h5"
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_a_folder_of_something_else_is_refused(made_up, data, tmp_path, overwrite):
+    """Such as notes, and the log of another trainer."""
+    out = tmp_path / "mine"
+    out.mkdir()
+    (out / ".draft.tmp.txt").write_text("mine")
+    (out / "metrics.csv").write_text("epoch,loss\n3,0.5\n")
+    with pytest.raises(OutputExistsError):
+        train_run("made-up", data, out, device="cpu", overwrite=overwrite)
+    assert (out / "metrics.csv").read_text() == "epoch,loss\n3,0.5\n"
+    assert len(list(out.iterdir())) == 2
+
+
+def test_overwrite_starts_again(whole, data):
+    train_run("made-up", data, whole, {"train": {"steps": 4}}, device="cpu", overwrite=True)
+    assert len(read_log(whole)) == 2
+
+
+@pytest.mark.parametrize(
+    "changes", [{"broken_at": 7}, {"steep_at": 7}, {"steep_at": 7, "train": {"clip_norm": 0.0}}], ids=str
+)
+def test_a_nan_ends_the_run_and_the_last_checkpoint_stays(made_up, data, tmp_path, changes):
+    """Of the loss, or of the gradient alone."""
+    out, done = tmp_path / "run", []
+    changes = merge_configs(changes, {"train": {"save_every": 1}})
+    progress = Progress(step=lambda step, _: done.append(step))
+    with pytest.raises(TrainingError):
+        train_run("made-up", data, out, changes, device="cpu", progress=progress)
+    assert_finite(out)
+    for name in ("checkpoint", "weights"):
+        assert int(checkpoints.load(out / f"{name}.safetensors", {})[1]["step"]) == done[-1] > 0
+    assert load_file(out / "checkpoint.safetensors")["optimizer.0.step"] == done[-1]
+
+
+def test_a_nan_that_was_not_checked_is_not_saved(made_up, data, tmp_path, monkeypatch):
+    """As on a GPU, where steps are not waited for, and without lines of the log, which end the run."""
+    monkeypatch.setattr(Learner, "check_finite", lambda self, step, **values: None)
+    changes = {"steep_at": 7, "train": {"save_every": 1, "log_every": 100, "check_every": 100}}
+    train_run("made-up", data, tmp_path / "run", changes, device="cpu")
+    assert_finite(tmp_path / "run")
+
+
+def test_a_removed_folder_is_an_error(made_up, data, tmp_path, monkeypatch):
+    """Between two steps, and during a write."""
+    out, save = tmp_path / "run", checkpoints.save
+
+    def remove(done, total):
+        if done == 5:
+            shutil.rmtree(out)
+
+    def remove_and_save(path, tensors, about):
+        shutil.rmtree(out, ignore_errors=True)
+        save(path, tensors, about)
+
+    with pytest.raises(RobocasError) as caught:
+        train_run("made-up", data, out, device="cpu", progress=Progress(step=remove))
+    assert caught.value.where == out
+    monkeypatch.setattr(checkpoints, "save", remove_and_save)
+    with pytest.raises(RobocasError) as caught:
+        train_run("made-up", data, out, device="cpu")
+    assert caught.value.where == out
+
+
+def test_a_baseline_can_not_end_the_process(made_up, data, tmp_path, monkeypatch):
+    monkeypatch.setattr(made_up, "model", lambda self, config, facts: sys.exit(0))
+    with pytest.raises(ExtensionError) as caught:
+        train_run("made-up", data, tmp_path / "run", device="cpu")
+    assert caught.value.where == "baseline made-up"
+
+
+def test_a_baseline_that_changes_the_working_directory(made_up, data, tmp_path, monkeypatch):
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path)
+    model = made_up.model
+    monkeypatch.setattr(made_up, "model", lambda *args: os.chdir(tmp_path / "elsewhere") or model(*args))
+    assert run(["train", "made-up", "--data", data.name, "--out", "run", "--steps", "4", "--device", "cpu"]) == 0
+    assert (tmp_path / "run" / "run.json").is_file()
+    assert not list((tmp_path / "elsewhere").iterdir())
+
+
+def test_without_validation(made_up, data, tmp_path):
+    data.write_text("few")
+    train_run("made-up", data, tmp_path / "run", device="cpu")
+    assert {row["split"] for row in read_log(tmp_path / "run")} == {"train"}
+
+
+def test_a_damaged_validation_split_is_an_error(made_up, data, tmp_path):
+    data.write_text("damaged")
+    with pytest.raises(DatasetError):
+        train_run("made-up", data, tmp_path / "run", device="cpu")
+
+
+def test_processes_share_a_batch_evenly(made_up, data, tmp_path, monkeypatch):
+    monkeypatch.setattr(devices, "make_accelerator", lambda *_: SimpleNamespace(num_processes=3))
+    with pytest.raises(TrainingError) as caught:
+        train_run("made-up", data, tmp_path / "run", device="cpu")
+    assert caught.value.where == "train.batch_size"
+
+
+def test_leftovers_of_a_kill_are_removed(whole, made_up, data, tmp_path):
+    """Before there was a record, and during the write of a checkpoint."""
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / ".run.123.tmp.json").write_text("{")
+    (whole / ".checkpoint.123.tmp.safetensors").write_bytes(b"half")
+    for out, changes in ((tmp_path / "run", {"train": {"steps": 4}}), (whole, {})):
+        train_run("made-up", data, out, changes, device="cpu")
+        assert not list(out.glob(".*"))
+
+
+def test_an_error_of_a_worker_is_that_of_the_samples(made_up, data, tmp_path):
+    with pytest.raises(DatasetError) as caught:
+        train_run("made-up", data, tmp_path / "run", {"damaged_at": 7, "train": {"workers": 1}}, device="cpu")
+    assert caught.value.where == "sample 7"
+
+
+def test_a_run_is_a_policy(whole):
+    policy = make_policy(str(whole))
+    assert isinstance(policy, RunPolicy)
+    about = policy.describe()
+    assert (about["baseline"], about["steps"], about["data"]["samples"]) == ("made-up", 40, 30)
+
+
+@pytest.mark.parametrize(
+    ("change", "where"),
+    [
+        (lambda run: (run / "weights.safetensors").unlink(), "weights.safetensors"),
+        (lambda run: change_record(run, version=2), ""),
+        (lambda run: change_record(run, config={"widht": 1}), "width"),
+        (lambda run: change_record(run, facts={"inputs": 5}), "net.0.weight"),
+        (lambda run: change_record(run, baseline="smal"), "run.json"),
+        (lambda run: (run / "run.json").write_text('{"protocol_hash": 1}'), "run.json"),
+    ],
+)
+def test_a_run_that_is_no_policy(whole, change, where):
+    change(whole)
+    with pytest.raises(TrainingError) as caught:
+        make_policy(str(whole))
+    assert str(whole) in str(caught.value.where) and where in str(caught.value)
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory):
+    """Runs of two processes, see `made_up_baseline`, and their data."""
+    out = tmp_path_factory.mktemp("shared")
+    (out / "data.h5").write_text("demonstrations")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    world = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "WORLD_SIZE": "2", "LOCAL_WORLD_SIZE": "2"}
+    words = [sys.executable, made_up_baseline.__file__, str(out / "data.h5"), str(out)]
+    env = {**os.environ, **world, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parents[3])}
+    processes = [
+        subprocess.Popen(words, env={**env, "RANK": rank, "LOCAL_RANK": rank}, stderr=subprocess.PIPE, text=True)
+        for rank in "01"
+    ]
+    try:
+        errors = [process.communicate(timeout=300)[1] for process in processes]
+    finally:
+        for process in processes:
+            process.kill()
+    assert [process.returncode for process in processes] == [0, 0], errors
+    return out
+
+
+@pytest.mark.slow
+def test_each_process_continues_with_its_own_random_state(shared):
+    assert_same(shared / "whole", shared / "again")
+    saved = load_file(shared / "again" / "checkpoint.safetensors")
+    assert not torch.equal(saved["random.cpu.0"], saved["random.cpu.1"])
+
+
+@pytest.mark.slow
+def test_a_run_continues_in_as_many_processes(made_up, shared):
+    with pytest.raises(TrainingError, match="num_processes 2"):
+        train_run("made-up", shared / "data.h5", shared / "whole", device="cpu")
