@@ -60,7 +60,7 @@ class TrajectoryContent(PageContent):
         """States as plots, recorded actions, and the paths of TCP and objects."""
         recording = self.recordings.episode(number).recording()
         motion = recording.motion(np.arange(recording.control_steps + 1))
-        objects = _objects(recording, scene, self.recordings.said(number).objects, motion.arm_base_in_world[0])
+        objects = _objects(recording, scene, self.recordings.info(number).objects, motion.arm_base_in_world[0])
         return {
             **show_motion(_arrays(recording, motion), _goals(recording), _actions(recording), objects, moving=True),
             "facts": facts_of({**scene, "source": None}),  # which is this file

@@ -26,8 +26,8 @@ from robocas_ms3.scenes.layout import PARKING_HEIGHT
 
 
 @dataclass(frozen=True)
-class SaidOfRecording:
-    """What the JSON says of an episode.
+class RecordingInfo:
+    """An episode as the JSON of its file describes it.
 
     Attributes:
         entry: what was recorded.
@@ -40,7 +40,7 @@ class SaidOfRecording:
     objects: Any
 
     @classmethod
-    def read(cls, file: TrajectoryFile, index: int) -> SaidOfRecording:
+    def read(cls, file: TrajectoryFile, index: int) -> RecordingInfo:
         """Read it.
 
         Raises:
@@ -83,27 +83,27 @@ class TrajectorySource(EpisodeSource):
         with TrajectoryFile(path, pack=pack) as file:
             self.stride = sample_stride(file.control_freq, self.rate_hz)
             self.index = [n for n, e in enumerate(file.episodes) if include_failed or succeeded(e)]
-            self._said = [_attempt(file, index) for index in self.index]
+            self._infos = [_read_info(file, index) for index in self.index]
         self.numbers, self.file = list(range(len(self.index))), file
 
-    def said(self, number: int) -> SaidOfRecording:
-        """What the JSON says of an episode.
+    def info(self, number: int) -> RecordingInfo:
+        """Return what the JSON says of an episode.
 
         Raises:
             DatasetError: it is damaged.
         """
-        said = self._said[number]
-        if isinstance(said, DatasetError):
-            raise said
-        return said
+        info = self._infos[number]
+        if isinstance(info, DatasetError):
+            raise info
+        return info
 
     def steps(self, number: int) -> int:
         """T of an episode."""
-        return len(sample_states(self.said(number).entry.control_steps, self.stride))
+        return len(sample_states(self.info(number).entry.control_steps, self.stride))
 
     @cached_property
     def _sides(self) -> dict[Side, list[int]]:
-        train, val = split_by_seed({number: self.said(number).entry.seed for number in self.numbers})
+        train, val = split_by_seed({number: self.info(number).entry.seed for number in self.numbers})
         return {"train": train, "val": val, "all": self.numbers}
 
     @cached_property
@@ -141,16 +141,16 @@ class TrajectorySource(EpisodeSource):
 
     def scene(self, number: int) -> dict[str, Any]:
         """What the JSON says of how an episode was made, and what its objects are called, if their pack is here."""
-        said = self.said(number)
-        kwargs = said.scene["env_info"]["env_kwargs"]
+        info = self.info(number)
+        kwargs = info.scene["env_info"]["env_kwargs"]
         config, names = kwargs.get("config"), _names(str(kwargs.get("pack", "builtin")))
         objects = [
             {"slot": slot, "id": asset, "name": names[asset]}
-            for slot, asset in enumerate(said.objects or ())
+            for slot, asset in enumerate(info.objects or ())
             if isinstance(asset, str) and asset in names
         ]
         config = config if isinstance(config, Mapping) else _shipped(str(config))
-        return {**said.scene, "config": config, "objects": objects}
+        return {**info.scene, "config": config, "objects": objects}
 
 
 class RecordedEpisode(SourceEpisode):
@@ -163,7 +163,7 @@ class RecordedEpisode(SourceEpisode):
 
     @property
     def _entry(self) -> Entry:
-        return self._source.said(self._number).entry
+        return self._source.info(self._number).entry
 
     @property
     def where(self) -> str:
@@ -205,7 +205,7 @@ class RecordedEpisode(SourceEpisode):
     @cached_property
     def layout(self) -> dict[str, Any]:
         """Objects at the first state; those that take no part wait below the floor."""
-        ids = list(self._source.said(self._number).objects or ())
+        ids = list(self._source.info(self._number).objects or ())
         actors = self.recording().states.get("actors", {})
         poses = [actors[f"object_{slot}"][0, :7] if f"object_{slot}" in actors else None for slot in range(len(ids))]
         there = [pose is not None and bool(pose[2] > PARKING_HEIGHT / 2) for pose in poses]
@@ -221,10 +221,10 @@ class RecordedEpisode(SourceEpisode):
         return self._source.recording(self._number, bodies=bodies)
 
 
-def _attempt(file: TrajectoryFile, index: int) -> SaidOfRecording | DatasetError:
-    """What the JSON says, or what is wrong with it, which is an error of that episode alone."""
+def _read_info(file: TrajectoryFile, index: int) -> RecordingInfo | DatasetError:
+    """Return what the JSON says, or the error, which is of that episode alone."""
     try:
-        return SaidOfRecording.read(file, index)
+        return RecordingInfo.read(file, index)
     except DatasetError as error:
         return error
 

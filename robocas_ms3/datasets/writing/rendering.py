@@ -113,7 +113,7 @@ class RenderedSource(TrajectorySource):
 
     def texts(self, number: int) -> list[str]:
         """Return the instruction of an episode and the texts of its sub-goals."""
-        entry = self.said(number).entry
+        entry = self.info(number).entry
         return [entry.instruction, *(goal.goal_description for goal in entry.subgoals)]
 
     def episode(self, number: int) -> RenderedEpisode:
