@@ -54,7 +54,7 @@ def test_envs_that_end_are_reset_in_the_same_step(envs):
         for value in (observation, reward, terminated, truncated):
             assert value.is_cuda and len(value) == ENVS
     assert truncated.all() and info["_final_info"].all()
-    assert not torch.equal(info["final_observation"], observation)
+    assert not torch.equal(info["final_obs"], observation)
     assert info["elapsed_steps"].tolist() == [0] * ENVS
     episode = info["final_info"]["episode"]
     assert episode["episode_len"].tolist() == [LIMIT] * ENVS
@@ -107,7 +107,7 @@ def test_numpy_arrays():
         observation, reward, terminated, truncated, info = envs.step(action)
         for value in (observation, reward, terminated, truncated, info["success"]):
             assert isinstance(value, np.ndarray) and len(value) == ENVS
-    assert isinstance(info["final_observation"], np.ndarray)
+    assert isinstance(info["final_obs"], np.ndarray)
     assert isinstance(info["final_info"]["episode"]["return"], np.ndarray)
     observation, info = envs.reset(options={"env_idx": np.array(SOME)})
     assert isinstance(observation, np.ndarray) and isinstance(info["elapsed_steps"], np.ndarray)

@@ -30,7 +30,7 @@ class LeftOrRight:
                 "target_lifted": self.returns > 3,
                 "success": self.returns > 3.9,
             }
-            info = {"final_observation": obs, "final_info": final, "_final_info": truncated}
+            info = {"final_obs": obs, "final_info": final, "_final_info": truncated}
             self.step_number, self.returns = 0, torch.zeros(self.count)
         return obs, reward, torch.zeros_like(truncated), truncated, info
 

@@ -74,7 +74,7 @@ class RolloutCollector:
             action = policy.sample()
             self._obs, reward, _, truncated, info = self._envs.step(action)  # pyright: ignore[reportArgumentType]
             # Episodes end by truncation alone, so the value of the observation after it counts
-            next_value = agent.value(agent.normalize(info.get("final_observation", self._obs)))
+            next_value = agent.value(agent.normalize(info.get("final_obs", self._obs)))
             log_prob = policy.log_prob(action).sum(-1)
             value = agent.value(normalized)
             steps.append((obs, normalized, action, log_prob, reward, value, next_value, truncated))

@@ -37,7 +37,7 @@ def make_vec(
     """Several environments as one vector environment, with ManiSkill's conventions.
 
     Observations, rewards and infos are tensors (N, ...) or dictionaries of them. An env that ends is reset in the same
-    step; its last observation and info are rows of ``info["final_observation"]`` and ``info["final_info"]``, where
+    step; its last observation and info are rows of ``info["final_obs"]`` and ``info["final_info"]``, where
     ``info["_final_info"]`` (N,) says so. ``final_info["episode"]`` has ``return``, ``episode_len``, ``reward``,
     ``success_once``, ``success_at_end``. ``reset(seed=..., options={"env_idx": ...})`` resets some envs.
 

@@ -14,6 +14,9 @@ from robocas_ms3.tasks.vector.processes import ProcessEnv
 class RoboCASVectorEnv(ManiSkillVectorEnv):
     """ManiSkill's vector environment, over one batched environment: on a GPU, or a `ProcessEnv`.
 
+    The last observations and infos of episodes are named as gymnasium's ``AutoresetMode.SAME_STEP`` names them:
+    ``final_obs`` and ``final_info``, with the flags ``_final_obs`` and ``_final_info``.
+
     ``info["episode"]`` and ``info["final_info"]["episode"]`` have ``success_at_end`` whether or not terminations are
     ignored; ManiSkill's have it only if they are.
     """
@@ -21,6 +24,9 @@ class RoboCASVectorEnv(ManiSkillVectorEnv):
     def step(self, actions: Any) -> tuple[Any, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Step every env; see ``ManiSkillVectorEnv``."""
         obs, reward, terminated, truncated, info = super().step(actions)
+        if "final_observation" in info:  # ManiSkill's name
+            info["final_obs"] = info.pop("final_observation")
+            info["_final_obs"] = info.pop("_final_observation")
         at_end = info.get("final_info", info)
         if self.record_metrics and "success" in at_end:
             at_end["episode"]["success_at_end"] = at_end["success"].clone()

@@ -45,7 +45,7 @@ def test_success_once_and_at_end_of_an_episode():
     episode = info["final_info"]["episode"]
     assert episode["success_once"].tolist() == [True, True, True]
     assert episode["success_at_end"].tolist() == [False, False, True]
-    assert (obs.tolist(), info["final_observation"].tolist()) == ([[0.0]] * 3, [[4.0]] * 3)
+    assert (obs.tolist(), info["final_obs"].tolist()) == ([[0.0]] * 3, [[4.0]] * 3)
     assert not terminated.any() and truncated.all()
 
 

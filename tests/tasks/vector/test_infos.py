@@ -33,7 +33,7 @@ def test_infos_observations_and_metrics_in_numpy(env):
     assert final["more"].tolist() == [[1, 1]] * 3
     assert [type(some) for some in final["of_some"]] == [np.ndarray, type(None), np.ndarray]
     assert final["episode"]["success_once"].tolist() == [True, False, True]
-    assert info["final_observation"]["agent"]["qpos"].shape == (3, 12)
+    assert info["final_obs"]["agent"]["qpos"].shape == (3, 12)
     for _ in range(2):
         *_, truncated, info = env.step(doing(0, 0, 0))
     assert truncated.tolist() == [False, True, False]

@@ -27,7 +27,7 @@ def episodes(env, num_envs: int, first_seed: int, steps: int) -> list[list[bytes
     for action in actions:
         obs, *_, info = env.step(action)
         for i, row in enumerate(obs):
-            last = info["final_observation"][i] if "final_info" in info and info["_final_info"][i] else row
+            last = info["final_obs"][i] if "final_info" in info and info["_final_info"][i] else row
             seen[i] += [last.numpy().tobytes(), row.numpy().tobytes()]
     for i, said in enumerate(env.unwrapped.get_language_instruction()):
         seen[i].append(said.encode())
