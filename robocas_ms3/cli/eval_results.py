@@ -147,7 +147,7 @@ def verify(cfg: Verify) -> int:
         say(problem)
     if broken := result.broken_off():
         say(f"note: broken off by an error: {count_of(broken, 'episode')}, counted as failed")
-    valid = f"{count_of(len(result.outcomes), 'episode')} of {result.run['protocol']}, all well"
+    valid = f"{count_of(len(result.outcomes), 'episode')} of {result.run.protocol}, all well"
     say(f"{', '.join(map(str, cfg.folders))}: {count_of(len(found), 'problem') if found else valid}")
     return 1 if found else 0
 
@@ -168,7 +168,7 @@ def videos(cfg: Videos) -> int:
     check_number("count", cfg.count, 1)
     result = read(cfg.folder)
     loaded = protocol_of(result, cfg.protocol)
-    name = str(result.run["policy"]["name"])
+    name = str(result.run.policy.name)
     if name not in {*POLICIES.builtin, *POLICIES.entry_points} and cfg.policy != name:
         fix = f"Name it yourself, if you trust it: --policy {name}"
         raise EvaluationError("this result is of a policy of somebody's own", where=cfg.folder, found=name, fix=fix)
@@ -208,7 +208,7 @@ def protocol_of(result: Result, given: str | None) -> LoadedProtocol:
     from robocas_ms3.core.errors import EvaluationError
     from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
 
-    name, shipped = result.run["protocol"], shipped_protocols()
+    name, shipped = result.run.protocol, shipped_protocols()
     if given is None and name not in shipped:
         expected, fix = f"one of {', '.join(shipped)}", "Pass --protocol FOLDER."
         raise EvaluationError(
@@ -227,7 +227,7 @@ def write_pages(result: Result, out: Path, given: str | None) -> None:
         protocol = protocol_of(result, given)
     except EvaluationError:
         protocol = None  # one of somebody's own, who knows where
-    if protocol is not None and protocol.hash != result.run["protocol_hash"]:
+    if protocol is not None and protocol.hash != result.run.protocol_hash:
         protocol = None
     written = write_report(result, out, protocol)
     say(f"{out}: {', '.join(path.name for path in written)}")

@@ -30,32 +30,67 @@ from robocas_ms3.evaluation.statistics import Share, share
 
 RUN, OUTCOMES = "run.json", "episodes.jsonl"
 _PACKAGES = ("robocas_ms3", "mani_skill", "sapien", "gymnasium", "numpy", "torch")
-_SAME = ("protocol", "protocol_hash", "policy", "weld", "backend", "versions", "pack_hashes")  # in parts of one result
 _NO_RESULT = "no result of an evaluation"
-_ADDRESSES = ("ws://", "wss://")
-_BEFORE = {"weld": False}  # of results that were written before there was one
 
 
-class _PolicyRecord(BaseModel):
+class PolicyRecord(BaseModel):
+    """What a result says about its policy. A policy adds entries of its own (`policy.describe`).
+
+    Attributes:
+        name: as the user gave it.
+        wants: the policy's specification, `PolicySpec`.
+        server: description of a policy that is behind a server.
+    """
+
     model_config = ConfigDict(strict=True, extra="allow")
 
     name: str
+    wants: dict[str, Any] = {}
     server: dict[str, Any] | None = None
 
+    def entries(self) -> dict[str, Any]:
+        """Return its values in the form of the file."""
+        return self.model_dump(exclude_unset=True)
 
-class _RunRecord(BaseModel):
-    """``run.json``, as far as results are told apart by it."""
+    def identity(self) -> dict[str, Any]:
+        """Return what tells it from another policy: of one behind a server, the description instead of the address."""
+        known = self.server and self.name.startswith(("ws://", "wss://"))
+        return {key: value for key, value in self.entries().items() if key != "name" or not known}
+
+
+class PartRecord(BaseModel):
+    """One of the folders that were merged into a result."""
+
+    model_config = ConfigDict(strict=True)
+
+    folder: str
+    episodes: int
+    machine: dict[str, Any] | None = None
+
+
+class RunRecord(BaseModel):
+    """``run.json``: what a result was measured with."""
 
     model_config = ConfigDict(strict=True, extra="allow")
 
     protocol: str
     protocol_hash: str
-    policy: _PolicyRecord
-    weld: bool
+    policy: PolicyRecord
+    weld: bool = False
     backend: str
     versions: dict[str, str]
     pack_hashes: dict[str, str]
     machine: dict[str, Any] | None = None
+    parts: list[PartRecord] = []
+
+    def entries(self) -> dict[str, Any]:
+        """Return its values in the form of the file."""
+        return self.model_dump(exclude_unset=True)
+
+    def identity(self) -> dict[str, Any]:
+        """Return the values that have to match in the parts of one result, and to continue it."""
+        names = ("protocol", "protocol_hash", "weld", "backend", "versions", "pack_hashes")
+        return {"policy": self.policy.identity(), **{name: getattr(self, name) for name in names}}
 
 
 @dataclass(frozen=True)
@@ -64,12 +99,12 @@ class Result:
 
     Attributes:
         folder: where it is; of several, the first one.
-        run: of ``run.json``; of several, the first one's, with ``parts``: what each is of.
+        run: what it was measured with; of several, the first one's, with their ``parts``.
         outcomes: by episode's number, in its order.
     """
 
     folder: Path
-    run: dict[str, Any]
+    run: RunRecord
     outcomes: dict[int, Outcome]
 
     def rate(self, what: str = "success", outcomes: Iterable[Outcome] | None = None) -> Share:
@@ -96,7 +131,7 @@ class Result:
 
 @contextmanager
 def open_result(
-    folder: Path, run: dict[str, Any], *, overwrite: bool = False, retry_errors: bool = False
+    folder: Path, run: RunRecord, *, overwrite: bool = False, retry_errors: bool = False
 ) -> Iterator[dict[int, Outcome]]:
     """Lock the folder of a result, and start it or continue it.
 
@@ -111,18 +146,29 @@ def open_result(
 
     Raises:
         OutputExistsError: it was measured with something else, or the folder is not of an evaluation.
-        EvaluationError: ``run`` has a value that `read` would refuse.
         RobocasError: another process writes there; or somebody removed the folder.
     """
-    text = json_text({**_BEFORE, **run}, folder / RUN, error=EvaluationError)
-    parse_json(_RunRecord, text, EvaluationError, where=folder / RUN, about="this evaluation can't be recorded")
     with OutputFolder(folder, OUTPUT, _settings_of(run), overwrite=overwrite) as output:
-        output.start(output.recorded or run)
+        output.start(output.recorded or run.entries())
         outcomes = _outcomes(folder)
         if retry_errors and any(one.error for one in outcomes.values()):
             outcomes = {number: one for number, one in outcomes.items() if not one.error}
             _ledger(folder).rewrite(outcomes.values())
         yield outcomes
+
+
+def run_record(values: dict[str, Any], where: object) -> RunRecord:
+    """Return the record of an evaluation.
+
+    Args:
+        values: of the record.
+        where: for error messages.
+
+    Raises:
+        EvaluationError: a value is missing or wrong, or could not be read back, such as NaN.
+    """
+    text = json_text(values, where, error=EvaluationError)
+    return parse_json(RunRecord, text, EvaluationError, where=where, about="this evaluation can't be recorded")
 
 
 def append(folder: Path, outcome: Outcome) -> None:
@@ -140,31 +186,32 @@ def read(*folders: Path) -> Result:
     first = parts[0]
     outcomes: dict[int, Outcome] = {}
     for part in parts:
-        for key in _SAME:
-            if _telling(key, part.run.get(key)) != _telling(key, first.run.get(key)):
-                expected, found = _differing(first.run.get(key), part.run.get(key))
-                raise EvaluationError(
-                    f"no part of one result with {first.folder}: another {key}",
-                    where=part.folder,
-                    expected=expected,
-                    found=found,
-                )
+        expected, found = _differing(first.run.identity(), part.run.identity())
+        if expected != found:
+            key = next(iter(found))
+            raise EvaluationError(
+                f"no part of one result with {first.folder}: another {key}",
+                where=part.folder,
+                expected=expected[key],
+                found=found[key],
+            )
         for outcome in part.outcomes.values():
             _add(outcomes, outcome, str(part.folder))
-    said = [
-        {"folder": str(part.folder), "episodes": len(part.outcomes), "machine": part.run.get("machine")}
-        for part in parts
-    ]
-    run = first.run if len(parts) == 1 else {**first.run, "parts": said}
+    run = first.run
+    if len(parts) > 1:
+        records = [
+            PartRecord(folder=str(part.folder), episodes=len(part.outcomes), machine=part.run.machine) for part in parts
+        ]
+        run = run.model_copy(update={"parts": records})
     return Result(first.folder, run, dict(sorted(outcomes.items())))
 
 
 def parts_of(folders: Iterable[Path]) -> list[list[Path]]:
     """Folders that `read` takes together: measured with the same, and of other episodes than those before."""
-    found: list[tuple[list[Any], set[int], list[Path]]] = []
+    found: list[tuple[dict[str, Any], set[int], list[Path]]] = []
     for folder in folders:
         part = _read(folder)
-        key = [_telling(name, part.run[name]) for name in _SAME]
+        key = part.run.identity()
         for other, episodes, group in found:
             if other == key and not episodes & part.outcomes.keys():
                 group.append(folder)
@@ -185,7 +232,7 @@ def merge(folders: Sequence[Path], out: Path) -> Result:
     result = read(*folders)
     check_replaceable(out)
     with replacing_folder(out) as folder:
-        write_json(folder / RUN, result.run)
+        write_json(folder / RUN, result.run.entries())
         _ledger(folder).rewrite(result.outcomes.values())
     return read(out)
 
@@ -195,24 +242,16 @@ def versions() -> dict[str, str]:
     return {name: version(name) for name in _PACKAGES}
 
 
-def _settings_of(run: dict[str, Any]) -> dict[str, Any]:
-    """Return what has to match to continue: of a server that names its policy, not its address."""
-    return {key: _telling(key, value) for key, value in {**_BEFORE, **run}.items()}
+def _settings_of(run: RunRecord) -> dict[str, Any]:
+    """Return what has to match to continue a result."""
+    return {**run.identity(), "machine": run.machine}
 
 
-OUTPUT = FolderKind("robocas eval", (RUN,), "protocol_hash", upgrade=_settings_of)
+def _recorded_settings(values: dict[str, Any]) -> dict[str, Any]:
+    return _settings_of(parse(RunRecord, values, EvaluationError, where=RUN, about=_NO_RESULT))
 
 
-def _telling(key: str, value: Any) -> Any:
-    """What of a run's entry tells it from others: of a server that says what it serves not where that is."""
-    if (
-        key == "policy"
-        and isinstance(value, dict)
-        and value.get("server")
-        and str(value.get("name")).startswith(_ADDRESSES)
-    ):
-        return {name: said for name, said in value.items() if name != "name"}
-    return value
+OUTPUT = FolderKind("robocas eval", (RUN,), "protocol_hash", upgrade=_recorded_settings)
 
 
 def _ledger(folder: Path) -> Ledger[Outcome]:
@@ -228,14 +267,12 @@ def _read(folder: Path) -> Result:
     return Result(folder, run, outcomes)
 
 
-def _read_run(folder: Path) -> dict[str, Any]:
+def _read_run(folder: Path) -> RunRecord:
     try:
         run = load_json(folder / RUN)
     except (OSError, ValueError) as error:
         raise EvaluationError(_NO_RESULT, where=folder, found=error) from error
-    run = {**_BEFORE, **run} if isinstance(run, dict) else run
-    parse(_RunRecord, run, EvaluationError, where=folder / RUN, about=_NO_RESULT)
-    return run
+    return parse(RunRecord, run, EvaluationError, where=folder / RUN, about=_NO_RESULT)
 
 
 def _outcomes(folder: Path) -> dict[int, Outcome]:

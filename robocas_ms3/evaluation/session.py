@@ -280,7 +280,7 @@ class EvaluationSession:
             **render,
         )
 
-    def _record(self, backend: str) -> dict[str, Any]:
+    def _record(self, backend: str) -> results.RunRecord:
         rules, name = self.protocol.rules, self.settings.policy_name
         pack = sha256(load_pack(rules.pack).root / MANIFEST)
         if pack != rules.pack_hash:
@@ -290,7 +290,7 @@ class EvaluationSession:
                 expected=rules.pack_hash,
                 found=pack,
             )
-        return {
+        values = {
             "protocol": rules.name,
             "protocol_hash": self.protocol.hash,
             "policy": {"name": name} | describe(self.policy) | {"name": name},  # a description may not rename it
@@ -300,6 +300,7 @@ class EvaluationSession:
             "pack_hashes": {rules.pack: pack},
             "machine": {"processor": platform.machine(), "python": platform.python_version()},
         }
+        return results.run_record(values, f"policy {name}")
 
 
 def evaluate(

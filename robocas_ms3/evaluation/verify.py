@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 from robocas_ms3.core.words import count_of
 from robocas_ms3.evaluation.outcomes import Outcome, failure_stage
 from robocas_ms3.evaluation.protocol import DEFAULT_HZ, LoadedProtocol
-from robocas_ms3.evaluation.results import Result
+from robocas_ms3.evaluation.results import Result, RunRecord
 from robocas_ms3.scenes.task_specs import TASKS
 
 
@@ -21,9 +20,9 @@ def problems(result: Result, protocol: LoadedProtocol) -> list[str]:
         protocol: that it says it is of.
     """
     found = []
-    if result.run.get("protocol_hash") != protocol.hash:
-        found.append(f"it is of another protocol than {protocol.folder}: {result.run.get('protocol_hash')}")
-    pack = result.run.get("pack_hashes", {}).get(protocol.rules.pack)
+    if result.run.protocol_hash != protocol.hash:
+        found.append(f"it is of another protocol than {protocol.folder}: {result.run.protocol_hash}")
+    pack = result.run.pack_hashes.get(protocol.rules.pack)
     if pack != protocol.rules.pack_hash:
         found.append(f"it was measured with another pack: {pack}")
     found += _of_weld(result, protocol)
@@ -45,7 +44,7 @@ def problems(result: Result, protocol: LoadedProtocol) -> list[str]:
 
 
 def _of_weld(result: Result, protocol: LoadedProtocol) -> Iterator[str]:
-    weld = result.run["weld"]
+    weld = result.run.weld
     if weld and protocol.rules.stepping != "upstream":
         yield "it was measured with upstream's weld, which does not belong to this protocol's steps"
     for number, outcome in result.outcomes.items():
@@ -53,9 +52,9 @@ def _of_weld(result: Result, protocol: LoadedProtocol) -> Iterator[str]:
             yield f"episode {number}: it {'counts no welds' if weld else 'counts welds'}, the run says weld: {weld}"
 
 
-def _too_long(outcome: Outcome, protocol: LoadedProtocol, run: dict[str, Any]) -> Iterator[str]:
+def _too_long(outcome: Outcome, protocol: LoadedProtocol, run: RunRecord) -> Iterator[str]:
     rules = protocol.rules
-    rate = rules.rate_hz or run["policy"].get("wants", {}).get("rate_hz") or DEFAULT_HZ
+    rate = rules.rate_hz or run.policy.wants.get("rate_hz") or DEFAULT_HZ
     limit = rules.steps(outcome.task, rate)
     if limit is not None and outcome.steps > limit:
         yield f"{count_of(outcome.steps, 'step')}, {limit} allowed"

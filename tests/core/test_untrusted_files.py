@@ -73,7 +73,7 @@ def test_results_of_an_evaluation(tmp_path, name):
         assert markdown(found)
         assert page(found)
         assert comparison([found, found])
-        OutputFolder(root, results.OUTPUT, run).read()
+        OutputFolder(root, results.OUTPUT, run.entries()).read()
 
     read()
     whole = json.loads((root / name).read_text().splitlines()[0])

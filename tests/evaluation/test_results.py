@@ -8,14 +8,14 @@ from made_up_results import RUN_OF, outcome, write
 
 from robocas_ms3.core.errors import EvaluationError, OutputExistsError, RobocasError
 from robocas_ms3.evaluation.outcomes import failure_stage
-from robocas_ms3.evaluation.results import OUTCOMES, RUN, append, merge, open_result, parts_of, read
+from robocas_ms3.evaluation.results import OUTCOMES, RUN, append, merge, open_result, parts_of, read, run_record
 
 SEARCH = dict.fromkeys(("obstacles_cleared", "reached_any", "target_grasped", "target_lifted", "success"))
 
 
 def start(folder, run=RUN_OF, new=(), **options):
     """Start or continue a result, add outcomes, and return the numbers of those that were there."""
-    with open_result(folder, run, **options) as done:
+    with open_result(folder, run_record(run, folder / RUN), **options) as done:
         for one in new:
             append(folder, one)
         return list(done)
@@ -24,7 +24,7 @@ def start(folder, run=RUN_OF, new=(), **options):
 def test_what_is_appended_is_read(tmp_path):
     start(tmp_path / "a", new=[outcome(3), outcome(1)])
     assert read(tmp_path / "a").outcomes == {1: outcome(1), 3: outcome(3)}
-    assert read(tmp_path / "a").run == RUN_OF
+    assert read(tmp_path / "a").run == run_record(RUN_OF, "")
 
 
 def test_a_line_that_was_cut_is_dropped_and_written_over(tmp_path):
@@ -77,7 +77,7 @@ def test_a_result_from_before_there_was_a_weld_is_one_without_it(tmp_path):
     run = {name: value for name, value in RUN_OF.items() if name != "weld"}
     start(tmp_path / "a", run, [outcome(0)])
     write(tmp_path / "b", [outcome(1)])
-    assert read(tmp_path / "a").run == RUN_OF
+    assert read(tmp_path / "a").run == run_record(RUN_OF, "")
     assert list(read(tmp_path / "a", tmp_path / "b").outcomes) == [0, 1]
     assert start(tmp_path / "a") == [0]
     with pytest.raises(OutputExistsError, match="weld: false -> true"):
@@ -105,7 +105,7 @@ def test_parts_are_read_as_one_whatever_the_clock_and_the_machine(tmp_path):
     write(tmp_path / "b", [outcome(1), outcome(2, inference_ms=9.0)], machine={"processor": "arm64"})
     both = read(tmp_path / "a", tmp_path / "b")
     assert both.outcomes == {0: outcome(0), 1: outcome(1), 2: outcome(2)}
-    assert [part["episodes"] for part in both.run["parts"]] == [2, 2]
+    assert [part.episodes for part in both.run.parts] == [2, 2]
 
 
 def test_parts_that_disagree_are_refused(tmp_path):
@@ -241,7 +241,7 @@ def test_where_a_server_was_is_not_who_it_served(tmp_path):
     assert list(read(tmp_path / "a", tmp_path / "b").outcomes) == [0, 1]
     assert parts_of([tmp_path / "a", tmp_path / "b"]) == [[tmp_path / "a", tmp_path / "b"]]
     assert start(tmp_path / "a", {**RUN_OF, "policy": {"name": "ws://c:1", **SERVED}}) == [0]
-    assert read(tmp_path / "a").run["policy"]["name"].startswith("ws://a")
+    assert read(tmp_path / "a").run.policy.name.startswith("ws://a")
     other = {**SERVED, "server": {"name": "other"}}
     with pytest.raises(OutputExistsError, match='policy.server.name: "mine" -> "other"'):
         start(tmp_path / "a", {**RUN_OF, "policy": {"name": "ws://c:1", **other}})
@@ -264,7 +264,7 @@ def test_what_an_error_broke_off_is_played_again_if_that_is_asked_for(tmp_path):
 def test_a_run_that_died_before_its_first_episode_is_in_nobodys_way(tmp_path):
     start(tmp_path / "a")
     start(tmp_path / "a", {**RUN_OF, "policy": {"name": "another"}}, [outcome(0)])
-    assert read(tmp_path / "a").run["policy"] == {"name": "another"}
+    assert read(tmp_path / "a").run.policy.entries() == {"name": "another"}
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
@@ -285,7 +285,7 @@ def test_episodes_without_what_they_were_measured_with_are_not_gone_on_with(tmp_
 
 
 def test_a_folder_that_is_removed_during_the_run(tmp_path):
-    with pytest.raises(RobocasError) as error, open_result(tmp_path / "a", RUN_OF):
+    with pytest.raises(RobocasError) as error, open_result(tmp_path / "a", run_record(RUN_OF, "")):
         shutil.rmtree(tmp_path / "a")
         append(tmp_path / "a", outcome(0))
     assert error.value.where == tmp_path / "a"

@@ -63,7 +63,7 @@ def test_what_a_description_says_is_read_back_and_does_not_rename_the_policy(tmp
     run = EvaluationSession(load_protocol("smoke"), policy, EvaluationSettings("mine", backend="processes")).record
     with results.open_result(tmp_path / "out", run):
         results.append(tmp_path / "out", outcome(0))
-    assert results.read(tmp_path / "out").run["policy"]["name"] == "mine"
+    assert results.read(tmp_path / "out").run.policy.name == "mine"
     with results.open_result(tmp_path / "out", run) as done:  # what was written is what is asked for again
         assert list(done) == [0]
 

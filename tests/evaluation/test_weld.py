@@ -218,7 +218,7 @@ def test_an_evaluation_with_it_counts_it_says_so_and_is_filmed_alike(tmp_path, m
     (outcome,) = play(folder, protocol.folder, "scripted-motions", episodes=1, weld=True).values()
     assert outcome["success"] and outcome["measures"]["welds"] == 1
     result = results.read(folder)
-    assert result.run["weld"] is True
+    assert result.run.weld
     assert problems(result, protocol) == ["missing: 399 of 400 episodes"]
     monkeypatch.setattr(videos, "SIZE", (64, 48))
     (filmed,) = film(result, protocol, make_policy("scripted-motions"), [0])

@@ -190,7 +190,7 @@ class RoboCAS:
             **outcome.measures,
             **vars(outcome),
             "instruction": episode.instruction,
-            **{name: self._session.record[name] for name in ("protocol", "protocol_hash", "versions")},
+            **self._session.record.model_dump(include={"protocol", "protocol_hash", "versions"}),
         }
 
     def cleanup(self) -> None:

@@ -40,25 +40,27 @@ def comparison(results: Sequence[Result]) -> str:
     """
     first = results[0]
     for other in results[1:]:
-        if first.run["protocol_hash"] != other.run["protocol_hash"]:
+        if first.run.protocol_hash != other.run.protocol_hash:
             raise EvaluationError(
                 "results of different protocols can't be compared",
                 where=other.folder,
-                expected=first.run["protocol_hash"][:16],
-                found=other.run["protocol_hash"][:16],
+                expected=first.run.protocol_hash[:16],
+                found=other.run.protocol_hash[:16],
             )
-        if first.run["weld"] != other.run["weld"]:
-            welded = (first if first.run["weld"] else other).folder
+        if first.run.weld != other.run.weld:
+            welded = (first if first.run.weld else other).folder
             raise EvaluationError("a result with upstream's weld can't be compared with one without", where=welded)
     shared = sorted(set.intersection(*(set(result.outcomes) for result in results)))
     if not shared:
         raise EvaluationError("these results have no episodes in common", where=results[-1].folder)
     names = [chr(ord("A") + number) for number in range(len(results))]
-    measured = first.run["protocol"] + (" with upstream's weld" if first.run["weld"] else "")
-    said = [f"{name}: {one.run['policy']['name']} ({one.folder})" for name, one in zip(names, results, strict=True)]
+    measured = first.run.protocol + (" with upstream's weld" if first.run.weld else "")
+    said = [f"{name}: {one.run.policy.name} ({one.folder})" for name, one in zip(names, results, strict=True)]
     both = "both" if len(results) == 2 else "all"
     head = in_markdown(f"{', '.join(said)}; {count_of(len(shared), 'episode')} of {measured} that {both} have.")
-    differing = [key for key in ("backend", "versions") if any(one.run[key] != first.run[key] for one in results)]
+    others = [one.run for one in results[1:]]
+    differing = ["backend"] if any(run.backend != first.run.backend for run in others) else []
+    differing += ["versions"] if any(run.versions != first.run.versions for run in others) else []
     if differing:
         head += f" **Measured with different {' and '.join(differing)}.**"
     configs = sorted({first.outcomes[number].config for number in shared})
@@ -79,9 +81,9 @@ def comparison_of_splits(result: Result, protocol: LoadedProtocol) -> str:
     Raises:
         EvaluationError: no two splits have the same scenes.
     """
-    if result.run["protocol_hash"] != protocol.hash:
+    if result.run.protocol_hash != protocol.hash:
         raise EvaluationError(
-            "it is of another protocol", where=result.folder, expected=protocol.hash, found=result.run["protocol_hash"]
+            "it is of another protocol", where=result.folder, expected=protocol.hash, found=result.run.protocol_hash
         )
     scenes: dict[tuple[str, bytes], list[tuple[str, str]]] = {}  # (split, configuration) of those with the same scenes
     for task, split, config in dict.fromkeys((one.task, one.split, one.config) for one in protocol.episodes):
@@ -100,7 +102,7 @@ def comparison_of_splits(result: Result, protocol: LoadedProtocol) -> str:
     if not rows:
         fix = "Name another result to compare it with."
         raise EvaluationError("no two splits of this result have the same scenes", where=result.folder, fix=fix)
-    head = f"{result.run['policy']['name']} ({result.folder}), splits of {result.run['protocol']} over the same scenes."
+    head = f"{result.run.policy.name} ({result.folder}), splits of {result.run.protocol} over the same scenes."
     return _table(in_markdown(head), "task", rows)
 
 

@@ -57,8 +57,8 @@ def _lead(result: Result, protocol: LoadedProtocol | None) -> str:
     whole = (
         count_of(count, "episode") if protocol is None else f"{count} of {count_of(len(protocol.episodes), 'episode')}"
     )
-    said = f"{whole}, protocol hash <code>{escape(result.run['protocol_hash'][:16])}</code>."
-    notes = [WELDED] if result.run["weld"] else []
+    said = f"{whole}, protocol hash <code>{escape(result.run.protocol_hash[:16])}</code>."
+    notes = [WELDED] if result.run.weld else []
     if protocol is not None and count < len(protocol.episodes):
         missing = Counter(episode.config for episode in protocol.episodes if episode.episode not in result.outcomes)
         of = ", ".join(f"{many} of {escape(config)}" for config, many in missing.items())
@@ -255,24 +255,22 @@ def _with_all(groups: dict[str, list[Outcome]]) -> list[tuple[str, list[Outcome]
 
 def _measured_with(result: Result, protocol: LoadedProtocol | None) -> str:
     """A section of the page."""
-    run, policy = result.run, result.run["policy"]
-    pairs: list[tuple[str, object]] = [("protocol", run["protocol"]), ("its hash", run["protocol_hash"])]
+    run, policy = result.run, result.run.policy
+    pairs: list[tuple[str, object]] = [("protocol", run.protocol), ("its hash", run.protocol_hash)]
     if protocol is not None:
         pairs += [("what it says", protocol.rules.description), ("its rules", _rules(protocol))]
-    pairs += [("policy", policy["name"])]
-    pairs += [(f"policy, {name}", _plain(value)) for name, value in policy.items() if name != "name"]
+    pairs += [("policy", policy.name)]
+    pairs += [(f"policy, {name}", _plain(value)) for name, value in policy.entries().items() if name != "name"]
     pairs += [
-        ("upstream's weld", "yes" if run["weld"] else "no"),
-        ("backend", run["backend"]),
-        ("versions", _plain(run["versions"])),
+        ("upstream's weld", "yes" if run.weld else "no"),
+        ("backend", run.backend),
+        ("versions", _plain(run.versions)),
     ]
-    pairs += [(f"pack {name}", value) for name, value in run["pack_hashes"].items()]
-    machines = {_plain(part["machine"]) for part in run.get("parts", [])} or {_plain(run.get("machine", {}))}
+    pairs += [(f"pack {name}", value) for name, value in run.pack_hashes.items()]
+    machines = {_plain(part.machine) for part in run.parts} or {_plain(run.machine or {})}
     pairs += [("machine", machine) for machine in sorted(machines)]
-    parts = ""
-    if "parts" in run:
-        rows = [[escape(part["folder"]), str(part["episodes"])] for part in run["parts"]]
-        parts = table(("part", "episodes#"), rows)
+    rows = [[escape(part.folder), str(part.episodes)] for part in run.parts]
+    parts = table(("part", "episodes#"), rows) if rows else ""
     return section("What it was measured with", "", facts(pairs) + parts)
 
 

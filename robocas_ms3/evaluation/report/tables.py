@@ -18,8 +18,8 @@ WELDED = (
 
 def title(result: Result) -> str:
     """Return what a result is of, in a line of plain text."""
-    how = " with upstream's weld" if result.run["weld"] else ""
-    return f"{result.run['policy']['name']} by {result.run['protocol']}{how}"
+    how = " with upstream's weld" if result.run.weld else ""
+    return f"{result.run.policy.name} by {result.run.protocol}{how}"
 
 
 def markdown(result: Result) -> str:
@@ -28,10 +28,10 @@ def markdown(result: Result) -> str:
     lines = [
         f"# {in_markdown(title(result))}",
         "",
-        *([f"**{WELDED}**", ""] if run["weld"] else []),
-        f"Protocol hash {in_markdown(run['protocol_hash'][:16])}, {count_of(len(result.outcomes), 'episode')}, "
-        f"{in_markdown(run['backend'])}; "
-        + in_markdown(", ".join(f"{name} {number}" for name, number in run["versions"].items()))
+        *([f"**{WELDED}**", ""] if run.weld else []),
+        f"Protocol hash {in_markdown(run.protocol_hash[:16])}, {count_of(len(result.outcomes), 'episode')}, "
+        f"{in_markdown(run.backend)}; "
+        + in_markdown(", ".join(f"{name} {number}" for name, number in run.versions.items()))
         + ". Intervals are Clopper-Pearson's, 95 %. RA, PA: any object reached, lifted; RR: the target reached; "
         "CO: what hid it cleared.",
         *(["", f"**Broken off by an error: {count_of(broken, 'episode')}, counted as failed.**"] if broken else []),

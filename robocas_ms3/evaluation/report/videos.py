@@ -57,14 +57,14 @@ def film(result: Result, protocol: LoadedProtocol, policy: Policy, episodes: Seq
         EvaluationError: the result is of another protocol.
         DatasetError: there is no render device.
     """
-    expected = result.run["protocol_hash"]
+    expected = result.run.protocol_hash
     if expected != protocol.hash:
         raise EvaluationError(
             "the result is of another protocol", where=result.folder, expected=expected, found=protocol.hash
         )
     require_renderer()
     recorder = _VideoRecorder()
-    settings = EvaluationSettings(num_envs=1, backend="processes", weld=result.run["weld"], render_size=SIZE)
+    settings = EvaluationSettings(num_envs=1, backend="processes", weld=result.run.weld, render_size=SIZE)
     session = EvaluationSession(protocol, policy, settings, recorder.wrap)
     recorder.period = max(1, round(session.rate / _FRAMES))
     make_folder(result.folder / VIDEOS)

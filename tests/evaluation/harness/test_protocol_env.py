@@ -136,7 +136,7 @@ def test_outcomes_are_written_once_per_episode(make, tmp_path):
                 pass
     env.close()
     result = results.read(tmp_path / "result")
-    assert sorted(result.outcomes) == [0, 1] and result.run["policy"]["name"] == "mine"
+    assert sorted(result.outcomes) == [0, 1] and result.run.policy.name == "mine"
     for _ in range(2):  # a refused environment does not keep the lock
         with pytest.raises(EvaluationError, match="there is a result already"):
             make(1, folder=tmp_path / "result")
