@@ -1,1 +1,1 @@
-"""Other people's harnesses: our episodes in their loops."""
+"""Episodes of a protocol in the evaluation loops of other packages: vla-eval and LeRobot."""
