@@ -64,13 +64,13 @@ def length(vectors: Array) -> Array:
     return (vectors * vectors).sum(-1) ** 0.5
 
 
-def none(conditions: Array) -> bool:
-    """Whether none of some conditions holds; on a GPU that is not asked, since it would have to be waited for."""
+def known_all_false(conditions: Array) -> bool:
+    """Return whether all flags are known to be False; on a GPU False, as asking would wait for the device."""
     return not isinstance(conditions, Tensor) and not conditions.any()
 
 
-def every(conditions: Array) -> bool:
-    """Whether all of some conditions hold; on a GPU that is not asked, since it would have to be waited for."""
+def known_all_true(conditions: Array) -> bool:
+    """Return whether all flags are known to be True; on a GPU False, as asking would wait for the device."""
     return not isinstance(conditions, Tensor) and bool(conditions.all())
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from robocas_ms3.core.arrays import as_float, as_tensor, choose, greater, length, native, none
+from robocas_ms3.core.arrays import as_float, as_tensor, choose, greater, known_all_false, length, native
 from robocas_ms3.tasks import terms
 from robocas_ms3.tasks.base import RoboCASEnv
 from robocas_ms3.tasks.bodies import link_poses
@@ -156,7 +156,7 @@ class RetrievalOrder:
         """Record which objects have moved in a control step."""
         self._held |= moment.held
         now = moment.disturbed & (self._moved_at == 0) & ~self._held[:, None]
-        if none(now):
+        if known_all_false(now):
             return
         self._found = None
         time = native(self._env.elapsed_steps.to(torch.int32))[:, None]

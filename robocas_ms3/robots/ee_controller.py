@@ -14,7 +14,18 @@ import torch
 from mani_skill.agents.controllers import PDEEPosController, PDEEPoseController, PDEEPoseControllerConfig
 from mani_skill.utils.structs import Link, Pose
 
-from robocas_ms3.core.arrays import as_double, as_float, as_tensor, choose, clamp, every, join, length, native, none
+from robocas_ms3.core.arrays import (
+    as_double,
+    as_float,
+    as_tensor,
+    choose,
+    clamp,
+    join,
+    known_all_false,
+    known_all_true,
+    length,
+    native,
+)
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.robots import rotations
 from robocas_ms3.robots.drives import ARM_SET_FROM_OUTSIDE, EvenDrives
@@ -117,7 +128,7 @@ class RoboCASEEPoseController(EvenDrives, _ArmChainController):
         start = choose(abs(last - now) > ARM_SET_FROM_OUTSIDE, now, last)
         wanted = self._wanted_pose(reference, action)
         target, solved = self._solve(wanted, now)
-        if not every(solved):
+        if not known_all_true(solved):
             stay = self._reference_pose() if reference is None else reference
             target, wanted = choose(solved[:, None], target, now), choose(solved[:, None], wanted, stay)
         self._target_pose, self._target_qpos = Pose(raw_pose=as_tensor(wanted)), as_tensor(target)
@@ -146,7 +157,7 @@ class RoboCASEEPoseController(EvenDrives, _ArmChainController):
         distance = length(target[:, :3] - now[:, :3])
         cosine = abs((target[:, 3:] * now[:, 3:]).sum(1))  # of half the angle between them
         lost = (distance > far) | (cosine < np.cos(turned / 2))
-        if none(lost):
+        if known_all_false(lost):
             return target
         return choose(lost[:, None], now, target)
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from robocas_ms3.core.arrays import Array, choose, clamp, join, matmul, none
+from robocas_ms3.core.arrays import Array, choose, clamp, join, known_all_false, matmul
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.robots.forward import read_joints
 from robocas_ms3.robots.rotations import left_matrix, positive
@@ -111,7 +111,7 @@ class SerialChain:
             error = join([position - tip[0, :, :3, 3:], 2 * rotation[:, 1:]], axis=1)  # (N, 6, 1)
             square = matmul(error.swapaxes(1, 2), error)  # (N, 1, 1)
             moving = square > IK_CONVERGED**2
-            if iteration == IK_ITERATIONS or none(moving):
+            if iteration == IK_ITERATIONS or known_all_false(moving):
                 return qpos[..., 0], square[:, 0, 0] < IK_TOLERANCE**2
             error = error * moving / clamp(square**0.5 / IK_MAX_ERROR, 1.0, np.inf)
             twists = _twists(frames)

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import torch
 
-from robocas_ms3.core.arrays import every, native
+from robocas_ms3.core.arrays import known_all_true, native
 from robocas_ms3.tasks import rewards, terms
 
 _RIM = 0.05  # m around the basket's inside that still count as over it for a target that falls
@@ -134,7 +134,7 @@ class InBasket(Goal):
 
     def lost(self, basket: Any, measures: dict[str, Any]) -> Any:
         """See `Goal`."""
-        if every(measures["basket_stands"]):  # as nearly always
+        if known_all_true(measures["basket_stands"]):  # as nearly always
             return None
         start = native(self.env.basket_at_start)
         over = terms.fell_over(basket[:, :3], basket[:, 3:], start[:, :3], start[:, 3:])

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from mani_skill.utils.structs import Articulation
 
-from robocas_ms3.core.arrays import as_tensor, native, none
+from robocas_ms3.core.arrays import as_tensor, known_all_false, native
 from robocas_ms3.scenes.layout import Array
 from robocas_ms3.scenes.task_specs import OPEN_PICK
 from robocas_ms3.tasks import cameras, rewards, terms
@@ -68,7 +68,7 @@ class RoboCASOpenPickEnv(RoboCASEnv):
         """Return the reward; see `RoboCASEnv`. The furniture must have been opened before the target may be grasped."""
         stage, found = self.dense_reward.of_goal()
         shut = (stage == self.REWARDS.index("grasp")) & ~native(self.success_check.stages["furniture_opened"])
-        if not none(shut):
+        if not known_all_false(shut):
             found["handle"] = rewards.closeness(self.tcp_in_world()[:, :3], self.handle_in_world())
             found["open"] = self._opened_share()
             stage = rewards.furthest(stage, [(shut, self.REWARDS.index("open"))])

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from robocas_ms3.core.arrays import as_tensor, native, none
+from robocas_ms3.core.arrays import as_tensor, known_all_false, native
 from robocas_ms3.scenes.targets import selection_camera
 from robocas_ms3.scenes.task_specs import SEARCH
 from robocas_ms3.tasks import occlusion, rewards, terms
@@ -93,7 +93,7 @@ class RoboCASSearchEnv(RoboCASEnv):
         """Return what `RoboCASEnv.evaluate` does, ``obstacles_cleared`` and ``cleared_at_reset``."""
         found, measured = super().evaluate(), self._measured
         unchanged = measured is not None and measured.others is not None and measured.others == self.bodies.others
-        if not unchanged and not none(due := self._due()):
+        if not unchanged and not known_all_false(due := self._due()):
             moment = self.moment
             in_heap = (
                 terms.of_target(moment.objects[..., 2], native(self.target_slot)) > self.success_check.fallen_below
@@ -156,7 +156,7 @@ class RoboCASSearchEnv(RoboCASEnv):
         stages = self.success_check.stages
         settled = native(stages["obstacles_cleared"]) | native(stages["target_grasped"])
         covered = (stage == self.REWARDS.index("grasp")) & ~settled
-        if not none(covered):
+        if not known_all_false(covered):
             found["push_point"] = rewards.closeness(self.tcp_in_world()[:, :3], native(self._push_point))
             found["clear"] = rewards.uncovered(native(self.hidden_share), native(self._obstacles.sum(dim=1)))
             stage = rewards.furthest(stage, [(covered, self.REWARDS.index("clear"))])

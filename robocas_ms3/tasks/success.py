@@ -11,7 +11,7 @@ import torch
 from mani_skill.utils.structs import Articulation
 
 from robocas_ms3.assets.manifest import BODY
-from robocas_ms3.core.arrays import as_tensor, count_up, native, none
+from robocas_ms3.core.arrays import as_tensor, count_up, known_all_false, native
 from robocas_ms3.tasks import terms
 from robocas_ms3.tasks.bodies import link_poses
 from robocas_ms3.tasks.goals import Moment
@@ -116,7 +116,7 @@ class SuccessCheck:
     def grasped(self, forces: Any) -> Any:
         """Return which objects (N, K) both fingers hold, from forces (N, 3, K, 3) N on the gripper; native."""
         pressed = terms.pressed(forces[:, 0], forces[:, 1])
-        if none(pressed):  # as most of the time: no need to ask in which direction
+        if known_all_false(pressed):  # as most of the time: no need to ask in which direction
             return pressed
         finger = native(link_poses(self._env.scene, [self._env.agent.finger1_link]))[:, 0]
         # the left finger opens along its own +y
@@ -152,7 +152,7 @@ class SuccessCheck:
         """
         env, objects = self._env, self.moment.objects
         low = (objects[..., 2] < self.fallen_below) & native(env.present & ~env.is_target)
-        if none(low):  # as nearly always
+        if known_all_false(low):  # as nearly always
             return low
         return low & ~env.goal.holds(env.centers(objects), self.moment.basket)
 
@@ -161,7 +161,7 @@ class SuccessCheck:
         goal, slot = self._env.goal, native(self._env.target_slot)
         height = terms.of_target(objects[..., 2], slot)
         low, lost = height < self.fallen_below, goal.lost(basket, measures)
-        if lost is None and none(low):  # as nearly always
+        if lost is None and known_all_false(low):  # as nearly always
             return low
         caught = goal.catches(terms.of_target(objects[..., :3], slot), basket)
         fell = terms.fell_off(height, self.surface, low & False if caught is None else caught, ~measures["untouched"])
