@@ -1,4 +1,4 @@
-"""`bc-state`: chunks from what only a simulator knows. What can be had without having to see."""
+"""`bc-state`: chunks of poses from the privileged state of the simulator, an upper bound without vision."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ class BcState:
     Config = BcStateConfig
 
     def data(self, config: BcStateConfig, folder: Path, split: Split, on_read: OnRead) -> StateSamples:
-        """Samples of a ``trajectory.h5``."""
+        """Read the samples of a ``trajectory.h5``."""
         return StateSamples(config, folder, split, on_read)
 
     def model(self, config: BcStateConfig, facts: dict[str, Any]) -> BcStateModel:
-        """The network."""
+        """Build the network."""
         return BcStateModel(config, facts)
 
     def policy(self, config: BcStateConfig, facts: dict[str, Any], model: BcStateModel) -> ChunkPolicy:
-        """What acts by it."""
+        """Return the policy."""
         device, size = next(model.parameters()).device, len(facts["inputs"]["mean"])
 
         def predict(seen: Observations, row: int) -> NDArray[np.floating]:

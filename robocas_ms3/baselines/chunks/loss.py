@@ -1,6 +1,6 @@
-"""What chunks are trained by: L1 of normalised poses, cross entropy of the gripper's commands, the next key pose.
+"""Loss of chunks: L1 of normalised poses, cross entropy of gripper commands, and L1 of the next key pose.
 
-Poses count by how near they are: a centimetre decides about a grasp, and hardly matters half a metre before it.
+Near poses have more weight: a centimetre decides about a grasp, and hardly matters half a metre before it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from robocas_ms3.baselines.baseline import Batch
 from robocas_ms3.baselines.chunks.poses import Scale
 
 NEAR = 0.05
-"""m; of what is called near in the log."""
+"""Distance in m below which the log calls a pose near."""
 
 
 class _Weights(Protocol):
@@ -29,7 +29,7 @@ class _Weights(Protocol):
 
 
 class Predictor(Protocol):
-    """A network with the scales of what it predicts."""
+    """A network with the scales of its predictions."""
 
     config: Any
     chunk_scale: Scale
@@ -37,11 +37,11 @@ class Predictor(Protocol):
 
 
 def chunk_losses(model: Predictor, batch: Batch, chunk: torch.Tensor, key: torch.Tensor) -> dict[str, torch.Tensor]:
-    """Losses of a batch.
+    """Return the losses of a batch.
 
     Args:
-        model: that predicted.
-        batch: with ``chunk`` (B, K, 10) and ``key`` (B, 9), as they are.
+        model: the network.
+        batch: with ``chunk`` (B, K, 10) and ``key`` (B, 9), not normalised.
         chunk: (B, K, 10) predicted, normalised but for the logits of the commands.
         key: (B, 9) predicted, normalised.
 
@@ -70,7 +70,7 @@ def chunk_losses(model: Predictor, batch: Batch, chunk: torch.Tensor, key: torch
 
 
 def _l1(found: torch.Tensor, poses: torch.Tensor, scale: Scale, near: float) -> torch.Tensor:
-    """Mean error of normalised poses (..., 9), weighted by near / (near + distance); near 0: all alike."""
+    """Return the mean error of normalised poses (..., 9), weighted by near / (near + distance); 0: no weights."""
     error = (found - scale(poses)).abs().mean(dim=-1)
     if not near:
         return error.mean()

@@ -20,15 +20,15 @@ class RT1:
     Config = RT1Config
 
     def data(self, config: RT1Config, folder: Path, split: Split, on_read: OnRead) -> RT1Samples:
-        """Samples of a dataset with pictures and embeddings, which are read when they are asked for."""
+        """Open a dataset with images and embeddings, whose images are read batch by batch."""
         return RT1Samples(config, folder, split, on_read)
 
     def model(self, config: RT1Config, facts: dict[str, Any]) -> RT1Model:
-        """The network."""
+        """Build the network."""
         return RT1Model(config, facts)
 
     def policy(self, config: RT1Config, facts: dict[str, Any], model: RT1Model) -> RT1Policy:
-        """What acts by it."""
+        """Return the policy."""
         return RT1Policy(config, facts, model)
 
 

@@ -21,15 +21,15 @@ class Small:
     Config = SmallConfig
 
     def data(self, config: SmallConfig, folder: Path, split: Split, on_read: OnRead) -> SmallSamples:
-        """Samples of a dataset with pictures and embeddings."""
+        """Read the samples of a dataset with images and embeddings."""
         return SmallSamples(config, folder, split, on_read)
 
     def model(self, config: SmallConfig, facts: dict[str, Any]) -> SmallModel:
-        """The network."""
+        """Build the network."""
         return SmallModel(config, facts)
 
     def policy(self, config: SmallConfig, facts: dict[str, Any], model: SmallModel) -> ChunkPolicy:
-        """What acts by it."""
+        """Return the policy."""
         return make_policy(config, facts, model)
 
 
