@@ -111,9 +111,14 @@ def _format(cfg: Convert) -> Format:
         DatasetError: a flag does not suit it.
     """
     from robocas_ms3.core.errors import DatasetError
+    from robocas_ms3.core.strict import nearest
     from robocas_ms3.datasets.formats import FORMATS
 
-    chosen = FORMATS.find(cfg.to, where="--to")
+    writable = [name for name, known in FORMATS.items() if known.writer]
+    if cfg.to not in writable:
+        expected, fix = f"one of {writable}", nearest(cfg.to, writable)
+        raise DatasetError("no such dataset format to write", where="--to", expected=expected, found=cfg.to, fix=fix)
+    chosen = FORMATS[cfg.to]
     flags = {
         "append": cfg.append,
         "leave_out": cfg.leave_out,

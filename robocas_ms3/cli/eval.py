@@ -64,7 +64,7 @@ class Run:
 
 @resumable
 def run(cfg: Run) -> int:
-    """Play the episodes that the result does not have yet."""
+    """Play the episodes that the result does not have yet; give 1 if any of the result ended with an error."""
     from robocas_ms3.core.errors import EvaluationError
     from robocas_ms3.core.strict import nearest
     from robocas_ms3.scenes.task_specs import TASKS
@@ -125,7 +125,7 @@ def run(cfg: Run) -> int:
     there = count_of(len(result.outcomes), "episode")
     say(f"{count_of(played, 'episode')} played, {succeeded} succeeded; {out}: {there}{fix}")
     write_pages(result, out, cfg.protocol)
-    return 0
+    return 1 if broken else 0
 
 
 def shard_of(text: str) -> tuple[int, int]:

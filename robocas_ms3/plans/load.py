@@ -136,14 +136,11 @@ def opening_part(plan: Plan, part: int) -> Iterator[None]:
 
 
 def _check_lerobot(plan: Plan) -> None:
-    from robocas_ms3.datasets.lerobot.schema import require_extra, whole_rate
+    from robocas_ms3.datasets.lerobot.schema import check_video_size, require_extra, whole_rate
 
     require_extra()
     whole_rate(plan.rate)
-    width, height = plan.pictures.size
-    if width % 2 or height % 2:
-        expected, found = "even width and height", f"{width} x {height}"
-        raise PlanError("videos need even sizes", where="pictures.size", expected=expected, found=found)
+    check_video_size(plan.pictures.size)
 
 
 def _completed(part: PartConfig, number: int, path: Path) -> tuple[PartConfig, Any]:

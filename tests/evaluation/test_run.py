@@ -155,9 +155,10 @@ def test_an_episode_that_ends_its_process_is_played_again_and_then_counts_as_fai
     assert all(env.closed for env in made)
     said = problems(results.read(tmp_path / "out"), protocol)
     assert not [one for one in said if one.startswith("episode 1:") and times == 2]
-    if times == 2:
-        play(tmp_path / "out", "still", protocol=short)  # it stays as it is
-        assert results.read(tmp_path / "out").broken_off() == 1
+    play(tmp_path / "out", "still", protocol=short)  # it stays as it is
+    assert results.read(tmp_path / "out").broken_off() == times - 1
+    command = ["eval", "--policy", "still", "--protocol", short, "--backend", "processes", "--out", tmp_path / "out"]
+    assert cli([str(word) for word in command]) == times - 1
 
 
 def test_a_process_that_dies_at_no_episode_ends_the_run(short, tmp_path, monkeypatch):

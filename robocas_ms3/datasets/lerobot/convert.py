@@ -16,7 +16,15 @@ from robocas_ms3.core.errors import IncompleteError
 from robocas_ms3.core.files import flush_to_disk, make_folder, naming, remove
 from robocas_ms3.core.outputs import OutputFolder, sweep
 from robocas_ms3.datasets.lerobot.plan import OUTPUT, PARTS, check_episodes, only, plan_of
-from robocas_ms3.datasets.lerobot.schema import CONTENT, INFO_FILE, STAGING, Limits, require_extra, whole_rate
+from robocas_ms3.datasets.lerobot.schema import (
+    CONTENT,
+    INFO_FILE,
+    STAGING,
+    Limits,
+    check_video_size,
+    require_extra,
+    whole_rate,
+)
 from robocas_ms3.datasets.lerobot.variants import Variant, find_variant
 from robocas_ms3.datasets.writing.inputs import open_input
 from robocas_ms3.datasets.writing.settings import Conversion, ConversionSettings, WrittenEpisode
@@ -56,6 +64,7 @@ def convert_lerobot(
         MissingExtraError: the ``lerobot`` extra is not installed.
     """
     require_extra()
+    check_video_size(settings.pictures.size)
     start, variant, out = time.perf_counter(), find_variant(settings.lerobot_version), settings.out
     settings = replace(settings, pictures=replace(settings.pictures, boxes=variant.language))
     with closing(open_input(settings)) as given:

@@ -244,6 +244,17 @@ def whole_rate(rate_hz: float) -> int:
     return round(rate_hz)
 
 
+def check_video_size(size: tuple[int, int] | None) -> None:
+    """Check a width and height, pixels; None is the cameras' own size.
+
+    Raises:
+        DatasetError: one is odd, which the codecs of the videos can't encode.
+    """
+    if size is not None and (size[0] % 2 or size[1] % 2):
+        expected, found = "even width and height", f"{size[0]} x {size[1]}"
+        raise DatasetError("videos need even sizes", where="size", expected=expected, found=found)
+
+
 def require_extra() -> None:
     """Check that pyarrow and PyAV are there.
 

@@ -6,6 +6,7 @@ TCP keepalive is on for every connection, and websocket pings are sent where the
 from __future__ import annotations
 
 import asyncio
+import logging
 import os
 import socket as sockets
 import threading
@@ -22,6 +23,7 @@ from robocas_ms3.core.words import printable
 from robocas_ms3.evaluation.remote.messages import ServerMetadata, read_metadata
 from robocas_ms3.evaluation.remote.wire import unpack
 
+_log = logging.getLogger(__name__)
 PING_INTERVAL = 10.0  # s
 PING_TIMEOUT = 60.0  # s without an answer to a ping
 TCP_OPTIONS = {"TCP_KEEPIDLE": 30, "TCP_KEEPINTVL": 10, "TCP_KEEPCNT": 3}  # s, s, probes without an answer
@@ -108,7 +110,7 @@ async def open_connection(url: str, connect_s: float) -> Connection:
         ConnectionFailed: no server answered in time, or its metadata are an error text or invalid.
         EvaluationError: the metadata have values out of range.
     """
-    deadline = time.monotonic() + connect_s
+    deadline, is_told = time.monotonic() + connect_s, False
     while True:
         try:
             socket, first = await asyncio.wait_for(_open(url), max(deadline - time.monotonic(), 0.01))
@@ -117,6 +119,9 @@ async def open_connection(url: str, connect_s: float) -> Connection:
             if deadline - time.monotonic() < _RETRY_S:
                 reason = f"no server at {url} within {connect_s:g} s: {_line_of(error)}"
                 raise ConnectionFailed(reason, gone=True) from error
+            if not is_told:
+                _log.warning("waiting for a policy server at %s, up to %g s", url, connect_s)
+                is_told = True
             await asyncio.sleep(_RETRY_S)
     try:
         return Connection(socket, read_metadata(_read(first), url))
