@@ -31,12 +31,11 @@ LONGEST = {
     "tests/evaluation/test_run.py",
     "tests/evaluation/test_weld.py",
     "tests/examples/test_examples.py",
-    "tests/plans/test_run.py",
+    "tests/plans/test_run_plan.py",
     "tests/tasks/test_registry.py",
     "tests/tasks/vector/test_processes.py",
     "tests/tasks/vector/test_same_episodes.py",
     "tests/test_emulated_gpu.py",
-    "tests/test_registration_of_strangers.py",
     "tests/viewer/test_page.py",
 }
 """Files of half a minute and more."""

@@ -75,7 +75,7 @@ def test_configs_and_builtin_pack_travel_in_the_wheel(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     for path in (ROOT / "task_configs").glob("*.yaml"):
         assert f"robocas_ms3/data/task_configs/{path.name}" in names
-    for folder in ("asset_tools/partnet/annotations", "robocas_ms3/language", "robocas_ms3/data/plans"):
+    for folder in ("asset_tools/partnet/annotations", "robocas_ms3/scenes/language", "robocas_ms3/data/plans"):
         data = sorted((ROOT / folder).glob("*.yaml"))
         assert data
         assert {f"{folder}/{path.name}" for path in data} <= names

@@ -15,11 +15,12 @@ import torch
 import robocas_ms3  # noqa: F401
 from robocas_ms3.cli.main import run as cli
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.evaluation import results, videos
+from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.metrics import read_sum
 from robocas_ms3.evaluation.policies import make_policy
 from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.report import videos
 from robocas_ms3.evaluation.report.videos import film
 from robocas_ms3.evaluation.session import EvaluationSession, evaluate
 from robocas_ms3.evaluation.settings import EvaluationSettings

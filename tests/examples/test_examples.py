@@ -80,7 +80,7 @@ def test_ppo_in_a_shortened_form(tmp_path):
     small = ["--steps", 128, "--envs", 2, "--workers", 1, "--batch", 64, "--layouts", 2, "--trials", 2]
     begun, tried = run("ppo.py", *small, cwd=tmp_path)
     assert begun.startswith("ppo: 0.05 M parameters, 128 steps in 2 layouts")
-    assert tried.startswith("without noise, in 2 layouts that are new to it: return ")
+    assert tried.startswith("test without noise, 2 other layouts: return ")
     with (tmp_path / "out/ppo/metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [(row["step"], row["split"]) for row in rows] == [("64", "train"), ("128", "train"), ("128", "val")]

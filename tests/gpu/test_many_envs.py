@@ -12,7 +12,7 @@ from batches import check_partial_reset, check_state_round_trip, make_batch, set
 from gpu_emulation import emulated_envs
 
 import robocas_ms3  # noqa: F401
-from robocas_ms3.cli.layouts import Build, Layouts, main
+from robocas_ms3.cli.layouts import Build, build
 from robocas_ms3.scenes.table import State
 from robocas_ms3.tasks import TASKS
 from robocas_ms3.tasks.starts import Starts
@@ -163,7 +163,7 @@ def test_heaps_are_tried_by_this_engine_and_resets_gather_what_stays(tmp_path):
     count = 2 if emulated_envs() else 4
     pairs = dict(objects=f"0:{count}", seeds=f"0:{count}")
     command = Build("search_table_small_heap", **pairs, jobs=2, out=tmp_path, engine="gpu")
-    assert main(Layouts(command)) == 0
+    assert build(command) == 0
     made = gym.make(
         "RoboCASSearch-v1",
         config="search_table_small_heap",

@@ -11,7 +11,7 @@ import pytest
 import torch
 from several_envs import several
 
-from robocas_ms3.cli.layouts import Build, Layouts, main
+from robocas_ms3.cli.layouts import Build, build
 from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.scenes import bank, source
 from robocas_ms3.scenes.table import State
@@ -25,7 +25,7 @@ def built(tmp_path_factory):
     """A bank's folder for objects of two seeds and layouts of three, with their table."""
     folder = tmp_path_factory.mktemp("banks")
     command = Build("pick_table_scattered", objects="0:2", seeds="0:3", jobs=1, out=folder, engine="cpu")
-    assert main(Layouts(command)) == 0
+    assert build(command) == 0
     return folder
 
 

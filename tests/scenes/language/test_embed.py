@@ -22,11 +22,9 @@ def without(monkeypatch, module):
 
 def test_without_the_extra_the_error_names_it(monkeypatch):
     without(monkeypatch, "sentence_transformers")
-    with pytest.raises(
-        MissingExtraError,
-        match=r'pip install "robocas-ms3\[language\]"; robocas convert does without by --no-embeddings',
-    ):
+    with pytest.raises(MissingExtraError) as found:
         embed.TextEmbedder()
+    assert ".[language]" in found.value.fix and "--no-embeddings" in found.value.fix
 
 
 def test_weights_come_from_the_variable_then_the_package_then_the_hub(monkeypatch, tmp_path):
