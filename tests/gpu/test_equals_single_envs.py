@@ -23,14 +23,14 @@ pytestmark = [
 def test_joint_modes(task, batch_and_singles, mode):
     batch, singles = batch_and_singles
     set_control_mode([batch, *singles], mode)
-    check_equals_singles(batch, singles, mode, steps=10, heap=task == "search")
+    check_equals_singles(batch, singles, mode, steps=10)
 
 
 @pytest.mark.parametrize("mode", END_EFFECTOR_MODES)
 def test_end_effector_modes(task, batch_and_singles, mode):
     batch, singles = batch_and_singles
     set_control_mode([batch, *singles], mode)
-    check_equals_singles(batch, singles, mode, steps=50, heap=task == "search")
+    check_equals_singles(batch, singles, mode, steps=50)
 
 
 @pytest.mark.emulated_gpu_full

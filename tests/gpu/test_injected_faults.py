@@ -42,7 +42,7 @@ def batch():
 
 
 def check(batch: Any, singles: Any) -> None:
-    check_equals_singles(batch, singles, MODE, steps=5, heap=False)
+    check_equals_singles(batch, singles, MODE, steps=5)
 
 
 def test_without_a_fault_the_checks_pass(batch, singles):
@@ -61,10 +61,10 @@ def test_a_missing_apply_of_target_velocities(batch, singles, monkeypatch):
     """Only end-effector modes set them."""
     mode = "pd_ee_delta_pose"
     set_control_mode([batch, *singles], mode)
-    check_equals_singles(batch, singles, mode, steps=5, heap=False)
+    check_equals_singles(batch, singles, mode, steps=5)
     monkeypatch.setattr(type(batch.unwrapped.scene.px), "gpu_apply_articulation_target_velocity", lambda self: None)
     with pytest.raises(AssertionError, match="qpos"):
-        check_equals_singles(batch, singles, mode, steps=5, heap=False)
+        check_equals_singles(batch, singles, mode, steps=5)
     set_control_mode(singles, MODE)
 
 

@@ -1,4 +1,4 @@
-"""Demonstrations of single envs on the CPU succeed in a batch on the emulated GPU interface; of heaps, most."""
+"""Demonstrations recorded in single envs on the CPU succeed in a batch on the emulated GPU interface."""
 
 from __future__ import annotations
 
@@ -12,13 +12,12 @@ import numpy as np
 import pytest
 import torch
 from gpu_emulation import emulated_envs
+from gpu_emulation.physics import EmulatedGpuSystem
 
 from robocas_ms3.demos.recordings.reading import Recording, TrajectoryFile
 from robocas_ms3.tasks import TASKS
 
 ROOT = Path(__file__).resolve().parents[2]
-LATER = 6  # steps after the recorded success; contacts in a heap amplify the last bit
-SHARE_OF_HEAPS = 0.8  # which succeed: without feedback, a heap that lies some mm elsewhere can be played past
 
 pytestmark = [
     pytest.mark.gpu,
@@ -37,7 +36,9 @@ def recordings(request, tmp_path_factory) -> tuple[str, list[Recording]]:
         return request.param, [file.recording(i) for i in range(len(file.episodes))]
 
 
-def test_whole_demonstrations_succeed_in_a_batch(recordings):
+def test_whole_demonstrations_succeed_in_a_batch(recordings, monkeypatch):
+    # the step decides in which order PhysX solves contacts; single envs on a CPU do not make it
+    monkeypatch.setattr(EmulatedGpuSystem, "steps_on_init", False)
     task, episodes = recordings
     seeds = [episode.seed for episode in episodes]
     env = gym.make(
@@ -50,16 +51,14 @@ def test_whole_demonstrations_succeed_in_a_batch(recordings):
     )
     base: Any = env.unwrapped  # without gymnasium's time limit
     base.reset(seed=seeds, options={"reconfigure": True})
-    steps = max(len(episode.actions) for episode in episodes) + LATER
+    steps = max(len(episode.actions) for episode in episodes)
     actions = np.stack([_held(episode.actions, steps) for episode in episodes], axis=1)
     successes = torch.stack([base.step(action)[4]["success"] for action in torch.from_numpy(actions).to(base.device)])
     first = torch.where(successes.any(0), successes.int().argmax(0), steps).tolist()
     env.close()
     recorded = [len(episode.actions) - 1 for episode in episodes]
     assert len(recorded) == emulated_envs()
-    succeeded = [found <= wanted + LATER for found, wanted in zip(first, recorded, strict=True)]
-    wanted = SHARE_OF_HEAPS if task == "search" else 1.0
-    assert sum(succeeded) >= wanted * len(succeeded), (first, recorded)
+    assert all(found <= wanted for found, wanted in zip(first, recorded, strict=True)), (first, recorded)
 
 
 def _held(actions: np.ndarray, steps: int) -> np.ndarray:

@@ -66,7 +66,7 @@ class ChunkPolicy:
             self._plans[env] = [plan.older() for plan in self._plans[env] if plan.age + 1 < len(plan.poses)]
         for row, env in enumerate(envs):
             if not self._plans[env] or self._plans[env][0].age >= self._play:
-                chunk = self._predict(observations, row)  # alone: in a batch it would depend on the others to the bit
+                chunk = self._predict(observations, row)  # alone: in a batch, its last bits depend on the other rows
                 poses, opened = decode(chunk, tcp[row])
                 self._plans[env].insert(0, _Plan(poses, opened))
                 if self._is_stuck(env, tcp[row, :3, 3], float(observations.gripper_width.reshape(-1)[row])):

@@ -22,8 +22,8 @@ def train_ppo(run: RunFolder, agent: Agent, config: PpoConfig, environments: Ppo
     """Train an agent until all steps are done, then test it without noise in other layouts.
 
     A run that continues has the weights, the optimiser, the observation statistics, the last episodes and the random
-    states of the last update. Its environments start anew, with the layouts after those that were played, so it does
-    not repeat an uninterrupted run to the bit.
+    states of the last update. Its environments start again, with the layouts after those that were used, so it
+    does not repeat an uninterrupted run bit for bit.
 
     Args:
         run: folder of the run.

@@ -18,7 +18,7 @@ from robocas_ms3.core.errors import TrainingError
 from robocas_ms3.core.files import replacing
 
 _FIXES = {
-    CHECKPOINT: "It is damaged, or of another program: train anew with --overwrite.",
+    CHECKPOINT: "It is damaged, or of another program: start again with --overwrite.",
     WEIGHTS: "It is damaged, or of another program: `robocas train` into this folder writes it again.",
 }
 

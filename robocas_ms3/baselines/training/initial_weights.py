@@ -13,7 +13,7 @@ from robocas_ms3.core.errors import TrainingError
 
 _INPUTS = ("rate_hz", "pictures", "cameras", "calibration", "observed", "acted")
 """Facts that have to be the same in both runs. Others, such as scales, need the same shape."""
-_TOLERANCE = 1e-3  # of these: a camera is not at the same place to the bit
+_TOLERANCE = 1e-3  # of these: camera poses differ in the last bits
 _SHOWN = 8  # values of a list in a message
 
 

@@ -191,7 +191,7 @@ class Learner:
                 where=where,
                 expected=processes,
                 found=self._accelerator.num_processes,
-                fix=f"accelerate launch --num_processes {processes}, or train anew with --overwrite.",
+                fix=f"accelerate launch --num_processes {processes}, or start again with --overwrite.",
             )
         number = self._accelerator.process_index
         torch.set_rng_state(states[f"cpu.{number}"])

@@ -110,7 +110,7 @@ async def open_connection(url: str, connect_s: float) -> Connection:
         ConnectionFailed: no server answered in time, or its metadata are an error text or invalid.
         EvaluationError: the metadata have values out of range.
     """
-    deadline, is_told = time.monotonic() + connect_s, False
+    deadline, warned = time.monotonic() + connect_s, False
     while True:
         try:
             socket, first = await asyncio.wait_for(_open(url), max(deadline - time.monotonic(), 0.01))
@@ -119,9 +119,9 @@ async def open_connection(url: str, connect_s: float) -> Connection:
             if deadline - time.monotonic() < _RETRY_S:
                 reason = f"no server at {url} within {connect_s:g} s: {_line_of(error)}"
                 raise ConnectionFailed(reason, gone=True) from error
-            if not is_told:
+            if not warned:
                 _log.warning("waiting for a policy server at %s, up to %g s", url, connect_s)
-                is_told = True
+                warned = True
             await asyncio.sleep(_RETRY_S)
     try:
         return Connection(socket, read_metadata(_read(first), url))

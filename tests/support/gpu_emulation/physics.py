@@ -44,6 +44,9 @@ class EmulatedGpuSystem:
     cuda_articulation_target_qpos: Buffer
     cuda_articulation_target_qvel: Buffer
 
+    steps_on_init = True
+    """Whether `gpu_init` steps once, as SAPIEN's does. A test may change it, to compare with recordings of a CPU."""
+
     def __init__(self, device: Any = None) -> None:
         self.device = device
         self.ready = False
@@ -90,9 +93,10 @@ class EmulatedGpuSystem:
     # ------------------------------------------------------------------ start and step
 
     def gpu_init(self) -> None:
-        """Allocate the buffers, and step once as SAPIEN does."""
-        for system in self._systems:
-            system.step()
+        """Allocate the buffers, and step once if `steps_on_init`."""
+        if self.steps_on_init:
+            for system in self._systems:
+                system.step()
         shuffle = np.random.default_rng(len(self._systems)).permutation
         bodies = self.rigid_dynamic_components
         articulations = [link.articulation for link in self.articulation_link_components if link.is_root]
