@@ -170,7 +170,7 @@ def changes_of(cfg: Training) -> dict[str, Any]:
     from robocas_ms3.baselines.training.session import merge_configs
     from robocas_ms3.core.documents import load_yaml
     from robocas_ms3.core.errors import TrainingError
-    from robocas_ms3.scenes.config.overrides import parse_override
+    from robocas_ms3.scenes.config.compose import parse_override
 
     found: dict[str, Any] = {}
     if cfg.config is not None:

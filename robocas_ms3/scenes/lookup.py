@@ -11,9 +11,9 @@ from robocas_ms3.assets.pack import LoadedFurniture, Pack, load_pack
 from robocas_ms3.core.errors import ConfigError
 from robocas_ms3.core.poses import planar
 from robocas_ms3.core.strict import nearest
-from robocas_ms3.scenes.config.relations import NEED_THREE, RELATIONS
 from robocas_ms3.scenes.config.task import OrderlyLayout, PlacedConfig, PoseConfig, SurfaceConfig, TaskConfig
 from robocas_ms3.scenes.placement import Array, Region
+from robocas_ms3.scenes.relations import NEED_THREE, RELATIONS
 from robocas_ms3.scenes.task_specs import TASKS
 
 OPENED_AT_MOST = {"prismatic": 0.95, "revolute": 0.8}  # share of a joint's range that scripted pulls aim at

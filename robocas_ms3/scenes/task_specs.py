@@ -61,7 +61,7 @@ class TaskSpec:
         return self.steps(STANDARD_FREQ)
 
 
-HAS_BASKET = "robocas_ms3.scenes.config.checks:has_basket"
+HAS_BASKET = "robocas_ms3.scenes.config.task:has_basket"
 
 PICK = TaskSpec(
     name="pick",
@@ -86,7 +86,7 @@ SELECT = TaskSpec(
     training_seconds=20,
     summary="grasp the one of several identical objects that the instruction names by where it stands",
     slots=("relation",),
-    checks=(HAS_BASKET, "robocas_ms3.scenes.config.checks:has_copies"),
+    checks=(HAS_BASKET, "robocas_ms3.scenes.config.task:has_copies"),
 )
 SEARCH = TaskSpec(
     name="search",

@@ -7,8 +7,8 @@ from typing import Any, cast
 import numpy as np
 import torch
 
-from robocas_ms3.scenes.config.relations import Relation
-from robocas_ms3.scenes.language.instructions import Instruction, choose_instruction, part_name
+from robocas_ms3.scenes.language.instructions import Instruction, InstructionSlots, choose_instruction, part_name
+from robocas_ms3.scenes.relations import Relation
 
 _LANGUAGE = 100  # stream of an episode's seed; those of layouts are in scenes/sample.py
 
@@ -43,14 +43,13 @@ class Instructions:
     def choose(self, env: int, name: str) -> Instruction:
         """Return the instruction that an env would have if its target had this name."""
         config, layout = self._env.task_config, self._env.layout(env)
-        return choose_instruction(
-            np.random.default_rng([int(self._env.seeds.layout_seeds[env]), _LANGUAGE]),
+        slots = InstructionSlots(
             config.task,
-            config.language.split,
             object=name,
             support=config.support,
             relation=cast("Relation | None", layout.relation or None),
             part=config.opening.part or part_name(config.opening.handle) if config.opening else "",
-            others=sorted(self.names(env) - {name}),
-            synonyms=config.language.synonyms,
         )
+        rng = np.random.default_rng([int(self._env.seeds.layout_seeds[env]), _LANGUAGE])
+        others, language = sorted(self.names(env) - {name}), config.language
+        return choose_instruction(rng, slots, language.split, others=others, synonyms=language.synonyms)

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robocas_ms3.scenes.config.relations import RELATIONS
-from robocas_ms3.scenes.relations import MARGIN, related
+from robocas_ms3.scenes.relations import MARGIN, RELATIONS, related
 
 # y = 0.2 is on the robot's left; distances 0.54, 0.6, 0.81, 0.7 m
 FOUR = np.array([[0.5, 0.2], [0.6, 0.0], [0.8, -0.1], [0.63, -0.3]])

@@ -28,7 +28,7 @@ from robocas_ms3.datasets.checks.scene_values import sound
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.pictures.boxes import Box
 from robocas_ms3.demos.recordings.subgoals import SubGoal
-from robocas_ms3.scenes.language.instructions import instruction, is_plural, part_name, template_ids
+from robocas_ms3.scenes.language.instructions import InstructionSlots, instruction, is_plural, part_name, template_ids
 
 PERSISTENT, EVENTS = "language_persistent", "language_events"
 Row = dict[str, Any]
@@ -105,17 +105,10 @@ def paraphrases(scene: Mapping[str, Any], text: str) -> list[str]:
     opening = (known.get("config") or {}).get("opening") or {}
     try:
         part = opening.get("part") or (part_name(opening["handle"]) if opening.get("handle") else "")
-        texts = [
-            instruction(
-                task,
-                object=target["name"],
-                support=recorded["support"],
-                relation=recorded.get("relation") or None,
-                part=part,
-                template_id=template,
-            ).text
-            for template in template_ids(task, "train")
-        ]
+        slots = InstructionSlots(
+            task, target["name"], recorded["support"], relation=recorded.get("relation") or None, part=part
+        )
+        texts = [instruction(slots, template).text for template in template_ids(task, "train")]
     except (RobocasError, LookupError, AttributeError, TypeError):  # another version's task, relation or configuration
         return []
     return list(dict.fromkeys([text, *texts])) if texts else []

@@ -7,18 +7,57 @@ The rules are those of docs/configuration.md: mappings are merged key by key, ot
 from __future__ import annotations
 
 import copy
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, Literal
 
+import yaml
+
 from robocas_ms3.core.documents import YAML_DEPTH
-from robocas_ms3.core.errors import ConfigError
+from robocas_ms3.core.errors import ConfigError, RobocasError
 from robocas_ms3.core.strict import nearest
 from robocas_ms3.scenes.config.task import TaskConfig
 
 EXTENDS = "extends"
 """The key of a file that names its base; no mapping inside another file may have it."""
 _KIND = "kind"
+_NULL = ("~", "null", "Null", "NULL")
+
+
+class _Loader(yaml.SafeLoader):
+    """Reads unquoted numbers with an exponent, such as ``3e-4``, as floats; YAML 1.1 reads them as strings."""
+
+
+_EXPONENT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)[eE][-+]?[0-9]+$")
+_Loader.add_implicit_resolver("tag:yaml.org,2002:float", _EXPONENT, list("-+.0123456789"))
+
+
+def parse_override(text: str, error: type[RobocasError], example: str) -> dict[str, Any]:
+    """Parse ``a.b=VALUE`` of a command line into ``{"a": {"b": VALUE}}``; the value is YAML.
+
+    Args:
+        text: the override.
+        error: error type to raise.
+        example: a valid override, for the message.
+
+    Raises:
+        RobocasError: ``error``, if there is no key, no ``=``, or the value is empty or not YAML.
+    """
+    key, sign, word = text.partition("=")
+    names = key.split(".")
+    if not sign or not all(names) or key != key.strip():
+        raise error("invalid override", where="--set", expected=f"KEY=VALUE, such as {example}", found=text)
+    try:
+        value: Any = yaml.load(word, Loader=_Loader)  # noqa: S506  (a SafeLoader)
+    except (yaml.YAMLError, ValueError) as problem:
+        raise error("invalid override: the value is not YAML", where="--set", found=text) from problem
+    if value is None and word.strip() not in _NULL:
+        fix = f"Write {key}=null to remove the key or to set it to null."
+        raise error("invalid override: the value is empty", where="--set", expected="a value", found=text, fix=fix)
+    for name in reversed(names):
+        value = {name: value}
+    return value
 
 
 class Composition:

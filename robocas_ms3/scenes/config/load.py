@@ -13,10 +13,9 @@ from robocas_ms3.core.documents import YAML_LIMIT, DocumentError, load_yaml, rea
 from robocas_ms3.core.errors import ConfigError
 from robocas_ms3.core.paths import task_configs_dir
 from robocas_ms3.core.strict import nearest, parse
-from robocas_ms3.scenes.config.compose import EXTENDS, Composition
-from robocas_ms3.scenes.config.overrides import parse_override
-from robocas_ms3.scenes.config.supports import SUPPORTS
+from robocas_ms3.scenes.config.compose import EXTENDS, Composition, parse_override
 from robocas_ms3.scenes.config.task import TaskConfig
+from robocas_ms3.scenes.language.texts import synonym_texts
 from robocas_ms3.scenes.task_specs import TaskSpec
 
 CHAIN_LIMIT = 8
@@ -31,11 +30,11 @@ def shipped_configs() -> dict[str, Path]:
 
 
 def load_config_of(spec: TaskSpec, config: str | Path | dict | TaskConfig | None = None) -> TaskConfig:
-    """Load a configuration of a task.
+    """Load a configuration of a task; see `load_task_config`.
 
     Args:
         spec: of the task.
-        config: see `load_task_config`; None: the task's default.
+        config: default: the task's own.
 
     Raises:
         ConfigError: the configuration is wrong, or another task's.
@@ -43,18 +42,15 @@ def load_config_of(spec: TaskSpec, config: str | Path | dict | TaskConfig | None
     loaded = load_task_config(spec.default_config if config is None else config)
     if loaded.task != spec.name:
         name = f" {config}" if isinstance(config, str) else ""
-        raise ConfigError(
-            f"{spec.env_id} can't run the configuration{name}",
-            expected=f"task: {spec.name}",
-            found=f"task: {loaded.task}",
-        )
+        what = f"{spec.env_id} can't run the configuration{name}"
+        raise ConfigError(what, expected=f"task: {spec.name}", found=f"task: {loaded.task}")
     return loaded
 
 
 def load_task_config(
     config: str | Path | dict | TaskConfig, changes: Mapping[str, Any] | None = None, overrides: Sequence[str] = ()
 ) -> TaskConfig:
-    """Load a task configuration. A file whose ``support`` is not one of ``SUPPORTS`` gets a warning.
+    """Load a task configuration. A file whose ``support`` has no words in ``synonyms.yaml`` gets a warning.
 
     Args:
         config: name of a shipped configuration (``pick_table_scattered``), path of a YAML file, a mapping of the same
@@ -75,27 +71,22 @@ def load_task_config(
         composition.merge(config, label, removes=False)
     else:
         label = _merge_file(composition, config)
-    if changes:
-        composition.merge(changes, "changes")
-    for text in overrides:
-        nested = parse_override(text, ConfigError, "objects.count=12")
-        composition.merge(nested, f"--set {text}")
-    changed_by = [*(["changes"] if changes else []), *(f"--set {text}" for text in overrides)]
-    everything = f"{label} with {', '.join(changed_by)}" if changed_by else label
-    where = partial(composition.source_of, default=everything)
+    sources = {"changes": changes} if changes else {}
+    sources |= {f"--set {text}": parse_override(text, ConfigError, "objects.count=12") for text in overrides}
+    for source, values in sources.items():
+        composition.merge(values, source)
+    label = f"{label} with {', '.join(sources)}" if sources else label
+    where = partial(composition.source_of, default=label)
     parsed = parse(TaskConfig, composition.values, ConfigError, where=where)
-    if parsed.support not in SUPPORTS and not isinstance(config, dict):
-        _log.warning(
-            "%s: texts know no support %r: they say 'on the %s' and no synonyms; known are %s",
-            *(composition.source_of("support", label), parsed.support, parsed.support, ", ".join(SUPPORTS)),
-        )
+    supports = synonym_texts().supports
+    if parsed.support not in supports and not isinstance(config, dict):
+        message = "%s: texts know no support %r: they say 'on the %s' and no synonyms; known are %s"
+        _log.warning(message, where("support"), parsed.support, parsed.support, ", ".join(sorted(supports)))
     return parsed
 
 
 def check_no_base(path: Path) -> None:
-    """Check that a file has no base, as a file in a frozen protocol: it must neither depend on nor read other files.
-
-    A file whose text has no such key is not parsed, to save time.
+    """Check that a file of a frozen protocol has no base, on which it would depend.
 
     Raises:
         ConfigError: the file has a base, or cannot be read.
@@ -104,17 +95,13 @@ def check_no_base(path: Path) -> None:
         text = read_text(path, YAML_LIMIT)
     except (OSError, DocumentError) as error:
         raise ConfigError("can't read this file", where=path, found=error) from error
-    if EXTENDS not in text and "\\" not in text:  # the key may be written with escapes
+    if EXTENDS not in text and "\\" not in text:  # parsing takes long; the key may be written with escapes
         return
     data = _read(path)
     if EXTENDS in data:
-        raise ConfigError(
-            f"{EXTENDS!r} is not allowed in a protocol",
-            where=path,
-            expected="a whole configuration",
-            found=f"{EXTENDS}: {data[EXTENDS]}"[:80],
-            fix="robocas eval freeze writes whole configurations.",
-        )
+        found, fix = f"{EXTENDS}: {data[EXTENDS]}"[:80], "robocas eval freeze writes whole configurations."
+        what = f"{EXTENDS!r} is not allowed in a protocol"
+        raise ConfigError(what, where=path, expected="a whole configuration", found=found, fix=fix)
 
 
 def _merge_file(composition: Composition, config: str | Path) -> str:
@@ -144,17 +131,15 @@ def _chain(path: Path) -> list[tuple[Path, dict[Any, Any]]]:
         if len(chain) == CHAIN_LIMIT:
             expected = f"at most {CHAIN_LIMIT} files"
             raise ConfigError("too many base configurations", where=where, expected=expected, found=files[0])
-        found = _base(data.pop(EXTENDS), path, where) if EXTENDS in data else None
+        found = None
+        if EXTENDS in data:
+            named = data.pop(EXTENDS)
+            if not isinstance(named, str) or not named:
+                what, expected = f"wrong value for {EXTENDS!r}", "a shipped name or a YAML file"
+                raise ConfigError(what, where=where, expected=expected, found=repr(named)[:80])
+            found = _find(named, path.parent, where)
         chain.append((path, data))
     return chain
-
-
-def _base(named: Any, path: Path, where: str) -> Path:
-    """Return the file that another one names as its base."""
-    if not isinstance(named, str) or not named:
-        expected = "a shipped name or a YAML file"
-        raise ConfigError(f"wrong value for {EXTENDS!r}", where=where, expected=expected, found=repr(named)[:80])
-    return _find(named, path.parent, where)
 
 
 def _read(path: Path) -> dict[Any, Any]:

@@ -10,7 +10,7 @@ from robocas_ms3.core.errors import ConfigError, ExtensionError
 from robocas_ms3.core.extensions import load
 from robocas_ms3.core.strict import StrictModel
 from robocas_ms3.scenes.config.randomisation import RandomisationConfig
-from robocas_ms3.scenes.config.relations import RELATIONS, Relation
+from robocas_ms3.scenes.relations import RELATIONS, Relation
 from robocas_ms3.scenes.task_specs import TASKS
 
 Coordinate = Annotated[float, Field(ge=-100, le=100)]
@@ -276,3 +276,15 @@ class TaskConfig(StrictModel):
         random, layout = self.randomisation, self.layout
         kept = isinstance(layout, OrderlyLayout) and layout.keep_what_fits
         return kept or bool(random.count or random.distractors)
+
+
+def has_basket(config: TaskConfig) -> None:
+    """Raise ValueError where there is no basket; a task names this function in its ``checks``."""
+    if config.basket is None:
+        raise ValueError(f"task {config.task} needs a `basket`")
+
+
+def has_copies(config: TaskConfig) -> None:
+    """Raise ValueError where there are no several objects of a kind, in rows; see `has_basket`."""
+    if not (isinstance(config.layout, OrderlyLayout) and config.layout.copies > 1):
+        raise ValueError(f"task {config.task} needs layout.kind orderly with layout.copies > 1")

@@ -1,4 +1,4 @@
-"""Say what a task asks for: upstream's words, or one of many paraphrases, with or without synonyms."""
+"""Instructions: upstream's words, or one of many paraphrases, with or without synonyms."""
 
 from __future__ import annotations
 
@@ -9,13 +9,48 @@ from typing import TypeVar, get_args
 import numpy as np
 
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.scenes.config.relations import Relation
 from robocas_ms3.scenes.language.texts import Split, Templates, instruction_texts, synonym_texts
+from robocas_ms3.scenes.relations import Relation
 from robocas_ms3.scenes.task_specs import TASKS
 
 SPLITS: tuple[Split, ...] = get_args(Split)
 
 _T = TypeVar("_T")
+
+
+@dataclass(frozen=True)
+class InstructionSlots:
+    """What an instruction is about, in plain names.
+
+    Attributes:
+        task: its name, ``pick``.
+        object: the target's name, ``sugar box``.
+        support: what the objects are on or in, ``table``.
+        relation: which one of several identical objects, where the task has that slot; None: the nearest, which
+            upstream does not say.
+        part: what has to be opened, ``left door``, where the task has that slot; see `part_name`.
+
+    Raises:
+        RobocasError: there is no such task, the part is missing, or the task has no slot for relation or part.
+    """
+
+    task: str
+    object: str
+    support: str
+    relation: Relation | None = None
+    part: str = ""
+
+    def __post_init__(self) -> None:
+        slots = TASKS.find(self.task).slots
+        if self.relation and "relation" not in slots:
+            what = f"the task {_tasks_with('relation')}, and no other, may have a relation"
+            raise RobocasError(what, where=self.task, found=repr(self.relation))
+        if bool(self.part) != ("part" in slots):
+            what, found = (
+                f"the task {_tasks_with('part')}, and no other, needs a part",
+                repr(self.part) if self.part else "none",
+            )
+            raise RobocasError(what, where=self.task, found=found)
 
 
 @dataclass(frozen=True)
@@ -28,7 +63,7 @@ class Instruction:
         split: of the template, and of synonyms.
         object_word: what the target is called: its name or a synonym.
         support_word: the same of the support; the template need not mention it.
-        relation_phrase: how the relation is said, ``closest {object}``; none where there is none.
+        relation_phrase: how the relation is said, ``closest {object}``; empty where there is none.
     """
 
     text: str
@@ -39,110 +74,66 @@ class Instruction:
     relation_phrase: str = ""
 
 
-def instruction(
-    task: str,
-    *,
-    object: str,
-    support: str,
-    relation: Relation | None = None,
-    part: str = "",
-    template_id: str = "",
-) -> Instruction:
-    """Tell the robot what to do, in plain names.
-
-    Args:
-        task: its name, pick.
-        object: the target's name, 'sugar box'.
-        support: what the objects are on or in, 'table'.
-        relation: where the task has that slot: which one of several identical objects; none: the nearest, which
-            upstream does not say.
-        part: where the task has that slot: what has to be opened, 'left door'; see ``part_name``.
-        template_id: of the template; none: upstream's.
+def instruction(slots: InstructionSlots, template_id: str = "") -> Instruction:
+    """Return the instruction of a template in plain names; default: upstream's template.
 
     Raises:
-        RobocasError: no such template, part missing, or relation or part out of place.
+        RobocasError: there is no such template.
     """
-    template_id = template_id or f"{task}/upstream/00"
+    template_id = template_id or f"{slots.task}/upstream/00"
     for split in SPLITS:
-        if template_id in (ids := template_ids(task, split)):
-            template = _templates(task, split)[ids.index(template_id)]
-            phrase = instruction_texts().relations[relation].plain if relation else ""
-            return _render(task, split, template_id, template, object, support, _on(support), phrase, part)
-    raise RobocasError(
-        "no such template",
-        where=template_id,
-        expected=f"{task}/SPLIT/NN with SPLIT one of {list(SPLITS)}, NN below their counts",
-    )
+        if template_id in (ids := template_ids(slots.task, split)):
+            phrase = instruction_texts().relations[slots.relation].plain if slots.relation else ""
+            return _render(slots, split, ids.index(template_id), (slots.object, slots.support, phrase))
+    expected = f"{slots.task}/SPLIT/NN with SPLIT one of {list(SPLITS)}, NN below their counts"
+    raise RobocasError("no such template", where=template_id, expected=expected)
 
 
 def choose_instruction(
     rng: np.random.Generator,
-    task: str,
+    slots: InstructionSlots,
     split: Split,
     *,
-    object: str,
-    support: str,
-    relation: Relation | None = None,
-    part: str = "",
     others: Iterable[str] = (),
     synonyms: bool = True,
 ) -> Instruction:
-    """Draw an instruction: a template of the split, then the target's name or one of its synonyms in the split.
+    """Draw an instruction: a template of the split, then a word each for object, support and relation.
 
-    The words for support and relation are drawn likewise. Held-out texts so never meet train's templates or synonyms;
-    plain names are in both.
+    Held-out texts never share templates or synonyms with those of ``train``; plain names are in both.
 
     Args:
         rng: moved on by four draws, whatever the arguments.
-        task: as in ``instruction``.
+        slots: what the instruction is about.
         split: ``upstream`` (its template, plain names), ``train`` or ``held_out``.
-        object: as in ``instruction``.
-        support: as in ``instruction``.
-        relation: as in ``instruction``.
-        part: as in ``instruction``.
         others: names of the other objects in the scene; synonyms that could mean one of them are left out.
-        synonyms: False: the plain names and plain relations in every template.
+        synonyms: False: plain names and plain relations in every template.
 
     Raises:
-        RobocasError: part missing, or relation or part out of place; or the task has no templates of the split.
+        RobocasError: the task has no templates of the split.
     """
     draws = rng.random(4)
-    texts, words = instruction_texts(), synonym_texts()
-    templates = _templates(task, split)
+    words, relation = synonym_texts(), instruction_texts().relations[slots.relation] if slots.relation else None
+    templates = _templates(slots.task, split)
     if not templates:
-        raise RobocasError("this task has no templates of this split", where=task, found=split)
-    index = _pick(range(len(templates)), draws[0])
-    others = [name for name in others if name != object]
-    object_words, support_words, phrases = [object], [support], [texts.relations[relation].plain] if relation else [""]
+        raise RobocasError("this task has no templates of this split", where=slots.task, found=split)
+    objects, supports, phrases = [slots.object], [slots.support], [relation.plain if relation else ""]
     if synonyms:
-        known = words.objects[object].of(split) if object in words.objects else ()
-        object_words += [word for word in known if not any(could_mean(word, name) for name in others)]
-        support_words += words.supports[support].of(split) if support in words.supports else ()
-        phrases += texts.relations[relation].of(split) if relation else ()
-    return _render(
-        task,
-        split,
-        _template_id(task, split, index),
-        templates[index],
-        _pick(object_words, draws[1]),
-        _pick(support_words, draws[2]),
-        _on(support),
-        _pick(phrases, draws[3]),
-        part,
-    )
+        known = words.objects[slots.object].of(split) if slots.object in words.objects else ()
+        others = [name for name in others if name != slots.object]
+        objects += [word for word in known if not any(could_mean(word, name) for name in others)]
+        supports += words.supports[slots.support].of(split) if slots.support in words.supports else ()
+        phrases += relation.of(split) if relation else ()
+    drawn = _pick(objects, draws[1]), _pick(supports, draws[2]), _pick(phrases, draws[3])
+    return _render(slots, split, _pick(range(len(templates)), draws[0]), drawn)
 
 
 def template_ids(task: str, split: Split) -> list[str]:
-    """Ids of the templates of a split, in order."""
-    return [_template_id(task, split, index) for index in range(len(_templates(task, split)))]
-
-
-def _templates(task: str, split: Split) -> Sequence[str]:
-    return Templates.for_task(TASKS.find(task)).of(split)
+    """Return the ids of the templates of a split, in order."""
+    return [f"{task}/{split}/{index:02d}" for index in range(len(_templates(task, split)))]
 
 
 def part_name(link: str) -> str:
-    """What to call a part of furniture that is named as the builtin ones are.
+    """Return what to call a part of furniture that is named as the builtin ones are.
 
     ``door_left`` is the 'left door', as seen by who stands before it; ``freezer_door`` the 'freezer door'.
     """
@@ -152,54 +143,34 @@ def part_name(link: str) -> str:
 
 
 def could_mean(word: str, name: str) -> bool:
-    """Whether a word fits an object of that name: 'shampoo bottle' fits the 'white shampoo bottle'."""
+    """Return whether a word fits an object of that name: 'shampoo bottle' fits the 'white shampoo bottle'."""
     return set(word.lower().split()) <= set(name.lower().split())
 
 
 def is_plural(word: str) -> bool:
-    """Whether a thing is 'them': 'scissors', but not a 'pair of scissors'."""
+    """Return whether a thing is 'them': 'scissors', but not a 'pair of scissors'."""
     return word.partition(" of ")[0].split()[-1] in synonym_texts().plurals
 
 
-def _render(
-    task: str,
-    split: Split,
-    template_id: str,
-    template: str,
-    object_word: str,
-    support_word: str,
-    on: str,
-    phrase: str,
-    part: str,
-) -> Instruction:
-    slots = TASKS[task].slots
-    if phrase and "relation" not in slots:
-        what = f"the task {_with('relation')}, and no other, may have a relation"
-        raise RobocasError(what, where=task, found=repr(phrase))
-    if bool(part) != ("part" in slots):
-        found = repr(part) if part else "none"
-        raise RobocasError(f"the task {_with('part')}, and no other, needs a part", where=task, found=found)
-    text = template.format(
+def _render(slots: InstructionSlots, split: Split, index: int, words: tuple[str, str, str]) -> Instruction:
+    object_word, support_word, phrase = words
+    known = synonym_texts().supports.get(slots.support)
+    text = _templates(slots.task, split)[index].format(
         object=phrase.format(object=object_word) if phrase else object_word,
         support=support_word,
-        part=part,
+        part=slots.part,
         it="them" if is_plural(object_word) else "it",
-        on=on,
+        on="in" if known and known.inside else "on",
     )
-    return Instruction(text, template_id, split, object_word, support_word, phrase)
+    return Instruction(text, template_ids(slots.task, split)[index], split, *words)
 
 
-def _with(slot: str) -> str:
+def _templates(task: str, split: Split) -> Sequence[str]:
+    return Templates.for_task(TASKS.find(task)).of(split)
+
+
+def _tasks_with(slot: str) -> str:
     return ", ".join(name for name, spec in TASKS.items() if slot in spec.slots)
-
-
-def _on(support: str) -> str:
-    known = synonym_texts().supports.get(support)
-    return "in" if known and known.inside else "on"
-
-
-def _template_id(task: str, split: Split, index: int) -> str:
-    return f"{task}/{split}/{index:02d}"
 
 
 def _pick(options: Sequence[_T], draw: float) -> _T:

@@ -1,6 +1,7 @@
-"""The examples of docs/configuration.md do what the page says."""
+"""The examples of docs/configuration.md do what the page says, and its reference is that of the declared form."""
 
 import re
+import runpy
 import shlex
 from pathlib import Path
 
@@ -9,9 +10,11 @@ import pytest
 from robocas_ms3.cli.main import run
 from robocas_ms3.evaluation.freeze import read_plan
 from robocas_ms3.scenes.config import load_task_config
+from robocas_ms3.scenes.language.texts import synonym_texts
 
 ROOT = Path(__file__).resolve().parents[3]
 PAGE = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
+REFERENCE = runpy.run_path(str(ROOT / "scripts" / "configuration_reference.py"))["markdown"]()
 
 
 def blocks(language: str, heading: str) -> list[str]:
@@ -19,16 +22,10 @@ def blocks(language: str, heading: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```$", section, re.DOTALL | re.MULTILINE)
 
 
-@pytest.fixture
-def files(tmp_path, monkeypatch):
+def test_the_files_load(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for text in blocks("yaml", "Extending a configuration"):
-        name = text.splitlines()[0].removeprefix("# ")
-        (tmp_path / name).write_text(text)
-    return tmp_path
-
-
-def test_the_files_load(files):
+        (tmp_path / text.splitlines()[0].removeprefix("# ")).write_text(text)
     mine, shelf = load_task_config("mine.yaml"), load_task_config("on_the_shelf.yaml")
     assert (mine.objects.count, mine.layout.kind, mine.task) == (6, "orderly", "pick")
     assert list(shelf.furniture) == ["shelf", "side_table"]
@@ -36,7 +33,7 @@ def test_the_files_load(files):
     assert load_task_config("mine.yaml", changes={"objects": {"count": 8}}).objects.count == 8
 
 
-def test_the_commands_set_keys_that_there_are(files):
+def test_the_commands_set_keys_that_there_are():
     (text,) = blocks("", "Changing keys on the command line")
     for line in text.splitlines():
         words = shlex.split(line)[1:]
@@ -56,3 +53,28 @@ def test_the_message_is_the_one_of_the_page(capsys):
     command, said = text.splitlines()
     assert run(shlex.split(command)[2:]) == 1
     assert capsys.readouterr().err == f"{said}\n"
+
+
+def test_the_reference_is_that_of_the_declared_form():
+    assert PAGE.endswith(f"\n\n{REFERENCE}\n"), "run scripts/configuration_reference.py"
+    rows = [row.split(" | ") for row in REFERENCE.splitlines() if row.startswith("| `")]
+    assert [row for row in rows if not row[3].strip(" |") and row[0] != "| `kind`"] == []  # each key has a meaning
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        "| `task` | `pick`, `select`, `search`, `open_pick` | required |",
+        "| `drop_height` | number, above 0 and at most 1 | 0.3 | above the surface or heap, m |",
+        "| `min_xy` | 2 numbers, each -100 to 100 | none | a corner of the part, m; none: the whole surface |",
+        "| `ids` | list of strings or whole numbers or `all` | `all` |",
+        "| `furniture` | mapping: NAME to block | required | A piece of furniture. |",
+        "### `layout` (stacked)",
+    ],
+)
+def test_rows_say_type_range_and_default(row):
+    assert row in REFERENCE
+
+
+def test_the_supports_of_the_page_are_those_of_the_texts():
+    assert f"by alphabet: {', '.join(sorted(synonym_texts().supports))}." in " ".join(PAGE.split())

@@ -9,7 +9,7 @@ from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import ConfigError
 from robocas_ms3.evaluation.freeze import Plan
 from robocas_ms3.scenes.config import load_task_config
-from robocas_ms3.scenes.config.overrides import parse_override
+from robocas_ms3.scenes.config.compose import parse_override
 
 NAME = "pick_table_scattered"
 FILE_CHANGED = {"extends": NAME, "objects": {"count": 5, "repeats": True}}
@@ -22,13 +22,11 @@ FILE_CHANGED = {"extends": NAME, "objects": {"count": 5, "repeats": True}}
         ("support=a=b", {"support": "a=b"}),
         ("target.max_distance=3e-1", {"target": {"max_distance": 0.3}}),
         ("surface.min_xy=[1e-1, -2.5E+0]", {"surface": {"min_xy": [0.1, -2.5]}}),
-        ('support="12"', {"support": "12"}),
         ("support='1e5'", {"support": "1e5"}),
-        ("support=nan", {"support": "nan"}),
         ("support=1e5x", {"support": "1e5x"}),
+        ("support=nan", {"support": "nan"}),
         ("support=''", {"support": ""}),
         ("opening=~", {"opening": None}),
-        ("surface.min_xy=[0.0, -0.3]", {"surface": {"min_xy": [0.0, -0.3]}}),
         ("opening=null", {"opening": None}),
     ],
 )
@@ -36,20 +34,11 @@ def test_values_are_yaml_and_dots_separate_keys(text, nested):
     assert parse_override(text, ConfigError, "a=1") == nested
 
 
-@pytest.mark.parametrize(
-    "text", ["objects.count", "=3", "objects.=3", ".count=3", "a=[1", " a=1", "", "a=", "a=  ", "a=#3", "a=---"]
-)
+@pytest.mark.parametrize("text", ["objects.count", "=3", "objects.=3", ".count=3", "a=[1", " a=1", "", "a=", "a=#3"])
 def test_an_invalid_override_is_an_error(text):
     with pytest.raises(ConfigError) as caught:
         parse_override(text, ConfigError, "a=1")
     assert (caught.value.where, caught.value.found) == ("--set", text)
-
-
-def test_an_empty_value_is_no_null():
-    with pytest.raises(ConfigError) as caught:
-        load_task_config(NAME, overrides=["objects.count="])
-    assert "objects.count=null" in caught.value.fix
-    assert load_task_config(NAME, overrides=["objects.count=3", "objects.count=null"]).objects.count == 10
 
 
 def test_they_are_merged_over_a_file_in_their_order(tmp_path):
@@ -59,7 +48,11 @@ def test_they_are_merged_over_a_file_in_their_order(tmp_path):
     assert (config.objects.count, config.objects.repeats, config.layout.kind) == (7, True, "stacked")
     loaded = load_task_config(NAME)
     assert load_task_config(loaded, overrides=["objects.count=3"]).objects.count == 3
-    assert loaded.objects.count == 10
+    assert load_task_config(NAME, overrides=["objects.count=3", "objects.count=null"]) == loaded
+    plan = Plan.model_validate(
+        {"rules": {}, "parts": [{"config": NAME, "count": 1, "first_seed": 0, "change": {"objects": {"count": 3}}}]}
+    )
+    assert plan.parts[0].changed(["objects.count=4"]).objects.count == 4
 
 
 @pytest.mark.parametrize(
@@ -67,12 +60,9 @@ def test_they_are_merged_over_a_file_in_their_order(tmp_path):
     [
         ("objects.cout=3", ["'objects.cout'", "'count'", "Did you mean count?"]),
         ("objcts.count=3", ["'objcts'", "Did you mean objects?"]),
-        ("objects.count=ten", ["'objects.count'", "a whole number", "'ten'"]),
         ('objects.count="12"', ["'objects.count'", "a whole number", "'12'"]),
         ("target.max_distance=nan", ["'target.max_distance'", "'nan'"]),
-        ("objects.count=0", ["greater than or equal to 1"]),
         ("objects=3", ["'objects'", "a mapping"]),
-        ("robot_start=retst", ["'robot_start'", "'rest'"]),
         ("room=null", ["'room'", "this key"]),
         ("layout.kind=stackd", ["'layout.kind'", "Did you mean stacked?"]),
         ("furniture.tabel=null", ["furniture.tabel", "Did you mean table?"]),
@@ -96,9 +86,8 @@ def test_show_prints_a_resolved_configuration_that_loads_again(tmp_path, capsys)
     words = ["show", "select_shelf_orderly", "--set", "objects.count=12", "--set", "layout.copies=4", "--print-config"]
     assert run([*words, "--out", str(tmp_path / "out")]) == 0
     (tmp_path / "printed.yaml").write_text(capsys.readouterr().out)
-    printed = load_task_config(tmp_path / "printed.yaml")
     overrides = ("objects.count=12", "layout.copies=4")
-    assert printed == load_task_config("select_shelf_orderly", overrides=overrides)
+    assert load_task_config(tmp_path / "printed.yaml") == load_task_config("select_shelf_orderly", overrides=overrides)
     assert "extends" not in yaml.safe_load((tmp_path / "printed.yaml").read_text())
     assert not (tmp_path / "out").exists()
 
@@ -122,25 +111,8 @@ def test_commands_refuse_a_wrong_key_and_write_nothing(words, tmp_path, monkeypa
     assert [path.name for path in tmp_path.iterdir()] == ["plan.yaml"]
 
 
-def test_freeze_sets_them_after_the_changes_of_the_plan():
-    part = {"config": NAME, "count": 1, "first_seed": 0, "change": {"objects": {"count": 3, "repeats": True}}}
-    plan = Plan.model_validate({"rules": {}, "parts": [part]})
-    config = plan.parts[0].changed(["objects.count=4"])
-    assert (config.objects.count, config.objects.repeats) == (4, True)
-
-
 @pytest.mark.slow
-def test_layouts_are_those_of_the_resolved_configuration(tmp_path, capsys):
-    build = ["layouts", "build", NAME, "--seeds", "0:1", "--jobs", "1", "--out", str(tmp_path)]
-    assert run(build) == 0
-    assert run([*build, "--set", "objects.count=4"]) == 0
-    assert run([*build, "--set", "objects.count=10"]) == 0  # as the file has it: the same cache
-    found = [json.loads(path.read_text()) for path in tmp_path.glob("*/*.json")]
-    assert sorted(about["config"]["objects"]["count"] for about in found) == [4, 10]
-
-
-@pytest.mark.slow
-def test_a_recording_has_the_resolved_configuration_and_resumes_with_no_other(tmp_path, capsys):
+def test_a_recording_has_the_resolved_configuration_and_continues_with_no_other(tmp_path, capsys):
     out = tmp_path / "out"
     words = ["generate", "pick", "-n", "1", "--out", str(out), "--replay-rate", "0", "--set"]
     assert run([*words, "objects.count=3"]) == 0
@@ -151,7 +123,6 @@ def test_a_recording_has_the_resolved_configuration_and_resumes_with_no_other(tm
     before = {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()}
     capsys.readouterr()
     assert run([*words, "objects.count=4"]) == 1
-    said = capsys.readouterr().err
-    assert "settings.config.objects.count: 3 -> 4" in said
+    assert "settings.config.objects.count: 3 -> 4" in capsys.readouterr().err
     assert {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()} == before
     assert run([*words, "objects.count=3"]) == 0

@@ -8,12 +8,9 @@ from robocas_ms3.scenes.config import load_task_config, shipped_configs
 TEMPLATES = [name for name in shipped_configs() if "partnet" in name]
 
 
-def test_there_are_templates():
-    assert len(TEMPLATES) >= 2
-
-
 @pytest.mark.parametrize("name", TEMPLATES)
 def test_surfaces_handles_and_joints_are_annotated(name):
+    assert "import-partnet" in shipped_configs()[name].read_text(encoding="utf-8")
     config = load_task_config(name)
     for key, item in config.furniture.items():
         pack, _, model = item.asset.rpartition("/")
@@ -27,9 +24,3 @@ def test_surfaces_handles_and_joints_are_annotated(name):
             assert all(a <= b for a, b in zip(high, surface.max_xy, strict=True))
         if config.opening and config.opening.furniture == key:
             assert config.opening.handle in annotation.handles
-
-
-@pytest.mark.parametrize("name", TEMPLATES)
-def test_the_file_says_which_import_it_needs(name):
-    text = shipped_configs()[name].read_text(encoding="utf-8")
-    assert "import-partnet" in text

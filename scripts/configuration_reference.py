@@ -1,12 +1,14 @@
-"""The reference of all keys of a task configuration, from the declared form; docs/configuration.md holds it."""
+"""Write the reference of all keys of a task configuration to the end of docs/configuration.md."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from robocas_ms3.scenes.config.compose import EXTENDS
 from robocas_ms3.scenes.config.task import TaskConfig
 
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "configuration.md"
 _HEAD = "| key | type and range | default | meaning |\n|---|---|---|---|\n"
 _ONE = {"string": "string", "integer": "whole number", "number": "number", "boolean": "true or false"}
 _MANY = {"string": "strings", "integer": "whole numbers", "number": "numbers"}
@@ -31,18 +33,6 @@ def markdown() -> str:
         rows = rows if name else [_EXTENDS, *rows]
         sections.append(f"### {title}\n\n{_about(block)}\n\n{_HEAD}" + "\n".join(rows))
     return "\n\n".join(sections)
-
-
-def undescribed() -> list[str]:
-    """Keys whose meaning is not declared, as ``Model.key``; none where their names and types say it all."""
-    schema = TaskConfig.model_json_schema()
-    blocks = {"TaskConfig": schema, **schema["$defs"]}
-    return [
-        f"{name}.{key}"
-        for name, block in blocks.items()
-        for key, field in block["properties"].items()
-        if not field.get("description") and not _references(field) and "const" not in field
-    ]
 
 
 def _collect(schema: Schema, block: Schema, path: str, places: dict[str, list[str]]) -> None:
@@ -131,3 +121,8 @@ def _limits(field: Schema, each: str = "") -> str:
         return f", {each}{found['minimum']:g} to {found['maximum']:g}"
     said = " and ".join(f"{words[key]} {value:g}" for key, value in found.items())
     return f", {each}{said}" if said else ""
+
+
+if __name__ == "__main__":
+    text = PAGE.read_text(encoding="utf-8")
+    PAGE.write_text(f"{text[: text.index('### The file')]}{markdown()}\n", encoding="utf-8")
