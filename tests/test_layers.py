@@ -42,7 +42,6 @@ SIMULATOR_FREE = (
     "tasks.rewards",
     "datasets.schema",
     "evaluation.statistics",
-    "evaluation.power",
     "evaluation.remote",
     "planning.protocol",
     "scenes.language",

@@ -4,80 +4,80 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
-    Field,
-    NonNegativeInt,
-    ValidationError,
-    ValidatorFunctionWrapHandler,
-    WrapValidator,
-)
+from pydantic import Field
 
-from robocas_ms3.core.strict import mistakes
-from robocas_ms3.core.words import printable
-from robocas_ms3.evaluation.protocol import Episode
-from robocas_ms3.scenes.task_specs import STAGES as STAGES_ON_THE_WAY
-from robocas_ms3.scenes.task_specs import TASKS
-
-if TYPE_CHECKING:
-    from robocas_ms3.evaluation.rollout import Rollout  # which imports the tasks; results are read without
+from robocas_ms3.scenes.task_specs import STAGES as DEFAULT_STAGES
 
 # evaluation_v0.md and the paper's table: reach, pick, recognise, clear
 STAGES = {"RA": "reached_any", "PA": "picked_any", "RR": "reached_target", "CO": "obstacles_cleared"}
 
-
-def _as_written(value: Any, check: ValidatorFunctionWrapHandler) -> Any:
-    check(value)
-    return value
-
-
-Number = Annotated[float, Field(ge=-1e12, le=1e12), WrapValidator(_as_written)]
-"""Whole if the file has it whole: what is written again says the same."""
-Measure = Annotated[float, Field(ge=0, le=1e12), WrapValidator(_as_written)]
+Measure = Annotated[int | float, Field(ge=0, le=1e12)]  # whole if the file has it whole, so that it is written the same
+Fraction = Annotated[int | float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=0, le=10**12)]
 
 
-class _Move(BaseModel):
-    model_config = ConfigDict(strict=True, extra="allow")
+@dataclass(frozen=True)
+class Move:
+    """An object that was moved before the target: at which policy step, and whether it had to be and came in order."""
 
     object: str
-    step: NonNegativeInt
+    step: Count
     needed: bool
     in_order: bool
 
 
-class _Order(BaseModel):
-    model_config = ConfigDict(strict=True, extra="allow")
+@dataclass(frozen=True)
+class Retrieval:
+    """The order in which objects were moved before the target of a heap.
 
-    moved: list[_Move]
-    needed: list[str]
-    left: NonNegativeInt
-    score: Annotated[float, Field(ge=0, le=1)] | None
-
-
-def check_order(order: dict[str, Any]) -> dict[str, Any]:
-    """Return what `retrieval_order` returned, as it is.
-
-    Raises:
-        ValueError: a key is missing, or a value is of another type or out of range.
+    Attributes:
+        moved: by step.
+        needed: ids of the objects that had to be moved (`metrics.RetrievalOrder`).
+        left: number of needed objects that had not been moved when the target was taken from a heap that was not
+            cleared.
+        score: share of the objects moved or left that were needed and moved in order; 1 if there are none; None if the
+            target was never held.
     """
-    try:
-        _Order.model_validate(order)
-    except ValidationError as error:
-        wrong = mistakes(error, _Order)[0]
-        raise ValueError(f"{wrong.what}, expected {wrong.expected}, found {wrong.found}") from error
-    return order
+
+    moved: list[Move]
+    needed: list[str]
+    left: Count
+    score: Fraction | None
+
+    @classmethod
+    def of(
+        cls, record: NDArray[np.integer], objects: Sequence[str], held_at: int | None, *, cleared: bool
+    ) -> Retrieval:
+        """Make it from a record of an episode.
+
+        Args:
+            record: (K, 3) of `metrics.RetrievalOrder.read`.
+            objects: ids by slot.
+            held_at: policy step after which the target was first held; None: never.
+            cleared: whether the obstacles had been cleared before.
+        """
+        slots = [slot for slot in np.argsort(record[:, 0], kind="stable").tolist() if record[slot, 0]]
+        moved = [Move(objects[slot], int(record[slot, 0]), *(bool(x) for x in record[slot, 1:])) for slot in slots]
+        left = 0 if cleared or held_at is None else int(((record[:, 0] == 0) & (record[:, 1] == 1)).sum())
+        needed = [objects[slot] for slot in np.flatnonzero(record[:, 1]).tolist()]
+        return cls(moved, needed, left, score_of(moved, left, held_at))
+
+
+def score_of(moved: Sequence[Move], left: int, held_at: int | None) -> float | None:
+    """Return `Retrieval.score`."""
+    if held_at is None:
+        return None
+    right, total = sum(move.needed and move.in_order for move in moved), len(moved) + left
+    return round(right / total, 4) if total else 1.0
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of an episode.
+    """The outcome of an episode: a line of ``episodes.jsonl``.
 
     Attributes:
         episode: its number in the protocol.
@@ -85,19 +85,19 @@ class Outcome:
         config: name of its configuration.
         seed: of its scene.
         split: of the protocol.
-        success: the task had succeeded at some moment.
-        success_at_end: it had at the last one.
-        success_v0: upstream's rule held at the last one; never where there is no basket.
+        success: whether the task succeeded at some step.
+        success_at_end: whether it succeeded at the last step.
+        success_v0: whether RoboCAS-v0's rule held at the last step; never without a basket.
         steps: policy steps.
-        seconds: of the scene.
-        failure_stage: see `failure_stage`; empty: it succeeded.
-        error: why.
+        seconds: simulated time.
+        failure_stage: see `failure_stage`; empty: success.
+        error: why it was ended early; empty: it was not.
         flags: by stage or rule, the policy step after which it first held.
-        flag_seconds: the same in s of the scene.
+        flag_seconds: the same in s of simulated time.
         measures: ``path_length`` m, ``contact_impulse`` N s, ``disturbed_most``, ``fallen``; ``welds`` with the weld.
-        inference_ms: clock time of the policy a step.
-        p_vis: share of the target that is seen from above.
-        retrieval: in tasks with obstacles to clear: what was moved before the target, see `retrieval_order`.
+        inference_ms: clock time of the policy per step.
+        p_vis: share of the target that is visible from above.
+        retrieval: in tasks with obstacles to clear, the order in which objects were moved.
     """
 
     episode: Count
@@ -114,109 +114,46 @@ class Outcome:
     error: str = ""
     flags: dict[str, Count | None] = field(default_factory=dict)
     flag_seconds: dict[str, Measure | None] = field(default_factory=dict)
-    measures: dict[str, Number] = field(default_factory=dict)
+    measures: dict[str, Measure] = field(default_factory=dict)
     inference_ms: Measure = 0.0
-    p_vis: Annotated[float, Field(ge=0, le=1), WrapValidator(_as_written)] | None = None
-    retrieval: Annotated[dict[str, Any], AfterValidator(check_order)] | None = None
-
-    @classmethod
-    def of(cls, played: Rollout, episode: Episode, objects: Sequence[str]) -> Outcome:
-        """What is kept of an episode that was played, with objects of these ids."""
-        flags, held_at, order = played.flags, played.flags.get("target_grasped"), None
-        if played.retrieval is not None:
-            cleared = flags.get("obstacles_cleared") is not None
-            order = retrieval_order(played.retrieval, objects, held_at, cleared=cleared)
-        return cls(
-            episode=episode.episode,
-            task=episode.task,
-            config=episode.config,
-            seed=episode.seed,
-            split=episode.split,
-            success=flags.get("success") is not None,
-            success_at_end=played.at_end.get("success", False),
-            success_v0=played.at_end.get("success_v0", False),
-            steps=played.steps,
-            seconds=round(played.seconds, 4),
-            failure_stage=failure_stage(flags, played.error, TASKS[episode.task].stages),
-            error=printable(played.error),  # a text of whoever wrote the policy
-            flags=flags,
-            flag_seconds=played.flag_seconds,
-            measures=played.measures,
-            inference_ms=round(1000 * played.inference_seconds / max(played.steps, 1), 3),
-            p_vis=episode.p_vis,
-            retrieval=order,
-        )
+    p_vis: Fraction | None = None
+    retrieval: Retrieval | None = None
 
     def without_clock(self) -> dict[str, Any]:
-        """All but what a clock said: the same for the same seed and policy."""
+        """Return the values that are the same for the same seed and policy."""
         return {name: value for name, value in asdict(self).items() if name != "inference_ms"}
 
 
-def failure_stage(flags: dict[str, int | None], error: str = "", order: Sequence[str] = STAGES_ON_THE_WAY) -> str:
-    """The stage an episode did not come to, next after the furthest that it did come to.
+def failure_stage(flags: dict[str, int | None], error: str = "", order: Sequence[str] = DEFAULT_STAGES) -> str:
+    """Return the first stage that an episode did not reach after the furthest one that it reached.
 
-    A target that is pulled out of its heap was reached though its obstacles were never cleared, so stages that were
-    left out on the way do not count. ``placed``: it came to all of them, as when the target was lifted; ``error``: the
-    episode was broken off; empty: success.
+    Stages that were skipped do not count: a target can be pulled out of a heap that was never cleared. ``placed``: it
+    reached all of them, but did not succeed; ``error``: it was ended by an error; empty: success.
 
     Args:
-        flags: by stage, when it was come to; stages that are not there are not the environment's.
-        error: that broke the episode off.
-        order: of the stages, a task's (`TaskSpec.stages`).
+        flags: by stage, the step at which it was reached; stages that are missing do not exist in the environment.
+        error: that ended the episode.
+        order: of the stages (`TaskSpec.stages`).
     """
     if error:
         return "error"
     if flags.get("success") is not None:
         return ""
     stages = [stage for stage in order if stage in flags]
-    came = [number for number, stage in enumerate(stages) if flags[stage] is not None]
-    following = came[-1] + 1 if came else 0
+    reached = [number for number, stage in enumerate(stages) if flags[stage] is not None]
+    following = reached[-1] + 1 if reached else 0
     return stages[following] if following < len(stages) else "placed"
 
 
-def retrieval_order(
-    kept: NDArray[np.integer], objects: Sequence[str], held_at: int | None, *, cleared: bool
-) -> dict[str, Any]:
-    """What a result says of an episode's order.
-
-    Args:
-        kept: (K, 3) of `metrics.RetrievalOrder.read`.
-        objects: ids by slot.
-        held_at: policy step after which the target was first held; None: it never was.
-        cleared: whether the obstacles had been cleared before.
-
-    Returns:
-        ``moved``, what was moved before the target: ``object``, ``step``, ``needed``, ``in_order`` each, by step;
-        ``needed``: ids; ``left``: how many of these had not been moved when the target was taken from a heap that was
-        not cleared; ``score``: how many were needed and moved in order, of all that were moved or left; 1 where nothing
-        was; None where the target was never held.
-    """
-    order = [slot for slot in np.argsort(kept[:, 0], kind="stable").tolist() if kept[slot, 0]]
-    moved = [
-        {
-            "object": objects[slot],
-            "step": int(kept[slot, 0]),
-            "needed": bool(kept[slot, 1]),
-            "in_order": bool(kept[slot, 2]),
-        }
-        for slot in order
-    ]
-    left = 0 if cleared or held_at is None else int(((kept[:, 0] == 0) & (kept[:, 1] == 1)).sum())
-    right, of = int(kept[:, 2].sum()), len(moved) + left
-    score = None if held_at is None else 1.0 if of == 0 else round(right / of, 4)
-    wanted = [objects[slot] for slot in np.flatnonzero(kept[:, 1]).tolist()]
-    return {"moved": moved, "needed": wanted, "left": left, "score": score}
-
-
 class RetrievalSummary(NamedTuple):
-    """Of several episodes, those in which the target was held.
+    """Summary of the episodes in which the target was held.
 
     Attributes:
-        held: how many these are.
-        score: mean of theirs.
+        held: number of episodes.
+        score: mean score.
         moved: mean number of objects moved before the target.
         needed: share of these that were needed.
-        left: mean number that was left in the way.
+        left: mean number of objects left in the way.
     """
 
     held: int
@@ -226,16 +163,16 @@ class RetrievalSummary(NamedTuple):
     left: float
 
 
-def summarize_retrieval(found: Iterable[dict[str, Any] | None]) -> RetrievalSummary | None:
-    """Sum up `retrieval_order` several episodes; None: the target was held in none."""
-    held = [one for one in found if one is not None and one["score"] is not None]
-    if not held:
+def summarize_retrieval(orders: Iterable[Retrieval | None]) -> RetrievalSummary | None:
+    """Return the summary of several episodes; None if the target was held in none."""
+    scored = [(order, order.score) for order in orders if order is not None and order.score is not None]
+    if not scored:
         return None
-    moved = [move for one in held for move in one["moved"]]
+    moved, count = [move for order, _ in scored for move in order.moved], len(scored)
     return RetrievalSummary(
-        held=len(held),
-        score=sum(one["score"] for one in held) / len(held),
-        moved=len(moved) / len(held),
-        needed=sum(move["needed"] for move in moved) / max(len(moved), 1),
-        left=sum(one["left"] for one in held) / len(held),
+        held=count,
+        score=sum(score for _, score in scored) / count,
+        moved=len(moved) / count,
+        needed=sum(move.needed for move in moved) / max(len(moved), 1),
+        left=sum(order.left for order, _ in scored) / count,
     )

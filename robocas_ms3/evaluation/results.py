@@ -1,9 +1,9 @@
-"""What came of an evaluation: a line an episode, appended as it ends, and what it was measured with beside it.
+"""Results of evaluations: one line per episode, appended as it ends, and a record of what was measured.
 
 ::
 
-    run.json            protocol and its hash, policy, versions, backend, packs, machine
-    episodes.jsonl      an `Outcome` a line, in any order; a line that a kill left half-written is dropped
+    run.json            protocol and its hash, policy, versions, backend, packs, machine (`RunRecord`)
+    episodes.jsonl      an `Outcome` per line, in any order; a line that a kill left half-written is dropped
 
 Parts of a result, such as shards, are read as one (`read`) or written as one (`merge`).
 """
@@ -23,7 +23,7 @@ from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.files import json_text, replacing_folder, write_json
 from robocas_ms3.core.ledger import Ledger
-from robocas_ms3.core.outputs import FolderKind, OutputFolder, check_replaceable
+from robocas_ms3.core.outputs import FolderKind, OutputFolder, check_replaceable, setting_changes
 from robocas_ms3.core.strict import parse, parse_json
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.statistics import Share, share
@@ -34,7 +34,7 @@ _NO_RESULT = "no result of an evaluation"
 
 
 class PolicyRecord(BaseModel):
-    """What a result says about its policy. A policy adds entries of its own (`policy.describe`).
+    """The policy of a result. A policy adds entries of its own (`policy.describe`).
 
     Attributes:
         name: as the user gave it.
@@ -47,15 +47,6 @@ class PolicyRecord(BaseModel):
     name: str
     wants: dict[str, Any] = {}
     server: dict[str, Any] | None = None
-
-    def entries(self) -> dict[str, Any]:
-        """Return its values in the form of the file."""
-        return self.model_dump(exclude_unset=True)
-
-    def identity(self) -> dict[str, Any]:
-        """Return what tells it from another policy: of one behind a server, the description instead of the address."""
-        known = self.server and self.name.startswith(("ws://", "wss://"))
-        return {key: value for key, value in self.entries().items() if key != "name" or not known}
 
 
 class PartRecord(BaseModel):
@@ -83,46 +74,74 @@ class RunRecord(BaseModel):
     machine: dict[str, Any] | None = None
     parts: list[PartRecord] = []
 
+    @classmethod
+    def of(cls, values: dict[str, Any], where: object) -> RunRecord:
+        """Return the record of these values, which can be written and read back.
+
+        Args:
+            values: of the record.
+            where: for error messages.
+
+        Raises:
+            EvaluationError: a value is missing or wrong, or could not be read back, such as NaN.
+        """
+        text = json_text(values, where, error=EvaluationError)
+        return parse_json(cls, text, EvaluationError, where=where, about="this evaluation can't be recorded")
+
     def entries(self) -> dict[str, Any]:
         """Return its values in the form of the file."""
         return self.model_dump(exclude_unset=True)
 
     def identity(self) -> dict[str, Any]:
-        """Return the values that have to match in the parts of one result, and to continue it."""
+        """Return the values that match in the parts of one result; a server's policy counts, not its address."""
+        policy = self.policy.model_dump(exclude_unset=True)
+        if self.policy.server and self.policy.name.startswith(("ws://", "wss://")):
+            del policy["name"]
         names = ("protocol", "protocol_hash", "weld", "backend", "versions", "pack_hashes")
-        return {"policy": self.policy.identity(), **{name: getattr(self, name) for name in names}}
+        return {"policy": policy, **{name: getattr(self, name) for name in names}}
+
+    def settings(self) -> dict[str, Any]:
+        """Return the values that have to match to continue a result."""
+        return {**self.identity(), "machine": self.machine}
+
+
+def _recorded_settings(values: dict[str, Any]) -> dict[str, Any]:
+    return parse(RunRecord, values, EvaluationError, where=RUN, about=_NO_RESULT).settings()
+
+
+OUTPUT = FolderKind("robocas eval", (RUN,), "protocol_hash", upgrade=_recorded_settings)
 
 
 @dataclass(frozen=True)
 class Result:
-    """A folder that was written, or several that are parts of one result.
+    """A result that was read.
 
     Attributes:
-        folder: where it is; of several, the first one.
-        run: what it was measured with; of several, the first one's, with their ``parts``.
-        outcomes: by episode's number, in its order.
+        folder: of the result; of several parts, the first one.
+        run: what it was measured with; of several parts, the first one's record, with their ``parts``.
+        outcomes: by number of the episode, in its order.
     """
 
     folder: Path
     run: RunRecord
     outcomes: dict[int, Outcome]
 
-    def rate(self, what: str = "success", outcomes: Iterable[Outcome] | None = None) -> Share:
-        """How many episodes a flag ever held in, of all or some (one at least), with its interval."""
+    def rate(self, name: str = "success", outcomes: Iterable[Outcome] | None = None) -> Share:
+        """Return the share of episodes in which a flag ever held, of all or of some (at least one)."""
         chosen = list(self.outcomes.values() if outcomes is None else outcomes)
-        held = [getattr(one, what) if hasattr(one, what) else one.flags.get(what) is not None for one in chosen]
+        held = [getattr(one, name) if hasattr(one, name) else one.flags.get(name) is not None for one in chosen]
         return share(sum(held), len(held))
 
     def repeats(self) -> bool:
-        """Whether a scene may be there several times, in several splits: then its episodes must not be pooled."""
+        """Return whether a scene occurs several times, as in several splits: then episodes must not be pooled."""
         return len({(one.task, one.seed) for one in self.outcomes.values()}) < len(self.outcomes)
 
     def broken_off(self) -> int:
-        """How many episodes an error ended."""
+        """Return the number of episodes that an error ended."""
         return sum(bool(one.error) for one in self.outcomes.values())
 
     def by(self, name: str) -> dict[str, list[Outcome]]:
-        """Its outcomes by one of their attributes, such as ``config``; sorted, but splits as the protocol has them."""
+        """Return the outcomes by an attribute such as ``config``, sorted; splits in the protocol's order."""
         found: dict[str, list[Outcome]] = {}
         for outcome in self.outcomes.values():
             found.setdefault(getattr(outcome, name), []).append(outcome)
@@ -139,7 +158,7 @@ def open_result(
         folder: of the result.
         run: what it is measured with.
         overwrite: start again.
-        retry_errors: drop episodes that an error broke off, so that they are played again.
+        retry_errors: drop episodes that an error ended, so that they run again.
 
     Yields:
         The outcomes that exist, by number of the episode.
@@ -148,7 +167,7 @@ def open_result(
         OutputExistsError: it was measured with something else, or the folder is not of an evaluation.
         RobocasError: another process writes there; or somebody removed the folder.
     """
-    with OutputFolder(folder, OUTPUT, _settings_of(run), overwrite=overwrite) as output:
+    with OutputFolder(folder, OUTPUT, run.settings(), overwrite=overwrite) as output:
         output.start(output.recorded or run.entries())
         outcomes = _outcomes(folder)
         if retry_errors and any(one.error for one in outcomes.values()):
@@ -157,43 +176,25 @@ def open_result(
         yield outcomes
 
 
-def run_record(values: dict[str, Any], where: object) -> RunRecord:
-    """Return the record of an evaluation.
-
-    Args:
-        values: of the record.
-        where: for error messages.
-
-    Raises:
-        EvaluationError: a value is missing or wrong, or could not be read back, such as NaN.
-    """
-    text = json_text(values, where, error=EvaluationError)
-    return parse_json(RunRecord, text, EvaluationError, where=where, about="this evaluation can't be recorded")
-
-
 def append(folder: Path, outcome: Outcome) -> None:
     """Add an episode; on the disk when this returns."""
     _ledger(folder).append([outcome], sync=True)
 
 
 def read(*folders: Path) -> Result:
-    """Read a result, or parts of one, in which an episode may be more than once if the outcome is the same.
+    """Read a result, or parts of one, which may share episodes if their outcomes are the same.
 
     Raises:
         EvaluationError: there is none, the parts were measured with different things, or they disagree.
     """
     parts = [_read(folder) for folder in folders]
-    first = parts[0]
-    outcomes: dict[int, Outcome] = {}
+    first, outcomes = parts[0], dict[int, Outcome]()
     for part in parts:
-        expected, found = _differing(first.run.identity(), part.run.identity())
-        if expected != found:
-            key = next(iter(found))
+        expected, found = first.run.identity(), part.run.identity()
+        if key := next((key for key in found if expected[key] != found[key]), ""):
+            changes = "; ".join(setting_changes(expected[key], found[key], key))
             raise EvaluationError(
-                f"no part of one result with {first.folder}: another {key}",
-                where=part.folder,
-                expected=expected[key],
-                found=found[key],
+                f"no part of one result with {first.folder}: another {key}", where=part.folder, found=changes
             )
         for outcome in part.outcomes.values():
             _add(outcomes, outcome, str(part.folder))
@@ -207,19 +208,19 @@ def read(*folders: Path) -> Result:
 
 
 def parts_of(folders: Iterable[Path]) -> list[list[Path]]:
-    """Folders that `read` takes together: measured with the same, and of other episodes than those before."""
-    found: list[tuple[dict[str, Any], set[int], list[Path]]] = []
+    """Group folders that `read` takes together: measured with the same, and of other episodes than those before."""
+    groups: list[tuple[dict[str, Any], set[int], list[Path]]] = []
     for folder in folders:
         part = _read(folder)
         key = part.run.identity()
-        for other, episodes, group in found:
+        for other, episodes, group in groups:
             if other == key and not episodes & part.outcomes.keys():
                 group.append(folder)
                 episodes.update(part.outcomes)
                 break
         else:
-            found.append((key, set(part.outcomes), [folder]))
-    return [group for _, _, group in found]
+            groups.append((key, set(part.outcomes), [folder]))
+    return [group for _, _, group in groups]
 
 
 def merge(folders: Sequence[Path], out: Path) -> Result:
@@ -238,20 +239,8 @@ def merge(folders: Sequence[Path], out: Path) -> Result:
 
 
 def versions() -> dict[str, str]:
-    """Of the packages that a score hangs on."""
+    """Return the versions of the packages that a score depends on."""
     return {name: version(name) for name in _PACKAGES}
-
-
-def _settings_of(run: RunRecord) -> dict[str, Any]:
-    """Return what has to match to continue a result."""
-    return {**run.identity(), "machine": run.machine}
-
-
-def _recorded_settings(values: dict[str, Any]) -> dict[str, Any]:
-    return _settings_of(parse(RunRecord, values, EvaluationError, where=RUN, about=_NO_RESULT))
-
-
-OUTPUT = FolderKind("robocas eval", (RUN,), "protocol_hash", upgrade=_recorded_settings)
 
 
 def _ledger(folder: Path) -> Ledger[Outcome]:
@@ -259,24 +248,16 @@ def _ledger(folder: Path) -> Ledger[Outcome]:
 
 
 def _read(folder: Path) -> Result:
-    run = _read_run(folder)
     try:
-        outcomes = dict(sorted(_outcomes(folder).items()))
+        record = load_json(folder / RUN)
+        run = parse(RunRecord, record, EvaluationError, where=folder / RUN, about=_NO_RESULT)
+        return Result(folder, run, dict(sorted(_outcomes(folder).items())))
     except (OSError, ValueError) as error:
         raise EvaluationError(_NO_RESULT, where=folder, found=error) from error
-    return Result(folder, run, outcomes)
-
-
-def _read_run(folder: Path) -> RunRecord:
-    try:
-        run = load_json(folder / RUN)
-    except (OSError, ValueError) as error:
-        raise EvaluationError(_NO_RESULT, where=folder, found=error) from error
-    return parse(RunRecord, run, EvaluationError, where=folder / RUN, about=_NO_RESULT)
 
 
 def _outcomes(folder: Path) -> dict[int, Outcome]:
-    """Those of a run that may be at it, or was killed."""
+    """Return the outcomes of a result, which a run may be writing."""
     ledger, found = _ledger(folder), dict[int, Outcome]()
     for line in ledger.lines():
         if line.record is not None:
@@ -287,18 +268,9 @@ def _outcomes(folder: Path) -> dict[int, Outcome]:
 
 
 def _add(outcomes: dict[int, Outcome], outcome: Outcome, where: str) -> None:
-    """Add an episode, which may be there already if the same came of it."""
-    before = outcomes.setdefault(outcome.episode, outcome)
-    one, other = before.without_clock(), outcome.without_clock()
-    if one != other:
-        expected, found = _differing(one, other)
+    """Add an episode, which may exist already with the same outcome."""
+    before = outcomes.setdefault(outcome.episode, outcome).without_clock()
+    now = outcome.without_clock()
+    if changes := [change for key in now for change in setting_changes(before[key], now[key], key)]:
         what = f"two outcomes of episode {outcome.episode} disagree"
-        raise EvaluationError(what, where=where, expected=expected, found=found)
-
-
-def _differing(one: Any, other: Any) -> tuple[Any, Any]:
-    """What of two values differs: of dictionaries only the entries that do."""
-    if not (isinstance(one, dict) and isinstance(other, dict)):
-        return one, other
-    both = {key: _differing(one.get(key), other.get(key)) for key in {**one, **other} if one.get(key) != other.get(key)}
-    return {key: a for key, (a, _) in both.items()}, {key: b for key, (_, b) in both.items()}
+        raise EvaluationError(what, where=where, found="; ".join(changes))

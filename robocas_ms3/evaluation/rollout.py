@@ -11,10 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import EvaluationError, PolicyFailed
+from robocas_ms3.core.words import printable
 from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.metrics import MEASURES, read_sum
+from robocas_ms3.evaluation.outcomes import Outcome, Retrieval, failure_stage
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, Policy, PolicySpec, policy_code, privileged
+from robocas_ms3.evaluation.protocol import Episode
 from robocas_ms3.scenes.language.embed import TextEmbedder
+from robocas_ms3.scenes.task_specs import TASKS
 
 NOT_FINITE = "the policy's action is not finite"
 _WELDS = "welds"  # of `weld`, where there is one
@@ -47,6 +51,33 @@ class Rollout:
     retrieval: NDArray[np.integer] | None = None
     inference_seconds: float = 0.0
     error: str = ""
+
+    def outcome(self, episode: Episode, objects: Sequence[str]) -> Outcome:
+        """Return the outcome of the episode, in which objects have these ids by slot."""
+        flags, order = self.flags, None
+        if self.retrieval is not None:
+            cleared = flags.get("obstacles_cleared") is not None
+            order = Retrieval.of(self.retrieval, objects, flags.get("target_grasped"), cleared=cleared)
+        return Outcome(
+            episode=episode.episode,
+            task=episode.task,
+            config=episode.config,
+            seed=episode.seed,
+            split=episode.split,
+            success=flags.get("success") is not None,
+            success_at_end=self.at_end.get("success", False),
+            success_v0=self.at_end.get("success_v0", False),
+            steps=self.steps,
+            seconds=round(self.seconds, 4),
+            failure_stage=failure_stage(flags, self.error, TASKS[episode.task].stages),
+            error=printable(self.error),  # a text of the policy's code
+            flags=flags,
+            flag_seconds=self.flag_seconds,
+            measures=self.measures,
+            inference_ms=round(1000 * self.inference_seconds / max(self.steps, 1), 3),
+            p_vis=episode.p_vis,
+            retrieval=order,
+        )
 
 
 @dataclass(frozen=True)

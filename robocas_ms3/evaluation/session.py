@@ -252,7 +252,7 @@ class EvaluationSession:
 
     def _outcome(self, ended: Rollout, episode: Episode) -> Outcome:
         layouts = FrozenLayouts(self.protocol.layouts_file(episode.config), self._objects)
-        return Outcome.of(ended, episode, layouts(episode.seed, episode.seed).object_ids)
+        return ended.outcome(episode, layouts(episode.seed, episode.seed).object_ids)
 
     def _make_env(self, episode: Episode, num_envs: int) -> Any:
         rules, settings = self.protocol.rules, self.settings
@@ -300,7 +300,7 @@ class EvaluationSession:
             "pack_hashes": {rules.pack: pack},
             "machine": {"processor": platform.machine(), "python": platform.python_version()},
         }
-        return results.run_record(values, f"policy {name}")
+        return results.RunRecord.of(values, f"policy {name}")
 
 
 def evaluate(

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from robocas_ms3.evaluation.metrics import RetrievalOrder, needed
-from robocas_ms3.evaluation.outcomes import retrieval_order, summarize_retrieval
+from robocas_ms3.evaluation.outcomes import Retrieval, summarize_retrieval
 
 TARGET, LID, CUP, PEAR = range(4)
 NAMES = ("target", "lid", "cup", "pear")
@@ -59,10 +59,10 @@ def test_what_lies_on_what_lies_on_the_target_is_needed():
 def test_from_the_top_down():
     kept = kept_of({CUP: 10, LID: 60, PEAR: 81})
     assert kept.tolist() == [[0, 0, 0], [30, 1, 1], [5, 1, 1], [41, 0, 0]]
-    found = retrieval_order(kept, NAMES, held_at=90, cleared=True)
-    assert [move["object"] for move in found["moved"]] == ["cup", "lid", "pear"]
-    assert [move["needed"] for move in found["moved"]] == [True, True, False]
-    assert (found["needed"], found["left"], found["score"]) == (["lid", "cup"], 0, 0.6667)
+    found = Retrieval.of(kept, NAMES, held_at=90, cleared=True)
+    assert [move.object for move in found.moved] == ["cup", "lid", "pear"]
+    assert [move.needed for move in found.moved] == [True, True, False]
+    assert (found.needed, found.left, found.score) == (["lid", "cup"], 0, 0.6667)
 
 
 @pytest.mark.parametrize(("cup", "in_order"), [(40, True), (41, False)])
@@ -72,9 +72,9 @@ def test_what_is_pushed_as_one_moves_within_a_second(cup, in_order):
 
 def test_from_below_or_not_at_all():
     assert kept_of({LID: 20}).tolist()[LID] == [10, 1, 0]
-    found = retrieval_order(kept_of({LID: 20}), NAMES, held_at=50, cleared=False)
-    assert (found["left"], found["score"]) == (1, 0.0)
-    assert retrieval_order(kept_of({LID: 20}), NAMES, held_at=50, cleared=True)["left"] == 0
+    found = Retrieval.of(kept_of({LID: 20}), NAMES, held_at=50, cleared=False)
+    assert (found.left, found.score) == (1, 0.0)
+    assert Retrieval.of(kept_of({LID: 20}), NAMES, held_at=50, cleared=True).left == 0
 
 
 def test_the_target_lies_over_nothing_that_waits_for_it(monkeypatch):
@@ -82,8 +82,8 @@ def test_the_target_lies_over_nothing_that_waits_for_it(monkeypatch):
     over = OVER.clone()
     over[0, TARGET, LID] = 0.4
     monkeypatch.setattr(Heap, "covering", lambda self, envs: over)
-    found = retrieval_order(kept_of({CUP: 10, LID: 60}), NAMES, held_at=50, cleared=True)
-    assert (found["needed"], found["left"], found["score"]) == (["lid", "cup"], 0, 1.0)
+    found = Retrieval.of(kept_of({CUP: 10, LID: 60}), NAMES, held_at=50, cleared=True)
+    assert (found.needed, found.left, found.score) == (["lid", "cup"], 0, 1.0)
 
 
 @pytest.mark.parametrize("start", range(20, 140, 7))
@@ -93,22 +93,22 @@ def test_a_second_is_a_second_wherever_it_begins(start):
 
 
 def test_what_moves_once_the_target_is_held_does_not_count():
-    found = retrieval_order(kept_of({CUP: 10, LID: 60}, held_at=60), NAMES, held_at=30, cleared=True)
-    assert [move["object"] for move in found["moved"]] == ["cup"]
+    found = Retrieval.of(kept_of({CUP: 10, LID: 60}, held_at=60), NAMES, held_at=30, cleared=True)
+    assert [move.object for move in found.moved] == ["cup"]
 
 
 def test_a_target_that_was_never_held_has_no_order():
-    found = retrieval_order(kept_of({CUP: 10}), NAMES, held_at=None, cleared=False)
-    assert (found["score"], found["left"], len(found["moved"])) == (None, 0, 1)
+    found = Retrieval.of(kept_of({CUP: 10}), NAMES, held_at=None, cleared=False)
+    assert (found.score, found.left, len(found.moved)) == (None, 0, 1)
     nothing = np.zeros((4, 3), np.int16)
-    assert retrieval_order(nothing, NAMES, held_at=5, cleared=True)["score"] == 1.0
+    assert Retrieval.of(nothing, NAMES, held_at=5, cleared=True).score == 1.0
 
 
 def test_several_episodes_are_summed_up_where_the_target_was_held():
     episodes = [
-        retrieval_order(kept_of({CUP: 10, LID: 60, PEAR: 81}), NAMES, held_at=90, cleared=True),
-        retrieval_order(kept_of({LID: 20}), NAMES, held_at=50, cleared=False),
-        retrieval_order(kept_of({CUP: 10}), NAMES, held_at=None, cleared=False),
+        Retrieval.of(kept_of({CUP: 10, LID: 60, PEAR: 81}), NAMES, held_at=90, cleared=True),
+        Retrieval.of(kept_of({LID: 20}), NAMES, held_at=50, cleared=False),
+        Retrieval.of(kept_of({CUP: 10}), NAMES, held_at=None, cleared=False),
         None,
     ]
     found = summarize_retrieval(episodes)

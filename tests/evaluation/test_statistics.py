@@ -1,26 +1,29 @@
 from __future__ import annotations
 
+from math import factorial
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binom, multinomial, norm
 
-from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.statistics import (
     Comparison,
-    Share,
     compare,
-    compare_counts,
     holm,
     mcnemar,
+    mcnemar_power,
     paired_interval,
     share,
+    smallest_paired_difference,
     success_by,
+    too_few,
 )
 
 Z2 = norm.isf(0.025) ** 2
 LEVELS = st.floats(0.5, 0.999)
+SHARES = st.just(0.0) | st.floats(1e-9, 1)  # SciPy's binomial overflows at probabilities of 1e-308
 COUNTS = st.tuples(*[st.integers(0, 30)] * 4).filter(any)  # both, only A, only B, neither
 
 
@@ -142,11 +145,10 @@ def test_paired_interval_covers_about_as_often_as_it_says(n, worst):
     assert np.mean(coverage) > 0.95
 
 
-@given(COUNTS, LEVELS)
-def test_swapping_the_runs_swaps_signs(counts, level):
+@given(COUNTS)
+def test_swapping_the_runs_swaps_signs(counts):
     both, only_a, only_b, neither = counts
-    ours = compare_counts(both, only_a, only_b, neither, level)
-    swapped = compare_counts(both, only_b, only_a, neither, level)
+    ours, swapped = Comparison.of(both, only_a, only_b, neither), Comparison.of(both, only_b, only_a, neither)
     assert ours.p_value == swapped.p_value
     assert ours.difference == -swapped.difference
     assert (ours.low, ours.high) == pytest.approx((-swapped.high, -swapped.low), abs=1e-9)
@@ -168,7 +170,7 @@ def test_runs_are_compared_scene_by_scene():
     found = compare(a, b)
     assert (found.both, found.only_a, found.only_b, found.neither) == (2, 3, 1, 2)
     assert (found.successes_a, found.successes_b, found.n, found.difference) == (5, 3, 8, 0.25)
-    assert found == compare_counts(2, 3, 1, 2)
+    assert found == Comparison.of(2, 3, 1, 2)
     assert found.p_value == pytest.approx(2 * (1 + 4) / 2**4)
     assert compare(a.tolist(), a.tolist()).p_value == 1
 
@@ -205,45 +207,48 @@ def test_bins_hold_every_episode_once(episodes):
     assert sum(x.k for x in shares) == successes.sum()
 
 
-@pytest.mark.parametrize(
-    ("call", "words"),
-    [
-        (lambda: share(3, 2), "k of n"),
-        (lambda: share(0, 0), "n > 0"),
-        (lambda: share(-1, 2), "0 or more"),
-        (lambda: share(0.5, 2), "an integer"),  # type: ignore[arg-type]
-        (lambda: share(1, 2, 95), "0 < level < 1"),
-        (lambda: Share(1, 2, 0.6, 0.9), "out of order"),
-        (lambda: Comparison(1, 1, 0, 0, 1.5, 0, 1), "p-value"),
-        (lambda: compare_counts(0, 0, 0, 0), "n: "),
-        (lambda: paired_interval(3, 3, 5), "6 or more"),
-        (lambda: compare([True], [True, False]), "1 scenes, found 2"),
-        (lambda: compare([1, 0], [True, False]), "(n,) bool"),
-        (lambda: holm([0.5, 1.5]), "0..1"),
-        (lambda: holm([float("nan")]), "0..1"),
-        (lambda: success_by([0.1, 1.2], [True, False], [0, 1]), "found [1.2]"),
-        (lambda: success_by([float("nan")], [True], [0, 1]), "found [nan]"),
-        (lambda: success_by([0.1], [True, False], [0, 1]), "other episodes"),
-        (lambda: success_by([0.1], [True], [1, 0]), "ascending"),
-    ],
-)
-def test_what_is_no_evaluation_is_an_error(call, words):
-    with pytest.raises(EvaluationError) as error:
-        call()
-    assert words in str(error.value)
+@pytest.mark.parametrize(("difference", "discordant"), [(0, 0.4), (0.3, 0.4), (0.4, 0.4), (0.6, 1)])
+def test_power_is_the_sum_over_all_outcomes(difference, discordant):
+    n, p, q = 14, (discordant + difference) / 2, (discordant - difference) / 2
+    told = 0.0
+    for a in range(n + 1):
+        for b in range(n + 1 - a):
+            ways = factorial(n) // (factorial(a) * factorial(b) * factorial(n - a - b))
+            if mcnemar(a, b) <= 0.05:
+                told += ways * p**a * q**b * (1 - p - q) ** (n - a - b)
+    assert mcnemar_power(n, difference, discordant) == pytest.approx(told, abs=1e-12)
 
 
-def test_another_package_says_the_same():
-    robostats = pytest.importorskip("robostats")
-    for n in (1, 2, 10, 39, 200):
-        for k in {0, 1, n // 3, n - 1, n}:
-            theirs = robostats.clopper_pearson(k, n)
-            assert (share(k, n).low, share(k, n).high) == pytest.approx((theirs.lower, theirs.upper), abs=1e-12)
-    for counts in [(20, 8, 5, 7), (59, 6, 16, 80), (0, 12, 0, 0), (9, 0, 0, 4), (3, 0, 6, 1), (0, 4, 4, 0)]:
-        table = robostats.PairedResult("a", "b", *counts, tuple(map(str, range(sum(counts)))), 0, 0, ("",), ("",), None)
-        theirs, ours = robostats.compare(table), compare_counts(*counts)
-        assert ours.p_value == pytest.approx(theirs.p_value, abs=1e-12)
-        assert (ours.low, ours.high) == pytest.approx((theirs.interval.lower, theirs.interval.upper), abs=1e-10)
-    kmodel = pytest.importorskip("robostats.kmodel")
-    for p_values in ([0.01, 0.04, 0.03, 0.005], [0.2, 0.2, 0.9], [0.001]):
-        assert holm(p_values) == pytest.approx(kmodel.adjust(p_values, "holm"), abs=1e-15)
+@given(st.integers(1, 60), SHARES, st.floats(0.001, 0.2))
+def test_equal_runs_are_told_apart_no_more_often_than_alpha(n, discordant, alpha):
+    assert mcnemar_power(n, 0.0, discordant, alpha=alpha) <= alpha + 1e-12
+
+
+def test_six_scenes_are_the_fewest():
+    assert smallest_paired_difference(5, 0) is None
+    assert smallest_paired_difference(6, 0) == pytest.approx(0.8 ** (1 / 6))  # all six are A's
+
+
+@given(st.integers(6, 120), SHARES)
+def test_the_smallest_difference_has_the_power_asked_for(n, discordant):
+    found = smallest_paired_difference(n, discordant)
+    assert found is not None
+    assert mcnemar_power(n, found, max(found, discordant)) == pytest.approx(0.8, abs=1e-6)
+
+
+def test_a_warning_says_what_would_show():
+    assert too_few(Comparison.of(20, 8, 5, 7)) == (
+        "not told apart: 40 episodes show differences of 26 points or more (80 % power)"
+    )
+    assert "5 episodes show no difference, however large" in (too_few(Comparison.of(0, 5, 0, 0)) or "")
+    assert too_few(Comparison.of(0, 6, 0, 0)) is None  # p = 1/32
+    assert too_few(Comparison.of(0, 6, 0, 0), alpha=0.05 / 2) is not None  # one of two comparisons
+
+
+@pytest.mark.parametrize("n", [6, 11, 20, 35])
+def test_differences_that_show_are_greater_than_those_warned_of(n):
+    for m in range(n + 1):
+        shown = smallest_paired_difference(n, m / n)
+        for b in range(m // 2 + 1):
+            comparison = Comparison.of(n - m, m - b, b, 0)
+            assert too_few(comparison) is None or comparison.difference < shown

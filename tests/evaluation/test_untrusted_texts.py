@@ -9,7 +9,6 @@ from made_up_results import outcome, write
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation import results
-from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.policy import EpisodeSpec, PolicySpec, describe
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.remote.server import PolicyServer
@@ -71,7 +70,7 @@ def test_what_a_description_says_is_read_back_and_does_not_rename_the_policy(tmp
 def test_an_error_text_of_a_policy_is_read_back(tmp_path):
     start = EpisodeSpec(0, 0, "pick", "table", "", "builtin", 0, "")
     episode = SimpleNamespace(episode=0, task="pick", config="table", seed=0, split="test", p_vis=None)
-    made = Outcome.of(Rollout(start, error=f"{HOSTILE}\udcff"), episode, [])
+    made = Rollout(start, error=f"{HOSTILE}\udcff").outcome(episode, [])
     assert made.error.isprintable()
     write(tmp_path / "out", [])
     results.append(tmp_path / "out", made)

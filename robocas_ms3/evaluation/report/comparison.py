@@ -8,10 +8,9 @@ from itertools import combinations
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.words import count_of, in_markdown
-from robocas_ms3.evaluation.power import too_few
 from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.results import Result
-from robocas_ms3.evaluation.statistics import Comparison, compare, holm
+from robocas_ms3.evaluation.statistics import Comparison, compare, holm, too_few
 
 _ALPHA = 0.05
 ALL = "all"

@@ -260,7 +260,11 @@ def _measured_with(result: Result, protocol: LoadedProtocol | None) -> str:
     if protocol is not None:
         pairs += [("what it says", protocol.rules.description), ("its rules", _rules(protocol))]
     pairs += [("policy", policy.name)]
-    pairs += [(f"policy, {name}", _plain(value)) for name, value in policy.entries().items() if name != "name"]
+    pairs += [
+        (f"policy, {name}", _plain(value))
+        for name, value in policy.model_dump(exclude_unset=True).items()
+        if name != "name"
+    ]
     pairs += [
         ("upstream's weld", "yes" if run.weld else "no"),
         ("backend", run.backend),

@@ -13,7 +13,6 @@ pytest.importorskip("msgpack")
 from remote_ends import IN_A_HURRY, StandIn, Told, a_start, serving, some_observations, talking
 
 from robocas_ms3.core.errors import EvaluationError, PolicyFailed
-from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.protocol import Episode
 from robocas_ms3.evaluation.remote.client import RemotePolicy
 from robocas_ms3.evaluation.remote.connection import MAX_REPLY
@@ -175,7 +174,7 @@ def test_a_run_goes_on_where_a_policy_fails():
     assert {number for number, one in played.items() if one.error} == {2, 5}
     assert played[2].error == "the server failed: RuntimeError: out of memory"
     assert [one.steps for one in played.values()] == [4, 4, 0, 4, 4, 0, 4]
-    outcome = Outcome.of(played[2], Episode(episode=2, task="pick", config="x", seed=7, instruction="", target="a"), ())
+    outcome = played[2].outcome(Episode(episode=2, task="pick", config="x", seed=7, instruction="", target="a"), ())
     assert (outcome.failure_stage, outcome.error, outcome.success) == ("error", played[2].error, False)
 
 
