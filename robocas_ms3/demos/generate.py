@@ -2,44 +2,65 @@
 
 from __future__ import annotations
 
+import json
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import asdict, dataclass, fields
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.errors import DatasetError, RobocasError
 from robocas_ms3.core.files import flush_to_disk, make_folder, write_json
 from robocas_ms3.core.outputs import FolderKind, OutputFolder
-from robocas_ms3.core.workers import Limits, Worker
-from robocas_ms3.demos.checks import WEIGHTS, check_arguments, upgrade_run
-from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings
-from robocas_ms3.demos.ledger import FAILURES_FILE, Failure, Ledger, count_by_stage, failed_attempts
+from robocas_ms3.core.strict import check_number
+from robocas_ms3.core.workers import Worker
+from robocas_ms3.demos.ledger import FAILURES_FILE, EpisodeResult, Failure, Ledger, count_by_stage, failed_attempts
 from robocas_ms3.demos.recordings.entries import read_json, reason
 from robocas_ms3.demos.recordings.merging import merge
+from robocas_ms3.demos.recordings.seeds import GREATEST_SEED
 from robocas_ms3.demos.recordings.stored import open_trajectory
 from robocas_ms3.demos.recordings.versions import versions
+from robocas_ms3.demos.settings import EpisodeSettings, GenerateSettings
 from robocas_ms3.demos.takeover import Takeover
 from robocas_ms3.demos.workers import generate_seeds, shard_name
+from robocas_ms3.planning.backends import BACKENDS
 from robocas_ms3.planning.seconds import Seconds
+from robocas_ms3.robots.table import find_robot
+from robocas_ms3.scenes.config import load_config_of
+from robocas_ms3.scenes.model import SceneModel
+from robocas_ms3.scenes.task_specs import SIM_FREQ, TASKS
 
 RUN = "run.json"
-OUTPUT = FolderKind("robocas generate", (RUN,), "settings", upgrade=upgrade_run)
+WEIGHTS = "after_policy_weights"
+"""Key of ``run.json``: hash of the weights of ``after_policy``."""
+
+
+def _upgrade_run(record: dict[str, Any]) -> dict[str, Any]:
+    """Return a ``run.json`` with defaults for what older versions of the package did not record."""
+    settings = record["settings"]
+    if isinstance(settings, dict):
+        settings = {**json.loads(json.dumps(asdict(EpisodeSettings("pick")))), **settings}
+    return {"versions": versions(), **record, "settings": settings}
+
+
+OUTPUT = FolderKind("robocas generate", (RUN,), "settings", upgrade=_upgrade_run)
 
 
 @dataclass(frozen=True)
 class Summary:
-    """What a run did.
+    """Result of a run.
 
     Attributes:
         trajectory: the HDF5 file.
         episodes: episodes in it.
         seeds: seeds tried for them.
         mean_seconds: CPU seconds per seed tried: reset, planning, simulation, trial.
-        mean_steps: control steps an episode.
+        mean_steps: control steps per episode.
         failures: ``{"stage: reason": count}`` of all attempts.
         gave_up: seeds without an episode.
     """
@@ -59,15 +80,8 @@ class Summary:
 
 
 def generate(
-    settings: EpisodeSettings,
-    out: Path,
+    settings: GenerateSettings,
     *,
-    episodes: int,
-    first_seed: int = 0,
-    jobs: int = 1,
-    fork: bool = True,
-    limits: Limits | None = None,
-    overwrite: bool = False,
     on_start: Callable[[int], None] = lambda there: None,
     on_result: Callable[[EpisodeResult], None] = lambda result: None,
     players: Callable[[], Worker[int, Takeover]] | None = None,
@@ -75,179 +89,201 @@ def generate(
 ) -> Summary:
     """Generate episodes of consecutive seeds until there are enough.
 
-    ``out`` gets ``trajectory.h5`` and ``.json``, ``failures.jsonl``, ``run.json`` (settings and versions) and
-    ``summary.json``. Each finished episode is a file of its own under ``out/episodes`` until the end: calling again
+    The output folder gets ``trajectory.h5`` and ``.json``, ``failures.jsonl``, ``run.json`` (settings and versions) and
+    ``summary.json``. Each finished episode is a file of its own under ``episodes`` until the end: calling again
     continues an interrupted run, or adds episodes to a finished one. Seeds are consecutive and results are taken in
     their order, so neither ``jobs`` nor an interruption changes the outcome.
 
     Args:
-        settings: the same for all episodes.
-        out: output folder.
-        episodes: successful episodes wanted.
-        first_seed: seeds are counted from here.
-        jobs: worker processes.
-        fork: undo what fails by forking where that is safe.
-        limits: of each seed. With them one job is a process of its own too; a seed that goes beyond them, or takes its
-            process down, is begun again once, and then given up. None: with one job this process does it.
-        overwrite: start again, and replace the run in ``out``.
-        on_start: called once arguments, configuration, pack and output turned out right, with how many of the episodes
-            are there.
-        on_result: called for each seed that was not dealt with before, in order.
-        players: opens what has ``settings.after_policy`` act in the scene of a seed, in a process (is pickled).
-        weights: hash of those that it acts with, if it has some: an output goes on with the same.
+        settings: options of the run.
+        on_start: called with the number of existing episodes, after all checks.
+        on_result: called for each new seed, in order.
+        players: opens the worker that runs ``after_policy`` in the scene of a seed, in a process (is pickled).
+        weights: hash of that policy's weights, if it has some; a run continues with the same.
 
     Raises:
-        OutputExistsError: ``out`` was written with other settings or versions, or by another command.
-        RobocasError: an argument is wrong, which leaves no trace; another process writes there; far too many seeds
+        OutputExistsError: the folder was written with other settings or versions, or by another command.
+        RobocasError: an argument is invalid, which leaves no trace; another process writes there; far too many seeds
             fail.
     """
-    check_arguments(settings, episodes=episodes, first_seed=first_seed, jobs=jobs, acts_first=players is not None)
-    run = {"settings": asdict(settings), "first_seed": first_seed, "versions": versions()}
+    settings = settings.resolve()
+    assert settings.out is not None
+    check_number("episodes", settings.episodes, 1)
+    check_number("seed", settings.seed, 0, GREATEST_SEED)
+    check_number("jobs", settings.jobs, 0)
+    check_number("episode_seconds", settings.episode_seconds, 1)
+    check_number("memory_gb", settings.memory_gb, 0.1)
+    check_episode_settings(settings.episode)
+    if bool(settings.episode.after_policy) != (players is not None):
+        raise RobocasError("after_policy needs players, and players need after_policy", where="after_policy")
+    record = {"settings": asdict(settings.episode), "first_seed": settings.seed, "versions": versions()}
     if weights:
-        run[WEIGHTS] = weights
-    with OutputFolder(out, OUTPUT, run, overwrite=overwrite) as output:
-        output.start(run)
-        return _generate_in(output, settings, episodes, first_seed, jobs, fork, limits, on_start, on_result, players)
+        record[WEIGHTS] = weights
+    with OutputFolder(settings.out, OUTPUT, record, overwrite=settings.overwrite) as output:
+        output.start(record)
+        run = _Run(output.path)
+        on_start(min(settings.episodes, sum(result.success for result in run.earlier.values())))
+        results, good = [], 0
+        try:
+            with closing(_results(settings, run, players)) as found:
+                while good < settings.episodes:
+                    result = next(found)
+                    if result.seed not in run.earlier:
+                        output.check_exists()
+                        run.ledger.append(_lines(result))
+                        on_result(result)
+                    results.append(result)
+                    good += result.success
+                    if len(results) - good > max(20, 3 * good):
+                        raise RobocasError(
+                            "far too many seeds fail",
+                            where=output.path,
+                            found=f"{len(results) - good} of {len(results)}",
+                            fix=f"See {FAILURES_FILE}; a smaller objects.count may help.",
+                        )
+        except BaseException:
+            if not (results or run.earlier):
+                shutil.rmtree(run.shards, ignore_errors=True)  # unfinished episodes
+            raise
+        return run.finish(results)
 
 
-def _generate_in(
-    output: OutputFolder,
-    settings: EpisodeSettings,
-    episodes: int,
-    first_seed: int,
-    jobs: int,
-    fork: bool,
-    limits: Limits | None,
-    on_start: Callable[[int], None],
-    on_result: Callable[[EpisodeResult], None],
-    players: Callable[[], Worker[int, Takeover]] | None,
-) -> Summary:
-    out = output.path
-    shards, ledger = make_folder(out / "episodes"), Ledger(out / FAILURES_FILE)
-    earlier = _finished(out, shards, ledger)
-    ledger.settle([line for seed in sorted(earlier) for line in _lines(earlier[seed])])
-    on_start(min(episodes, sum(result.success for result in earlier.values())))
-    missing = (seed for seed in count(first_seed) if seed not in earlier)
-    results: list[EpisodeResult] = []
-    good = 0
-    try:
-        made = generate_seeds(settings, missing, shards, jobs, fork=fork, limits=limits, players=players)
-        with closing(made) as new:
-            for seed in count(first_seed):
-                if good >= episodes:
-                    break
-                if seed in earlier:
-                    results.append(earlier[seed])
-                    good += earlier[seed].success
-                    continue
-                result = next(new)
-                output.check_exists()
-                ledger.append(_lines(result))
-                results.append(result)
-                good += result.success
-                on_result(result)
-                if len(results) - good > max(20, 3 * good):
-                    raise RobocasError(
-                        "far too many seeds fail",
-                        where=out,
-                        found=f"{len(results) - good} of {len(results)}",
-                        fix=f"See {ledger.path.name}; a smaller objects.count may help.",
-                    )
-    except BaseException:
-        if not (results or earlier):
-            shutil.rmtree(shards, ignore_errors=True)  # unfinished episodes
-        raise
-    return _finish(out, shards, ledger, results, earlier)
+def check_episode_settings(settings: EpisodeSettings) -> None:
+    """Check settings before anything is written.
+
+    Raises:
+        RobocasError: a number is out of its range, the task can't run the configuration, or there is no such planner,
+            robot or pack.
+    """
+    control, replay = settings.control_freq, settings.replay_rate or 0
+    check_number("max_attempts", settings.max_attempts, 1)
+    check_number("control_freq", control, 1, SIM_FREQ)
+    if SIM_FREQ % control:
+        raise RobocasError(
+            "the control rate must divide the rate of physics",
+            where="control_freq",
+            expected=f"one of {', '.join(str(f) for f in range(1, SIM_FREQ + 1) if SIM_FREQ % f == 0)}",
+            found=control,
+        )
+    for name in ("noisy_trials", "noisy_failures", "noise_mm", "noise_deg"):
+        check_number(name, getattr(settings, name), 0)
+    check_number("replay_rate", replay, 0, control)
+    if replay and (control % replay or SIM_FREQ % replay):
+        raise RobocasError(
+            "the rate of the open-loop check must divide the control rate and the rate of physics",
+            where="replay_rate",
+            expected=f"a divisor of {control}, or 0 for no check",
+            found=replay,
+        )
+    check_number("after_steps", settings.after_steps[0], 1)
+    check_number("after_steps", settings.after_steps[1], settings.after_steps[0])
+    BACKENDS.find(settings.planner, where="planner")
+    robot = find_robot(settings.robot)
+    config = load_config_of(TASKS[settings.task], settings.config)
+    SceneModel.load(config, load_pack(settings.pack), load_pack("builtin"), robot=robot.description)
+
+
+def _results(
+    settings: GenerateSettings, run: _Run, players: Callable[[], Worker[int, Takeover]] | None
+) -> Iterator[EpisodeResult]:
+    """Yield the results of all seeds in order: those of earlier runs, and new ones."""
+    missing = (seed for seed in count(settings.seed) if seed not in run.earlier)
+    with closing(generate_seeds(settings, missing, run.shards, players)) as new:
+        for seed in count(settings.seed):
+            yield run.earlier[seed] if seed in run.earlier else next(new)
 
 
 def _lines(result: EpisodeResult) -> list[Failure]:
-    """What the ledger says of a seed."""
+    """Return the lines of a seed in the ledger."""
     given_up = [] if result.success else [Failure(result.seed, -1, "episode", "gave_up", 0.0)]
     return [*result.failures, *given_up]
 
 
-def _finished(out: Path, shards: Path, ledger: Ledger) -> dict[int, EpisodeResult]:
-    """Seeds that an earlier run dealt with: in the merged file, in files of their own, or given up."""
-    noted = ledger.by_seed()
-    results = {
-        seed: EpisodeResult(seed, success=False, failures=lines[:-1])
-        for seed, lines in noted.items()
-        if [line.attempt for line in lines] == [*range(len(lines) - 1), -1]  # else some are lost: it is run again
-    }
-    for path in sorted(shards.glob("seed_*.h5")):
-        try:
-            open_trajectory(path).close()
-            results |= _recorded(path, noted)
-        except RobocasError:
-            path.unlink()
-    return results | _merged(out, noted)
+class _Run:
+    """Files of a run in its output folder.
 
-
-def _recorded(path: Path, noted: Mapping[int, list[Failure]]) -> dict[int, EpisodeResult]:
-    """Seed -> what came of it, of each episode in a file; ``noted`` are the ledger's lines by seed.
-
-    Raises:
-        DatasetError: its JSON says something else.
+    Attributes:
+        shards: folder with a file per episode that is not merged yet.
+        ledger: ``failures.jsonl``.
+        earlier: results of earlier runs by seed: in the merged file, in files of their own, or given up.
     """
-    results = {}
-    for episode in read_json(path)["episodes"]:
-        try:
-            # the block is written last: without it the episode was cut short
-            if said := episode.get("robocas"):
-                seed = int(episode["episode_seed"])
-                result = EpisodeResult(seed, True, int(episode["elapsed_steps"]), int(said["attempts"]))
-                before = noted.get(seed, [])
-                known = said.get("failed_attempts")  # those of an earlier version don't say
-                result.failures = before if known is None else failed_attempts(seed, known, before)
-                for part, value in said["seconds"].items():
-                    setattr(result.seconds, part, float(value))
-                results[seed] = result
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            where, fix = path.with_suffix(".json"), "Choose another --out, or --overwrite."
-            raise DatasetError(
-                "this is not of `robocas generate`", where=where, found=reason(error), fix=fix
-            ) from error
-    return results
 
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._trajectory = folder, folder / "trajectory.h5"
+        self.shards, self.ledger = make_folder(folder / "episodes"), Ledger(folder / FAILURES_FILE)
+        noted = self.ledger.by_seed()
+        self.earlier = {
+            seed: EpisodeResult(seed, success=False, failures=lines[:-1])
+            for seed, lines in noted.items()
+            if [line.attempt for line in lines] == [*range(len(lines) - 1), -1]  # else lines are lost: run it again
+        }
+        for path in sorted(self.shards.glob("seed_*.h5")):
+            try:
+                open_trajectory(path).close()
+                self.earlier |= self._read(path)
+            except RobocasError:
+                path.unlink()
+        self.earlier |= self._merged()
+        self.ledger.settle([line for seed in sorted(self.earlier) for line in _lines(self.earlier[seed])])
 
-def _merged(out: Path, noted: Mapping[int, list[Failure]]) -> dict[int, EpisodeResult]:
-    """What the merged file holds; parameters of `_recorded`."""
-    path = out / "trajectory.h5"
-    if not path.is_file():
-        return {}
-    data = read_json(path)
-    with open_trajectory(path) as file:
-        there = [episode for episode in data["episodes"] if f"traj_{episode['episode_id']}" in file]
-    if len(there) < len(data["episodes"]):  # a merge was killed between its two files
-        write_json(path.with_suffix(".json"), {**data, "episodes": there})
-    return _recorded(path, noted)
+    def _read(self, path: Path) -> dict[int, EpisodeResult]:
+        """Return the results of the episodes in a file by seed.
 
+        Raises:
+            DatasetError: `robocas generate` did not write it.
+        """
+        results, noted = {}, self.ledger.by_seed()
+        for episode in read_json(path)["episodes"]:
+            try:
+                # the block is written last: without it the episode was cut short
+                if about := episode.get("robocas"):
+                    seed = int(episode["episode_seed"])
+                    result = EpisodeResult(seed, True, int(episode["elapsed_steps"]), int(about["attempts"]))
+                    lines = noted.get(seed, [])
+                    failed = about.get("failed_attempts")  # missing in files of older versions
+                    result.failures = lines if failed is None else failed_attempts(seed, failed, lines)
+                    for part, value in about["seconds"].items():
+                        setattr(result.seconds, part, float(value))
+                    results[seed] = result
+            except (KeyError, TypeError, ValueError, AttributeError) as error:
+                where, fix = path.with_suffix(".json"), "Choose another --out, or --overwrite."
+                what = "`robocas generate` did not write this file"
+                raise DatasetError(what, where=where, found=reason(error), fix=fix) from error
+        return results
 
-def _finish(
-    out: Path, shards: Path, ledger: Ledger, results: list[EpisodeResult], earlier: dict[int, EpisodeResult]
-) -> Summary:
-    trajectory, merged = out / "trajectory.h5", _merged(out, ledger.by_seed())
-    beyond = range(results[-1].seed + 1, max(merged, default=-1) + 1)  # more are there than were asked for
-    results = [*results, *(earlier[seed] for seed in beyond if seed in earlier)]
-    good = [r for r in results if r.success]
-    new = [shards / f"{shard_name(r.seed)}.h5" for r in good if r.seed not in merged]
-    if new:
-        merge(([trajectory] if merged else []) + new, trajectory)
-        flush_to_disk(out)  # before the files go that it is made of
-    shutil.rmtree(shards)
-    ledger.settle([line for result in results for line in _lines(result)])
-    parts = [part.name for part in fields(Seconds)]
-    seconds = {p: round(float(np.mean([getattr(r.seconds, p) for r in results] or [0])), 3) for p in parts}
-    summary = Summary(
-        trajectory,
-        len(good),
-        len(results),
-        seconds,
-        round(float(np.mean([r.steps for r in good] or [0])), 1),
-        count_by_stage(ledger.read()),
-        [r.seed for r in results if not r.success],
-    )
-    write_json(
-        out / "summary.json", {**asdict(summary), "trajectory": trajectory.name, "success_rate": summary.success_rate}
-    )
-    return summary
+    def _merged(self) -> dict[int, EpisodeResult]:
+        path = self._trajectory
+        if not path.is_file():
+            return {}
+        data = read_json(path)
+        with open_trajectory(path) as file:
+            there = [episode for episode in data["episodes"] if f"traj_{episode['episode_id']}" in file]
+        if len(there) < len(data["episodes"]):  # a merge was killed between its two files
+            write_json(path.with_suffix(".json"), {**data, "episodes": there})
+        return self._read(path)
+
+    def finish(self, results: list[EpisodeResult]) -> Summary:
+        """Merge all episodes and write the summary."""
+        merged = self._merged()
+        beyond = range(results[-1].seed + 1, max(merged, default=-1) + 1)  # more are there than were asked for
+        results = [*results, *(self.earlier[seed] for seed in beyond if seed in self.earlier)]
+        good = [result for result in results if result.success]
+        new = [self.shards / f"{shard_name(result.seed)}.h5" for result in good if result.seed not in merged]
+        if new:
+            merge(([self._trajectory] if merged else []) + new, self._trajectory)
+            flush_to_disk(self._folder)  # before the files are deleted that it is made of
+        shutil.rmtree(self.shards)
+        self.ledger.settle([line for result in results for line in _lines(result)])
+        seconds = {part.name: [getattr(result.seconds, part.name) for result in results] for part in fields(Seconds)}
+        summary = Summary(
+            self._trajectory,
+            len(good),
+            len(results),
+            {name: round(float(np.mean(values)), 3) for name, values in seconds.items()},
+            round(float(np.mean([result.steps for result in good])), 1),
+            count_by_stage(self.ledger.read()),
+            [result.seed for result in results if not result.success],
+        )
+        rate = {"trajectory": self._trajectory.name, "success_rate": summary.success_rate}
+        write_json(self._folder / "summary.json", {**asdict(summary), **rate})
+        return summary

@@ -15,14 +15,15 @@ from robocas_ms3.core.errors import EpisodeLost, LayoutError, PlanningFailed
 from robocas_ms3.core.extensions import load
 from robocas_ms3.demos.branches import ForkedBranches
 from robocas_ms3.demos.completing import complete
-from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings
 from robocas_ms3.demos.forking import say_once, why_not_fork
+from robocas_ms3.demos.ledger import EpisodeResult
 from robocas_ms3.demos.open_loop import Noise, OpenLoop
 from robocas_ms3.demos.recordings.environment import RecordedEnv
 from robocas_ms3.demos.recordings.motion import sample_stride
 from robocas_ms3.demos.recordings.subgoals import SubGoal
 from robocas_ms3.demos.recordings.writing import EpisodeRecorder
 from robocas_ms3.demos.resimulation import Resimulation
+from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.demos.takeover import Takeover
 from robocas_ms3.demos.trials import Trials
 from robocas_ms3.planning.backends import make_planner

@@ -1,19 +1,23 @@
-"""``failures.jsonl``: one line for every failed attempt, and one for every seed that was given up."""
+"""Results of seeds, and ``failures.jsonl``: one line per failed attempt, and one per seed that was given up."""
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 from pydantic import Field
 
 from robocas_ms3.core import ledger
+from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.demos.recordings.seeds import GREATEST_SEED
+from robocas_ms3.planning.seconds import Seconds
 
 FAILURES_FILE = "failures.jsonl"
+NOISY = "noisy_"  # begins the reasons of attempts that failed for noise alone
 
 
 @dataclass(frozen=True)
@@ -38,6 +42,53 @@ class Failure:
     def gave_up(self) -> bool:
         """Whether this line says that the seed has no episode."""
         return self.attempt < 0
+
+
+@dataclass
+class EpisodeResult:
+    """Result of a seed; forked processes send it on (`backtracking.Tally`).
+
+    Attributes:
+        seed: of the episode.
+        success: whether an episode was recorded.
+        steps: its length in control steps.
+        attempts: attempts used.
+        seconds: where the time went.
+        failures: every attempt that failed.
+        max_attempts: after so many the seed is given up.
+        begun: start of the attempt, s of the clock.
+    """
+
+    seed: int
+    success: bool
+    steps: int = 0
+    attempts: int = 0
+    seconds: Seconds = field(default_factory=Seconds)
+    failures: list[Failure] = field(default_factory=list)
+    max_attempts: int = 1
+    begun: float = field(default_factory=time.perf_counter)
+
+    @property
+    def noisy_failures(self) -> int:
+        """Number of attempts that failed for noise alone."""
+        return sum(failure.reason.startswith(NOISY) for failure in self.failures)
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether the seed is given up."""
+        return len(self.failures) >= self.max_attempts
+
+    def failed(self, error: PlanningFailed) -> None:
+        """Note a failed attempt."""
+        now = time.perf_counter()
+        seconds = round(now - self.begun, 3)
+        self.failures.append(Failure(self.seed, len(self.failures), error.stage, error.reason, seconds))
+        self.begun = now
+
+    def adopt(self, other: EpisodeResult) -> None:
+        """Take over the values that another process sent."""
+        vars(self.seconds).update(vars(other.seconds))  # the executor keeps counting in this object
+        vars(self).update({key: value for key, value in vars(other).items() if key != "seconds"})
 
 
 class Ledger(ledger.Ledger[Failure]):

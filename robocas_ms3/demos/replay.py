@@ -25,12 +25,13 @@ from robocas_ms3.demos.recordings.environment import RecordedEnv, read_env
 from robocas_ms3.demos.recordings.merging import merge
 from robocas_ms3.demos.recordings.stored import open_trajectory
 from robocas_ms3.demos.recordings.writing import EpisodeRecorder
+from robocas_ms3.demos.settings import ReplaySettings
 from robocas_ms3.tasks.base import RoboCASEnv
 
 
 @dataclass(frozen=True)
 class Replay:
-    """What a replay of one episode did.
+    """Result of the replay of one episode.
 
     Attributes:
         episode_id: in the source file.
@@ -46,50 +47,27 @@ class Replay:
     state_error: float | None
 
 
-def replay(
-    trajectory: Path,
-    *,
-    control_mode: str | None = None,
-    obs_mode: str = "none",
-    use_env_states: bool = False,
-    count: int | None = None,
-    save: Path | None = None,
-    allow_failure: bool = False,
-    overwrite: bool = False,
-    pack: str | Path | None = None,
-    env_kwargs: dict[str, Any] | None = None,
-) -> Iterator[Replay]:
-    """Replay episodes one by one, as the iterator is asked for them. Arguments are checked at once.
-
-    Args:
-        trajectory: HDF5 file, its JSON beside it.
-        control_mode: convert the actions to this mode; default: as recorded.
-        obs_mode: observations to record in ``save``.
-        use_env_states: set the recorded state after every step.
-        count: only the first so many episodes.
-        save: write the replayed episodes to this HDF5 file.
-        allow_failure: write the failed ones too.
-        overwrite: replace ``save`` if it exists.
-        pack: name or folder of the objects' pack, instead of what the file names.
-        env_kwargs: further arguments of the environment.
+def replay(settings: ReplaySettings) -> Iterator[Replay]:
+    """Replay episodes one by one, as the iterator is asked for them. Settings are checked at once.
 
     Raises:
         DatasetError: the file can't be read, or the control mode can't be converted to.
-        OutputExistsError: ``save``, or the JSON that would be beside it, is there already.
-        RobocasError: ``count`` or ``obs_mode`` is wrong.
+        OutputExistsError: ``save``, or its JSON, exists already.
+        RobocasError: ``count`` or ``obs_mode`` is invalid.
     """
-    if count is not None:
-        check_number("count", count, 1)
-    _check_obs_mode(obs_mode)
+    trajectory, save = settings.file, settings.save
+    if settings.count is not None:
+        check_number("count", settings.count, 1)
+    _check_obs_mode(settings.obs_mode)
     data = read_json(trajectory)
-    env = read_env(data["env_info"], trajectory.with_suffix(".json"), pack=pack)
+    env = read_env(data["env_info"], trajectory.with_suffix(".json"), pack=settings.pack)
     recorded_mode = env.control_mode
-    mode = control_mode or recorded_mode
+    mode = settings.control_mode or recorded_mode
     if mode not in {*CONVERTIBLE, recorded_mode}:
         raise DatasetError(
             "no control mode to convert to", where=trajectory, expected=f"one of {', '.join(CONVERTIBLE)}", found=mode
         )
-    if mode != recorded_mode and (use_env_states or recorded_mode != "pd_joint_pos"):
+    if mode != recorded_mode and (settings.use_env_states or recorded_mode != "pd_joint_pos"):
         raise DatasetError(
             "only pd_joint_pos recordings can be converted, and not while setting states",
             where=trajectory,
@@ -102,12 +80,11 @@ def replay(
         if save.resolve() == trajectory.resolve():
             raise DatasetError("this is the recording itself", where=save, fix="Choose another name for the replay.")
         for path in (save, save.with_suffix(".json")):
-            check_replaceable(path, overwrite=overwrite)
-    kwargs = {"control_mode": mode, "obs_mode": obs_mode, **(env_kwargs or {})}
-    if obs_mode == "none":
-        kwargs.setdefault("render_backend", "none")
-    episodes = data["episodes"][:count]
-    return _replay_all(trajectory, env, kwargs, episodes, use_env_states, save, allow_failure)
+            check_replaceable(path, overwrite=settings.overwrite)
+    kwargs: dict[str, Any] = {"control_mode": mode, "obs_mode": settings.obs_mode}
+    if settings.obs_mode == "none":
+        kwargs["render_backend"] = "none"
+    return _replay_all(settings, env, kwargs, data["episodes"][: settings.count])
 
 
 def _check_obs_mode(mode: str) -> None:
@@ -123,48 +100,41 @@ def _check_obs_mode(mode: str) -> None:
 
 
 def _replay_all(
-    trajectory: Path,
-    recorded: RecordedEnv,
-    kwargs: dict[str, Any],
-    episodes: list[dict[str, Any]],
-    use_env_states: bool,
-    save: Path | None,
-    allow_failure: bool,
+    settings: ReplaySettings, recorded: RecordedEnv, kwargs: dict[str, Any], episodes: list[dict[str, Any]]
 ) -> Iterator[Replay]:
+    save = settings.save
     shards: list[Path] = []
     place = {} if save is None else {"dir": make_folder(save.parent), "prefix": f".{save.stem}.", "suffix": ".tmp"}
     with closing(recorded.make(**kwargs)) as env, tempfile.TemporaryDirectory(**place) as parts:
         for episode in episodes:
             if save is None:
-                yield _replay_one(env, trajectory, episode, use_env_states)
+                yield _replay_one(env, settings, episode)
                 continue
             shard = Path(parts, f"episode_{episode['episode_id']}.h5")
             recorder = EpisodeRecorder(env, shard.parent, shard.stem)
-            result = _replay_one(recorder, trajectory, episode, use_env_states)
-            if result.success or allow_failure:
+            result = _replay_one(recorder, settings, episode)
+            if result.success or settings.allow_failure:
                 recorder.finish(episode.get("robocas", {}))
                 shards.append(shard)
-            else:
-                recorder.discard()
             yield result
         if save is not None and shards:
             merge(shards, save)
 
 
-def _replay_one(env: gym.Env, trajectory: Path, episode: dict[str, Any], use_env_states: bool) -> Replay:
+def _replay_one(env: gym.Env, settings: ReplaySettings, episode: dict[str, Any]) -> Replay:
     base_env = env.unwrapped
     assert isinstance(base_env, RoboCASEnv)
-    recorded = Recorded.read(trajectory, episode)
+    recorded = Recorded.read(settings.file, episode)
     _, info = env.reset(seed=recorded.seed, options=recorded.options)
     recorded.check_fits(base_env)
     converted = base_env.control_mode != recorded.control_mode
     if isinstance(env, EpisodeRecorder) and recorded.taken_over:
         env.begin_at(recorded.states[0])
-    elif use_env_states or recorded.taken_over:
+    elif settings.use_env_states or recorded.taken_over:
         base_env.set_state_dict(recorded.states[0])
     for action, state in zip(recorded.actions, recorded.states[1:], strict=True):
         *_, info = env.step(convert_action(action, base_env) if converted else action)
-        if use_env_states:
+        if settings.use_env_states:
             base_env.set_state_dict(state)
     error = None if converted else state_distance(cast(Any, base_env.get_state_dict()), recorded.states[-1])
     return Replay(episode["episode_id"], recorded.seed, bool(info["success"][0]), error)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import EpisodeLost
-from robocas_ms3.demos.episode import NOISY
+from robocas_ms3.demos.ledger import NOISY
 from robocas_ms3.demos.open_loop import Noise, OpenLoop
 from robocas_ms3.demos.recordings.motion import Motion, sample_states
 from robocas_ms3.demos.takeover import Takeover

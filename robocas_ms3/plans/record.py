@@ -10,9 +10,9 @@ from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.core.files import write_json
 from robocas_ms3.core.workers import use_one_torch_thread
-from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.recordings.entries import read_json
+from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.plans.load import opening_part, recording_settings
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.units import SeedFiles

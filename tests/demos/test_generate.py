@@ -4,6 +4,7 @@ import hashlib
 import json
 import os
 import signal
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -12,23 +13,20 @@ import torch
 from mani_skill.utils.gym_utils import find_max_episode_steps_value
 from mani_skill.utils.structs import Pose
 
-from robocas_ms3.core.errors import DatasetError, EpisodeLost, OutputExistsError, PlanningFailed, RobocasError
-from robocas_ms3.demos.episode import EpisodeSettings
+from robocas_ms3.core.errors import EpisodeLost, PlanningFailed
 from robocas_ms3.demos.forking import Child
 from robocas_ms3.demos.generate import generate
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.recordings.entries import read_json
-from robocas_ms3.demos.recordings.merging import merge
-from robocas_ms3.demos.recordings.stored import open_trajectory
 from robocas_ms3.demos.replay import replay
+from robocas_ms3.demos.settings import EpisodeSettings, GenerateSettings, ReplaySettings
 from robocas_ms3.demos.trials import Trials
 from robocas_ms3.planning.executor import Executor
 from robocas_ms3.planning.protocol import Trajectory
 from robocas_ms3.robots.description import MOBILE_PANDA
-from robocas_ms3.scenes.task_specs import TASKS
 
 pytestmark = pytest.mark.slow
-SETTINGS = EpisodeSettings("pick", "pick_table_scattered", "builtin")
+PICK, SEARCH = EpisodeSettings("pick"), EpisodeSettings("search", "search_table_small_heap")
 SEEDS = 3
 SEARCH_SEED = 3
 TOO_LONG = "horizon", "too_long"
@@ -37,7 +35,25 @@ TOO_LONG = "horizon", "too_long"
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     out = tmp_path_factory.mktemp("demos") / "pick"
-    return generate(SETTINGS, out, episodes=SEEDS), out
+    return generate(GenerateSettings(PICK, out, episodes=SEEDS, jobs=0)), out
+
+
+@pytest.fixture(scope="module")
+def pick_generator():
+    generator = EpisodeGenerator(PICK)
+    yield generator
+    generator.close()
+
+
+@pytest.fixture(scope="module")
+def search_generator():
+    generator = EpisodeGenerator(SEARCH)
+    yield generator
+    generator.close()
+
+
+def change(monkeypatch, generator, **settings):
+    monkeypatch.setattr(generator, "settings", replace(generator.settings, **settings))
 
 
 def load(path):
@@ -93,13 +109,10 @@ def test_motion_is_a_robots(run):
         assert longest <= 10  # 0.5 s
 
 
-def test_the_same_seed_gives_the_same_episode_bit_for_bit(run, tmp_path):
+def test_the_same_seed_gives_the_same_episode_bit_for_bit(run, pick_generator, tmp_path):
     summary, _ = run
-    generator = EpisodeGenerator(SETTINGS)
     last = read_json(summary.trajectory)["episodes"][-1]
-    result = generator.generate(last["episode_seed"], tmp_path, "again")  # first here, last there
-    generator.close()
-    assert result.success
+    assert pick_generator.generate(last["episode_seed"], tmp_path, "again").success  # first here, last there
     again = load(tmp_path / "again.h5")["traj_0"]
     recorded = load(summary.trajectory)[f"traj_{last['episode_id']}"]
     assert np.array_equal(again["actions"], recorded["actions"])
@@ -110,45 +123,20 @@ def test_the_same_seed_gives_the_same_episode_bit_for_bit(run, tmp_path):
 
 def test_action_replay_is_exact_and_ee_deltas_succeed(run):
     summary, _ = run
-    assert [(r.success, r.state_error) for r in replay(summary.trajectory)] == [(True, 0.0)] * SEEDS
-    assert all(r.success for r in replay(summary.trajectory, use_env_states=True, count=1))
-    assert all(r.success for r in replay(summary.trajectory, control_mode="pd_ee_delta_pose"))
+    assert [(r.success, r.state_error) for r in replay(ReplaySettings(summary.trajectory))] == [(True, 0.0)] * SEEDS
+    assert all(r.success for r in replay(ReplaySettings(summary.trajectory, use_env_states=True, count=1)))
+    assert all(r.success for r in replay(ReplaySettings(summary.trajectory, control_mode="pd_ee_delta_pose")))
 
 
 def test_resuming_adds_episodes_and_equals_an_uninterrupted_run(run, tmp_path):
     summary, _ = run
     out = tmp_path / "resumed"
-    generate(SETTINGS, out, episodes=1)
-    resumed = generate(SETTINGS, out, episodes=2)
+    for episodes in (1, 2):
+        resumed = generate(GenerateSettings(PICK, out, episodes=episodes, jobs=0))
     assert resumed.episodes == 2
     whole, parts = load(summary.trajectory), load(resumed.trajectory)
     for name in ("traj_0", "traj_1"):
         assert np.array_equal(whole[name]["actions"], parts[name]["actions"])
-    other = EpisodeSettings("pick", "pick_table_scattered", "builtin", control_freq=5)
-    with pytest.raises(OutputExistsError) as caught:
-        generate(other, out, episodes=2)
-    assert (caught.value.where, caught.value.found) == (out / "run.json", "settings.control_freq: 20 -> 5")
-
-
-def test_files_that_cannot_be_read_are_one_clear_line(run, tmp_path):
-    summary, _ = run
-    cut = tmp_path / "cut.h5"
-    content = summary.trajectory.read_bytes()
-    cut.write_bytes(content[: len(content) // 2])
-    with pytest.raises(DatasetError, match="JSON that belongs to this trajectory is missing"):
-        read_json(cut)
-    with pytest.raises(DatasetError, match="can.t read this HDF5 file: it is cut off"):
-        open_trajectory(cut)
-    cut.with_suffix(".json").write_text(json.dumps(read_json(summary.trajectory)))
-    with pytest.raises(DatasetError, match="cut off"):
-        merge([cut], tmp_path / "merged.h5")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["cut.h5", "cut.json"]
-
-
-def test_a_wrong_pack_leaves_nothing_behind(tmp_path):
-    with pytest.raises(RobocasError, match="no such asset pack"):
-        generate(EpisodeSettings("pick", "pick_table_scattered", "nowhere"), tmp_path / "out", episodes=1)
-    assert not (tmp_path / "out").exists()
 
 
 def call_it_done(monkeypatch):
@@ -181,14 +169,13 @@ def waiting(steps):
         (True, [-12, 4], [0, 0]),  # failed, and too long for anything to follow
     ],
 )
-def test_what_takes_longer_than_an_episode_may_is_undone(tmp_path, monkeypatch, keep, steps, begins):
-    settings = EpisodeSettings("pick", "pick_table_scattered", "builtin", max_attempts=len(steps), keep_recoveries=keep)
-    generator = EpisodeGenerator(settings)
+def test_what_takes_longer_than_an_episode_may_is_undone(tmp_path, monkeypatch, pick_generator, keep, steps, begins):
+    change(monkeypatch, pick_generator, max_attempts=len(steps), keep_recoveries=keep)
     call_it_done(monkeypatch)
-    generator.horizon = 10
-    generator.policy, begun = waiting(steps)
-    result = generator.generate(1, tmp_path, "timed")
-    generator.close()
+    policy, begun = waiting(steps)
+    monkeypatch.setattr(pick_generator, "policy", policy)
+    monkeypatch.setattr(pick_generator, "horizon", 10)
+    result = pick_generator.generate(1, tmp_path, "timed")
     assert result.success
     assert begun[-1] == 0
     assert begins is None or begun == begins
@@ -199,32 +186,17 @@ def test_what_takes_longer_than_an_episode_may_is_undone(tmp_path, monkeypatch, 
     assert data["robocas"]["recoveries"] == []
 
 
-@pytest.mark.parametrize(("freq", "steps"), [(20, 800), (5, 200), (100, 4000)])
-def test_the_horizon_is_as_many_seconds_at_any_rate(freq, steps):
-    assert TASKS["pick"].steps(freq) == steps
-
-
 def test_a_horizon_at_another_rate_is_the_environments_too():
-    generator = EpisodeGenerator(EpisodeSettings("pick", "pick_table_scattered", "builtin", control_freq=5))
+    generator = EpisodeGenerator(replace(PICK, control_freq=5))
     assert find_max_episode_steps_value(generator.env) == generator.horizon == 200
     generator.close()
 
 
-def test_a_generator_leaves_the_processs_threads_alone():
-    before = torch.get_num_threads()
-    try:
-        torch.set_num_threads(2)
-        EpisodeGenerator(EpisodeSettings("pick", "pick_table_scattered", "builtin")).close()
-        assert torch.get_num_threads() == 2
-    finally:
-        torch.set_num_threads(before)
-
-
-def test_that_a_policy_is_done_is_no_success(tmp_path):
-    generator = EpisodeGenerator(EpisodeSettings("pick", "pick_table_scattered", "builtin", max_attempts=2))
-    generator.policy, begun = waiting([3, 3])
-    result = generator.generate(1, tmp_path, "nothing")
-    generator.close()
+def test_that_a_policy_is_done_is_no_success(tmp_path, monkeypatch, pick_generator):
+    change(monkeypatch, pick_generator, max_attempts=2)
+    policy, begun = waiting([3, 3])
+    monkeypatch.setattr(pick_generator, "policy", policy)
+    result = pick_generator.generate(1, tmp_path, "nothing")
     assert not result.success
     assert begun == [0, 0]
     assert [(failure.stage, failure.reason) for failure in result.failures] == [("episode", "no_success")] * 2
@@ -255,13 +227,12 @@ def stirring(log):
 
 
 @pytest.mark.parametrize("fork", [True, False])
-def test_the_way_back_to_a_decision_leaves_no_trace(tmp_path, monkeypatch, fork):
+def test_the_way_back_to_a_decision_leaves_no_trace(tmp_path, monkeypatch, search_generator, fork):
     call_it_done(monkeypatch)
-    settings = EpisodeSettings("search", "search_table_small_heap", "builtin", max_attempts=2)
-    generator = EpisodeGenerator(settings, fork=fork)
-    generator.policy = stirring(tmp_path / "log")
-    result = generator.generate(1, tmp_path, "stirred")
-    generator.close()
+    change(monkeypatch, search_generator, max_attempts=2)
+    monkeypatch.setattr(search_generator, "_fork", fork)
+    monkeypatch.setattr(search_generator, "policy", stirring(tmp_path / "log"))
+    result = search_generator.generate(1, tmp_path, "stirred")
     assert [(failure.stage, failure.reason) for failure in result.failures] == [("stir", "enough")]
     first, again = map(json.loads, (tmp_path / "log").read_text().splitlines())
     assert first[:3] == again[:3]  # the same state, bit for bit
@@ -273,7 +244,7 @@ def test_the_way_back_to_a_decision_leaves_no_trace(tmp_path, monkeypatch, fork)
     assert len(load(tmp_path / "stirred.h5")["traj_0"]["actions"]) == 18
 
 
-def test_forked_or_not_a_search_is_the_same_and_replays_bit_for_bit(tmp_path, monkeypatch):
+def test_forked_or_not_a_search_is_the_same_and_replays_bit_for_bit(tmp_path, monkeypatch, search_generator):
     """Even where a branch is killed from outside while it goes on."""
     tell = Child.tell
 
@@ -286,9 +257,8 @@ def test_forked_or_not_a_search_is_the_same_and_replays_bit_for_bit(tmp_path, mo
     monkeypatch.setattr(Child, "tell", tell_and_kill_the_first)
     episodes = []
     for fork in (True, False):
-        generator = EpisodeGenerator(EpisodeSettings("search", "search_table_small_heap", "builtin"), fork=fork)
-        result = generator.generate(SEARCH_SEED, tmp_path, f"fork_{fork}")
-        generator.close()
+        monkeypatch.setattr(search_generator, "_fork", fork)
+        result = search_generator.generate(SEARCH_SEED, tmp_path, f"fork_{fork}")
         assert result.success
         assert result.steps > 0
         episodes.append((load(tmp_path / f"fork_{fork}.h5")["traj_0"], result))
@@ -298,15 +268,14 @@ def test_forked_or_not_a_search_is_the_same_and_replays_bit_for_bit(tmp_path, mo
     np.testing.assert_array_equal(forked["actions"], again["actions"])
     for name, values in forked["states"].items():
         np.testing.assert_array_equal(values, again["states"][name], err_msg=name)
-    (replayed,) = replay(tmp_path / "fork_True.h5")
+    (replayed,) = replay(ReplaySettings(tmp_path / "fork_True.h5"))
     assert replayed.success
     assert replayed.state_error == 0.0
 
 
-def test_recoveries_stay_unless_the_episode_is_lost(tmp_path, monkeypatch):
+def test_recoveries_stay_unless_the_episode_is_lost(tmp_path, monkeypatch, search_generator):
     call_it_done(monkeypatch)
-    settings = EpisodeSettings("search", "search_table_small_heap", "builtin", max_attempts=4, keep_recoveries=True)
-    generator = EpisodeGenerator(settings)
+    change(monkeypatch, search_generator, max_attempts=4, keep_recoveries=True)
     failures = iter([PlanningFailed("grasp", "missed"), EpisodeLost("clear", "fell_off_table")])
     begun = []
 
@@ -317,9 +286,8 @@ def test_recoveries_stay_unless_the_episode_is_lost(tmp_path, monkeypatch):
         if failure:
             raise failure
 
-    generator.policy = policy
-    result = generator.generate(1, tmp_path, "kept")
-    generator.close()
+    monkeypatch.setattr(search_generator, "policy", policy)
+    result = search_generator.generate(1, tmp_path, "kept")
     assert result.attempts == 3
     assert begun[0] == 0
     assert begun[1] > 4  # what failed stays, and the arm's way out of it
@@ -328,9 +296,9 @@ def test_recoveries_stay_unless_the_episode_is_lost(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("reason", ["no_success", "clipped", "parted"])
-def test_an_attempt_whose_own_actions_do_not_come_out_the_same_is_undone(tmp_path, monkeypatch, reason):
-    generator = EpisodeGenerator(EpisodeSettings("pick", "pick_table_scattered", "builtin", noisy_failures=2))
-    world, spoilt = generator.worlds[-1], []
+def test_an_attempt_whose_own_actions_do_not_come_out_the_same_is_undone(tmp_path, monkeypatch, pick_generator, reason):
+    change(monkeypatch, pick_generator, noisy_failures=2)
+    world, spoilt = pick_generator.worlds[-1], []
     step, settle = world.step, world.settle
 
     def spoil(action):
@@ -349,8 +317,7 @@ def test_an_attempt_whose_own_actions_do_not_come_out_the_same_is_undone(tmp_pat
 
     monkeypatch.setattr(world, "step", spoil)
     monkeypatch.setattr(world, "settle", fail)
-    result = generator.generate(1, tmp_path, "again")
-    generator.close()
+    result = pick_generator.generate(1, tmp_path, "again")
     assert result.success
     assert result.failures[0].stage == "replay"
     assert result.failures[0].reason == f"noisy_{reason}"
@@ -358,12 +325,10 @@ def test_an_attempt_whose_own_actions_do_not_come_out_the_same_is_undone(tmp_pat
     assert (data["replay_rate"], data["noisy_trials"]) == (5, 1)
 
 
-def test_where_noise_alone_spoils_attempts_an_episode_counts_without_in_the_end(tmp_path, monkeypatch):
-    settings = EpisodeSettings("pick", "pick_table_scattered", "builtin", noisy_failures=2)
-    generator = EpisodeGenerator(settings)
-    monkeypatch.setattr(generator.worlds[1], "settle", lambda: False)
-    result = generator.generate(1, tmp_path, "spoilt")
-    generator.close()
+def test_where_noise_alone_spoils_attempts_an_episode_counts_without_in_the_end(tmp_path, monkeypatch, pick_generator):
+    change(monkeypatch, pick_generator, noisy_failures=2)
+    monkeypatch.setattr(pick_generator.worlds[1], "settle", lambda: False)
+    result = pick_generator.generate(1, tmp_path, "spoilt")
     assert result.success
     assert [failure.reason for failure in result.failures].count("noisy_no_success") == 2
     assert read_json(tmp_path / "spoilt.h5")["episodes"][0]["robocas"]["noisy_trials"] == 0

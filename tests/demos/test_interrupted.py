@@ -2,21 +2,25 @@
 
 import json
 import shutil
+from dataclasses import asdict
 
 import h5py
 import pytest
 
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.demos import generate as module
-from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings
-from robocas_ms3.demos.generate import generate
-from robocas_ms3.demos.ledger import FAILURES_FILE, Failure, Ledger
+from robocas_ms3.demos.ledger import FAILURES_FILE, EpisodeResult, Failure, Ledger
 from robocas_ms3.demos.recordings.entries import read_json
+from robocas_ms3.demos.settings import EpisodeSettings, GenerateSettings
 from robocas_ms3.demos.workers import shard_name
 
-SETTINGS = EpisodeSettings("pick", "pick_table_scattered", "builtin")
+SETTINGS = EpisodeSettings("pick")
 HOPELESS = 2  # a seed without an episode
 FAILED = {1: ["reach: far"], 2: ["reach: far", "lift: slipped"], 4: ["grasp: missed", "reach: far"]}
+
+
+def generate(out, episodes, **how):
+    return module.generate(GenerateSettings(SETTINGS, out, episodes=episodes), **how)
 
 
 def failures_of(seed):
@@ -47,7 +51,7 @@ def made(monkeypatch):
     """Seeds that were generated, in the order in which they were."""
     seeds_made = []
 
-    def make(settings, seeds, folder, jobs, *, fork, limits, players):
+    def make(settings, seeds, folder, players):
         for seed in seeds:
             seeds_made.append(seed)
             if seed != HOPELESS:
@@ -72,7 +76,7 @@ def seeds_of(out):
 
 def begun(out, shards, lines=()):
     """A run that was killed: workers had finished some seeds, not all of them in their order."""
-    run = {"settings": vars(SETTINGS), "first_seed": 0}
+    run = {"settings": asdict(SETTINGS), "first_seed": 0}
     (out / "episodes").mkdir(parents=True)
     (out / "run.json").write_text(json.dumps(run))
     Ledger(out / "failures.jsonl").append(lines)
@@ -87,7 +91,7 @@ def begun(out, shards, lines=()):
 def test_seeds_that_workers_had_finished_ahead_are_in_nobodys_place(tmp_path, made, shards, given_up, missing):
     out = tmp_path / "out"
     begun(out, shards, [line for seed in given_up for line in lines_of(seed)])
-    summary = generate(SETTINGS, out, episodes=3)
+    summary = generate(out, episodes=3)
     assert made == missing
     assert seeds_of(out) == [0, 1, 3]
     assert (summary.episodes, summary.seeds, summary.gave_up) == (3, 4, [HOPELESS])
@@ -110,12 +114,12 @@ def test_failures_are_told_as_if_it_had_not_been(tmp_path, shards, lines):
     """Of all attempts, once each, in the order of the seeds."""
     started = []
     begun(tmp_path / "out", shards, lines)
-    found = generate(SETTINGS, tmp_path / "out", episodes=4, on_start=started.append)
-    whole = generate(SETTINGS, tmp_path / "whole", episodes=4)
+    found = generate(tmp_path / "out", episodes=4, on_start=started.append)
+    whole = generate(tmp_path / "whole", episodes=4)
     assert (tmp_path / "out" / FAILURES_FILE).read_text() == (tmp_path / "whole" / FAILURES_FILE).read_text()
     assert found.failures == whole.failures == {"reach: far": 3, "lift: slipped": 1, "grasp: missed": 1}
     assert started == [min(4, len(shards))]
-    generate(SETTINGS, tmp_path / "out", episodes=4)
+    generate(tmp_path / "out", episodes=4)
     assert (tmp_path / "out" / FAILURES_FILE).read_text() == (tmp_path / "whole" / FAILURES_FILE).read_text()
 
 
@@ -126,7 +130,7 @@ def test_what_was_cut_off_is_made_again(tmp_path, made, suffix, left):
     begun(out, (0, 1), lines_of(1))
     path = (out / "episodes" / shard_name(1)).with_suffix(suffix)
     path.write_bytes(path.read_bytes()[: int(left * path.stat().st_size)])
-    generate(SETTINGS, out, episodes=3)
+    generate(out, episodes=3)
     assert made == [1, 2, 3]
     assert seeds_of(out) == [0, 1, 3]
     assert Ledger(out / FAILURES_FILE).read() == [*lines_of(1), *lines_of(2)]
@@ -140,37 +144,38 @@ def test_files_that_do_not_tell_of_failures_leave_them_to_the_ledger(tmp_path):
     content = json.loads(path.read_text())
     del content["episodes"][0]["robocas"]["failed_attempts"]
     path.write_text(json.dumps(content))
-    generate(SETTINGS, out, episodes=2)
+    generate(out, episodes=2)
     assert Ledger(out / FAILURES_FILE).read() == lines_of(1)
 
 
 def test_killed_when_all_was_merged_already(tmp_path, made):
     out = tmp_path / "out"
-    generate(SETTINGS, out, episodes=2)
-    begun(out.with_name("again"), (0, 1))
-    shutil.move(out.with_name("again") / "episodes", out)  # they had not been removed yet
-    generate(SETTINGS, out, episodes=3)
+    generate(out, episodes=2)
+    (out / "episodes").mkdir()
+    for seed in (0, 1):
+        record(out / "episodes", seed)
+    generate(out, episodes=3)
     assert seeds_of(out) == [0, 1, 3]
     assert made == [0, 1, 2, 3]
 
 
 def test_killed_between_the_two_merged_files(tmp_path, made):
     out = tmp_path / "out"
-    generate(SETTINGS, out, episodes=2)
+    generate(out, episodes=2)
     (out / "episodes").mkdir()
     record(out / "episodes", 3)
     data = read_json(out / "trajectory.h5")
     ahead = {**data["episodes"][0], "episode_id": 2, "episode_seed": 3}
     (out / "trajectory.json").write_text(json.dumps({**data, "episodes": [*data["episodes"], ahead]}))
-    generate(SETTINGS, out, episodes=3)
+    generate(out, episodes=3)
     assert seeds_of(out) == [0, 1, 3]
     assert made == [0, 1, 2]
 
 
 def test_fewer_than_there_are(tmp_path, made):
     out = tmp_path / "out"
-    before = generate(SETTINGS, out, episodes=4)
-    after = generate(SETTINGS, out, episodes=2)
+    before = generate(out, episodes=4)
+    after = generate(out, episodes=2)
     assert seeds_of(out) == [0, 1, 3, 4]
     assert (after.episodes, after.seeds, after.gave_up) == (before.episodes, before.seeds, before.gave_up)
     assert made == [0, 1, 2, 3, 4]
@@ -179,5 +184,5 @@ def test_fewer_than_there_are(tmp_path, made):
 def test_an_output_folder_that_vanishes_is_one_clear_line(tmp_path, made):
     out = tmp_path / "out"
     with pytest.raises(RobocasError):
-        generate(SETTINGS, out, episodes=5, on_result=lambda result: shutil.rmtree(out))
+        generate(out, episodes=5, on_result=lambda result: shutil.rmtree(out))
     assert made == [0, 1]

@@ -6,12 +6,12 @@ import pytest
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.actions import episode_actions
 from robocas_ms3.datasets.sources.arrays import episode_arrays
-from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.open_loop import Noise, OpenLoop
 from robocas_ms3.demos.recordings.motion import sample_states
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
 from robocas_ms3.demos.recordings.subgoals import sample_subgoals
+from robocas_ms3.demos.settings import EpisodeSettings
 
 pytestmark = pytest.mark.slow
 SEED = 1  # a light target: one that hangs heavily off the gripper bends the arm by millimetres

@@ -13,6 +13,7 @@ from synthetic import STEPS, write_trajectory
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.demos.recorded import Recorded
 from robocas_ms3.demos.replay import replay
+from robocas_ms3.demos.settings import ReplaySettings
 
 SEED = "episode_seed"
 
@@ -30,7 +31,7 @@ def entry(trajectory):
 def test_json_that_is_none_of_a_trajectory(trajectory, text):
     trajectory.with_suffix(".json").write_bytes(text)
     with pytest.raises(DatasetError, match="not a trajectory's JSON") as caught:
-        replay(trajectory)
+        replay(ReplaySettings(trajectory))
     assert "\n" not in str(caught.value)
 
 

@@ -15,11 +15,11 @@ from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.datasets.writing.settings import ConversionSettings
-from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.recordings.entries import read_json
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
 from robocas_ms3.demos.replay import replay
+from robocas_ms3.demos.settings import EpisodeSettings, ReplaySettings
 from robocas_ms3.demos.takeover import Takeover
 from robocas_ms3.evaluation.acting import Player, check_acting, steps_of
 from robocas_ms3.evaluation.policies.replay import ReplayPolicy
@@ -113,9 +113,9 @@ def test_the_record_begins_where_the_policy_was(player, generator, tmp_path):
     (episode,) = read_json(one)["episodes"]
     assert episode["robocas"]["takeover"] == {"policy": "random", "policy_steps": 31}
     assert episode["robocas"]["subgoals"][0]["goal_range"][0] == 0
-    assert [(played.success, played.state_error) for played in replay(one)] == [(True, 0.0)]
+    assert [(played.success, played.state_error) for played in replay(ReplaySettings(one))] == [(True, 0.0)]
     saved = tmp_path / "saved.h5"
-    assert [played.success for played in replay(one, use_env_states=True, save=saved)] == [True]
+    assert [played.success for played in replay(ReplaySettings(one, use_env_states=True, save=saved))] == [True]
     assert actions_of(saved) == actions_of(one)
     with TrajectoryFile(saved) as file:
         assert file.entry(0).taken_over

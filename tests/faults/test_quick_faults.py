@@ -17,8 +17,8 @@ from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.datasets.writing.settings import ConversionSettings
-from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.demos.generate import generate
+from robocas_ms3.demos.settings import EpisodeSettings, GenerateSettings
 
 
 @pytest.fixture
@@ -53,13 +53,8 @@ def test_a_conversion_leaves_out_what_ends_its_process_twice_and_goes_on_later(b
 def test_a_generation_gives_a_seed_up_that_hangs_twice(befalls, tmp_path):
     log = befalls(1, "hang", 2, made_up=True)
     given_up = []
-    summary = generate(
-        EpisodeSettings("pick", "pick_table_scattered", "builtin"),
-        tmp_path / "out",
-        episodes=3,
-        limits=Limits(seconds=2),
-        on_result=lambda result: given_up.extend(result.failures),
-    )
+    settings = GenerateSettings(EpisodeSettings("pick"), tmp_path / "out", episodes=3, episode_seconds=2)
+    summary = generate(settings, on_result=lambda result: given_up.extend(result.failures))
     assert [(one.seed, one.stage, one.reason) for one in given_up] == [(1, "worker", "too slow")]
     assert (summary.episodes, summary.gave_up) == (3, [1])
     episodes = json.loads((tmp_path / "out" / "trajectory.json").read_text())["episodes"]

@@ -11,8 +11,8 @@ from mani_skill.utils.structs import Pose
 
 from robocas_ms3.core.errors import EpisodeLost, PlanningFailed
 from robocas_ms3.core.poses import transform
-from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.demos.generator import EpisodeGenerator
+from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.planning.decisions import StraightDecisions
 from robocas_ms3.planning.executor import Executor
 from robocas_ms3.planning.protocol import Obstacle, Shape

@@ -11,12 +11,12 @@ import pytest
 import robocas_ms3  # noqa: F401
 from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.datasets.sources.arrays import episode_arrays, planar_base
-from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.recordings.motion import sample_states
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
 from robocas_ms3.demos.recordings.subgoals import sample_subgoals
 from robocas_ms3.demos.replay import replay
+from robocas_ms3.demos.settings import EpisodeSettings, ReplaySettings
 from robocas_ms3.demos.trials import Trials
 from robocas_ms3.planning.executor import Executor
 from robocas_ms3.planning.skills.driving import base_at, drive
@@ -122,7 +122,7 @@ def test_a_drive_is_in_the_datasets_base_motion(driven):
 
 def test_a_drive_replays_exactly(driven):
     path, _ = driven
-    (again,) = replay(path)
+    (again,) = replay(ReplaySettings(path))
     assert again.state_error == 0.0
 
 

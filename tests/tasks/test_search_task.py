@@ -10,8 +10,8 @@ import torch
 from mani_skill.utils.structs import Pose
 
 import robocas_ms3.tasks  # noqa: F401
-from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.demos.generator import EpisodeGenerator
+from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.tasks import occlusion
 from robocas_ms3.tasks.search import MEASUREMENTS_PER_SECOND
 

@@ -13,8 +13,8 @@ from mani_skill.utils.structs import Pose
 
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.errors import AssetError
-from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.demos.generator import EpisodeGenerator
+from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.planning.executor import Executor
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.planning.skills.grasping import plan_grasp

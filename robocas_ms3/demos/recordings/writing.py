@@ -133,10 +133,6 @@ class EpisodeRecorder(gym.Wrapper):
             "max_episode_steps": find_max_episode_steps_value(self.env),
         }
 
-    def discard(self) -> None:
-        """Forget the episode; the environment stays open."""
-        self._steps = _Steps()
-
 
 @dataclass
 class _Steps:

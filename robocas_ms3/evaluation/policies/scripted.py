@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.recordings.motion import sample_stride
+from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.evaluation.policies.tracks import Followers, JointTrack, PoseTrack, Track
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.robots.table import find_robot

@@ -11,8 +11,8 @@ import numpy as np
 from learning_envs import STATE_ONLY
 
 import robocas_ms3  # noqa: F401
-from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.demos.generator import EpisodeGenerator
+from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.tasks import TASKS
 
 OPEN, SHUT = 1.0, -1.0  # the gripper's command, the last number of an action
