@@ -29,7 +29,7 @@ import robocas_ms3.tasks  # noqa: F401
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.assets.physics import CONTACT_OFFSET
 from robocas_ms3.scenes import build
-from robocas_ms3.scenes.bank import layout_bank
+from robocas_ms3.scenes.cache import layout_source
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.task_specs import TASKS
@@ -74,7 +74,7 @@ class BareEnv(BaseEnv):
         ]
 
     def _load_scene(self, options: dict) -> None:
-        self.layout = layout_bank(self.model)(0, 0)
+        self.layout = layout_source(self.model)(0, 0)
         build.build_fixtures(self.scene, self.model, "fast", [0] * self.num_envs)
         assets = [self.model.object_pack.objects[i] for i in self.layout.object_ids]
         self.things = [build.build_object_slot(self.scene, k, [a] * self.num_envs) for k, a in enumerate(assets)]

@@ -1,4 +1,4 @@
-"""What a reset takes that finds its layout in the bank, state only; prints JSON.
+"""What a reset takes that finds its layout in the cache, state only; prints JSON.
 
 python benchmarks/resets.py --seeds 60
 """
@@ -14,15 +14,14 @@ import numpy as np
 import torch
 import tyro
 
-from robocas_ms3.scenes.bank import LayoutBank
+from robocas_ms3.scenes.cache import LayoutCache, pairs_of
 from robocas_ms3.scenes.config import load_task_config
-from robocas_ms3.scenes.fill import fill, pairs_of
 from robocas_ms3.tasks import TASKS
 
 
 @dataclass
 class Benchmark:
-    """Fill the bank, then reset to each of its seeds."""
+    """Fill the cache, then reset to each of its seeds."""
 
     config: str = "search_table_stacked"
     """Task configuration; this one has 15 objects."""
@@ -41,7 +40,7 @@ def main(cfg: Benchmark) -> None:
     env = gym.make(TASKS[config.task].env_id, config=cfg.config, pack=cfg.pack, obs_mode="none", render_backend="none")
     base = env.unwrapped
     pairs = pairs_of(range(cfg.seeds))
-    failed = {pair for pair, problem in fill(LayoutBank(base.model), pairs) if problem}
+    failed = {pair for pair, problem in LayoutCache(base.model).fill(pairs) if problem}
     seeds = [seed for seed, _ in pairs if (seed, seed) not in failed]
     rounds = []
     for _ in range(cfg.rounds):

@@ -1,4 +1,4 @@
-"""``robocas layouts build | info``: banks of layouts, made ahead."""
+"""``robocas layouts build | info``: layout caches, filled ahead."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 if TYPE_CHECKING:
-    from robocas_ms3.scenes.bank import LayoutBank
+    from robocas_ms3.scenes.cache import LayoutCache
     from robocas_ms3.scenes.table import Engine, Pair
 
 from robocas_ms3.cli.options import Maybe, Repeated
@@ -22,7 +22,7 @@ from robocas_ms3.core.words import count_of
 class Build:
     """Make the layouts of a range of seeds ahead, so that a reset only sets poses.
 
-    What is there already is kept: the same command goes on where one was interrupted.
+    Existing layouts are kept: the same command continues after an interruption.
 
     One env has objects and arrangement of one seed. Several envs are built with the objects of seeds 0, 1, ... and keep
     them, while arrangements change: for num_envs=4, --objects 0:4 --seeds 0:100 is what resets without a seed use.
@@ -50,7 +50,7 @@ class Build:
     jobs: Maybe[int] = None
     """Processes. Default: one for each CPU core."""
     out: Maybe[Path] = None
-    """Folder of all banks. Default: in the cache, where environments look for them."""
+    """Folder of all layout caches. Default: where environments look for them."""
 
 
 @dataclass
@@ -61,7 +61,7 @@ class Info:
     """
 
     folder: Maybe[Path] = None
-    """Folder of all banks. Default: in the cache."""
+    """Folder of all layout caches. Default: where environments look for them."""
 
 
 def build(command: Build) -> int:
@@ -74,45 +74,46 @@ def build(command: Build) -> int:
 
     if command.jobs is not None:
         check_number("jobs", command.jobs, 1)
-    objects = None if command.objects is None else objects_seeds(command.objects)
-    seeds = seed_range(command.seeds)
+    objects = None if command.objects is None else parse_seeds(command.objects, "--objects", listed=True)
+    seeds = parse_seeds(command.seeds, "--seeds")
     config = load_task_config(command.config, overrides=command.set)
     packs = load_pack(command.pack), load_pack(command.furniture_pack)  # before what takes seconds to import
-    from robocas_ms3.scenes.bank import LayoutBank
-    from robocas_ms3.scenes.fill import fill, pairs_of
+    from robocas_ms3.scenes.cache import LayoutCache, pairs_of
     from robocas_ms3.scenes.model import SceneModel
 
     pairs = pairs_of(seeds, objects)
-    model = SceneModel.load(config, *packs)
-    bank = LayoutBank(model, command.out or "auto")
+    cache = LayoutCache(SceneModel.load(config, *packs), command.out or "auto")
     engine = choose_engine(command.engine) if objects is not None else None
-    there = len(pairs) - len(bank.missing(pairs))
-    failures = moving = 0
+    there = len(pairs) - len(cache.missing(pairs))
+    failures = 0
     with bar("layouts made") as shown:
         shown.start(len(pairs), there)
-        for (chosen, seed), problem in fill(bank, pairs, command.jobs or os.cpu_count() or 1):
-            shown.advance()
+        for (chosen, seed), problem in cache.fill(pairs, command.jobs or os.cpu_count() or 1):
             if problem:
                 failures += 1
                 which = f"seed {seed}" if objects is None else f"objects {chosen}, seed {seed}"
                 shown.note(f"{which}: {problem}")
+            else:
+                shown.advance()
     if engine is not None:  # for several envs, whose resets then read one file
-        bank.write_table(engine, pairs)
+        cache.write_table(engine, pairs)
+    moving = 0
     if engine == "gpu":
-        moving = try_all(bank, engine, pack=command.pack, furniture_pack=command.furniture_pack)
+        moving = try_all(cache, engine, pack=command.pack, furniture_pack=command.furniture_pack)
     made = len(pairs) - there - failures
     say(f"{count_of(made, 'layout')} made, {there} there already, {count_of(failures, 'seed')} without one")
-    if engine is not None and (table := bank.table(engine)) is not None:
+    if engine is not None and (table := cache.table(engine)) is not None:
         sets, arrangements = table.rows.shape
-        say(f"table: {bank.table_path(engine)}, {count_of(sets, 'set')} of objects by {count_of(arrangements, 'seed')}")
+        size = f"{count_of(sets, 'set')} of objects by {count_of(arrangements, 'seed')}"
+        say(f"table: {cache.table_path(engine)}, {size}")
     if engine == "gpu":
-        say(f"objects of {moving} move when the GPU lets go of them: no reset takes these")
-    say(f"bank: {bank.folder}")
+        say(f"objects of {moving} move when the GPU simulates them: no reset takes these")
+    say(f"cache: {cache.folder}")
     return 1 if failures else 0
 
 
 def choose_engine(wanted: Literal["auto", "cpu", "gpu"]) -> Engine:
-    """What is to run the layouts.
+    """Return the engine that is to run the layouts.
 
     Raises:
         ConfigError: there is no GPU.
@@ -126,16 +127,16 @@ def choose_engine(wanted: Literal["auto", "cpu", "gpu"]) -> Engine:
     return "gpu" if wanted != "cpu" and is_available() else "cpu"
 
 
-def try_all(bank: LayoutBank, engine: Engine, **packs: str) -> int:
-    """Let the engine try what it has not tried; how many layouts' objects move, of all in the table."""
+def try_all(cache: LayoutCache, engine: Engine, **packs: str) -> int:
+    """Let the engine try layouts in state `UNTRIED`; return how many layouts of the table it moves."""
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.scenes.table import State
     from robocas_ms3.tasks.trial import judged, try_layouts, untried
 
-    seeds = untried(bank, engine)
+    seeds = untried(cache, engine)
     if seeds:
         found: dict[Pair, State] = {}
-        trial = try_layouts(bank, engine, seeds, **packs)
+        trial = try_layouts(cache, engine, seeds, **packs)
         try:
             with bar("layouts tried") as shown:
                 shown.start(sum(map(len, seeds.values())))
@@ -143,8 +144,8 @@ def try_all(bank: LayoutBank, engine: Engine, **packs: str) -> int:
                     found[pair] = judged(moved)
                     shown.advance()
         finally:  # interrupted, it keeps what was found
-            bank.mark_table(engine, found)
-    table = bank.table(engine)
+            cache.mark_table(engine, found)
+    table = cache.table(engine)
     return len(table.pairs(State.MOVES)) if table else 0
 
 
@@ -155,52 +156,41 @@ def info(command: Info) -> int:
 
     from robocas_ms3.cli.terminal import table_console
     from robocas_ms3.core.documents import load_json
-    from robocas_ms3.scenes.bank import ABOUT, banks_folder, count_layouts
+    from robocas_ms3.scenes.cache import ABOUT, caches_folder, count_layouts
 
-    root = banks_folder(command.folder or "auto")
-    table = Table("bank", "layouts", "task", "layout", "objects", "object pack", "furniture")
+    root = caches_folder(command.folder or "auto")
+    table = Table("cache", "layouts", "task", "layout", "objects", "object pack", "furniture")
     for path in sorted(root.glob(f"*/{ABOUT}")):
         try:
             about = load_json(path)
             config, furniture = about["config"], ", ".join(sorted(about["furniture"]))
             of = (config["task"], config["layout"]["kind"], config["objects"]["count"], about["object_pack"]["name"])
-        except (OSError, ValueError, KeyError, TypeError):  # it is the layouts that count: they are still of use
+        except (OSError, ValueError, KeyError, TypeError):  # the layouts are still of use
             of, furniture = (f"{ABOUT} is damaged", "", "", ""), ""
         row = (path.parent.name, count_layouts(path.parent), *of, furniture)
         table.add_row(*(escape(str(value)) for value in row))
     table_console().print(
-        table if table.row_count else escape(f"no banks in {root}"), soft_wrap=not table.row_count, highlight=False
+        table if table.row_count else escape(f"no layout caches in {root}"),
+        soft_wrap=not table.row_count,
+        highlight=False,
     )
     return 0
 
 
-def seed_range(text: str) -> range:
-    """Seeds of ``FIRST:END``.
+def parse_seeds(text: str, option: str, *, listed: bool = False) -> list[int]:
+    """Return the seeds of ``FIRST:END``, or, where that is allowed, of a list ``SEED,SEED``.
 
     Raises:
-        ConfigError: it isn't one, or it is empty.
+        ConfigError: they are neither, or the range is empty.
     """
     from robocas_ms3.core.errors import ConfigError
 
-    match = re.fullmatch(r"(\d+):(\d+)", text)
-    if match is None or int(match[1]) >= int(match[2]):
-        raise ConfigError("no range of seeds", where="--seeds", expected="FIRST:END such as 0:100", found=text)
-    return range(int(match[1]), int(match[2]))
-
-
-def objects_seeds(text: str) -> list[int]:
-    """Seeds of ``FIRST:END`` or ``SEED,SEED``.
-
-    Raises:
-        ConfigError: they aren't any.
-    """
-    from robocas_ms3.core.errors import ConfigError
-
-    if re.fullmatch(r"\d+(,\d+)*", text):
+    if listed and re.fullmatch(r"\d+(,\d+)*", text):
         return list(dict.fromkeys(int(seed) for seed in text.split(",")))
     match = re.fullmatch(r"(\d+):(\d+)", text)
     if match is None or int(match[1]) >= int(match[2]):
-        raise ConfigError("no seeds of objects", where="--objects", expected="0:4, or 3,7", found=text)
+        expected = "FIRST:END such as 0:100" + (", or 3,7" if listed else "")
+        raise ConfigError("no range of seeds", where=option, expected=expected, found=text)
     return list(range(int(match[1]), int(match[2])))
 
 

@@ -32,8 +32,8 @@ from robocas_ms3.evaluation.protocol import (
 )
 from robocas_ms3.robots.table import DEFAULT
 from robocas_ms3.scenes.config import TaskConfig, load_task_config, shipped_configs
-from robocas_ms3.scenes.frozen import write_frozen
 from robocas_ms3.scenes.layout import Layout
+from robocas_ms3.scenes.table import write_frozen
 from robocas_ms3.scenes.task_specs import TASKS
 from robocas_ms3.tasks.base import RoboCASEnv
 
@@ -120,7 +120,7 @@ def freeze(
     Args:
         plan: what it is made from.
         folder: that it becomes.
-        layouts: bank to take scenes from.
+        layouts: cache to take scenes from.
         overrides: keys to set in all its configurations, see `load_task_config`.
 
     Yields:

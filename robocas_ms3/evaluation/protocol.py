@@ -5,7 +5,7 @@
     protocol.yaml            the rules, see `Protocol`
     episodes.jsonl           an episode a line, see `Episode`
     configs/NAME.yaml        the configurations that episodes name, whole
-    layouts/NAME.npy         the scenes of a configuration's episodes (`scenes.frozen`)
+    layouts/NAME.npy         the scenes of a configuration's episodes (`scenes.table`)
     train/NAME.yaml          of a suite that holds something out: configurations that don't have it, to train on
 
 Its hash is that of all these files, so two results of one hash were measured by the same thing.

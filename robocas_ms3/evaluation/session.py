@@ -26,7 +26,7 @@ from robocas_ms3.evaluation.rollout import NOT_FINITE, EndConditions, EpisodeBat
 from robocas_ms3.evaluation.settings import EvaluationSettings, check_one_configuration, choose_episodes
 from robocas_ms3.evaluation.stepping import UPSTREAM_HZ, PolicyStepping, env_kwargs
 from robocas_ms3.evaluation.weld import check_weld
-from robocas_ms3.scenes.frozen import FrozenLayouts
+from robocas_ms3.scenes.table import FrozenLayouts
 from robocas_ms3.scenes.task_specs import TASKS
 from robocas_ms3.tasks.vector import make_vec
 from robocas_ms3.tasks.vector.backend import choose_backend

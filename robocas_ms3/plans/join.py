@@ -29,7 +29,7 @@ from robocas_ms3.plans.folder import REPORT, UNITS
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.split import rule_of, split_of
 from robocas_ms3.plans.units import Outcome, SeedFiles, Unit
-from robocas_ms3.scenes.frozen import join_frozen
+from robocas_ms3.scenes.table import join_frozen
 
 LAYOUTS, DEMOS, DATASETS, STATISTICS = "layouts", "demos", "datasets", "statistics"
 TRAJECTORY = "trajectory.h5"

@@ -17,10 +17,10 @@ from robocas_ms3.plans.load import opening_part, recording_settings
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.units import SeedFiles
 from robocas_ms3.robots.table import find_robot
-from robocas_ms3.scenes.bank import layout_bank
+from robocas_ms3.scenes.cache import layout_source
 from robocas_ms3.scenes.config import load_config_of
-from robocas_ms3.scenes.frozen import write_frozen
 from robocas_ms3.scenes.model import SceneModel
+from robocas_ms3.scenes.table import write_frozen
 from robocas_ms3.scenes.task_specs import TASKS
 
 
@@ -35,7 +35,7 @@ class LayoutMaker:
         config, robot = load_config_of(TASKS[settings.task], settings.config), find_robot(settings.robot)
         model = SceneModel.load(config, load_pack(settings.pack), load_pack("builtin"), robot=robot.description)
         self._names = model.object_pack.objects
-        self._layouts = layout_bank(model, settings.layouts)
+        self._layouts = layout_source(model, settings.layouts)
 
     def write(self, files: SeedFiles) -> None:
         """Write the layout of a seed.

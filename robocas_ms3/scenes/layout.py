@@ -1,19 +1,25 @@
-"""What a layout is: where everything stands at the beginning of an episode. No simulator."""
+"""A layout: where everything is at the start of an episode; and its ``.npz`` file. No simulator."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field, fields
+from io import BytesIO
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.core.documents import open_arrays
+from robocas_ms3.core.files import replacing
+
 Array = NDArray[np.float64]
 
 ObjectIds = tuple[str, ...]
-"""Objects of a scene, one id of the object pack a slot."""
+"""Objects of a scene: an id of the object pack per slot."""
 
-_SKEW = 1e-3  # by which a rotation may differ from one, as single precision does
+_ROTATION_ERROR = 1e-3  # by which a matrix may differ from a rotation, as single precision does
 PARKING_HEIGHT = -5.0  # z of the plane, m, on which slots wait that an episode does not use
 
 
@@ -22,13 +28,13 @@ class Layout:
     """A settled arrangement of objects and its target. K objects; world frame, metres.
 
     Attributes:
-        object_ids: K ids of the object pack, one a slot.
-        object_poses: (K, 4, 4) objects in the world, at rest; of those that aren't present, where they wait.
-        robot_pose: (4, 4) the robot's root on the floor, in the world.
-        basket_pose: (4, 4) the basket's frame in the world; None where there is no basket.
+        object_ids: K ids of the object pack.
+        object_poses: (K, 4, 4) objects at rest; of those that aren't present, where they wait.
+        robot_pose: (4, 4) the robot's root on the floor.
+        basket_pose: (4, 4) the basket's frame; None where there is no basket.
         target: slot of the target.
-        relation: how the instruction tells the target from its likes, e.g. ``nearest``; empty where its name does.
-        present: (K,) which slots take part; default: all. Slots are as many for every seed, their use may vary.
+        relation: how the instruction tells the target from identical objects, e.g. ``nearest``; empty: by its name.
+        present: (K,) which slots take part; default: all. The number of slots is the same for every seed.
         visible_shares: (K,) p_vis of each object from the selection camera; NaN where it was not asked for.
     """
 
@@ -48,22 +54,50 @@ class Layout:
             object.__setattr__(self, "visible_shares", np.full(len(self.object_ids), np.nan))
 
     def check(self, names: Collection[str]) -> None:
-        """See that it can be built, whoever wrote it.
-
-        Args:
-            names: ids of the object pack's objects.
-
-        Raises:
-            ValueError: it can't, saying why.
-        """
+        """Raise ValueError where a layout read from a file can't be built with the objects of these names."""
         count = len(self.object_ids)
         shapes = self.object_poses.shape, self.present.shape, self.visible_shares.shape
         if shapes != ((count, 4, 4), (count,), (count,)) or not set(self.object_ids) <= set(names):
             raise ValueError("other objects than those of the pack, or not as many poses as objects")
-        others = [self.robot_pose] if self.basket_pose is None else [self.robot_pose, self.basket_pose]
-        if any(pose.shape != (4, 4) for pose in others) or not 0 <= self.target < count:
-            raise ValueError("a pose is no 4x4, or the target none of the objects")
-        poses = np.concatenate([self.object_poses, others])
+        fixtures = [self.robot_pose] if self.basket_pose is None else [self.robot_pose, self.basket_pose]
+        if any(pose.shape != (4, 4) for pose in fixtures) or not 0 <= self.target < count:
+            raise ValueError("a pose is not 4x4, or the target is not one of the objects")
+        poses = np.concatenate([self.object_poses, fixtures])
         turns = poses[:, :3, :3]
-        if not np.isfinite(poses).all() or np.abs(turns @ turns.swapaxes(1, 2) - np.eye(3)).max() > _SKEW:
-            raise ValueError("a pose is no pose")
+        if not np.isfinite(poses).all() or np.abs(turns @ turns.swapaxes(1, 2) - np.eye(3)).max() > _ROTATION_ERROR:
+            raise ValueError("a pose is not finite, or not a rotation")
+
+
+LayoutSource = Callable[[int, int], Layout]
+"""(objects seed, seed) -> layout."""
+
+
+def write_layout(layout: Layout, path: Path) -> None:
+    """Write a layout as ``.npz``."""
+    values = {f.name: getattr(layout, f.name) for f in fields(Layout)}
+    arrays: dict[str, Any] = {
+        name: np.zeros(0) if value is None else np.asarray(value) for name, value in values.items()
+    }
+    archive = BytesIO()  # a zip file on a full disk raises once more when it is closed
+    np.savez(archive, **arrays)
+    with replacing(path) as tmp:
+        tmp.write_bytes(archive.getbuffer())
+
+
+def read_layout(path: Path) -> Layout:
+    """Read a layout.
+
+    Raises:
+        ValueError: or another of `documents.DAMAGED`, or KeyError or TypeError: the file is damaged.
+    """
+    with open_arrays(path) as file:
+        values = {f.name: file[f.name] for f in fields(Layout)}
+    return Layout(
+        **{
+            **values,
+            "basket_pose": values["basket_pose"] if values["basket_pose"].size else None,
+            "object_ids": tuple(values["object_ids"].tolist()),
+            "target": int(values["target"]),
+            "relation": str(values["relation"]),
+        }
+    )

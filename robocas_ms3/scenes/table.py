@@ -1,14 +1,15 @@
-"""Layouts of many envs as arrays: one file that is mapped into memory, so that a reset of any number is a gather.
+"""Many layouts in one ``.npy`` file, an array of records in single precision.
 
-A table holds S sets of objects (by the seed that drew them) with L layouts each (by their own seeds), for one engine:
-PhysX on a CPU or on a GPU. It is made of a bank (`fill.fill`, then `LayoutBank.write_table`) and lies beside its
-layouts. On a GPU the engine then tries whether the objects stay (`tasks.trial`).
+- A table, of a layout cache: S sets of objects (by the seed that drew them) with L layouts each (by their own seeds),
+  for PhysX on a CPU or on a GPU. It is mapped into memory, so that a reset of any number of envs is a gather.
+- Frozen layouts, of a protocol: those of a list of seeds, the same scenes on every machine.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from enum import IntEnum
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
@@ -16,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.core.documents import DAMAGED, check_regular
+from robocas_ms3.core.documents import DAMAGED, check_regular, load_array
 from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.core.files import replacing
 from robocas_ms3.core.poses import from_wxyz, to_wxyz
@@ -27,26 +28,25 @@ Engine = Literal["cpu", "gpu"]
 Pair = tuple[int, int]
 """Objects seed, seed."""
 
-_MADE_BY = "Make it again: robocas layouts build."
-_AXES = ("objects_seed", (slice(None), 0)), ("seed", (0, slice(None)))  # both in rising order
+_FIX = "Make it again: robocas layouts build."
 
 
 class State(IntEnum):
-    """What is known of a layout of a table."""
+    """State of a layout in a table."""
 
     LACKING = 0
-    UNTRIED = 1  # good, as far as the engine that made it can tell
+    UNTRIED = 1  # stable in the engine that made it
     STAYS = 2
-    MOVES = 3  # its objects do, by the engine that the table is for
+    MOVES = 3  # the engine of the table moves its objects
 
 
 def good(states: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Which `State` allows an episode to begin there."""
+    """Return whether an episode may begin with layouts in these states."""
     return (states == State.UNTRIED) | (states == State.STAYS)
 
 
 class LayoutTable:
-    """Layouts from a mapped file.
+    """Layouts of a table file; see the module.
 
     Args:
         path: of the file.
@@ -56,80 +56,74 @@ class LayoutTable:
         rows: (S, L) records, mapped.
 
     Raises:
-        LayoutError: it is damaged.
+        LayoutError: the file is damaged.
     """
 
     def __init__(self, path: Path, names: Sequence[str]) -> None:
-        self._names: list[str] = list(names)
-        try:
-            check_regular(path)
-            self.rows: NDArray[np.void] = np.lib.format.open_memmap(path, mode="r")
-            self._sets, self._seeds = (self.rows[name][place].copy() for name, place in _AXES)
-            self._states = self.rows["state"].copy()
-            check_record(self.rows.dtype)
-        except (*DAMAGED, IndexError, KeyError, TypeError) as error:  # of other fields
-            raise LayoutError("no table of layouts", where=path, found=error, fix=_MADE_BY) from error
+        self._names = list(names)
+        self.rows = _open(path, partial(np.lib.format.open_memmap, mode="r"), "no table of layouts", dimensions=2)
+        self._sets, self._seeds = self.rows["objects_seed"][:, 0].copy(), self.rows["seed"][0].copy()  # rising
+        self._states = self.rows["state"].copy()
 
     def places(self, objects_seeds: NDArray[np.int64], seeds: NDArray[np.int64]) -> tuple[NDArray, NDArray, NDArray]:
-        """Where E pairs are, (E,) each: the `State`, of what is not there `LACKING`; row; column."""
+        """Return `State`, row and column of E pairs, (E,) each; of those not in the table the state is `LACKING`."""
         rows = np.minimum(np.searchsorted(self._sets, objects_seeds), len(self._sets) - 1)
         columns = np.minimum(np.searchsorted(self._seeds, seeds), len(self._seeds) - 1)
         there = (self._sets[rows] == objects_seeds) & (self._seeds[columns] == seeds)
         return np.where(there, self._states[rows, columns], State.LACKING), rows, columns
 
     def state(self, pair: Pair) -> State:
-        """What is known of a layout."""
+        """Return the state of a layout."""
         return State(int(self.places(np.array([pair[0]]), np.array([pair[1]]))[0][0]))
 
     def pairs(self, *states: State) -> list[Pair]:
-        """Objects seed and seed of the layouts that it holds, of those states alone if any is named."""
+        """Return the pairs of the layouts in these states; default: of all that the table holds."""
         rows, columns = np.nonzero(np.isin(self._states, states) if states else self._states)
         return [*zip(self._sets[rows].tolist(), self._seeds[columns].tolist(), strict=True)]
 
     def stays(self, objects_seed: int) -> bool:
-        """Whether any layout of a seed's objects is good, as far as is known."""
-        row = self._states[self._sets == objects_seed]
-        return bool(good(row).any())
+        """Return whether any layout of a seed's objects is good."""
+        return bool(good(self._states[self._sets == objects_seed]).any())
 
     def object_ids(self, objects_seed: int) -> ObjectIds | None:
-        """The objects of a seed; None where it has no layout of them."""
+        """Return the objects of a seed; None where the table has no layout of them."""
         row = int(np.searchsorted(self._sets, objects_seed))
         if row == len(self._sets) or self._sets[row] != objects_seed:
             return None
-        some = int(np.argmax(self._states[row] != State.LACKING))
-        return tuple(str(self._names[i]) for i in self.rows["objects"][row, some].tolist())
+        column = int(np.argmax(self._states[row] != State.LACKING))
+        return tuple(str(self._names[i]) for i in self.rows["objects"][row, column].tolist())
 
     def layout(self, pair: Pair) -> Layout | None:
-        """A layout, in single precision; None where it lacks it."""
+        """Return a layout, in single precision; None where the table lacks it."""
         state, rows, columns = self.places(np.array([pair[0]]), np.array([pair[1]]))
-        if state[0] == State.LACKING:
-            return None
-        return read_record(self.rows[rows[0], columns[0]], self._names)
+        return _layout(self.rows[rows[0], columns[0]], self._names) if state[0] != State.LACKING else None
 
 
 def write_table(
-    path: Path, names: Sequence[str], layouts: Mapping[Pair, Layout], states: Mapping[Pair, State] | None = None
+    path: Path,
+    names: Sequence[str],
+    layouts: Mapping[Pair, Layout],
+    states: Mapping[Pair, State] = MappingProxyType({}),
 ) -> None:
     """Write layouts as a table.
 
     Args:
         path: of the file.
         names: ids of the object pack's objects, sorted.
-        layouts: by objects seed and seed, those of an objects seed all of the same objects; pairs of these seeds that
-            are missing have no layout.
-        states: what is known of them; default: `State.UNTRIED`.
+        layouts: by pair; those of an objects seed have the same objects. Other pairs of the same seeds are lacking.
+        states: of these layouts; default: `State.UNTRIED`.
     """
-    sets, seeds = (sorted({pair[side] for pair in layouts}) for side in (0, 1))
-    records = as_records(names, layouts, states or {})
+    records = _records(names, layouts, states)
+    sets, row = np.unique(records["objects_seed"], return_inverse=True)
+    seeds, column = np.unique(records["seed"], return_inverse=True)
     rows = np.zeros((len(sets), len(seeds)), records.dtype)
-    rows["objects_seed"], rows["seed"] = np.array(sets)[:, None], seeds
-    row_of, column_of = ({seed: i for i, seed in enumerate(axis)} for axis in (sets, seeds))
-    rows[[row_of[one] for one, _ in layouts], [column_of[other] for _, other in layouts]] = records
+    rows["objects_seed"], rows["seed"] = sets[:, None], seeds
+    rows[row, column] = records
     _save(path, rows)
 
 
 def mark_table(path: Path, names: Sequence[str], states: Mapping[Pair, State]) -> None:
-    """Write what is known of some layouts into a table; those that it lacks it goes on lacking."""
+    """Write the states of some layouts into a table; layouts that it lacks stay `State.LACKING`."""
     table = LayoutTable(path, names)
     rows = np.array(table.rows)
     for pair, state in states.items():
@@ -139,14 +133,68 @@ def mark_table(path: Path, names: Sequence[str], states: Mapping[Pair, State]) -
     _save(path, rows)
 
 
-def as_records(
+class FrozenLayouts:
+    """A `LayoutSource` of frozen layouts; it samples none.
+
+    Args:
+        path: of the file.
+        names: ids of the object pack's objects.
+
+    Raises:
+        LayoutError: the file is damaged.
+    """
+
+    def __init__(self, path: Path, names: Collection[str]) -> None:
+        self._path, self._names = path, sorted(names)
+        self._records = _open(path, load_array, "no frozen layouts", dimensions=1)
+        self._places = {int(seed): i for i, seed in enumerate(self._records["seed"])}
+
+    @property
+    def seeds(self) -> tuple[int, int]:
+        """First and last of the consecutive seeds from the least on."""
+        first = last = min(self._places)
+        while last + 1 in self._places:
+            last += 1
+        return first, last
+
+    def __call__(self, objects_seed: int, seed: int) -> Layout:
+        """Return the layout of a seed, which has its own objects.
+
+        Raises:
+            LayoutError: there is none, or the seeds differ.
+        """
+        if objects_seed != seed or seed not in self._places:
+            found = seed if objects_seed == seed else f"objects of {objects_seed}, layout of {seed}"
+            raise LayoutError("has no layout of this seed", where=self._path, found=found)
+        return _layout(self._records[self._places[seed]], self._names)
+
+
+def write_frozen(path: Path, names: Collection[str], layouts: Mapping[int, Layout]) -> None:
+    """Write layouts by their seeds; see `FrozenLayouts`."""
+    _save(path, _records(sorted(names), {(seed, seed): layout for seed, layout in layouts.items()}))
+
+
+def join_frozen(path: Path, parts: Sequence[Path]) -> None:
+    """Join files of one configuration's layouts, in the order given; see `FrozenLayouts`.
+
+    Raises:
+        LayoutError: one of them is damaged, or of another configuration.
+    """
+    pieces = [_open(part, load_array, "no frozen layouts", dimensions=1) for part in parts]
+    for part, piece in zip(parts, pieces, strict=True):
+        if piece.dtype["objects"] != pieces[0].dtype["objects"]:
+            raise LayoutError("no frozen layouts of this configuration", where=part)
+    _save(path, np.concatenate(pieces))
+
+
+def _records(
     names: Sequence[str], layouts: Mapping[Pair, Layout], states: Mapping[Pair, State] = MappingProxyType({})
 ) -> NDArray[np.void]:
-    """Layouts of equally many slots as records (E,); see `write_table`."""
+    """Return layouts of equally many slots as records (E,)."""
     slots = len(next(iter(layouts.values())).object_ids)
     words = max(1, *(len(layout.relation) for layout in layouts.values()))
     number = {name: i for i, name in enumerate(names)}
-    records = np.zeros(len(layouts), _record(slots, words))
+    records = np.zeros(len(layouts), _record_type(slots, words))
     for i, (pair, layout) in enumerate(layouts.items()):
         records[i] = (
             *pair,
@@ -163,12 +211,8 @@ def as_records(
     return records
 
 
-def read_record(record: Any, names: Sequence[str]) -> Layout:
-    """The layout of a record, in single precision.
-
-    Raises:
-        LayoutError: it is damaged.
-    """
+def _layout(record: Any, names: Sequence[str]) -> Layout:
+    """Return the layout of a record; LayoutError where it is damaged."""
     try:
         layout = Layout(
             object_ids=tuple(str(names[i]) for i in record["objects"].tolist()),
@@ -182,19 +226,20 @@ def read_record(record: Any, names: Sequence[str]) -> Layout:
         )
         layout.check(names)
     except (ValueError, IndexError) as error:
-        raise LayoutError("this layout is damaged", found=error, fix=_MADE_BY) from error
+        raise LayoutError("this layout is damaged", found=error, fix=_FIX) from error
     return layout
 
 
-def check_record(dtype: np.dtype) -> None:
-    """See that an array is one of records.
-
-    Raises:
-        ValueError: it isn't.
-    """
-    slots, words = dtype["present"].itemsize, dtype["relation"].itemsize // 4
-    if dtype != _record(slots, words):
-        raise ValueError("other fields than a table's")
+def _open(path: Path, load: Callable[[Path], Any], what: str, *, dimensions: int) -> NDArray[np.void]:
+    try:
+        check_regular(path)
+        rows = load(path)
+        slots, words = rows.dtype["present"].itemsize, rows.dtype["relation"].itemsize // 4
+        if rows.dtype != _record_type(slots, words) or rows.ndim != dimensions or not rows.size:
+            raise ValueError("other fields than those of layouts")
+    except (*DAMAGED, KeyError, TypeError) as error:
+        raise LayoutError(what, where=path, found=error, fix=_FIX if dimensions == 2 else "") from error
+    return rows
 
 
 def _save(path: Path, rows: NDArray[np.void]) -> None:
@@ -202,7 +247,7 @@ def _save(path: Path, rows: NDArray[np.void]) -> None:
         np.save(file, rows)
 
 
-def _record(slots: int, words: int) -> np.dtype:
+def _record_type(slots: int, words: int) -> np.dtype:
     return np.dtype(
         [
             ("objects_seed", "i8"),

@@ -24,11 +24,10 @@ from robocas_ms3.core.extensions import load
 from robocas_ms3.robots.agent import MobileManipulator
 from robocas_ms3.robots.table import DEFAULT, find_robot
 from robocas_ms3.scenes import build
-from robocas_ms3.scenes.bank import layout_bank
+from robocas_ms3.scenes.cache import layout_source
 from robocas_ms3.scenes.config import TaskConfig, load_config_of
-from robocas_ms3.scenes.layout import Array, Layout
+from robocas_ms3.scenes.layout import Array, Layout, LayoutSource
 from robocas_ms3.scenes.model import SceneModel
-from robocas_ms3.scenes.source import LayoutSource
 from robocas_ms3.scenes.task_specs import SIM_FREQ, STANDARD_FREQ, TaskSpec
 from robocas_ms3.tasks import cameras, rewards, terms
 from robocas_ms3.tasks.bodies import Bodies, link_poses
@@ -63,10 +62,10 @@ class RoboCASEnv(BaseEnv):
         pack: name or folder of the pack that objects come from.
         furniture_pack: the same for room, furniture and basket.
         visual_level: ``fast`` or ``full`` meshes to render.
-        layouts: folder of the layout bank; default: in the cache, filled as layouts are asked for; None: no bank,
-            every layout is sampled again (the same ones, only slower); a file of frozen ones (`scenes.frozen`); or a
+        layouts: folder of the layout cache; default: in the user's cache folder, filled on demand; None: no cache,
+            every layout is sampled again (the same ones, only slower); a file of frozen ones (`scenes.table`); or a
             function that gives the layout of an objects seed and a seed.
-        seeds: least and greatest seed that unseeded resets draw from, such as those of a bank built ahead; default: any
+        seeds: least and greatest seed that unseeded resets draw from, such as those of a filled cache; default: any
             seed, with several envs 0 to 99, those of frozen layouts.
         robot_uids: name of the robot in `robots.table`.
         num_envs: see ``BaseEnv``.
@@ -123,8 +122,8 @@ class RoboCASEnv(BaseEnv):
         self._engine_errors: EngineErrors | None = None
         if reconfiguration_freq is None:
             reconfiguration_freq = 1 if num_envs == 1 else 0
-        bank, stay = layout_bank(self.model, layouts), reconfiguration_freq == 0
-        self.seeds = EpisodeSeeds(self, num_envs, bank, seed_range=seeds, objects_stay=stay)
+        cache, stay = layout_source(self.model, layouts), reconfiguration_freq == 0
+        self.seeds = EpisodeSeeds(self, num_envs, cache, seed_range=seeds, objects_stay=stay)
         self.instructions = Instructions(self)
         self.dense_reward = DenseReward(self, self.REWARDS)
         frequency = {"num_envs": num_envs, "reconfiguration_freq": reconfiguration_freq}

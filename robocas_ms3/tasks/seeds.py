@@ -12,11 +12,9 @@ from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import ConfigError, LayoutError
-from robocas_ms3.scenes.bank import LayoutBank
-from robocas_ms3.scenes.frozen import FrozenLayouts
-from robocas_ms3.scenes.layout import Layout, ObjectIds
-from robocas_ms3.scenes.source import LayoutSource
-from robocas_ms3.scenes.table import LayoutTable, Pair, State
+from robocas_ms3.scenes.cache import LayoutCache
+from robocas_ms3.scenes.layout import Layout, LayoutSource, ObjectIds
+from robocas_ms3.scenes.table import FrozenLayouts, LayoutTable, Pair, State
 from robocas_ms3.tasks.starts import Starts, TabledStarts
 
 SEVERAL_ENVS_SEEDS = (0, 99)  # least and greatest seed of several envs' unseeded resets
@@ -62,7 +60,7 @@ class EpisodeSeeds:
         layout_seeds: (N,) seed of each env's layout.
         objects_seeds: (N,) seed of each env's objects.
         object_ids: of each env.
-        table: all layouts of the bank, if it has a table.
+        table: all layouts of the cache, if it has a table.
         tabled: starts gathered from that table.
         first_reset: whether the next reset is that of making the environment, whose seed nobody asked for.
     """
@@ -154,7 +152,7 @@ class EpisodeSeeds:
     def choose_objects(self, seeds: NDArray[np.int64], *, on_gpu: bool) -> None:
         """Choose the objects that each env is built with from its seed (N,), which changes if it has no layout."""
         self._built_with = {}
-        if isinstance(self.layouts, LayoutBank) and (self._objects_stay or on_gpu):
+        if isinstance(self.layouts, LayoutCache) and (self._objects_stay or on_gpu):
             self.table = self.layouts.table("gpu" if on_gpu else "cpu")
             self._other_seeds = _OTHER_SEEDS if self.table else self._other_seeds
         self.object_ids = [self._first_possible(self._objects_of, env, seeds) for env in range(self._num_envs)]
@@ -162,7 +160,7 @@ class EpisodeSeeds:
         self.tabled = TabledStarts(self.table, self.objects_seeds, self._env.device) if self.table else None
 
     def find_starts(self, envs: NDArray[np.int64]) -> Starts:
-        """Return where some envs' episodes start; gathered on their device if the bank's table holds them all."""
+        """Return where some envs' episodes start; gathered on their device if the cache's table holds them all."""
         self.forget_layouts(envs)
         if self.tabled is None:
             return Starts.of([self.layout(env) for env in envs.tolist()], self._env.device)

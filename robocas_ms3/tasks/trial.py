@@ -7,7 +7,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from robocas_ms3.scenes.bank import LayoutBank
+from robocas_ms3.scenes.cache import LayoutCache
 from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.scenes.settle import CHECK_SECONDS, MAX_SHIFT
 from robocas_ms3.scenes.table import Engine, Pair, State
@@ -17,9 +17,9 @@ _ENVS = {"cpu": 1, "gpu": 256}  # at once
 _BACKENDS = {"cpu": "physx_cpu", "gpu": "physx_cuda"}
 
 
-def untried(bank: LayoutBank, engine: Engine) -> dict[int, list[int]]:
+def untried(cache: LayoutCache, engine: Engine) -> dict[int, list[int]]:
     """Seeds of layouts that are to be tried, by objects seed."""
-    table = bank.table(engine)
+    table = cache.table(engine)
     seeds: dict[int, list[int]] = {}
     for objects_seed, seed in table.pairs(State.UNTRIED) if table else ():
         seeds.setdefault(objects_seed, []).append(seed)
@@ -27,30 +27,30 @@ def untried(bank: LayoutBank, engine: Engine) -> dict[int, list[int]]:
 
 
 def try_layouts(
-    bank: LayoutBank, engine: Engine, seeds: dict[int, list[int]], **kwargs: Any
+    cache: LayoutCache, engine: Engine, seeds: dict[int, list[int]], **kwargs: Any
 ) -> Generator[tuple[Pair, float]]:
     """Let an environment begin with each layout and do nothing for a second.
 
     Args:
-        bank: where the layouts are.
+        cache: where the layouts are.
         engine: that is to run them.
         seeds: of layouts, by objects seed (`untried`).
-        kwargs: for ``gym.make``: the packs that the bank is of.
+        kwargs: for ``gym.make``: the packs that the cache is of.
 
     Yields:
         Objects seed and seed, and how far the object that moved farthest has moved then, m.
     """
     first_row = next(iter(seeds))
 
-    def layouts(objects_seed: int, seed: int) -> Layout:  # a bank as an env's own would tell what moves
+    def layouts(objects_seed: int, seed: int) -> Layout:  # a cache as an env's own would tell what moves
         known = objects_seed in seeds  # else the env is only being made
-        return bank.get(objects_seed, seed) if known else bank.get(first_row, first_row)
+        return cache.get(objects_seed, seed) if known else cache.get(first_row, first_row)
 
     count = min(_ENVS[engine], len(seeds))
     env: Any = gym.make(
-        TASKS[bank.model.config.task].env_id,
+        TASKS[cache.model.config.task].env_id,
         num_envs=count,
-        config=bank.model.config,
+        config=cache.model.config,
         layouts=layouts,
         reconfiguration_freq=0,
         sim_backend=_BACKENDS[engine],

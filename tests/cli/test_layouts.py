@@ -3,10 +3,11 @@ import json
 import pytest
 
 from robocas_ms3.cli import layouts
-from robocas_ms3.cli.layouts import Build, Info, objects_seeds, seed_range
+from robocas_ms3.cli.layouts import Build, Info, parse_seeds
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import ConfigError, LayoutError
-from robocas_ms3.scenes import bank, source
+from robocas_ms3.scenes import cache
+from robocas_ms3.scenes.layout import read_layout
 from robocas_ms3.scenes.sample import sample_layout
 
 
@@ -17,7 +18,7 @@ def build(folder, seeds):
 def test_layouts_are_made_once_and_a_later_run_goes_on(tmp_path, monkeypatch, capsys):
     made = []
     monkeypatch.setattr(
-        source, "sample_layout", lambda model, o, s, ids: made.append((o, s)) or sample_layout(model, o, s)
+        cache, "sample_layout", lambda model, o, s, ids: made.append((o, s)) or sample_layout(model, o, s)
     )
     assert build(tmp_path, "0:2") == 0
     assert build(tmp_path, "0:3") == 0
@@ -30,7 +31,7 @@ def test_layouts_are_made_once_and_a_later_run_goes_on(tmp_path, monkeypatch, ca
 
 def test_a_description_with_brackets_is_shown_as_it_is(tmp_path, capsys):
     build(tmp_path, "0:1")
-    (about,) = tmp_path.glob(f"*/{bank.ABOUT}")
+    (about,) = tmp_path.glob(f"*/{cache.ABOUT}")
     said = json.loads(about.read_text())
     about.write_text(json.dumps({**said, "object_pack": {"name": "[/red]"}}))
     assert layouts.info(Info(tmp_path)) == 0
@@ -43,11 +44,12 @@ def test_seeds_without_a_layout_are_named_and_the_others_made(tmp_path, monkeypa
             raise LayoutError("no object qualifies as the target", where="target")
         return sample_layout(model, objects_seed, seed)
 
-    monkeypatch.setattr(source, "sample_layout", fussy)
+    monkeypatch.setattr(cache, "sample_layout", fussy)
     assert build(tmp_path, "0:3") == 1
     captured = capsys.readouterr()
     assert "2 layouts made, 0 there already, 1 seed without one" in captured.out
     assert "seed 1: target: no object qualifies" in captured.err
+    assert "layouts made: 2 of 3" in captured.err
 
 
 @pytest.mark.slow
@@ -57,28 +59,24 @@ def test_processes_make_the_same_files(tmp_path):
     one, two = (sorted((tmp_path / jobs).glob("*/*/*.npz")) for jobs in "12")
     assert [path.name for path in one] == [path.name for path in two]
     for a, b in zip(one, two, strict=True):
-        first, second = bank.read_layout(a), bank.read_layout(b)
+        first, second = read_layout(a), read_layout(b)
         assert (first.object_poses == second.object_poses).all() and first.target == second.target
 
 
-@pytest.mark.parametrize("text", ["", "5", "3:3", "4:1", "-1:2", "a:b"])
-def test_what_is_no_range_of_seeds(text):
-    with pytest.raises(ConfigError, match="--seeds: no range of seeds"):
-        seed_range(text)
+def test_seeds():
+    assert parse_seeds("2:5", "--seeds") == parse_seeds("2:5", "--objects", listed=True) == [2, 3, 4]
+    assert parse_seeds("7,3,7", "--objects", listed=True) == [7, 3]
+    for text in ("", "a:b", "3:3", "4:1", "1,", "-1:2"):
+        with pytest.raises(ConfigError) as caught:
+            parse_seeds(text, "--objects", listed=True)
+        assert (caught.value.where, caught.value.found) == ("--objects", text)
+    with pytest.raises(ConfigError):
+        parse_seeds("5", "--seeds")
 
 
-def test_seeds_of_objects():
-    assert objects_seeds("2:5") == [2, 3, 4]
-    assert objects_seeds("7,3,7") == [7, 3]
-    for text in ("", "a", "3:3", "1,", "-1"):
-        with pytest.raises(ConfigError, match="--objects: no seeds of objects"):
-            objects_seeds(text)
-
-
-def test_no_banks_is_said(tmp_path, capsys):
+def test_no_caches(tmp_path, capsys):
     assert run(["layouts", "info", "--folder", str(tmp_path)]) == 0
-    assert "no banks in" in capsys.readouterr().out
-    assert layouts.seed_range("2:4") == range(2, 4)
+    assert "no layout caches in" in capsys.readouterr().out
 
 
 def test_wrong_numbers_are_one_line(capsys):

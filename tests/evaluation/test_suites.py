@@ -8,8 +8,8 @@ import pytest
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.scenes.config import load_task_config
-from robocas_ms3.scenes.frozen import FrozenLayouts
 from robocas_ms3.scenes.language.texts import instruction_texts, synonym_texts
+from robocas_ms3.scenes.table import FrozenLayouts
 
 SUITES = ("objects", "arrangement", "clutter", "instructions", "cameras", "looks", "furniture", "paper-words")
 

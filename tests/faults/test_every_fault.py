@@ -288,7 +288,7 @@ def test_a_file_of_a_run_that_was_cut_off(commands, undisturbed, tmp_path, row, 
     row.judge(undisturbed(command)[0], content(command, out))
 
 
-def test_a_layout_bank_that_was_cut_off(commands, undisturbed, tmp_path, row, monkeypatch):
+def test_a_layout_cache_that_was_cut_off(commands, undisturbed, tmp_path, row, monkeypatch):
     """Its layouts are made anew."""
     command, cache = commands["generate"], tmp_path / "cache"
     row.command = command.name

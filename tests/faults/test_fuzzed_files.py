@@ -28,12 +28,11 @@ from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
 from robocas_ms3.evaluation.report.comparison import comparison
 from robocas_ms3.evaluation.report.page import page
 from robocas_ms3.evaluation.report.tables import markdown
-from robocas_ms3.scenes.bank import ABOUT, LayoutBank
+from robocas_ms3.scenes.cache import ABOUT, LayoutCache
 from robocas_ms3.scenes.config import load_task_config
-from robocas_ms3.scenes.frozen import FrozenLayouts, write_frozen
 from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.scenes.model import SceneModel
-from robocas_ms3.scenes.table import LayoutTable, write_table
+from robocas_ms3.scenes.table import FrozenLayouts, LayoutTable, write_frozen, write_table
 
 
 def read_dataset(root):
@@ -140,48 +139,48 @@ LAYOUT = Layout(
 
 
 @pytest.fixture
-def bank(tmp_path, monkeypatch):
-    """A bank whose layouts are drawn at no cost: all the same one."""
+def cache(tmp_path, monkeypatch):
+    """A cache whose layouts are drawn at no cost: all the same one."""
     pack = load_pack("builtin")
-    bank = LayoutBank(SceneModel.load(load_task_config("pick_table_scattered"), pack, pack), tmp_path)
+    cache = LayoutCache(SceneModel.load(load_task_config("pick_table_scattered"), pack, pack), tmp_path)
     layout = Layout(
-        tuple(bank._names[:3]), *(getattr(LAYOUT, f) for f in ("object_poses", "robot_pose", "basket_pose")), 1
+        tuple(cache._names[:3]), *(getattr(LAYOUT, f) for f in ("object_poses", "robot_pose", "basket_pose")), 1
     )
-    monkeypatch.setattr(bank._sample, "make", lambda *_: layout)
-    return bank
+    monkeypatch.setattr(cache._sample, "make", lambda *_: layout)
+    return cache
 
 
 def same(one, other):
     return one.object_ids == other.object_ids and np.array_equal(one.object_poses, other.object_poses)
 
 
-def test_a_damaged_layout_of_a_bank_is_made_again(bank):
-    whole_layout = bank.get(0, 0)
-    path = bank.path(0, 0)
+def test_a_damaged_layout_of_a_bank_is_made_again(cache):
+    whole_layout = cache.get(0, 0)
+    path = cache.path(0, 0)
     whole = path.read_bytes()
     for seed in range(40):
         path.write_bytes(flipped(whole, seed))
-        assert same(bank.get(0, 0), whole_layout), f"seed {seed}"
+        assert same(cache.get(0, 0), whole_layout), f"seed {seed}"
     arrays = dict(np.load(io.BytesIO(whole)))
     rng = np.random.default_rng(0)
     for name in arrays:  # a whole file of other arrays
         for value in (np.zeros(0), np.array("x"), rng.random((3, 4, 4)), np.array(9), np.array([True]), None):
             others = {**arrays, name: value} if value is not None else {k: a for k, a in arrays.items() if k != name}
             np.savez(path, **others)
-            if not same(bank.get(0, 0), whole_layout):
+            if not same(cache.get(0, 0), whole_layout):
                 raise AssertionError(f"{name} {value}")
 
 
-def test_banks_with_damaged_notes_are_listed(bank, capsys):
-    bank.get(0, 0)
-    path = bank.folder / ABOUT
+def test_banks_with_damaged_notes_are_listed(cache, capsys):
+    cache.get(0, 0)
+    path = cache.folder / ABOUT
     whole = json.loads(path.read_text())
     for seed in range(60):
         twist_file(path, whole, seed)
-        assert info(Info(folder=bank.folder.parent)) == 0, f"seed {seed}"
+        assert info(Info(folder=cache.folder.parent)) == 0, f"seed {seed}"
     for value in VALUES:
         path.write_text(json.dumps(value))
-        assert info(Info(folder=bank.folder.parent)) == 0, value
+        assert info(Info(folder=cache.folder.parent)) == 0, value
         assert "damaged" in capsys.readouterr().out
 
 

@@ -10,9 +10,9 @@ from robocas_ms3.plans.join import LAYOUTS, join
 from robocas_ms3.plans.record import LayoutMaker, Recorder
 from robocas_ms3.plans.units import Outcome, Unit
 from robocas_ms3.scenes.config import load_task_config
-from robocas_ms3.scenes.frozen import FrozenLayouts
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.sample import sample_layout
+from robocas_ms3.scenes.table import FrozenLayouts
 
 ALONE = PLAN.model_copy(update={"stages": ["layouts"], "parts": PLAN.parts[:1]})
 

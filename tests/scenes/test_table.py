@@ -1,36 +1,42 @@
-"""Layouts as one mapped file give what the layouts themselves give."""
+"""Layouts in one file, tables and frozen ones, are those that were written."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import LayoutError
-from robocas_ms3.core.poses import to_wxyz
 from robocas_ms3.scenes.layout import Layout
-from robocas_ms3.scenes.table import LayoutTable, State, mark_table, write_table
+from robocas_ms3.scenes.table import (
+    FrozenLayouts,
+    LayoutTable,
+    State,
+    join_frozen,
+    mark_table,
+    write_frozen,
+    write_table,
+)
 
 NAMES = ["five", "one", "three", "two"]
 
 
-def layout(seed: int, objects: tuple[str, ...] | None = None) -> Layout:
-    """Anything, of three slots."""
+def layout(seed: int, objects: tuple[str, ...] | None = None, slots: int = 3) -> Layout:
     rng = np.random.default_rng(seed)
-    poses = np.tile(np.eye(4), (5, 1, 1))
-    poses[:, :3, :3] = Rotation.random(5, random_state=seed).as_matrix()
-    poses[:, :3, 3] = rng.uniform(-1, 1, (5, 3))
+    poses = np.tile(np.eye(4), (slots + 2, 1, 1))
+    poses[:, :3, :3] = Rotation.random(slots + 2, random_state=seed).as_matrix()
+    poses[:, :3, 3] = rng.uniform(-1, 1, (slots + 2, 3))
     return Layout(
-        object_ids=tuple(NAMES[i] for i in rng.permutation(3)) if objects is None else objects,
-        object_poses=poses[:3],
-        robot_pose=poses[3],
-        basket_pose=poses[4],
-        target=int(rng.integers(3)),
+        object_ids=tuple(NAMES[i] for i in rng.permutation(slots)) if objects is None else objects,
+        object_poses=poses[2:],
+        robot_pose=poses[0],
+        basket_pose=poses[1],
+        target=int(rng.integers(slots)),
         relation=("", "nearest")[seed % 2],
-        present=rng.random(3) < 0.7,
-        visible_shares=np.array([np.nan, *rng.random(2)]),
+        present=rng.random(slots) < 0.7,
+        visible_shares=np.array([np.nan, *rng.random(slots - 1)]),
     )
 
 
@@ -106,11 +112,28 @@ def test_a_damaged_one_is_named(tmp_path):
             LayoutTable(path, NAMES)
 
 
-@given(st.integers(0, 10_000))
-def test_poses_are_matrices_as_position_and_quaternion(seed):
-    matrices = layout(seed).object_poses
-    poses = to_wxyz(matrices[None])
-    assert poses.shape == (1, 3, 7)
-    turned = Rotation.from_quat(poses[0][:, [4, 5, 6, 3]]).as_matrix()
-    np.testing.assert_allclose(turned, matrices[:, :3, :3], atol=1e-6)
-    np.testing.assert_allclose(poses[0, :, :3], matrices[:, :3, 3], atol=1e-6)
+def test_frozen_parts_make_the_file_of_the_whole(tmp_path):
+    layouts = {seed: replace(layout(seed), relation=said) for seed, said in ((3, ""), (4, "nearest"), (9, "left"))}
+    write_frozen(tmp_path / "whole.npy", NAMES, layouts)
+    for seed, one in layouts.items():
+        write_frozen(tmp_path / f"{seed}.npy", NAMES, {seed: one})
+    join_frozen(tmp_path / "joined.npy", [tmp_path / f"{seed}.npy" for seed in layouts])
+    assert (tmp_path / "joined.npy").read_bytes() == (tmp_path / "whole.npy").read_bytes()
+    found = FrozenLayouts(tmp_path / "joined.npy", NAMES)
+    assert found.seeds == (3, 4)
+    assert_same(found(9, 9), layouts[9])
+    for pair in ((3, 4), (5, 5)):
+        with pytest.raises(LayoutError):
+            found(*pair)
+
+
+def test_what_can_not_be_joined_is_refused_and_nothing_written(tmp_path):
+    write_frozen(tmp_path / "a.npy", NAMES, {1: layout(1)})
+    write_frozen(tmp_path / "b.npy", NAMES, {2: layout(2, slots=4)})
+    (tmp_path / "c.npy").write_bytes((tmp_path / "a.npy").read_bytes()[:-5])
+    np.save(tmp_path / "d.npy", np.zeros(3))
+    for other in "bcd":
+        with pytest.raises(LayoutError) as caught:
+            join_frozen(tmp_path / "joined.npy", [tmp_path / "a.npy", tmp_path / f"{other}.npy"])
+        assert caught.value.where == tmp_path / f"{other}.npy"
+    assert not (tmp_path / "joined.npy").exists()

@@ -184,7 +184,7 @@ def test_what_is_near_in_the_picture_is_near():
 @pytest.mark.slow
 def test_hidden_shares_are_what_rays_say():
     from robocas_ms3.assets.pack import load_pack
-    from robocas_ms3.scenes.bank import layout_bank
+    from robocas_ms3.scenes.cache import layout_source
     from robocas_ms3.scenes.config import load_task_config
     from robocas_ms3.scenes.model import SceneModel
     from robocas_ms3.scenes.targets import selection_camera
@@ -195,7 +195,7 @@ def test_hidden_shares_are_what_rays_say():
     eye = torch.as_tensor(selection_camera(model).pose[:3, 3], dtype=torch.float32)
     differences = []
     for seed in range(3):
-        layout = layout_bank(model)(seed, seed)
+        layout = layout_source(model)(seed, seed)
         poses = torch.as_tensor(to_wxyz(layout.object_poses), dtype=torch.float32)[None]
         sampled = [_sample(pack.objects[i].annotations.surface_points) for i in layout.object_ids]
         points = torch.as_tensor(np.array(sampled).swapaxes(1, 2), dtype=torch.float32)[None]

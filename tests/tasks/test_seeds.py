@@ -11,7 +11,7 @@ from several_envs import Thing, several
 
 from robocas_ms3 import tasks
 from robocas_ms3.core.errors import ConfigError, LayoutError, RobocasError
-from robocas_ms3.scenes import source
+from robocas_ms3.scenes import cache
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.tasks.base import RoboCASEnv
 from robocas_ms3.tasks.seeds import SEVERAL_ENVS_SEEDS, EpisodeSeeds
@@ -92,7 +92,7 @@ def test_a_range_that_is_none():
 
 
 def test_one_seed_for_several_envs_is_the_first_ones_and_the_others_follow_within_the_range(monkeypatch):
-    monkeypatch.setattr(tasks.base, "layout_bank", lambda model, folder: Thing)
+    monkeypatch.setattr(tasks.base, "layout_source", lambda model, folder: Thing)
     env, asked = several(None, monkeypatch, seeds=(10, 13))
     env.reset(seed=12)
     assert [seed for _, seed in asked[-1]] == [12, 13, 10, 11]
@@ -110,7 +110,7 @@ def test_only_the_seed_that_was_asked_for_must_have_a_layout(monkeypatch):
             raise LayoutError("none", where="layout")
         return Thing(objects, seed)
 
-    monkeypatch.setattr(tasks.base, "layout_bank", lambda model, folder: layouts)
+    monkeypatch.setattr(tasks.base, "layout_source", lambda model, folder: layouts)
     env, asked = several(None, monkeypatch, seeds=(10, 13))
     env.reset(seed=10)
     drawn = [seed for _, seed in asked[-1]]
@@ -131,7 +131,7 @@ def test_states_are_no_way_to_reset():
 
 def test_several_envs_draw_from_a_range_without_being_told_and_beyond_it_share_objects(monkeypatch):
     low, high = SEVERAL_ENVS_SEEDS
-    monkeypatch.setattr(tasks.base, "layout_bank", lambda model, folder: Thing)
+    monkeypatch.setattr(tasks.base, "layout_source", lambda model, folder: Thing)
     env, asked = several(None, monkeypatch, num_envs=high - low + 3)
     assert asked[0] == [(i, i) for i in [*range(low, high + 1), low, low + 1]]
     assert env.seeds.object_ids[0] == env.seeds.object_ids[high - low + 1] != env.seeds.object_ids[1]
@@ -157,7 +157,7 @@ def without(*pairs):
 def test_an_unseeded_reset_goes_on_to_a_seed_that_has_a_layout(monkeypatch, caplog):
     bad = [(objects, seed) for objects in (1, 2) for seed in range(100) if seed % 2 and seed != objects]
     source, asked = without(*bad)
-    monkeypatch.setattr(tasks.base, "layout_bank", lambda model, folder: source)
+    monkeypatch.setattr(tasks.base, "layout_source", lambda model, folder: source)
     env, chosen = several(None, monkeypatch)
     for _ in range(30):
         env.reset()
@@ -173,14 +173,14 @@ def test_an_unseeded_reset_goes_on_to_a_seed_that_has_a_layout(monkeypatch, capl
 
 def test_that_there_is_no_layout_at_all_is_said_soon(monkeypatch):
     source, asked = without(*((seed, seed) for seed in range(100)))
-    monkeypatch.setattr(tasks.base, "layout_bank", lambda model, folder: source)
+    monkeypatch.setattr(tasks.base, "layout_source", lambda model, folder: source)
     with pytest.raises(LayoutError, match="no object qualifies"):
         several(None, monkeypatch)
     assert len(asked) <= 3
 
 
 def test_one_env_starts_over_with_another_seed_unless_it_was_asked_for(monkeypatch, caplog):
-    sample, failed = source.sample_layout, []
+    sample, failed = cache.sample_layout, []
 
     def fussy(model, objects, seed, object_ids):
         if len(failed) < 2 or seed == 5:
@@ -188,7 +188,7 @@ def test_one_env_starts_over_with_another_seed_unless_it_was_asked_for(monkeypat
             raise LayoutError("no object qualifies as the target")
         return sample(model, objects, seed)
 
-    monkeypatch.setattr(source, "sample_layout", fussy)
+    monkeypatch.setattr(cache, "sample_layout", fussy)
     env = gym.make("RoboCASPick-v1", layouts=None, **STATE_ONLY)
     assert failed[0] == 2022 and "another is drawn" in caplog.text
     failed.clear()

@@ -1,4 +1,4 @@
-"""Resets from a bank's table, and what its engine has found of layouts. No GPU."""
+"""Resets from the table of a cache, and what its engine has found of layouts. No GPU."""
 
 import shutil
 from dataclasses import fields
@@ -13,7 +13,8 @@ from several_envs import several
 
 from robocas_ms3.cli.layouts import Build, build
 from robocas_ms3.core.errors import LayoutError
-from robocas_ms3.scenes import bank, source
+from robocas_ms3.scenes import cache
+from robocas_ms3.scenes.layout import read_layout
 from robocas_ms3.scenes.table import State
 from robocas_ms3.tasks.starts import Starts
 
@@ -22,8 +23,8 @@ STATE_ONLY = {"render_backend": "none", "control_mode": "pd_joint_pos", "obs_mod
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
-    """A bank's folder for objects of two seeds and layouts of three, with their table."""
-    folder = tmp_path_factory.mktemp("banks")
+    """A cache folder for objects of two seeds and layouts of three, with their table."""
+    folder = tmp_path_factory.mktemp("layouts")
     command = Build("pick_table_scattered", objects="0:2", seeds="0:3", jobs=1, out=folder, engine="cpu")
     assert build(command) == 0
     return folder
@@ -33,11 +34,11 @@ def built(tmp_path_factory):
 def tabled(built, tmp_path, monkeypatch):
     """The same with the table of a GPU, which no GPU has tried, and nothing else: making or reading one would fail."""
     shutil.copytree(built, tmp_path, dirs_exist_ok=True)
-    assert bank.count_layouts(next(tmp_path.iterdir())) == 6
+    assert cache.count_layouts(next(tmp_path.iterdir())) == 6
     table = next(tmp_path.glob("*/table-cpu.npy"))
     table.rename(table.with_name("table-gpu.npy"))
-    monkeypatch.setattr(source, "sample_layout", None)
-    monkeypatch.setattr(bank, "read_layout", None)
+    monkeypatch.setattr(cache, "sample_layout", None)
+    monkeypatch.setattr(cache, "read_layout", None)
     return tmp_path
 
 
@@ -120,14 +121,14 @@ def test_where_a_table_lacks_layouts_the_bank_makes_them(built, tmp_path, monkey
 
 
 def test_one_env_that_keeps_its_objects_resets_from_a_table(built, monkeypatch):
-    monkeypatch.setattr(source, "sample_layout", None)
+    monkeypatch.setattr(cache, "sample_layout", None)
     made = gym.make("RoboCASPick-v1", layouts=built, reconfiguration_freq=0, seeds=(0, 2), **STATE_ONLY)
     env: Any = made.unwrapped
     assert env.seeds.tabled is not None
     monkeypatch.setattr(env.seeds.tabled, "gather", gather := Mock(wraps=env.seeds.tabled.gather))
     for seed in (2, 0):
         made.reset(seed=seed)
-        wanted = bank.read_layout(env.seeds.layouts.path(env.seeds.objects_seeds[0], seed))
+        wanted = read_layout(env.seeds.layouts.path(env.seeds.objects_seeds[0], seed))
         torch.testing.assert_close(env.object_poses, Starts.of([wanted], "cpu").object_poses, atol=1e-6, rtol=0)
         assert int(env.target_slot) == wanted.target
     assert gather.call_count == 2

@@ -1,0 +1,221 @@
+"""The layout cache returns what was made, makes what is missing, and knows what layouts depend on."""
+
+from __future__ import annotations
+
+import _thread
+import gc
+import os
+import signal
+import subprocess
+import sys
+import threading
+from dataclasses import fields, replace
+
+import numpy as np
+import psutil
+import pytest
+from sapien import physx
+
+from robocas_ms3.assets.pack import load_pack
+from robocas_ms3.core.errors import LayoutError, SimulationError
+from robocas_ms3.scenes import cache as cache_module
+from robocas_ms3.scenes.cache import LayoutCache, Sampler, count_layouts, layout_source, pairs_of
+from robocas_ms3.scenes.config import load_task_config
+from robocas_ms3.scenes.layout import Layout
+from robocas_ms3.scenes.model import SceneModel
+from robocas_ms3.scenes.sample import sample_layout
+from robocas_ms3.scenes.table import State
+
+NO_TARGET = {"target": {"max_distance": 0.1}, "objects": {"ids": "all", "count": 2}}
+
+
+def model(**changes) -> SceneModel:
+    pack = load_pack("builtin")
+    data = {**load_task_config("pick_table_scattered").model_dump(mode="json"), **changes}
+    return SceneModel.load(load_task_config(data), pack, pack)
+
+
+def assert_same(one: Layout, two: Layout) -> None:
+    for field in fields(Layout):
+        a, b = getattr(one, field.name), getattr(two, field.name)
+        assert type(a) is type(b), field.name
+        np.testing.assert_array_equal(a, b, err_msg=field.name)
+
+
+def test_a_layout_is_made_once_and_comes_back_the_same(tmp_path, monkeypatch):
+    scene = model()
+    made = LayoutCache(scene, tmp_path).get(1, 1)
+    assert_same(made, sample_layout(scene, 1, 1))
+    assert_same(layout_source(scene, None)(1, 1), made)
+    monkeypatch.setattr(cache_module, "sample_layout", None)  # making it again would fail
+    cache = LayoutCache(scene, tmp_path)
+    assert_same(cache.get(1, 1), made)
+    assert cache.missing(pairs_of(range(3))) == [(0, 0), (2, 2)]
+    assert count_layouts(cache.folder) == 1
+
+
+def test_objects_of_one_seed_and_arrangement_of_another_are_kept_apart(tmp_path):
+    cache = LayoutCache(model(), tmp_path)
+    assert not np.allclose(cache.get(1, 1).object_poses, cache.get(1, 2).object_poses)
+    assert cache.get(1, 2).object_ids == cache.get(1, 1).object_ids
+    assert cache.missing([(2, 2), (1, 2)]) == [(2, 2)]
+
+
+@pytest.mark.parametrize(
+    ("changes", "same"),
+    [
+        ({"lights": {"ambient": 0.1}}, True),
+        ({"description": "other words"}, True),
+        ({"robot_start": "evaluation"}, True),
+        ({"randomisation": {"cameras": {}, "room": ["wall"]}}, True),
+        ({"randomisation": {"robot": {}}}, False),
+        ({"layout": {"kind": "scattered", "min_gap": 0.02}}, False),
+        ({"objects": {"ids": "all", "count": 9}}, False),
+    ],
+)
+def test_what_layouts_depend_on_is_in_the_name(tmp_path, changes, same):
+    assert (LayoutCache(model(**changes), tmp_path).folder == LayoutCache(model(), tmp_path).folder) is same
+
+
+def test_changed_furniture_has_layouts_of_its_own(tmp_path):
+    scene = model()
+    table = scene.furniture["table"]
+    top = table.asset.surfaces["top"]
+    higher = table.asset.model_copy(update={"surfaces": {"top": top.model_copy(update={"z": top.z + 0.05})}})
+    changed = replace(scene, furniture={"table": replace(table, asset=higher)})
+    assert LayoutCache(changed, tmp_path).folder != LayoutCache(scene, tmp_path).folder
+
+
+def test_several_envs_want_each_objects_with_every_seed_and_their_own():
+    assert pairs_of([0, 1]) == [(0, 0), (1, 1)]
+    assert pairs_of([0, 1], [1, 7]) == [(1, 1), (1, 0), (7, 7), (7, 0), (7, 1)]
+
+
+def test_a_table_keeps_what_an_earlier_one_holds_and_what_is_known_of_it(tmp_path):
+    cache = LayoutCache(model(), tmp_path)
+    assert cache.table("cpu") is None
+    for pair in ((0, 0), (0, 1), (2, 1)):
+        cache.get(*pair)
+    cache.write_table("cpu", [(0, 0), (0, 1)])
+    cache.mark_table("cpu", {(0, 1): State.MOVES})
+    cache.path(0, 0).unlink()
+    table = cache.write_table("cpu", [(2, 1), (2, 9)])  # of the last there is no layout yet
+    assert table is not None
+    assert table.pairs() == [(0, 0), (0, 1), (2, 1)]
+    assert table.pairs(State.MOVES) == [(0, 1)]
+    assert table.pairs(State.UNTRIED) == [(0, 0), (2, 1)]
+    path = cache.table_path("cpu")
+    path.write_bytes(path.read_bytes()[:-9])
+    assert cache.table("cpu") is None  # damaged
+    assert cache.table("gpu") is None
+
+
+def test_a_table_is_changed_by_one_process_at_a_time(tmp_path):
+    cache, other = LayoutCache(model(), tmp_path), LayoutCache(model(), tmp_path)
+    cache.get(0, 0)
+    cache.get(1, 1)
+    with cache._locked():
+        writing = threading.Thread(target=other.write_table, args=("cpu", [(1, 1)]))
+        writing.start()
+        writing.join(0.3)
+        assert writing.is_alive()
+    writing.join()
+    table = cache.write_table("cpu", [(0, 0)])
+    assert table is not None
+    assert table.pairs() == [(0, 0), (1, 1)]
+
+
+@pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_objects_that_can_not_be_laid_out_are_tried_once_and_leave_nothing_behind(jobs, tmp_path):
+    cache = LayoutCache(model(**NO_TARGET), tmp_path)
+    problems = dict(cache.fill(pairs_of([0, 1, 2], [1]), jobs))
+    assert problems.keys() == {(1, 1), (1, 0), (1, 2)}
+    assert len(set(problems.values())) == 1
+    assert "no object qualifies" in problems[1, 1]
+    assert count_layouts(cache.folder) == 0
+
+
+def test_without_a_cache_the_objects_of_a_seed_are_looked_for_once(monkeypatch):
+    asked = []
+    monkeypatch.setattr(cache_module, "sample_layout", lambda *order: asked.append(order[1:]) or sample_layout(*order))
+    layouts = layout_source(model(), None)
+    ids = layouts(1, 2).object_ids
+    assert layouts(1, 3).object_ids == layouts(1, 1).object_ids == ids
+    assert asked == [(1, 1, None), (1, 2, ids), (1, 3, ids), (1, 1, None)]
+
+
+# ------------------------------------------------------------- where PhysX has a GPU, a worker process samples
+
+
+@pytest.fixture
+def gpu(monkeypatch):
+    monkeypatch.setattr(physx, "is_gpu_enabled", lambda: True)
+
+
+def test_the_worker_samples_the_same_layouts_is_replaced_and_ends_with_its_object(gpu):
+    scene, before = model(), psutil.Process().children()
+    sampler = Sampler(scene)
+
+    def worker() -> psutil.Process:
+        (process,) = [child for child in psutil.Process().children() if child not in before]
+        return process
+
+    for seed in (3, 4):
+        np.testing.assert_array_equal(sampler(3, seed).object_poses, sample_layout(scene, 3, seed).object_poses)
+    worker().kill()
+    np.testing.assert_array_equal(sampler(1, 1).object_poses, sample_layout(scene, 1, 1).object_poses)
+    process = worker()
+    del sampler
+    gc.collect()
+    assert psutil.wait_procs([process], timeout=30)[0] == [process]
+
+
+class Deadly:
+    """Object ids that kill the process that unpickles them."""
+
+    def __reduce__(self):
+        return kill_this_process, ()
+
+
+def kill_this_process():
+    os.kill(os.getpid(), signal.SIGSEGV)
+
+
+def test_a_process_that_dies_twice_is_not_a_missing_layout(gpu):
+    with pytest.raises(SimulationError) as caught:
+        Sampler(model()).make(0, 1, Deadly())  # pyright: ignore[reportArgumentType]
+    assert (caught.value.where, caught.value.found) == ("seed 1", "SIGSEGV")
+
+
+def test_after_an_interruption_no_layout_is_taken_for_another(gpu):
+    scene = model()
+    sampler = Sampler(scene)
+    sampler(1, 1)
+    threading.Timer(0.05, _thread.interrupt_main).start()
+    with pytest.raises(KeyboardInterrupt):
+        for seed in range(2, 1000):
+            sampler(seed, seed)
+    np.testing.assert_array_equal(sampler(3, 3).object_poses, sample_layout(scene, 3, 3).object_poses)
+
+
+@pytest.mark.slow
+def test_a_process_whose_physx_has_a_gpu_makes_the_same_layouts():
+    program = (
+        "import sys\nfrom sapien import physx\n"
+        "if sys.argv[1] == 'gpu':\n    physx._enable_gpu()\n"
+        "from robocas_ms3.assets.pack import load_pack\nfrom robocas_ms3.scenes.config import load_task_config\n"
+        "from robocas_ms3.scenes.cache import layout_source\nfrom robocas_ms3.scenes.model import SceneModel\n"
+        "pack = load_pack('builtin')\n"
+        "model = SceneModel.load(load_task_config('search_table_small_heap'), pack, pack)\n"
+        "for seed in (0, 1):\n"
+        "    found = layout_source(model, None)(seed, seed)\n"
+        "    sys.stdout.buffer.write(found.object_poses.tobytes() + bytes([found.target]))\n"
+    )
+    said = []
+    for way in ("cpu", "gpu"):
+        command = [sys.executable, "-c", program, way]
+        done = subprocess.run(command, capture_output=True, timeout=120, check=False)
+        assert done.returncode == 0, done.stderr.decode()
+        said.append(done.stdout)
+    assert len(said[0]) > 100
+    assert said[0] == said[1]
