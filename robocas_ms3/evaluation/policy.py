@@ -6,10 +6,11 @@ import json
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ConfigDict, Field
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.exits import no_exit
@@ -19,6 +20,8 @@ from robocas_ms3.robots.table import DEFAULT
 
 Language = Literal["none", "text", "embedding"]
 Reference = Literal["tcp", "target"]
+Side = Annotated[int, Field(ge=1, le=4096)]
+"""Of an image, pixels."""
 CAMERAS = ("base_camera", "gripper_camera", "static_camera")
 
 
@@ -39,10 +42,12 @@ class PolicySpec:
             several times that.
     """
 
+    __pydantic_config__ = ConfigDict(extra="forbid")  # of specifications in messages and addresses
+
     convention: str = "robocas"
     reference: Reference = "target"
-    rate_hz: float | None = None
-    cameras: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    rate_hz: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    cameras: Mapping[str, tuple[Side, Side]] = field(default_factory=dict)
     depth: bool = False
     state: bool = False
     language: Language = "text"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import logging
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,68 +21,62 @@ from robocas_ms3.evaluation.remote.messages import (
     ENV,
     ERROR,
     FILE_NAME_PARTS,
+    MAX_TEXT,
     PROMPT,
     RESET,
     START,
     batch_of,
-    check_length,
-    observations_of,
-    one_line,
-    short_line,
-    stack_observations,
+    read_observations,
 )
-from robocas_ms3.evaluation.remote.wire import unpack
+from robocas_ms3.evaluation.remote.wire import one_line, unpack
 
-_LOG = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 _MAX_ENVS = 1024  # of all clients
 _LARGEST_NUMBER = 2**32 - 1  # of episodes and seeds
 
 
 @dataclass(frozen=True)
 class ServedFiles:
-    """Files and packs that clients may choose, by the names that messages have for them.
-
-    A message names a file by its protocol's folder, ``smoke/configs/pick.yaml``. No text of a message becomes a path.
+    """Files and packs that clients may choose by name. No text of a message becomes a path.
 
     Attributes:
-        configs: paths of configurations by name.
-        layouts: paths of layouts by name.
+        files: paths of configurations and layouts, by the names that messages have for them, such as
+            ``smoke/configs/pick.yaml``, and by themselves, for clients on the same machine.
         packs: names, or folders as protocols of the server have them.
     """
 
-    configs: dict[str, str]
-    layouts: dict[str, str]
+    files: dict[str, str]
     packs: frozenset[str]
 
     @classmethod
     def of(cls, protocols: Iterable[Path] = (), packs: Iterable[str] = ()) -> ServedFiles:
-        """Collect the files of shipped protocols, and of others.
+        """Collect the files of shipped protocols and installed packs, and of others.
 
         Args:
             protocols: folders of others.
             packs: that these name.
 
         Raises:
-            EvaluationError: two of them have one name.
+            EvaluationError: two protocols have the same name.
         """
         folders = {folder.name: folder for folder in protocols_dir().iterdir()}
         for folder in protocols:
             if folder.resolve() != folders.setdefault(folder.name, folder).resolve():
                 what, fix = "two protocols have one name", "Rename the folder."
                 raise EvaluationError(what, where=folder, found=folders[folder.name], fix=fix)
+        files = {}
+        for pattern in ("configs/*.yaml", "layouts/*.npy"):
+            for path in itertools.chain.from_iterable(folder.glob(pattern) for folder in folders.values()):
+                files["/".join(path.parts[-FILE_NAME_PARTS:])] = files[str(path)] = str(path)
         installed = (builtin_packs_dir(), data_dir() / "packs")
         names = {folder.name for parent in installed if parent.is_dir() for folder in parent.iterdir()}
-        configs, layouts = ("configs/*.yaml", "layouts/*.npy")
-        return cls(_named(folders.values(), configs), _named(folders.values(), layouts), frozenset({*names, *packs}))
+        return cls(files, frozenset({*names, *packs}))
 
     def resolved(self, start: EpisodeSpec) -> EpisodeSpec:
-        """Return a client's start with paths of this machine; empty: files and packs that are not served."""
-        return replace(
-            start,
-            config_file=self.configs.get(start.config_file, ""),
-            layouts_file=self.layouts.get(start.layouts_file, ""),
-            pack=start.pack if start.pack in self.packs else "",
-        )
+        """Return a client's episode with paths of this machine; empty: files and packs that are not served."""
+        config, layouts = (self.files.get(name, "") for name in (start.config_file, start.layouts_file))
+        pack = start.pack if start.pack in self.packs else ""
+        return replace(start, config_file=config, layouts_file=layouts, pack=pack)
 
 
 class Answers:
@@ -121,10 +115,8 @@ class Answers:
         if not isinstance(message, dict):
             raise WireError("no observation", expected="a map")
         if BATCH not in message:
-            observations, starts = self._read([message], envs)
-            return {ACTIONS: self._act(observations, starts)[0]}
-        batch = batch_of(message, 1, self._max_batch)
-        observations, starts = self._read(batch, envs)
+            return {ACTIONS: self._act(*self._read([message], envs))[0]}
+        observations, starts = self._read(batch_of(message, 1, self._max_batch), envs)
         actions, reasons = self._act_or_explain(observations, starts)
         rows = enumerate(observations.envs.tolist())
         return {BATCH: [{ERROR: reasons[env]} if env in reasons else {ACTIONS: actions[row]} for row, env in rows]}
@@ -140,27 +132,26 @@ class Answers:
             number, reset = self._env(message, envs)
             numbers.append(number)
             if reset:
-                starts.append(read_episode_spec(message, number, self._files))
+                starts.append(self._files.resolved(read_episode_spec(message, number)))
         if len(set(numbers)) < len(numbers):
             raise WireError("invalid batch", where=ENV, expected="each env once", found=sorted(numbers))
-        read = [observations_of(message, env, self._spec) for message, env in zip(messages, numbers, strict=True)]
-        return stack_observations(read), starts
+        return read_observations(messages, numbers, self._spec), starts
 
     def _env(self, message: dict[str, Any], envs: dict[int, int]) -> tuple[int, bool]:
         """Return the policy's number of a message's env, and whether an episode starts."""
-        said, reset = message.get(ENV, 0), message.get(RESET)
-        if type(said) is not int or not (reset is None or isinstance(reset, bool)):
-            raise WireError("no observation", expected=f"a number {ENV}, and whether to {RESET}")
-        if said in envs:
-            return envs[said], bool(reset)
+        env, reset = message.get(ENV, 0), message.get(RESET)
+        if type(env) is not int or not (reset is None or isinstance(reset, bool)):
+            raise WireError("no observation", expected=f"an integer {ENV}, and a bool {RESET}")
+        if env in envs:
+            return envs[env], bool(reset)
         if reset is False:
-            raise WireError("no episode is running", where=f"{ENV} {said}", expected=f"{RESET}: true first")
+            raise WireError("no episode is running", where=f"{ENV} {env}", expected=f"{RESET}: true first")
         if len(self._used) >= _MAX_ENVS:
             raise WireError("too many envs", expected=f"{_MAX_ENVS} at most")
-        wished = [said] if 0 <= said < _MAX_ENVS else []  # the client's number, where it is free
-        envs[said] = next(env for env in itertools.chain(wished, itertools.count()) if env not in self._used)
-        self._used.add(envs[said])
-        return envs[said], True
+        wanted = [env] if 0 <= env < _MAX_ENVS else []  # the client's number, if it is free
+        envs[env] = next(number for number in itertools.chain(wanted, itertools.count()) if number not in self._used)
+        self._used.add(envs[env])
+        return envs[env], True
 
     def _act(self, observations: Observations, starts: list[EpisodeSpec]) -> NDArray[Any]:
         """Return the policy's (E, H, A) actions."""
@@ -171,22 +162,51 @@ class Answers:
 
     def _act_or_explain(self, observations: Observations, starts: list[EpisodeSpec]) -> tuple[Any, dict[int, str]]:
         """Return the policy's (E, H, A) actions, and by env why it has none; an error without an env is that of all."""
+        reasons: dict[int, str] = {}
         try:
-            try:
-                return self._act(observations, starts), {}
-            except PolicyFailed as failed:
-                if failed.actions is None:
-                    raise
-                _LOG.warning("%s", failed)
-                return _chunks(failed.actions, len(observations.envs)), _lines(failed)
+            return self._act(observations, starts), {}
+        except PolicyFailed as failed:
+            _log.warning("%s", failed)
+            reasons, text = {env: one_line(reason, 300) for env, reason in failed.reasons.items()}, error_line(failed)
+            if failed.actions is not None:
+                return _chunks(failed.actions, len(observations.envs)), reasons
         except RobocasError as error:
-            _LOG.warning("the policy failed: %s", error)
-            reasons = _lines(error) if isinstance(error, PolicyFailed) else {}
-            text = one_line(error)
+            _log.warning("the policy failed: %s", error)
+            text = error_line(error)
         except Exception as error:  # a policy may raise anything; other clients are still served
-            _LOG.exception("the policy failed")
-            reasons, text = {}, one_line(error)
+            _log.exception("the policy failed")
+            text = error_line(error)
         return None, {env: reasons.get(env, text) for env in observations.envs.tolist()}
+
+
+def error_line(error: BaseException) -> str:
+    """Return an error as a line without control characters, for the other end of a connection."""
+    return one_line(error if isinstance(error, RobocasError) else f"{type(error).__name__}: {error}", 300)
+
+
+def read_episode_spec(message: Mapping[str, Any], env: int) -> EpisodeSpec:
+    """Return the episode that starts; of a client that tells nothing else, the instruction.
+
+    Args:
+        message: of the client.
+        env: of the policy.
+
+    Raises:
+        WireError: a value is unknown, or of another type or size.
+    """
+    blank = EpisodeSpec(env, 0, "", "", "", "", 0, message.get(PROMPT, ""))
+    said = message.get(START, {})
+    if not isinstance(said, dict) or not said.keys() <= {field.name for field in fields(blank)} - {"env"}:
+        raise WireError("invalid start of an episode", where=START, found=one_line(said))
+    for name, value in said.items():
+        fits = (
+            len(value) <= MAX_TEXT if isinstance(value, str) else type(value) is int and 0 <= value <= _LARGEST_NUMBER
+        )
+        if not fits or type(value) is not type(getattr(blank, name)):
+            expected = f"at most {MAX_TEXT} characters, or 0 to {_LARGEST_NUMBER}"
+            found = one_line(repr(value), 80)
+            raise WireError("invalid start of an episode", where=f"{START}.{name}", expected=expected, found=found)
+    return replace(blank, **said)
 
 
 def _chunks(acted: Any, count: int) -> NDArray[Any]:
@@ -200,42 +220,3 @@ def _chunks(acted: Any, count: int) -> NDArray[Any]:
         expected = f"({count}, size) or ({count}, chunk, size) numbers"
         raise EvaluationError("actions don't fit", expected=expected, found=f"{actions.shape} {actions.dtype}")
     return actions[:, None] if actions.ndim == 2 else actions
-
-
-def _lines(failed: PolicyFailed) -> dict[int, str]:
-    return {env: one_line(EvaluationError(why)) for env, why in failed.reasons.items()}
-
-
-def read_episode_spec(message: Mapping[str, Any], env: int, files: ServedFiles) -> EpisodeSpec:
-    """Return the episode that starts; of a client that does not say more, the instruction alone.
-
-    Args:
-        message: of the client.
-        env: of the policy.
-        files: that the client may choose.
-
-    Raises:
-        WireError: it is no start of an episode.
-    """
-    blank = EpisodeSpec(env, 0, "", "", "", "", 0, message.get(PROMPT, ""))
-    said = message.get(START, {})
-    if not isinstance(said, dict) or not said.keys() <= vars(blank).keys() - {"env"}:
-        raise WireError("no start of an episode", where=START, found=short_line(said))
-    for name, value in said.items():
-        if type(value) is not type(getattr(blank, name)):
-            raise WireError("no start of an episode", where=f"{START}.{name}", found=short_line(repr(value)))
-        if isinstance(value, int) and not 0 <= value <= _LARGEST_NUMBER:
-            expected = f"0 to {_LARGEST_NUMBER}"
-            raise WireError("number out of range", where=f"{START}.{name}", expected=expected, found=value)
-        if isinstance(value, str):
-            check_length(f"{START}.{name}", value)
-    return files.resolved(EpisodeSpec(**{**vars(blank), **said}))
-
-
-def _named(folders: Iterable[Path], pattern: str) -> dict[str, str]:
-    return {name: str(path) for folder in folders for path in folder.glob(pattern) for name in _names(path)}
-
-
-def _names(path: Path) -> tuple[str, str]:
-    """The name of a file in messages, and its path, which a client on the same machine may know."""
-    return "/".join(path.parts[-FILE_NAME_PARTS:]), str(path)

@@ -1,30 +1,34 @@
-"""A policy that asks a server for actions, and the requests that it sends."""
+"""A policy that asks a server for actions."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Mapping, Sequence
+import threading
+import time
+from collections.abc import Coroutine, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from websockets.asyncio.client import ClientConnection
 
 from robocas_ms3.core.errors import EvaluationError, PolicyFailed, WireError
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.evaluation.remote.address import Address, read_address
 from robocas_ms3.evaluation.remote.connection import (
-    AnswerTimer,
-    Connection,
-    ConnectionFailed,
-    error_line,
+    LOST,
+    close_connection,
     open_connection,
-    run_in_loop,
+    read_message,
+    reason_of,
+    server_error,
 )
 from robocas_ms3.evaluation.remote.messages import (
     BATCH,
     ERROR,
+    LARGEST_BATCH,
     PREFIX,
     ServerMetadata,
     actions_of,
@@ -34,8 +38,21 @@ from robocas_ms3.evaluation.remote.messages import (
 )
 from robocas_ms3.evaluation.remote.wire import pack
 
-_LOG = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 _SHARED = -1  # key of the connection for batched requests; other keys are numbers of envs
+_T = TypeVar("_T")
+
+
+class ConnectionLost(EvaluationError):
+    """The connection to a policy server was closed during an episode."""
+
+
+@dataclass
+class _Connection:
+    """A connection, and the envs whose episodes the server knows by it."""
+
+    socket: ClientConnection
+    envs: set[int] = field(default_factory=set)
 
 
 class RemotePolicy:
@@ -45,37 +62,41 @@ class RemotePolicy:
     gets one request per env, each over a connection of its own, and all of them are in flight together. Answers are
     read in the order of the envs, so the order in which they arrive changes nothing.
 
-    A forked process cannot use the policy of its parent; it makes its own.
-
     A lost connection is opened again when the next episode starts: a server that restarted does not know the present
-    one.
+    one. If it can't be opened, `act` raises an error that ends the evaluation.
+
+    A forked process cannot use the policy of its parent; it makes its own.
 
     Args:
         address: ``ws://host:port``, with options (`read_address`).
 
     Raises:
-        EvaluationError: no such server, or what its policy wants is missing or invalid.
+        EvaluationError: no such server, or its policy's specification is missing or invalid.
     """
 
     def __init__(self, address: str) -> None:
         self._address: Address = read_address(address)
-        connection = run_in_loop(open_connection(self._address.url, self._address.connect_s))
+        self._loop = asyncio.new_event_loop()  # answers pings while the caller simulates
+        self._thread = threading.Thread(target=self._loop.run_forever, name="robocas-remote", daemon=True)
+        self._thread.start()
+        self._connections: dict[int, _Connection] = {}
+        self._starts: dict[int, EpisodeSpec] = {}  # of episodes that the server does not know yet
+        self._chunk_length: int | None = None
+        self._last_answer = 0.0  # clock time, s
+        self._metadata: ServerMetadata = ServerMetadata()
         try:
-            spec = policy_spec(connection.metadata, self._address)
-        except EvaluationError:
-            run_in_loop(connection.close())
+            self._metadata = self._run(self._read_metadata())
+            spec = self._spec_of(self._metadata)
+        except BaseException:
+            self.close()
             raise
         # With `play` the server is asked before a chunk ends, so each observation needs images.
         self.spec: PolicySpec = replace(spec, look_every=1) if self._address.play else spec
-        self._description = connection.metadata.policy
-        self._sender = RequestSender(self._address, connection)
-        self._starts: dict[int, EpisodeSpec] = {}  # of episodes that the server does not know yet
-        self._chunk_length: int | None = None
 
     def describe(self) -> dict[str, Any]:
-        """Return what a result says of the policy: the server's description."""
+        """Return the entries of a result: the server's description."""
         rename = {"rename": self._address.rename} if self._address.rename else {}
-        return {"server": self._description, "play": self._address.play, **rename}
+        return {"server": self._metadata.policy, "play": self._address.play, **rename}
 
     def reset(self, starts: list[EpisodeSpec]) -> None:
         """Start episodes; the server learns of them with their first observation."""
@@ -86,33 +107,56 @@ class RemotePolicy:
 
         Raises:
             PolicyFailed: some envs got no actions; the error has the chunks of the others.
+            EvaluationError: a connection can't be opened.
         """
         envs: list[int] = observations.envs.tolist()
         starts = {env: self._starts.pop(env) for env in envs if env in self._starts}
+        messages = [self._message(observations, row, starts.get(env)) for row, env in enumerate(envs)]
+        answers = self._run(self._ask(envs, messages, set(starts)))
         chunks: dict[int, NDArray[np.float32]] = {}
         reasons: dict[int, str] = {}
-        for row, answer in enumerate(self._sender.send(observations, starts)):
+        for row, env in enumerate(envs):
             try:
-                chunks[row] = self._chunk(answer)
+                chunks[row] = self._chunk(answers[row])
             except EvaluationError as error:
-                reasons[envs[row]] = str(error)
-                _LOG.warning("env %d: %s", envs[row], error)
-                self._sender.forget(envs[row])
-        if not reasons:
-            return np.stack(list(chunks.values()))
+                reasons[env] = str(error)
+                _log.warning("env %d: %s", env, error)
+                self._forget(env)
         if not chunks:
             raise PolicyFailed(reasons)
-        actions = np.zeros((len(envs), *next(iter(chunks.values())).shape), np.float32)
-        for row, chunk in chunks.items():
-            actions[row] = chunk
-        raise PolicyFailed(reasons, actions)
+        first = next(iter(chunks.values()))
+        actions = np.stack([chunks.get(row, np.zeros_like(first)) for row in range(len(envs))])
+        if reasons:
+            raise PolicyFailed(reasons, actions)
+        return actions
 
     def close(self) -> None:
         """Close all connections."""
-        self._sender.close()
+        if self._loop.is_closed():
+            return
+        if self._connections:
+            self._run(self._close_all())
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+
+    def _run(self, work: Coroutine[Any, Any, _T]) -> _T:
+        """Run a coroutine in the thread of the event loop and return its result."""
+        future = asyncio.run_coroutine_threadsafe(work, self._loop)
+        try:
+            return future.result()
+        except BaseException:
+            future.cancel()
+            raise
+
+    def _message(self, observations: Observations, row: int, start: EpisodeSpec | None) -> dict[str, Any]:
+        known = start if self._metadata.spec is not None else None  # a plain openpi server does not expect the key
+        message = observation_message(observations, row, known, reset=start is not None)
+        rename = self._address.rename
+        return {rename.get(key.removeprefix(PREFIX), key): value for key, value in message.items()}
 
     def _chunk(self, answer: Any) -> NDArray[np.float32]:
-        """Return the (H, A) actions of an answer; raise where it is an error."""
+        """Return the (H, A) actions of an answer; raise if it is an error."""
         if isinstance(answer, EvaluationError):
             raise answer
         chunk = actions_of(answer, self.spec.convention)[: self._address.play]
@@ -121,205 +165,143 @@ class RemotePolicy:
             raise WireError("chunks differ in length", expected=self._chunk_length, found=len(chunk))
         return chunk
 
-
-@dataclass
-class Round:
-    """One observation per env, and the answers.
-
-    Attributes:
-        observations: of E envs.
-        starts: the episodes that start with this observation, by env.
-        answers: by row: the map with the actions, or the error.
-    """
-
-    observations: Observations
-    starts: Mapping[int, EpisodeSpec]
-    answers: dict[int, Any] = field(default_factory=dict)
-
-    def env(self, row: int) -> int:
-        """Return the env of a row."""
-        return int(self.observations.envs[row])
-
-    def fail(self, rows: Sequence[int], error: EvaluationError) -> None:
-        """Note that there is no answer for these rows."""
-        self.answers |= dict.fromkeys(rows, error)
-
-
-@dataclass
-class _Part:
-    """Observations that are sent in one message.
-
-    Attributes:
-        key: of the connection.
-        rows: of the observations.
-    """
-
-    key: int
-    rows: list[int]
-
-
-class RequestSender:
-    """Connections to a server, and the requests over them.
-
-    A server that takes batches has one connection, any other server one per env.
-
-    Args:
-        address: of the server.
-        connection: the first one, on which nothing was sent.
-    """
-
-    def __init__(self, address: Address, connection: Connection) -> None:
-        self._address, self._metadata = address, connection.metadata
-        self._terms = _terms(connection.metadata, address)
-        self._unused: Connection | None = connection
-        self._connections: dict[int, Connection] = {}
-        self._timer = AnswerTimer(address.timeout_s)
-
-    def send(self, observations: Observations, starts: Mapping[int, EpisodeSpec]) -> list[Any]:
-        """Send observations and wait for all answers.
-
-        Args:
-            observations: of E envs.
-            starts: the episodes that start with this observation, by env.
-
-        Returns:
-            E answers: a map with the actions, or the error.
-        """
-        asked = Round(observations, starts)
-        run_in_loop(self._send(asked))
-        return [asked.answers[row] for row in range(len(observations.envs))]
-
-    def forget(self, env: int) -> None:
-        """End an episode whose answer was invalid; without batches its connection is closed."""
+    def _forget(self, env: int) -> None:
+        """End an episode without an answer; without batches its connection is closed."""
         if env in self._connections:
-            run_in_loop(self._close(env))
+            self._run(self._close(env))
         elif _SHARED in self._connections:
             self._connections[_SHARED].envs.discard(env)
 
-    def close(self) -> None:
-        """Close all connections."""
-        connections = [*self._connections.values(), *([self._unused] if self._unused else [])]
-        self._connections, self._unused = {}, None
-        run_in_loop(_close_all(connections))
+    async def _ask(self, envs: list[int], messages: list[dict[str, Any]], starting: set[int]) -> dict[int, Any]:
+        """Send messages and wait for the answers.
 
-    async def _send(self, asked: Round) -> None:
-        rows = range(len(asked.observations.envs))
-        size = self._metadata.max_batch
-        if size is None:
-            parts = [_Part(asked.env(row), [row]) for row in rows]
-        else:
-            parts = [_Part(_SHARED, [*rows[first : first + size]]) for first in rows[::size]]
-        for _ in range(2):  # a server may have restarted since the last episode
-            # A plain openpi server accepts no connection during inference, so all are opened before the first request.
-            await self._connect_all(parts, asked)
-            await self._request_all(parts, asked)
+        Args:
+            envs: of the messages.
+            messages: one per env.
+            starting: envs whose episodes start.
 
-    async def _connect_all(self, parts: Sequence[_Part], asked: Round) -> None:
-        """Open missing connections for episodes that start; episodes whose connection was lost have failed."""
-        for part in parts:
-            connection = self._connections.get(part.key)
-            known = connection.envs if connection else set()
-            lost = [row for row in part.rows if asked.env(row) not in {*known, *asked.starts}]
-            asked.fail(lost, ConnectionFailed("the connection is lost", gone=True))
-            part.rows = [row for row in part.rows if row not in lost]
-        missing = {part.key for part in parts if part.rows} - self._connections.keys()
-        failures = dict(zip(missing, await asyncio.gather(*map(self._connect, missing)), strict=True))
-        for part in parts:
-            if failure := failures.get(part.key):
-                asked.fail(part.rows, failure)
-                part.rows = []
+        Returns:
+            By row: a map with the actions, or the error.
+        """
+        answers: dict[int, Any] = {}
+        size = min(self._metadata.max_batch or 1, LARGEST_BATCH)
+        slots = asyncio.Semaphore(1 if self._metadata.max_batch else self._address.max_in_flight or len(envs))
 
-    async def _request_all(self, parts: Sequence[_Part], asked: Round) -> None:
-        """Send requests and wait for all answers; rows that remain in the parts are to be asked again."""
-        in_flight = 1 if self._metadata.max_batch else self._address.max_in_flight or len(parts)
-        slots = asyncio.Semaphore(in_flight)
-
-        async def request(part: _Part) -> None:
+        async def request(key: int, rows: list[int]) -> None:
             async with slots:
-                if part.rows:
-                    await self._request(part, asked)
+                answers.update(await self._request(key, rows, envs, messages))
 
-        await asyncio.gather(*map(request, parts))
+        rows = range(len(envs))
+        for _ in range(2):  # a server may have restarted since the last episode: new ones are asked about again
+            groups: dict[int, list[int]] = {}
+            for row in rows:
+                key = _SHARED if self._metadata.max_batch else envs[row]
+                known = self._connections[key].envs if key in self._connections else set()
+                if envs[row] in known | starting:
+                    groups.setdefault(key, []).append(row)
+                else:
+                    answers[row] = ConnectionLost("the connection is lost")
+            # A plain openpi server accepts no connection during inference, so all are opened before the first request.
+            missing = groups.keys() - self._connections.keys()
+            await asyncio.gather(*(self._connect(key) for key in missing))
+            parts = [(key, group[at : at + size]) for key, group in groups.items() for at in range(0, len(group), size)]
+            await asyncio.gather(*(request(key, part) for key, part in parts))
+            rows = [row for row in rows if envs[row] in starting and isinstance(answers[row], ConnectionLost)]
+        return answers
 
-    async def _request(self, part: _Part, asked: Round) -> None:
-        rows, part.rows = part.rows, []
-        messages = [self._message(row, asked) for row in rows]
+    async def _request(
+        self, key: int, rows: Sequence[int], envs: list[int], messages: list[dict[str, Any]]
+    ) -> dict[int, Any]:
+        """Send one request and return the answers by row; errors are answers too."""
+        connection = self._connections.get(key)
         try:
-            connection = self._connections.get(part.key)
-            if connection is None:
-                raise ConnectionFailed("the connection is lost", gone=True)
+            if connection is None:  # another request has lost it
+                raise ConnectionLost("the connection is lost")
             if self._metadata.max_batch is None:
-                answers = [await self._timer.limit(connection.request(pack(messages[0])))]
+                answers = [await self._answer(connection.socket, messages[rows[0]])]
             else:
-                answer = await self._timer.limit(connection.request(pack({BATCH: messages})))
+                answer = await self._answer(connection.socket, {BATCH: [messages[row] for row in rows]})
                 answers = [_without_error(one) for one in batch_of(answer, len(rows), len(rows))]
         except EvaluationError as error:
-            await self._close(part.key)
-            asked.fail(rows, error)
-            if isinstance(error, ConnectionFailed) and error.gone:
-                part.rows = [row for row in rows if asked.env(row) in asked.starts]
-        else:
-            asked.answers |= dict(zip(rows, answers, strict=True))
-            connection.envs |= {asked.env(row) for row in rows}
+            await self._close(key)
+            return dict.fromkeys(rows, error)
+        connection.envs |= {envs[row] for row in rows}
+        return dict(zip(rows, answers, strict=True))
 
-    def _message(self, row: int, asked: Round) -> dict[str, Any]:
-        start = asked.starts.get(asked.env(row))
-        shown = start if self._metadata.spec is not None else None  # a plain openpi server does not expect the key
-        message = observation_message(asked.observations, row, shown, reset=start is not None)
-        rename = self._address.rename
-        return {rename.get(key.removeprefix(PREFIX), key): value for key, value in message.items()}
+    async def _answer(self, socket: ClientConnection, message: dict[str, Any]) -> Any:
+        """Send a message and return the answer.
 
-    async def _connect(self, key: int) -> EvaluationError | None:
-        """Open a connection; return why there is none."""
+        A server that computes one answer after another may take ``timeout_s`` for each of them, so the time counts from
+        the last answer to any request.
+
+        Raises:
+            ConnectionLost: the connection is closed.
+            EvaluationError: there is no answer in time, or it is an error text or invalid.
+        """
+
+        async def exchange() -> str | bytes:
+            await socket.send(pack(message))
+            return await socket.recv()
+
+        sent, timeout_s, answer = time.monotonic(), self._address.timeout_s, asyncio.ensure_future(exchange())
         try:
-            self._connections[key] = await self._open()
-        except EvaluationError as error:
-            return error
-        return None
+            while not answer.done():
+                left = max(sent, self._last_answer) + timeout_s - time.monotonic()
+                if left <= 0:
+                    raise EvaluationError(f"no answer within {timeout_s:g} s")
+                await asyncio.wait({answer}, timeout=left)
+            self._last_answer = time.monotonic()
+            return read_message(answer.result())
+        except LOST as error:
+            raise ConnectionLost(f"the connection is lost: {reason_of(error)}") from error
+        finally:
+            answer.cancel()
 
-    async def _open(self) -> Connection:
-        if self._unused is not None:
-            connection, self._unused = self._unused, None
-            return connection
-        connection = await open_connection(self._address.url, self._address.connect_s)
-        try:
-            if self._terms != _terms(connection.metadata, self._address):
-                raise ConnectionFailed("another policy is served now: the server announces something else")
-        except EvaluationError:
-            await connection.close()
-            raise
-        return connection
+    async def _read_metadata(self) -> ServerMetadata:
+        """Return what the server announces."""
+        socket, metadata = await self._open()
+        await close_connection(socket)
+        return metadata
+
+    async def _connect(self, key: int) -> None:
+        """Open a connection.
+
+        Raises:
+            EvaluationError: no server answers in time, or it serves another policy.
+        """
+        socket, metadata = await self._open()
+        if self._spec_of(metadata) != self._spec_of(self._metadata) or metadata.max_batch != self._metadata.max_batch:
+            await close_connection(socket)
+            raise EvaluationError("another policy is served now", where=self._address.url)
+        self._connections[key] = _Connection(socket)
+
+    async def _close_all(self) -> None:
+        await asyncio.gather(*map(self._close, list(self._connections)))
+
+    async def _open(self) -> tuple[ClientConnection, ServerMetadata]:
+        address = self._address
+        return await open_connection(address.url, address.connect_s, pings=self._metadata.answers_pings)
 
     async def _close(self, key: int) -> None:
         if connection := self._connections.pop(key, None):
-            await connection.close()
+            await close_connection(connection.socket)
 
+    def _spec_of(self, metadata: ServerMetadata) -> PolicySpec:
+        """Return what the policy declares, as its server announces it or the address says.
 
-def policy_spec(metadata: ServerMetadata, address: Address) -> PolicySpec:
-    """Return what a policy declares, as its server announces it or the address says.
-
-    Raises:
-        EvaluationError: it is invalid, or both say it.
-    """
-    if metadata.spec is not None and address.spec:
-        fix = "Leave these out of the address."
-        found = sorted(address.spec)
-        raise EvaluationError(
-            "the server announces its policy specification itself", where=address.url, found=found, fix=fix
-        )
-    return read_policy_spec(address.spec if metadata.spec is None else metadata.spec, address.url)
-
-
-def _terms(metadata: ServerMetadata, address: Address) -> tuple[PolicySpec, int | None]:
-    """What has to stay as it is over all connections."""
-    return policy_spec(metadata, address), metadata.max_batch
+        Raises:
+            EvaluationError: it is invalid, or both say it.
+        """
+        url, given = self._address.url, self._address.spec
+        if metadata.spec is None:
+            return given or PolicySpec()
+        if given is not None:
+            fix = "Leave these options out of the address."
+            raise EvaluationError("the server announces its policy specification itself", where=url, fix=fix)
+        return read_policy_spec(metadata.spec, url)
 
 
 def _without_error(answer: dict[str, Any]) -> Any:
     """Return an answer of a batch, or the error that it holds."""
     text = answer.get(ERROR)
-    return ConnectionFailed(f"the server failed: {error_line(text)}") if isinstance(text, str) else answer
-
-
-async def _close_all(connections: Sequence[Connection]) -> None:
-    await asyncio.gather(*(connection.close() for connection in connections))
+    return server_error(text) if isinstance(text, str) else answer

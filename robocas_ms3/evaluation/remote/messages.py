@@ -1,52 +1,50 @@
-"""Convert observations and actions to messages and back. Messages are plain maps, which `wire` packs.
+"""The messages between a policy's client and server: plain maps, which `wire` packs; docs/remote_policies.md.
 
-The first message of a server is its metadata (`ServerMetadata`). An observation is the map of one env, without an axis
-for envs; the answer is ``{"actions": (H, A)}``, or a text with the error, after which the server closes the connection.
-A batched request is ``{"batch": [observation, ...]}``; the answer is ``{"batch": [answer, ...]}`` in the same order,
-where an answer is ``{"actions": (H, A)}`` or ``{"error": text}``.
+The first message of a server is its `ServerMetadata`. A request is the observation of one env, without an axis for
+envs; the answer is ``{"actions": (H, A)}``, or a text with the error, after which the server closes the connection. A
+batched request is ``{"batch": [observation, ...]}``; the answer is ``{"batch": [answer, ...]}`` in the same order, where
+an answer is ``{"actions": (H, A)}`` or ``{"error": text}``.
 """
 
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import TypeAdapter, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PositiveInt, TypeAdapter, ValidationError
 
-from robocas_ms3.core.errors import EvaluationError, RobocasError, WireError
+from robocas_ms3.core.errors import EvaluationError, WireError
 from robocas_ms3.core.paths import protocols_dir
 from robocas_ms3.core.strict import refusal
-from robocas_ms3.core.words import printable
 from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
-from robocas_ms3.evaluation.remote.wire import MAX_BYTES
+from robocas_ms3.evaluation.remote.wire import MAX_BYTES, one_line
 from robocas_ms3.robots.table import DEFAULT
 
-ENV, RESET, START, PROMPT, ACTIONS = "env_id", "reset", "start", "prompt", "actions"
-BATCH, ERROR = "batch", "error"
+ENV, RESET, START, PROMPT, ACTIONS, BATCH, ERROR = "env_id", "reset", "start", "prompt", "actions", "batch", "error"
 PREFIX = "observation/"
 ROBOT = {"qpos": 12, "tcp_in_base": 7, "gripper_width": 1}
-_LARGEST = 1e3  # m or rad: physics of what is beyond would be broken, and nobody means it
-_MAX_PIXELS = 4096  # a side
-_MAX_TEXT = 10_000  # characters
-_LONGEST_LINE = 300  # characters
-_OTHER_BYTES = 8 * 2**20  # of a request, besides images
-_POLICY_SPEC = TypeAdapter(PolicySpec)
-WANTS, POLICY = "robocas_wants", "robocas_policy"
-MAX_BATCH, ANSWERS_PINGS = "robocas_max_batch", "robocas_answers_pings"
 DEFAULT_BATCH, LARGEST_BATCH = 64, 256  # envs
-_MAX_DESCRIPTION = 2**20  # characters of JSON
 FILE_NAME_PARTS = 3  # of a file's name in messages: folder of the protocol, folder in it, file
+MAX_TEXT = 10_000  # characters
+_LARGEST_ACTION = 1e3  # m or rad; physics breaks far below it
+_OTHER_BYTES = 8 * 2**20  # of a request, besides images
+_MAX_DESCRIPTION = 2**20  # characters of JSON
+_POLICY_SPEC = TypeAdapter(PolicySpec)
 
 
-@dataclass(frozen=True)
-class ServerMetadata:
+def _as_json(description: Any) -> Any:
+    text = json.dumps(description, default=str)
+    if len(text) > _MAX_DESCRIPTION:
+        raise ValueError(f"expected {_MAX_DESCRIPTION} characters of JSON at most, found {len(text)}")
+    return json.loads(text)
+
+
+class ServerMetadata(BaseModel):
     """The metadata of a server. A plain openpi server announces none of them.
 
     Attributes:
@@ -56,210 +54,142 @@ class ServerMetadata:
         answers_pings: whether the server answers websocket pings during inference.
     """
 
-    spec: Any = None
-    policy: Any = None
-    max_batch: int | None = None
-    answers_pings: bool = False
+    model_config = ConfigDict(strict=True, frozen=True, populate_by_name=True)
 
-    def message(self) -> dict[str, Any]:
-        """Return the message; `read_metadata` reads it."""
-        return {
-            WANTS: self.spec,
-            POLICY: self.policy,
-            MAX_BATCH: self.max_batch,
-            ANSWERS_PINGS: self.answers_pings,
-        }
+    spec: Any = Field(default=None, alias="robocas_wants")
+    policy: Annotated[Any, BeforeValidator(_as_json)] = Field(default=None, alias="robocas_policy")
+    max_batch: PositiveInt | None = Field(default=None, alias="robocas_max_batch")
+    answers_pings: bool = Field(default=False, alias="robocas_answers_pings")
 
 
 def read_metadata(message: Any, url: str) -> ServerMetadata:
     """Read a server's metadata; keys of other packages are ignored.
 
     Raises:
-        EvaluationError: a value is out of range.
+        EvaluationError: a value is invalid.
     """
-    said = message if isinstance(message, dict) else {}
-    max_batch, answers_pings = said.get(MAX_BATCH), said.get(ANSWERS_PINGS, False)
-    if max_batch is not None and not (type(max_batch) is int and max_batch >= 1):
-        raise EvaluationError(
-            f"invalid {MAX_BATCH}", where=url, expected="an integer above 0", found=short_line(repr(max_batch))
-        )
-    if not isinstance(answers_pings, bool):
-        raise EvaluationError(
-            f"invalid {ANSWERS_PINGS}", where=url, expected="a bool", found=short_line(repr(answers_pings))
-        )
-    policy = json.dumps(said.get(POLICY), default=str)
-    if len(policy) > _MAX_DESCRIPTION:
-        expected = f"{_MAX_DESCRIPTION} characters of JSON at most"
-        raise EvaluationError("policy description too long", where=url, expected=expected, found=len(policy))
-    limit = min(max_batch, LARGEST_BATCH) if max_batch else None
-    return ServerMetadata(said.get(WANTS), json.loads(policy), limit, answers_pings)
+    try:
+        return ServerMetadata.model_validate(message if isinstance(message, dict) else {})
+    except ValidationError as problem:
+        raise refusal(problem, ServerMetadata, EvaluationError, where=url, about="invalid metadata") from problem
 
 
 def read_policy_spec(message: Any, where: object) -> PolicySpec:
-    """The way back; what is not said is as `PolicySpec` has it.
+    """Read a policy's specification; missing fields have the defaults of `PolicySpec`.
 
     Raises:
-        EvaluationError: there is no such thing to want.
+        EvaluationError: it has an unknown field or an invalid value.
     """
-    known = [field.name for field in fields(PolicySpec)]
-    if not isinstance(message, dict) or not set(message) <= set(known):
-        raise EvaluationError(
-            "invalid policy specification", where=where, expected=f"some of {known}", found=short_line(message)
-        )
+    what = "invalid policy specification"
     try:
-        spec = _POLICY_SPEC.validate_json(json.dumps(message), strict=True)
-    except ValidationError as error:
-        raise refusal(
-            error, _POLICY_SPEC, EvaluationError, where=where, about="invalid policy specification"
-        ) from error
+        return _POLICY_SPEC.validate_json(json.dumps(message), strict=True)
+    except ValidationError as problem:
+        raise refusal(problem, _POLICY_SPEC, EvaluationError, where=where, about=what) from problem
     except (TypeError, ValueError) as error:
-        raise EvaluationError("invalid policy specification", where=where, found=short_line(error)) from error
-    sides = [side for size in spec.cameras.values() for side in size]
-    if not all(1 <= side <= _MAX_PIXELS for side in sides) or not 0 < (spec.rate_hz or 1) < math.inf:
-        raise EvaluationError("invalid policy specification", where=where, found=short_line(message))
-    return spec
+        raise EvaluationError(what, where=where, found=one_line(error)) from error
 
 
 def observation_message(
     observations: Observations, row: int, start: EpisodeSpec | None, *, reset: bool
 ) -> dict[str, Any]:
-    """What one env shows.
+    """Return the message with the observation of one env.
 
     Args:
-        observations: of several.
-        row: which one.
-        start: of the episode, where the server is to be told of it; None: it isn't.
-        reset: whether the episode begins here.
+        observations: of several envs.
+        row: of the env.
+        start: the episode that starts, if the server is to know it.
+        reset: whether an episode starts.
     """
-    message: dict[str, Any] = {ENV: int(observations.envs[row]), RESET: reset, PROMPT: observations.instructions[row]}
     arrays: dict[str, Any] = {name: getattr(observations, name)[row] for name in ROBOT}
     arrays |= {name: images[row] for name, images in observations.images.items()}
     arrays |= {f"{name}_depth": depths[row] for name, depths in observations.depths.items()}
     for name, values in (("embedding", observations.embeddings), ("simulator_state", observations.state)):
         if values is not None:
             arrays[name] = values[row]
+    message: dict[str, Any] = {ENV: int(observations.envs[row]), RESET: reset, PROMPT: observations.instructions[row]}
     message |= {PREFIX + name: array for name, array in arrays.items()}
     if start is not None:
-        message[START] = {name: value for name, value in vars(start).items() if name != "env"}
-        message[START] |= {name: name_of(message[START][name]) for name in ("config_file", "layouts_file")}
-        if start.robot == DEFAULT:  # a server may be older than that there are others
-            del message[START]["robot"]
+        said = {name: value for name, value in vars(start).items() if name != "env"}
+        said |= {name: name_of(said[name]) for name in ("config_file", "layouts_file")}
+        if start.robot == DEFAULT:  # unknown to servers of older versions
+            del said["robot"]
+        message[START] = said
     return message
 
 
-def observations_of(message: Mapping[str, Any], env: int, spec: PolicySpec) -> Observations:
-    """The way back, a batch of one env.
+def read_observations(messages: Sequence[Mapping[str, Any]], envs: Sequence[int], spec: PolicySpec) -> Observations:
+    """Return the observations of several messages as a policy gets them.
+
+    Args:
+        messages: of one env each.
+        envs: the policy's number of each.
+        spec: of the policy.
 
     Raises:
-        WireError: something is not there, or has another shape or type.
+        WireError: an entry is missing, or has another shape or type.
     """
 
-    def array(name: str, dtype: Any, *shape: int | None) -> NDArray[Any]:
-        found = message.get(PREFIX + name)
-        if (
-            isinstance(found, np.ndarray)
-            and found.dtype.kind == np.dtype(dtype).kind
-            and found.ndim == len(shape)
-            and all(wanted in (None, length) for wanted, length in zip(shape, found.shape, strict=True))
-        ):
-            return found.astype(dtype)[None]
-        what = f"{found.shape} {found.dtype}" if isinstance(found, np.ndarray) else type(found).__name__
-        raise WireError("not in the observation", where=PREFIX + name, expected=f"{shape} {dtype}", found=what)
+    def stack(name: str, dtype: str, *shape: int | None) -> NDArray[Any]:
+        arrays = [message.get(PREFIX + name) for message in messages]
+        for found in arrays:
+            if not (
+                isinstance(found, np.ndarray)
+                and found.dtype.kind == np.dtype(dtype).kind
+                and found.ndim == len(shape)
+                and all(length in (None, actual) for length, actual in zip(shape, found.shape, strict=True))
+            ):
+                what = f"{found.shape} {found.dtype}" if isinstance(found, np.ndarray) else type(found).__name__
+                raise WireError("not in the observation", where=PREFIX + name, expected=f"{shape} {dtype}", found=what)
+        if len({array.shape for array in arrays}) > 1:
+            raise WireError("observations of a batch differ in shape", where=PREFIX + name)
+        return np.stack(arrays).astype(dtype)
 
-    prompt = message.get(PROMPT, "")
-    if not isinstance(prompt, str):
-        raise WireError("an instruction is no text", where=PROMPT, found=type(prompt).__name__)
-    check_length(PROMPT, prompt)
+    prompts = [message.get(PROMPT, "") for message in messages]
+    if not all(isinstance(prompt, str) and len(prompt) <= MAX_TEXT for prompt in prompts):
+        raise WireError("invalid instruction", where=PROMPT, expected=f"a text of {MAX_TEXT} characters at most")
     sizes = {name: (height, width) for name, (width, height) in spec.cameras.items()}
     return Observations(
-        envs=np.array([env]),
-        instructions=[prompt if spec.language != "none" else ""],
-        embeddings=array("embedding", "float32", None) if spec.language == "embedding" else None,
-        images={name: array(name, "uint8", *size, 3) for name, size in sizes.items()},
-        depths={name: array(f"{name}_depth", "int16", *size, 1) for name, size in sizes.items()} if spec.depth else {},
-        qpos=array("qpos", "float32", ROBOT["qpos"]),
-        tcp_in_base=array("tcp_in_base", "float32", ROBOT["tcp_in_base"]),
-        gripper_width=array("gripper_width", "float32", ROBOT["gripper_width"]),
-        state=array("simulator_state", "float32", None) if spec.state else None,
-    )
-
-
-def stack_observations(observations: Sequence[Observations]) -> Observations:
-    """Return one batch of several, in their order.
-
-    Raises:
-        WireError: arrays of the same name differ in shape.
-    """
-    if len(observations) == 1:
-        return observations[0]
-
-    def stack(name: str, arrays: list[Any]) -> Any:
-        if arrays[0] is None:
-            return None
-        if len({array.shape[1:] for array in arrays}) > 1:
-            shapes = sorted({str(array.shape[1:]) for array in arrays})
-            raise WireError("observations of a batch differ in shape", where=PREFIX + name, found=", ".join(shapes))
-        return np.concatenate(arrays)
-
-    def of_all(name: str) -> list[Any]:
-        return [getattr(one, name) for one in observations]
-
-    first = observations[0]
-    return Observations(
-        envs=np.concatenate(of_all("envs")),
-        instructions=[text for one in observations for text in one.instructions],
-        embeddings=stack("embedding", of_all("embeddings")),
-        images={name: stack(name, [one.images[name] for one in observations]) for name in first.images},
-        depths={name: stack(f"{name}_depth", [one.depths[name] for one in observations]) for name in first.depths},
-        **{name: stack(name, of_all(name)) for name in ROBOT},
-        state=stack("simulator_state", of_all("state")),
+        envs=np.array(envs),
+        instructions=prompts if spec.language != "none" else [""] * len(prompts),
+        embeddings=stack("embedding", "float32", None) if spec.language == "embedding" else None,
+        images={name: stack(name, "uint8", *size, 3) for name, size in sizes.items()},
+        depths={name: stack(f"{name}_depth", "int16", *size, 1) for name, size in sizes.items()} if spec.depth else {},
+        **{name: stack(name, "float32", size) for name, size in ROBOT.items()},
+        state=stack("simulator_state", "float32", None) if spec.state else None,
     )
 
 
 def name_of(path: str) -> str:
     """Return the name of a protocol's file in messages; its path if a shipped protocol has that name."""
-    parts = Path(path).parts
-    shipped = protocols_dir()
-    if len(parts) < FILE_NAME_PARTS or (
-        (shipped / parts[-FILE_NAME_PARTS]).exists() and not Path(path).is_relative_to(shipped)
-    ):
+    parts, shipped = Path(path).parts[-FILE_NAME_PARTS:], protocols_dir()
+    if len(parts) < FILE_NAME_PARTS or ((shipped / parts[0]).exists() and not Path(path).is_relative_to(shipped)):
         return path
-    return "/".join(parts[-FILE_NAME_PARTS:])
+    return "/".join(parts)
 
 
-def actions_of(reply: Any, convention: str) -> NDArray[np.float32]:
-    """(H, A) actions of a reply; a single one may come as (A,).
-
-    Args:
-        reply: of a server.
-        convention: of the policy's actions.
+def actions_of(answer: Any, convention: str) -> NDArray[np.float32]:
+    """Return the (H, A) actions of an answer, which may have (A,).
 
     Raises:
-        WireError: there are none, not of this convention, or not finite.
+        WireError: there are none, or they do not fit the convention, or are not finite.
     """
     size = CONVENTIONS[convention].size
-    said = reply.get(ACTIONS) if isinstance(reply, dict) else None
+    values = answer.get(ACTIONS) if isinstance(answer, dict) else None
     try:
-        found = np.asarray(said)
+        actions = np.asarray(values)
     except ValueError as error:  # lists of different lengths
-        raise WireError("no actions", expected=f"(chunk, {size})", found=short_line(error)) from error
-    if found.dtype.kind not in "iuf" or found.ndim not in (1, 2) or found.shape[-1] != size or not found.size:
-        what = short_line(reply) if said is None else f"{found.shape} {found.dtype}"
-        raise WireError("no actions", expected=f"(chunk, {size}) numbers", found=what)
-    if not (np.abs(found.astype(np.float64)) <= _LARGEST).all():  # nor is what is not a number
-        raise WireError(
-            "an action beyond all measure", expected=f"{_LARGEST:g} at most", found=short_line(found.tolist())
-        )
-    return found.reshape(-1, size).astype(np.float32)
+        raise WireError("no actions", expected=f"(chunk, {size})", found=one_line(error)) from error
+    if actions.dtype.kind not in "iuf" or actions.ndim not in (1, 2) or actions.shape[-1] != size or not actions.size:
+        found = one_line(answer) if values is None else f"{actions.shape} {actions.dtype}"
+        raise WireError("no actions", expected=f"(chunk, {size}) numbers", found=found)
+    if not (np.abs(actions.astype(np.float64)) <= _LARGEST_ACTION).all():  # NaN too
+        expected, found = f"{_LARGEST_ACTION:g} at most", one_line(actions.tolist())
+        raise WireError("action value out of range", expected=expected, found=found)
+    return actions.reshape(-1, size).astype(np.float32)
 
 
 def batch_of(message: Any, least: int, most: int) -> list[dict[str, Any]]:
-    """Return the maps of a batched request, or of the answer to it.
-
-    Args:
-        message: with the key ``batch``.
-        least: smallest number of maps.
-        most: largest number of maps.
+    """Return the maps of a batched request, or of the answer to it, ``least`` to ``most`` of them.
 
     Raises:
         WireError: it is no list of maps, or has another length.
@@ -270,12 +200,6 @@ def batch_of(message: Any, least: int, most: int) -> list[dict[str, Any]]:
     if not least <= len(batch) <= most:
         raise WireError("invalid batch", where=BATCH, expected=f"{least} to {most} maps", found=len(batch))
     return batch
-
-
-def one_line(error: BaseException) -> str:
-    """Return an error as a line without control characters, for the other end of a connection."""
-    said = str(error) if isinstance(error, RobocasError) else f"{type(error).__name__}: {error}"
-    return printable(" ".join(said.split())[:_LONGEST_LINE])
 
 
 def message_bytes(spec: PolicySpec, max_batch: int = 1) -> int:
@@ -289,21 +213,4 @@ def batch_limit(spec: PolicySpec, envs: int) -> int:
 
 
 def _image_bytes(spec: PolicySpec) -> int:
-    """Size of the images of one env."""
-    pixels = sum(width * height for width, height in spec.cameras.values())
-    return pixels * (5 if spec.depth else 3)
-
-
-def check_length(where: str, text: str) -> None:
-    """Check the length of a text of a client.
-
-    Raises:
-        WireError: it is too long.
-    """
-    if len(text) > _MAX_TEXT:
-        raise WireError("text too long", where=where, expected=f"{_MAX_TEXT} characters at most", found=len(text))
-
-
-def short_line(text: object) -> str:
-    """Return a value as a line of at most 200 characters, for an error message."""
-    return " ".join(str(text).split())[:200]
+    return sum(width * height for width, height in spec.cameras.values()) * (5 if spec.depth else 3)

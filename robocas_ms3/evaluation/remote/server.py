@@ -1,14 +1,13 @@
-"""A server that lets a policy answer over websockets: clients of ours, and openpi's."""
+"""Serve a policy over websockets, to our clients and openpi's."""
 
 from __future__ import annotations
 
 import asyncio
 import http
-import json
 import logging
 import threading
 from collections.abc import Callable
-from concurrent.futures import Executor, Future
+from concurrent.futures import Future
 from functools import partial
 from queue import SimpleQueue
 from typing import Any
@@ -22,69 +21,28 @@ from robocas_ms3.core.errors import EvaluationError, RobocasError, WireError
 from robocas_ms3.evaluation.policy import Policy, describe, policy_code, policy_spec_values
 from robocas_ms3.evaluation.remote import connection
 from robocas_ms3.evaluation.remote.address import netloc, strip_brackets
-from robocas_ms3.evaluation.remote.answers import Answers, ServedFiles
-from robocas_ms3.evaluation.remote.messages import (
-    DEFAULT_BATCH,
-    ServerMetadata,
-    batch_limit,
-    message_bytes,
-    one_line,
-)
+from robocas_ms3.evaluation.remote.answers import Answers, ServedFiles, error_line
+from robocas_ms3.evaluation.remote.messages import DEFAULT_BATCH, ServerMetadata, batch_limit, message_bytes
 from robocas_ms3.evaluation.remote.wire import pack
 
-_LOG = logging.getLogger(__name__)
 HEALTH = "/healthz"
 MAX_CONNECTIONS = 256
+_log = logging.getLogger(__name__)
 _IDLE = 3600.0  # s without a message, after which a connection is closed
 _STOP_S = 5.0  # for the network's thread to end
 _FAILED, _GARBAGE, _FULL = 1011, 1008, 1013  # close codes
 
 
-class CallerThreadExecutor(Executor):
-    """Run submitted functions, one after another, in the thread that calls `run`.
-
-    So a policy stays in the thread that made it, and Ctrl-C reaches its code, while another thread does the
-    network's work. A submitted function that is cancelled before its turn is skipped.
-    """
-
-    def __init__(self) -> None:
-        self._calls: SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None] = SimpleQueue()
-        self._ended = False
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Add a function to the queue."""
-        future: Future[Any] = Future()
-        self._calls.put((future, partial(fn, *args, **kwargs)))
-        return future
-
-    def run(self) -> None:
-        """Run submitted functions until `shutdown`."""
-        while (item := self._calls.get()) is not None and not self._ended:
-            future, call = item
-            if not future.set_running_or_notify_cancel():
-                continue
-            try:
-                result = call()
-            except Exception as error:  # raised by future.result() in the waiting thread
-                future.set_exception(error)
-            else:
-                future.set_result(result)
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End `run` after the function that it runs now."""
-        self._ended = True
-        self._calls.put(None)
-
-
 class PolicyServer:
     """Serve a policy: one request after another, in the thread that calls `run`.
 
-    A second thread does the network's work. It answers pings and ``/healthz`` during inference.
+    So the policy stays in the thread that made it, and Ctrl-C reaches its code. A second thread does the network's
+    work: it answers pings and ``/healthz`` during inference.
 
     Args:
         policy: that acts.
-        host: to listen on; there is no password, so with any address but loopback everyone who can reach it may ask.
-        port: 0: any that is free.
+        host: address to listen on. There is no password: everyone who can reach the address can use the policy.
+        port: 0: a free one.
         files: that clients may choose; default: those of shipped protocols.
         max_batch: number of envs that a batched request may have; fewer where their images exceed a message's size.
     """
@@ -102,10 +60,11 @@ class PolicyServer:
             spec = policy.spec
         max_batch = batch_limit(spec, max_batch)
         self._max_bytes = message_bytes(spec, max_batch)
-        about = json.loads(json.dumps({**describe(policy), "robocas_ms3": __version__}, default=str))
-        self._metadata = pack(ServerMetadata(policy_spec_values(spec), about, max_batch, answers_pings=True).message())
+        about = {**describe(policy), "robocas_ms3": __version__}
+        metadata = ServerMetadata(spec=policy_spec_values(spec), policy=about, max_batch=max_batch, answers_pings=True)
+        self._metadata = pack(metadata.model_dump(by_alias=True))
         self._answers = Answers(policy, files or ServedFiles.of(), self._max_bytes, max_batch)
-        self._executor = CallerThreadExecutor()
+        self._calls: SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None] = SimpleQueue()
         self._connections = 0
 
     def run(self, listening: Callable[[str], object] = lambda url: None) -> None:
@@ -123,14 +82,17 @@ class PolicyServer:
         url, end = started.result()
         try:
             listening(url)
-            self._executor.run()
+            while call := self._calls.get():
+                future, work = call
+                if future.set_running_or_notify_cancel():  # the client is still there
+                    future.set_result(work())
         finally:
             end()
             network.join(_STOP_S)
 
     def stop(self) -> None:
-        """End `run`, from another thread, after the request that it answers now."""
-        self._executor.shutdown()
+        """End `run`, from another thread, after the requests that it has received."""
+        self._calls.put(None)
 
     def _serve(self, started: Future[tuple[str, Callable[[], object]]]) -> None:
         """Run the network's event loop."""
@@ -138,11 +100,11 @@ class PolicyServer:
             asyncio.run(self._listen(started))
         except Exception as error:
             if started.done():
-                _LOG.exception("the server's network thread failed")
+                _log.exception("the server's network thread failed")
             else:
                 started.set_exception(error)
         finally:
-            self._executor.shutdown()
+            self.stop()
 
     async def _listen(self, started: Future[tuple[str, Callable[[], object]]]) -> None:
         loop, ended = asyncio.get_running_loop(), asyncio.Event()
@@ -180,7 +142,7 @@ class PolicyServer:
             await client.send(self._metadata)
             while True:
                 message = await asyncio.wait_for(client.recv(), _IDLE)
-                reply = asyncio.get_running_loop().run_in_executor(self._executor, self._reply, message, envs)
+                reply = asyncio.wrap_future(self._submit(partial(self._reply, message, envs)))
                 await asyncio.wait({reply, closed}, return_when=asyncio.FIRST_COMPLETED)
                 if not reply.done():  # the client closed the connection
                     reply.cancel()
@@ -194,21 +156,27 @@ class PolicyServer:
         finally:
             closed.cancel()
             self._connections -= 1
-            self._executor.submit(self._answers.release, envs)
+            self._submit(partial(self._answers.release, envs))
+
+    def _submit(self, work: Callable[[], Any]) -> Future[Any]:
+        """Have the thread of `run` call a function."""
+        future: Future[Any] = Future()
+        self._calls.put((future, work))
+        return future
 
     def _reply(self, message: str | bytes, envs: dict[int, int]) -> tuple[str | bytes, int]:
         """Return an answer, and the code to close the connection with; 0: it stays open."""
         try:
             return pack(self._answers.answer(message, envs)), 0
         except WireError as error:
-            _LOG.warning("a client sent an invalid message: %s", error)
-            return one_line(error), _GARBAGE
+            _log.warning("a client sent an invalid message: %s", error)
+            return error_line(error), _GARBAGE
         except RobocasError as error:
-            _LOG.warning("the policy failed: %s", error)
-            return one_line(error), _FAILED
+            _log.warning("the policy failed: %s", error)
+            return error_line(error), _FAILED
         except Exception as error:  # a policy may raise anything; other clients are still served
-            _LOG.exception("the policy failed")
-            return one_line(error), _FAILED
+            _log.exception("the policy failed")
+            return error_line(error), _FAILED
 
 
 def _health(client: ServerConnection, request: Request) -> Response | None:

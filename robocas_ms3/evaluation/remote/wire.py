@@ -1,4 +1,4 @@
-"""Values as bytes: msgpack, with arrays as openpi-client writes them. What is read is not trusted."""
+"""Values as bytes: msgpack, with arrays as openpi-client writes them. Bytes that are read are not trusted."""
 
 from __future__ import annotations
 
@@ -11,68 +11,61 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import WireError
+from robocas_ms3.core.words import printable
 
 MAX_BYTES = 64 * 2**20  # of a message
-MAX_DEPTH = 16  # of maps and lists in each other
+MAX_DEPTH = 16  # of nested maps and lists
 MAX_ITEMS = 100_000  # of all maps and lists together; arrays count as one
 _MAX_LIST, _MAX_MAP, _MAX_DIMENSIONS, _MAX_LENGTH = 10_000, 1_000, 8, 2**31
-_DTYPE = re.compile(r"[<>|=]?[biuf][1248]")  # np.dtype understands much more, pickled objects among it
+_DTYPE = re.compile(r"[<>|=]?(b1|[iu][1248]|f[248])")  # np.dtype reads much more, pickled objects among it
 _ARRAY, _SCALAR = b"__ndarray__", b"__npgeneric__"
 
 
 def pack(value: Any) -> bytes:
-    """Bytes of a value made of maps, lists, texts, bytes, numbers, None and NumPy arrays of numbers.
+    """Return the bytes of a value made of maps, lists, texts, bytes, numbers, None and NumPy arrays of numbers.
 
     Raises:
-        WireError: something else is in it.
+        WireError: it holds something else.
     """
     try:
-        return msgpack.Packer(default=_written).pack(value)
+        return msgpack.packb(value, default=_encode)
     except (TypeError, ValueError, OverflowError) as error:
         raise WireError("can't be sent", found=error) from error
 
 
 def unpack(data: bytes, max_bytes: int = MAX_BYTES) -> Any:
-    """The value of bytes. Arrays are copies, writable, in this machine's byte order; NumPy scalars are Python's.
+    """Return the value of bytes; arrays are writable copies in native byte order, NumPy scalars become Python's.
 
     Raises:
         WireError: they are no message, or one beyond the limits.
     """
     if len(data) > max_bytes:
         raise WireError("a message is too large", expected=f"{max_bytes} bytes at most", found=len(data))
-    try:
-        value = msgpack.unpackb(
-            data,
-            object_hook=(count := _Counter()),
-            list_hook=count,
-            ext_hook=_refuse_extension,
-            max_array_len=_MAX_LIST,
-            max_map_len=_MAX_MAP,
-            max_ext_len=0,
-        )
-    except (ValueError, OverflowError, RecursionError, msgpack.UnpackException) as error:
-        raise WireError("no message", found=_line(error)) from error
-    return _read(value, 0)
+    items = 0
 
-
-class _Counter:
-    """Counts what is in maps and lists as they are read, so that a small message can't fill the memory."""
-
-    def __init__(self) -> None:
-        self.items = 0
-
-    def __call__(self, container: Any) -> Any:
-        self.items += 1 + len(container)
-        if self.items > MAX_ITEMS:
+    def count(container: Any) -> Any:
+        """Count items while they are read, so that a small message can't fill the memory."""
+        nonlocal items
+        items += 1 + len(container)
+        if items > MAX_ITEMS:
             raise ValueError(f"more than {MAX_ITEMS} items")
         return container
 
+    try:
+        value = msgpack.unpackb(
+            data, object_hook=count, list_hook=count, max_array_len=_MAX_LIST, max_map_len=_MAX_MAP, max_ext_len=0
+        )
+    except (ValueError, OverflowError, RecursionError, msgpack.UnpackException) as error:
+        raise WireError("no message", found=one_line(error)) from error
+    return _decode(value, 0)
 
-def _refuse_extension(code: int, data: bytes) -> Any:
-    raise ValueError(f"extension type {code}")
+
+def one_line(text: object, length: int = 200) -> str:
+    """Return the start of a text as one line without control characters."""
+    return printable(" ".join(str(text).split())[:length])
 
 
-def _written(value: Any) -> dict[bytes, Any]:
+def _encode(value: Any) -> dict[bytes, Any]:
     if not isinstance(value, np.ndarray | np.generic):
         raise TypeError(f"a {type(value).__name__}")
     if not _DTYPE.fullmatch(value.dtype.str):
@@ -82,58 +75,52 @@ def _written(value: Any) -> dict[bytes, Any]:
     return {_ARRAY: True, b"data": value.tobytes(), b"dtype": value.dtype.str, b"shape": value.shape}
 
 
-def _read(value: Any, depth: int) -> Any:
+def _decode(value: Any, depth: int) -> Any:
     if depth > MAX_DEPTH:
         raise WireError("a message is too deep", expected=f"{MAX_DEPTH} levels at most")
     if isinstance(value, list):
-        return [_read(one, depth + 1) for one in value]
+        return [_decode(one, depth + 1) for one in value]
     if not isinstance(value, dict):
+        if isinstance(value, msgpack.ExtType):
+            raise WireError("no message", found=one_line(value))
         return value
     if _ARRAY in value:
         return _array(value)
     if _SCALAR in value:
         return _scalar(value)
-    for key in value:
-        if not isinstance(key, str):
-            raise WireError("a key is no text", found=_line(repr(key)))
-    return {key: _read(one, depth + 1) for key, one in value.items()}
+    if not all(isinstance(key, str) for key in value):
+        raise WireError("keys have to be text", found=one_line(list(value)))
+    return {key: _decode(one, depth + 1) for key, one in value.items()}
 
 
 def _array(value: dict[Any, Any]) -> NDArray[Any]:
-    if value.keys() != {_ARRAY, b"data", b"dtype", b"shape"}:
-        raise WireError("no array", expected="data, dtype and shape", found=_line(sorted(map(str, value))))
-    data, shape, dtype = value[b"data"], value[b"shape"], _dtype(value[b"dtype"])
-    if not isinstance(shape, list) or len(shape) > _MAX_DIMENSIONS:
-        raise WireError("no shape of an array", expected=f"{_MAX_DIMENSIONS} lengths at most", found=_line(shape))
-    if not all(type(length) is int and 0 <= length < _MAX_LENGTH for length in shape):
-        raise WireError("no shape of an array", found=_line(shape))
-    size = math.prod(shape) * dtype.itemsize
-    if not isinstance(data, bytes) or len(data) != size:
-        found = f"{len(data)} bytes" if isinstance(data, bytes) else type(data).__name__
-        raise WireError("an array's data don't fit its shape", expected=f"{size} bytes", found=found)
+    data, shape, dtype = value.get(b"data"), value.get(b"shape"), _dtype(value.get(b"dtype"))
+    if (
+        len(value) != 4
+        or not isinstance(data, bytes)
+        or not isinstance(shape, list)
+        or len(shape) > _MAX_DIMENSIONS
+        or not all(type(length) is int and 0 <= length < _MAX_LENGTH for length in shape)
+        or len(data) != math.prod(shape) * dtype.itemsize
+    ):
+        found = f"{type(data).__name__} of {len(data) if isinstance(data, bytes) else '?'} bytes, shape {shape}"
+        raise WireError("invalid array", expected="data, dtype and a shape that fit", found=one_line(found))
     stored = np.dtype(np.uint8) if dtype.kind == "b" else dtype  # a bool's byte may be any, and NumPy expects 0 or 1
     try:
         return np.ndarray(shape, stored, buffer=data).astype(dtype.newbyteorder("="))
-    except ValueError as error:  # empty, and as long as no array may be
-        raise WireError("no shape of an array", found=_line(error)) from error
+    except ValueError as error:  # an empty array with lengths beyond NumPy's
+        raise WireError("invalid array", found=one_line(error)) from error
 
 
 def _scalar(value: dict[Any, Any]) -> bool | int | float:
     number = value.get(b"data")
-    if value.keys() != {_SCALAR, b"data", b"dtype"} or not isinstance(number, bool | int | float):
-        raise WireError("no scalar", expected="data and dtype of a number", found=_line(value))
-    _dtype(value[b"dtype"])
+    if len(value) != 3 or not isinstance(number, bool | int | float):
+        raise WireError("invalid scalar", expected="data and dtype of a number", found=one_line(value))
+    _dtype(value.get(b"dtype"))
     return number
 
 
 def _dtype(text: Any) -> np.dtype:
-    try:
-        if isinstance(text, str) and _DTYPE.fullmatch(text):
-            return np.dtype(text)
-    except TypeError:  # such as f1
-        pass
-    raise WireError("no type of numbers", expected="such as <f4 or |u1", found=_line(repr(text)))
-
-
-def _line(text: object) -> str:
-    return " ".join(str(text).split())[:200]
+    if isinstance(text, str) and _DTYPE.fullmatch(text):
+        return np.dtype(text)
+    raise WireError("invalid type of numbers", expected="such as <f4 or |u1", found=one_line(repr(text)))

@@ -5,6 +5,7 @@ pytest.importorskip("msgpack")
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.policies import make_policy
+from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.remote.address import Address, read_address
 
 
@@ -18,7 +19,7 @@ def test_options():
     text += "&max_in_flight=2&timeout_s=9"
     assert read_address(text) == Address(
         "ws://host:1",
-        spec={"cameras": {"base_camera": [320, 240], "gripper_camera": [64, 64]}, "depth": True, "rate_hz": 5.0},
+        spec=PolicySpec(cameras={"base_camera": (320, 240), "gripper_camera": (64, 64)}, depth=True, rate_hz=5.0),
         rename={"qpos": "state"},
         play=5,
         max_in_flight=2,
@@ -39,7 +40,7 @@ def test_options():
         "ws://host:1?camera=base_camera:2x2",
         "ws://host:1?cameras=base_camera:2",
         "ws://host:1?cameras=base_camera",
-        "ws://host:1?depth=yes",
+        "ws://host:1?depth=maybe",
         "ws://host:1?play=0",
         "ws://host:1?max_in_flight=0",
         "ws://host:1?timeout_s=-1",

@@ -13,13 +13,12 @@ pytest.importorskip("msgpack")
 from remote_ends import IN_A_HURRY, StandIn, Told, a_start, serving, some_observations, talking
 
 from robocas_ms3.core.errors import EvaluationError, PolicyFailed
+from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.protocol import Episode
 from robocas_ms3.evaluation.remote.client import RemotePolicy
-from robocas_ms3.evaluation.remote.connection import MAX_REPLY
+from robocas_ms3.evaluation.remote.connection import MAX_ANSWER
 from robocas_ms3.evaluation.remote.wire import pack
 from robocas_ms3.evaluation.rollout import EndConditions, EpisodeBatch, rollout
-
-GOOD = pack({"actions": np.zeros((1, 7))})
 
 
 def answering(reply):
@@ -50,9 +49,9 @@ def answering(reply):
         (pack({"actions": np.zeros((1, 8))}), r"expected \(chunk, 7\) numbers, found \(1, 8\)"),
         (pack({"actions": np.zeros((0, 7))}), "no actions"),
         (pack({"actions": np.zeros((1, 2, 7))}), "no actions"),
-        (pack({"actions": np.full((1, 7), np.nan)}), "beyond all measure"),
-        (pack({"actions": np.full((1, 7), 1e30)}), "beyond all measure"),
-        (pack({"x": bytes(MAX_REPLY)}), "connection is lost"),
+        (pack({"actions": np.full((1, 7), np.nan)}), "out of range"),
+        (pack({"actions": np.full((1, 7), 1e30)}), "out of range"),
+        (pack({"x": bytes(MAX_ANSWER)}), "connection is lost"),
         (lambda socket: time.sleep(1), "no answer within 0.5 s"),
         (lambda socket: socket.close(), "connection is lost"),
         (lambda socket: socket.socket.shutdown(sockets.SHUT_RDWR), "connection is lost"),
@@ -63,10 +62,8 @@ def test_a_bad_answer_fails_the_episode(reply, reason):
     with answering(reply) as url:
         remote = RemotePolicy(f"{url}?{IN_A_HURRY}")
         remote.reset([a_start(0)])
-        begun = time.monotonic()
         with pytest.raises(PolicyFailed, match=reason):
             remote.act(some_observations(0))
-        assert time.monotonic() - begun < 5
 
 
 @pytest.mark.parametrize(
@@ -104,7 +101,7 @@ def test_something_else_listens(said):
                 client.close()
 
         threading.Thread(target=talk, daemon=True).start()
-        with pytest.raises(EvaluationError, match="no server at"):
+        with pytest.raises(EvaluationError, match="no server within"):
             RemotePolicy(f"ws://127.0.0.1:{server.getsockname()[1]}?{IN_A_HURRY}")
         server.shutdown(sockets.SHUT_RDWR)
 
@@ -123,33 +120,24 @@ def test_a_server_that_does_not_read_is_not_waited_for():
             remote.act(seen)
 
 
-def test_the_next_episode_finds_a_server_that_came_back():
+def test_the_next_episode_finds_a_server_that_came_back_with_the_same_policy():
     with serving(Told()) as url:
-        port = int(url.rpartition(":")[2])
         remote = RemotePolicy(f"{url}?{IN_A_HURRY}")
-        remote.reset([a_start(0)])
-        remote.act(some_observations(0))
-    with pytest.raises(PolicyFailed, match="connection is lost"):
-        remote.act(some_observations(0))
-    remote.reset([a_start(0)])
-    with pytest.raises(PolicyFailed, match="no server at"):
-        remote.act(some_observations(0))
+        remote.reset([a_start(0), a_start(1)])
+        remote.act(some_observations(0, 1))
+    port = int(url.rpartition(":")[2])
     policy = Told()
     with serving(policy, port):
-        remote.reset([a_start(0, episode=9)])
-        remote.act(some_observations(0))
-        assert policy.starts == [a_start(0, episode=9)]
-
-
-def test_another_policy_in_its_place_is_noticed():
-    from robocas_ms3.evaluation.policy import PolicySpec
-
-    with serving(Told()) as url:
-        remote = RemotePolicy(f"{url}?{IN_A_HURRY}")
-    with serving(Told(PolicySpec(convention="delta_euler")), int(url.rpartition(":")[2])):
+        remote.reset([a_start(1, episode=9)])
+        with pytest.raises(PolicyFailed, match="connection is lost") as failed:
+            remote.act(some_observations(0, 1))
+        assert failed.value.reasons.keys() == {0}
+        assert policy.starts == [a_start(1, episode=9)]
+    with serving(Told(PolicySpec(convention="delta_euler")), port):
         remote.reset([a_start(0)])
-        with pytest.raises(PolicyFailed, match="another policy"):
+        with pytest.raises(EvaluationError, match="another policy is served now"):
             remote.act(some_observations(0))
+    remote.close()
 
 
 class Stumbling(Told):
@@ -167,28 +155,31 @@ def play(policy, count=7, envs=2):
     return {one.start.episode: one for one in rollout(batch, policy, starts)}
 
 
-def test_a_run_goes_on_where_a_policy_fails():
+def test_a_run_continues_after_episodes_in_which_the_policy_fails():
     with serving(Stumbling()) as url:
         played = play(RemotePolicy(url), envs=1)
-    assert sorted(played) == list(range(7))
+    assert {number: one.steps for number, one in played.items()} == {0: 4, 1: 4, 2: 0, 3: 4, 4: 4, 5: 0, 6: 4}
     assert {number for number, one in played.items() if one.error} == {2, 5}
     assert played[2].error == "the server failed: RuntimeError: out of memory"
-    assert [one.steps for one in played.values()] == [4, 4, 0, 4, 4, 0, 4]
     outcome = played[2].outcome(Episode(episode=2, task="pick", config="x", seed=7, instruction="", target="a"), ())
     assert (outcome.failure_stage, outcome.error, outcome.success) == ("error", played[2].error, False)
 
 
-def test_a_run_ends_where_the_server_is_dead():
+def test_a_run_ends_when_its_server_can_not_be_reached_again():
     with serving(Told()) as url:
         remote = RemotePolicy(f"{url}?{IN_A_HURRY}")
-    played = play(remote, count=3)
-    assert all("no server at" in one.error for one in played.values())
+    start = time.monotonic()
+    with pytest.raises(EvaluationError, match="no server within 0.5 s"):
+        play(remote, count=50)
+    assert time.monotonic() - start < 10  # it waits for connect_s once, not once per episode
+    remote.close()
 
 
 class Hopeless(Told):
+    """Fails in the first env."""
+
     def act(self, observations):
-        failed = [env for env in observations.envs.tolist() if env == 0]
-        if failed:
+        if 0 in observations.envs:
             raise PolicyFailed({0: "zero"}, super().act(observations) if len(observations.envs) > 1 else None)
         return super().act(observations)
 

@@ -109,7 +109,7 @@ def test_a_dead_network_is_noticed_by_both_ends(fast_pings):
         remote.act(some_observations(0))
         cut.set()
         start = time.monotonic()
-        with pytest.raises(PolicyFailed, match="no answer to a ping within 1 s"):
+        with pytest.raises(PolicyFailed, match="keepalive ping timeout"):
             remote.act(some_observations(0))
         assert time.monotonic() - start < 20
         while time.monotonic() - start < 20:  # until the server has released the env
@@ -147,7 +147,7 @@ CUT = """
 import os, subprocess, sys, threading, time
 subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
 from remote_ends import a_start, some_observations, talking
-from robocas_ms3.core.errors import PolicyFailed
+from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.remote import connection
 from robocas_ms3.evaluation.remote.client import RemotePolicy
 from robocas_ms3.evaluation.remote.wire import pack
@@ -166,8 +166,8 @@ with talking(talk) as url:
     start = time.monotonic()
     try:
         policy.act(some_observations(0))
-    except PolicyFailed as failed:
-        print("no server at" in str(failed), time.monotonic() - start, flush=True)
+    except EvaluationError as failed:
+        print("no server within" in str(failed), time.monotonic() - start, flush=True)
     os._exit(0)
 """
 

@@ -119,7 +119,7 @@ def test_a_start_names_the_robot_where_it_is_another():
         start = replace(a_start(), robot=robot)
         message = observation_message(some_observations(0), 0, start, reset=True)
         assert message["start"].keys() & {"robot"} == keys
-        assert read_episode_spec(message, 0, ServedFiles.of()) == start
+        assert ServedFiles.of().resolved(read_episode_spec(message, 0)) == start
 
 
 def test_openpis_client_asks_our_server():
