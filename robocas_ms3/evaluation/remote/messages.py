@@ -2,8 +2,8 @@
 
 The first message of a server is its `ServerMetadata`. A request is the observation of one env, without an axis for
 envs; the answer is ``{"actions": (H, A)}``, or a text with the error, after which the server closes the connection. A
-batched request is ``{"batch": [observation, ...]}``; the answer is ``{"batch": [answer, ...]}`` in the same order, where
-an answer is ``{"actions": (H, A)}`` or ``{"error": text}``.
+batched request is ``{"batch": [observation, ...]}``; the answer is ``{"batch": [answer, ...]}`` in the same order; an
+answer is ``{"actions": (H, A)}`` or ``{"error": text}``.
 """
 
 from __future__ import annotations
