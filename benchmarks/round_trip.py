@@ -25,10 +25,10 @@ from robocas_ms3.datasets.lerobot.check import check_lerobot
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.variants import NEWEST, VARIANTS
+from robocas_ms3.datasets.manage.copying import CopyOptions, open_finished
 from robocas_ms3.datasets.manage.importing import import_robocas
 from robocas_ms3.datasets.manage.merging import merge
-from robocas_ms3.datasets.manage.parts import open_part
-from robocas_ms3.datasets.manage.splitting import parts_by_value, write_parts
+from robocas_ms3.datasets.manage.splitting import split_by_value, write_split
 from robocas_ms3.datasets.manage.survey import survey
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
@@ -65,8 +65,9 @@ def main(cfg: Benchmark) -> None:
         merge(roots, merged)
     report["merge"]["violations"] = len(validate(merged).violations)
     with _timed(report, "split"):
-        part = open_part(merged)
-        write_parts(part, parts_by_value(part, "task", None, cfg.out / "split"), share=None)
+        source = open_finished(merged)
+        pieces = split_by_value(source.dataset, "task", None)
+        write_split(source, {cfg.out / "split" / name: sides for name, sides in pieces.items()}, None)
     report["split"]["episodes_changed"] = sum(
         _different(Dataset(root), Dataset(cfg.out / "split" / root.name.removesuffix("_robocas"))) for root in roots
     )
@@ -91,7 +92,7 @@ def _one(trajectory: Path, ours: Path, size: tuple[int, int] | None) -> dict[str
     theirs, back = Path(f"{base}_upstream"), Path(f"{base}_imported")
     _as_upstream(ours, theirs)
     with _timed(report, "import"):
-        import_robocas(survey(theirs), back, link=True)
+        import_robocas(survey(theirs), back, options=CopyOptions())
     changed = _different(Dataset(ours), Dataset(back))
     report["import"] |= {"episodes_changed": changed, "violations": len(validate(back).violations)}
     return report

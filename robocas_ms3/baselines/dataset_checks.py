@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.datasets.manage.eef import eef_turn
+from robocas_ms3.datasets.manage.repairs import eef_turn
 from robocas_ms3.datasets.sources.protocol import EpisodeSource
 
 _STANDING = 0.005  # m or rad; a base that stands trembles by less than a tenth of a mm

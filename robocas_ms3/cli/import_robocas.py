@@ -44,16 +44,17 @@ class ImportRobocas:
 
 
 def main(cfg: ImportRobocas) -> int:
-    """Look, tell, import; gives the exit code."""
+    """Survey, report, import; gives the exit code."""
     import json
 
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.terminal import say, say_lines
     from robocas_ms3.core.outputs import OutputFolder
     from robocas_ms3.core.words import count_of
+    from robocas_ms3.datasets.manage.copying import CopyOptions, check_apart
     from robocas_ms3.datasets.manage.importing import import_robocas
     from robocas_ms3.datasets.manage.survey import survey
-    from robocas_ms3.datasets.writing.output import DATASET, check_apart
+    from robocas_ms3.datasets.writing.output import DATASET
 
     if cfg.out is not None:
         check_apart(cfg.out, [cfg.dataset])
@@ -72,22 +73,15 @@ def main(cfg: ImportRobocas) -> int:
     if not found.taken or cfg.out is None:
         return 0 if found.taken else 1
     with bar("episodes written") as shown:
-        kept = import_robocas(
-            found,
-            cfg.out,
-            link=cfg.link,
-            embed=embed,
-            overwrite=cfg.overwrite,
-            on_start=shown.start,
-            on_episode=shown.advance,
-        )
+        options = CopyOptions(cfg.link, cfg.overwrite, shown.start, shown.advance)
+        kept = import_robocas(found, cfg.out, embed=embed, options=options)
     if not cfg.json:
         say(f"{cfg.out}: {count_of(len(found.taken), 'episode')}{f', {kept} kept' if kept else ''}")
     return 0
 
 
 def _table(found: Survey) -> None:
-    """What is wrong, the same of many episodes in one line."""
+    """Print what is wrong, the same fault of several episodes in one line."""
     from rich.table import Table
 
     from robocas_ms3.cli.terminal import say, table_console
@@ -106,12 +100,12 @@ def _table(found: Survey) -> None:
         for (outcome, place, problem), numbers in sorted(rows.items()):
             table.add_row(ranges(numbers) or "all", outcome, place, problem)
         table_console().print(table)
-    left_out = len(found.as_json()["left_out"])
-    say(f"{found.root}: {count_of(found.episodes, 'episode')}, can be taken: {len(found.taken)}, left out: {left_out}")
+    counts = f"can be taken: {len(found.taken)}, left out: {len(found.left_out)}"
+    say(f"{found.root}: {count_of(found.episodes, 'episode')}, {counts}")
 
 
 def ranges(numbers: list[int], most: int = 6) -> str:
-    """Numbers in short: ``0-3, 7``."""
+    """Format numbers as ``0-3, 7``."""
     runs: list[list[int]] = []
     for number in sorted(set(numbers)):
         if runs and number == runs[-1][1] + 1:

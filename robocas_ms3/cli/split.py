@@ -50,64 +50,52 @@ def main(cfg: Split) -> int:
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.core.words import count_of
-    from robocas_ms3.datasets.manage.splitting import Share, resplit, write_parts
+    from robocas_ms3.datasets.manage import splitting
+    from robocas_ms3.datasets.manage.copying import CopyOptions, open_finished
 
-    check(cfg)
+    _check(cfg)
+    by = cfg.by or "seed"
     whole = cfg.out is not None and not cfg.parts  # each part is one task or target, which can't be cut by itself
-    share = None if cfg.val_share is None else Share(cfg.val_share, "seed" if whole else cfg.by or "seed")
+    share = None if cfg.val_share is None else splitting.Share(cfg.val_share, "seed" if whole else by)
     if cfg.in_place:
-        train, val = resplit(cfg.dataset, share)
+        train, val = splitting.resplit(cfg.dataset, share)
         say(f"{cfg.dataset}: {count_of(len(train), 'episode')} for training, {len(val)} for validation")
         return 0
-    part, pieces = _pieces(cfg, share)
-    with bar("episodes written") as shown:
-        done = write_parts(
-            part,
-            pieces,
-            share=share,
-            link=not cfg.copy,
-            overwrite=cfg.overwrite,
-            on_start=shown.start,
-            on_episode=shown.advance,
+    source = open_finished(cfg.dataset)
+    if cfg.out_train and cfg.out_val:
+        pieces = splitting.split_by_side(source, share, cfg.out_train, cfg.out_val)
+    else:
+        assert cfg.out is not None
+        named = (
+            splitting.split_by_fractions(source.dataset, cfg.parts, by, share)
+            if cfg.parts
+            else splitting.split_by_value(source.dataset, by, share)
         )
+        pieces = {cfg.out / name: sides for name, sides in named.items()}
+    with bar("episodes written") as shown:
+        options = CopyOptions(not cfg.copy, cfg.overwrite, shown.start, shown.advance)
+        done = splitting.write_split(source, pieces, share, options)
     for written in done:
         say(str(written))
     return 0
 
 
-def check(cfg: Split) -> None:
-    """Check that one way of splitting was chosen, whole.
+def _check(cfg: Split) -> None:
+    """Check that exactly one way of splitting was chosen, with all of its options.
 
     Raises:
-        DatasetError: none, several, or half of one.
+        DatasetError: it was not.
     """
     from robocas_ms3.core.errors import DatasetError
 
     sides = cfg.out_train is not None or cfg.out_val is not None
     ways = [cfg.in_place, sides, cfg.out is not None]
     if sum(ways) != 1 or (sides and (cfg.out_train is None or cfg.out_val is None)):
-        raise DatasetError(
-            "how to split?",
-            expected="one of --in-place, --out-train T --out-val V, --parts ... --out O, --by ... --out O",
-        )
+        ways = "one of --in-place, --out-train T --out-val V, --parts ... --out O, --by ... --out O"
+        raise DatasetError("how to split?", expected=ways)
     if cfg.parts and cfg.out is None:
         raise DatasetError("parts need a folder", expected="--out")
     if cfg.out is not None and not cfg.parts and cfg.by in (None, "seed"):
         raise DatasetError("what is a part?", expected="--parts, or --by task or target")
     if cfg.in_place and cfg.by and cfg.val_share is None:
         raise DatasetError("how much validates?", expected="--val-share")
-
-
-def _pieces(cfg: Split, share):
-    from robocas_ms3.datasets.manage.parts import open_part
-    from robocas_ms3.datasets.manage.splitting import parts_by_share, parts_by_side, parts_by_value
-
-    part = open_part(cfg.dataset)
-    if cfg.out is None:
-        assert cfg.out_train is not None
-        assert cfg.out_val is not None
-        return part, parts_by_side(part, share, cfg.out_train, cfg.out_val)
-    by = cfg.by or "seed"
-    if cfg.parts:
-        return part, parts_by_share(part, cfg.parts, by, share, cfg.out)
-    return part, parts_by_value(part, by, share, cfg.out)

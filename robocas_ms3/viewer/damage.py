@@ -9,7 +9,9 @@ from typing import Any, TypeVar
 
 from robocas_ms3.core.documents import DAMAGED
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.datasets.checks.scene_values import check_rate, sound
+from robocas_ms3.datasets.checks.scene import sound
+from robocas_ms3.datasets.checks.violation import check_form
+from robocas_ms3.datasets.sources.records import RateRecord
 
 T = TypeVar("T")
 _WRONG = (*DAMAGED, ArithmeticError, AttributeError, AssertionError, LookupError, RecursionError, TypeError)
@@ -73,7 +75,7 @@ def scene(read: Callable[[], Any], name: str) -> tuple[dict[str, Any], str]:
 
 def rate_of(settings: Mapping[str, Any], name: str, default: float) -> tuple[float, str]:
     """Steps a second, and what is wrong with what the settings say of it."""
-    wrong = check_rate(settings)
+    wrong = check_form(RateRecord, settings, "")
     if not wrong:
         return float(settings["rate_hz"]), ""
     said = f"`rate_hz` of `{name}`: expected {wrong[0].expected}, found {wrong[0].found}; {default:g} Hz is assumed."

@@ -6,13 +6,12 @@ from dying import die_at
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.core import files
-from robocas_ms3.datasets.manage import assemble, importing
-from robocas_ms3.datasets.writing import output
+from robocas_ms3.datasets.manage import copying, importing
 
 PLACES = {  # moment -> (module, function, which call is the last)
-    "file": (output.Placer, "file", 70),  # in the second episode
+    "file": (copying.FilePlacer, "place", 70),  # in the second episode
     "rename": (files, "_move_in", 2),
-    "merge overview": (assemble, "write_info", 1),
+    "merge overview": (copying, "write_info", 1),
     "import overview": (importing, "write_info", 1),
 }
 

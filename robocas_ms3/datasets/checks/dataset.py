@@ -1,36 +1,35 @@
-"""Checks a dataset against the schema, and lists every violation."""
+"""Checks a RoboCAS folder against the schema, and lists every violation."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks import arrays as laws
-from robocas_ms3.datasets.checks import pictures as seen
-from robocas_ms3.datasets.checks.content import SURPLUS, EpisodeContent, read_episode
-from robocas_ms3.datasets.checks.info import check_info, read_info
-from robocas_ms3.datasets.checks.pictures import Sizes
-from robocas_ms3.datasets.checks.scene import check_ledger, check_scene, read_settings
-from robocas_ms3.datasets.checks.violation import Violation
+from robocas_ms3.datasets.checks.info import check_info
+from robocas_ms3.datasets.checks.pictures import SURPLUS, Sizes, check_cameras, check_depth, check_images
+from robocas_ms3.datasets.checks.scene import check_ledger, check_values, read_settings
+from robocas_ms3.datasets.checks.violation import Violation, read_object
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import no_dataset
+from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, read_arrays
 from robocas_ms3.datasets.writing.output import MARKS
+
+_EMBEDDINGS = {spec.name for spec in schema.EPISODE_INFO if spec.embedding}
 
 
 @dataclass(frozen=True)
 class Report:
-    """What was found.
+    """Result of a check.
 
     Attributes:
-        episodes: how many were looked at.
-        steps: how many steps they have.
-        violations: every one.
+        episodes: number of episodes checked.
+        steps: number of their steps.
+        violations: all of them.
     """
 
     episodes: int
@@ -38,7 +37,7 @@ class Report:
     violations: list[Violation]
 
     def as_json(self) -> dict[str, Any]:
-        """For ``--json``."""
+        """Return the report of ``--json``."""
         return {
             "valid": not self.violations,
             "episodes": self.episodes,
@@ -64,37 +63,40 @@ def validate(root: str | Path, *, on_episode: Callable[[int, int], None] | None 
     numbers = {n: folder for folder in sorted(root.iterdir()) if (n := schema.episode_number(folder.name)) is not None}
     if not (numbers or marked) and any(root.iterdir()):
         raise no_dataset(root, "folders episode_0000000, ...")
-    settings = read_settings(root)
-    pictures, violations = settings.pictures, list(settings.wrong)
-    episodes: dict[int, EpisodeContent] = {}
+    settings, pictures, violations = read_settings(root)
+    episodes: dict[int, tuple[EpisodeArrays, dict[str, Any]]] = {}
     sizes: Sizes = {}
     embedded: set[bool] = set()
-    for done, (number, folder) in enumerate(numbers.items()):
-        content = read_episode(folder, pictures)
-        sizes = {**seen.sizes_of(content.headers), **sizes}  # those of the first episode count
-        violations += check_episode(content, pictures, sizes)
-        episodes[number] = content.without_pictures()
-        embedded |= {"language_embedding" in content.stored.arrays} if content.stored.arrays else set()
+    for done, (number, folder) in enumerate(numbers.items(), start=1):
+        stored = read_arrays(folder / schema.EPISODE_FILE)
+        scene, wrong = read_object(root, f"{folder.name}/{schema.SCENE_FILE}")
+        wrong = wrong or check_values(scene, f"{folder.name}/{schema.SCENE_FILE}")
+        violations += [*wrong, *check_episode(folder, stored, pictures, sizes)]
+        embedded |= {"language_embedding" in stored.arrays} if stored.arrays else set()
+        small = {key: array for key, array in stored.arrays.items() if key not in _EMBEDDINGS}
+        episodes[number] = replace(stored, arrays=small), scene
         if on_episode:
-            on_episode(done + 1, len(numbers))
+            on_episode(done, len(numbers))
     if len(embedded) > 1:
         violations.append(Violation("", "language_embedding", "in all episodes or none", "in some"))
     violations += check_ledger(settings, episodes)
-    violations += check_info(read_info(root), episodes)
-    lengths = (content.stored.arrays.get("ee_pos", np.zeros(0)) for content in episodes.values())
-    return Report(len(numbers), sum(len(positions) for positions in lengths if positions.ndim), violations)
+    violations += check_info(root, {number: stored.arrays for number, (stored, _) in episodes.items()})
+    positions = (stored.arrays.get("ee_pos") for stored, _ in episodes.values())
+    return Report(len(numbers), sum(len(found) for found in positions if found is not None and found.ndim), violations)
 
 
-def check_episode(content: EpisodeContent, pictures: Pictures, sizes: Sizes) -> list[Violation]:
-    """What is wrong with an episode; parameters of `seen.check_pictures`."""
-    stored = content.stored
-    form = list(laws.violations_of(stored, laws.FORM))
-    turns = [] if form else list(laws.check_units(stored))
-    values = [] if form else list(laws.violations_of(stored, laws.CONTENT))
-    cameras = list(seen.check_cameras(content, pictures))
-    found = [*form, *turns, *values, *check_scene(content), *cameras]
+def check_episode(folder: Path, stored: EpisodeArrays, pictures: Pictures, sizes: Sizes) -> list[Violation]:
+    """Check the arrays, cameras and images of an episode; see `check_images`."""
+    wrong = list(laws.violations_of(stored, laws.FORM))
+    if not wrong:
+        wrong = list(laws.check_units(stored))
+        values = list(laws.violations_of(stored, laws.CONTENT))
+    else:
+        values = []
+    wrong += check_cameras(folder, pictures)
     if "" in stored.unreadable:
-        return found  # nobody knows how many pictures there should be
-    images = list(seen.check_pictures(content.headers, content.name, pictures, sizes))
-    sound = not (form or turns or cameras or any(wrong.found != SURPLUS for wrong in images))
-    return [*found, *images, *(seen.check_depth(content, pictures) if pictures.depth and sound else ())]
+        return wrong  # the number of images is unknown
+    images = list(check_images(folder, pictures, stored.steps, sizes))
+    if pictures.depth and not wrong and all(image.found == SURPLUS for image in images):
+        images += check_depth(folder, stored, pictures)
+    return [*wrong, *values, *images]

@@ -1,10 +1,11 @@
-"""Does depth agree with the cameras' intrinsics and poses? Pure maths, robust against occlusion and thin edges.
+"""Check that depth agrees with intrinsics and poses of the cameras, whatever is occluded.
 
-Three laws hold in any scene. Nothing lies below the floor, and what is level and near the floor lies on it, but for
-furniture's own bottoms, which the gripper's camera sees from near. A surface point one camera sees is, seen by another
-camera, at the depth stored there or hidden by something nearer: no camera looks through a surface that another one saw.
-And all cameras look at the workspace, so at some step the depth of each agrees with another one's. Wrong poses,
-intrinsics, axes or units break one of them.
+Three rules hold in any scene; wrong poses, intrinsics, axes or units break one of them:
+
+- Nothing is below the floor. Level surfaces near the floor are the floor, except bottoms of furniture, which the
+  gripper camera sees.
+- No camera looks through a surface that another camera sees.
+- All cameras see the workspace, so at some step the depth of each agrees with that of another.
 """
 
 from __future__ import annotations
@@ -34,10 +35,10 @@ NEAR = 0.15  # m; nearer than this a pixel covers less than the depth's millimet
 
 @dataclass(frozen=True)
 class View:
-    """What one camera saw at one step.
+    """An image of depth.
 
     Attributes:
-        camera: its name.
+        camera: name of the camera.
         depth: (H, W) uint16, mm, 0 = nothing.
         intrinsic: (4,) fx, fy, cx, cy.
         camera_in_world: (4, 4), OpenCV frame.
@@ -48,16 +49,16 @@ class View:
     intrinsic: Array
     camera_in_world: Array
 
-    def points(self, step: int = 0) -> Array:
-        """(N, 3) seen points in the world, one of ``step`` x ``step`` pixels (0: as the size asks for), m."""
-        grid, known = self.grid(step)
+    def points(self) -> Array:
+        """Return the seen points (N, 3) in the world, m; of large images every few pixels."""
+        grid, known = self._grid()
         return grid[known]
 
-    def reach(self, step: int = 0) -> Array:
-        """(N,) m, how far about each of `points` the surface goes on, as far as this camera can tell.
+    def reach(self) -> Array:
+        """Return how far the surface around each of `points` continues (N,), m, as far as this camera can tell.
 
-        The inverse depth of a plane is linear in the pixels: where a pixel departs from what those beside it say, by as
-        much as depths may differ, there may be an edge.
+        The inverse depth of a plane is linear in the pixels: a pixel that departs from the line through its neighbours
+        may be an edge.
         """
         z = self.depth.astype(np.float64) / 1000
         inverse = np.divide(1, z, out=np.zeros_like(z), where=z > 0)
@@ -68,48 +69,45 @@ class View:
         ]
         smooth = (z > 0) & (np.maximum(*bends) * z**2 < _tolerance(z))
         pixels = cv2.distanceTransform(np.pad(smooth.astype(np.uint8), 1), cv2.DIST_L2, 3)[1:-1, 1:-1]
-        rows, columns = self._pixels(step)
+        rows, columns = self._pixels()
         seen = z[rows, columns]
         return (pixels[rows, columns] * seen / self.intrinsic[:2].max())[seen > 0]
 
     def level_points(self) -> Array:
-        """(N, 3) those on level surfaces."""
-        grid, known = self.grid()
+        """Return the points (N, 3) on level surfaces."""
+        grid, known = self._grid()
         across, down = np.diff(grid, axis=1)[:-1], np.diff(grid, axis=0)[:, :-1]
         normals = np.cross(across, down)
         level = np.abs(normals[..., 2]) > LEVEL * np.linalg.norm(normals, axis=-1)
         joined = np.maximum(np.linalg.norm(across, axis=-1), np.linalg.norm(down, axis=-1)) < JUMP
         return grid[:-1, :-1][level & joined & known[:-1, :-1] & known[1:, :-1] & known[:-1, 1:]]
 
-    def grid(self, step: int = 0) -> tuple[Array, NDArray[np.bool_]]:
-        """Every ``step``-th row and column: points (R, C, 3) in the world, m, and whether something was seen (R, C)."""
-        rows, columns = self._pixels(step)
+    def _grid(self) -> tuple[Array, NDArray[np.bool_]]:
+        """Return points (R, C, 3) in the world, m, and whether something was seen (R, C)."""
+        rows, columns = self._pixels()
         z = self.depth[rows, columns].astype(np.float64) / 1000
         fx, fy, cx, cy = self.intrinsic
         # SAPIEN's rays go through pixel centres, which lie at + 0.5.
         local = np.stack([(columns + 0.5 - cx) / fx * z, (rows + 0.5 - cy) / fy * z, z], axis=-1)
         return local @ self.camera_in_world[:3, :3].T + self.camera_in_world[:3, 3], z > 0
 
-    def _pixels(self, step: int) -> NDArray[np.int64]:
-        step = step or max(1, self.depth.shape[0] // POINT_ROWS)
+    def _pixels(self) -> NDArray[np.int64]:
+        step = max(1, self.depth.shape[0] // POINT_ROWS)
         return np.mgrid[step // 2 : self.depth.shape[0] : step, step // 2 : self.depth.shape[1] : step]
 
 
 def check(steps: Sequence[Sequence[View]]) -> Iterator[tuple[int, str, str, str]]:
-    """Check what the cameras saw at some steps of an episode.
-
-    Args:
-        steps: the views of each of these steps.
+    """Check the views of some steps of an episode.
 
     Yields:
-        (index into ``steps``, camera, expected, found) of each broken law, each law once a camera.
+        (index into ``steps``, camera, expected, found), each expectation once per camera.
     """
-    told: set[tuple[str, str]] = set()
+    reported: set[tuple[str, str]] = set()
     agreement: dict[str, float] = {}  # of cameras that others may agree with
     for index, views in enumerate(steps):
         clouds = {view.camera: view.points() for view in views}
         reaches = {view.camera: view.reach() for view in views}
-        broken = [law for view in views for law in _floor(view, clouds[view.camera])]
+        broken = [rule for view in views for rule in _floor(view, clouds[view.camera])]
         seen = {camera for camera, points in clouds.items() if len(points) >= MIN_POINTS}
         for camera in clouds:
             if seen - {camera}:
@@ -127,8 +125,8 @@ def check(steps: Sequence[Sequence[View]]) -> Iterator[tuple[int, str, str, str]
                     found = f"{through:.0%} of {count} points seen through"
                     broken.append((view.camera, f"no looking through what {other.camera} sees", found))
         for camera, expected, found in broken:
-            if (camera, expected) not in told:
-                told.add((camera, expected))
+            if (camera, expected) not in reported:
+                reported.add((camera, expected))
                 yield index, camera, expected, found
     for camera, share in agreement.items():
         if share < AGREEING:
@@ -150,19 +148,18 @@ def _floor(view: View, points: Array) -> Iterator[tuple[str, str, str]]:
         yield view.camera, "floor at height 0", f"a floor {np.median(near) * 100:.0f} cm off"
 
 
-def compare(points: Array, view: View, reach: Array | None = None) -> tuple[int, float, float]:
-    """Compare points another camera saw with a view.
+def compare(points: Array, view: View, reach: Array) -> tuple[int, float, float]:
+    """Compare points that another camera saw with a view.
 
     Args:
         points: (N, 3) in the world, m.
-        view: where they may be seen.
-        reach: (N,) m, see `View.reach`; what is smaller than a pixel of the view may be missed by it. None: far.
+        view: of this camera.
+        reach: (N,) m, see `View.reach`; the view may miss surfaces smaller than its pixels.
 
     Returns:
-        How many fall into the picture; which share of them the view looks through; which share lies at its depth.
+        Number of points in the image; fraction that the view looks through; fraction at its depth.
     """
     local = (points - view.camera_in_world[:3, 3]) @ inverse(view.camera_in_world)[:3, :3].T
-    reach = np.full(len(local), np.inf) if reach is None else reach
     local, reach = local[local[:, 2] > NEAR], reach[local[:, 2] > NEAR]
     fx, fy, cx, cy = view.intrinsic
     z = local[:, 2]
@@ -187,5 +184,4 @@ def compare(points: Array, view: View, reach: Array | None = None) -> tuple[int,
 
 
 def _tolerance(z: Array) -> Array:
-    """By how much depths of one place may differ, m."""
     return 0.01 + 0.01 * z

@@ -1,118 +1,158 @@
-"""Checks what an episode's cameras saw: intrinsics and poses, the pictures' files, depth against both."""
+"""Checks of what the cameras of an episode saw: intrinsics and poses, image files, depth against both."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.core.documents import DAMAGED, load_array
 from robocas_ms3.core.poses import from_xyzw
 from robocas_ms3.core.words import count_of
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks import depth as geometry
-from robocas_ms3.datasets.checks.content import NO_FILE, SURPLUS, EpisodeContent, Headers
-from robocas_ms3.datasets.checks.rigid import is_rigid
-from robocas_ms3.datasets.checks.violation import Violation
-from robocas_ms3.datasets.pictures.headers import PictureHeader
+from robocas_ms3.datasets.checks.violation import NO_FILE, Violation
+from robocas_ms3.datasets.pictures.headers import PictureHeader, read_header
 from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.sources.files import CAMERA_LIMIT
+from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, first_line
 
+SURPLUS = "a file beyond them"
+SOUND = "a sound picture"
+_GEOMETRY_STEPS = 3  # whose depth is decoded
+_READERS = 4  # threads: reading and checksums run outside of Python's lock
 _HEADERS = {"rgb": (8, 3), "depth": (16, 1)}
-Sizes = Mapping[str, tuple[int, int]]
-"""Camera -> width and height of its pictures."""
+Sizes = dict[str, tuple[int, int]]
+"""Camera -> width and height of its images."""
+ReadHeader = Callable[[Path], PictureHeader | None]
+"""Returns the header of an image, None if only its integrity was checked; raises ValueError or OSError."""
 
 
-def check_cameras(content: EpisodeContent, pictures: Pictures) -> Iterator[Violation]:
-    """Check that every camera has sound intrinsics and its pose under both names, and that there are no others."""
-    for camera in sorted(content.cameras - set(pictures.cameras)):
-        expected = f"the cameras of {schema.CONVERSION_FILE} only"
-        yield Violation(f"{content.name}/{camera}", "", expected, "another camera")
+def check_cameras(folder: Path, pictures: Pictures) -> Iterator[Violation]:
+    """Check that each camera has valid intrinsics and its pose under both names, and that there are no others."""
+    for camera in schema.CAMERAS:
+        if camera.name not in pictures.cameras and (folder / camera.name).exists():
+            expected = f"the cameras of {schema.CONVERSION_FILE} only"
+            yield Violation(f"{folder.name}/{camera.name}", "", expected, "another camera")
     for camera in pictures.specs:
         poses: list[NDArray] = []
         for name in (schema.INTRINSIC_FILE, *camera.pose_files):
-            file = f"{content.name}/{camera.name}/{name}"
-            found = content.camera_files.get(f"{camera.name}/{name}", NO_FILE)
-            if isinstance(found, str):
-                yield Violation(file, "", "this file" if found == NO_FILE else "a numpy array", found)
+            file = f"{folder.name}/{camera.name}/{name}"
+            try:
+                found = load_array(folder / camera.name / name, CAMERA_LIMIT)
+            except FileNotFoundError:
+                yield Violation(file, "", "this file", NO_FILE)
+                continue
+            except DAMAGED as error:
+                yield Violation(file, "", "a numpy array", first_line(error))
                 continue
             wrong = list(check_camera_file(file, found, pose=name in camera.pose_files))
             yield from wrong
             poses += [found] if name in camera.pose_files and not wrong else []
         if len(poses) == 2 and not np.allclose(poses[0], poses[1], atol=1e-6):
-            file = f"{content.name}/{camera.name}/{camera.pose_files[1]}"
+            file = f"{folder.name}/{camera.name}/{camera.pose_files[1]}"
             yield Violation(file, "", f"the same as {camera.pose_files[0]}", "another pose")
 
 
 def check_camera_file(file: str, array: NDArray, *, pose: bool) -> Iterator[Violation]:
-    """Check a camera's pose (4, 4), or its intrinsics (4,)."""
+    """Check the pose (4, 4) or the intrinsics (4,) of a camera."""
     shape = (4, 4) if pose else (4,)
     if array.shape != shape or array.dtype.kind != "f":
         yield Violation(file, "", f"floats of shape {shape}", f"{array.dtype} of shape {array.shape}")
-    elif pose and not is_rigid(array):
+    elif pose and not _is_rigid(array):
         yield Violation(file, "", "a rigid transform", "another matrix")
     elif not pose and not (np.isfinite(array) & (array > 0)).all():
         yield Violation(file, "", "fx, fy, cx, cy > 0", str(array.tolist()))
 
 
-def sizes_of(headers: Headers) -> dict[str, tuple[int, int]]:
-    """The size of each camera's first sound picture."""
-    found: dict[str, tuple[int, int]] = {}
-    for place, inside in headers.items():
-        for header in inside.values():
-            if isinstance(header, PictureHeader):
-                found.setdefault(place.split("/")[0], (header.width, header.height))
-    return found
+def _is_rigid(matrix: NDArray) -> bool:
+    rotation, last_row = matrix[:3, :3], matrix[3]
+    is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) and np.linalg.det(rotation) > 0
+    return bool(np.isfinite(matrix).all() and is_rotation and np.allclose(last_row, [0, 0, 0, 1], atol=1e-6))
 
 
-def check_pictures(headers: Headers, folder: str, pictures: Pictures, sizes: Sizes) -> Iterator[Violation]:
-    """Check that there is a sound picture of every step, all of one size, and nothing else.
+def check_images(
+    folder: Path, pictures: Pictures, steps: int, sizes: Sizes, read: ReadHeader = read_header
+) -> Iterator[Violation]:
+    """Check that there is an intact image of each step, all of one size, and nothing else.
 
     Args:
-        headers: of the pictures.
-        folder: name of the episode's.
-        pictures: what ``conversion.json`` promises.
-        sizes: of each camera's pictures, where none is promised.
+        folder: of the episode.
+        pictures: images that ``conversion.json`` promises.
+        steps: T; of more than `schema.MAX_STEPS` the first are checked.
+        sizes: size of the images per camera if none is promised; cameras that are missing are added.
+        read: reads the header of an image.
     """
-    for place, inside in headers.items():
-        camera, kind = place.split("/")
-        wanted = [name for name, header in inside.items() if header != SURPLUS]
-        for name, header in inside.items():
-            file = f"{folder}/{place}/{name}"
+    places = [(camera, kind) for camera in pictures.cameras for kind in pictures.kinds]
+    with ThreadPoolExecutor(_READERS) as pool:
+        headers = list(pool.map(partial(_read_headers, folder, pictures.image_format, steps, read), places))
+    for (camera, kind), found in zip(places, headers, strict=True):
+        wanted = [name for name, header in found.items() if header != SURPLUS]
+        for name, header in found.items():
+            file = f"{folder.name}/{camera}/{kind}/{name}"
             if header == NO_FILE:
                 yield Violation(file, "", "a picture of every step", NO_FILE)
             elif header == SURPLUS:
-                yield Violation(
-                    file, "", f"{count_of(len(wanted), 'picture')} from {min(wanted, default='none')}", SURPLUS
-                )
+                expected = f"{count_of(len(wanted), 'picture')} from {min(wanted, default='none')}"
+                yield Violation(file, "", expected, SURPLUS)
             elif isinstance(header, str):
-                yield Violation(file, "", "a sound picture", header)
+                yield Violation(file, "", SOUND, header)
             elif header is not None:
-                expected = PictureHeader(*(pictures.size or sizes[camera]), *_HEADERS[kind])
+                size = sizes.setdefault(camera, (header.width, header.height))
+                expected = PictureHeader(*(pictures.size or size), *_HEADERS[kind])
                 if header != expected:
                     yield Violation(file, "", str(expected), str(header))
 
 
-def check_depth(content: EpisodeContent, pictures: Pictures) -> Iterator[Violation]:
-    """Check depth at some steps against intrinsics and poses, see `geometry.check`; all of these have to be sound."""
-    arrays = {key: array.astype(np.float64) for key, array in content.stored.arrays.items() if array.dtype.kind == "f"}
+def _read_headers(
+    folder: Path, image_format: schema.ImageFormat, steps: int, read: ReadHeader, place: tuple[str, str]
+) -> dict[str, PictureHeader | str | None]:
+    """Return by file name the header of an image, or what is wrong with it."""
+    first = schema.image_path(folder, *place, 0, image_format)
+    there = {path.name for path in first.parent.iterdir()} if first.parent.is_dir() else set()
+    wanted = [f"{step:04d}{first.suffix}" for step in range(min(steps, schema.MAX_STEPS))]
+    found: dict[str, PictureHeader | str | None] = {}
+    for name in wanted:
+        try:
+            found[name] = read(first.with_name(name)) if name in there else NO_FILE
+        except (OSError, ValueError) as error:
+            found[name] = getattr(error, "strerror", None) or first_line(error)
+    return {**found, **dict.fromkeys(sorted(there - set(wanted)), SURPLUS)}
+
+
+def check_depth(folder: Path, stored: EpisodeArrays, pictures: Pictures) -> Iterator[Violation]:
+    """Check depth at a few steps against intrinsics and poses, see `geometry.check`; nothing else may be wrong."""
+    arrays = {key: array.astype(np.float64) for key, array in stored.arrays.items() if array.dtype.kind == "f"}
     base = from_xyzw(arrays["base_pos"], arrays["base_orn"])
     ee = base @ from_xyzw(arrays["ee_pos"], arrays["ee_orn"])
+    cameras = {
+        camera.name: [
+            np.asarray(load_array(folder / camera.name / name, CAMERA_LIMIT), np.float64)
+            for name in (schema.INTRINSIC_FILE, camera.pose_files[0])
+        ]
+        for camera in pictures.specs
+    }
+    steps = sorted({round(step) for step in np.linspace(0, stored.steps - 1, _GEOMETRY_STEPS)})
     views: list[list[geometry.View]] = []
-    for step, images in content.depth.items():
+    for step in steps:
         parents = {"ee": ee[step], "arm_base": base[step], "world": np.eye(4)}
         views.append([])
         for camera in pictures.specs:
-            file, image = f"{content.name}/{camera.name}/depth/{step:04d}.png", images[camera.name]
+            path = schema.image_path(folder, camera.name, "depth", step)
+            file = f"{folder.name}/{path.relative_to(folder)}"
+            image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)  # `check_images` has checked file and size
             if image is None:
-                yield Violation(file, "", "a sound picture", "damage")
+                yield Violation(file, "", SOUND, "damage")
                 return
             if not image.any():
                 yield Violation(file, "", "depth", "only zeros")
-            intrinsic, pose = (
-                np.asarray(content.camera_files[f"{camera.name}/{name}"], np.float64)
-                for name in (schema.INTRINSIC_FILE, camera.pose_files[0])
-            )
-            views[-1].append(geometry.View(camera.name, image, intrinsic, parents[camera.parent] @ pose))
-    steps = list(content.depth)
+            intrinsic, pose = cameras[camera.name]
+            view = geometry.View(camera.name, image.astype(np.uint16), intrinsic, parents[camera.parent] @ pose)
+            views[-1].append(view)
     for index, camera_name, expected, found in geometry.check(views):
-        yield Violation(f"{content.name}/{camera_name}/depth/{steps[index]:04d}.png", "", expected, found)
+        yield Violation(f"{folder.name}/{camera_name}/depth/{steps[index]:04d}.png", "", expected, found)

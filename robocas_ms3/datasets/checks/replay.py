@@ -1,9 +1,10 @@
-"""Are the data true? Plays every episode's own actions open loop in its rebuilt scene."""
+"""Replay the actions of each episode open loop in its rebuilt scene."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
+from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,21 +20,21 @@ from robocas_ms3.demos.recordings.entries import read_reset_options, was_taken_o
 from robocas_ms3.demos.recordings.environment import read_env
 from robocas_ms3.demos.recordings.seeds import one_seed
 
-SAME_PLACE = 1e-3  # m
-BASE_STILL = 1e-3  # m that the base may move in all: 7-D actions do not move it
+_SAME_PLACE = 1e-3  # m
+_BASE_STILL = 1e-3  # m that the base may move in all: 7-D actions do not move it
 
 
 @dataclass(frozen=True)
 class EpisodeReplay:
-    """What came of one episode.
+    """Outcome of one episode.
 
     Attributes:
         number: of the episode.
         task: pick, select, ...; empty: unknown.
-        success: whether the task succeeded again; None: it could not be tried.
-        mean_error, max_error: distance of the TCP from the dataset's, m.
-        clipped: actions beyond what ``pd_ee_delta_pose`` does in a step.
-        skipped: why it could not be tried.
+        success: whether the task succeeded again; None: the episode was not replayed.
+        mean_error, max_error: distance of the TCP from the recorded one, m.
+        clipped: number of actions that exceed the limits of ``pd_ee_delta_pose``.
+        skipped: why it was not replayed.
     """
 
     number: int
@@ -47,20 +48,21 @@ class EpisodeReplay:
 
 @dataclass(frozen=True)
 class ReplayReport:
-    """What came of a dataset's actions."""
+    """Outcomes of a dataset."""
 
     episodes: list[EpisodeReplay] = field(default_factory=list)
 
     def by_task(self) -> dict[str, dict[str, Any]]:
-        """For each task: episodes tried, how many succeeded again, tracking errors in m, episodes skipped."""
+        """Return counts, success rate and tracking errors in m of each task."""
         result = {}
         for task in sorted({episode.task for episode in self.episodes}):
             of_task = [episode for episode in self.episodes if episode.task == task]
             tried = [episode for episode in of_task if episode.success is not None]
+            succeeded = sum(bool(episode.success) for episode in tried)
             result[task] = {
                 "tried": len(tried),
-                "succeeded": sum(bool(episode.success) for episode in tried),
-                "share": sum(bool(episode.success) for episode in tried) / len(tried) if tried else None,
+                "succeeded": succeeded,
+                "share": succeeded / len(tried) if tried else None,
                 "mean_error": float(np.mean([episode.mean_error for episode in tried])) if tried else None,
                 "max_error": max((episode.max_error for episode in tried), default=None),
                 "skipped": len(of_task) - len(tried),
@@ -68,43 +70,37 @@ class ReplayReport:
         return result
 
     def as_json(self) -> dict[str, Any]:
-        """For ``--json``."""
+        """Return the report of ``--json``."""
         return {"by_task": self.by_task(), "episodes": [asdict(episode) for episode in self.episodes]}
 
 
 def replay_dataset(
     root: str | Path,
     *,
-    numbers: Iterable[int] | None = None,
     pack: str | Path | None = None,
     on_episode: Callable[[EpisodeReplay, int], None] = lambda episode, count: None,
 ) -> ReplayReport:
-    """Play the 7-D actions of a RoboCAS folder with ``pd_ee_delta_pose`` at the dataset's rate, without any correction.
+    """Replay the 7-D actions of a RoboCAS folder with ``pd_ee_delta_pose`` at the rate of the dataset.
 
     Args:
-        root: the dataset.
-        numbers: of episodes; default: all.
-        pack: name or folder of the objects' pack, instead of what the episodes name.
+        root: folder of the dataset.
+        pack: name or folder of the object pack, instead of the recorded one.
         on_episode: called with each outcome and the number of episodes.
 
     Raises:
-        DatasetError: there is no dataset, or actions can't be played at its rate.
+        DatasetError: there is no dataset, or actions can't be replayed at its rate.
     """
     dataset = Dataset(Path(root))
-    chosen = dataset.numbers if numbers is None else list(numbers)
-    player = _Player(dataset.rate_hz, pack)
     replays = []
-    try:
-        for number in chosen:
+    with closing(_Player(dataset.rate_hz, pack)) as player:
+        for number in dataset.numbers:
             replays.append(player.play(number, dataset.episode(number)))
-            on_episode(replays[-1], len(chosen))
-    finally:
-        player.close()
+            on_episode(replays[-1], len(dataset.numbers))
     return ReplayReport(replays)
 
 
 class _Player:
-    """Keeps the environment from one episode to the next while it is the same."""
+    """Keeps the environment as long as it is the same."""
 
     def __init__(self, rate_hz: float, pack: str | Path | None) -> None:
         self._rate_hz, self._pack = rate_hz, pack
@@ -147,7 +143,7 @@ class _Player:
 
 
 def _other_scene(scene: dict[str, Any], open_loop: OpenLoop) -> str:
-    """What of a rebuilt scene is not as recorded: another pack, configuration or version; empty: nothing."""
+    """Return what differs between a rebuilt and the recorded scene; empty: nothing."""
     recorded, built = scene.get("layout") or {}, open_loop.layout
     if "object_ids" in recorded and list(recorded["object_ids"]) != list(built.object_ids):
         return "other objects"
@@ -159,7 +155,7 @@ def _other_scene(scene: dict[str, Any], open_loop: OpenLoop) -> str:
         if recorded.get(key) and poses is not None:
             places = np.reshape([pose[:3] for pose in np.atleast_2d(recorded[key])], (-1, 3)).astype(np.float64)
             apart = np.linalg.norm(places - np.reshape(poses, (-1, 4, 4))[:, :3, 3], axis=1).max()
-            if apart > SAME_PLACE:
+            if apart > _SAME_PLACE:
                 return f"{what} up to {apart * 1000:.0f} mm away"
     return ""
 
@@ -177,6 +173,6 @@ def _not_playable(episode: Episode) -> str:
     if not all(np.isfinite(episode.arrays[key]).all() for key in ("rel_pos", "rel_orn", "ee_pos", "base_pos")):
         return "its arrays hold NaN or infinity"  # which the simulation would keep
     base = episode.arrays["base_pos"]
-    if np.linalg.norm(base - base[0], axis=1).max() > BASE_STILL:
+    if np.linalg.norm(base - base[0], axis=1).max() > _BASE_STILL:
         return "its base drives, which 7-D actions leave out"
     return ""

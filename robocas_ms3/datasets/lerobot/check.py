@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 from robocas_ms3.core.documents import DocumentError
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.datasets.checks.content import read_object
 from robocas_ms3.datasets.checks.dataset import Report
-from robocas_ms3.datasets.checks.scene_values import check_form, check_values
-from robocas_ms3.datasets.checks.violation import Violation
+from robocas_ms3.datasets.checks.scene import check_values
+from robocas_ms3.datasets.checks.violation import Violation, read_object
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check_frames import check_data
 from robocas_ms3.datasets.lerobot.check_statistics import check_statistics
@@ -57,8 +55,10 @@ def check_lerobot(
     """
     schema.require_extra()
     root = Path(root)
-    info = read_object(root, schema.INFO_FILE, absent="JSON")
-    wrong = [info.wrong] if info.wrong else list(_check_info(info.content))
+    info, wrong = read_object(root, schema.INFO_FILE, InfoRecord, absent="JSON")
+    if not wrong:
+        shapes = wrong_shapes(info["features"])
+        wrong = [Violation(schema.INFO_FILE, key, str(expected), str(found)) for key, expected, found in shapes]
     if wrong:
         return wrong
     try:
@@ -88,13 +88,6 @@ def check_lerobot(
 
 def _violation(file: str, expected: str, error: DatasetError) -> Violation:
     return Violation(file, "", expected, first_line(error))
-
-
-def _check_info(info: Mapping[str, Any]) -> Iterator[Violation]:
-    wrong = check_form(InfoRecord, info, schema.INFO_FILE)
-    yield from wrong
-    for key, expected, found in wrong_shapes(info["features"]) if not wrong else ():
-        yield Violation(schema.INFO_FILE, key, str(expected), str(found))
 
 
 def _check_counts(dataset: LeRobotDataset) -> Iterator[Violation]:
@@ -151,10 +144,10 @@ def _check_totals(dataset: LeRobotDataset) -> Iterator[Violation]:
 
 
 def _check_checksums(root: Path) -> Iterator[Violation]:
-    sums = read_object(root, schema.CHECKSUMS_FILE)
-    if sums.wrong and (root / schema.CHECKSUMS_FILE).is_file():
-        yield sums.wrong
-    for name, expected in sums.content.items():
+    sums, wrong = read_object(root, schema.CHECKSUMS_FILE)
+    if (root / schema.CHECKSUMS_FILE).is_file():
+        yield from wrong
+    for name, expected in sums.items():
         if not isinstance(expected, str):
             yield Violation(schema.CHECKSUMS_FILE, name, "a SHA-256", type(expected).__name__)
         elif PurePosixPath(name).parts[:1] not in {(folder,) for folder in schema.CONTENT} or ".." in Path(name).parts:
@@ -177,10 +170,9 @@ def _check_conversion(dataset: LeRobotDataset) -> Iterator[Violation]:
     """Check how the dataset says it was made, where it does."""
     if not (dataset.root / schema.CONVERSION_FILE).exists():
         return
-    made = read_object(dataset.root, schema.CONVERSION_FILE)
-    wrong = [made.wrong] if made.wrong else check_form(ConversionRecord, made.content, schema.CONVERSION_FILE)
+    made, wrong = read_object(dataset.root, schema.CONVERSION_FILE, ConversionRecord)
     yield from wrong
-    sides = {key: made.content.get(key, []) for key in ("train_eps", "val_eps")} if not wrong else {}
+    sides = {key: made.get(key, []) for key in ("train_eps", "val_eps")} if not wrong else {}
     for key, unknown in unknown_numbers(sides, dataset.row_of).items():
         yield Violation(schema.CONVERSION_FILE, key, "numbers of episodes", str(unknown[:5]))
 
@@ -216,5 +208,5 @@ def report_lerobot(root: Path, *, on_episode: Callable[[int, int], None] | None 
             on_episode(done, total)
 
     violations = check_lerobot(root, on_episode=count)
-    steps = read_object(root, schema.INFO_FILE).content.get("total_frames")
+    steps = read_object(root, schema.INFO_FILE)[0].get("total_frames")
     return Report(looked, steps if isinstance(steps, int) else 0, violations)

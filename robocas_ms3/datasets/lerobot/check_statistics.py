@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.datasets.checks.content import read_object
-from robocas_ms3.datasets.checks.violation import Violation
+from robocas_ms3.datasets.checks.violation import Violation, read_object
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check_frames import Ranges
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
@@ -26,14 +25,14 @@ def check_statistics(dataset: LeRobotDataset, ranges: Ranges) -> Iterator[Violat
         yield from _check_lines(dataset)
         if not (dataset.root / schema.STATS_FILE).exists():  # of an older format, and optional
             return
-    stats = read_object(dataset.root, schema.STATS_FILE, absent="JSON")
-    if stats.wrong:
-        yield stats.wrong
+    stats, wrong = read_object(dataset.root, schema.STATS_FILE, absent="JSON")
+    if wrong:
+        yield from wrong
         return
     for key, feature in dataset.info["features"].items():
         if feature["dtype"] in ("string", "language"):
             continue
-        found = stats.content.get(key, {})
+        found = stats.get(key, {})
         if not isinstance(found, dict):
             yield Violation(schema.STATS_FILE, key, "an object", type(found).__name__)
             continue

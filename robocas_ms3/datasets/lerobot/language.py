@@ -24,7 +24,7 @@ from pydantic import BaseModel, ValidationError
 
 from robocas_ms3.core.errors import DatasetError, RobocasError
 from robocas_ms3.core.strict import validate_json
-from robocas_ms3.datasets.checks.scene_values import sound
+from robocas_ms3.datasets.checks.scene import sound
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.pictures.boxes import Box
 from robocas_ms3.demos.recordings.subgoals import SubGoal

@@ -1,4 +1,4 @@
-"""Several datasets as one."""
+"""Merges several datasets into one."""
 
 from __future__ import annotations
 
@@ -8,84 +8,77 @@ from pathlib import Path
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.manage.assemble import Assembly, Member, OnEpisode, OnStart, Side, assemble, check_before
-from robocas_ms3.datasets.manage.parts import Part, names_of, open_part, shown
+from robocas_ms3.datasets.manage.copying import (
+    KEEP_RULE,
+    CopiedEpisode,
+    CopyOptions,
+    CopyResult,
+    FinishedDataset,
+    copy_episodes,
+    open_finished,
+    shown,
+)
 from robocas_ms3.datasets.writing.plan import SETTINGS
-
-SPLIT_RULE = "every episode keeps the side it had in the dataset it is from"
 
 
 @dataclass(frozen=True)
 class MergeResult:
-    """What was done: the new dataset, and how many duplicates were left out."""
+    """The new dataset, and the number of duplicates that were skipped."""
 
-    written: Assembly
+    written: CopyResult
     skipped: int
 
 
 def merge(
-    roots: Sequence[Path],
-    out: Path,
-    *,
-    skip_duplicates: bool = False,
-    link: bool = True,
-    overwrite: bool = False,
-    on_start: OnStart | None = None,
-    on_episode: OnEpisode | None = None,
+    roots: Sequence[Path], out: Path, *, skip_duplicates: bool = False, options: CopyOptions | None = None
 ) -> MergeResult:
-    """Write a dataset of all episodes of others, in the order given, numbered anew; the split stays as it was.
+    """Write a dataset of all episodes of others, in the given order; each keeps its side of the split.
 
     Args:
-        roots: the datasets, of the same schema version and settings.
-        out: folder of the new one.
-        skip_duplicates: take an episode that is there already once, instead of refusing.
-        link, overwrite, on_start, on_episode: see `assemble`.
+        roots: folders of the datasets, of the same schema version and settings.
+        out: folder of the new dataset.
+        skip_duplicates: take an episode of several datasets once, instead of an error.
+        options: how to copy.
 
     Raises:
-        DatasetError: they do not fit together, are not finished, or an episode is damaged.
+        DatasetError: the datasets do not fit together or are not finished, or an episode is damaged.
         OutputExistsError: ``out`` is another dataset, or none.
     """
     if not roots:
         raise DatasetError("nothing to merge", expected="folders of datasets", fix="robocas merge A B --out C")
-    parts = [open_part(root) for root in roots]
-    _check_settings(parts)
-    members: list[Member] = []
-    seen: dict[str, Member] = {}
-    duplicates: list[tuple[Member, Member]] = []
-    for part, name in zip(parts, names_of(roots), strict=True):
-        validates = set(part.sides[1])
-        for number in part.dataset.numbers:
-            side: Side = "val" if number in validates else "train"
-            member = Member(part, name, number, side)
-            first = seen.setdefault(part.identity(number), member)
-            if first is member:
-                members.append(member)
-            else:
+    sources = [open_finished(root, name) for root, name in zip(roots, distinct_names(roots), strict=True)]
+    _check_settings(sources)
+    members: dict[str, CopiedEpisode] = {}
+    duplicates: list[tuple[CopiedEpisode, CopiedEpisode]] = []
+    for source in sources:
+        validates = set(source.dataset.sides[1])
+        for number in source.dataset.numbers:
+            member = CopiedEpisode(source, number, "val" if number in validates else "train")
+            first = members.setdefault(source.identity(number), member)
+            if first is not member:
                 duplicates.append((first, member))
     if duplicates and not skip_duplicates:
-        pairs = (f"{a.name} {a.number} = {b.name} {b.number}" for a, b in duplicates)
-        raise DatasetError(
-            "the same recording twice",
-            where=", ".join(map(str, roots)),
-            found=f"{len(duplicates)}: {shown(pairs, 4)}",
-            fix="Pass --skip-duplicates to take each once.",
-        )
-    check_before({out: members}, SPLIT_RULE, overwrite=overwrite)
-    written = assemble(
-        out,
-        members,
-        split_rule=SPLIT_RULE,
-        link=link,
-        overwrite=overwrite,
-        on_start=on_start,
-        on_episode=on_episode,
-    )
+        pairs = (f"{a.source.name} {a.number} = {b.source.name} {b.number}" for a, b in duplicates)
+        where, found = ", ".join(map(str, roots)), f"{len(duplicates)}: {shown(pairs, 4)}"
+        fix = "Pass --skip-duplicates to take each once."
+        raise DatasetError("the same recording twice", where=where, found=found, fix=fix)
+    (written,) = copy_episodes({out: list(members.values())}, KEEP_RULE, options or CopyOptions())
     return MergeResult(written, len(duplicates))
 
 
-def _check_settings(parts: Sequence[Part]) -> None:
-    first = parts[0]
-    for other in parts[1:]:
+def distinct_names(roots: Sequence[Path]) -> list[str]:
+    """Return the shortest ends of paths that differ."""
+    parts = [root.resolve().parts for root in roots]
+    for length in range(1, max(map(len, parts), default=1) + 1):
+        names = [str(Path(*path[-length:])) for path in parts]
+        if len(set(names)) == len(names):
+            return names
+    return [str(Path(*path)) for path in parts]
+
+
+def _check_settings(sources: Sequence[FinishedDataset]) -> None:
+    first = sources[0].dataset
+    for other in (source.dataset for source in sources[1:]):
         different = [key for key in SETTINGS if first.settings.get(key) != other.settings.get(key)]
         if different:
             raise DatasetError(

@@ -1,4 +1,4 @@
-"""One dataset as several, or its split into training and validation anew."""
+"""Splits a dataset into several, or chooses its training and validation episodes again."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -17,14 +16,23 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import write_json
 from robocas_ms3.core.locks import locked_folder
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.manage.assemble import Assembly, Member, OnEpisode, OnStart, Side, assemble, check_before
-from robocas_ms3.datasets.manage.input_check import check_numbers
-from robocas_ms3.datasets.manage.parts import Part, Sides, names_of
+from robocas_ms3.datasets.checks import arrays as laws
+from robocas_ms3.datasets.manage.copying import (
+    KEEP_RULE,
+    CopiedEpisode,
+    CopyOptions,
+    CopyResult,
+    FinishedDataset,
+    copy_episodes,
+    damaged_episode,
+)
 from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.datasets.sources.tolerant import read_arrays
 from robocas_ms3.datasets.writing.info import info_of
 
 By = Literal["seed", "target", "task"]
-KEEP_RULE = "every episode keeps the side it had in the dataset it is from"
+Sides = tuple[list[int], list[int]]
+"""Numbers of the training and validation episodes."""
 
 
 @dataclass(frozen=True)
@@ -40,25 +48,20 @@ class Share:
     by: By = "seed"
 
     def __post_init__(self) -> None:
-        """Check the share.
-
-        Raises:
-            DatasetError: it is none.
-        """
         if not 0 < self.val < 1:
             raise DatasetError("not a share", where="val_share", expected="> 0 and < 1", found=self.val)
 
     @property
     def rule(self) -> str:
-        """In words, for ``conversion.json``."""
+        """Description for ``conversion.json``."""
         return f"{self.by}s in the order of sha256({self.by}), the first {self.val:g} of the episodes validate"
 
 
 def groups_of(dataset: Dataset, by: By) -> dict[int, str]:
-    """Episode number -> its seed, target object or task, as text.
+    """Return by episode number its seed, target object or task, as text.
 
     Raises:
-        DatasetError: an episode does not say it.
+        DatasetError: an episode does not have it.
     """
     groups = {}
     for number in dataset.numbers:
@@ -66,7 +69,7 @@ def groups_of(dataset: Dataset, by: By) -> dict[int, str]:
         target = scene.get("target") or {}
         value = {"seed": scene.get("seed"), "target": target.get("asset_id"), "task": scene.get("task")}[by]
         if value is None and by == "seed":
-            value = number  # an unknown seed is one of its own, as in `info.summarize`
+            value = number  # as in `info.summarize`
         if value is None:
             raise DatasetError(
                 f"this episode does not say its {by}",
@@ -78,15 +81,15 @@ def groups_of(dataset: Dataset, by: By) -> dict[int, str]:
 
 
 def cut(groups: Mapping[int, str], shares: Sequence[float], salt: str = "") -> list[list[int]]:
-    """Cut episodes into parts of about these shares; a group is never cut.
+    """Cut episodes into parts of about these shares without cutting a group.
 
-    Groups come in the order of their SHA-256, and fill the last part first: a group's place depends on the groups
-    alone. Each part gets a group as long as there are some.
+    Groups in the order of their SHA-256 fill the last part first, so the place of a group depends on the groups alone.
+    Each part gets at least one.
 
     Args:
         groups: episode number -> its group.
         shares: of each part; they sum to 1.
-        salt: before a group's name; another one gives an order that has nothing to do with this one.
+        salt: prefix of the names of groups; another salt gives an independent order.
 
     Raises:
         DatasetError: fewer groups than parts, or no shares.
@@ -111,13 +114,13 @@ def cut(groups: Mapping[int, str], shares: Sequence[float], salt: str = "") -> l
 
 
 def resplit(root: Path, share: Share | None = None) -> Sides:
-    """Rewrite ``data_info.json`` from the episodes on disk; no episode is touched. Gives the sides.
+    """Rewrite ``data_info.json`` from the episodes on disk, and return the sides; no episode is changed.
 
-    ``conversion.json`` forgets episodes that are not there any more.
+    Episodes that are not on disk are removed from ``conversion.json``.
 
     Args:
-        root: the dataset.
-        share: how to split; None: every episode keeps its side, new ones are split by the writer's rule.
+        root: folder of the dataset.
+        share: how to split; None: each episode keeps its side, new ones are split by the rule of the writer.
 
     Raises:
         DatasetError: there is no dataset, it can't be split so, or arrays of an episode are damaged.
@@ -125,22 +128,23 @@ def resplit(root: Path, share: Share | None = None) -> Sides:
     with locked_folder(root):
         dataset = Dataset(root)
         sides = dataset.sides if share is None else _sides(dataset, share)
-        check_numbers(dataset)
-        info = info_of(root, sides)
-        settings = dataset.settings
-        if settings:
-            there = {str(number) for number in dataset.numbers}
-            kept = {number: entry for number, entry in settings.get("episodes", {}).items() if number in there}
-            rule = {} if share is None else {"split": share.rule}
-            new = {**settings, **rule, **({"episodes": kept} if "episodes" in settings else {})}
-            if new != settings:
-                write_json(root / schema.CONVERSION_FILE, new)
+        for number in dataset.numbers:
+            stored = read_arrays(dataset.episode(number).folder / schema.EPISODE_FILE)
+            for wrong in laws.violations_of(stored, (laws.check_file, laws.check_finite)):
+                raise damaged_episode(root, wrong)
+        info, settings = info_of(root, sides), dataset.settings
+        new = {**settings, **({} if share is None else {"split": share.rule})}
+        if "episodes" in settings:
+            there = set(map(str, dataset.numbers))
+            new["episodes"] = {number: entry for number, entry in settings["episodes"].items() if number in there}
+        if settings and new != settings:
+            write_json(root / schema.CONVERSION_FILE, new)
         write_json(root / schema.DATA_INFO_FILE, info)
     return info["train_eps"], info["val_eps"]
 
 
-def parts_by_side(part: Part, share: Share | None, train: Path, val: Path) -> dict[Path, Sides]:
-    """Training and validation as two datasets: output -> sides of its episodes.
+def split_by_side(source: FinishedDataset, share: Share | None, train: Path, val: Path) -> dict[Path, Sides]:
+    """Return the sides of the episodes of two datasets: training and validation.
 
     Raises:
         DatasetError: both would be one folder, or one in the other.
@@ -148,27 +152,27 @@ def parts_by_side(part: Part, share: Share | None, train: Path, val: Path) -> di
     a, b = train.resolve(), val.resolve()
     if a == b or a in b.parents or b in a.parents:
         raise DatasetError("two datasets in one folder", where=val, fix="Choose two that are apart.")
-    sides = part.sides if share is None else _sides(part.dataset, share)
+    sides = source.dataset.sides if share is None else _sides(source.dataset, share)
     return {train: (sides[0], []), val: ([], sides[1])}
 
 
-def parts_by_share(part: Part, shares: Sequence[float], by: By, share: Share | None, out: Path) -> dict[Path, Sides]:
-    """Datasets ``out/part_0``, ... of these shares."""
-    # In an order of its own: in that of the sides, the last part would get all that validates.
-    pieces = cut(groups_of(part.dataset, by), shares, salt="part ")
-    return {out / f"part_{index}": _within(part, piece, share) for index, piece in enumerate(pieces)}
+def split_by_fractions(dataset: Dataset, shares: Sequence[float], by: By, share: Share | None) -> dict[str, Sides]:
+    """Return the sides of the episodes of datasets ``part_0``, ... of these shares."""
+    # With the salt of the sides, the last part would get all validation episodes.
+    pieces = cut(groups_of(dataset, by), shares, salt="part ")
+    return {f"part_{index}": _within(dataset, piece, share) for index, piece in enumerate(pieces)}
 
 
-def parts_by_value(part: Part, by: By, share: Share | None, out: Path) -> dict[Path, Sides]:
-    """A dataset ``out/<value>`` for each task or target object."""
-    groups = groups_of(part.dataset, by)
+def split_by_value(dataset: Dataset, by: By, share: Share | None) -> dict[str, Sides]:
+    """Return the sides of the episodes of one dataset per task or target object, by its folder."""
+    groups = groups_of(dataset, by)
     pieces = {value: [n for n, group in groups.items() if group == value] for value in sorted(set(groups.values()))}
     names = folder_names(pieces)
-    return {out / names[value]: _within(part, piece, share) for value, piece in pieces.items()}
+    return {names[value]: _within(dataset, piece, share) for value, piece in pieces.items()}
 
 
 def folder_names(values: Iterable[str]) -> dict[str, str]:
-    """Names of folders for values, whatever a dataset says; no two have the same."""
+    """Return a distinct and safe name of a folder for each value."""
     plain = {value: re.sub(r"[^\w.-]+", "_", value).strip(".")[:40] or "_" for value in values}
     shared = Counter(plain.values())
     return {
@@ -177,53 +181,41 @@ def folder_names(values: Iterable[str]) -> dict[str, str]:
     }
 
 
-def write_parts(
-    part: Part,
-    pieces: Mapping[Path, Sides],
-    *,
-    share: Share | None,
-    link: bool = True,
-    overwrite: bool = False,
-    on_start: OnStart | None = None,
-    on_episode: OnEpisode | None = None,
-) -> list[Assembly]:
-    """Write the datasets that a split makes.
+def write_split(
+    source: FinishedDataset, pieces: Mapping[Path, Sides], share: Share | None, options: CopyOptions | None = None
+) -> list[CopyResult]:
+    """Write the datasets of a split.
 
     Args:
-        part: the dataset that is split.
-        pieces: output -> training and validation episodes of ``part``.
-        share: how the sides were chosen; None: as they were.
-        link, overwrite: see `assemble`.
-        on_start: called with the number of episodes of all pieces.
-        on_episode: called after each.
+        source: the dataset that is split.
+        pieces: folder of each new dataset -> its training and validation episodes.
+        share: how the sides were chosen; None: as in the source.
+        options: how to copy.
 
     Raises:
         DatasetError: an output would be empty, or is the input; an episode is damaged.
         OutputExistsError: an output is another dataset, or none.
     """
-    for out, sides in pieces.items():
-        if not any(sides):
-            raise DatasetError("no episodes for this part", where=out, fix="Choose other shares.")
-    name = names_of([part.root])[0]
-    members: dict[Path, list[Member]] = {}
+    members: dict[Path, list[CopiedEpisode]] = {}
     for out, (train, val) in pieces.items():
-        side_of: dict[int, Side] = {**dict.fromkeys(train, "train"), **dict.fromkeys(val, "val")}
-        members[out] = [Member(part, name, number, side_of[number]) for number in sorted(side_of)]
-    rule = share.rule if share else KEEP_RULE
-    check_before(members, rule, overwrite=overwrite)
-    if on_start:
-        on_start(sum(map(len, members.values())))
-    write = partial(assemble, split_rule=rule, link=link, overwrite=overwrite, on_episode=on_episode)
-    return [write(out, chosen) for out, chosen in members.items()]
+        if not train and not val:
+            raise DatasetError("no episodes for this part", where=out, fix="Choose other shares.")
+        validates = set(val)
+        members[out] = [
+            CopiedEpisode(source, number, "val" if number in validates else "train")
+            for number in sorted([*train, *val])
+        ]
+    return copy_episodes(members, share.rule if share else KEEP_RULE, options or CopyOptions())
 
 
-def _within(part: Part, numbers: list[int], share: Share | None) -> Sides:
+def _within(dataset: Dataset, numbers: list[int], share: Share | None) -> Sides:
     if share is not None and len(numbers) > 1:
-        groups = groups_of(part.dataset, share.by)
+        groups = groups_of(dataset, share.by)
         train, val = cut({number: groups[number] for number in numbers}, [1 - share.val, share.val])
         return train, val
     chosen = set(numbers)
-    return [n for n in part.sides[0] if n in chosen], [n for n in part.sides[1] if n in chosen]
+    train, val = ([number for number in side if number in chosen] for side in dataset.sides)
+    return train, val
 
 
 def _sides(dataset: Dataset, share: Share) -> Sides:

@@ -1,4 +1,4 @@
-"""Declared forms of ``conversion.json`` and ``scene.json``; writers, readers, checks and the viewer share them."""
+"""Declared forms of the JSON files of a RoboCAS folder; writers, readers, checks and the viewer share them."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, NonNegativeInt, 
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.demos.recordings.seeds import one_seed
+from robocas_ms3.demos.recordings.subgoals import SubGoalRecord
 
 
 def _seed(value: Any) -> Any:
@@ -116,6 +117,26 @@ class SettingsRecord(RateRecord):
 
 class ConversionRecord(EpisodesRecord, SettingsRecord):
     """``conversion.json``."""
+
+
+_Row = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
+_Range = Annotated[list[_Row], Field(min_length=2, max_length=2)]
+
+
+class _ActionSpace(_Part):
+    relative_position: _Range
+    relative_rotation: _Range
+
+
+class DataInfoRecord(_Part):
+    """``data_info.json``; see ``schema.DATA_INFO``."""
+
+    train_eps: list[int]
+    val_eps: list[int]
+    ep_length: dict[EpisodeNumber, int]
+    language_goal: dict[EpisodeNumber, str]
+    step_goals: dict[EpisodeNumber, list[SubGoalRecord]]
+    action_space: _ActionSpace
 
 
 class SceneRecord(_Part):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.checks.scene_values import sound
+from robocas_ms3.datasets.checks.scene import sound
 from robocas_ms3.datasets.sources.protocol import SourceEpisode
 from robocas_ms3.datasets.sources.provenance import task_of
 

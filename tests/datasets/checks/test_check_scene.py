@@ -7,9 +7,8 @@ import pytest
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.dataset import validate
-from robocas_ms3.datasets.checks.scene_values import check_values, sound
+from robocas_ms3.datasets.checks.scene import check_values, sound
 from robocas_ms3.datasets.sources.records import SceneRecord
-from robocas_ms3.demos.recordings.seeds import one_seed
 
 FILE = "episode_0000001/scene.json"
 POSE = [0.5, 0.8, 0.6, 1.0, 0.0, 0.0, 0.0]
@@ -142,18 +141,6 @@ def test_one_violation_a_fault(new, key, expected, found):
 
 def test_two_faults_are_two_violations():
     assert [v.key for v in check_values({**WHOLE, "seed": "x", "objects": 5})] == ["seed", "objects"]
-
-
-def test_long_values_are_cut():
-    (violation,) = check_values({**WHOLE, "seed": "x" * 500})
-    assert len(violation.found) == 60
-
-
-@pytest.mark.parametrize(
-    ("value", "seed"), [(3, 3), ([3], 3), ([3, 4], None), (True, None), ("3", None), (3.0, None), ([], None)]
-)
-def test_seeds(value, seed):
-    assert one_seed(value) == seed
 
 
 def test_scenes_that_are_no_objects():

@@ -12,12 +12,11 @@ from irregular import KINDS, replace_file
 from robocas_ms3.core.documents import DocumentError
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.checks.dataset import validate
-from robocas_ms3.datasets.manage.input_check import look_at_ends
+from robocas_ms3.datasets.manage.copying import FilePlacer, check_ends
 from robocas_ms3.datasets.pictures.headers import LARGEST, read_header
 from robocas_ms3.datasets.pictures.stored import Pictures, read_picture
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.episode_folder import find_damaged
-from robocas_ms3.datasets.writing.output import Placer
 from robocas_ms3.demos.recordings.stored import open_trajectory
 from robocas_ms3.viewer.source import open_source
 
@@ -52,7 +51,7 @@ def test_readers_of_pictures(dataset, kind):
             read("base_camera", 3)
         assert error.value.where == paths[1]
     with pytest.raises(DocumentError):
-        look_at_ends(paths[0])
+        check_ends(paths[0])
 
 
 def test_readers_of_other_files(dataset, tmp_path):
@@ -60,7 +59,7 @@ def test_readers_of_other_files(dataset, tmp_path):
         with pytest.raises(DatasetError):
             open_trajectory(replace_file(tmp_path / "F.h5", kind))
         with pytest.raises(DocumentError):
-            Placer(link=False).file(replace_file(tmp_path / "F.h5", kind), tmp_path / "copy")
+            FilePlacer(link=False).place(replace_file(tmp_path / "F.h5", kind), tmp_path / "copy")
         path = replace_file(dataset / EPISODE / PICTURES[0], kind)
         assert find_damaged(dataset / EPISODE, Pictures()) == path
         path.unlink()

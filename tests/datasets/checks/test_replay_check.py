@@ -96,7 +96,7 @@ def test_tracking_error_by_hand(dataset):
     shifted = np.zeros((7, 3), np.float32)
     shifted[6] = 0.0, 0.07, 0.0  # the player stays at the origin: 7 cm off at the last of seven steps
     edit_arrays(dataset, 0, ee_pos=shifted)
-    episode = replay_dataset(dataset, numbers=[0]).episodes[0]
+    episode = replay_dataset(dataset).episodes[0]
     assert episode.mean_error == pytest.approx(0.01)
     assert episode.max_error == pytest.approx(0.07)
 

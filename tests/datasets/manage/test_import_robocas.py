@@ -14,8 +14,8 @@ from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.dataset import validate
-from robocas_ms3.datasets.manage.eef import eef_turn
 from robocas_ms3.datasets.manage.importing import import_robocas
+from robocas_ms3.datasets.manage.repairs import eef_turn
 from robocas_ms3.datasets.manage.survey import survey
 from robocas_ms3.datasets.pictures.video import PANEL, contact_sheet, video_frame
 from robocas_ms3.datasets.sources.reader import Dataset
@@ -121,15 +121,6 @@ def test_what_upstream_writes_becomes_a_valid_dataset(dataset, made, tmp_path, p
     assert files_of(root) == before
 
 
-def test_the_torch_dataset_reads_it(four, tmp_path):
-    from robocas_ms3.datasets.training.torch_dataset import RoboCASDataset
-
-    imported(four, tmp_path / "out")
-    samples = RoboCASDataset(tmp_path / "out")
-    assert len(samples) > 0
-    assert samples[len(samples) - 1]["action"].shape[-1] == 7
-
-
 def test_the_plain_reader_opens_it_as_it_is(upstream, made):
     ours, theirs = Dataset(made).episode(1), Dataset(upstream).episode(1)
     change(upstream / "episode_0000001", language_goal=None, step_goal_type=None, step_lang_goals=None, rel_orn=None)
@@ -194,13 +185,6 @@ def test_pickles_are_never_loaded(upstream, tmp_path):
     new = imported(upstream, tmp_path / "out")
     assert new.numbers == [1]
     assert validate(new.root).violations == []
-
-
-def test_a_file_that_is_one_pickle(upstream):
-    (upstream / "episode_0000000" / "episode_info.npz").write_bytes(b"\x80\x04N.")
-    found = [problem for problem in problems(upstream) if problem[0] == 0]
-    assert len(found) == 1
-    assert found[0][2].endswith("which are never loaded")
 
 
 def test_relative_motion_as_the_paper_writes_it(upstream, made, tmp_path):
@@ -427,13 +411,6 @@ def test_the_overview(four, tmp_path):
     assert validate(imported(root, tmp_path / "again").root).violations == []
 
 
-def test_an_episode_twice(four, tmp_path):
-    root = shutil.copytree(four, tmp_path / "four")
-    shutil.copytree(root / "episode_0000001", root / "episode_0000009")
-    assert (9, "episode_0000009", "the same as episode 1", "left out") in problems(root)
-    assert imported(root, tmp_path / "out").numbers == [0, 1, 2, 3]
-
-
 def test_an_episode_twice_of_which_the_first_can_not_be_taken(four, tmp_path):
     root = shutil.copytree(four, tmp_path / "four")
     shutil.copytree(root / "episode_0000001", root / "episode_0000009")
@@ -472,11 +449,6 @@ def test_embeddings_that_are_missing_can_be_made(dataset, made, tmp_path):
     old, new = (arrays_of(root / "episode_0000001")["step_goal_embs"] for root in (made, out))
     np.testing.assert_array_equal(old, new)  # those that are there stay
     assert set(Dataset(out).episode(0).scene["source"]["derived"]) == {"language_embedding", "step_goal_embs"}
-
-
-def test_no_rate(four):
-    with pytest.raises(DatasetError, match="no such rate"):
-        survey(four, rate_hz=0)
 
 
 def test_ours_with_damage_keeps_what_it_says(dataset, made, tmp_path):

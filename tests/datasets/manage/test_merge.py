@@ -9,13 +9,12 @@ from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import DatasetError, OutputExistsError, RobocasError
 from robocas_ms3.core.locks import locked_folder
 from robocas_ms3.datasets.checks.dataset import validate
-from robocas_ms3.datasets.manage.merging import merge
-from robocas_ms3.datasets.manage.parts import names_of
+from robocas_ms3.datasets.manage.copying import CopyOptions, FilePlacer
+from robocas_ms3.datasets.manage.merging import distinct_names, merge
 from robocas_ms3.datasets.manage.splitting import Share, resplit
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.convert import convert
-from robocas_ms3.datasets.writing.output import Placer
 from robocas_ms3.datasets.writing.settings import ConversionSettings
 
 
@@ -54,7 +53,7 @@ def test_episodes_follow_each_other_and_keep_their_side(parts, tmp_path):
 def test_files_are_shared_unless_copied(parts, tmp_path):
     picture = "episode_0000001/base_camera/rgb/0003.png"
     merge([parts[0]], tmp_path / "linked")
-    merge([parts[0]], tmp_path / "copied", link=False)
+    merge([parts[0]], tmp_path / "copied", options=CopyOptions(link=False))
     inode = (parts[0] / picture).stat().st_ino
     assert (tmp_path / "linked" / picture).stat().st_ino == inode
     assert (tmp_path / "copied" / picture).stat().st_ino != inode
@@ -67,8 +66,8 @@ def test_links_that_the_file_system_refuses_become_copies(tmp_path, monkeypatch)
 
     (tmp_path / "a").write_text("1")
     monkeypatch.setattr("os.link", refuse)
-    placer = Placer(link=True)
-    placer.file(tmp_path / "a", tmp_path / "b")
+    placer = FilePlacer(link=True)
+    placer.place(tmp_path / "a", tmp_path / "b")
     assert (placer.linked, placer.copied, placer.link) == (0, 1, False)
     assert (tmp_path / "b").read_text() == "1"
 
@@ -82,9 +81,9 @@ def test_where_a_merged_episode_had_been_before_is_kept(parts, tmp_path):
 
 def test_names_tell_datasets_apart(tmp_path):
     roots = [tmp_path / "x" / "ds", tmp_path / "y" / "ds"]
-    assert names_of(roots) == ["x/ds", "y/ds"]
-    assert names_of(roots[:1]) == ["ds"]
-    assert names_of([roots[0], roots[0]]) == [str(roots[0])] * 2
+    assert distinct_names(roots) == ["x/ds", "y/ds"]
+    assert distinct_names(roots[:1]) == ["ds"]
+    assert distinct_names([roots[0], roots[0]]) == [str(roots[0])] * 2
 
 
 def test_duplicates(parts, tmp_path):
@@ -196,7 +195,7 @@ def test_what_is_overwritten_stays_where_an_input_is_damaged(parts, tmp_path):
     before = files_of(tmp_path / "out")
     (part / "episode_0000000" / "static_camera" / "rgb" / "0000.png").unlink()
     with pytest.raises(DatasetError, match="this episode is damaged"):
-        merge([part], tmp_path / "out", overwrite=True)
+        merge([part], tmp_path / "out", options=CopyOptions(overwrite=True))
     assert files_of(tmp_path / "out") == before
 
 
@@ -229,20 +228,20 @@ def test_the_output(parts, tmp_path):
     before = files_of(a)
     for out in (a, a / "inside", a.parent):
         with pytest.raises(DatasetError, match="the output is an input"):
-            merge([a, b], out, overwrite=True)
+            merge([a, b], out, options=CopyOptions(overwrite=True))
     assert files_of(a) == before
     merge([a], tmp_path / "out")
     assert merge([a], tmp_path / "out").written.kept == 2
     with pytest.raises(OutputExistsError) as error:
         merge([a, b], tmp_path / "out")
     assert error.value.where == tmp_path / "out" / "conversion.json"
-    merge([a, b], tmp_path / "out", overwrite=True)
+    merge([a, b], tmp_path / "out", options=CopyOptions(overwrite=True))
     assert len(Dataset(tmp_path / "out").numbers) == 4
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("years of work")
     for overwrite in (False, True):
         with pytest.raises(OutputExistsError):
-            merge([a, b], tmp_path / "mine", overwrite=overwrite)
+            merge([a, b], tmp_path / "mine", options=CopyOptions(overwrite=overwrite))
     assert (tmp_path / "mine" / "thesis.tex").exists()
     with locked_folder(tmp_path / "locked"), pytest.raises(RobocasError, match="another process is writing here"):
         merge([a], tmp_path / "locked")

@@ -1,5 +1,4 @@
 import shutil
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -12,7 +11,7 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.manage import splitting
 from robocas_ms3.datasets.manage.merging import merge
-from robocas_ms3.datasets.manage.splitting import Share, cut, folder_names, groups_of, parts_by_share, resplit
+from robocas_ms3.datasets.manage.splitting import Share, cut, folder_names, groups_of, resplit, split_by_fractions
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.split import split_by_seed
 
@@ -60,11 +59,11 @@ def test_a_tenth_of_the_episodes_is_not_always_a_tenth_of_the_seeds():
 def test_parts_have_some_of_both_sides():
     """Of 800 episodes, as of a dataset of `reproduce_small.sh`."""
     seeds = {number: 510000 + number for number in range(800)}
-    part = SimpleNamespace(sides=split_by_seed(seeds), dataset=None)
+    dataset = SimpleNamespace(sides=split_by_seed(seeds))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(splitting, "groups_of", lambda dataset, by: {n: str(seed) for n, seed in seeds.items()})
         for share in (0.5, 0.25, 0.0625):
-            for train, val in parts_by_share(part, [share, 1 - share], "seed", None, Path("out")).values():
+            for train, val in split_by_fractions(dataset, [share, 1 - share], "seed", None).values():
                 assert 0.04 < len(val) / (len(train) + len(val)) < 0.2
 
 

@@ -7,7 +7,7 @@ from managing import arrays_of, change
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks import arrays as laws
-from robocas_ms3.datasets.manage.mends import mend_all
+from robocas_ms3.datasets.manage.repairs import repair_arrays
 from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, load_arrays, motion_arrays, read_arrays
 
 FILE = "episode_0000001/episode_info.npz"
@@ -78,7 +78,7 @@ def test_mends_leave_what_they_are_given(made):
     arrays |= {"rel_agv_pose": arrays["rel_agv_pose"] + 1, "language_embedding": np.ones(384, "f4")}
     before = {key: array.copy() for key, array in arrays.items()}
     stored = EpisodeArrays(episode / "episode_info.npz", arrays)
-    mended, findings = mend_all(stored)
+    mended, findings = repair_arrays(stored)
     assert [(finding.file.split(", ", 1)[1], finding.outcome) for finding in findings] == [
         ("language_embedding", "noted"),
         ("rel_pos, rel_orn", "mended"),
@@ -88,5 +88,5 @@ def test_mends_leave_what_they_are_given(made):
     assert list(stored.arrays) == list(before)
     for key, array in before.items():
         np.testing.assert_array_equal(stored.arrays[key], array)
-    assert mend_all(mended) == (mended, [])
+    assert repair_arrays(mended) == (mended, [])
     assert "language_embedding" not in mended.arrays
