@@ -33,7 +33,7 @@ from robocas_ms3.scenes.cache import layout_source
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.task_specs import TASKS
-from robocas_ms3.tasks.gpu_memory import gpu_memory
+from robocas_ms3.tasks.engine import gpu_memory
 
 SIZE = dict(width=128, height=128)
 

@@ -66,7 +66,7 @@ class EpisodeMetrics:
         tcp = self._tcp_pos()
         sums[:, _PATH] += length(tcp - self._tcp)
         self._tcp = tcp
-        moment = env.moment
+        moment = env.success_check.moment
         if moment is not self._moment:
             self._moment = moment
             impulse = length(moment.forces).sum((1, 2)) * env.control_timestep

@@ -9,17 +9,14 @@ import numpy as np
 import sapien
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
-from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
-from mani_skill.render.utils import can_render
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
 from mani_skill.utils.structs import Actor
-from mani_skill.utils.structs.types import SceneConfig, SimConfig
+from mani_skill.utils.structs.types import SimConfig
 
 from robocas_ms3.assets.pack import VISUALS, LoadedObject, VisualLevel, load_pack
-from robocas_ms3.assets.physics import CONTACT_OFFSET
 from robocas_ms3.core.arrays import as_tensor, native
-from robocas_ms3.core.errors import ConfigError, RobocasError
+from robocas_ms3.core.errors import ConfigError
 from robocas_ms3.core.extensions import load
 from robocas_ms3.robots.agent import MobileManipulator
 from robocas_ms3.robots.table import DEFAULT, find_robot
@@ -28,49 +25,40 @@ from robocas_ms3.scenes.cache import layout_source
 from robocas_ms3.scenes.config import TaskConfig, load_config_of
 from robocas_ms3.scenes.layout import Array, Layout, LayoutSource
 from robocas_ms3.scenes.model import SceneModel
-from robocas_ms3.scenes.task_specs import SIM_FREQ, STANDARD_FREQ, TaskSpec
-from robocas_ms3.tasks import cameras, rewards, terms
-from robocas_ms3.tasks.bodies import Bodies, link_poses
-from robocas_ms3.tasks.contacts import Contacts
-from robocas_ms3.tasks.dense import DENSE, DenseReward
-from robocas_ms3.tasks.engine_errors import EngineErrors
-from robocas_ms3.tasks.goals import Goal, InBasket, Moment
-from robocas_ms3.tasks.gpu_memory import gpu_memory
+from robocas_ms3.scenes.task_specs import TaskSpec
+from robocas_ms3.tasks import engine
+from robocas_ms3.tasks.bodies import Bodies, Contacts, link_poses
+from robocas_ms3.tasks.goals import Goal, InBasket
 from robocas_ms3.tasks.instructions import Instructions
-from robocas_ms3.tasks.observations import privileged_observations
-from robocas_ms3.tasks.renderer import keep_renderer
+from robocas_ms3.tasks.observations import over_the_shoulder, privileged_observations
+from robocas_ms3.tasks.rewards import DENSE, TRANSFER, DenseReward, RewardTable
 from robocas_ms3.tasks.seeds import EpisodeSeeds
 from robocas_ms3.tasks.starts import place
 from robocas_ms3.tasks.success import SuccessCheck
-from robocas_ms3.tasks.vector.backend import check_one_process
 
 STAGES = ("reached_any", "picked_any", "reached_target", "target_grasped", "target_lifted", "target_in_basket")
-# with a renderer what is left of a scene holds 8 MB until it is collected, without one 0.5 MB
-_RESETS_PER_COLLECTION, _RESETS_PER_COLLECTION_STATE_ONLY = 20, 30
 
 
 class RoboCASEnv(BaseEnv):
     """Base of all tasks: move the target to the ``GOAL``, which is the basket unless a task says otherwise.
 
     A task is a subclass with a ``SPEC``, which overrides ``evaluate``, ``compute_dense_reward`` and
-    ``privileged_observations`` where it adds something. N envs, K object slots. Every env has its own objects and
-    target. A single env is rebuilt at each reset. Several envs, on a GPU, draw their objects once, and each reset draws
-    a new layout and target (``reconfiguration_freq`` changes either).
+    ``privileged_observations`` where it adds something. N envs, K object slots. A single env is rebuilt at each reset.
+    Several envs, on a GPU, draw their objects once, and each reset draws a new layout and target.
 
     Args:
         config: name, path or content of a task configuration; default: the task's own.
         pack: name or folder of the pack that objects come from.
         furniture_pack: the same for room, furniture and basket.
         visual_level: ``fast`` or ``full`` meshes to render.
-        layouts: folder of the layout cache; default: in the user's cache folder, filled on demand; None: no cache,
-            every layout is sampled again (the same ones, only slower); a file of frozen ones (`scenes.table`); or a
-            function that gives the layout of an objects seed and a seed.
-        seeds: least and greatest seed that unseeded resets draw from, such as those of a filled cache; default: any
-            seed, with several envs 0 to 99, those of frozen layouts.
+        layouts: folder of the layout cache; default: in the user's cache folder; None: no cache, every layout is
+            sampled again; a file of frozen layouts (`scenes.table`); or a function that returns the layout of an
+            objects seed and a seed.
+        seeds: least and greatest seed that unseeded resets draw from; default: any seed, with several envs 0 to 99,
+            those of frozen layouts.
         robot_uids: name of the robot in `robots.table`.
-        num_envs: see ``BaseEnv``.
-        reconfiguration_freq: see ``BaseEnv``; default 1 for one env, 0 for several.
-        kwargs: passed to ``BaseEnv``.
+        num_envs: N; several need a GPU.
+        kwargs: passed to ``BaseEnv``; ``reconfiguration_freq`` is 1 for one env, 0 for several, unless it is given.
 
     Raises:
         VectorEnvError: there are several envs and no GPU.
@@ -78,19 +66,16 @@ class RoboCASEnv(BaseEnv):
         ConfigError: an argument is invalid.
 
     Attributes:
-        looks: whether an observation shows what the cameras see; otherwise its images are black, and nothing is
-            rendered.
+        looks: whether images are rendered for observations; else they are black.
         present: (N, K) bool, which object slots are in use.
-        target_slot: (N,) slot of the target.
-        is_target: (N, K) bool, the same as flags.
-        start_poses: (N, K, 7) poses of the objects at the start of the episode.
-        basket_at_start: (N, 7) pose of the basket then.
+        target_slot: (N,) slot of the target; ``is_target`` (N, K) bool has the same as flags.
+        start_poses: (N, K, 7) poses of the objects at the start of the episode; ``basket_at_start`` (N, 7).
     """
 
     SPEC: ClassVar[TaskSpec]
     STAGES: ClassVar[tuple[str, ...]] = STAGES
     GOAL: ClassVar[type[Goal]] = InBasket
-    REWARDS: ClassVar[rewards.RewardTable] = rewards.TRANSFER
+    REWARDS: ClassVar[RewardTable] = TRANSFER
     SUPPORTED_REWARD_MODES = ("sparse", *DENSE, "none")  # the first is the default
 
     agent: MobileManipulator
@@ -98,7 +83,6 @@ class RoboCASEnv(BaseEnv):
 
     def __init__(
         self,
-        *args: Any,
         config: str | Path | dict | TaskConfig | None = None,
         pack: str | Path = "builtin",
         furniture_pack: str | Path = "builtin",
@@ -107,11 +91,12 @@ class RoboCASEnv(BaseEnv):
         seeds: tuple[int, int] | None = None,
         robot_uids: str | None = DEFAULT,
         num_envs: int = 1,
-        reconfiguration_freq: int | None = None,
         **kwargs: Any,
     ) -> None:
-        check_one_process(num_envs, kwargs.get("sim_backend", "auto"))
-        _check_rendering(visual_level, kwargs.get("render_backend"), kwargs.get("obs_mode"))
+        engine.check_engine(num_envs, **kwargs)
+        if visual_level not in VISUALS:
+            expected = f"one of {list(VISUALS)}"
+            raise ConfigError("no such visual_level", where="visual_level", expected=expected, found=visual_level)
         self.task_config = load_config_of(self.SPEC, config)
         self.robot_spec = find_robot(robot_uids, where="robot_uids")
         load(self.robot_spec.agent)  # registers it with ManiSkill
@@ -119,29 +104,20 @@ class RoboCASEnv(BaseEnv):
         self.model = SceneModel.load(self.task_config, load_pack(pack), load_pack(furniture_pack), robot=robot)
         self._visual_level: VisualLevel = visual_level
         self._resets = 0
-        self._engine_errors: EngineErrors | None = None
-        if reconfiguration_freq is None:
-            reconfiguration_freq = 1 if num_envs == 1 else 0
-        cache, stay = layout_source(self.model, layouts), reconfiguration_freq == 0
+        self._engine_errors: engine.EngineErrors | None = None
+        if kwargs.get("reconfiguration_freq") is None:
+            kwargs["reconfiguration_freq"] = 1 if num_envs == 1 else 0
+        cache, stay = layout_source(self.model, layouts), kwargs["reconfiguration_freq"] == 0
         self.seeds = EpisodeSeeds(self, num_envs, cache, seed_range=seeds, objects_stay=stay)
         self.instructions = Instructions(self)
         self.dense_reward = DenseReward(self, self.REWARDS)
-        frequency = {"num_envs": num_envs, "reconfiguration_freq": reconfiguration_freq}
-        super().__init__(*args, robot_uids=robot.uid, **frequency, **kwargs)
+        super().__init__(num_envs=num_envs, robot_uids=robot.uid, **kwargs)
 
     @property
     def _default_sim_config(self) -> SimConfig:
         distractors = self.task_config.randomisation.distractors
         objects = self.task_config.objects.count + (distractors.count[1] if distractors else 0)
-        return SimConfig(
-            sim_freq=SIM_FREQ,
-            control_freq=STANDARD_FREQ,
-            spacing=10,
-            scene_config=SceneConfig(contact_offset=CONTACT_OFFSET),
-            gpu_memory_config=gpu_memory(self.num_envs, objects),
-        )
-
-    # ------------------------------------------------------------------ cameras
+        return engine.sim_config(self.num_envs, objects)
 
     @property
     def _default_human_render_camera_configs(self) -> CameraConfig:
@@ -151,15 +127,12 @@ class RoboCASEnv(BaseEnv):
 
     def overview(self) -> tuple[Array, Array]:
         """Return a viewpoint of the task and the point to look at, (3,) each, world, m."""
-        return cameras.over_the_shoulder(self.model)
+        return over_the_shoulder(self.model)
 
     def _setup_sensors(self, options: dict) -> None:
         super()._setup_sensors(options)
-        sensors: dict[str, Any] = dict(self._sensors)
-        cameras = [sensors[name].camera for name in sorted(sensors)]
+        cameras = [sensor.camera for _, sensor in sorted(cast("dict[str, Any]", self._sensors).items())]
         build.shift_cameras(cameras, self.task_config, self.scene_seeds)
-
-    # ------------------------------------------------------------------ scene
 
     @property
     def scene_seeds(self) -> list[int]:
@@ -171,37 +144,31 @@ class RoboCASEnv(BaseEnv):
         """Rebuild the scene; see ``BaseEnv``. If a seed has no layout, the old scene stays."""
         assert self._episode_seed is not None
         self.seeds.choose_objects(self._episode_seed, on_gpu=self._sim_device.is_cuda())
+        engine.keep_renderer(self.backend.render_device)
         super()._reconfigure(options)
 
     def _clear(self) -> None:
-        """Drop the scene. ManiSkill collects garbage each time, 0.14 s; on a CPU this does so only now and then."""
         self._resets += 1
-        renders = can_render(self.backend.render_device)
-        every = _RESETS_PER_COLLECTION if renders else _RESETS_PER_COLLECTION_STATE_ONLY
-        if self._resets % every == 0 or self.num_envs > 1 or self._sim_device.is_cuda():
+        on_gpu = self.num_envs > 1 or self._sim_device.is_cuda()
+        if on_gpu or engine.is_collection_due(self.backend.render_device, self._resets):
             super()._clear()
-            return
-        self._close_viewer()
-        self.agent = None  # pyright: ignore[reportAttributeAccessIssue]
-        self._sensors, self._human_render_cameras, self._hidden_objects = {}, {}, []
-        self.scene = None  # pyright: ignore[reportAttributeAccessIssue]
+        else:  # without ManiSkill's garbage collection, which takes 0.14 s
+            self._close_viewer()
+            self._sensors, self._human_render_cameras, self._hidden_objects = {}, {}, []
+            self.agent = self.scene = None  # pyright: ignore[reportAttributeAccessIssue]
 
     def close(self) -> None:
         """Close the environment and free what it held."""
-        self._resets = -1
+        self._resets = -1  # collects garbage
         if self._engine_errors is not None:
             self._engine_errors.close()
-            self._engine_errors = None
         super().close()
-
-    def _setup_scene(self) -> None:
-        keep_renderer(self.backend.render_device)
-        super()._setup_scene()
 
     def _load_agent(self, options: dict, *args: Any, **kwargs: Any) -> None:
         super()._load_agent(options, sapien.Pose(self.model.robot_pose))
         if self.task_config.static_camera == "overview":
-            eye, target = cameras.static_camera(self.overview())
+            eye, target = self.overview()
+            eye = target + 0.75 * (eye - target)  # nearer than the render camera: it sees 90 deg instead of 60
             self.agent.static_camera_pose = sapien_utils.look_at(eye.tolist(), target.tolist()).sp
 
     def _load_scene(self, options: dict) -> None:
@@ -215,20 +182,13 @@ class RoboCASEnv(BaseEnv):
         ]
         if self.task_config.leaves_slots_empty:
             build.build_parking(self.scene, slots)
-        facts = [[asset.asset for asset in row] for row in self.object_assets]
-        self._centers_of_mass = self._floats([[fact.center_of_mass for fact in row] for row in facts])
-        self.extents = self._floats([[fact.extents for fact in row] for row in facts])
         self.start_poses = torch.zeros(self.num_envs, slots, 7, device=self.device)
         self.present = torch.ones(self.num_envs, slots, dtype=torch.bool, device=self.device)
         self.target_slot = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
         self.is_target = torch.zeros_like(self.present)
-        self.target_extents = torch.zeros(self.num_envs, 3, device=self.device)
         self.basket_at_start = torch.zeros(self.num_envs, 7, device=self.device)
         self.goal = self.GOAL(self)
         self.success_check = SuccessCheck(self, self.STAGES)
-
-    def _floats(self, values: Any) -> torch.Tensor:
-        return torch.tensor(values, dtype=torch.float32, device=self.device)
 
     def _load_lighting(self, options: dict) -> None:
         shadow = self.task_config.lights.shadow or self.enable_shadow
@@ -237,60 +197,35 @@ class RoboCASEnv(BaseEnv):
     def _after_reconfigure(self, options: dict) -> None:
         super()._after_reconfigure(options)
         if self.gpu_sim_enabled and self._engine_errors is None:
-            self._engine_errors = EngineErrors()
+            self._engine_errors = engine.EngineErrors()
         self.bodies = Bodies(self.scene, self.agent.robot, self.objects, self.fixtures.basket)
         gripper = [self.agent.finger1_link, self.agent.finger2_link, self.agent.hand_link]
         self.gripper_contacts = Contacts(self.scene, gripper, self.objects)
 
-    # ------------------------------------------------------------------ reset
-
     def reset(self, seed: int | list[int] | None = None, options: dict | None = None) -> tuple[Any, dict]:
         """Reset; see ``BaseEnv``. The same seed gives the same layout, whichever envs are reset.
 
-        Args:
-            seed: of each env. With several envs a single one is the first env's, and the others take those after it,
-                within the range if it is of the range.
-            options: of ``BaseEnv``, but not ``reset_to_env_states``.
+        With several envs a single seed is the first env's; the others take those after it, within the range if it is of
+        the range.
 
         Raises:
             LayoutError: there is no layout for a seed that was asked for, or for many that were drawn.
-            RobocasError: ``reset_to_env_states`` was given.
+            RobocasError: ``options`` has ``reset_to_env_states``.
         """
-        if options and "reset_to_env_states" in options:
-            fix = "Reset with the seed of the recorded episode, then call set_state_dict."
-            raise RobocasError("a state lacks objects, target and stages", where="reset_to_env_states", fix=fix)
-        envs = list(range(self.num_envs))
-        if options and "env_idx" in options:  # a list, or an array as of ManiSkill's wrapper for Stable-Baselines3
-            index = options["env_idx"]
-            index = index if isinstance(index, torch.Tensor) else torch.as_tensor(index, device=self.device)
-            index = index.nonzero()[:, 0] if index.dtype == torch.bool else index
-            options, envs = {**options, "env_idx": index}, index.tolist() if self.num_envs > 1 else envs
-        reset_scene = super().reset
-        return self.seeds.reset(lambda seed: reset_scene(seed, options), seed, envs)
+        return self.seeds.reset(super().reset, seed, options)
 
     def _set_episode_rng(self, seed: Any, env_idx: torch.Tensor) -> None:
-        """Seed the episodes of some envs and no others; ManiSkill's own forgets the others' seeds."""
-        index = env_idx.cpu().numpy()
-        if seed is not None:
-            seed = self.seeds.within_range(seed)
-        if seed is None or self._batched_episode_rng is None or len(index) == self.num_envs:
-            super()._set_episode_rng(seed, env_idx)
-        else:
-            if len(seed) == 1 and len(index) > 1:
-                seed = np.concatenate([seed, np.random.RandomState(seed[0]).randint(2**31, size=len(index) - 1)])
-            self._episode_seed[index] = seed
-            self._batched_episode_rng[index] = BatchedRNG.from_seeds(seed, backend=self._batched_rng_backend)
-        for i in index:
-            self.seeds.layout_seeds[i] = self.seeds.draw(i) if seed is None else self._episode_seed[i]
+        """Seed the episodes of some envs; see ``BaseEnv``, which forgets the seeds of the others."""
+        self.seeds.seed_episodes(super()._set_episode_rng, seed, env_idx)
 
     def _clear_sim_state(self) -> None:
         """Stop everything in the envs that are being reset, on a GPU in two writes."""
         if not self.gpu_sim_enabled:
             super()._clear_sim_state()
-            return
-        self.bodies.stop(self.scene._reset_mask.nonzero()[:, 0])
-        self.scene._gpu_apply_all()
-        self.scene._gpu_fetch_all()
+        else:
+            self.bodies.stop(self.scene._reset_mask.nonzero()[:, 0])
+            self.scene._gpu_apply_all()
+            self.scene._gpu_fetch_all()
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         if self._engine_errors is not None:
@@ -304,26 +239,17 @@ class RoboCASEnv(BaseEnv):
         """Return the layout of an env's episode."""
         return self.seeds.layout(env)
 
-    # ------------------------------------------------------------------ state
-
     def get_state_dict(self) -> dict:
         """Return the state in ManiSkill's form, from one read of all bodies, and `state_beside_bodies`."""
         return {**self.bodies.split(self.bodies.read().clone()), **self.state_beside_bodies()}
 
     def state_beside_bodies(self) -> dict:
-        """Return what a state holds besides poses and velocities.
-
-        ``controller`` holds the targets that the next actions start from (`RobotController.targets`), ``task`` the
-        ``stages`` reached so far, (N, stages) bool.
-        """
+        """Return targets of controllers, and the ``stages`` (N, stages) bool that were reached so far."""
         stages = self.success_check.reached.T.clone()
         return {"controller": self.agent.controller_targets(), "task": {"stages": stages}}
 
     def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None) -> None:
-        """Set the state. Without targets, the next action starts from where the robot is; without stages, they stay.
-
-        The next step's dense reward is as that after a reset.
-        """
+        """Set the state. Without targets, the next action starts from where the robot is; without stages, they stay."""
         super().set_state_dict(state, cast("torch.Tensor", env_idx))
         self.agent.set_controller_targets(state.get("controller"), env_idx)
         envs = slice(None) if env_idx is None else env_idx
@@ -332,7 +258,7 @@ class RoboCASEnv(BaseEnv):
 
     @property
     def object_states(self) -> torch.Tensor:
-        """(N, K, 13) poses of the objects, linear and angular velocities (`bodies.BODY`); don't write to it."""
+        """(N, K, 13) states of the objects (`bodies.BODY`); don't write to it."""
         return self.bodies.objects(self.bodies.read())
 
     @property
@@ -351,16 +277,6 @@ class RoboCASEnv(BaseEnv):
         """(N, 7) pose of the TCP in the world, native (`arrays`)."""
         return native(link_poses(self.scene, [self.agent.tcp]))[:, 0]
 
-    def centers(self, objects: Any) -> Any:
-        """(N, K, 3) m, centres of mass of the objects in the world, from states (N, K, 13); native (`arrays`)."""
-        return objects[..., :3] + terms.rotate(objects[..., 3:7], native(self._centers_of_mass))
-
-    def target_center(self, objects: Any) -> Any:
-        """(N, 3) m, the target's centre of mass in the world, from states (N, K, 13); native (`arrays`)."""
-        slot = native(self.target_slot)
-        target, center = terms.of_target(objects, slot), terms.of_target(native(self._centers_of_mass), slot)
-        return target[:, :3] + terms.rotate(target[:, 3:7], center)
-
     def target_asset(self, env: int = 0) -> LoadedObject:
         """The target's asset in one env."""
         return self.object_assets[env][int(self.target_slot[env])]
@@ -373,8 +289,6 @@ class RoboCASEnv(BaseEnv):
         """(N, K) bool: which objects both fingers hold right now."""
         return as_tensor(self.success_check.grasped(self.gripper_contacts.forces()))
 
-    # ------------------------------------------------------------------ step
-
     def step(self, action: Any) -> tuple[Any, torch.Tensor, torch.Tensor, torch.Tensor, dict]:
         """Step; see ``BaseEnv``, whose step takes longer on a CPU where neither observation nor reward is wanted.
 
@@ -386,43 +300,22 @@ class RoboCASEnv(BaseEnv):
         plain = self._obs_mode == "none" and self._reward_mode == "none" and isinstance(action, np.ndarray)
         if not plain or self.gpu_sim_enabled or action.shape != self._orig_single_action_space.shape:
             return super().step(action)
-        self.agent.set_action(torch.from_numpy(action.astype(np.float32, copy=False))[None])
-        self._before_control_step()
-        for _ in range(self._sim_steps_per_control):
-            self.agent.before_simulation_step()
-            self._before_simulation_step()
-            self.scene.step()
-            self._after_simulation_step()
-        self._after_control_step()
-        self._elapsed_steps += 1
+        engine.step_without_observation(self, action)
         info, self._last_obs = self.get_info(), {}
         return {}, torch.zeros(1), info["success"] | info["fail"], torch.zeros(1, dtype=torch.bool), info
 
     def evaluate(self) -> dict[str, torch.Tensor]:
-        """Return stages, success and fail of each env, (N,) bool each; ``disturbed`` (N,) int. Don't write to them.
+        """Return stages, ``success`` and ``fail`` of each env, (N,) bool, and ``disturbed`` (N,) int.
 
-        The stages stay true until the reset: ``reached_any`` (the gripper touched any object), ``picked_any`` (both
-        fingers held any object >= 3 cm above where it stood), ``reached_target``, ``target_grasped``, ``target_lifted``
-        (as ``picked_any``, of the target), and that of the goal, ``target_in_basket``. ``success`` is of this moment:
-        the target was lifted, now is at rest in the basket's inner volume, untouched by the gripper, and the basket
-        stands (moved <= 0.1 m, tilted <= 20 deg). So is ``fail``: the target is or falls more than 5 cm below what it
-        stood on, out of basket and gripper, or the basket has fallen (10 cm lower, or tilted by 60 deg). Other goals
-        may do without the lift, and have measures of their own. ``disturbed`` counts the objects other than the target
-        that are more than 3 cm from where they stood, or have fallen over (30 deg), relative to the door or drawer that
-        they are on.
+        Stages stay true until the reset; ``success`` and ``fail`` are of this moment. docs/tasks.md defines them.
+        ``disturbed`` counts the objects other than the target that are more than 3 cm from where they stood, or have
+        fallen over (30 deg), relative to the door or drawer that they are on.
         """
         return self.success_check.check()
-
-    @property
-    def moment(self) -> Moment:
-        """What `evaluate` found last; the same object as before where nothing has changed since."""
-        return self.success_check.moment
 
     def target_measures(self) -> dict[str, torch.Tensor]:
         """Return what has to hold at the same moment for success, besides the lift: (N,) bool each."""
         return self.success_check.measures()
-
-    # ------------------------------------------------------------------ observations
 
     def get_language_instruction(self) -> list[str]:
         """Return the text of each env's instruction."""
@@ -435,7 +328,7 @@ class RoboCASEnv(BaseEnv):
         return {**privileged, "tcp_pose": as_tensor(self.tcp_in_world())}
 
     def privileged_observations(self) -> dict[str, torch.Tensor]:
-        """Return what only a simulator knows, (N, D) each; the order is that of the flat state."""
+        """Return privileged state, (N, D) each, in the order of the flat state; see docs/rl.md."""
         return privileged_observations(self)
 
     def _get_obs_sensor_data(self, apply_texture_transforms: bool = True) -> dict:
@@ -445,14 +338,11 @@ class RoboCASEnv(BaseEnv):
             return super()._get_obs_sensor_data(apply_texture_transforms)
         return {camera: {kind: torch.zeros_like(of) for kind, of in kinds.items()} for camera, kinds in last.items()}
 
-    # ------------------------------------------------------------------ rewards
-
     def get_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
         """Return the reward (N,) of the env's mode, and remember the action.
 
-        ``normalized_dense`` is in [0, 1]: 1 on success and only then, 0 on ``fail``, else what `rewards` makes of the
-        table ``REWARDS``. ``dense`` is this times the table's total. ``progress`` is how much the first has changed
-        since the last step; a first step pays nothing.
+        ``normalized_dense`` is in [0, 1]: 1 on success and only then, 0 on ``fail``. ``dense`` is this times the total
+        of ``REWARDS``. ``progress`` is how much the first has changed since the last step.
         """
         if self._reward_mode == "progress":
             reward = self.dense_reward.gain(self.compute_normalized_dense_reward(obs, action, info))
@@ -474,12 +364,3 @@ class RoboCASEnv(BaseEnv):
     def compute_normalized_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
         """Return the reward (N,) float32 in [0, 1]; see `compute_dense_reward`."""
         return self.compute_dense_reward(obs, action, info) / self.REWARDS.total
-
-
-def _check_rendering(visual_level: str, render_backend: str | None, obs_mode: str | None) -> None:
-    if visual_level not in VISUALS:
-        found = visual_level
-        raise ConfigError("no such visual_level", where="visual_level", expected=f"one of {list(VISUALS)}", found=found)
-    if render_backend == "none" and obs_mode not in {None, "none", "state", "state_dict"}:
-        found, fix = f'"none", with obs_mode={obs_mode!r}', "Leave render_backend out."
-        raise ConfigError("images need a renderer", where="render_backend", found=found, fix=fix)

@@ -1,20 +1,23 @@
-"""What only a simulator knows: privileged observations, (N, D) each; see docs/rl.md."""
+"""Privileged observations, and the viewpoint of the overview camera."""
 
 from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 
 from robocas_ms3.core.arrays import as_tensor, join, native
+from robocas_ms3.scenes.layout import Array
+from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.tasks import terms
 
 
 def privileged_observations(env: Any) -> dict[str, torch.Tensor]:
-    """Return the poses of objects and basket, and the target's place relative to the TCP and the goal."""
+    """Return the poses of objects and basket, and the target's position relative to TCP and goal, (N, D) each."""
     state, tcp = env.bodies.read(), env.tcp_in_world()
     objects, basket = env.bodies.objects(state), env.bodies.basket(state)
-    center = env.target_center(native(objects))
+    center = env.success_check.target_center(native(objects))
     observations = {
         "object_poses": torch.where(env.present[..., None], objects[..., :7], 0.0).flatten(1),
         "target": env.is_target.float(),
@@ -27,9 +30,20 @@ def privileged_observations(env: Any) -> dict[str, torch.Tensor]:
     else:
         seen = in_tcp_frame(tcp, join([to_target, point - center]).reshape(-1, 2, 3))
         observations |= {"tcp_to_target": seen[:, 0], env.goal.TOWARDS: seen[:, 1]}
-    return observations | {"target_extents": env.target_extents}
+    return observations | {"target_extents": terms.of_target(env.success_check.extents, env.target_slot)}
 
 
 def in_tcp_frame(tcp: Any, vectors: Any) -> torch.Tensor:
     """Return vectors (N, V, 3) of the world along the axes of poses (N, 7); both native (`arrays`)."""
     return as_tensor(vectors @ terms.rotation(tcp[:, 3:]))
+
+
+def over_the_shoulder(model: SceneModel) -> tuple[Array, Array]:
+    """Return a viewpoint over the robot's shoulder, and a point on the support, (3,) each, world, m."""
+    region, robot = model.region, model.robot_pose[:3, 3]
+    middle = np.array([*np.add(region.min_xy, region.max_xy) / 2, region.z, 1.0])
+    target = (model.support_pose @ middle)[:3]
+    back = (robot - target)[:2] / np.linalg.norm((robot - target)[:2])
+    aside = np.array([-back[1], back[0]])
+    eye = target + np.append(1.05 * back + 1.2 * aside, max(1.1, 1.5 - target[2]))
+    return eye, target + [0, 0, 0.05]

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 from mani_skill.utils.structs import Articulation
 
 from robocas_ms3.core.arrays import as_tensor, known_all_false, native
 from robocas_ms3.scenes.layout import Array
 from robocas_ms3.scenes.task_specs import OPEN_PICK
-from robocas_ms3.tasks import cameras, rewards, terms
+from robocas_ms3.tasks import rewards, terms
 from robocas_ms3.tasks.base import STAGES, RoboCASEnv
 from robocas_ms3.tasks.bodies import link_poses
 from robocas_ms3.tasks.observations import in_tcp_frame
@@ -28,7 +29,18 @@ class RoboCASOpenPickEnv(RoboCASEnv):
 
     def overview(self) -> tuple[Array, Array]:
         """Return a viewpoint above the basket's side, where an opening door does not hide the gripper."""
-        return cameras.above_the_basket(self.model)
+        model, opening = self.model, self.task_config.opening
+        assert opening is not None  # checked by the configuration
+        assert model.basket_pose is not None
+        handle = model.furniture[opening.furniture].asset.handles[opening.handle]
+        held = model.furniture_poses[opening.furniture] @ np.append(handle.position, 1.0)
+        out = model.robot_pose[:2, 3] - held[:2]
+        out /= np.linalg.norm(out)
+        side = np.array([-out[1], out[0]])
+        if side @ (model.basket_pose[:2, 3] - held[:2]) < 0:
+            side = -side
+        eye = np.append(held[:2] + 0.9 * out + 1.4 * side, held[2] + 0.9)
+        return eye, np.append(held[:2] + 0.3 * out, held[2] + 0.1)
 
     def _load_scene(self, options: dict) -> None:
         super()._load_scene(options)

@@ -1,4 +1,4 @@
-"""Dense rewards: named terms in [0, 1], worth what a table says. Pure functions on batched arrays, as `terms`. N envs.
+"""Dense rewards: named terms in [0, 1], weighed by a task's table. Pure functions on arrays, as `terms`. N envs.
 
 A task is a row of stages, and each env is in one of them at a time. The terms of the stages before it count in full,
 those of its own stage as far as they have come, those of later ones not at all. So whatever is in a later stage is
@@ -9,9 +9,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
-from robocas_ms3.core.arrays import Array, as_float, choose, clamp, length
+import torch
+
+from robocas_ms3.core.arrays import Array, as_float, as_tensor, choose, clamp, length, native
 from robocas_ms3.tasks.occlusion import MAX_HIDDEN_SHARE, MAX_OBSTACLES
+
+DENSE = ("normalized_dense", "dense", "progress")  # reward modes whose terms are computed
 
 
 @dataclass(frozen=True)
@@ -136,3 +141,75 @@ def shift(position: Array, position_before: Array, *, limit: float = 0.1) -> Arr
 def action_rate(action: Array, before: Array, *, span: float = 2.0) -> Array:
     """(N,) in [0, 1]: mean change of an action's components (N, A) since the last one, 1 from ``span`` on."""
     return clamp(abs(action - before).mean(-1) / span, 0.0, 1.0)
+
+
+class DenseReward:
+    """Weighs terms and penalties, and remembers the last action and reward.
+
+    Args:
+        env: the `base.RoboCASEnv`.
+        table: weights of its terms.
+
+    Attributes:
+        last_action: (N, A), NaN where there was none since the reset; None: none yet.
+        last_level: (N,) last normalized reward of the mode ``progress``, NaN where there was none since the reset.
+    """
+
+    def __init__(self, env: Any, table: RewardTable) -> None:
+        self._env, self._table = env, table
+        self.last_action: torch.Tensor | None = None
+        self.last_level: torch.Tensor | None = None
+
+    def reset(self, envs: Any) -> None:
+        """Forget the last action and reward of some envs."""
+        for last in (self.last_action, self.last_level):
+            if last is not None:
+                last[envs] = torch.nan
+
+    def remember(self, action: Any) -> None:
+        """Remember the action of this step."""
+        self.last_action = torch.as_tensor(action, device=self._env.device).reshape(self._env.num_envs, -1).clone()
+
+    def gain(self, level: torch.Tensor) -> torch.Tensor:
+        """Return how much a reward (N,) has risen since the last step; 0 in the first one."""
+        before = level if self.last_level is None else self.last_level
+        self.last_level = level.clone()
+        return (level - before).nan_to_num()
+
+    def of_goal(self) -> tuple[Any, dict[str, Any]]:
+        """Return stages (N,) and terms by name, (N,) in [0, 1] each, of the goal; native (`arrays`)."""
+        brought = native(self._env.success_check.stages["target_lifted"])
+        return self._env.goal.progress(self._env.success_check.moment, brought, self._table)
+
+    def weigh(self, stage: Any, found: dict[str, Any], action: Any, info: dict[str, Any]) -> torch.Tensor:
+        """Return the reward (N,) in [0, total of the table], and add ``reward_terms`` to the info.
+
+        Args:
+            stage: (N,) places in the table's stages, native (`arrays`).
+            found: terms by name, (N,) in [0, 1] each, native.
+            action: of this step.
+            info: of this step, from `RoboCASEnv.evaluate`.
+        """
+        penalties = self._penalties(action)
+        stage = choose(native(info["success"]), 0 * stage + len(self._table.stages), stage)
+        reward, counted = weigh(self._table, stage, found, penalties)
+        counted.update(penalties)
+        info["reward_terms"] = {name: as_tensor(term) for name, term in counted.items()}
+        return as_tensor(reward * ~native(info["fail"]))
+
+    def _penalties(self, action: Any) -> dict[str, Any]:
+        """The table's penalties by name, (N,) in [0, 1] each, native."""
+        moment = self._env.success_check.moment
+        found = {
+            "disturbed": count_share(moment.disturbed.sum(1)),
+            **self._env.goal.penalties(moment),
+            "action_rate": self._action_rate(action),
+        }
+        return {name: found[name] for name in self._table.penalties}
+
+    def _action_rate(self, action: Any) -> Any:
+        before = self.last_action
+        if action is None or before is None or before.shape[-1] != action.shape[-1]:
+            return native(torch.zeros(self._env.num_envs, device=self._env.device))
+        action = torch.as_tensor(action, device=self._env.device).reshape(self._env.num_envs, -1)
+        return action_rate(native(action), native(torch.where(before.isnan(), action, before)))

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import numpy as np
-from mani_skill.envs.sapien_env import BaseEnv
+import torch
 from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
 from numpy.typing import NDArray
 
-from robocas_ms3.core.errors import ConfigError, LayoutError
+from robocas_ms3.core.errors import ConfigError, LayoutError, RobocasError
 from robocas_ms3.scenes.cache import LayoutCache
 from robocas_ms3.scenes.layout import Layout, LayoutSource, ObjectIds
 from robocas_ms3.scenes.table import FrozenLayouts, LayoutTable, Pair, State
@@ -67,7 +67,7 @@ class EpisodeSeeds:
 
     def __init__(
         self,
-        env: BaseEnv,
+        env: Any,
         num_envs: int,
         layouts: LayoutSource,
         *,
@@ -95,19 +95,27 @@ class EpisodeSeeds:
         self._built_with: dict[int, Layout] = {}  # by seed
         self._failed: dict[Pair, LayoutError] = {}  # finding out takes long
 
-    # ------------------------------------------------------------------ resets
-
-    def reset(self, reset: Callable[[Any], _T], seed: int | Sequence[int] | None, envs: Sequence[int]) -> _T:
+    def reset(self, reset: Callable[..., _T], seed: Any, options: dict[str, Any] | None) -> _T:
         """Reset some envs; if there is no layout, all seeds stay as they were.
 
         Args:
-            reset: resets them with a seed each, or None.
+            reset: ``BaseEnv.reset``.
             seed: of each env; a single one is the first env's, and the others take the seeds after it.
-            envs: their numbers.
+            options: of ``BaseEnv``. ``env_idx`` may be an array or a mask too.
 
         Raises:
             LayoutError: there is no layout for a requested seed, or for many that were drawn.
+            RobocasError: ``reset_to_env_states`` was given.
         """
+        options, device = dict(options or {}), self._env.device
+        if "reset_to_env_states" in options:
+            fix = "Reset with the seed of the recorded episode, then call set_state_dict."
+            raise RobocasError("a state lacks objects, target and stages", where="reset_to_env_states", fix=fix)
+        envs = list(range(self._num_envs))
+        if "env_idx" in options:
+            index = torch.as_tensor(options["env_idx"], device=device)
+            options["env_idx"] = index.nonzero()[:, 0] if index.dtype == torch.bool else index
+            envs = options["env_idx"].tolist() if self._num_envs > 1 else envs
         first, self.first_reset = self.first_reset, False
         seeded = seed is not None and not first
         self._requested = set(envs) if seeded else set()
@@ -116,14 +124,14 @@ class EpisodeSeeds:
             if first:
                 seed = following_seeds(within[0], self._num_envs, within)
             elif seed is not None and np.ndim(seed) == 0:
-                self._requested = set(list(envs)[:1])
+                self._requested = set(envs[:1])
                 seed = following_seeds(int(np.asarray(seed)), len(envs), within)
         before = self.layout_seeds.copy(), dict(self._found)
         attempts = self._other_seeds + 1 if self._num_envs == 1 and not seeded else 1
         while True:
             attempts -= 1
             try:
-                return reset(seed)
+                return reset(seed, options)
             except LayoutError as error:
                 if not attempts:
                     self.layout_seeds[:], self._found = before
@@ -131,7 +139,27 @@ class EpisodeSeeds:
                 _log.log(_level(error), "no layout for the seed of this reset, another is drawn: %s", error)
                 seed = None
 
-    def within_range(self, seed: Any) -> NDArray[np.int64]:
+    def seed_episodes(self, seed_all: Callable[[Any, torch.Tensor], None], seed: Any, env_idx: torch.Tensor) -> None:
+        """Seed the episodes of some envs (E,), with a seed each, or by their generators.
+
+        Args:
+            seed_all: ``BaseEnv._set_episode_rng``.
+            seed: (E,), a single one, or None.
+            env_idx: (E,).
+        """
+        env, index = self._env, env_idx.cpu().numpy()
+        seed = None if seed is None else self._within_range(seed)
+        if seed is None or env._batched_episode_rng is None or len(index) == self._num_envs:
+            seed_all(seed, env_idx)
+        else:
+            if len(seed) == 1 and len(index) > 1:
+                seed = np.concatenate([seed, np.random.RandomState(seed[0]).randint(2**31, size=len(index) - 1)])
+            env._episode_seed[index] = seed
+            env._batched_episode_rng[index] = BatchedRNG.from_seeds(seed, backend=env._batched_rng_backend)
+        for i in index:
+            self.layout_seeds[i] = self._draw(i) if seed is None else env._episode_seed[i]
+
+    def _within_range(self, seed: Any) -> NDArray[np.int64]:
         """Return the seeds (E,) of a reset, moved into the range if nobody asked for them."""
         seed = np.atleast_1d(np.asarray(seed, dtype=np.int64))
         if self._requested or self.range is None:
@@ -139,15 +167,13 @@ class EpisodeSeeds:
         low, high = self.range
         return np.where((seed >= low) & (seed <= high), seed, low + seed % (high - low + 1))
 
-    def draw(self, env: int) -> int:
+    def _draw(self, env: int) -> int:
         """Draw a seed of the range with an env's generator."""
         generators = self._env._batched_episode_rng
         assert isinstance(generators, BatchedRNG)
         drawn = int(generators[env].randint(2**31))
         low, high = self.range or (0, 2**31 - 1)
         return low + drawn % (high - low + 1)
-
-    # ------------------------------------------------------------------ objects and layouts
 
     def choose_objects(self, seeds: NDArray[np.int64], *, on_gpu: bool) -> None:
         """Choose the objects that each env is built with from its seed (N,), which changes if it has no layout."""
@@ -226,7 +252,7 @@ class EpisodeSeeds:
                 if env in self._requested or self._num_envs == 1:  # a single env starts over with other objects
                     raise
                 _log.log(_level(error), "env %d: no layout for seed %d, another is drawn: %s", env, seeds[env], error)
-                seeds[env] = self.draw(env)
+                seeds[env] = self._draw(env)
         return make(int(seeds[env]))
 
 

@@ -35,6 +35,6 @@ class RoboCASSelectEnv(RoboCASEnv):
 
     def _others_out(self) -> torch.Tensor:
         """(N,) bool."""
-        inside = self.goal.holds(self.centers(native(self.object_states)), native(self.basket_pose))
+        inside = self.goal.holds(self.success_check.centers(native(self.object_states)), native(self.basket_pose))
         others_in = terms.another_of_its_kind(inside, native(self._kinds), native(self.target_slot))
         return as_tensor(~others_in)

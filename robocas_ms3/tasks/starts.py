@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from robocas_ms3.core.poses import to_wxyz
 from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.scenes.table import LayoutTable, good
-from robocas_ms3.tasks import terms
 
 
 @dataclass(frozen=True)
@@ -116,4 +115,3 @@ def place(env: Any, starts: Starts, envs: torch.Tensor) -> None:
         env.target_slot[envs] = starts.targets
         env.present[envs] = starts.present
         env.is_target = torch.nn.functional.one_hot(env.target_slot, len(env.objects)).bool()
-        env.target_extents = terms.of_target(env.extents, env.target_slot)

@@ -30,6 +30,7 @@ class SuccessCheck:
         reached: (stages, N) bool.
         stages: its rows by name; views.
         moment: what the last check found; the same object as before where nothing has changed since.
+        extents: (N, K, 3) m, of the objects.
         surface: height of what objects stand on, m.
         fallen_below: height below which an object counts as fallen off it, m.
     """
@@ -43,6 +44,11 @@ class SuccessCheck:
         self._last: tuple[object, dict[str, torch.Tensor]] | None = None
         shut = env.model.support_motion(opened=False)
         self._support_shut = torch.as_tensor(shut, dtype=torch.float32, device=env.device)
+        facts = [[asset.asset for asset in row] for row in env.object_assets]
+        centers = [[fact.center_of_mass for fact in row] for row in facts]
+        self._centers_of_mass = torch.tensor(centers, dtype=torch.float32, device=env.device)
+        extents = [[fact.extents for fact in row] for row in facts]
+        self.extents = torch.tensor(extents, dtype=torch.float32, device=env.device)
         self._sideways = torch.tensor([[0.0, 1.0, 0.0]], device=env.device)
         self.surface = float(env.model.support_pose[2, 3]) + env.model.region.z
         self.fallen_below = self.surface - terms.FALLEN
@@ -113,6 +119,16 @@ class SuccessCheck:
         flags = {"success": as_tensor(success), "fail": as_tensor(fail)}
         return {**stages, **flags, "disturbed": as_tensor(disturbed.sum(1))}
 
+    def centers(self, objects: Any) -> Any:
+        """Return the centres of mass (N, K, 3) of the objects in the world, from their states (N, K, 13)."""
+        return objects[..., :3] + terms.rotate(objects[..., 3:7], native(self._centers_of_mass))
+
+    def target_center(self, objects: Any) -> Any:
+        """Return the target's centre of mass (N, 3) in the world, from the objects' states (N, K, 13)."""
+        slot = native(self._env.target_slot)
+        target, center = terms.of_target(objects, slot), terms.of_target(native(self._centers_of_mass), slot)
+        return target[:, :3] + terms.rotate(target[:, 3:7], center)
+
     def grasped(self, forces: Any) -> Any:
         """Return which objects (N, K) both fingers hold, from forces (N, 3, K, 3) N on the gripper; native."""
         pressed = terms.pressed(forces[:, 0], forces[:, 1])
@@ -139,7 +155,7 @@ class SuccessCheck:
         goal, slot = self._env.goal, native(self._env.target_slot)
         target = terms.of_target(objects, slot)
         return {
-            goal.NAME: goal.holds(self._env.target_center(objects), basket),
+            goal.NAME: goal.holds(self.target_center(objects), basket),
             "untouched": ~terms.of_target(touched, slot),
             "at_rest": terms.at_rest(target[:, 7:10], target[:, 10:]),
             **goal.measures(basket),
@@ -154,7 +170,7 @@ class SuccessCheck:
         low = (objects[..., 2] < self.fallen_below) & native(env.present & ~env.is_target)
         if known_all_false(low):  # as nearly always
             return low
-        return low & ~env.goal.holds(env.centers(objects), self.moment.basket)
+        return low & ~env.goal.holds(self.centers(objects), self.moment.basket)
 
     def _has_failed(self, measures: dict[str, Any], objects: Any, basket: Any) -> Any:
         """(N,) bool of ``fail``, native, from the measures, states (N, K, 13) and the basket's pose."""

@@ -17,7 +17,7 @@ import pytest
 from sapien import physx
 
 from robocas_ms3.assets.pack import load_pack
-from robocas_ms3.core.errors import LayoutError, SimulationError
+from robocas_ms3.core.errors import SimulationError
 from robocas_ms3.scenes import cache as cache_module
 from robocas_ms3.scenes.cache import LayoutCache, Sampler, count_layouts, layout_source, pairs_of
 from robocas_ms3.scenes.config import load_task_config

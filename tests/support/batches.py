@@ -65,6 +65,7 @@ class Trace:
         objects: (T + 1, N, K, 7).
         rewards: (T, N).
         flags: (T, N, F) bool, of the info.
+        privileged: (T, N, D) privileged observations.
     """
 
     qpos: torch.Tensor
@@ -72,19 +73,23 @@ class Trace:
     objects: torch.Tensor
     rewards: torch.Tensor
     flags: torch.Tensor
+    privileged: torch.Tensor
 
 
 def play(env: gym.Env, actions: torch.Tensor) -> Trace:
     """Step with actions (T, N, A)."""
     base: Any = env.unwrapped
-    states, rewards, flags = [_state(base)], [], []
+    states, rewards, flags, privileged = [_state(base)], [], [], []
     for action in actions.to(base.device):
         _, reward, _, _, info = env.step(action)
+        privileged.append(torch.cat([*base.privileged_observations().values()], dim=1))
         states.append(_state(base))
         rewards.append(reward)
         flags.append(torch.stack([info[name] for name in (*base.STAGES, "success", "fail", "disturbed")], dim=-1))
     qpos, tcp, objects = (torch.stack(values).cpu() for values in zip(*states, strict=True))
-    return Trace(qpos, tcp, objects, torch.stack(rewards).cpu(), torch.stack(flags).cpu())
+    return Trace(
+        qpos, tcp, objects, torch.stack(rewards).cpu(), torch.stack(flags).cpu(), torch.stack(privileged).cpu()
+    )
 
 
 def play_singles(envs: Sequence[gym.Env], actions: torch.Tensor) -> Trace:
@@ -152,6 +157,7 @@ def check_equals_singles(batch: gym.Env, singles: Sequence[gym.Env], mode: str, 
     _close(found.qpos, expected.qpos, TOLERANCE, "qpos")
     _close(found.tcp, expected.tcp, TOLERANCE, "TCP")
     _close(found.rewards, expected.rewards, TOLERANCE, "rewards")
+    _close(found.privileged, expected.privileged, 10 * TOLERANCE, "privileged observations")  # positions over extents
 
 
 def check_partial_reset(batch: gym.Env, some: Sequence[int], mode: str) -> None:

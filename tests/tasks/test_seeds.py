@@ -22,6 +22,8 @@ STATE_ONLY = {"render_backend": "none", "control_mode": "pd_joint_pos", "obs_mod
 class FourEnvs(RoboCASEnv):
     """Four envs' seeds and layouts, and nothing else of an environment."""
 
+    device = torch.device("cpu")
+
     def __init__(self, seed_range=None) -> None:
         self.num_envs, self._enhanced_determinism, self._batched_rng_backend = 4, False, "numpy:random_state"
         self._episode_seed, self._batched_episode_rng = None, None
@@ -29,7 +31,8 @@ class FourEnvs(RoboCASEnv):
         self.seeds.first_reset = False
 
     def seed(self, seeds, envs=(0, 1, 2, 3)) -> None:
-        self.seeds.reset(lambda seeds: self._set_episode_rng(seeds, torch.tensor(envs)), seeds, envs)
+        index = torch.tensor(envs)
+        self.seeds.reset(lambda seeds, options: self._set_episode_rng(seeds, index), seeds, {"env_idx": index})
 
 
 def states(env: FourEnvs) -> list[tuple]:

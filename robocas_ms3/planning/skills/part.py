@@ -17,7 +17,7 @@ from robocas_ms3.planning.scene import SPACING, shape_of
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.scenes.lookup import OPENED_AT_MOST
 from robocas_ms3.tasks import terms
-from robocas_ms3.tasks.contacts import contact_forces
+from robocas_ms3.tasks.bodies import contact_forces
 
 LEAST_SHARE = 0.25  # of the joint's range; a pull that can't even do this is not worth it
 STEP = {"prismatic": 0.015, "revolute": 0.03}  # m, rad between poses of a pull

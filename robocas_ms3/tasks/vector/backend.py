@@ -38,18 +38,3 @@ def choose_backend(backend: str, sim_backend: str = "auto") -> Literal["processe
         return "processes"
     fix = 'Pass backend="processes", which runs on the CPU.'
     raise VectorEnvError("needs a GPU", where="make_vec", found="no CUDA device", fix=fix)
-
-
-def check_one_process(num_envs: int, sim_backend: str) -> None:
-    """See that one process can hold that many environments.
-
-    Raises:
-        VectorEnvError: there are several and physics would run on a CPU.
-    """
-    if num_envs > 1 and (sim_backend in CPU_SIM_BACKENDS or not torch.cuda.is_available()):
-        raise VectorEnvError(
-            "several environments in one process need a GPU",
-            where=f"num_envs={num_envs}",
-            found="no CUDA device" if sim_backend not in CPU_SIM_BACKENDS else f"sim_backend={sim_backend!r}",
-            fix="On a CPU use robocas_ms3.make_vec(env_id, num_envs), which runs them in processes.",
-        )

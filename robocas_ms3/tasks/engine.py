@@ -1,0 +1,164 @@
+"""Renderer and physics engine of a process: what they keep, the memory they get, and the errors they only print."""
+
+from __future__ import annotations
+
+import atexit
+import os
+import re
+import subprocess
+import tempfile
+from functools import cache
+from typing import IO, Any
+
+import numpy as np
+import sapien
+import torch
+from mani_skill.envs.utils.system.backend import CPU_SIM_BACKENDS
+from mani_skill.render.utils import can_render
+from mani_skill.utils.structs.types import GPUMemoryConfig, SceneConfig, SimConfig
+from numpy.typing import NDArray
+
+from robocas_ms3.assets.physics import CONTACT_OFFSET
+from robocas_ms3.core.errors import ConfigError, SimulationError, VectorEnvError
+from robocas_ms3.scenes.task_specs import SIM_FREQ, STANDARD_FREQ
+
+# What one env has at most, counted on a CPU (4 seeds of each shipped configuration, the arm moving about): 25 contact
+# points and 8 pairs of touching shapes per object, the robot's and the basket's included. Twice that, since PhysX drops
+# contacts when it runs out of memory.
+CONTACTS_PER_OBJECT, PATCHES_PER_OBJECT = 50, 16
+CONTACTS_BESIDE, PATCHES_BESIDE = 100, 32  # of the robot, the furniture and the basket with each other
+STACK_PER_PATCH, TEMPORARY_PER_CONTACT = 512, 64  # bytes
+
+_OUT_OF_MEMORY = re.compile(
+    rb"\[SAPIEN\].*\[(?:critical|error)\].*"
+    rb"(?:overflow|to increase|increase (?:its size|capacity)|miss interactions|Internal CUDA error).*",
+    re.IGNORECASE,
+)
+_FIX = (
+    "Contacts were lost, so results are worth nothing. Use fewer envs, or give what it names more room, such as "
+    "sim_config=dict(gpu_memory_config=dict(max_rigid_contact_count=2**23)); see docs/batched.md."
+)
+
+
+def check_engine(
+    num_envs: int, sim_backend: str = "auto", render_backend: str | None = None, obs_mode: str | None = None, **_: Any
+) -> None:
+    """Check arguments of an environment against what this machine and process can run.
+
+    Raises:
+        VectorEnvError: there are several envs, and physics would run on a CPU.
+        ConfigError: images are observed, and nothing is to be rendered.
+    """
+    if num_envs > 1 and (sim_backend in CPU_SIM_BACKENDS or not torch.cuda.is_available()):
+        found = f"sim_backend={sim_backend!r}" if sim_backend in CPU_SIM_BACKENDS else "no CUDA device"
+        fix = "On a CPU use robocas_ms3.make_vec(env_id, num_envs), which runs them in processes."
+        what = "several environments in one process need a GPU"
+        raise VectorEnvError(what, where=f"num_envs={num_envs}", found=found, fix=fix)
+    if render_backend == "none" and obs_mode not in {None, "none", "state", "state_dict"}:
+        found, fix = f'"none", with obs_mode={obs_mode!r}', "Leave render_backend out."
+        raise ConfigError("images need a renderer", where="render_backend", found=found, fix=fix)
+
+
+def sim_config(num_envs: int, objects: int) -> SimConfig:
+    """Return the default configuration of the simulation of a number of envs with ``objects`` each."""
+    return SimConfig(
+        sim_freq=SIM_FREQ,
+        control_freq=STANDARD_FREQ,
+        spacing=10,
+        scene_config=SceneConfig(contact_offset=CONTACT_OFFSET),
+        gpu_memory_config=gpu_memory(num_envs, objects),
+    )
+
+
+def gpu_memory(num_envs: int, objects: int) -> GPUMemoryConfig:
+    """Return the capacities of PhysX on a GPU for a number of envs with ``objects`` each; at least ManiSkill's."""
+    least = GPUMemoryConfig()
+    contacts = num_envs * (CONTACTS_PER_OBJECT * objects + CONTACTS_BESIDE)
+    patches = num_envs * (PATCHES_PER_OBJECT * objects + PATCHES_BESIDE)
+    return GPUMemoryConfig(
+        temp_buffer_capacity=max(least.temp_buffer_capacity, _power_of_2(TEMPORARY_PER_CONTACT * contacts)),
+        max_rigid_contact_count=max(least.max_rigid_contact_count, _power_of_2(contacts)),
+        max_rigid_patch_count=max(least.max_rigid_patch_count, _power_of_2(patches)),
+        collision_stack_size=max(least.collision_stack_size, _power_of_2(STACK_PER_PATCH * patches)),
+    )
+
+
+def _power_of_2(least: int) -> int:
+    return 1 << (least - 1).bit_length()
+
+
+def step_without_observation(env: Any, action: NDArray[Any]) -> None:
+    """Make the control step of ``BaseEnv.step`` in a single env on a CPU, and nothing else."""
+    env.agent.set_action(torch.from_numpy(action.astype(np.float32, copy=False))[None])
+    env._before_control_step()
+    for _ in range(env._sim_steps_per_control):
+        env.agent.before_simulation_step()
+        env._before_simulation_step()
+        env.scene.step()
+        env._after_simulation_step()
+    env._after_control_step()
+    env._elapsed_steps += 1
+
+
+def is_collection_due(device: sapien.Device | None, resets: int) -> bool:
+    """Return whether garbage is to be collected after a number of resets; a scene is 8 MB of it, 0.5 MB unrendered."""
+    return resets % (20 if can_render(device) else 30) == 0
+
+
+def keep_renderer(device: sapien.Device | None) -> None:
+    """Keep SAPIEN's shaders and meshes in this process from one scene to the next, where a CPU renders.
+
+    With its last render system SAPIEN frees them: 6 s of CPU time for the first image of the next environment, 0.1 s
+    per scene.
+    """
+    if device is not None and device.is_cpu() and can_render(device):
+        _render_system()
+
+
+@cache
+def _render_system() -> sapien.render.RenderSystem:
+    atexit.register(_render_system.cache_clear)  # before the library is unloaded
+    return sapien.render.RenderSystem(sapien.Device("cpu"))
+
+
+class EngineErrors:
+    """Reads what this process writes to standard error: PhysX only prints there that it dropped contacts."""
+
+    def __init__(self) -> None:
+        self._log = open(_log_standard_error(), "rb", buffering=0)  # noqa: SIM115  (closed in `close`)
+        self._log.seek(0, os.SEEK_END)
+
+    def check(self) -> None:
+        """Check what was written since the last check.
+
+        Raises:
+            SimulationError: an engine of this process ran out of memory.
+        """
+        if os.fstat(self._log.fileno()).st_size == self._log.tell():
+            return
+        for line in self._log.read().split(b"\n"):
+            if _OUT_OF_MEMORY.search(line):
+                found = line.decode(errors="replace").strip()
+                raise SimulationError("PhysX ran out of memory on the GPU", found=found, fix=_FIX)
+
+    def close(self) -> None:
+        """Stop reading."""
+        self._log.close()
+
+
+_tees: list[tuple[subprocess.Popen, IO[bytes], os.stat_result]] = []  # each with its log and its pipe
+
+
+def _log_standard_error() -> str:
+    """Pass standard error on through ``tee``, which outlives a crash of this process; return the log file's name."""
+    if not _tees or not os.path.samestat(os.fstat(2), _tees[-1][2]):
+        log = tempfile.NamedTemporaryFile(prefix="robocas-stderr-")  # noqa: SIM115  (removed when the process ends)
+        # a session of its own: an interrupt is meant for this process
+        tee = subprocess.Popen(
+            ["tee", "-a", log.name], stdin=subprocess.PIPE, stdout=2, stderr=2, start_new_session=True
+        )
+        assert tee.stdin is not None
+        _tees.append((tee, log, os.fstat(tee.stdin.fileno())))
+        os.dup2(tee.stdin.fileno(), 2)
+        tee.stdin.close()
+    return _tees[-1][1].name
