@@ -33,10 +33,7 @@ SIMULATOR_FREE = (
     "core",
     "scenes.task_specs",
     "scenes.config",
-    *(
-        f"scenes.{name}"
-        for name in ("model", "placement", "orderly", "relations", "targets", "randomise", "visibility")
-    ),
+    *(f"scenes.{name}" for name in ("model", "placement", "relations", "targets", "randomise", "visibility")),
     "tasks.terms",
     "tasks.occlusion",
     "tasks.rewards",

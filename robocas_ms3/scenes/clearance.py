@@ -1,4 +1,4 @@
-"""Whether what a configuration places can be there at once, and be worked on from where the robot is. No simulator."""
+"""Checks that nothing in a configuration overlaps, and that all is within the robot's reach. No simulator."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ _STEP, _ALONG = 0.05, 0.01  # m between places of the base that are tried, and a
 
 @dataclass(frozen=True)
 class Standing:
-    """Something that stands somewhere.
+    """Something in the scene.
 
     Attributes:
-        key: what the configuration calls it.
+        key: of the configuration.
         hulls: vertices (V, 3) in the world, m, and faces.
     """
 
@@ -43,58 +43,50 @@ class Standing:
 
 def check_clearance(
     config: TaskConfig,
-    room: LoadedFurniture,
-    furniture: Mapping[str, LoadedFurniture],
-    poses: Mapping[str, Array],
-    basket: tuple[LoadedFurniture, Array] | None,
-    robot_pose: Array,
+    placed: Mapping[str, tuple[LoadedFurniture, Array]],
     region: tuple[Region, Array],
+    robot_pose: Array,
     robot: RobotDescription,
 ) -> None:
     """Check that furniture, basket and robot don't overlap, and that basket and objects are within the arm's reach.
 
-    What a seed moves is left to where it is drawn (`standing`), and reach is judged with what that may give.
+    What a seed moves is checked where it is drawn (`standing`), and reach includes what that may give.
 
     Args:
         config: the configuration.
-        room: the room, at the world's origin.
-        furniture: by the configuration's names.
-        poses: 4x4 in the world, of furniture by name.
-        basket: and its pose 4x4 in the world; None: there is none.
-        robot_pose: 4x4 in the world, of the robot's root.
+        placed: assets and their poses 4x4 in the world, by key: ``furniture.NAME``, ``room``, and ``basket`` if any.
         region: for objects, and 4x4 of its frame in the world, with what has to be opened open.
-        robot: that is to work there; one without an envelope is not looked at.
+        robot_pose: 4x4 in the world, of the robot's root.
+        robot: a robot without an envelope is not checked.
 
     Raises:
         ConfigError: naming the two, and by how much.
     """
-    fixed = [
-        Standing(f"furniture.{name}", _world_hulls(part, poses[name], config.furniture[name].joints))
-        for name, part in furniture.items()
-    ]
-    around = Standing("room", _world_hulls(room, np.eye(4), {}))
-    pairs = [*combinations(fixed, 2), *((one, around) for one in fixed)]
+    joints = {f"furniture.{name}": item.joints for name, item in config.furniture.items()}
+    around = {key: Standing(key, _world_hulls(*at, joints.get(key, {}))) for key, at in placed.items()}
+    room, basket = around.pop("room"), around.pop("basket", None)
+    pairs = [*combinations(around.values(), 2), *((one, room) for one in around.values())]
+    fixed = [*around.values(), room]
     if basket is not None and config.randomisation.basket is None:
-        standing = Standing("basket", _world_hulls(*basket, {}))
-        pairs += [(standing, other) for other in (*fixed, around)]
-        fixed.append(standing)
+        pairs += [(basket, other) for other in fixed]
+        fixed.append(basket)
     envelope = robot.envelope
     if envelope is not None and config.randomisation.robot is None:
-        pairs += [(_body(envelope, robot_pose), other) for other in (*fixed, around)]
+        pairs += [(_body(envelope, robot_pose), other) for other in fixed]
     for one, other in pairs:
         deep = max((overlap(a, b) for a, b in _near(one, other)), default=0.0)
         if deep > _TOUCHING:
-            fix = f"Move one of them by more than {deep:.2f} m" + ("." if other is around else ", or leave one out.")
+            fix = f"Move one of them by more than {deep:.2f} m" + ("." if other is room else ", or leave one out.")
             raise ConfigError(f"{one.key} and {other.key} overlap", expected="apart", found=f"{deep:.3f} m", fix=fix)
     if envelope is not None:
         if config.randomisation.robot is None:
             arm = np.array(envelope.arm_at_start[config.robot_start])
-            _check_arm(transform(robot_pose, _densely(arm)), [*fixed, around])
-        _check_reach(config, basket, robot_pose, region, robot, envelope)
+            _check_arm(transform(robot_pose, _densely(arm)), fixed)
+        _check_reach(config, placed.get("basket"), region, _shoulders(config, robot_pose, robot, envelope), envelope)
 
 
 def overlap(one: Hull, other: Hull) -> float:
-    """How far one hull has to be moved to be clear of another, m; 0 where it is (by separating axes: exact)."""
+    """Return how far one hull has to be moved to be clear of another, m; 0 where it is (by separating axes: exact)."""
     least = _least_overlap(one, other, np.concatenate([_normals(one), _normals(other)]))
     if least > 0:
         crossed = np.cross(_edges(one)[:, None], _edges(other)[None]).reshape(-1, 3)
@@ -118,7 +110,7 @@ def _normals(hull: Hull) -> Array:
 
 
 def _edges(hull: Hull) -> Array:
-    """Directions (E, 3) of its edges, those along each other once."""
+    """Return directions (E, 3) of a hull's edges, parallel ones once."""
     pairs = np.sort(np.concatenate([hull.faces[:, [0, 1]], hull.faces[:, [1, 2]], hull.faces[:, [2, 0]]]), axis=1)
     ways = np.diff(hull.vertices[np.unique(pairs, axis=0)], axis=1)[:, 0]
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
@@ -152,7 +144,7 @@ def _densely(corners: Array) -> Array:
 
 
 def _check_arm(points: Array, others: list[Standing]) -> None:
-    """Check that the arm does not begin inside of something. Points (P, 3) lie along it."""
+    """Check that the arm, sampled at points (P, 3), does not start inside of something."""
     for other in others:
         for hull, low, high in zip(other.hulls, *other.bounds, strict=True):
             close = points[np.all((points > low) & (points < high), axis=1)]
@@ -165,31 +157,34 @@ def _check_arm(points: Array, others: list[Standing]) -> None:
                 raise ConfigError("the robot's arm begins inside of something", where="robot", found=other.key, fix=fix)
 
 
-def _check_reach(
-    config: TaskConfig,
-    basket: tuple[LoadedFurniture, Array] | None,
-    robot_pose: Array,
-    region: tuple[Region, Array],
-    robot: RobotDescription,
-    envelope: Envelope,
-) -> None:
-    """Check that the nearest points of region and basket are where a stretched arm gets, or the base brings it."""
-    moved = config.randomisation.robot
-    slack = _STEP + (np.sqrt(2) * moved.position if moved else 0.0)
+def _shoulders(config: TaskConfig, robot_pose: Array, robot: RobotDescription, envelope: Envelope) -> Array:
+    """Return where the arm's shoulder may be (P, 3), world, m: one place, or a grid where the base moves."""
     ranges = robot.base_limits[:2] if config.base_motion else ((0.0, 0.0),) * 2
     spans = [np.arange(low, high + _STEP, _STEP) for low, high in ranges]
     x, y = (grid.ravel() for grid in np.meshgrid(*spans))
     height = np.full(len(x), robot.arm_base_height + envelope.shoulder)
-    shoulders = transform(robot_pose, np.stack([x, y, height], axis=1))
+    return transform(robot_pose, np.stack([x, y, height], axis=1))
+
+
+def _check_reach(
+    config: TaskConfig,
+    basket: tuple[LoadedFurniture, Array] | None,
+    region: tuple[Region, Array],
+    shoulders: Array,
+    envelope: Envelope,
+) -> None:
+    """Check that the nearest points of region and basket are where a stretched arm gets, or the base brings it."""
+    moved = config.randomisation.robot
+    reach = envelope.reach + _STEP + (np.sqrt(2) * moved.position if moved else 0.0)
     area, frame = region
     low, high = np.array([*area.min_xy, area.z]), np.array([*area.max_xy, area.z])
     fix = "Move it or the robot" if config.base_motion else "Move it or the robot, or set base_motion"
-    _within(_distance(shoulders, frame, low, high), envelope.reach + slack, f"surface {config.surface.name!r}", fix)
+    _within(_distance(shoulders, frame, low, high), reach, f"surface {config.surface.name!r}", fix)
     if basket is not None:
         by = config.randomisation.basket
         corners = np.concatenate(basket[0].hulls)
         far = _distance(shoulders, basket[1], corners.min(axis=0), corners.max(axis=0))
-        _within(far, envelope.reach + slack + (np.sqrt(2) * by.position if by else 0.0), "the basket", fix)
+        _within(far, reach + (np.sqrt(2) * by.position if by else 0.0), "the basket", fix)
 
 
 def _within(distance: float, limit: float, what: str, fix: str) -> None:
@@ -203,6 +198,6 @@ def _within(distance: float, limit: float, what: str, fix: str) -> None:
 
 
 def _distance(points: Array, frame: Array, low: Array, high: Array) -> float:
-    """Least distance of points (P, 3) in the world from a box in a frame, m."""
+    """Return the least distance of points (P, 3) in the world from a box in a frame, m."""
     local = transform(np.asarray(np.linalg.inv(frame), dtype=np.float64), points)
     return float(np.linalg.norm(local - np.clip(local, low, high), axis=1).min())

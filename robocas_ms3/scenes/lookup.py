@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Collection
 
 import numpy as np
 
@@ -20,19 +21,24 @@ OPENED_AT_MOST = {"prismatic": 0.95, "revolute": 0.8}  # share of a joint's rang
 
 
 def fixture_pose(config: PoseConfig) -> Array:
-    """4x4 of a pose in the configuration."""
+    """Return 4x4 of a pose in the configuration."""
     return planar(*config.position, np.deg2rad(config.yaw_deg))
 
 
 def furniture_pose(config: PlacedConfig, furniture: LoadedFurniture) -> Array:
-    """4x4 of a piece of furniture's frame: the configuration says where its lowest point stands."""
+    """Return 4x4 of a piece of furniture's frame; the configuration has the place of its lowest point."""
     pose = fixture_pose(config.pose)
     pose[2, 3] += furniture.asset.origin_height
     return pose
 
 
+def _check_known(what: str, found: str, known: Collection[str]) -> None:
+    if found not in known:
+        raise ConfigError(what, expected=f"one of {sorted(known)}", found=found, fix=nearest(found, known))
+
+
 def find_furniture(pack: Pack, asset_id: str, *, key: str) -> LoadedFurniture:
-    """Look up a piece of furniture: an id of the pack, or ``pack/id`` of another one.
+    """Return a piece of furniture: an id of the pack, or ``pack/id`` of another one.
 
     Raises:
         ConfigError: the pack has no such furniture.
@@ -41,43 +47,31 @@ def find_furniture(pack: Pack, asset_id: str, *, key: str) -> LoadedFurniture:
     other, _, name = asset_id.rpartition("/")
     if other:
         pack = load_pack(other)
-    if name not in pack.furniture:
-        raise ConfigError(
-            f"{key}: no such furniture in pack {pack.name!r}", expected=f"one of {sorted(pack.furniture)}", found=name
-        )
+    _check_known(f"{key}: no such furniture in pack {pack.name!r}", name, pack.furniture)
     return pack.furniture[name]
 
 
 def find_room(pack: Pack, config: TaskConfig) -> LoadedFurniture:
-    """Look up the room, with its finishes.
+    """Return the room.
 
     Raises:
         ConfigError: there is no such room, part or finish.
     """
     room = find_furniture(pack, config.room.asset, key="room.asset")
+    known, random = room.asset.finishes, config.randomisation
     for part, finish in config.room.finishes.items():
-        parts = sorted(room.asset.finishes)
-        if part not in parts:
-            what, fix = f"room.finishes.{part}: no such part of the room", nearest(part, parts)
-            raise ConfigError(what, expected=f"one of {parts}", found=part, fix=fix)
-        known = room.asset.finishes[part]
-        if finish not in known:
-            what, fix = f"room.finishes.{part}: no such finish", nearest(finish, known)
-            raise ConfigError(what, expected=f"one of {list(known)}", found=finish, fix=fix)
-    for part, finishes in config.randomisation.finishes.items():
-        unknown = sorted(set(finishes) - set(room.asset.finishes.get(part, finishes)))
-        if unknown:
-            expected = f"some of {list(room.asset.finishes[part])}"
-            raise ConfigError(f"randomisation.finishes.{part}: no such finish", expected=expected, found=unknown)
-    for part in config.randomisation.room or ():
-        if part not in room.asset.finishes:
-            expected = f"one of {sorted(room.asset.finishes)}"
-            raise ConfigError("randomisation.room: no such part of the room", expected=expected, found=part)
+        _check_known(f"room.finishes.{part}: no such part of the room", part, known)
+        _check_known(f"room.finishes.{part}: no such finish", finish, known[part])
+    for part in random.room or ():
+        _check_known("randomisation.room: no such part of the room", part, known)
+    for part, finishes in random.finishes.items():  # its parts are among `randomisation.room`
+        for finish in finishes:
+            _check_known(f"randomisation.finishes.{part}: no such finish", finish, known[part])
     return room
 
 
 def find_container(pack: Pack, config: PlacedConfig) -> LoadedFurniture:
-    """Look up the basket.
+    """Return the basket.
 
     Raises:
         ConfigError: no such furniture, or it isn't a movable container.
@@ -89,10 +83,10 @@ def find_container(pack: Pack, config: PlacedConfig) -> LoadedFurniture:
 
 
 def find_objects(pack: Pack, config: TaskConfig) -> list[str]:
-    """Ids of the configuration's objects; it may name them by the numbers they have in GraspNet-1Billion.
+    """Return the ids of the configuration's objects.
 
     Raises:
-        ConfigError: an id is not in the pack, or the pack has no objects.
+        ConfigError: an id is not in the pack, the pack has no objects, or too few are alike for a relation.
     """
     wanted = sorted(pack.objects) if config.objects.ids == "all" else config.objects.ids
     ids = resolve_ids(pack, wanted, key="objects.ids")
@@ -107,21 +101,14 @@ def find_objects(pack: Pack, config: TaskConfig) -> list[str]:
 
 
 def _check_relations(pack: Pack, config: TaskConfig, ids: list[str]) -> None:
-    """Check that a layout can have objects enough of a name for the relations that a configuration asks for.
-
-    All of them together, the default, stand for those that can be.
-
-    Raises:
-        ConfigError: it can't.
-    """
+    """Check that a layout can have enough objects of a name for each relation; all relations stand for those it can."""
     asked, layout, random = config.target.relations, config.layout, config.randomisation
     named = "relation" in TASKS[config.task].slots
     if not named or not isinstance(layout, OrderlyLayout) or set(asked) == set(RELATIONS):
         return
     wrong = [relation for relation in asked if relation in NEED_THREE]
     sets = [resolve_ids(pack, names, key="randomisation.object_sets") for names in random.object_sets or ()] or [ids]
-    count, repeats = config.objects.count, config.objects.repeats
-    most = max(_most_alike(pack, names, layout.copies, count, repeats=repeats) for names in sets)
+    most = max(_most_alike(pack, names, config, layout.copies) for names in sets)
     if random.distractors and random.distractors.count[1]:  # may be of the same name
         most += random.distractors.count[1]
     if wrong and most < 3:
@@ -133,9 +120,10 @@ def _check_relations(pack: Pack, config: TaskConfig, ids: list[str]) -> None:
         )
 
 
-def _most_alike(pack: Pack, ids: list[str], copies: int, count: int, *, repeats: bool) -> int:
-    """How many objects of one name a layout may have at most."""
-    if repeats:
+def _most_alike(pack: Pack, ids: list[str], config: TaskConfig, copies: int) -> int:
+    """Return how many objects of one name a layout may have at most."""
+    count = config.objects.count
+    if config.objects.repeats:
         return count
     names = Counter(pack.objects[i].asset.name for i in ids)
     kinds = -(-count // copies)
@@ -144,7 +132,7 @@ def _most_alike(pack: Pack, ids: list[str], copies: int, count: int, *, repeats:
 
 
 def resolve_ids(pack: Pack, wanted: list[str | int] | list[str], *, key: str) -> list[str]:
-    """Ids of a pack's objects, from ids or GraspNet-1Billion's numbers.
+    """Return the ids of a pack's objects, from ids or GraspNet-1Billion's numbers.
 
     Raises:
         ConfigError: one is not in the pack.
@@ -161,29 +149,23 @@ def resolve_ids(pack: Pack, wanted: list[str | int] | list[str], *, key: str) ->
         likely = " ".join(filter(None, (nearest(i, pack.objects) for i in unknown)))
         if likely:
             expected = f"ids of `robocas assets info {pack.name}`"
-        raise ConfigError(
-            f"{key}: no such object in pack {pack.name!r}", expected=expected, found=", ".join(unknown), fix=likely
-        )
+        what = f"{key}: no such object in pack {pack.name!r}"
+        raise ConfigError(what, expected=expected, found=", ".join(unknown), fix=likely)
     return ids
 
 
 def find_region(config: SurfaceConfig, furniture: LoadedFurniture) -> Region:
-    """Rectangle that objects are placed on, in the furniture's frame.
+    """Return the rectangle that objects are placed on, in the furniture's frame.
 
     Raises:
         ConfigError: the furniture has no such surface, or the rectangle sticks out of it.
     """
     surfaces = furniture.asset.surfaces
-    if config.name not in surfaces:
-        raise ConfigError("surface.name: no such surface", expected=f"one of {sorted(surfaces)}", found=config.name)
+    _check_known("surface.name: no such surface", config.name, surfaces)
     whole = surfaces[config.name]
     if config.min_xy is None or config.max_xy is None:
         return Region(whole.min_xy, whole.max_xy, whole.z)
-    inside = all(
-        low <= a and b <= high
-        for low, a, b, high in zip(whole.min_xy, config.min_xy, config.max_xy, whole.max_xy, strict=True)
-    )
-    if not inside:
+    if not (np.greater_equal(config.min_xy, whole.min_xy) & np.less_equal(config.max_xy, whole.max_xy)).all():
         raise ConfigError(
             f"surface: the rectangle lies outside surface {config.name!r} of {furniture.asset.id!r}",
             expected=f"within {whole.min_xy}..{whole.max_xy}",
@@ -193,17 +175,15 @@ def find_region(config: SurfaceConfig, furniture: LoadedFurniture) -> Region:
 
 
 def check_joints(config: TaskConfig, furniture: dict[str, LoadedFurniture]) -> None:
-    """Check where doors and drawers stand at first, and that there is one to open, not open yet, which a pull can open.
+    """Check positions of doors and drawers, and that the one to open is closed at first and can be pulled open.
 
     Raises:
-        ConfigError: no such joint or handle, or a position or share that can't be.
+        ConfigError: no such joint or handle, or a position or share out of range.
     """
     for name, item in config.furniture.items():
         known = {link.joint.name: link.joint.limits for link in furniture[name].asset.links}
         for joint, position in item.joints.items():
-            if joint not in known:
-                where = f"furniture.{name}.joints: no such joint"
-                raise ConfigError(where, expected=f"one of {sorted(known)}", found=joint)
+            _check_known(f"furniture.{name}.joints: no such joint", joint, known)
             low, high = known[joint]
             if not low <= position <= high:
                 where = f"furniture.{name}.joints.{joint}: out of its limits"
@@ -211,9 +191,7 @@ def check_joints(config: TaskConfig, furniture: dict[str, LoadedFurniture]) -> N
     opening = config.opening
     if opening is None:
         return
-    handles = furniture[opening.furniture].asset.handles
-    if opening.handle not in handles:
-        raise ConfigError("opening.handle: no such handle", expected=f"one of {sorted(handles)}", found=opening.handle)
+    _check_known("opening.handle: no such handle", opening.handle, furniture[opening.furniture].asset.handles)
     joint = find_opened_joint(config, furniture)
     limit = OPENED_AT_MOST[joint.kind]
     if opening.opened_at >= limit:
@@ -235,7 +213,7 @@ def check_joints(config: TaskConfig, furniture: dict[str, LoadedFurniture]) -> N
 
 
 def find_opened_joint(config: TaskConfig, furniture: dict[str, LoadedFurniture]) -> Joint:
-    """The joint of the configuration's handle."""
+    """Return the joint of the configuration's handle."""
     opening = config.opening
     assert opening is not None
     asset = furniture[opening.furniture].asset

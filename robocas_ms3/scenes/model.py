@@ -1,4 +1,4 @@
-"""A configuration and the assets it names, looked up and checked. No simulator."""
+"""A configuration with its assets, looked up and checked. No simulator."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from robocas_ms3.scenes.placement import Array, Region
 
 @dataclass(frozen=True)
 class SceneModel:
-    """What every scene of a configuration is made of. Poses are 4x4 in the world where no seed has moved anything.
+    """A configuration with its assets. Poses are 4x4 in the world where no seed has moved anything.
 
     Attributes:
         config: the configuration.
-        object_pack: where objects come from.
+        object_pack: pack of the objects.
         object_ids: ids that objects are drawn from.
         room: the room.
         furniture: by the configuration's names.
@@ -67,14 +67,8 @@ class SceneModel:
     ) -> SceneModel:
         """Look up all assets of a configuration.
 
-        Args:
-            config: the configuration.
-            object_pack: of its objects.
-            furniture_pack: of everything else.
-            robot: that is to work there.
-
         Raises:
-            ConfigError: an asset is unknown or can't play its part, or where it stands it can't (`check_clearance`).
+            ConfigError: an asset is unknown or unfit for its use, or things overlap or are out of the robot's reach.
         """
         furniture = {
             name: find_furniture(furniture_pack, item.asset, key=f"furniture.{name}.asset")
@@ -94,16 +88,12 @@ class SceneModel:
             region=find_region(config.surface, furniture[config.surface.furniture]),
         )
         check_joints(config, furniture)
-        check_clearance(
-            config,
-            model.room,
-            furniture,
-            model.furniture_poses,
-            (basket, model.basket_pose) if basket and model.basket_pose is not None else None,
-            model.robot_pose,
-            (model.region, model.support_pose @ model.support_motion(opened=True)),
-            robot,
-        )
+        placed = {f"furniture.{name}": (asset, model.furniture_poses[name]) for name, asset in furniture.items()}
+        placed["room"] = model.room, np.eye(4)
+        if basket and model.basket_pose is not None:
+            placed["basket"] = basket, model.basket_pose
+        frame = model.support_pose @ model.support_motion(opened=True)
+        check_clearance(config, placed, (model.region, frame), model.robot_pose, robot)
         return model
 
     @property
@@ -113,31 +103,31 @@ class SceneModel:
 
     @property
     def headroom(self) -> float:
-        """Free height above what objects stand on, m; infinite under the open sky."""
+        """Free height above the surface, m; infinite where nothing is above."""
         surface = self.config.surface
         return self.furniture[surface.furniture].asset.surfaces[surface.name].headroom or np.inf
 
     @property
     def support_link(self) -> str:
-        """Moving part of that furniture that objects stand on; empty: its body."""
+        """Moving part that objects stand on; empty: the body of the furniture."""
         surface = self.config.surface
         return self.furniture[surface.furniture].asset.surfaces[surface.name].link
 
     @property
     def opened_joint(self) -> Joint | None:
-        """The joint that has to be opened, if any."""
+        """Joint that has to be opened, if any."""
         return find_opened_joint(self.config, self.furniture) if self.config.opening else None
 
     @property
     def opened_position(self) -> float:
-        """Joint position, m or rad, from which that joint counts as opened; its sign says which way it opens."""
+        """Joint position, m or rad, from which that joint counts as opened; its sign is the direction of opening."""
         joint, opening = self.opened_joint, self.config.opening
         assert joint is not None
         assert opening is not None
         return opening.opened_at * max(joint.limits, key=abs)
 
     def joint_positions(self, name: str, *, opened: bool) -> dict[str, float]:
-        """Positions of a piece of furniture's joints by name: as at first or as the task wants them; others 0."""
+        """Return the joint positions of a piece of furniture by name, as at first or once opened; others are 0."""
         positions = dict(self.config.furniture[name].joints)
         joint, opening = self.opened_joint, self.config.opening
         if opened and joint is not None and opening is not None and opening.furniture == name:
@@ -145,7 +135,7 @@ class SceneModel:
         return positions
 
     def support_motion(self, *, opened: bool) -> Array:
-        """4x4 by which joints have moved what objects stand on from where it is when closed, in the support's frame."""
+        """Return 4x4 by which joints have moved the surface from its closed pose, in the support's frame."""
         name = self.config.surface.furniture
         if not self.support_link:
             return np.eye(4)
@@ -153,24 +143,20 @@ class SceneModel:
         return link_poses(self.furniture[name].asset.links, positions)[self.support_link]
 
     def fixture_points(self, basket_pose: Array | None, *, opened: bool = False) -> Array:
-        """Samples (P, 3) of the collision surfaces of furniture and basket, world, m.
+        """Return samples (P, 3) of the collision surfaces of furniture and basket, world, m.
 
         Args:
             basket_pose: 4x4; None where there is no basket.
-            opened: with what the task wants opened as it should be.
+            opened: with the door or drawer of the task opened.
         """
-        furniture = self._opened_points if opened else self._closed_points
+        furniture = self._opened_points if opened else self.furniture_points
         if self.basket is None or basket_pose is None:
             return furniture
         return np.concatenate([furniture, transform(basket_pose, self.basket.surface_points())])
 
-    @property
+    @cached_property
     def furniture_points(self) -> Array:
         """Samples (P, 3) of the collision surfaces of furniture, doors and drawers as at first, world, m."""
-        return self._closed_points
-
-    @cached_property
-    def _closed_points(self) -> Array:
         return self._furniture_points(opened=False)
 
     @cached_property

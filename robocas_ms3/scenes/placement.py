@@ -1,7 +1,8 @@
-"""Layouts: where objects stand on a surface. Pure maths, no simulator."""
+"""Places of objects on a surface: scattered, or in columns. No simulator."""
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,25 +12,20 @@ from numpy.typing import NDArray
 from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.core.poses import planar
 from robocas_ms3.core.words import count_of
+from robocas_ms3.scenes.config.task import OrderlyLayout, ScatteredLayout
 
 Array = NDArray[np.float64]
 
 _TIGHT = 0.3  # share of the tries after which objects are packed rather than strewn
 _TRIES_AT_ONCE = 40  # positions of one object before the layout starts over
+# Builtin products show their label to their own -y, and resting poses have no yaw of their own, so that in every one
+# the label looks to -y of the plane or up, text upright for someone who stands at -y.
+_LABEL_YAW = -np.pi / 2
 
 
 @dataclass(frozen=True)
 class PlaceableObject:
-    """What a layout has to know of one object.
-
-    Attributes:
-        name: for messages.
-        resting_poses: (S, 4, 4) object in a frame whose z = 0 is the support and whose origin lies below the object's
-            centre of mass, m.
-        probabilities: (S,) how often the object comes to rest so; any positive scale.
-        footprints: S convex polygons (K, 2): the object's outline from above in each resting pose, m.
-        display_pose: index of the resting pose in which it stands upright, or -1.
-    """
+    """An object to be placed; the arrays are those of `assets.annotations.Annotations`."""
 
     name: str
     resting_poses: Array
@@ -48,18 +44,11 @@ class Region:
 
 
 def sample_scattered(
-    rng: np.random.Generator, placeables: list[PlaceableObject], region: Region, *, min_gap: float, max_tries: int
+    rng: np.random.Generator, placeables: list[PlaceableObject], region: Region, layout: ScatteredLayout
 ) -> Array:
     """Place objects apart from each other, each in one of its resting poses at a random yaw.
 
     Big objects are placed first, since they are the hard ones; when one finds no room, the layout starts over.
-
-    Args:
-        rng: source of all randomness.
-        placeables: the objects.
-        region: rectangle that holds every footprint.
-        min_gap: least distance between two footprints, m.
-        max_tries: positions tried in all before giving up.
 
     Returns:
         (K, 4, 4) objects in the region's frame, in the order of ``placeables``.
@@ -67,7 +56,7 @@ def sample_scattered(
     Raises:
         LayoutError: the objects don't fit.
     """
-    tries = 0
+    tries, max_tries, min_gap = 0, layout.max_tries, layout.min_gap
     all_areas = [np.array([shapely.Polygon(footprint).area for footprint in p.footprints]) for p in placeables]
     while tries < max_tries:
         poses = np.zeros((len(placeables), 4, 4))
@@ -103,7 +92,7 @@ def sample_scattered(
 
 
 def _snuggest(outlines: NDArray, placed: list[shapely.Polygon], region: Region) -> int:
-    """The outline that is nearest to its two nearest neighbours, the region's edges being neighbours too."""
+    """Return the index of the outline nearest to its two nearest neighbours; the region's edges are neighbours too."""
     low, high = shapely.bounds(outlines)[:, :2], shapely.bounds(outlines)[:, 2:]
     gaps = [low - region.min_xy, np.subtract(region.max_xy, high)]
     if placed:
@@ -112,7 +101,7 @@ def _snuggest(outlines: NDArray, placed: list[shapely.Polygon], region: Region) 
 
 
 def _candidates(rng: np.random.Generator, footprint: Array, region: Region) -> tuple[Array, Array, NDArray]:
-    """Random yaws (n,), positions (n, 2) and outlines (n,) of a footprint inside a region; fewer where it is narrow."""
+    """Draw yaws (n,), positions (n, 2) and outlines (n,) of a footprint in a region; fewer where it is narrow."""
     yaws = rng.uniform(-np.pi, np.pi, _TRIES_AT_ONCE)
     shares = rng.uniform(0, 1, (_TRIES_AT_ONCE, 2))
     cos, sin = np.cos(yaws), np.sin(yaws)
@@ -128,6 +117,98 @@ def _choose_pose(rng: np.random.Generator, placeable: PlaceableObject, areas: Ar
     weights = np.asarray(placeable.probabilities, dtype=float)
     drawn = rng.choice(len(weights), size=draws, p=weights / weights.sum())
     return int(drawn[np.argmin(areas[drawn])])
+
+
+def sample_orderly(
+    rng: np.random.Generator, placeables: list[PlaceableObject], region: Region, layout: OrderlyLayout, front: Array
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Stand objects in columns that begin at the front edge, labels to the front.
+
+    All objects stand in their display pose, or, where there is none, in the most probable one. Neighbouring columns
+    are as far apart as the mean of their widths times ``column_spacing``. What is drawn: the order of the columns,
+    those of one kind of object staying together, and where in the free room along the edge the block stands.
+
+    Args:
+        rng: source of all randomness.
+        placeables: K objects.
+        region: rectangle that holds every footprint.
+        layout: sizes of columns and gaps; ``keep_what_fits`` leaves out the first column that doesn't fit, all after
+            it, and objects behind the region.
+        front: (2,) unit vector along an axis of the region's frame, out of the front edge.
+
+    Returns:
+        (K, 4, 4) objects in the region's frame, in the order of ``placeables``; (K,) which of them there is room for.
+
+    Raises:
+        LayoutError: the columns don't fit side by side, or one is too long; or nothing fits at all.
+    """
+    columns = _columns(placeables, layout.rows)
+    along = np.array([-front[1], front[0]])  # the front edge's own direction
+    jitter = np.deg2rad(layout.yaw_jitter_deg)
+    yaws = np.arctan2(front[1], front[0]) - _LABEL_YAW + rng.uniform(-jitter, jitter, len(placeables))
+    if layout.column_yaw == "random":
+        turns = {column: rng.uniform(-np.pi, np.pi) for column in dict.fromkeys(columns)}
+        yaws += [turns[column] for column in columns]
+    choices = [p.display_pose if p.display_pose >= 0 else int(np.argmax(p.probabilities)) for p in placeables]
+    low, high = np.zeros((len(placeables), 2)), np.zeros((len(placeables), 2))  # extents along the edge, and ahead
+    for i, (placeable, choice, yaw) in enumerate(zip(placeables, choices, yaws, strict=True)):
+        turned = placeable.footprints[choice] @ planar(0, 0, 0, yaw)[:2, :2].T @ np.column_stack([along, front])
+        low[i], high[i] = turned.min(axis=0), turned.max(axis=0)
+
+    members = _ordered(rng, columns)
+    widths = np.array([max(high[i, 0] - low[i, 0] for i in column) for column in members])
+    centers = np.concatenate([[0.0], np.cumsum(layout.column_spacing * (widths[1:] + widths[:-1]) / 2)])
+    taken = centers + (widths[0] + widths) / 2  # by the columns up to each
+    corners = np.array([region.min_xy, region.max_xy]) @ np.column_stack([along, front])
+    (left, back), (right, edge) = corners.min(axis=0), corners.max(axis=0)
+    count = int((taken <= right - left).sum()) if layout.keep_what_fits else len(members)
+    if count == 0 or taken[count - 1] > right - left:
+        raise _does_not_fit(f"{count_of(len(members), 'column')} side by side", taken[count - 1], right - left)
+    start = left + widths[0] / 2 + rng.uniform() * (right - left - taken[count - 1])
+
+    poses, there = np.tile(np.eye(4), (len(placeables), 1, 1)), np.zeros(len(placeables), dtype=bool)
+    for column, center in zip(members[:count], start + centers[:count], strict=True):
+        free = edge  # what is left of the column begins here
+        for i in column:
+            x, y = (center - (low[i, 0] + high[i, 0]) / 2) * along + (free - high[i, 1]) * front
+            poses[i] = planar(x, y, region.z, yaws[i]) @ placeables[i].resting_poses[choices[i]]
+            free -= high[i, 1] - low[i, 1] + layout.row_gap
+            depth = edge - free - layout.row_gap
+            there[i] = depth <= edge - back
+        if not there[column].all() and not layout.keep_what_fits:
+            raise _does_not_fit(f"{len(column)} x {placeables[column[0]].name} in a column", depth, edge - back)
+    if not there.any():
+        raise _does_not_fit("even the first objects of the columns", min(high[:, 1] - low[:, 1]), edge - back)
+    return poses, there
+
+
+def _columns(placeables: list[PlaceableObject], rows: int) -> list[tuple[str, int]]:
+    """Return the column of each object, kind and number: objects of a kind, at most ``rows`` of them."""
+    seen: Counter[str] = Counter()
+    columns = []
+    for placeable in placeables:
+        columns.append((placeable.name, seen[placeable.name] // rows))
+        seen[placeable.name] += 1
+    return columns
+
+
+def _ordered(rng: np.random.Generator, columns: list[tuple[str, int]]) -> list[list[int]]:
+    """Return the objects of each column, in the order of the columns along the edge: kinds are shuffled."""
+    kinds: dict[str, dict[int, list[int]]] = {}
+    for i, (kind, number) in enumerate(columns):
+        kinds.setdefault(kind, {}).setdefault(number, []).append(i)
+    names = list(kinds)
+    return [column for k in rng.permutation(len(names)) for column in kinds[names[k]].values()]
+
+
+def _does_not_fit(what: str, needed: float, room: float) -> LayoutError:
+    return LayoutError(
+        f"{what} don't fit on the surface",
+        where="layout",
+        expected=f"at most {room:.2f} m",
+        found=f"{needed:.2f} m",
+        fix="Lower objects.count, layout.rows, layout.copies or layout.column_spacing, or enlarge the surface.",
+    )
 
 
 def choose_objects(rng: np.random.Generator, ids: list[str], count: int, *, repeats: bool = False) -> list[str]:

@@ -15,8 +15,7 @@ from robocas_ms3.scenes.config.task import OrderlyLayout, ScatteredLayout, Stack
 from robocas_ms3.scenes.layout import PARKING_HEIGHT, Layout, ObjectIds
 from robocas_ms3.scenes.lookup import resolve_ids
 from robocas_ms3.scenes.model import SceneModel
-from robocas_ms3.scenes.orderly import sample_orderly
-from robocas_ms3.scenes.placement import Array, PlaceableObject, choose_objects, sample_scattered
+from robocas_ms3.scenes.placement import Array, PlaceableObject, choose_objects, sample_orderly, sample_scattered
 from robocas_ms3.scenes.settle import settle
 from robocas_ms3.scenes.stacked import drop_heap
 from robocas_ms3.scenes.standing import place_basket, place_robot
@@ -25,18 +24,18 @@ from robocas_ms3.scenes.task_specs import TASKS
 
 # Every random decision of a scene has a stream of its own, so that a new one never shifts the others.
 _OBJECTS, _LAYOUT, _TARGET, _ROBOT, _BASKET, _COUNT = range(6)
-_SETS, _TRIES = 5, 10  # sets of objects that a seed may go on to, and layouts of each
+_SETS, _TRIES = 5, 10  # sets of objects that a seed tries, and layouts of each
 _KINDS = 50  # tries to find kinds whose columns fit
-_SEVERAL = 5  # layouts without a target, of which the target is to blame, not that others did not come to rest
+_SEVERAL = 5  # layouts without a target, from which on the error blames the target
 _log = logging.getLogger(__name__)
 
 
 def object_set(model: SceneModel, objects_seed: int, number: int = 0) -> ObjectIds:
-    """A set of objects, one id a slot: those of the task, then distractors.
+    """Draw a set of objects, an id per slot: those of the task, then distractors.
 
     Args:
         model: the scene's assets.
-        objects_seed: decides them, and nothing else but ``number`` does.
+        objects_seed: seed of the objects.
         number: which of the sets that the seed draws one after the other.
 
     Raises:
@@ -48,11 +47,10 @@ def object_set(model: SceneModel, objects_seed: int, number: int = 0) -> ObjectI
     if config.randomisation.object_sets:
         wanted = config.randomisation.object_sets[rng.integers(len(config.randomisation.object_sets))]
         ids = resolve_ids(model.object_pack, wanted, key="randomisation.object_sets")
-    count = config.objects.count
     if isinstance(config.layout, OrderlyLayout):
         chosen = _kinds_that_fit(rng, model, _usable(model, ids, columns=True), config.layout.copies)
     else:
-        chosen = choose_objects(rng, _usable(model, ids), count, repeats=config.objects.repeats)
+        chosen = choose_objects(rng, _usable(model, ids), config.objects.count, repeats=config.objects.repeats)
     distractors = config.randomisation.distractors
     if distractors is not None:
         others = _usable(model, resolve_ids(model.object_pack, distractors.ids, key="randomisation.distractors.ids"))
@@ -68,7 +66,7 @@ def sample_layout(model: SceneModel, objects_seed: int, seed: int, object_ids: O
 
     Args:
         model: the scene's assets.
-        objects_seed: decides the objects; on a CPU the same as ``seed``.
+        objects_seed: decides the objects; with a single env the same as ``seed``.
         seed: decides everything else.
         object_ids: the objects of ``objects_seed``, where they are known: it takes its own layout to know them.
 
@@ -116,11 +114,11 @@ def sample_layout(model: SceneModel, objects_seed: int, seed: int, object_ids: O
                 basket_pose = place_basket(model, robot_pose, basket_rng)
                 unsettled += 1
                 continue
-            settled = settle(used, placed, model, basket_pose, heap=isinstance(config.layout, StackedLayout))
-            if not settled.stable:
+            heap = isinstance(config.layout, StackedLayout)
+            poses[present], stable = settle(used, placed, model, basket_pose, heap=heap)
+            if not stable:
                 unsettled += 1
                 continue
-            poses[present] = settled.poses
             scene = Arrangement(model, assets, poses, present, candidate & present, robot_pose, basket_pose)
             if (choice := choose_target(target_rng, scene)) is not None:
                 return Layout(
@@ -133,14 +131,7 @@ def sample_layout(model: SceneModel, objects_seed: int, seed: int, object_ids: O
 def meets_basket(
     assets: list[LoadedObject], poses: Array, basket: LoadedFurniture | None, basket_pose: Array | None
 ) -> bool:
-    """Whether an object is in the basket, or where its walls are, judged by boxes around them.
-
-    Args:
-        assets: K objects.
-        poses: (K, 4, 4) in the world.
-        basket: what may have been moved among them; None: there is none to meet.
-        basket_pose: 4x4 in the world.
-    """
+    """Return whether an object at its pose (K, 4, 4) is in the basket, or meets its walls, judged by bounding boxes."""
     if basket is None or basket_pose is None:
         return False
     walls = np.concatenate(basket.hulls)
@@ -153,7 +144,7 @@ def meets_basket(
 
 
 def _failure(model: SceneModel, unarranged: list[LayoutError], unsettled: int, untargeted: int) -> LayoutError:
-    """What to say of a layout that could not be made: where several came to rest, that none had a target."""
+    """Return the error of a layout that could not be made: no target, where several came to rest."""
     if untargeted < _SEVERAL and len(unarranged) > _SETS * _TRIES // 2:
         return unarranged[-1]
     found = (
@@ -165,16 +156,16 @@ def _failure(model: SceneModel, unarranged: list[LayoutError], unsettled: int, u
         return LayoutError("the objects don't come to rest", where="layout", found=found, fix=fix)
     lower = ", ".join(target_rule(model.config.task).keys)
     fix = f"Raise target.max_distance, lower target.{lower} or min_free_grasps, or use other objects."
-    if "relation" in TASKS[model.config.task].slots:
-        names = ", ".join(model.config.target.relations)
-        fix = (f"Give other target.relations than {names}, or more layout.copies. " if names else "") + fix
+    relations = ", ".join(model.config.target.relations)
+    if relations and "relation" in TASKS[model.config.task].slots:
+        fix = f"Give other target.relations than {relations}, or more layout.copies. {fix}"
     return LayoutError("no object qualifies as the target", where="target", found=found, fix=fix)
 
 
 def _kinds_that_fit(rng: np.random.Generator, model: SceneModel, ids: list[str], copies: int) -> list[str]:
     """Draw kinds until their columns fit on the surface."""
     objects, count = model.object_pack.objects, model.config.objects.count
-    failure = LayoutError("no kinds to choose from", where="objects.ids")
+    failure = LayoutError("no kinds fit", where="objects.ids")
     for attempt in range(_KINDS):
         kinds = choose_objects(rng, ids, -(-count // copies), repeats=model.config.objects.repeats)
         chosen = [kind for kind in kinds for _ in range(copies)][:count]
@@ -187,7 +178,7 @@ def _kinds_that_fit(rng: np.random.Generator, model: SceneModel, ids: list[str],
 
 
 def _usable(model: SceneModel, ids: list[str], *, columns: bool = False) -> list[str]:
-    """Those of some ids that fit under what is above; for columns only those with a display pose, if any has one.
+    """Return the ids of objects that fit under what is above; for columns those with a display pose, if any has one.
 
     Raises:
         LayoutError: none fits.
@@ -202,12 +193,12 @@ def _usable(model: SceneModel, ids: list[str], *, columns: bool = False) -> list
     if columns:
         usable = [i for i in usable if things[i].display_pose >= 0] or usable
     if model.config.objects.ids != "all" and len(usable) < len(ids):
-        _tell_left_out(tuple(i for i in ids if i not in usable))
+        _warn_left_out(tuple(i for i in ids if i not in usable))
     return usable
 
 
 @lru_cache  # once each
-def _tell_left_out(ids: tuple[str, ...]) -> None:
+def _warn_left_out(ids: tuple[str, ...]) -> None:
     _log.warning(
         "objects left out, since no resting pose fits under what is above the surface, or, in an orderly layout, "
         "since they have no display pose that does: %s",
@@ -216,7 +207,7 @@ def _tell_left_out(ids: tuple[str, ...]) -> None:
 
 
 def placeable(asset: LoadedObject, headroom: float = np.inf) -> PlaceableObject:
-    """What a layout has to know of an object: its resting poses that are lower than ``headroom``, m."""
+    """Return an object with its resting poses that are lower than ``headroom``, m."""
     notes = asset.annotations
     low = np.arange(len(notes.resting_poses))
     if np.isfinite(headroom):
@@ -234,40 +225,18 @@ def placeable(asset: LoadedObject, headroom: float = np.inf) -> PlaceableObject:
 def _arrange(
     rng: np.random.Generator, model: SceneModel, assets: list[LoadedObject]
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """(K, 4, 4) objects in the support's frame, (K,) which of them there is room for."""
+    """Return (K, 4, 4) objects in the support's frame, (K,) which of them there is room for."""
     layout, region, everything = model.config.layout, model.region, np.ones(len(assets), dtype=bool)
+    if isinstance(layout, StackedLayout):
+        return drop_heap(rng, assets, region, layout, headroom=model.headroom), everything
+    placeables = [placeable(asset, model.headroom) for asset in assets]
     if isinstance(layout, ScatteredLayout):
-        placeables = [placeable(asset, model.headroom) for asset in assets]
-        poses = sample_scattered(rng, placeables, region, min_gap=layout.min_gap, max_tries=layout.max_tries)
-        return poses, everything
-    if isinstance(layout, OrderlyLayout):
-        return sample_orderly(
-            rng,
-            [placeable(asset, model.headroom) for asset in assets],
-            _columns([asset.asset.id for asset in assets], layout.rows),
-            region,
-            front=model.front,
-            row_gap=layout.row_gap,
-            column_spacing=layout.column_spacing,
-            yaw_jitter=np.deg2rad(layout.yaw_jitter_deg),
-            turn_columns=layout.column_yaw == "random",
-            keep_what_fits=layout.keep_what_fits,
-        )
-    return drop_heap(rng, assets, region, layout, headroom=model.headroom), everything
-
-
-def _columns(ids: list[str], rows: int) -> list[str]:
-    """Name the column of each object: objects of a kind, at most ``rows`` of them."""
-    seen: dict[str, int] = {}
-    columns = []
-    for i in ids:
-        columns.append(f"{i}/{seen.get(i, 0) // rows}")
-        seen[i] = seen.get(i, 0) + 1
-    return columns
+        return sample_scattered(rng, placeables, region, layout), everything
+    return sample_orderly(rng, placeables, region, layout, model.front)
 
 
 def _presence(model: SceneModel, slots: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """(K,) which slots take part, (K,) which of them may be the target."""
+    """Draw (K,) which slots take part, (K,) which of them may be the target."""
     config = model.config
     count, random = config.objects.count, config.randomisation
     used = int(rng.integers(random.count[0], random.count[1] + 1)) if random.count else count

@@ -32,7 +32,7 @@ BUCKET_SECONDS = 1.0  # at most, after the last one
 SPREAD_SECONDS, OPEN_SECONDS = 2.0, 0.5  # at most: within a fence along the sides of the region, and without it
 SPREAD = 0.05  # m that centres of mass may lie outside the region in the end
 WALL = 0.05  # m, half its thickness
-_LOOK_EVERY = 10  # steps between two looks at whether everything lies still
+_LOOK_EVERY = 10  # steps between two checks whether everything is at rest
 _TRIES = 40
 
 # Evenly spread unit vectors (64, 3), a Fibonacci lattice: an object's extreme points along them make its outline
@@ -50,11 +50,10 @@ def drop_heap(
     *,
     headroom: float = np.inf,
 ) -> Array:
-    """Drop objects into a frictionless bucket on a plane, then take the bucket away (upstream's way).
+    """Drop objects into a frictionless bucket on a plane, then take the bucket away (docs/layouts.md).
 
-    Other than upstream's, by default the bucket is a little smaller than the region, and small objects rather fall
-    first: this buries more of them (docs/layouts.md has figures). They fall as one convex hull each, one soon after the
-    other; the heap then spreads as what it really is, at first within a fence, which stops what would roll away.
+    They fall as one convex hull each, one soon after the other; the heap then spreads with all hulls of its objects, at
+    first within a fence, which stops what would roll away.
 
     Args:
         rng: source of all randomness.
@@ -70,7 +69,8 @@ def drop_heap(
         LayoutError: heap after heap fell apart over the region's edges, or was too high.
     """
     for _ in range(_TRIES):
-        poses = _drop(rng, assets, region, layout)
+        with engine_settings():
+            poses = _spread(assets, _fill_bucket(rng, assets, region, layout), region)
         centers = np.stack(
             [transform(p, np.array([a.asset.center_of_mass]))[0] for a, p in zip(assets, poses, strict=True)]
         )
@@ -88,16 +88,10 @@ def drop_heap(
     )
 
 
-def _drop(rng: np.random.Generator, assets: Sequence[LoadedObject], region: Region, layout: StackedLayout) -> Array:
-    """A heap (K, 4, 4), at rest as far as it came to."""
-    with engine_settings():
-        return _spread(assets, _fill_bucket(rng, assets, region, layout), region)
-
-
 def _fill_bucket(
     rng: np.random.Generator, assets: Sequence[LoadedObject], region: Region, layout: StackedLayout
 ) -> Array:
-    """Objects (K, 4, 4) that have fallen into the bucket, with their outlines for bodies."""
+    """Return poses (K, 4, 4) of objects that have fallen into the bucket, with their outlines for bodies."""
     # narrower buckets make higher heaps, which spread when the walls are gone
     middle, half = _middle(region), layout.bucket * np.subtract(region.max_xy, region.min_xy) / 2
     scene = new_scene()
@@ -120,7 +114,7 @@ def _fill_bucket(
 
 
 def _spread(assets: Sequence[LoadedObject], poses: Array, region: Region) -> Array:
-    """Objects (K, 4, 4) after the bucket is gone, and then the fence."""
+    """Return poses (K, 4, 4) of objects after the bucket is gone, and then the fence."""
     middle = _middle(region)
     scene = new_scene()
     add_ground(scene, np.array([*middle, region.z]))
@@ -136,7 +130,7 @@ def _spread(assets: Sequence[LoadedObject], poses: Array, region: Region) -> Arr
 
 
 def outline(asset: LoadedObject) -> Array:
-    """Points (V, 3), at most 64, whose convex hull is about that of the object, m, in the asset's frame."""
+    """Return points (V, 3), at most 64, whose convex hull is about that of the object, m, in the asset's frame."""
     points = np.concatenate(asset.hulls)
     return points[np.unique(np.argmax(points @ _DIRECTIONS.T, axis=0))]
 
@@ -146,10 +140,7 @@ def _middle(region: Region) -> Array:
 
 
 def falling_order(rng: np.random.Generator, assets: Sequence[LoadedObject], noise: float | None) -> NDArray[np.intp]:
-    """Indices in the order of falling: small ones rather first, each one's size times a random factor.
-
-    ``noise`` is the deviation of that factor's logarithm; None: in any order.
-    """
+    """Draw the order of falling: by size times a random factor, whose logarithm deviates by ``noise``; None: any."""
     if noise is None:
         return rng.permutation(len(assets))
     sizes = np.array([np.prod(asset.asset.extents) for asset in assets])
@@ -157,7 +148,7 @@ def falling_order(rng: np.random.Generator, assets: Sequence[LoadedObject], nois
 
 
 def _falling_pose(rng: np.random.Generator, asset: LoadedObject, tumble: float) -> Array:
-    """4x4 about the object's own centre of mass."""
+    """Draw 4x4 about the object's own centre of mass."""
     notes = asset.annotations
     if rng.uniform() < tumble:
         pose = np.eye(4)
@@ -169,7 +160,7 @@ def _falling_pose(rng: np.random.Generator, asset: LoadedObject, tumble: float) 
 
 
 def _add_walls(scene: sapien.Scene, middle: Array, half: Array, z: float) -> list[sapien.Entity]:
-    """Four frictionless walls around a rectangle."""
+    """Add four frictionless walls around a rectangle."""
     slippery = physx.PhysxMaterial(0.0, 0.0, 0.0)
     walls = []
     for axis, sign in ((0, -1), (0, 1), (1, -1), (1, 1)):

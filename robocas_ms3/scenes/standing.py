@@ -17,14 +17,14 @@ from robocas_ms3.scenes.placement import Array
 from robocas_ms3.scenes.settle import add_furniture
 
 STAND_SECONDS = 1.0
-MAX_SHIFT, MAX_TURN_DEG = 0.005, 2.0  # meanwhile, of a basket that stands
-LOAD = 0.5  # kg, of something in it
+MAX_SHIFT, MAX_TURN_DEG = 0.005, 2.0  # in STAND_SECONDS, of a basket that stands
+LOAD = 0.5  # kg
 _TRIES = 50
 _BODY_BOXES = PANDA_ENVELOPE.body_boxes  # whatever robot: a layout follows from its configuration and seeds alone
 
 
 def place_robot(model: SceneModel, rng: np.random.Generator) -> Array:
-    """4x4 of the robot's root, drawn until its body is clear of furniture; as configured where nothing moves it.
+    """Draw 4x4 of the robot's root until its body is clear of furniture; as configured where nothing moves it.
 
     Raises:
         LayoutError: it never is.
@@ -35,9 +35,10 @@ def place_robot(model: SceneModel, rng: np.random.Generator) -> Array:
 
 
 def place_basket(model: SceneModel, robot_pose: Array, rng: np.random.Generator) -> Array | None:
-    """4x4 of the basket's frame, drawn until it stands, clear of the robot; as configured where nothing moves it.
+    """Draw 4x4 of the basket's frame until it stands clear of the robot; as configured where nothing moves it.
 
-    None where there is no basket.
+    Returns:
+        None where there is no basket.
 
     Raises:
         LayoutError: it never does.
@@ -78,11 +79,11 @@ def _moved(pose: Array, by: PoseRandomisation, rng: np.random.Generator) -> Arra
 
 
 def body_is_free(base_in_world: Array, cloud: Array) -> bool:
-    """Whether none of some points is where the robot's body would be. Nothing below the floor is.
+    """Return whether no point (P, 3) in the world is in the robot's body; points below the floor are not.
 
     Args:
         base_in_world: 4x4 of a frame on the floor, turned as the mobile base is: the robot's root, base joints at 0.
-        cloud: (P, 3) world, m.
+        cloud: the points, m.
     """
     local = transform(np.asarray(np.linalg.inv(base_in_world), dtype=np.float64), cloud)
     x, y, z = np.abs(local[:, 0]), np.abs(local[:, 1]), local[:, 2]
@@ -91,17 +92,13 @@ def body_is_free(base_in_world: Array, cloud: Array) -> bool:
 
 
 def basket_stands(model: SceneModel, basket_pose: Array) -> bool:
-    """Whether the basket stays where it is put, also with something in any of its corners. Simulated, 30 ms.
+    """Simulate whether the basket stays at a pose 4x4 in the world, also with a load in any of its corners; 30 ms.
 
-    Over an edge it tips, in the air it falls, out of a wall it is pushed. Objects are no part of this.
-
-    Args:
-        model: where room and furniture stand; doors and drawers stay as at first.
-        basket_pose: 4x4 in the world.
+    Over an edge it tips, in the air it falls, out of a wall it is pushed.
     """
-    assert model.basket is not None  # there is a pose of it
+    assert model.basket is not None
     facts = model.basket.asset
-    assert facts.inner is not None  # the model saw to it
+    assert facts.inner is not None
     assert facts.mass is not None
     mass, own_center = facts.mass + LOAD, np.array(facts.center_of_mass)
     inertia, axes = np.array(facts.inertia), np.array(facts.inertia_wxyz)

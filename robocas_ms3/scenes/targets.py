@@ -18,7 +18,7 @@ from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.placement import Array
 from robocas_ms3.scenes.relations import related
 from robocas_ms3.scenes.task_specs import TASKS
-from robocas_ms3.scenes.visibility import PinholeCamera, object_mesh, top_down_camera, visible_shares
+from robocas_ms3.scenes.visibility import PinholeCamera, Scenery, object_mesh, top_down_camera
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Arrangement:
 
     Attributes:
         model: configuration and assets.
-        assets: one a slot.
+        assets: of the K slots.
         poses: (K, 4, 4).
         present: (K,) which slots take part.
         candidate: (K,) which may be the target: present, and no distractor.
@@ -60,7 +60,7 @@ class Arrangement:
 
     @property
     def names(self) -> list[str]:
-        """What the K objects are called."""
+        """Names of the K objects."""
         return [asset.asset.name for asset in self.assets]
 
     @cached_property
@@ -90,7 +90,7 @@ class Arrangement:
         return self.model.fixture_points(self.basket_pose, opened=True)
 
     def has_free_grasps(self, slot: int) -> bool:
-        """Whether enough of an object's grasps are clear of everything else."""
+        """Return whether enough of an object's grasps are clear of everything else."""
         others = [
             transform(self.opened_poses[other], self.assets[other].surface_points())
             for other in np.flatnonzero(self.present)
@@ -99,7 +99,7 @@ class Arrangement:
         return self._has_grasps(slot, others, self.model.config.target.min_free_grasps)
 
     def has_uncovered_grasps(self, slot: int) -> bool:
-        """Whether enough of an object's grasps would be clear with all other objects out of the way."""
+        """Return whether enough of an object's grasps would be clear with all other objects out of the way."""
         return self._has_grasps(slot, [], self.model.config.target.min_uncovered_grasps)
 
     def _has_grasps(self, slot: int, others: list[Array], at_least: int) -> bool:
@@ -113,7 +113,7 @@ class Arrangement:
         )
 
     def _within_reach(self, slot: int, other: int) -> bool:
-        """Whether any of an object comes near enough to another one to be in its grasps' way; cheap, to be sure."""
+        """Return False where an object is certainly too far away from another to be in its grasps' way."""
         centers = self.opened_poses[[slot, other], :3, 3]
         radius = np.linalg.norm(np.concatenate(self.assets[other].hulls), axis=1).max()
         grasps = self.assets[slot].annotations.grasps_tcp_in_object[:, :3, 3]
@@ -123,7 +123,7 @@ class Arrangement:
 
 @dataclass(frozen=True)
 class TargetRule:
-    """How a target is chosen.
+    """A way to choose the target.
 
     Attributes:
         choose: from a generator and an arrangement; None where no object qualifies.
@@ -135,7 +135,7 @@ class TargetRule:
 
 
 def target_rule(task: str) -> TargetRule:
-    """The rule of a task."""
+    """Return the rule of a task."""
     return load(TASKS[task].target)
 
 
@@ -145,25 +145,18 @@ def choose_target(rng: np.random.Generator, scene: Arrangement) -> Choice | None
 
 
 def _by_name(rng: np.random.Generator, scene: Arrangement) -> Choice | None:
-    """Any object; its name is all the instruction says, so among same-named ones the nearest is meant."""
-    distances = np.linalg.norm(scene.xy_in_robot, axis=1)
+    """Choose any object; its name is all the instruction says, so among same-named ones the nearest is meant."""
     nearest: dict[str, int] = {}
-    for slot in np.argsort(distances, kind="stable"):
+    for slot in np.argsort(np.linalg.norm(scene.xy_in_robot, axis=1), kind="stable"):
         if scene.present[slot]:
             nearest.setdefault(scene.names[slot], int(slot))
     slots = sorted(slot for slot in nearest.values() if scene.eligible[slot])
-    return _first(rng, slots, scene.has_free_grasps)
-
-
-def _first(rng: np.random.Generator, slots: list[int], test: Callable[[int], bool]) -> Choice | None:
-    for slot in rng.permutation(np.array(slots, dtype=int)):
-        if test(int(slot)):
-            return Choice(int(slot))
-    return None
+    shuffled = rng.permutation(np.array(slots, dtype=int)).tolist()
+    return next((Choice(slot) for slot in shuffled if scene.has_free_grasps(slot)), None)
 
 
 def _by_relation(rng: np.random.Generator, scene: Arrangement) -> Choice | None:
-    """One of several identical objects, named by where it stands among them; or by its name alone, the nearest."""
+    """Choose one of several identical objects, named by where it is among them; or by its name alone, the nearest."""
     if not scene.model.config.target.relations:
         return _by_name(rng, scene)
     pairs = [(name, relation) for name in sorted(set(scene.names)) for relation in scene.model.config.target.relations]
@@ -177,7 +170,7 @@ def _by_relation(rng: np.random.Generator, scene: Arrangement) -> Choice | None:
 
 
 def selection_camera(model: SceneModel) -> PinholeCamera:
-    """The camera that p_vis is measured with: over the middle of the objects' region."""
+    """Return the camera that p_vis is measured with: over the middle of the objects' region."""
     region = model.region
     middle = np.append(np.add(region.min_xy, region.max_xy) / 2, region.z)
     center = transform(model.support_pose, middle[None])[0]
@@ -185,16 +178,16 @@ def selection_camera(model: SceneModel) -> PinholeCamera:
 
 
 def _by_visibility(rng: np.random.Generator, scene: Arrangement) -> Choice | None:
-    """A hidden object, near ones more often: weight 1 / distance to the robot (upstream's when it makes data).
+    """Choose a hidden object, near ones more often: weight 1 / distance to the robot (upstream's when it makes data).
 
-    One that can't be grasped as it lies is none, whatever lies on it: a can on its broad side, a screwdriver in a gap.
-    Upstream evaluates with any object, all alike: `max_visible_share` null, `weight` uniform, no grasps asked for.
+    An object whose grasps furniture or basket block does not qualify, whatever lies on it: a can on its broad side, a
+    screwdriver in a gap.
     """
     rules = scene.model.config.target
-    model, slots = scene.model, np.flatnonzero(scene.present)
-    camera = selection_camera(model)
+    slots = np.flatnonzero(scene.present)
     shares = np.full(len(scene.assets), np.nan)
-    shares[slots] = visible_shares(camera, [object_mesh(scene.assets[s]) for s in slots], scene.poses[slots])
+    scenery = Scenery([object_mesh(scene.assets[s]) for s in slots], scene.poses[slots])
+    shares[slots] = scenery.visible_shares(selection_camera(scene.model))
     unique = np.array([scene.names.count(name) == 1 for name in scene.names])
     fits = scene.eligible & unique
     if rules.max_visible_share is not None:

@@ -1,4 +1,4 @@
-"""How much of an object a camera sees (p_vis), by casting rays at its mesh: no renderer, no simulator."""
+"""How much of an object a camera sees (p_vis), by casting rays at its mesh. No renderer, no simulator."""
 
 from __future__ import annotations
 
@@ -26,12 +26,10 @@ _scenes: WeakKeyDictionary[trimesh.Trimesh, EmbreeScene] = WeakKeyDictionary()
 
 @dataclass(frozen=True)
 class PinholeCamera:
-    """A camera.
+    """A camera of ``width`` x ``height`` pixels.
 
     Attributes:
         pose: (4, 4) in the world, SAPIEN's convention: x forward, y left, z up; m.
-        width: pixels.
-        height: pixels.
         fov_y: vertical field of view, rad.
     """
 
@@ -42,18 +40,18 @@ class PinholeCamera:
 
     @property
     def focal_length(self) -> float:
-        """How far the picture lies behind the pinhole, pixels."""
+        """Focal length, pixels."""
         return self.height / 2 / np.tan(self.fov_y / 2)
 
     def rays(self, box: PixelBox) -> Array:
-        """(rows, columns, 3) directions through the centres of pixels, in the camera's frame; their x is 1."""
+        """Return directions (rows, columns, 3) through the centres of pixels, in the camera's frame; their x is 1."""
         rows, columns = np.mgrid[box]
         left = (self.width / 2 - columns - 0.5) / self.focal_length
         up = (self.height / 2 - rows - 0.5) / self.focal_length
         return np.stack([np.ones(rows.shape), left, up], axis=-1)
 
     def pixel_box(self, points: Array) -> PixelBox:
-        """Rows and columns within which points (P, 3) in the world appear; empty where they don't."""
+        """Return rows and columns within which points (P, 3) in the world appear; empty where they don't."""
         local = (points - self.pose[:3, 3]) @ self.pose[:3, :3]
         if local[:, 0].min() <= 1e-3:  # partly behind the camera: anywhere
             return slice(0, self.height), slice(0, self.width)
@@ -68,15 +66,7 @@ class PinholeCamera:
 def top_down_camera(
     center_xy: Array, support_z: float, *, height: float = 0.5, size: int = 512, fov: float = np.pi / 2
 ) -> PinholeCamera:
-    """Upstream's selection camera: straight down from ``height`` above the support (defaults: upstream's).
-
-    Args:
-        center_xy: (2,) m, world, what it looks at.
-        support_z: m, world.
-        height: m.
-        size: pixels, width and height.
-        fov: rad.
-    """
+    """Return a camera that looks straight down on (x, y) from ``height`` above the support; defaults: upstream's."""
     pose = np.eye(4)
     pose[:3, :3] = np.column_stack([(0, 0, -1.0), (0, 1.0, 0), (1.0, 0, 0)])
     pose[:3, 3] = *center_xy, support_z + height
@@ -91,13 +81,13 @@ def _mesh_of(path: Path, _changed_ns: int) -> trimesh.Trimesh:
 
 
 def object_mesh(asset: Part, level: VisualLevel = "fast") -> trimesh.Trimesh:
-    """The mesh that is rendered, in the asset's frame; shared, so not to be changed."""
+    """Return the mesh that is rendered, in the asset's frame; shared, so not to be changed."""
     path = asset.visual(level)
     return _mesh_of(path, path.stat().st_mtime_ns)
 
 
 class Scenery:
-    """Meshes where they stand, for rays from any number of cameras.
+    """Meshes at their poses, seen by any number of cameras.
 
     Args:
         meshes: K meshes.
@@ -111,34 +101,19 @@ class Scenery:
         self._placed = [*zip(meshes, poses, strict=True), *occluders]
         self._count = len(meshes)
 
-    def hit_ids(self, camera: PinholeCamera) -> NDArray[np.int_]:
-        """(height, width) index of the mesh that each pixel shows; K and above: occluders; -1: none."""
-        return self._look(camera)[0]
-
-    def full_mask(self, camera: PinholeCamera, index: int) -> NDArray[np.bool_]:
-        """(height, width) pixels that one mesh would fill with everything else hidden."""
-        mask = np.zeros((camera.height, camera.width), dtype=bool)
-        box, depths = _depths(camera, *self._placed[index])
-        mask[box] = depths < np.inf
-        return mask
-
-    def visible_pixels(self, camera: PinholeCamera) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
-        """(K,) pixels in which each mesh is seen, and (K,) pixels it would fill with everything else hidden."""
-        ids, full = self._look(camera)
-        visible = np.bincount(ids[ids >= 0], minlength=len(full))
-        return visible[: self._count], full[: self._count]
-
     def visible_shares(self, camera: PinholeCamera) -> Array:
-        """(K,) p_vis of each mesh, in 0..1; NaN where the camera would not see it at all."""
-        visible, full = self.visible_pixels(camera)
+        """Return p_vis = visible / full projected area of each mesh (K,), in 0..1; NaN where it is out of view."""
+        ids, full = self.segmentation(camera)
+        visible = np.bincount(ids[ids >= 0], minlength=len(full))[: self._count]
+        full = full[: self._count]
         return visible / np.where(full > 0, full, np.nan)
 
-    def visible_share(self, camera: PinholeCamera, index: int) -> float:
-        """p_vis of one mesh; 1 minus it is its hidden share."""
-        return float(self.visible_shares(camera)[index])
+    def segmentation(self, camera: PinholeCamera) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+        """Return what each pixel shows, and the pixels that each mesh would fill alone.
 
-    def _look(self, camera: PinholeCamera) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
-        """`hit_ids`, and the pixels that each mesh, occluders too, would fill alone."""
+        Returns:
+            (height, width) index of a mesh, K and above: occluders, -1: none; number of pixels per mesh and occluder.
+        """
         nearest = np.full((camera.height, camera.width), np.inf)
         ids, full = np.full(nearest.shape, -1), np.zeros(len(self._placed), dtype=int)
         for i, (mesh, pose) in enumerate(self._placed):
@@ -150,29 +125,8 @@ class Scenery:
         return ids, full
 
 
-def visible_shares(
-    camera: PinholeCamera,
-    meshes: Sequence[trimesh.Trimesh],
-    poses: Array,
-    *,
-    occluders: Sequence[tuple[trimesh.Trimesh, Array]] = (),
-) -> Array:
-    """p_vis = visible / full projected area of each mesh, as in the paper.
-
-    Args:
-        camera: where from.
-        meshes: K meshes.
-        poses: (K, 4, 4) in the world.
-        occluders: further meshes with their poses, which only hide.
-
-    Returns:
-        (K,) in 0..1; NaN where the camera would not see a mesh at all.
-    """
-    return Scenery(meshes, poses, occluders).visible_shares(camera)
-
-
 def _depths(camera: PinholeCamera, mesh: trimesh.Trimesh, pose: Array) -> tuple[PixelBox, Array]:
-    """Depth, m, of the first surface of a mesh behind each pixel of the box it appears in; infinite: none."""
+    """Return the box of pixels that a mesh appears in, and its depth there, m; infinite: none."""
     box = camera.pixel_box(transform(pose, mesh.vertices))
     # rays go into the mesh's frame: its search tree is built once, and single precision is plenty there
     to_mesh = pose[:3, :3].T
@@ -183,16 +137,12 @@ def _depths(camera: PinholeCamera, mesh: trimesh.Trimesh, pose: Array) -> tuple[
         return box, np.full(shape, np.inf)
     directions = directions.reshape(-1, 3).astype(np.float32)
     origins = np.tile(position.astype(np.float32), (len(directions), 1))
-    depths = _scene_of(mesh).run(origins, directions, query="DISTANCE").astype(float)
+    depths = ray_scene(mesh).run(origins, directions, query="DISTANCE").astype(float)
     return box, np.where(depths < _FAR, depths, np.inf).reshape(shape)
 
 
-def prepare_rays(mesh: trimesh.Trimesh) -> None:
-    """Build a mesh's search tree now, for as long as the process runs, instead of at the first ray."""
-    _scene_of(mesh)
-
-
-def _scene_of(mesh: trimesh.Trimesh) -> EmbreeScene:
+def ray_scene(mesh: trimesh.Trimesh) -> EmbreeScene:
+    """Return the search tree of a mesh, which is built once per process."""
     if mesh not in _scenes:
         scene = EmbreeScene(robust=True)  # no ray slips through between two triangles
         TriangleMesh(scene, mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32))

@@ -13,11 +13,6 @@ def directions_of(pose):
     return {name: bool(passed[0]) for name, passed in directions_ok(pose[None], CENTER).items()}
 
 
-def test_the_helper_leans_where_it_says():
-    np.testing.assert_allclose(grasp(30, 0)[:3, 2], [0.5, 0, -np.sqrt(0.75)], atol=1e-12)
-    np.testing.assert_allclose(grasp(90, 90)[:3, 2], [0, 1, 0], atol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("lean", "heading", "from_above", "from_the_robots_side"),
     [

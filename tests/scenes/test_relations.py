@@ -46,9 +46,6 @@ def test_of_two_only_the_ends_are_named():
     }
     assert found["nearest"] == found["leftmost"] == 0
     assert found["farthest"] == found["rightmost"] == 1
-
-
-def test_one_or_none_needs_no_relation():
     assert all(related(relation, FOUR[:count]) is None for relation in RELATIONS for count in (0, 1))
 
 
@@ -64,11 +61,6 @@ def test_a_column_ahead_is_told_apart_by_distance_only():
     column = np.array([[0.5, 0.0], [0.6, 0.0], [0.7, 0.0]])
     assert [related(r, column) for r in ("nearest", "second_nearest", "farthest")] == [0, 1, 2]
     assert [related(r, column) for r in ("leftmost", "middle", "rightmost")] == [None] * 3
-
-
-def test_distance_is_horizontal_and_from_the_robot():
-    # 0.5 ahead and 0.3 aside (0.583) is farther than 0.54 straight ahead
-    assert related("nearest", np.array([[0.5, 0.3], [0.54, 0.0]])) == 1
 
 
 POINTS = st.lists(

@@ -21,20 +21,13 @@ def model(name: str = "pick_table_scattered", **changes) -> SceneModel:
     return SceneModel.load(load_task_config(data), pack, pack)
 
 
-def test_the_same_seeds_give_the_same_layout():
-    scene = model()
-    one, two, other = (sample_layout(scene, seed, seed) for seed in (4, 4, 5))
-    assert one.object_ids == two.object_ids
-    np.testing.assert_array_equal(one.object_poses, two.object_poses)
-    assert one.target == two.target
-    assert one.object_ids != other.object_ids
-
-
 def test_objects_and_their_places_have_seeds_of_their_own():
     scene = model()
-    one, two = sample_layout(scene, 4, 4), sample_layout(scene, 4, 5)
-    assert one.object_ids == two.object_ids == object_set(scene, 4)
-    assert not np.allclose(one.object_poses, two.object_poses)
+    one, again, moved, other = (sample_layout(scene, *seeds) for seeds in ((4, 4), (4, 4), (4, 5), (5, 5)))
+    np.testing.assert_array_equal(one.object_poses, again.object_poses)
+    assert (one.object_ids, one.target) == (again.object_ids, again.target)
+    assert one.object_ids == moved.object_ids == object_set(scene, 4) != other.object_ids
+    assert not np.allclose(one.object_poses, moved.object_poses)
 
 
 def test_objects_among_which_no_target_is_found_give_way_to_others(monkeypatch):
@@ -47,7 +40,6 @@ def test_objects_among_which_no_target_is_found_give_way_to_others(monkeypatch):
     monkeypatch.setattr(sample, "choose_target", fussy)
     found = sample_layout(scene, 4, 4)
     assert asked[0] == object_set(scene, 4) != found.object_ids == object_set(scene, 4, 1)
-    assert len(asked) == 11
     assert sample_layout(scene, 4, 5).object_ids == found.object_ids
     monkeypatch.setattr(sample, "choose_target", choose)
     assert sample_layout(scene, 4, 5, found.object_ids).object_ids == found.object_ids
@@ -190,16 +182,6 @@ def test_counts_and_distractors_use_some_of_the_slots():
     assert {others for _, others in counts} == {1, 2, 3}
 
 
-def test_rows_that_do_not_fit_say_so():
-    scene = model(
-        layout={"kind": "orderly", "copies": 1},
-        objects={"ids": ["mug"], "count": 1},
-        randomisation={"distractors": {"ids": ["power_drill", "sugar_box"], "count": [9, 9]}},
-    )
-    with pytest.raises(LayoutError, match=r"columns side by side don't fit"):
-        sample_layout(scene, 0, 0)
-
-
 def test_one_of_several_object_sets_is_drawn():
     sets = [["apple", "lemon", "peach"], ["mug", "banana", "padlock"]]
     scene = model(objects={"ids": "all", "count": 3}, randomisation={"object_sets": sets})
@@ -238,22 +220,14 @@ def rows(copies: int, relations: list[str] | None, count: int = 10, **objects) -
 
 @pytest.mark.parametrize("relations", [["middle"], ["nearest", "second_from_left", "second_nearest"]])
 def test_relations_of_three_need_three(relations):
-    words = (
-        rf"target.relations: {', '.join(r for r in relations if r != 'nearest')} needs.*copies 2.*Raise layout.copies"
-    )
-    with pytest.raises(ConfigError, match=words):
-        rows(2, relations)
-    with pytest.raises(ConfigError, match=r"objects.count 2"):
-        rows(3, relations, count=2)
+    for wrong in ({"copies": 2}, {"copies": 3, "count": 2}):
+        with pytest.raises(ConfigError, match="target.relations"):
+            rows(relations=relations, **wrong)
     rows(3, relations)
     rows(2, relations, count=6, ids=["mug", "soap_box"])  # four mugs, or four boxes
     rows(2, relations, repeats=True)
-
-
-def test_relations_of_two_and_all_of_them_go_with_two_copies():
-    assert len(rows(2, None).config.target.relations) == 8
     rows(2, ["nearest", "farthest", "leftmost", "rightmost"])
-    rows(2, list(rows(2, None).config.target.relations))  # the default, as a record has it
+    rows(2, list(rows(2, None).config.target.relations))  # all: those that can be
 
 
 def test_layouts_that_come_to_rest_without_a_target_blame_the_target():
@@ -275,65 +249,50 @@ def test_no_target_is_an_error_that_says_what_to_change():
 
 
 @pytest.mark.parametrize(
-    ("changes", "words"),
+    ("changes", "key", "words"),
     [
-        ({"randomisation": {"room": ["roof"]}}, r"randomisation.room: no such part.*found roof"),
-        ({"randomisation": {"finishes": {"wall": ["tiles"]}}}, r"randomisation.finishes: \['wall'\] must be among"),
+        ({"randomisation": {"room": ["roof"]}}, "randomisation.room", "roof"),
+        ({"randomisation": {"finishes": {"wall": ["tiles"]}}}, "randomisation.finishes", "wall"),
         (
             {"randomisation": {"room": ["wall"], "finishes": {"wall": ["tiles", "gold"]}}},
-            r"randomisation.finishes.wall: no such finish.*found \['gold'\]",
+            "randomisation.finishes.wall",
+            "gold",
         ),
-        ({"randomisation": {"cameras": {"min_position": 0.05}}}, "min_position 0.05 must not be above position 0.02"),
-        ({"randomisation": {"object_sets": [["spam"]]}}, r"randomisation.object_sets.0.*found spam"),
-        ({"randomisation": {"distractors": {"ids": ["spam"]}}}, r"distractors.ids.*found spam"),
-        ({"randomisation": {"distractors": {"ids": []}}}, r"randomisation.distractors.ids"),
-        ({"randomisation": {"object_sets": [[]]}}, r"randomisation.object_sets.0"),
-        ({"randomisation": {"distractors": {"ids": ["mug"], "count": [3, 1]}}}, r"count: \[3, 1\] is no range"),
-        ({"randomisation": {"lights": {"ambient": [0.6, 0.2]}}}, r"lights.ambient: \[0.6, 0.2\] is no range"),
-        ({"randomisation": {"count": [3, 12]}}, r"randomisation.count \[3, 12\] must rise and end at objects.count 10"),
-        ({"opening": {"furniture": "table", "handle": "door"}}, "`opening` goes with task open_pick"),
+        ({"randomisation": {"cameras": {"min_position": 0.05}}}, "min_position 0.05", "position 0.02"),
+        ({"randomisation": {"object_sets": [["spam"]]}}, "randomisation.object_sets.0", "spam"),
+        ({"randomisation": {"distractors": {"ids": ["spam"]}}}, "randomisation.distractors.ids", "spam"),
+        ({"randomisation": {"distractors": {"ids": []}}}, "randomisation.distractors.ids", ""),
+        ({"randomisation": {"distractors": {"ids": ["mug"], "count": [3, 1]}}}, "distractors.count", "[3, 1]"),
+        ({"randomisation": {"lights": {"ambient": [0.6, 0.2]}}}, "lights.ambient", "[0.6, 0.2]"),
+        ({"opening": {"furniture": "table", "handle": "door"}}, "opening", "open_pick"),
+        ({"objects": {"ids": [6, "aple"], "count": 2}}, "objects.ids", "Did you mean apple?"),
+        ({"room": {"asset": "room", "finishes": {"wal": "plaster"}}}, "room.finishes.wal", "Did you mean wall?"),
+        ({"room": {"asset": "room", "finishes": {"floor": "lava"}}}, "room.finishes.floor", "lava"),
     ],
 )
-def test_blocks_that_cannot_be(changes, words):
-    with pytest.raises(ConfigError, match=words):
+def test_blocks_that_cannot_be(changes, key, words):
+    with pytest.raises(ConfigError) as caught:
         model(**changes)
-
-
-@pytest.mark.parametrize(
-    ("joints", "words"),
-    [({"flap": 0.1}, r"no such joint.*found flap"), ({"door_slide": 9.0}, r"door_slide: out of its limits.*found 9.0")],
-)
-def test_joints_that_cannot_stand_so(joints, words):
-    furniture = load_task_config("pick_table_scattered").model_dump(mode="json")["furniture"]
-    furniture["box"] = {"asset": "container", "pose": {"position": [-2.0, 0.0, 0.0]}, "joints": joints}
-    with pytest.raises(ConfigError, match=words):
-        model(furniture=furniture)
+    assert key in str(caught.value) and words in str(caught.value)
 
 
 @pytest.mark.parametrize(
     ("name", "opening", "joints", "words"),
     [
+        ("open_pick_container", {}, {"flap": 0.1}, r"no such joint.*found flap"),
+        ("open_pick_container", {}, {"door_slide": 9.0}, r"door_slide: out of its limits.*found 9.0"),
         ("open_pick_container", {"opened_at": 0.95}, {}, r"opening.opened_at: .* 'door_slide' no further than 0.95"),
         ("open_pick_refrigerator", {"opened_at": 0.85}, {}, r"opened_at: .*revolute.*below 0.8, found 0.85.*Lower"),
-        # 0.8 of 0.55 m
-        (
-            "open_pick_container",
-            {},
-            {"door_slide": 0.45},
-            r"door_slide: open at first.*0.44, found 0.45.*Leave the joint",
-        ),
+        ("open_pick_container", {}, {"door_slide": 0.45}, "door_slide: open at first"),  # beyond 0.8 of 0.55 m
+        ("open_pick_container", {"opened_at": 0.8}, {"door_slide": 0.43}, ""),
     ],
 )
-def test_openings_that_cannot_be(name, opening, joints, words):
+def test_joints_and_openings(name, opening, joints, words):
     data = load_task_config(name).model_dump(mode="json")
-    part = data["opening"]["furniture"]
-    data["furniture"][part]["joints"] = joints
-    with pytest.raises(ConfigError, match=words):
-        model(name, furniture=data["furniture"], opening={**data["opening"], **opening})
-
-
-def test_openings_that_can_be():
-    data = load_task_config("open_pick_container").model_dump(mode="json")
-    data["furniture"][data["opening"]["furniture"]]["joints"] = {"door_slide": 0.43}
-    scene = model("open_pick_container", furniture=data["furniture"], opening={**data["opening"], "opened_at": 0.8})
-    assert scene.opened_position == pytest.approx(0.44)
+    data["furniture"][data["opening"]["furniture"]]["joints"] = joints
+    changes = {"furniture": data["furniture"], "opening": {**data["opening"], **opening}}
+    if words:
+        with pytest.raises(ConfigError, match=words):
+            model(name, **changes)
+    else:
+        assert model(name, **changes).opened_position == pytest.approx(0.44)

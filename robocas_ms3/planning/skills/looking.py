@@ -11,7 +11,7 @@ from robocas_ms3.core.poses import from_wxyz, inverse
 from robocas_ms3.planning.protocol import Array, Trajectory
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.scenes.randomise import draw_camera_shift
-from robocas_ms3.scenes.visibility import PinholeCamera, Scenery, object_mesh, prepare_rays
+from robocas_ms3.scenes.visibility import PinholeCamera, Scenery, object_mesh, ray_scene
 
 CAMERA = "gripper_camera"
 FAR, NEAR = (0.4, 0.5), (0.2, 0.3)  # m from the camera to what it looks at: at first; between two removals (upstream's)
@@ -64,7 +64,7 @@ def prepare_looks(arm: Arm) -> None:
     """Read the objects' meshes before the first decision: each branch that looks would read them again."""
     for asset, present in zip(arm.env.object_assets[0], arm.env.present[0].tolist(), strict=True):
         if present:
-            prepare_rays(object_mesh(asset))
+            ray_scene(object_mesh(asset))
 
 
 def hidden_share(arm: Arm, slot: int) -> float:
@@ -80,7 +80,7 @@ def hidden_share(arm: Arm, slot: int) -> float:
     slots = np.flatnonzero(env.present[0].cpu().numpy()).tolist()
     poses = np.stack([arm.scene.arm_base_in_world @ arm.scene.object_in_base(s) for s in slots])
     scenery = Scenery([object_mesh(env.object_assets[0][s]) for s in slots], poses)
-    share = scenery.visible_share(camera, slots.index(slot))
+    share = float(scenery.visible_shares(camera)[slots.index(slot)])
     return 1.0 if np.isnan(share) else 1.0 - share
 
 
