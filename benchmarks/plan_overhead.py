@@ -17,10 +17,8 @@ from typing import Any
 import numpy as np
 import tyro
 
-from robocas_ms3.plans.executors import Setting
 from robocas_ms3.plans.executors.local import LocalExecutor
 from robocas_ms3.plans.plan import PartConfig, Plan
-from robocas_ms3.plans.progress import Shard
 from robocas_ms3.plans.run import run_shard
 from robocas_ms3.plans.units import SeedFiles, Unit
 from robocas_ms3.plans.worker import UnitWorker
@@ -72,8 +70,7 @@ def main(cfg: Benchmark) -> None:
     with tempfile.TemporaryDirectory() as folder:
         out, begun = Path(folder) / "out", time.time()
         cpu = time.process_time()
-        setting = Setting(plan, out, cfg.workers, open_worker=partial(UnitWorker, record=record))
-        run_shard(plan, out, lambda: LocalExecutor(setting), Shard())
+        run_shard(LocalExecutor(plan, out, cfg.workers, open_worker=partial(UnitWorker, record=record)), (0, 1))
         cpu = time.process_time() - cpu
         units = [Unit(0, block) for block in range(cfg.units)]
         at = np.sort([one.at for unit in units for one in unit.outcomes(plan, out) or ()])

@@ -112,9 +112,8 @@ def report(cfg: Benchmark, out: Path, wall: float, ctrl_c: float, memory: dict[i
     plan = read_plan(out)
     progress = Progress(plan, out)
     found: dict[str, list[Outcome]] = defaultdict(list)
-    for part, partial in progress.partial().items():
-        done = progress.parts[part].done.values()
-        found[plan.name_of(part).split("-")[0]] += [*(outcome for unit in done for outcome in unit), *partial]
+    for unit, outcomes in [*progress.done.items(), *progress.partial.items()]:
+        found[plan.name_of(unit.part).split("-")[0]] += outcomes
     good = {task: [one for one in made if one.success] for task, made in found.items()}
     cpu = {
         task: sum(one.record_seconds + one.render_seconds for one in made) / max(1, len(good[task]))

@@ -7,43 +7,80 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
-from typing import Any
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager, nullcontext
+from typing import TYPE_CHECKING, Any
 
 from robocas_ms3.cli.terminal import tell, terminal_of_stderr
-from robocas_ms3.core.words import printable
+from robocas_ms3.core.words import count_of, printable
+
+if TYPE_CHECKING:
+    from robocas_ms3.plans.status import Status
 
 EVERY = 60.0  # s between two lines of a log
+_PART_BARS = 12  # parts of a plan; more of them have one bar
 
 
-class Log:
-    """Lines on stderr: the first at once, then at most one per minute.
+class Display:
+    """Rows of a progress display, or lines of a log if stderr is not a terminal.
 
     Args:
-        quiet: omit the first and the last line.
+        transient: remove the display at the end, and write nothing to a log within the first minute.
     """
 
-    def __init__(self, *, quiet: bool = False) -> None:
-        self._start = time.monotonic()
-        self._next = self._start + (EVERY if quiet else 0.0)
-        self._quiet = quiet
-        self._text = ""
+    def __init__(self, *, transient: bool = False) -> None:
+        self.bars = _rich_progress(transient)  # None: a log
+        self._quiet = transient
+        self._start = self._next = time.monotonic()
+        self._text = self._about = self._written = ""
 
-    def tell(self, text: str, about: str = "", *, last: bool = False) -> None:
-        """Write a line if one is due.
+    def show(self, rows: Sequence[tuple[str, int, int]], text: str, about: str) -> None:
+        """Show the progress: the first call starts the display.
 
         Args:
-            text: the progress.
+            rows: name, count and number done of each bar.
+            text: the progress, for a log.
             about: speed and time left.
-            last: write it now, unless the previous line was the same.
         """
+        first, self._text, self._about = not self._text, text, about
         now = time.monotonic()
-        due = not self._quiet and text != self._text if last else now >= self._next
-        if due:
-            self._next, self._text = now + EVERY, text
-            after = f"after {span(now - self._start)}" if now - self._start >= 1 else ""
-            tell(", ".join(filter(None, (text, about, after))))
+        if first:
+            self._start, self._next = now, now + (EVERY if self._quiet else 0.0)
+        if self.bars is None:
+            if now >= self._next:
+                self._write_line()
+            return
+        if first:
+            for name, count, _ in rows:
+                self.bars.add_task(name, total=count, about="")
+            self.bars.start()
+        for bar, (_, _, done) in zip(self.bars.task_ids, rows, strict=True):
+            self.bars.update(bar, completed=done)
+        self.bars.update(self.bars.task_ids[-1], about=about)
+
+    def note(self, text: str) -> None:
+        """Write a line above the bars."""
+        if self.bars is None:
+            tell(text)
+        else:
+            self.bars.console.print(printable(text), soft_wrap=True)
+
+    def flush(self) -> None:
+        """Write the last progress to a log."""
+        if self.bars is None and self._text != self._written and not self._quiet:
+            self._write_line()
+
+    def close(self) -> None:
+        """Remove the bars, or write the last line."""
+        self.flush()
+        if self.bars is not None and self._text:  # otherwise it prints an empty line
+            self.bars.stop()
+
+    def _write_line(self) -> None:
+        now = time.monotonic()
+        self._next, self._written = now + EVERY, self._text
+        after = f"after {span(now - self._start)}" if now - self._start >= 1 else ""
+        tell(", ".join(filter(None, (self._text, self._about, after))))
 
 
 class Bar:
@@ -51,25 +88,19 @@ class Bar:
 
     Args:
         description: name of the task.
-        progress: a `rich.progress.Progress`; None if stderr is not a terminal.
-        quiet: write no line to a log within the first minute.
+        transient: see `bar`.
     """
 
-    def __init__(self, description: str, progress: Any, *, quiet: bool) -> None:
-        self._description, self._progress, self._quiet = description, progress, quiet
-        self._log: Log | None = None  # until there is something to do
-        self._start, self._done, self._there, self._count, self._about = 0.0, 0, 0, 0, ""
+    def __init__(self, description: str, *, transient: bool) -> None:
+        self._description, self._display = description, Display(transient=transient)
+        self.note, self.close = self._display.note, self._display.close
+        self._start, self._done, self._there, self._count = 0.0, 0, 0, 0
 
     def start(self, count: int, there: int = 0) -> None:
         """Show the bar for ``count`` items, ``there`` of which were done before; nothing for 0 items."""
-        if not count:
-            return
-        self._start, self._done, self._there, self._count = time.monotonic(), there, there, count
-        self._log = Log(quiet=self._quiet)
-        if self._progress:
-            self._progress.add_task(self._description, total=count)
-            self._progress.start()
-        self._show()
+        if count:
+            self._start, self._there, self._count = time.monotonic(), there, count
+            self._show(there)
 
     def advance(self, *_: object) -> None:
         """Count one more item as done."""
@@ -80,35 +111,31 @@ class Bar:
         if not self._count:
             self.start(count, there=done)
         elif done != self._done:
-            self._done = done
-            self._show()
+            self._show(done)
 
     def next_of(self, count: int) -> None:
         """Count one more item of ``count`` as done."""
         self.at(self._done + 1, count)
 
-    def note(self, text: str) -> None:
-        """Write a line above the bar."""
-        if self._progress:
-            self._progress.console.print(printable(text), soft_wrap=True)
-        else:
-            tell(text)
+    def _show(self, done: int) -> None:
+        self._done = done
+        about = speed(done, self._count, self._there, time.monotonic() - self._start)
+        text = f"{self._description}: {done} of {self._count}"
+        self._display.show([(self._description, self._count, done)], text, about)
 
-    def stop(self) -> None:
-        """Remove the bar, or write the last line."""
-        self._show(last=True)
-        if self._progress and self._log is not None:  # else it prints an empty line
-            self._progress.stop()
 
-    def _show(self, *, last: bool = False) -> None:
-        if self._log is None:
-            return
-        if not last:  # the speed is known when an item is done
-            self._about = speed(self._done, self._count, self._there, time.monotonic() - self._start)
-        if self._progress:
-            self._progress.update(self._progress.task_ids[0], completed=self._done, about=self._about)
-        else:
-            self._log.tell(f"{self._description}: {self._done} of {self._count}", self._about, last=last)
+def show_plan(display: Display, status: Status) -> None:
+    """Show the status of a plan: a bar for each part, and one for all."""
+    rows = [(part.name, part.wanted, part.done) for part in status.parts]
+    total, done = sum(part.wanted for part in status.parts), sum(part.done for part in status.parts)
+    parts = [f"{name} {done} of {wanted}" for name, wanted, done in rows if 0 < done < wanted]
+    text = f"{done} of {count_of(total, 'episode')}"
+    text += f" ({'; '.join(parts[:_PART_BARS])})" if len(rows) > 1 and parts else ""
+    about = ""
+    if status.seconds_left is not None:
+        rate = count_of(round(status.episodes_an_hour), "episode")
+        about = f"{rate} per hour, {span(status.seconds_left)} left"
+    display.show([*(rows if 1 < len(rows) <= _PART_BARS else []), ("all", total, done)], text, about)
 
 
 def speed(done: float, count: float, there: float, seconds: float) -> str:
@@ -137,27 +164,6 @@ def span(seconds: float) -> str:
     return f"{minutes // 60} h {minutes % 60} min" if minutes < 2 * 24 * 60 else f"{seconds / 86400:.1f} days"
 
 
-def columns() -> tuple[Any, ...]:
-    """Return the columns of a bar: description, bar, count, time elapsed, speed and time left."""
-    from rich.progress import BarColumn, MofNCompleteColumn, ProgressColumn, TextColumn, TimeElapsedColumn
-    from rich.text import Text
-
-    class Speed(ProgressColumn):
-        def render(self, task: Any) -> Text:
-            about = task.fields.get("about")
-            if about is None:
-                about = speed(task.completed, task.total or 0, 0, task.elapsed or 0.0)
-            return Text(about, style="progress.remaining")
-
-    return (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(20),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        Speed(),
-    )
-
-
 @contextmanager
 def bar(description: str, *, transient: bool = False) -> Iterator[Bar]:
     """Yield a progress bar.
@@ -166,11 +172,8 @@ def bar(description: str, *, transient: bool = False) -> Iterator[Bar]:
         description: name of the task.
         transient: remove the bar at the end, and write nothing to a log within the first minute.
     """
-    shown = Bar(description, _progress(transient), quiet=transient)
-    try:
+    with closing(Bar(description, transient=transient)) as shown:
         yield shown
-    finally:
-        shown.stop()
 
 
 @contextmanager
@@ -181,12 +184,18 @@ def working(text: str) -> Iterator[None]:
         yield
 
 
-def _progress(transient: bool) -> Any:
-    """Return a progress display of rich; None if stderr is not a terminal."""
+def _rich_progress(transient: bool) -> Any:
     terminal = terminal_of_stderr()
     if terminal is None:
         return None
-    from rich.progress import Progress
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-    beside = sys.stdout.isatty()  # else what goes into a file or a pipe would be shown here instead
-    return Progress(*columns(), console=terminal, transient=transient, redirect_stdout=beside)
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(20),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[about]}", style="progress.remaining"),
+    )
+    redirects = sys.stdout.isatty()  # otherwise the content of a file or a pipe would be shown here instead
+    return Progress(*columns, console=terminal, transient=transient, redirect_stdout=redirects)

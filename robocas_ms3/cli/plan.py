@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import dataclass
+from contextlib import closing
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -78,37 +79,39 @@ class List:
 @resumable
 def run(command: Run) -> int:
     """Run ``run``."""
-    from robocas_ms3.cli.plan_progress import PlanProgress
+    from robocas_ms3.cli.bars import Display, show_plan
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.core.errors import PlanError
     from robocas_ms3.core.strict import check_number
-    from robocas_ms3.plans.executors import Setting, check_executor, open_executor
+    from robocas_ms3.plans.executors import open_executor
     from robocas_ms3.plans.load import load_plan
-    from robocas_ms3.plans.progress import Shard
+    from robocas_ms3.plans.progress import parse_shard
     from robocas_ms3.plans.run import Callbacks, run_plan, run_shard
 
     jobs = command.jobs if command.jobs is not None else os.cpu_count() or 1
     check_number("jobs", jobs, 1)
-    shard = Shard.parse(command.shard) if command.shard is not None else None
+    shard = parse_shard(command.shard) if command.shard is not None else None
     if shard and (command.overwrite or command.executor != "local"):
         found = "--overwrite" if command.overwrite else f"--executor {command.executor}"
         raise PlanError("a shard continues in its folder, on this machine", where="--shard", found=found)
     options = dict(_option(word) for word in command.executor_option)
     plan = load_plan(command.plan)
-    check_executor(command.executor, options)
+    executor = open_executor(command.executor, plan, command.out, jobs, options)
     if command.executor == "local" and plan.makes_datasets:
         from robocas_ms3.datasets.writing.render import require_renderer
 
         require_renderer()
-    setting = Setting(plan, command.out, jobs, options)
-    opened = partial(open_executor, command.executor, setting)
-    with PlanProgress(plan) as progress:
-        callbacks = Callbacks(progress.show, progress.note)
+    with closing(Display()) as display:
+
+        def show_stage(text: str) -> None:
+            display.flush()  # the progress when the stage began
+            display.note(text)
+
+        callbacks = Callbacks(partial(show_plan, display), show_stage)
         if shard:
-            complete = run_shard(plan, command.out, opened, shard, callbacks)
+            complete = run_shard(executor, shard, callbacks)
         else:
-            overwrite = command.overwrite
-            report = run_plan(plan, command.out, opened, jobs=jobs, overwrite=overwrite, callbacks=callbacks)
+            report = run_plan(executor, overwrite=command.overwrite, callbacks=callbacks)
     if shard:
         then = f"robocas plan join {command.out} joins all" if complete else "other work units are missing"
         say(f"{command.out}: the work units of shard {command.shard} are done; {then}")
@@ -148,7 +151,7 @@ def show_status(command: Status) -> int:
 
     found = read_status(command.out)
     if command.json:
-        say_lines(json.dumps(found.as_json(), indent=2))
+        say_lines(json.dumps(asdict(found), indent=2))
         return 0
     table = Table("part", "episodes", "seeds", "failed", "record, CPU s each", "render, CPU s each", "MB")
     for part in found.parts:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,10 @@ from robocas_ms3.core.outputs import sweep
 from robocas_ms3.core.words import count_of
 from robocas_ms3.core.workers import Limits
 from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.manage.splitting import Share, cut, groups_of
 from robocas_ms3.datasets.sources.provenance import recording_entry
+from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.datasets.sources.split import SPLIT_RULE, split_by_seed
 from robocas_ms3.datasets.writing.info import write_info
 from robocas_ms3.datasets.writing.plan import dataset_settings, header
 from robocas_ms3.demos.recordings.entries import reason
@@ -27,7 +31,6 @@ from robocas_ms3.demos.recordings.merging import damage_of, merge
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
 from robocas_ms3.plans.folder import REPORT, UNITS
 from robocas_ms3.plans.plan import Plan
-from robocas_ms3.plans.split import rule_of, split_of
 from robocas_ms3.plans.units import Outcome, SeedFiles, Unit
 from robocas_ms3.scenes.table import join_frozen
 
@@ -36,11 +39,11 @@ TRAJECTORY = "trajectory.h5"
 Chosen = Mapping[int, Sequence[tuple[Unit, Outcome]]]
 """Part -> its episodes, in the order of their seeds."""
 EpisodeFiles = Mapping[int, Sequence[SeedFiles]]
+Say = Callable[[str], None]
+_log = logging.getLogger(__name__)
 
 
-def join(
-    plan: Plan, out: Path, chosen: Chosen, *, jobs: int = 1, say: Callable[[str], None] = lambda text: None
-) -> dict[str, Any]:
+def join(plan: Plan, out: Path, chosen: Chosen, *, jobs: int = 1, say: Say = lambda text: None) -> dict[str, Any]:
     """Join all episodes; after a kill at any moment, another call continues and makes the same.
 
     Files of units are deleted once the joined files are on the disk and complete.
@@ -62,10 +65,12 @@ def join(
     files = {
         part: [unit.files(plan, out, outcome.seed) for unit, outcome in episodes] for part, episodes in chosen.items()
     }
-    finished = _is_written(out / REPORT, report)
-    if not finished or _left(out):
-        for joined in _joined_files(plan, out, files):
-            joined.write(say)
+    finished = False
+    with suppress(OSError, ValueError):
+        finished = load_json(out / REPORT) == report
+    # folders of seeds that are joined, not needed, or left by a killed process
+    if not finished or any(path.is_dir() for path in (out / UNITS).glob("*/*/*")):
+        _join_files(plan, out, files, say)
     if not finished:
         if plan.makes_datasets and "lerobot" in plan.formats:
             say("making the LeRobot dataset")
@@ -76,92 +81,55 @@ def join(
     flush_to_disk(out)
     if not finished:
         write_json(out / REPORT, report, sync=True)
-    for path in _left(out):
-        shutil.rmtree(path)  # joined, more than the plan asks for, or left behind by a process that was killed
+    for path in [path for path in (out / UNITS).glob("*/*/*") if path.is_dir()]:
+        shutil.rmtree(path)
     return report
 
 
-def has_moved(out: Path) -> bool:
-    """Whether files of units may have been moved or deleted already."""
-    return (out / DATASETS).exists() or (out / DEMOS).exists() or (out / REPORT).is_file()
-
-
 def damaged_episodes(plan: Plan, out: Path, chosen: Chosen) -> dict[Unit, list[int]]:
-    """Return seeds whose files have lost their size, as a disk with errors may do."""
+    """Return seeds whose files have lost their size, as a disk with errors may do; none once files were moved."""
     found: dict[Unit, list[int]] = {}
-    for unit, outcome in (episode for episodes in chosen.values() for episode in episodes):
-        if unit.files(plan, out, outcome.seed).size() != outcome.size:
-            found.setdefault(unit, []).append(outcome.seed)
+    if not any((out / name).exists() for name in (DATASETS, DEMOS, REPORT)):
+        for unit, outcome in (episode for episodes in chosen.values() for episode in episodes):
+            if unit.files(plan, out, outcome.seed).size() != outcome.size:
+                found.setdefault(unit, []).append(outcome.seed)
     return found
 
 
-@dataclass(frozen=True)
-class _Joined:
-    """A file or folder that is joined from others.
-
-    Attributes:
-        path: of it.
-        sources: files that it is joined from, as far as they are not joined yet.
-        damage: returns what is wrong with it; empty: nothing.
-        join: writes it.
-        stage: for the user.
-    """
-
-    path: Path
-    sources: Iterable[Path]
-    damage: Callable[[], str]
-    join: Callable[[], None]
-    stage: str
-
-    def write(self, say: Callable[[str], None]) -> None:
-        """Join it, unless it is complete.
-
-        Raises:
-            PlanError: it is damaged and a source is gone, or it is damaged right after it was written.
-        """
-        if not (found := self.damage()):
-            return
-        if gone := next((source for source in self.sources if not source.exists()), None):
-            found = f"{found}; {gone.parent.name}/{gone.name} is gone"
-            fix = "Restore either from a copy, or start again with --overwrite."
-            raise PlanError("this is damaged, and can't be joined again", where=self.path, found=found, fix=fix)
-        say(self.stage)
-        self.join()
-        if found := self.damage():
-            fix = "Check the disk; then run the command again."
-            raise PlanError("this is not what was written", where=self.path, found=found, fix=fix)
-
-
-def _joined_files(plan: Plan, out: Path, files: EpisodeFiles) -> Iterator[_Joined]:
+def _join_files(plan: Plan, out: Path, files: EpisodeFiles, say: Say) -> None:
+    seeds = {part: [each.seed for each in episodes] for part, episodes in files.items()}
     for part, episodes in files.items() if plan.makes_layouts else ():
         path, layouts = out / LAYOUTS / f"{plan.name_of(part)}.npy", [each.layout for each in episodes]
         sweep(make_folder(path.parent))
-        damage = partial(_layouts_damage, path, [each.seed for each in episodes])
-        join_layouts = partial(join_frozen, path, layouts)
-        yield _Joined(path, layouts, damage, join_layouts, f"joining layouts, {plan.name_of(part)}")
+        damage, write = partial(_layouts_damage, path, seeds[part]), partial(join_frozen, path, layouts)
+        _join_file(path, layouts, damage, write, partial(say, f"joining layouts, {plan.name_of(part)}"))
     if plan.makes_datasets:
         root, count = out / DATASETS / "robocas", sum(map(len, files.values()))
-        damage = partial(_dataset_damage, root, count)
-        join_dataset = partial(_join_dataset, plan, root, files)
-        yield _Joined(root, _dataset_sources(plan, root, files), damage, join_dataset, "joining the dataset")
+        sweep(make_folder(root))
+        damage, write = partial(_dataset_damage, root, count), partial(_join_dataset, plan, root, files)
+        _join_file(root, _dataset_sources(plan, root, files), damage, write, partial(say, "joining the dataset"))
     for part, episodes in files.items() if plan.makes_demonstrations else ():
         path, recordings = out / DEMOS / plan.name_of(part) / TRAJECTORY, [each.recording for each in episodes]
         sweep(make_folder(path.parent))
-        damage = partial(damage_of, path, [each.seed for each in episodes])
-        join_demos = partial(merge, recordings, path)
-        yield _Joined(path, recordings, damage, join_demos, f"joining demonstrations, {plan.name_of(part)}")
+        damage, write = partial(damage_of, path, seeds[part]), partial(merge, recordings, path)
+        _join_file(path, recordings, damage, write, partial(say, f"joining demonstrations, {plan.name_of(part)}"))
 
 
-def _is_written(path: Path, report: Mapping[str, Any]) -> bool:
-    """Whether the report is written; a damaged one is written again."""
-    with suppress(OSError, ValueError):
-        return load_json(path) == report
-    return False
-
-
-def _left(out: Path) -> list[Path]:
-    """Return folders of seeds, and temporary ones of processes that were killed."""
-    return [path for path in (out / UNITS).glob("*/*/*") if path.is_dir()]
+def _join_file(
+    path: Path, sources: Iterable[Path], damage: Callable[[], str], write: Callable[[], None], say: Callable[[], None]
+) -> None:
+    """Write a file or folder that is joined from others, unless it is complete: ``damage`` returns nothing."""
+    if not (found := damage()):
+        return
+    if gone := next((source for source in sources if not source.exists()), None):
+        found = f"{found}; {gone.parent.name}/{gone.name} is gone"
+        fix = "Restore either from a copy, or start again with --overwrite."
+        raise PlanError("this is damaged, and can't be joined again", where=path, found=found, fix=fix)
+    say()
+    write()
+    if found := damage():
+        fix = "Check the disk; then run the command again."
+        raise PlanError("this is not what was written", where=path, found=found, fix=fix)
 
 
 def _layouts_damage(path: Path, seeds: Sequence[int]) -> str:
@@ -189,15 +157,14 @@ def _reason(error: Exception) -> str:
 
 def _dataset_sources(plan: Plan, root: Path, files: EpisodeFiles) -> Iterator[Path]:
     for part, episodes in files.items():
-        for place, each in enumerate(episodes):
+        for number, each in enumerate(episodes, plan.first_episode(part)):
             yield each.recording
-            if not (root / schema.episode_folder(plan.first_episode(part) + place)).is_dir():
+            if not (root / schema.episode_folder(number)).is_dir():
                 yield each.episode
 
 
 def _join_dataset(plan: Plan, root: Path, files: EpisodeFiles) -> None:
     """Move the rendered episodes into one dataset, numbered part by part."""
-    sweep(make_folder(root))
     entries: dict[str, Any] = {}
     for part, episodes in files.items():
         trajectory = {"trajectory": f"{DEMOS}/{plan.name_of(part)}/{TRAJECTORY}"}  # that of the unit is deleted
@@ -222,6 +189,39 @@ def _set_source(path: Path, source: dict[str, Any]) -> None:
     text = json_text({**scene, "source": {**scene["source"], **source}}, path, indent=1)
     with replacing(path, sync=True) as tmp:
         tmp.write_text(text + "\n", encoding="utf-8")
+
+
+def rule_of(plan: Plan) -> str:
+    """Return in words which episodes validate, for ``conversion.json``."""
+    rule = Share(plan.split.val_share, plan.split.by).rule if plan.split else SPLIT_RULE
+    named = [f"{part.name}: {part.split}" for part in plan.parts if part.split]
+    return "; ".join([*named, *([rule] if len(named) < len(plan.parts) else [])])
+
+
+def split_of(plan: Plan, root: Path) -> tuple[list[int], list[int]]:
+    """Return training and validation episodes of a dataset; of the parts that name no split, by the plan's rule.
+
+    Raises:
+        DatasetError: an episode lacks its seed, target or task.
+    """
+    train: list[int] = []
+    val: list[int] = []
+    free: list[int] = []
+    for number, part in enumerate(plan.parts):
+        first = plan.first_episode(number)
+        chosen = {None: free, "train": train, "val": val}[part.split]
+        chosen += range(first, first + part.episodes)
+    by = plan.split.by if plan.split else "seed"
+    among, found = set(free), groups_of(Dataset(root), by) if free else {}
+    groups = {number: group for number, group in found.items() if number in among}
+    if plan.split is None:
+        by_rule = split_by_seed({number: int(group) for number, group in groups.items()})
+    elif len(set(groups.values())) < 2:
+        _log.warning("%s: all episodes have one %s: they are for training", root, by)
+        by_rule = free, []
+    else:
+        by_rule = cut(groups, [1 - plan.split.val_share, plan.split.val_share])
+    return sorted([*train, *by_rule[0]]), sorted([*val, *by_rule[1]])
 
 
 def _convert_lerobot(plan: Plan, robocas: Path, out: Path, jobs: int) -> None:

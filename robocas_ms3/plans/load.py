@@ -38,7 +38,12 @@ def load_plan(plan: str | Path) -> Plan:
         PlanError: there is no such plan, or a key or value is invalid.
         ConfigError: a configuration is invalid.
     """
-    path = _find(plan)
+    shipped, path = shipped_plans(), Path(plan)
+    if str(plan) in shipped:
+        path = shipped[str(plan)]
+    elif path.suffix not in {".yaml", ".yml"} or not path.is_file():
+        expected, fix = f"a YAML file, or one of {', '.join(shipped)}", nearest(str(plan), shipped)
+        raise PlanError("no such plan", where=plan, expected=expected, fix=fix)
     try:
         data = load_yaml(path)
     except (OSError, DocumentError) as error:
@@ -48,13 +53,12 @@ def load_plan(plan: str | Path) -> Plan:
         loaded.pictures.chosen()
     except RobocasError as error:
         raise PlanError("not a valid plan: pictures", where=path, found=error) from error
-    parts, scenes = [], []
-    for number, config in enumerate(loaded.parts):
-        part, scene = _completed(config, number, path)
-        parts.append(part)
-        scenes.append(scene)
-    _check_names(parts, path)
-    _check_seeds(parts, scenes, loaded.block, path)
+    completed = [_completed(part, number, path) for number, part in enumerate(loaded.parts)]
+    parts = [part for part, _ in completed]
+    names = [part.name or "" for part in parts]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise PlanError("parts of one name", where=path, found=", ".join(twice), fix="Give them a name each.")
+    _check_seeds(parts, [scene for _, scene in completed], loaded.block, path)
     packs = sorted({_FURNITURE_PACK, *(part.pack for part in parts)})
     found = {pack: digest for pack in packs if (digest := _digest(pack))}
     check_packs(loaded, found)
@@ -98,7 +102,11 @@ def check_plan(plan: Plan) -> None:
 
             TextEmbedder()  # raises if something is missing; loads nothing
         if "lerobot" in plan.formats:
-            _check_lerobot(plan)
+            from robocas_ms3.datasets.lerobot.schema import check_video_size, require_extra, whole_rate
+
+            require_extra()
+            whole_rate(plan.rate)
+            check_video_size(plan.pictures.size)
     if "statistics" in plan.stages and find_spec("matplotlib") is None:
         fix = 'In the clone: pip install -e ".[plots]", or leave the stage out.'
         raise MissingExtraError("statistics are drawn with matplotlib", fix=fix)
@@ -109,7 +117,7 @@ def recording_settings(plan: Plan, part: int) -> EpisodeSettings:
     config = plan.parts[part]
     assert config.config is not None  # set by `load_plan`
     rate = int(plan.rate) if plan.rate == int(plan.rate) else 5  # episodes are checked at the dataset's rate
-    chosen = {"control_freq": plan.control_freq, "replay_rate": rate, **plan.recording.chosen()}
+    chosen = {"control_freq": plan.control_freq, "replay_rate": rate, **plan.recording.model_dump(exclude_none=True)}
     return EpisodeSettings(config.task, config.config, config.pack, **chosen)
 
 
@@ -135,14 +143,6 @@ def opening_part(plan: Plan, part: int) -> Iterator[None]:
         raise PlanError("this part can't be opened", where=f"part {config.name}", found=found, fix=fix) from error
 
 
-def _check_lerobot(plan: Plan) -> None:
-    from robocas_ms3.datasets.lerobot.schema import check_video_size, require_extra, whole_rate
-
-    require_extra()
-    whole_rate(plan.rate)
-    check_video_size(plan.pictures.size)
-
-
 def _completed(part: PartConfig, number: int, path: Path) -> tuple[PartConfig, Any]:
     """Return a part with its configuration, pack and name; and what its scenes depend on."""
     if part.task not in TASKS:
@@ -154,7 +154,10 @@ def _completed(part: PartConfig, number: int, path: Path) -> tuple[PartConfig, A
         config = path.parent / config
     loaded = load_config_of(spec, config)
     shipped = isinstance(config, str) and config in shipped_configs()  # a file may change until the next run
-    stem, pack = Path(name).stem if isinstance(name, str) else part.task, _pack(part.pack, path.parent)
+    stem, pack = Path(name).stem if isinstance(name, str) else part.task, part.pack
+    if pack not in pack_folders():  # a folder, relative to the plan or to the working directory
+        folders = [folder for folder in (path.parent / pack, Path(pack)) if folder.is_dir()]
+        pack = str(folders[0].resolve()) if folders else pack
     completed = {
         "config": name if shipped else loaded.model_dump(mode="json"),
         "pack": pack,
@@ -163,24 +166,10 @@ def _completed(part: PartConfig, number: int, path: Path) -> tuple[PartConfig, A
     return part.model_copy(update=completed), (part.task, loaded, pack)
 
 
-def _pack(name: str, folder: Path) -> str:
-    """Return a pack's name, or the absolute path of its folder, relative to the plan's or the working directory."""
-    if name in pack_folders():
-        return name
-    return next((str(path.resolve()) for path in (folder / name, Path(name)) if path.is_dir()), name)
-
-
 def _digest(pack: str) -> str:
     """Return the hash of a pack's manifest, which has those of its files; empty where there is no such pack."""
     path = pack_folders().get(pack, Path(pack)) / MANIFEST
     return sha256(path) if path.is_file() else ""
-
-
-def _check_names(parts: Sequence[PartConfig], path: Path) -> None:
-    names = [part.name for part in parts]
-    twice = sorted({str(name) for name in names if names.count(name) > 1})
-    if twice:
-        raise PlanError("parts of one name", where=path, found=", ".join(twice), fix="Give them a name each.")
 
 
 def _check_seeds(parts: Sequence[PartConfig], scenes: Sequence[Any], block: int, path: Path) -> None:
@@ -196,13 +185,3 @@ def _check_seeds(parts: Sequence[PartConfig], scenes: Sequence[Any], block: int,
             if scenes[number] == scene and last.seed < end:
                 expected, found = f"one of the two from {end} on", f"{part.seed}, and {other.seed} of {other.name}"
                 raise PlanError("two parts may try the same seeds", where=where, expected=expected, found=found)
-
-
-def _find(plan: str | Path) -> Path:
-    shipped, path = shipped_plans(), Path(plan)
-    if str(plan) in shipped:
-        return shipped[str(plan)]
-    if path.suffix in {".yaml", ".yml"} and path.is_file():
-        return path
-    expected, fix = f"a YAML file, or one of {', '.join(shipped)}", nearest(str(plan), shipped)
-    raise PlanError("no such plan", where=plan, expected=expected, fix=fix)

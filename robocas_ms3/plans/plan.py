@@ -47,10 +47,6 @@ class RecordingConfig(StrictModel):
     noise_mm: Annotated[float, Field(ge=0, le=1000)] | None = None
     noise_deg: Annotated[float, Field(ge=0, le=180)] | None = None
 
-    def chosen(self) -> dict[str, Any]:
-        """Return the settings that the plan names."""
-        return self.model_dump(exclude_none=True)
-
 
 class PicturesConfig(StrictModel):
     """Images that are rendered."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 from robocas_ms3.core.errors import PlanError
@@ -13,28 +12,20 @@ from robocas_ms3.plans.folder import UNITS
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.units import Outcome, Unit, started_blocks
 
+Shard = tuple[int, int]
+"""K, N: the work units whose block is K modulo N."""
 
-@dataclass(frozen=True)
-class Shard:
-    """The work units whose block is ``index`` modulo ``count``."""
 
-    index: int = 0
-    count: int = 1
+def parse_shard(text: str) -> Shard:
+    """Parse ``K/N``.
 
-    @classmethod
-    def parse(cls, text: str) -> Shard:
-        """Parse ``K/N``.
-
-        Raises:
-            PlanError: it has another form, or K is not less than N.
-        """
-        found = re.fullmatch(r"(\d{1,9})/(\d{1,9})", text)
-        if not found or int(found[1]) >= int(found[2]):
-            raise PlanError("invalid shard", where="--shard", expected="K/N with K < N, such as 0/4", found=repr(text))
-        return cls(int(found[1]), int(found[2]))
-
-    def __contains__(self, unit: Unit) -> bool:
-        return unit.block % self.count == self.index
+    Raises:
+        PlanError: it has another form, or K is not less than N.
+    """
+    found = re.fullmatch(r"(\d{1,9})/(\d{1,9})", text)
+    if not found or int(found[1]) >= int(found[2]):
+        raise PlanError("invalid shard", where="--shard", expected="K/N with K < N, such as 0/4", found=repr(text))
+    return int(found[1]), int(found[2])
 
 
 class Progress:
@@ -42,29 +33,51 @@ class Progress:
 
     Units of a part are needed in order, until they have its number of episodes; a unit that is not done counts as if
     all its seeds succeeded. So which units are needed in the end depends on the plan alone.
+
+    Attributes:
+        done: outcomes of each unit that is complete.
+        partial: outcomes of each unit that was started and is not complete.
     """
 
     def __init__(self, plan: Plan, out: Path) -> None:
         self.plan, self._out = plan, out
-        self.parts = [_PartProgress(plan, number) for number in range(len(plan.parts))]
+        self.done: dict[Unit, list[Outcome]] = {}
+        self.partial: dict[Unit, list[Outcome]] = {}
+        # per part, of its first units that are done without a gap: number of units, of seeds, of successes
+        self._first = [(0, 0, 0)] * len(plan.parts)
+        self._failing: PlanError | None = None
         self.read()
 
     def read(self) -> None:
-        """Read the outcomes of units that were completed since."""
-        for part in self.parts:
-            for block in started_blocks(self.plan, self._out, part.number):
-                if block not in part.done:
-                    self.add(Unit(part.number, block))
+        """Read the outcomes of units that are not complete."""
+        for part in range(len(self.plan.parts)):
+            for block in started_blocks(self.plan, self._out, part):
+                self.add(Unit(part, block))
 
     def add(self, unit: Unit) -> bool:
         """Read the outcomes of a unit; return whether it is complete."""
-        part = self.parts[unit.part]
-        if unit.block not in part.done:
+        if unit not in self.done:
             outcomes = unit.outcomes(self.plan, self._out)
             if outcomes is None:
+                self.partial[unit] = unit.partial_outcomes(self.plan, self._out)
                 return False
-            part.add(unit.block, outcomes)
+            self.done[unit] = outcomes
+            self.partial.pop(unit, None)
+            self._count(unit.part)
         return True
+
+    def _count(self, part: int) -> None:
+        block, seeds, successes = self._first[part]
+        # block by block without a gap: whether too many fail must not depend on which unit is done first
+        while (outcomes := self.done.get(Unit(part, block))) is not None:
+            block, seeds, successes = block + 1, seeds + len(outcomes), successes + _successes(outcomes)
+            if seeds - successes > max(20, 3 * successes):
+                every = (outcome for unit, done in self.done.items() if unit.part == part for outcome in done)
+                reasons = Counter(outcome.failures[-1] for outcome in every if outcome.failures)
+                found = f"{seeds - successes} of {seeds}, most of them: {reasons.most_common(1)[0][0]}"
+                where, fix = self._out / UNITS / self.plan.name_of(part), "A smaller objects.count may help."
+                self._failing = PlanError("almost all seeds fail", where=where, found=found, fix=fix)
+        self._first[part] = block, seeds, successes
 
     def check_failures(self) -> None:
         """Check that seeds succeed.
@@ -72,90 +85,37 @@ class Progress:
         Raises:
             PlanError: almost all seeds of a part fail.
         """
-        for part in self.parts:
-            if part.failures:
-                where, fix = self._out / UNITS / self.plan.name_of(part.number), "A smaller objects.count may help."
-                raise PlanError("almost all seeds fail", where=where, found=part.failures, fix=fix)
-
-    def missing(self, shard: Shard | None = None) -> Iterator[Unit]:
-        """Yield the units that are needed and not done, in the order of the plan."""
-        for part in self.parts:
-            for unit in part.missing():
-                if shard is None or unit in shard:
-                    yield unit
-
-    def partial(self) -> dict[int, list[Outcome]]:
-        """Read the outcomes of seeds in units that are not complete, by the number of their part."""
-        return {
-            part.number: [
-                outcome
-                for block in started_blocks(self.plan, self._out, part.number)
-                if block not in part.done
-                for outcome in Unit(part.number, block).partial_outcomes(self.plan, self._out)
-            ]
-            for part in self.parts
-        }
-
-    def chosen(self) -> dict[int, list[tuple[Unit, Outcome]]]:
-        """Return the episodes of each part: the first successful seeds, in order, once no unit is missing."""
-        return {part.number: part.chosen() for part in self.parts}
+        if self._failing:
+            raise self._failing
 
     def forget(self, unit: Unit, seeds: list[int]) -> None:
         """Delete some seeds, which are then done again."""
         unit.forget(self.plan, self._out, seeds)
-        self.parts[unit.part].forget(unit.block)
+        del self.done[unit]
+        self._first[unit.part] = 0, 0, 0
 
+    def missing(self, shard: Shard = (0, 1)) -> Iterator[Unit]:
+        """Yield the units of a shard that are needed and not done, in the order of the plan."""
+        for part, config in enumerate(self.plan.parts):
+            block, _, expected = self._first[part]
+            while expected < config.episodes:
+                unit = Unit(part, block)
+                if unit in self.done:
+                    expected += _successes(self.done[unit])
+                else:
+                    expected += self.plan.block_of(part)
+                    if block % shard[1] == shard[0]:
+                        yield unit
+                block += 1
 
-class _PartProgress:
-    """The outcomes of one part's units.
-
-    Attributes:
-        done: block -> outcomes of a unit that is complete.
-        failures: how many seeds fail, if almost all do; else empty.
-    """
-
-    def __init__(self, plan: Plan, number: int) -> None:
-        self.number, self._size, self._wanted = number, plan.block_of(number), plan.parts[number].episodes
-        self.done: dict[int, list[Outcome]] = {}
-        self.failures = ""
-        self._checked = self._seeds = self._successes = 0  # of the first blocks, without a gap
-
-    def missing(self) -> Iterator[Unit]:
-        block, expected = self._checked, self._successes
-        while expected < self._wanted:
-            if block in self.done:
-                expected += _successes(self.done[block])
-            else:
-                expected += self._size
-                yield Unit(self.number, block)
-            block += 1
-
-    def add(self, block: int, outcomes: list[Outcome]) -> None:
-        self.done[block] = outcomes
-        # block by block without a gap: whether too many fail must not depend on which unit is done first
-        while self._checked in self.done:
-            first = self.done[self._checked]
-            self._checked += 1
-            self._seeds += len(first)
-            self._successes += _successes(first)
-            failed = self._seeds - self._successes
-            if failed > max(20, 3 * self._successes) and not self.failures:
-                reasons = Counter(each.failures[-1] for done in self.done.values() for each in done if each.failures)
-                self.failures = f"{failed} of {self._seeds}"
-                self.failures += f", most of them: {reasons.most_common(1)[0][0]}" if reasons else ""
-
-    def chosen(self) -> list[tuple[Unit, Outcome]]:
-        episodes = [
-            (Unit(self.number, block), outcome)
-            for block in sorted(self.done)
-            for outcome in self.done[block]
-            if outcome.success
-        ]
-        return episodes[: self._wanted]
-
-    def forget(self, block: int) -> None:
-        del self.done[block]
-        self._checked = self._seeds = self._successes = 0
+    def chosen(self) -> dict[int, list[tuple[Unit, Outcome]]]:
+        """Return the episodes of each part: the first successful seeds, in order, once no unit is missing."""
+        chosen: dict[int, list[tuple[Unit, Outcome]]] = {}
+        for part, config in enumerate(self.plan.parts):
+            units = sorted(unit for unit in self.done if unit.part == part)
+            episodes = [(unit, outcome) for unit in units for outcome in self.done[unit] if outcome.success]
+            chosen[part] = episodes[: config.episodes]
+        return chosen
 
 
 def _successes(outcomes: list[Outcome]) -> int:

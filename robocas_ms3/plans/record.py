@@ -24,60 +24,47 @@ from robocas_ms3.scenes.table import write_frozen
 from robocas_ms3.scenes.task_specs import TASKS
 
 
-class LayoutMaker:
-    """Samples the layouts that the environment of a task configuration has.
-
-    Args:
-        settings: of the episodes.
-    """
-
-    def __init__(self, settings: EpisodeSettings) -> None:
-        config, robot = load_config_of(TASKS[settings.task], settings.config), find_robot(settings.robot)
-        model = SceneModel.load(config, load_pack(settings.pack), load_pack("builtin"), robot=robot.description)
-        self._names = model.object_pack.objects
-        self._layouts = layout_source(model, settings.layouts)
-
-    def write(self, files: SeedFiles) -> None:
-        """Write the layout of a seed.
-
-        Raises:
-            LayoutError: the seed has none.
-        """
-        write_frozen(files.layout, self._names, {files.seed: self._layouts(files.seed, files.seed)})
-
-
 class Recorder:
     """Records episodes; keeps the environment while the part stays the same."""
 
     def __init__(self, plan: Plan) -> None:
         use_one_torch_thread()
         self._plan = plan
-        self._settings: EpisodeSettings | None = None
+        self._part: int | None = None
         self._generator: EpisodeGenerator | None = None
-        self._layouts: LayoutMaker | None = None
+        self._model: SceneModel | None = None
+        self._layouts: Any = None
 
     def run(self, files: SeedFiles) -> dict[str, Any]:
         """Write the layout of a seed and record its episode, as the plan asks; return fields of its `Outcome`."""
         start = _cpu_seconds()
-        self._open(files.part)
-        result = self._make_layout(files)
-        if result["success"] and self._plan.makes_demonstrations:
-            result = self._record(files)
+        if self._part != files.part:
+            self.close()
+            with opening_part(self._plan, files.part):
+                self._open(recording_settings(self._plan, files.part))
+            self._part = files.part
+        try:
+            if self._model is not None:  # as the environment samples it
+                layout = self._layouts(files.seed, files.seed)
+                write_frozen(files.layout, self._model.object_pack.objects, {files.seed: layout})
+            result = self._record(files, self._generator) if self._generator else {"success": True}
+        except LayoutError as error:
+            result = {"success": False, "failures": [f"layout: {error.what}"]}
         return {**result, "record_seconds": round(_cpu_seconds() - start, 2)}
 
-    def _make_layout(self, files: SeedFiles) -> dict[str, Any]:
-        if self._layouts is not None:
-            try:
-                self._layouts.write(files)
-            except LayoutError as error:
-                return {"success": False, "failures": [f"layout: {error.what}"]}
-        return {"success": True}
+    def _open(self, settings: EpisodeSettings) -> None:
+        if self._plan.makes_layouts:
+            config, robot = load_config_of(TASKS[settings.task], settings.config), find_robot(settings.robot)
+            pack = load_pack(settings.pack)
+            self._model = SceneModel.load(config, pack, load_pack("builtin"), robot=robot.description)
+            self._layouts = layout_source(self._model, settings.layouts)
+        if self._plan.makes_demonstrations:
+            self._generator = EpisodeGenerator(settings)
 
-    def _record(self, files: SeedFiles) -> dict[str, Any]:
-        assert self._generator is not None
+    def _record(self, files: SeedFiles, generator: EpisodeGenerator) -> dict[str, Any]:
         if not files.recording.is_file():  # otherwise its process died after it had written the file
             tmp = files.folder / ".recording.tmp.h5"
-            result = self._generator.generate(files.seed, files.folder, tmp.stem)
+            result = generator.generate(files.seed, files.folder, tmp.stem)
             if not result.success:
                 return {"success": False, "failures": [f"{each.stage}: {each.reason}" for each in result.failures]}
             _remove_times(tmp.with_suffix(".json"))
@@ -90,21 +77,11 @@ class Recorder:
             "failures": episode["robocas"]["failed_attempts"],
         }
 
-    def _open(self, part: int) -> None:
-        settings = recording_settings(self._plan, part)
-        if settings == self._settings:
-            return
-        self.close()
-        with opening_part(self._plan, part):
-            self._layouts = LayoutMaker(settings) if self._plan.makes_layouts else None
-            self._generator = EpisodeGenerator(settings) if self._plan.makes_demonstrations else None
-        self._settings = settings
-
     def close(self) -> None:
         """Close the environments."""
         if self._generator is not None:
             self._generator.close()
-        self._settings = self._generator = None
+        self._part = self._generator = self._model = None
 
 
 def _remove_times(path: Path) -> None:

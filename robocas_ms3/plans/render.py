@@ -14,26 +14,26 @@ from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.writing import rendering
 from robocas_ms3.datasets.writing.episode_folder import FolderWriter
 from robocas_ms3.datasets.writing.inputs import ConversionInput
-from robocas_ms3.datasets.writing.rendering import OpenRenderer, RenderedSource, open_env
 from robocas_ms3.demos.recordings.environment import RecordedEnv
 from robocas_ms3.plans.load import opening_part
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.units import SeedFiles
 
 
+def open_env(env: RecordedEnv, control_mode: str, pictures: Pictures) -> rendering.Renderer:
+    """Open the environment that recorded an episode."""
+    use_one_torch_thread()
+    return rendering.open_env(env, control_mode, pictures)
+
+
 class Renderer:
     """Renders recorded episodes; keeps the environment while the part stays the same."""
 
-    def __init__(self, plan: Plan, open_renderer: OpenRenderer = open_env) -> None:
+    def __init__(self, plan: Plan, open_renderer: rendering.OpenRenderer = open_env) -> None:
         os.environ.setdefault("LP_NUM_THREADS", "1")  # one process per core renders
-        if open_renderer is open_env:
-            from robocas_ms3.datasets.writing.render import require_renderer
-
-            use_one_torch_thread()
-            require_renderer()  # an error of all episodes
         self._plan, self._open_renderer = plan, open_renderer
         self._part: int | None = None
-        self._source: RenderedSource | None = None
+        self._source: rendering.RenderedSource | None = None
         self._embedder: Any = None
 
     def run(self, files: SeedFiles) -> dict[str, Any]:
@@ -45,11 +45,11 @@ class Renderer:
             FolderWriter(files.folder, embed).write(0, recording, 0)
         return {"render_seconds": round(time.process_time() - start, 2)}
 
-    def _source_of(self, files: SeedFiles) -> RenderedSource:
+    def _source_of(self, files: SeedFiles) -> rendering.RenderedSource:
         if self._source is None or self._part != files.part:
             self.close()
             self._part = files.part
-            self._source = RenderedSource(
+            self._source = rendering.RenderedSource(
                 files.recording,
                 rate_hz=self._plan.rate,
                 pictures=self._plan.pictures.chosen(),

@@ -4,29 +4,31 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 from robocas_ms3.core.errors import PlanError
+from robocas_ms3.core.exits import deferred_interrupts
 from robocas_ms3.core.files import make_folder, write_json
 from robocas_ms3.core.locks import locked_folder
 from robocas_ms3.core.outputs import OutputFolder, is_empty
 from robocas_ms3.core.words import count_of
 from robocas_ms3.plans.executors import Executor
 from robocas_ms3.plans.folder import KIND, PLAN, check_plan_record, plan_record, read_plan, settings_of
-from robocas_ms3.plans.join import damaged_episodes, has_moved, join
+from robocas_ms3.plans.join import damaged_episodes, join
 from robocas_ms3.plans.load import check_plan
-from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.progress import Progress, Shard
 from robocas_ms3.plans.status import Status, status_of
 from robocas_ms3.plans.units import Unit
 
 _ROUNDS = 3  # how often episodes are made again that a disk has damaged
-_TRIES = 3  # jobs in a row that may end at the same seed of a unit
+_TRIES = 3  # jobs that may end at the same seed of a unit
+_POLL = 0.05  # s between two looks at the jobs
 _LOOK = 1.0  # s between two looks at the folder, at least
 _LOOKS = 10_000.0  # seeds per second that are looked at, at most
 
@@ -45,53 +47,54 @@ class Callbacks:
 
 
 def run_plan(
-    plan: Plan,
-    out: Path,
-    open_executor: Callable[[], Executor],
+    executor: Executor,
     *,
-    jobs: int = 1,
     overwrite: bool = False,
     callbacks: Callbacks = Callbacks(),  # noqa: B008  (frozen)
 ) -> dict[str, Any]:
     """Make the dataset of a plan, or continue; its content depends on the plan alone.
 
     Args:
-        plan: the plan.
-        out: gets ``plan.json``, ``units/``, and in the end ``demos/``, ``datasets/``, ``statistics/``, ``report.json``.
-        open_executor: opens what has units done, in ``out``.
-        jobs: processes that join.
-        overwrite: replace the content of ``out``.
+        executor: has the units done. Its output folder gets ``plan.json``, ``units/``, and in the end ``demos/``,
+            ``datasets/``, ``statistics/``, ``report.json``.
+        overwrite: replace the content of the folder.
         callbacks: see there.
 
     Returns:
         The content of ``report.json``.
 
     Raises:
-        OutputExistsError: ``out`` was started with another plan or other versions, or by another command.
+        OutputExistsError: the folder was started with another plan or other versions, or by another command.
         PlanError: almost all seeds of a part fail.
-        RobocasError: another run writes into ``out``; or an error that every seed would meet.
+        RobocasError: another run writes into the folder; or an error that every seed would meet.
     """
+    plan, out = executor.plan, executor.out
     check_plan(plan)
     record = plan_record(plan)
     with OutputFolder(out, KIND, settings_of(record), overwrite=overwrite) as output:
         output.start(record)
-        with _opened(open_executor) as executor:
-            progress = _make_episodes(plan, output, executor, callbacks)
-        return join(plan, out, progress.chosen(), jobs=jobs, say=callbacks.stage)
+        with executor:
+            progress = Progress(plan, out)
+            for _ in range(_ROUNDS):
+                _do_units(executor, progress, callbacks)
+                damaged = _forget_damaged(progress, out)
+                if not damaged:
+                    break
+                callbacks.stage(f"{count_of(sum(map(len, damaged.values())), 'episode')} again: damaged files")
+            else:
+                unit, seeds = min(damaged.items())
+                found, fix = f"seed {seeds[0]}, made {_ROUNDS} times", "Check the disk; then run the command again."
+                what, where = "files don't keep the sizes that they were written with", unit.folder(plan, out)
+                raise PlanError(what, where=where, found=found, fix=fix)
+        return join(plan, out, progress.chosen(), jobs=executor.jobs, say=callbacks.stage)
 
 
 def run_shard(
-    plan: Plan,
-    out: Path,
-    open_executor: Callable[[], Executor],
+    executor: Executor,
     shard: Shard,
     callbacks: Callbacks = Callbacks(),  # noqa: B008  (frozen)
 ) -> bool:
     """Do the work units of a shard that are needed and not done, next to other shards in the same folder.
-
-    Args:
-        plan, out, open_executor, callbacks: as of `run_plan`.
-        shard: the units.
 
     Returns:
         Whether no unit of the plan is missing: `join_plan` can join it.
@@ -99,17 +102,17 @@ def run_shard(
     Raises:
         RobocasError: as `run_plan`.
     """
+    plan, out = executor.plan, executor.out
     check_plan(plan)
-    output = OutputFolder(out, KIND)  # not entered: shards run at the same time
     if not (out / PLAN).exists():
         if not is_empty(out):
             raise PlanError("not the folder of a plan", where=out, expected=PLAN, fix="Choose another --out.")
         write_json(make_folder(out) / PLAN, plan_record(plan), sync=True)
     check_plan_record(out, plan)
     progress = Progress(plan, out)
-    if next(progress.missing(shard), None) is not None:
-        with _opened(open_executor) as executor:
-            _do_units(progress, output, executor, callbacks, shard)
+    if next(progress.missing(shard), None):
+        with executor:
+            _do_units(executor, progress, callbacks, shard)
     progress.read()
     return next(progress.missing(), None) is None
 
@@ -128,9 +131,7 @@ def join_plan(out: Path, *, jobs: int = 1, say: Callable[[str], None] = lambda t
     check_plan_record(out, plan)
     with locked_folder(out):
         progress = Progress(plan, out)
-        if not has_moved(out):
-            for unit, seeds in damaged_episodes(plan, out, progress.chosen()).items():
-                progress.forget(unit, seeds)
+        _forget_damaged(progress, out)
         missing = [f"{unit.folder(plan, out).relative_to(out)}" for unit in progress.missing()]
         if missing:
             found, fix = f"{count_of(len(missing), 'unit')}, {missing[0]} first", "robocas plan run does them."
@@ -138,48 +139,31 @@ def join_plan(out: Path, *, jobs: int = 1, say: Callable[[str], None] = lambda t
         return join(plan, out, progress.chosen(), jobs=jobs, say=say)
 
 
-@contextmanager
-def _opened(open_executor: Callable[[], Executor]) -> Iterator[Executor]:
-    executor = open_executor()
-    try:
-        yield executor
-    finally:
-        executor.close()
+def _forget_damaged(progress: Progress, out: Path) -> dict[Unit, list[int]]:
+    """Delete chosen episodes whose files have lost their size; return their seeds."""
+    damaged = damaged_episodes(progress.plan, out, progress.chosen())
+    for unit, seeds in damaged.items():
+        progress.forget(unit, seeds)
+    return damaged
 
 
-def _make_episodes(plan: Plan, output: OutputFolder, executor: Executor, callbacks: Callbacks) -> Progress:
-    """Do units until there are enough episodes, whose files have the sizes that they were written with."""
-    out = output.path
-    progress = Progress(plan, out)
-    for _ in range(_ROUNDS):
-        _do_units(progress, output, executor, callbacks)
-        damaged = {} if has_moved(out) else damaged_episodes(plan, out, progress.chosen())
-        if not damaged:
-            return progress
-        callbacks.stage(f"{count_of(sum(map(len, damaged.values())), 'episode')} again: their files are damaged")
-        for unit, seeds in damaged.items():
-            progress.forget(unit, seeds)
-    unit = min(damaged)
-    found, fix = f"seed {damaged[unit][0]}, made {_ROUNDS} times", "Check the disk; then run the command again."
-    where = unit.folder(plan, out)
-    raise PlanError("files don't keep the sizes that they were written with", where=where, found=found, fix=fix)
-
-
-def _do_units(
-    progress: Progress, output: OutputFolder, executor: Executor, callbacks: Callbacks, shard: Shard | None = None
-) -> None:
+def _do_units(executor: Executor, progress: Progress, callbacks: Callbacks, shard: Shard = (0, 1)) -> None:
     """Do the units that are needed; which ones these are is seen as seeds fail."""
+    plan, out = executor.plan, executor.out
     running: dict[Any, Sequence[Unit]] = {}
-    failures = _JobFailures(progress.plan, output.path)
+    killed: Counter[tuple[Unit, int]] = Counter()  # jobs that ended at a unit with so many seeds done
     shown = -math.inf
     while True:
         busy = {unit for units in running.values() for unit in units}
         free = executor.jobs - len(running)
         waiting = (unit for unit in progress.missing(shard) if unit not in busy)
-        groups = _grouped(list(islice(waiting, free * executor.units_per_job)), free)
-        running |= zip(executor.submit(groups), groups, strict=False) if groups else {}
+        units = list(islice(waiting, free * executor.units_per_job))
+        if units:
+            size = math.ceil(len(units) / free)
+            groups = [units[first : first + size] for first in range(0, len(units), size)]
+            running |= zip(executor.submit(groups), groups, strict=False)
         if time.monotonic() > shown:
-            output.check_exists()
+            OutputFolder(out, KIND).check_exists()
             progress.read()
             progress.check_failures()
             status = status_of(progress)
@@ -188,37 +172,25 @@ def _do_units(
         if next(progress.missing(shard), None) is None:
             callbacks.progress(status_of(progress))
             return
-        for job in executor.ended(list(running), _LOOK):
+        for job in _ended(running, shown):
+            job.result()
             for unit in running.pop(job):
-                if not progress.add(unit):
-                    failures.add(unit, executor.log_of(job))
-                    break  # the job was at this unit
+                if progress.add(unit):
+                    continue
+                killed[place := (unit, len(progress.partial[unit]))] += 1
+                if killed[place] >= _TRIES:
+                    where, fix = unit.folder(plan, out), f"See {executor.log_of(job)}; is memory short?"
+                    found = f"{killed[place]} in a row"
+                    raise PlanError("the jobs of this unit die", where=where, found=found, fix=fix)
+                break  # the job was at this unit
         progress.check_failures()
 
 
-def _grouped(units: Sequence[Unit], jobs: int) -> list[Sequence[Unit]]:
-    """Divide units among jobs that are free."""
-    size = math.ceil(len(units) / jobs) if jobs else 1
-    return [units[first : first + size] for first in range(0, len(units), size or 1)]
-
-
-class _JobFailures:
-    """Counts the jobs that ended before their unit was complete, as after a kill or the loss of a node."""
-
-    def __init__(self, plan: Plan, out: Path) -> None:
-        self._plan, self._out = plan, out
-        self._count: dict[Unit, tuple[int, int]] = {}  # failures in a row, at so many seeds
-
-    def add(self, unit: Unit, log: str) -> None:
-        """Count a job.
-
-        Raises:
-            PlanError: so many ended in a row, without another seed of the unit.
-        """
-        seeds = len(unit.partial_outcomes(self._plan, self._out))
-        before, seeds_before = self._count.get(unit, (0, -1))
-        count = before + 1 if seeds == seeds_before else 1
-        self._count[unit] = count, seeds
-        if count >= _TRIES:
-            where, fix = unit.folder(self._plan, self._out), f"See {log or 'the log of the job'}; is memory short?"
-            raise PlanError("the jobs of this unit die", where=where, found=f"{count} in a row", fix=fix)
+def _ended(running: dict[Any, Sequence[Unit]], until: float) -> list[Any]:
+    """Wait for a job to end, at most until some time."""
+    while True:
+        with deferred_interrupts():  # Ctrl-C inside could leave a lock of a future held
+            ended = [job for job in running if job.done()]
+        if ended or time.monotonic() > until:
+            return ended
+        Event().wait(_POLL)

@@ -5,9 +5,8 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from robocas_ms3.plans.folder import REPORT, read_plan
 from robocas_ms3.plans.progress import Progress
@@ -42,7 +41,7 @@ class PartStatus:
 
 @dataclass(frozen=True)
 class Status:
-    """Status of a plan.
+    """Status of a plan; the content of ``robocas plan status --json``.
 
     Attributes:
         parts: status of each part.
@@ -58,10 +57,6 @@ class Status:
     idle_seconds: float | None
     finished: bool
 
-    def as_json(self) -> dict[str, Any]:
-        """Return the content of ``--json``."""
-        return asdict(self)
-
 
 def read_status(out: Path) -> Status:
     """Read the status of the plan in a folder.
@@ -74,64 +69,57 @@ def read_status(out: Path) -> Status:
 
 def status_of(progress: Progress, *, finished: bool = False) -> Status:
     """Return the status of a plan from the outcomes of its seeds."""
-    plan, partial = progress.plan, progress.partial()
-    parts: list[PartStatus] = []
-    times: list[tuple[float, int]] = []  # when an episode was done, and its part
+    outcomes: list[list[Outcome]] = [[] for _ in progress.plan.parts]
+    for unit, found in [*progress.done.items(), *progress.partial.items()]:
+        outcomes[unit.part] += found
+    parts = [
+        _part_status(part.name or "", part.episodes, found)
+        for part, found in zip(progress.plan.parts, outcomes, strict=True)
+    ]
     latest = time.time() + _RECENT  # a clock far ahead would hide all other episodes
-    for number, part in enumerate(progress.parts):
-        outcomes = [*(outcome for unit in part.done.values() for outcome in unit), *partial[number]]
-        parts.append(_part(plan.name_of(number), plan.parts[number].episodes, outcomes))
-        times += [(outcome.at, number) for outcome in outcomes if outcome.success and outcome.at <= latest]
-    recent, seconds = _recent(sorted(times))
-    left = seconds_left(parts, recent, seconds)
+    ends = sorted(
+        (outcome.at, part)
+        for part, found in enumerate(outcomes)
+        for outcome in found
+        if outcome.success and outcome.at <= latest
+    )
+    recent = [(at, part) for at, part in ends if at > ends[-1][0] - _RECENT]
+    seconds = recent[-1][0] - recent[0][0] if recent else 0.0
+    left = seconds_left(parts, [part for _, part in recent[1:]], seconds) if seconds else None
     return Status(
         parts,
-        round(3600 * len(recent) / seconds, 1) if seconds else 0.0,
-        None if left is None else round(left, 1),
-        round(max(0.0, time.time() - max(times)[0]), 1) if times else None,
-        finished,
+        episodes_an_hour=round(3600 * (len(recent) - 1) / seconds, 1) if seconds else 0.0,
+        seconds_left=None if left is None else round(left, 1),
+        idle_seconds=round(max(0.0, time.time() - ends[-1][0]), 1) if ends else None,
+        finished=finished,
     )
 
 
-def _part(name: str, wanted: int, outcomes: Sequence[Outcome]) -> PartStatus:
+def _part_status(name: str, wanted: int, outcomes: Sequence[Outcome]) -> PartStatus:
     good = [outcome for outcome in outcomes if outcome.success]
-    failed = Counter(each.failures[-1] for each in outcomes if not each.success and each.failures)
     done, count = min(wanted, len(good)), max(1, len(good))
     return PartStatus(
         name,
         wanted,
         done,
-        len(outcomes),
-        dict(failed),
-        round(sum(each.record_seconds for each in outcomes) / count, 2),
-        round(sum(each.render_seconds for each in outcomes) / count, 2),
-        round(sum(each.size for each in good) * done / count),
+        tried=len(outcomes),
+        failed=dict(Counter(each.failures[-1] for each in outcomes if not each.success and each.failures)),
+        record_seconds=round(sum(each.record_seconds for each in outcomes) / count, 2),
+        render_seconds=round(sum(each.render_seconds for each in outcomes) / count, 2),
+        bytes=round(sum(each.size for each in good) * done / count),
     )
 
 
-def _recent(times: list[tuple[float, int]]) -> tuple[list[int], float]:
-    """Return the parts of recent episodes and the seconds that they took; 0 s where that is unknown."""
-    recent = [(at, part) for at, part in times if at > times[-1][0] - _RECENT]
-    if len(recent) < 2 or recent[-1][0] <= recent[0][0]:
-        return [], 0.0
-    return [part for _, part in recent[1:]], recent[-1][0] - recent[0][0]
-
-
-def seconds_left(parts: Sequence[PartStatus], recent: Sequence[int], seconds: float) -> float | None:
-    """Estimate the time until all episodes are done; None: unknown.
+def seconds_left(parts: Sequence[PartStatus], recent: Sequence[int], seconds: float) -> float:
+    """Estimate the time until all episodes are done.
 
     Args:
         parts: status of each part: an episode takes the mean CPU time of its part, or of all where it has none.
-        recent: parts of the recent episodes.
+        recent: parts of the recent episodes, at least one.
         seconds: that these took.
     """
-    if not recent:
-        return None
-    done = sum(part.done for part in parts)
     spent = [(part.record_seconds + part.render_seconds) * part.done for part in parts]
-    mean = sum(spent) / max(1, done)
-    cost = [each / part.done if part.done else mean for each, part in zip(spent, parts, strict=True)]
-    if not mean:  # no CPU times are known
-        cost = [1.0] * len(parts)
+    mean = sum(spent) / max(1, sum(part.done for part in parts)) or 1.0  # 1.0: no CPU times are known
+    cost = [each / part.done if each else mean for each, part in zip(spent, parts, strict=True)]
     left = sum(each * (part.wanted - part.done) for each, part in zip(cost, parts, strict=True))
-    return left * seconds / max(1e-9, sum(cost[part] for part in recent))
+    return left * seconds / sum(cost[part] for part in recent)

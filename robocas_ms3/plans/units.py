@@ -63,13 +63,7 @@ _OUTCOME: TypeAdapter[Outcome] = TypeAdapter(Outcome)
 
 @dataclass(frozen=True)
 class SeedFiles:
-    """Files of one seed.
-
-    Attributes:
-        part: number of its part in the plan.
-        seed: the seed.
-        folder: of the files.
-    """
+    """Files of one seed of a part, in a folder."""
 
     part: int
     seed: int
@@ -96,10 +90,8 @@ class SeedFiles:
 
     def outcome(self) -> Outcome | None:
         """Read the outcome; None: the seed is not done, or its file is damaged."""
-        try:
+        with suppress(OSError, DocumentError, ValidationError):
             return validate_json(_OUTCOME, read_bytes(self.folder / OUTCOME, JSON_LIMIT))
-        except (OSError, DocumentError, ValidationError):
-            return None
 
     def write(self, outcome: Outcome) -> None:
         """Write the outcome."""
@@ -146,10 +138,9 @@ class Unit:
 
     def outcomes(self, plan: Plan, out: Path) -> list[Outcome] | None:
         """Read the outcomes of all its seeds, in order; None: it is not complete."""
-        try:
-            found = {outcome.seed: outcome for outcome in _outcomes(self.folder(plan, out)).read()}
-        except (OSError, DocumentError):
-            return None
+        found: dict[int, Outcome] = {}
+        with suppress(OSError, DocumentError):
+            found = {outcome.seed: outcome for outcome in self._ledger(plan, out).read()}
         seeds = self.seeds(plan)
         return [found[seed] for seed in seeds] if found.keys() >= set(seeds) else None
 
@@ -162,13 +153,16 @@ class Unit:
         """Write ``seeds.jsonl``, once all seeds are done."""
         outcomes = self.partial_outcomes(plan, out)
         if len(outcomes) == len(self.seeds(plan)):
-            _outcomes(self.folder(plan, out)).rewrite(outcomes)
+            self._ledger(plan, out).rewrite(outcomes)
 
     def forget(self, plan: Plan, out: Path, seeds: Collection[int]) -> None:
         """Delete some seeds, which are then done again."""
-        (self.folder(plan, out) / OUTCOMES).unlink(missing_ok=True)
+        self._ledger(plan, out).path.unlink(missing_ok=True)
         for seed in seeds:
             shutil.rmtree(self.files(plan, out, seed).folder, ignore_errors=True)
+
+    def _ledger(self, plan: Plan, out: Path) -> Ledger[Outcome]:
+        return Ledger(self.folder(plan, out) / OUTCOMES, Outcome)
 
 
 def started_blocks(plan: Plan, out: Path, part: int) -> list[int]:
@@ -177,7 +171,3 @@ def started_blocks(plan: Plan, out: Path, part: int) -> list[int]:
     with suppress(FileNotFoundError):
         names = os.listdir(out / UNITS / plan.name_of(part))  # asks an NFS server; whether a file exists may not
     return sorted(int(name) for name in names if name.isascii() and name.isdecimal())
-
-
-def _outcomes(folder: Path) -> Ledger[Outcome]:
-    return Ledger(folder / OUTCOMES, Outcome)

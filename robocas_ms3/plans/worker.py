@@ -61,9 +61,10 @@ class UnitWorker:
         self, plan: Plan, out: Path, record: OpenStage = open_recorder, render: OpenStage = open_renderer
     ) -> None:
         self._plan, self._out = plan, out
-        limits = plan.limits
-        self._record = _open_process(record, plan, Limits(limits.record_seconds, limits.memory_gb))
-        self._render = _open_process(render, plan, Limits(limits.render_seconds, limits.memory_gb))
+        memory_gb = plan.limits.memory_gb
+        limits = Limits(plan.limits.record_seconds, memory_gb), Limits(plan.limits.render_seconds, memory_gb)
+        self._record = WorkerPool(partial(record, plan), 1, limits=limits[0], retries=0)
+        self._render = WorkerPool(partial(render, plan), 1, limits=limits[1], retries=0)
 
     def do(self, unit: Unit) -> None:
         """Do the seeds of a unit that are not done.
@@ -108,7 +109,7 @@ class UnitWorker:
         for _ in range(TRIES):
             try:
                 return process.run(files)
-            except WorkerStartError as failed:  # would affect every seed
+            except WorkerStartError as failed:
                 raise PlanError("a process could not start", found=failed) from failed
             except WorkerCrashed as crash:
                 reason = f"{crash.found}"
@@ -132,19 +133,8 @@ class UnitWorker:
         self._render.close()
 
 
-def _open_process(stage: OpenStage, plan: Plan, limits: Limits) -> WorkerPool[SeedFiles, dict[str, Any]]:
-    return WorkerPool(partial(_open_stage, stage, plan), 1, limits=limits, retries=0)
-
-
-def _open_stage(stage: OpenStage, plan: Plan) -> Worker[SeedFiles, dict[str, Any]]:
-    try:
-        return stage(plan)
-    except Exception as error:  # would affect every seed
-        raise PlanError("a process could not start", found=error) from error
-
-
 def _is_of_a_seed(error: Exception) -> bool:
-    """Whether an error is due to a seed: its scene or files, a bug that it has found, memory that was missing.
+    """Return whether an error is due to a seed: its scene or files, a bug that it has found, memory that was missing.
 
     Errors of the disk, the system or the installation are not: all seeds of a machine would be left out.
     """

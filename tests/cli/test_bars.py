@@ -1,13 +1,17 @@
 """Bars show on a terminal; elsewhere the first line, one a minute and the last do, plain and with the same numbers."""
 
+import io
 import os
 import re
 import subprocess
 import sys
 
 import pytest
+from plan_stages import PLAN
 
 from robocas_ms3.cli import bars
+from robocas_ms3.cli.terminal import console
+from robocas_ms3.plans.status import PartStatus, Status
 
 SCRIPT = """
 from robocas_ms3.cli.bars import bar, working
@@ -29,18 +33,16 @@ with bar("never begun") as shown:
     pass
 say("done")
 """
-FORCED = ("FORCE_COLOR", "TTY_COMPATIBLE", "TTY_INTERACTIVE")
 
 
 def run(*, forced="", **kwargs):
-    environment = {k: v for k, v in os.environ.items() if k not in FORCED} | ({forced: "1"} if forced else {})
+    environment = {k: v for k, v in os.environ.items() if k != "FORCE_COLOR"} | ({forced: "1"} if forced else {})
     command = [sys.executable, "-c", SCRIPT]
     return subprocess.run(command, check=True, env={**environment, "TERM": "xterm"}, timeout=60, **kwargs)
 
 
-@pytest.mark.parametrize("forced", ["", *FORCED])
-def test_where_stderr_is_no_terminal(forced):
-    done = run(forced=forced, capture_output=True)
+def test_where_stderr_is_no_terminal():
+    done = run(forced="FORCE_COLOR", capture_output=True)
     assert done.stdout == b"one\ndone\n"
     noted = b"[1] is :odd: " + 90 * b"x"
     assert done.stderr.splitlines() == [b"counted: 0 of 2", noted, done.stderr.splitlines()[-1]]
@@ -70,7 +72,7 @@ def clock(monkeypatch):
     return now
 
 
-def test_a_line_a_minute_in_a_log_and_the_first_and_the_last(clock, capsys):
+def test_a_log_has_the_first_line_one_per_minute_and_the_last(clock, capsys):
     with bars.bar("episodes") as shown:
         shown.start(300)
         for _ in range(300):
@@ -82,13 +84,13 @@ def test_a_line_a_minute_in_a_log_and_the_first_and_the_last(clock, capsys):
     assert len(lines) == 9
 
 
-def test_what_was_there_before_does_not_make_it_faster(clock, capsys):
+def test_items_done_before_do_not_count_in_the_rate(clock, capsys):
     with pytest.raises(KeyboardInterrupt), bars.bar("layouts") as shown:
-        shown.start(100, there=90)
-        clock[0] += 20
-        shown.advance()
-        clock[0] += 20
-        shown.advance()
+        clock[0] += 500  # before the first item
+        shown.at(90, 100)
+        clock[0] += 40
+        shown.at(91, 100)
+        shown.next_of(100)
         raise KeyboardInterrupt
     assert capsys.readouterr().err.splitlines() == [
         "layouts: 90 of 100",
@@ -96,19 +98,7 @@ def test_what_was_there_before_does_not_make_it_faster(clock, capsys):
     ]
 
 
-def test_it_may_begin_with_the_first_that_is_done(clock, capsys):
-    with bars.bar("episodes") as shown:
-        clock[0] += 500  # of which nobody knows what they were for
-        shown.at(3, 9)
-        clock[0] += 2
-        shown.next_of(9)
-    assert capsys.readouterr().err.splitlines() == [
-        "episodes: 3 of 9",
-        "episodes: 4 of 9, 2.0 s each, 10 s left, after 2 s",
-    ]
-
-
-def test_what_has_a_verdict_is_quiet_for_a_minute(clock, capsys):
+def test_a_transient_bar_writes_nothing_within_a_minute(clock, capsys):
     with bars.bar("checked", transient=True) as shown:
         for done in range(1, 9):
             shown.at(done, 9)
@@ -117,13 +107,48 @@ def test_what_has_a_verdict_is_quiet_for_a_minute(clock, capsys):
 
 
 @pytest.mark.parametrize(
-    ("seconds", "said"), [(0, "0 s"), (59.4, "59 s"), (59.6, "1 min"), (3569, "59 min"), (3590, "1 h 0 min")]
+    ("seconds", "said"),
+    [(0, "0 s"), (59.4, "59 s"), (59.6, "1 min"), (3569, "59 min"), (3590, "1 h 0 min"), (99000, "27 h 30 min")],
 )
 def test_spans(seconds, said):
     assert bars.span(seconds) == said
 
 
-def test_speed():
-    assert bars.speed(40, 20, 0, 10) == "4.0 a second"
-    assert bars.speed(5, 10, 5, 60) == bars.speed(5, 10, 0, 0) == ""
-    assert bars.speed(9, 1000, 0, 900) == "100.0 s each, 27 h 32 min left"
+def plan_status(*done):
+    parts = [
+        PartStatus(part.name, part.episodes, count, count, {}, 1.0, 1.0, 0)
+        for part, count in zip(PLAN.parts, done, strict=True)
+    ]
+    return Status(parts, 120.0, 5400.0, 1.0, False)
+
+
+def test_a_plan_in_a_log(clock, capsys):
+    display = bars.Display()
+    for done in ((0, 0), (3, 0), (5, 1)):
+        bars.show_plan(display, plan_status(*done))
+        clock[0] += 31
+    display.flush()  # though it is not time
+    display.note("joining the dataset")
+    bars.show_plan(display, plan_status(5, 2))
+    display.close()
+    speed = "120 episodes per hour, 1 h 30 min left"
+    assert capsys.readouterr().err.splitlines() == [
+        f"0 of 7 episodes, {speed}",
+        f"6 of 7 episodes (b 1 of 2), {speed}, after 1 min",
+        "joining the dataset",
+        f"7 of 7 episodes, {speed}, after 2 min",
+    ]
+
+
+def test_a_plan_on_a_terminal_has_a_bar_per_part_and_one_for_all(monkeypatch, capsys):
+    file = io.StringIO()
+    terminal = console(file=file, force_terminal=True, width=120)
+    monkeypatch.setattr(bars, "terminal_of_stderr", lambda: terminal)
+    display = bars.Display()
+    for done in ((2, 0), (5, 1)):
+        bars.show_plan(display, plan_status(*done))
+    display.note("joining [red]the dataset")
+    display.close()
+    for text in ("5/5", "1/2", "6/7", "120 episodes per hour, 1 h 30 min left", "joining [red]the dataset"):
+        assert text in file.getvalue()
+    assert capsys.readouterr().err == ""

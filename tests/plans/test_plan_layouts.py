@@ -7,7 +7,7 @@ from plan_stages import PLAN
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.plans.join import LAYOUTS, join
-from robocas_ms3.plans.record import LayoutMaker, Recorder
+from robocas_ms3.plans.record import Recorder
 from robocas_ms3.plans.units import Outcome, Unit
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.model import SceneModel
@@ -39,9 +39,9 @@ def test_layouts_alone_are_made_and_joined(files, tmp_path):
 
 
 def test_a_seed_without_a_layout_is_one_that_failed(files, monkeypatch):
-    def nothing(self, files):
+    def nothing(*_):
         raise LayoutError("no room for all objects")
 
-    monkeypatch.setattr(LayoutMaker, "write", nothing)
+    monkeypatch.setattr("robocas_ms3.plans.record.layout_source", lambda *_: nothing)
     found = Recorder(ALONE).run(files)
     assert (found["success"], found["failures"]) == (False, ["layout: no room for all objects"])

@@ -7,7 +7,7 @@ from plan_stages import PLAN
 
 from robocas_ms3.datasets.manage import splitting
 from robocas_ms3.datasets.sources.split import SPLIT_RULE
-from robocas_ms3.plans import split as splits
+from robocas_ms3.plans import join as splits
 from robocas_ms3.plans.plan import Plan
 
 COUNTS = (20, 5, 10)

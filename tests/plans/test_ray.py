@@ -18,9 +18,7 @@ from plan_stages import PLAN, MadeUp, assert_same, open_worker, render, run_here
 from ray.cluster_utils import Cluster
 
 from robocas_ms3.core.errors import MissingExtraError, PlanError
-from robocas_ms3.plans.executors import Setting, check_executor, open_executor, read_options
-from robocas_ms3.plans.executors.ray import RayExecutor, do_units
-from robocas_ms3.plans.executors.ray_cluster import RayOptions
+from robocas_ms3.plans.executors.ray import RayExecutor, RayOptions, do_units
 from robocas_ms3.plans.run import run_plan
 from robocas_ms3.plans.units import Unit
 from robocas_ms3.plans.worker import UnitWorker
@@ -110,7 +108,7 @@ def _name(process):
 
 def run(cluster, out, gather, open_worker=open_worker, jobs=2):
     options = {"address": cluster.address, "gather": "yes" if gather else "no", "units_per_job": "1"}
-    return run_plan(PLAN, out, lambda: RayExecutor(Setting(PLAN, out, jobs, options, open_worker)))
+    return run_plan(RayExecutor(PLAN, out, jobs, options, open_worker))
 
 
 def once(out, happen):
@@ -191,17 +189,17 @@ def raylet(cluster):
 def test_options_are_read_or_refused():
     options = {"num_gpus": "0.25", "gather": "yes", "address": "10.0.0.1:6379"}
     expected = RayOptions(num_gpus=0.25, gather=True, address="10.0.0.1:6379")
-    assert read_options("ray", RayOptions, options) == expected
+    assert RayExecutor(PLAN, Path(), options=options).options == expected
     for options in ({"cpus": "2"}, {"num_cpus": "0"}, {"gather": "perhaps"}):
         with pytest.raises(PlanError) as error:
-            check_executor("ray", options)
+            RayExecutor(PLAN, Path(), options=options)
         assert str(error.value.where).startswith("--executor-option")
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "ray://127.0.0.1:1"])
 def test_a_cluster_that_is_not_there_is_an_error(tmp_path, address):
-    with pytest.raises(PlanError, match=address):
-        open_executor("ray", Setting(PLAN, tmp_path, options={"address": address}))
+    with pytest.raises(PlanError, match=address), RayExecutor(PLAN, tmp_path, options={"address": address}):
+        pass
 
 
 @GATHER
@@ -221,9 +219,8 @@ def test_a_unit_that_goes_on_killing_its_tasks_ends_the_plan(cluster, tasks, tmp
 
 def test_a_node_that_does_not_see_the_folder_is_an_error(tmp_path, monkeypatch):
     monkeypatch.setattr("robocas_ms3.plans.executors.ray._APPEARS", 0.0)
-    sent = do_units(PLAN, tmp_path / "elsewhere", [Unit(0, 0)], open_worker)
     with pytest.raises(PlanError, match="gather=yes"):
-        sent.reraise()
+        do_units(PLAN, tmp_path / "elsewhere", [Unit(0, 0)], open_worker)
 
 
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGKILL])
@@ -257,5 +254,4 @@ def _of_ray(before):
 
 if __name__ == "__main__":
     sys.path.insert(0, str(SUPPORT))
-    setting = Setting(PLAN, Path(sys.argv[1]), 2, json.loads(sys.argv[2]), open_worker)
-    run_plan(PLAN, setting.out, lambda: RayExecutor(setting))
+    run_plan(RayExecutor(PLAN, Path(sys.argv[1]), 2, json.loads(sys.argv[2]), open_worker))

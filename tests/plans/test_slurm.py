@@ -13,7 +13,7 @@ from plan_stages import PLAN, assert_same, deaths_of, plan_faults, run_here
 from slurm_runs import LOCAL, NO_SLURM, SLURM, job_at, processes_of, run, slurm_answers, start, wait_for
 
 from robocas_ms3.core.errors import MissingExtraError, PlanError
-from robocas_ms3.plans.executors import Setting, check_executor, open_executor
+from robocas_ms3.plans.executors import open_executor
 
 SUPPORT = Path(__file__).resolve().parents[1] / "support"
 CLUSTERS = [
@@ -111,14 +111,14 @@ def test_an_error_of_all_seeds_ends_the_run(undisturbed, tmp_path):
 @pytest.mark.parametrize("options", [{"partitoin": "x"}, {"units_per_job": "0"}, {"time": "2h"}, {"cluster": "pbs"}])
 def test_invalid_options_are_refused(options):
     with pytest.raises(PlanError) as error:
-        check_executor("slurm", options)
+        open_executor("slurm", PLAN, Path(), 1, options)
     assert str(error.value.where).startswith("--executor-option")
 
 
 def test_without_slurm_the_executor_says_so(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(PlanError) as error:
-        open_executor("slurm", Setting(PLAN, tmp_path))
+        open_executor("slurm", PLAN, tmp_path, 1, {})
     assert error.value.where == "--executor slurm"
 
 
@@ -142,16 +142,18 @@ def slurm(tmp_path, monkeypatch):
 
 @pytest.fixture
 def executor(slurm, tmp_path):
-    return open_executor("slurm", Setting(PLAN, tmp_path / "out", 2))
+    executor = open_executor("slurm", PLAN, tmp_path / "out", 2, {})
+    executor.__enter__()
+    return executor
 
 
 def test_a_queue_that_does_not_answer_changes_nothing(executor, slurm, caplog):
     jobs = executor.submit([["one"], ["two"]])
     slurm("squeue", "exit 1")
-    assert executor.ended(jobs, 0.0) == []
+    assert not any(job.done() for job in jobs)
     assert "squeue does not answer" in caplog.text
     slurm("squeue", "echo '7_0|None'")
-    assert executor.ended(jobs, 0.0) == [jobs[1]]
+    assert [job.done() for job in jobs] == [False, True]
 
 
 def test_jobs_that_slurm_refuses_are_an_error_at_first_and_wait_later(executor, slurm):
@@ -165,12 +167,12 @@ def test_a_held_job_that_can_never_start_is_cancelled(executor, slurm, tmp_path)
     jobs = executor.submit([["one"], ["two"]])
     slurm("squeue", "echo '7_0|None'; echo '7_1|launch failed requeued held'")
     slurm("scancel", f"echo \"$@\" >>'{tmp_path}/cancelled'")
-    assert executor.ended(jobs, 0.0) == [jobs[1]]
+    assert [job.done() for job in jobs] == [False, True]
     assert (tmp_path / "cancelled").read_text() == "7_1\n"
 
 
 def test_a_slow_scancel_is_not_cut_off(executor, slurm, tmp_path):
     slurm("scancel", f"sleep 2.5; touch '{tmp_path}/cancelled'")
-    executor.close()
+    executor.__exit__()
     assert not (tmp_path / "cancelled").exists()
     wait_for((tmp_path / "cancelled").exists, 20)

@@ -11,7 +11,6 @@ import time
 from synthetic import RayCaster, write_trajectory
 
 from robocas_ms3.core.errors import DatasetError, MissingExtraError, RobocasError
-from robocas_ms3.plans.executors import Setting
 from robocas_ms3.plans.executors.local import LocalExecutor
 from robocas_ms3.plans.plan import PartConfig, Plan
 from robocas_ms3.plans.render import Renderer
@@ -74,7 +73,7 @@ def render(plan):
 
 
 def cannot_begin(plan):
-    raise OSError("no such device\nat all")
+    raise RobocasError("no such device")
 
 
 def open_worker(plan, out):
@@ -84,9 +83,7 @@ def open_worker(plan, out):
 
 def run_here(out, plan=None, jobs=1, open_worker=open_worker, **more):
     """Run the made-up plan on this machine."""
-    plan = plan or PLAN
-    setting = Setting(plan, out, jobs, open_worker=open_worker)
-    return run_plan(plan, out, lambda: LocalExecutor(setting), **more)
+    return run_plan(LocalExecutor(plan or PLAN, out, jobs, open_worker=open_worker), **more)
 
 
 PLAN = Plan.model_validate(

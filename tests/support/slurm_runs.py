@@ -9,7 +9,6 @@ from pathlib import Path
 import psutil
 from plan_stages import PLAN, open_worker
 
-from robocas_ms3.plans.executors import Setting
 from robocas_ms3.plans.executors.slurm import SlurmExecutor
 from robocas_ms3.plans.run import run_plan
 
@@ -26,8 +25,7 @@ def slurm_answers():
 
 
 def run(out, options, jobs=2):
-    setting = Setting(PLAN, out, jobs, options, open_worker)
-    return run_plan(PLAN, out, lambda: SlurmExecutor(setting))
+    return run_plan(SlurmExecutor(PLAN, out, jobs, options, open_worker))
 
 
 def start(out, options, **more):

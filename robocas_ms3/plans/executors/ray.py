@@ -3,163 +3,170 @@
 from __future__ import annotations
 
 import logging
+import math
+import os
 import shutil
 import socket
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from importlib import import_module
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from robocas_ms3.core.errors import PlanError
+from pydantic import Field
+
+from robocas_ms3.core.errors import MissingExtraError, PlanError, RobocasError
 from robocas_ms3.core.exits import deferred_interrupts
 from robocas_ms3.core.files import ABANDONED, make_folder, write_json
-from robocas_ms3.core.remote_errors import RemoteError
-from robocas_ms3.plans.executors import Setting, ended_futures, read_options
-from robocas_ms3.plans.executors.ray_cluster import RayOptions, connect, require_ray
+from robocas_ms3.core.strict import StrictModel
+from robocas_ms3.plans.executors import ThreadExecutor
 from robocas_ms3.plans.folder import PLAN, read_plan_record
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.units import OUTCOME, Outcome, SeedFiles, Unit
 from robocas_ms3.plans.worker import UnitWorker
+
+try:
+    ray: Any = import_module("ray")
+except ImportError as missing:
+    raise MissingExtraError(
+        "plans on Ray need ray, which is not installed", fix='In the clone: pip install -e ".[ray]"'
+    ) from missing
 
 RETRIES = 2
 """How often Ray starts a task again whose worker or node dies."""
 PIECE = 16 * 2**20  # bytes that are sent at once
 _PIECES = 4  # that wait in the object store, of each task
 _APPEARS = 20.0  # s until a file is seen on another node
-_HOME = "robocas-ray-"
+_CONNECT = 10.0  # s
+_TEMPORARY = "robocas-ray-"
 _log = logging.getLogger(__name__)
 OpenWorker = Callable[[Plan, Path], UnitWorker]
+Piece = tuple[tuple[Unit, int], str, bytes]
+"""(unit, seed), name of a file in the seed's folder, what follows in it."""
 
 
-class RayExecutor:
-    """See `executors.Executor`; a thread per task."""
+class RayOptions(StrictModel):
+    """Values of ``--executor-option``."""
 
-    def __init__(self, setting: Setting) -> None:
-        self._options, self._setting = read_options("ray", RayOptions, setting.options), setting
-        self.jobs, self.units_per_job = setting.jobs, self._options.units_per_job
-        self._out = setting.out.absolute()
-        self._ray = require_ray()
-        self._disconnects = connect(self._options, setting.jobs)
-        remote = self._ray.remote(num_cpus=self._options.num_cpus, num_gpus=self._options.num_gpus, max_retries=RETRIES)
-        self._do_units, self._send_units = remote(do_units), remote(send_units)
+    address: str | None = Field(
+        default=None, description="of the cluster; default: RAY_ADDRESS, or a cluster that is started on this machine"
+    )
+    num_cpus: Annotated[float, Field(gt=0)] = Field(default=1.0, description="of a task")
+    num_gpus: Annotated[float, Field(ge=0)] = Field(default=0.0, description="of a task")
+    units_per_job: Annotated[int, Field(ge=1)] = Field(default=4, description="that a task does one after the other")
+    gather: bool = Field(default=False, description="nodes do not see the folder, and send their files")
+
+
+class RayExecutor(ThreadExecutor):
+    """See `Executor`; a thread per task."""
+
+    options_type = RayOptions
+
+    def __enter__(self) -> RayExecutor:
+        self._disconnects = not ray.is_initialized()
+        if self._disconnects:
+            _connect(self.options, self.jobs)
         self._tasks: set[Any] = set()
-        self._threads = ThreadPoolExecutor(setting.jobs, thread_name_prefix="ray")
+        super().__enter__()
+        return self
 
-    @staticmethod
-    def check(options: Mapping[str, str]) -> None:
-        """Check the options, and that Ray is installed."""
-        require_ray()
-        read_options("ray", RayOptions, options)
-
-    def submit(self, groups: Sequence[Sequence[Unit]]) -> list[Future[None]]:
-        """Start a task for each group."""
-        job = self._gather if self._options.gather else self._do
-        return [self._threads.submit(job, group) for group in groups]
-
-    def ended(self, jobs: Sequence[Future[None]], seconds: float) -> list[Future[None]]:
-        """Wait for a task."""
-        return ended_futures(jobs, seconds)
-
-    def log_of(self, job: Future[None]) -> str:
-        """Return where Ray says why a task died."""
-        return "the log of Ray on its node"
-
-    def close(self) -> None:
-        """Cancel the tasks, and end the cluster if it was started here."""
-        with deferred_interrupts(second_ends=False):
-            self._threads.shutdown(wait=False, cancel_futures=True)
-            for task in list(self._tasks):
-                with suppress(Exception):  # it has just ended
-                    self._ray.cancel(task, force=True)
-            if self._disconnects:
-                self._ray.shutdown()
-
-    def _do(self, units: Sequence[Unit]) -> None:
-        """Wait for a task that writes into the plan's folder."""
-        task = self._do_units.remote(self._setting.plan, self._out, units, self._setting.open_worker)
-        with self._running(task):
-            error = self._ray.get(task)
-            if error is not None:
-                error.reraise()
-
-    def _gather(self, units: Sequence[Unit]) -> None:
-        """Receive the files of a task whose node does not see the plan's folder."""
-        plan, out = self._setting.plan, self._out
-        done = [unit.partial_outcomes(plan, out) for unit in units]
-        # what this folder has when it starts decides what a task sends, so another one has to be submitted
-        send = self._send_units.options(
-            num_returns="streaming", _generator_backpressure_num_objects=_PIECES, max_retries=0
-        )
-        task = send.remote(plan, read_plan_record(out), units, done, self._setting.open_worker)
-        with self._running(task):
-            for (unit, seed), messages in groupby(self._messages(task), lambda message: (message.unit, message.seed)):
-                with unit.files(plan, out, seed).temporary() as tmp:
-                    for message in messages:
-                        path = tmp.folder / message.name
-                        path.parent.mkdir(parents=True, exist_ok=True)
-                        with path.open("ab") as file:
-                            file.write(message.data)
-            for unit in units:
-                unit.complete(plan, out)
-
-    def _messages(self, task: Any) -> Iterator[Piece]:
-        for reference in task:
-            message = self._ray.get(reference)
-            if isinstance(message, RemoteError):
-                message.reraise()
-            yield message
-
-    @contextmanager
-    def _running(self, task: Any) -> Iterator[None]:
-        """Turn a task that Ray has lost into one that has ended, whose units are not done."""
+    def run(self, units: Sequence[Unit]) -> None:
+        """Wait for a task; one that Ray has lost leaves units that are not done."""
+        options = {"num_cpus": self.options.num_cpus, "num_gpus": self.options.num_gpus}
+        if self.options.gather:
+            done = [unit.partial_outcomes(self.plan, self.out) for unit in units]
+            # the outcomes decide what a task sends, so a retry needs other arguments
+            options |= {"max_retries": 0, "num_returns": "streaming", "_generator_backpressure_num_objects": _PIECES}
+            send = ray.remote(**options)(send_units)
+            task = send.remote(self.plan, read_plan_record(self.out), units, done, self.open_worker)
+        else:
+            do = ray.remote(**options, max_retries=RETRIES)(do_units)
+            task = do.remote(self.plan, self.out, units, self.open_worker)
         self._tasks.add(task)
         try:
-            yield
-        except self._ray.exceptions.RayTaskError as error:
+            self._receive(task, units) if self.options.gather else ray.get(task)
+        except ray.exceptions.RayTaskError as error:
+            if isinstance(error.cause, RobocasError | OSError):
+                raise error.cause from error
             fix = "Do all nodes have robocas-ms3, in the same Python?"
             raise PlanError("a task of Ray failed", where="--executor ray", found=_line(error), fix=fix) from error
-        except self._ray.exceptions.RayError as error:
+        except ray.exceptions.RayError as error:
             _log.warning("a task of Ray was lost: %s", _line(error))
         finally:
             self._tasks.discard(task)
 
+    def _receive(self, task: Any, units: Sequence[Unit]) -> None:
+        """Receive the files of a task whose node does not see the plan's folder."""
+        pieces = (ray.get(reference) for reference in task)
+        for (unit, seed), files in groupby(pieces, lambda piece: piece[0]):
+            with unit.files(self.plan, self.out, seed).temporary() as tmp:
+                for _, name, data in files:
+                    path = tmp.folder / name
+                    path.parent.mkdir(parents=True, exist_ok=True)
+                    with path.open("ab") as file:
+                        file.write(data)
+        for unit in units:
+            unit.complete(self.plan, self.out)
 
-@dataclass(frozen=True)
-class Piece:
-    """A piece of a file of a seed, on its way from a node.
+    def log_of(self, job: Any) -> str:
+        """Return where Ray says why a task died."""
+        return "the log of Ray on its node"
 
-    Attributes:
-        unit, seed: the seed.
-        name: of the file in the seed's folder.
-        data: what follows in the file.
-    """
-
-    unit: Unit
-    seed: int
-    name: str
-    data: bytes
+    def __exit__(self, *error: object) -> None:
+        with deferred_interrupts(second_ends=False):
+            self.threads.shutdown(wait=False, cancel_futures=True)
+            for task in list(self._tasks):
+                with suppress(Exception):  # it has just ended
+                    ray.cancel(task, force=True)
+            if self._disconnects:
+                ray.shutdown()
 
 
-def do_units(plan: Plan, out: Path, units: Sequence[Unit], open_worker: OpenWorker) -> RemoteError | None:
-    """Do units in the plan's folder, as a task; return an error that every seed would meet."""
-    node = socket.gethostname()
+def _connect(options: RayOptions, jobs: int) -> None:
+    """Connect to the cluster, or start one on this machine for some jobs."""
+    address = options.address or os.environ.get("RAY_ADDRESS") or "local"
+    if address.startswith("ray://"):
+        fix = "Run this on a node of the cluster, as `ray job submit` does, with address=auto."
+        raise PlanError("Ray's client is not supported", where="--executor-option address", found=address, fix=fix)
+    host, _, port = address.rpartition(":")
+    chosen: dict[str, Any] = {}
+    if address == "local":
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+        chosen = {"num_cpus": math.ceil(jobs * options.num_cpus), "include_dashboard": False}
+    try:
+        if host and port.isdecimal():  # Ray would try for minutes, and then end the process
+            socket.create_connection((host, int(port)), _CONNECT).close()
+        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **chosen)
+    except (ray.exceptions.RayError, OSError, OverflowError, RuntimeError, ValueError) as error:
+        fix = "See `ray status` there."
+        raise PlanError("no cluster of Ray answers", where=address, found=_line(error), fix=fix) from error
+    wanted = {"CPU": options.num_cpus, "GPU": options.num_gpus}
+    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    if not any(all(node.get(kind, 0) >= count for kind, count in wanted.items()) for node in nodes):
+        error = PlanError("no node of Ray has room for a task", where="--executor-option", expected=wanted)
+        if address == "local":
+            ray.shutdown()
+            raise error
+        _log.warning("%s; waiting for one", error)
+
+
+def do_units(plan: Plan, out: Path, units: Sequence[Unit], open_worker: OpenWorker) -> None:
+    """Do units in the plan's folder, as a task."""
     worker = open_worker(plan, out)
     try:
-        if not _appears(out / PLAN):
-            fix = "Choose an --out that all nodes share, or pass --executor-option gather=yes."
-            raise PlanError("this node does not see the output folder", where=f"node {node}", expected=out, fix=fix)
+        until = time.monotonic() + _APPEARS
+        while not (out / PLAN).is_file():
+            if time.monotonic() > until:
+                where, fix = f"node {socket.gethostname()}", "Choose an --out that all nodes share, or gather=yes."
+                raise PlanError("this node does not see the output folder", where=where, expected=out, fix=fix)
+            time.sleep(0.5)
         for unit in units:
             worker.do(unit)
-    except Exception as error:
-        return RemoteError.of(error, f"a task on {node}")
     finally:
         worker.close()
-    return None
 
 
 def send_units(
@@ -168,7 +175,7 @@ def send_units(
     units: Sequence[Unit],
     done: Sequence[Sequence[Outcome]],
     open_worker: OpenWorker,
-) -> Iterator[Piece | RemoteError]:
+) -> Iterator[Piece]:
     """Do units in a temporary folder of the node, as a task, and send the files seed by seed.
 
     Args:
@@ -178,20 +185,18 @@ def send_units(
         done: outcomes of the seeds of each unit that are done already.
         open_worker: makes what does the units.
     """
-    with _home() as home:
-        write_json(home / PLAN, record)
+    with _temporary_folder() as out:
+        write_json(out / PLAN, record)
         for unit, outcomes in zip(units, done, strict=True):
             for outcome in outcomes:
-                files = unit.files(plan, home, outcome.seed)
+                files = unit.files(plan, out, outcome.seed)
                 make_folder(files.folder)
                 files.write(outcome)
-        worker = open_worker(plan, home)
+        worker = open_worker(plan, out)
         try:
             for unit in units:
                 for files in worker.seeds(unit):
                     yield from _pieces(unit, files)
-        except Exception as error:
-            yield RemoteError.of(error, f"a task on {socket.gethostname()}")
         finally:
             worker.close()
 
@@ -200,34 +205,23 @@ def _pieces(unit: Unit, files: SeedFiles) -> Iterator[Piece]:
     """Yield the files of a seed, and delete all but its outcome."""
     for path in sorted(path for path in files.folder.rglob("*") if path.is_file()):
         with path.open("rb") as file:
-            data = file.read(PIECE)
-            while True:
-                yield Piece(unit, files.seed, path.relative_to(files.folder).as_posix(), data)
-                data = file.read(PIECE)
-                if not data:
-                    break
+            name = path.relative_to(files.folder).as_posix()
+            yield (unit, files.seed), name, file.read(PIECE)
+            while data := file.read(PIECE):
+                yield (unit, files.seed), name, data
         if path.name != OUTCOME:
             path.unlink()
 
 
 @contextmanager
-def _home() -> Iterator[Path]:
+def _temporary_folder() -> Iterator[Path]:
     """Yield a temporary folder of this node; delete those of tasks that were killed a day ago."""
-    for path in Path(tempfile.gettempdir()).glob(f"{_HOME}*"):
+    for path in Path(tempfile.gettempdir()).glob(f"{_TEMPORARY}*"):
         with suppress(OSError):
             if time.time() - path.stat().st_mtime > ABANDONED:
                 shutil.rmtree(path, ignore_errors=True)
-    with tempfile.TemporaryDirectory(prefix=_HOME, ignore_cleanup_errors=True) as home:
-        yield Path(home)
-
-
-def _appears(path: Path) -> bool:
-    until = time.monotonic() + _APPEARS
-    while not path.is_file():
-        if time.monotonic() > until:
-            return False
-        time.sleep(0.5)
-    return True
+    with tempfile.TemporaryDirectory(prefix=_TEMPORARY, ignore_cleanup_errors=True) as folder:
+        yield Path(folder)
 
 
 def _line(error: Exception) -> str:

@@ -10,26 +10,33 @@ import hashlib
 import logging
 import os
 import re
+import signal
 import subprocess
+import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from threading import Event
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, create_model
 
 from robocas_ms3.core.errors import MissingExtraError, PlanError
 from robocas_ms3.core.files import make_folder
+from robocas_ms3.core.remote_errors import RemoteError
 from robocas_ms3.core.strict import StrictModel
-from robocas_ms3.plans.executors import Setting, read_options
-from robocas_ms3.plans.executors.slurm_job import UnitsJob
+from robocas_ms3.plans.executors import Executor
+from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.units import Unit
+from robocas_ms3.plans.worker import UnitWorker
 
 try:
     from submitit import LocalExecutor  # pyright: ignore[reportMissingImports]
     from submitit import SlurmExecutor as SubmititExecutor  # pyright: ignore[reportMissingImports]
     from submitit.core.utils import pickle_load  # pyright: ignore[reportMissingImports]
+    from submitit.helpers import DelayedSubmission  # pyright: ignore[reportMissingImports]
 except ImportError as error:
     raise MissingExtraError(
         "plans on Slurm need submitit, which is not installed", fix='In the clone: pip install -e ".[slurm]"'
@@ -42,6 +49,7 @@ SBATCH_OPTIONS = (
     *("licenses", "nice", "begin", "comment", "exclusive", "mem_per_cpu", "mail_type", "mail_user", "wckey"),
 )
 """Options that are passed to sbatch as they are."""
+_SBATCH_FIELDS: dict[str, Any] = {name: (str | None, None) for name in SBATCH_OPTIONS}
 _ASK = 5.0  # s between two calls of squeue
 _ANSWER = 60.0  # s that a command of Slurm may take
 _CANCEL = 1.0  # s that Ctrl-C waits for scancel
@@ -50,9 +58,7 @@ _STUCK = ("JobHoldMaxRequeue", "launch_failed_requeued_held", "launch failed req
 _log = logging.getLogger(__name__)
 
 
-class SlurmOptions(StrictModel):
-    """Values of ``--executor-option``, besides `SBATCH_OPTIONS`."""
-
+class _OwnOptions(StrictModel):
     cluster: Literal["slurm", "local"] = Field(default="slurm", description="local: jobs are processes here")
     units_per_job: Annotated[int, Field(ge=1)] = Field(default=1, description="one after the other")
     time: Annotated[int, Field(ge=1)] = Field(default=240, description="minutes of a job")
@@ -63,103 +69,79 @@ class SlurmOptions(StrictModel):
     cpus_per_task: Annotated[int, Field(ge=1)] = 1
 
 
-def read_slurm_options(options: Mapping[str, str]) -> tuple[SlurmOptions, dict[str, str]]:
-    """Read the values of ``--executor-option``; return those of sbatch apart.
+class SlurmExecutor(Executor):
+    """See `Executor`; the plan's folder has to be at the same path on all nodes."""
 
-    Raises:
-        PlanError: a name is unknown, or a value is invalid.
-    """
-    own = {name: value for name, value in options.items() if name not in SBATCH_OPTIONS}
-    sbatch = {name: value for name, value in options.items() if name in SBATCH_OPTIONS}
-    return read_options("slurm", SlurmOptions, own), sbatch
+    options_type = create_model("SlurmOptions", __base__=_OwnOptions, **_SBATCH_FIELDS)
 
+    def check(self) -> None:
+        """Check that this machine has Slurm."""
+        self._local = self.options.cluster == "local"
+        if not self._local and SubmititExecutor.affinity() < 0:
+            fix = "Run this where sbatch and srun are, or try --executor-option cluster=local."
+            raise PlanError("there is no Slurm here", where="--executor slurm", expected="srun", fix=fix)
 
-class SlurmExecutor:
-    """See `executors.Executor`; the plan's folder has to be at the same path on all nodes."""
-
-    def __init__(self, setting: Setting) -> None:
-        self._setting = setting
-        self._options, self._sbatch = read_slurm_options(setting.options)
-        self.jobs, self.units_per_job = setting.jobs, self._options.units_per_job
-        self._out = setting.out.absolute()
-        self._local = self._options.cluster == "local"
-        if not self._local:
-            _check_slurm()
-        folder = make_folder(self._out / LOGS)
-        digest = hashlib.sha256(os.fsencode(self._out.resolve())).hexdigest()[:8]
-        self._name = f"robocas-{re.sub(r'[^A-Za-z0-9-]', '-', self._out.name)}-{digest}"
-        if self._local:
-            self._submitit = LocalExecutor(folder, max_num_timeout=self._options.requeues)
-            self._submitit.update_parameters(timeout_min=self._options.time, stderr_to_stdout=True)
-        else:
-            self._submitit = SubmititExecutor(folder, max_num_timeout=self._options.requeues)
-            self._submitit.update_parameters(**self._parameters())
-        self._asked, self._alive = 0.0, None
-        self._submitted = False
+    def __enter__(self) -> SlurmExecutor:
+        digest = hashlib.sha256(os.fsencode(self.out.resolve())).hexdigest()[:8]
+        self._name = f"robocas-{re.sub(r'[^A-Za-z0-9-]', '-', self.out.name)}-{digest}"
+        self._asked = 0.0
+        self._alive: set[str] | None = None
         self._refused, self._not_before = 0, 0.0
-        self._jobs: list[Any] = []
+        self._jobs: list[_Job] = []
+        folder, requeues = make_folder(self.out / LOGS), self.options.requeues
+        if self._local:
+            self._submitit = LocalExecutor(folder, max_num_timeout=requeues)
+            self._submitit.update_parameters(timeout_min=self.options.time, stderr_to_stdout=True)
+        else:
+            self._submitit = SubmititExecutor(folder, max_num_timeout=requeues)
+            self._submitit.update_parameters(**self._parameters())
         self._cancel(_ANSWER)  # the jobs of a run that was killed: two at a unit are harmless, but one is enough
-
-    @staticmethod
-    def check(options: Mapping[str, str]) -> None:
-        """Check the options, and that Slurm is on this machine."""
-        if read_slurm_options(options)[0].cluster == "slurm":
-            _check_slurm()
+        return self
 
     def _parameters(self) -> dict[str, Any]:
-        options = self._options
-        mem_gb = options.mem_gb or 2 * self._setting.plan.limits.memory_gb
+        options = self.options
+        sbatch = options.model_dump(include=set(SBATCH_OPTIONS), exclude_none=True)
+        mem_gb = options.mem_gb or 2 * self.plan.limits.memory_gb
         return {
             "job_name": self._name,
             "time": options.time,
-            "mem": None if "mem_per_cpu" in self._sbatch else f"{round(mem_gb * 1024)}MB",
+            "mem": None if options.mem_per_cpu else f"{round(mem_gb * 1024)}MB",
             "cpus_per_task": options.cpus_per_task,
             "srun_args": [f"--cpus-per-task={options.cpus_per_task}"],  # srun does not read that of sbatch since 22.05
             "stderr_to_stdout": True,
             "wckey": None,
             "array_parallelism": self.jobs,
-            "additional_parameters": {"requeue": True, **{k: v == "true" or v for k, v in self._sbatch.items()}},
+            "additional_parameters": {"requeue": True, **{k: v == "true" or v for k, v in sbatch.items()}},
         }
 
-    def submit(self, groups: Sequence[Sequence[Unit]]) -> list[Any]:
+    def submit(self, groups: Sequence[Sequence[Unit]]) -> list[_Job]:
         """Submit a job array."""
         if time.monotonic() < self._not_before:
             return []
-        setting = self._setting
-        jobs = [UnitsJob(setting.plan, self._out, tuple(group), setting.open_worker) for group in groups]
         try:
-            handles = self._submitit.submit_array(jobs)
+            handles = self._submitit.submit_array(
+                [DoUnits(self.plan, self.out, tuple(group), self.open_worker) for group in groups]
+            )
         except Exception as error:
             self._refused += 1
             self._not_before = time.monotonic() + _RETRY
-            if not self._submitted or self._refused > _RETRIES:
+            if not self._jobs or self._refused > _RETRIES:
                 fix = "See --executor-option partition, account, qos, time and mem_gb."
                 raise PlanError("Slurm refuses the jobs", where="sbatch", found=error, fix=fix) from error
             _log.warning("Slurm refuses jobs, and is asked again in %g s: %s", _RETRY, error)
             return []
-        self._submitted, self._refused, self._asked = True, 0, 0.0
-        self._jobs += handles
-        return handles
+        self._refused, self._asked = 0, 0.0
+        jobs = [_Job(handle, None if self._local else self._has_left_queue) for handle in handles]
+        self._jobs += jobs
+        return jobs
 
-    def ended(self, jobs: Sequence[Any], seconds: float) -> list[Any]:
-        """Ask squeue, every few seconds; jobs of this machine are looked at."""
-        Event().wait(seconds)
-        if self._local:
-            ended = [job for job in jobs if job.done()]
-        else:
-            if time.monotonic() - self._asked > _ASK:
-                self._asked, self._alive = time.monotonic(), self._ask()
-            alive = self._alive
-            ended = [] if alive is None else [job for job in jobs if job.job_id not in alive]
-        for job in ended:
-            self._jobs.remove(job)
-            with suppress(OSError, EOFError):  # a job that was killed has no result
-                outcome, error = pickle_load(job.paths.result_pickle)
-                if outcome == "success" and error is not None:
-                    error.reraise()
-        return ended
+    def _has_left_queue(self, job_id: str) -> bool:
+        if time.monotonic() - self._asked > _ASK:
+            self._alive = self._queue()
+            self._asked = time.monotonic()
+        return self._alive is not None and job_id not in self._alive
 
-    def _ask(self) -> set[str] | None:
+    def _queue(self) -> set[str] | None:
         """Return the ids of jobs that wait or run; None: Slurm does not answer."""
         answer = _output(["squeue", "--noheader", "--array", *self._mine(), "--format=%i|%r"])
         if answer is None:
@@ -171,12 +153,11 @@ class SlurmExecutor:
             _output(["scancel", job])
         return set(reasons) - stuck
 
-    def log_of(self, job: Any) -> str:
+    def log_of(self, job: _Job) -> str:
         """Return the log of a job."""
-        return f"{job.paths.stdout}; --executor-option mem_gb and time may help"
+        return f"{job.handle.paths.stdout}; --executor-option mem_gb and time may help"
 
-    def close(self) -> None:
-        """Cancel the jobs."""
+    def __exit__(self, *error: object) -> None:
         self._cancel(_CANCEL)
 
     def _mine(self) -> list[str]:
@@ -185,7 +166,7 @@ class SlurmExecutor:
     def _cancel(self, seconds: float) -> None:
         if self._local:
             for job in self._jobs:
-                job.cancel()
+                job.handle.cancel()
             until = time.monotonic() + seconds
             while time.monotonic() < until and not all(job.done() for job in self._jobs):
                 time.sleep(0.05)
@@ -197,10 +178,57 @@ class SlurmExecutor:
                 _log.warning("jobs of this plan may be left: %s failed", " ".join(command))
 
 
-def _check_slurm() -> None:
-    if SubmititExecutor.affinity() < 0:
-        fix = "Run this where sbatch and srun are, or try --executor-option cluster=local."
-        raise PlanError("there is no Slurm here", where="--executor slurm", expected="srun", fix=fix)
+@dataclass(frozen=True)
+class _Job:
+    """A job that was submitted; submitit would ask sacct about it, which not every cluster has."""
+
+    handle: Any
+    has_left_queue: Callable[[str], bool] | None
+
+    def done(self) -> bool:
+        return self.has_left_queue(self.handle.job_id) if self.has_left_queue else self.handle.done()
+
+    def result(self) -> None:
+        with suppress(OSError, EOFError):  # a job that was killed has no result
+            outcome, error = pickle_load(self.handle.paths.result_pickle)
+            if outcome == "success" and error is not None:
+                error.reraise()
+
+
+@dataclass(frozen=True)
+class DoUnits:
+    """What a job does, as submitit pickles it; a job that is requeued continues where the units stopped."""
+
+    plan: Plan
+    out: Path
+    units: tuple[Unit, ...]
+    open_worker: Callable[[Plan, Path], UnitWorker]
+
+    def __call__(self) -> RemoteError | None:
+        """Do the units; return an error that every seed would meet."""
+        signal.signal(signal.SIGTERM, _exit)  # submitit would ignore it, and Slurm wait for 30 s
+        worker = self.open_worker(self.plan, self.out)
+        # Slurm announces the end of the time to all processes of a job: block it in those of the worker, which inherit
+        # the mask of this thread
+        announcements = {signal.SIGUSR1, signal.SIGUSR2}
+        thread = ThreadPoolExecutor(1, initializer=signal.pthread_sigmask, initargs=(signal.SIG_BLOCK, announcements))
+        try:
+            for unit in self.units:
+                thread.submit(worker.do, unit).result()
+        except Exception as error:
+            return RemoteError.of(error, "a job")
+        finally:
+            worker.close()
+        return None
+
+    def checkpoint(self) -> Any:
+        """Return what submitit runs once the time is up: the same job."""
+        return DelayedSubmission(self)
+
+
+def _exit(number: int, frame: object) -> None:
+    signal.signal(number, signal.SIG_IGN)
+    sys.exit(128 + number)
 
 
 def _output(command: list[str]) -> str | None:
