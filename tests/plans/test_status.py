@@ -69,7 +69,6 @@ def test_what_is_left_costs_what_its_part_costs():
     # recent: ten picks and a search, 40 CPU s in 20 s; left: four searches, and three of a mean of 40 / 11
     left = 4 * 20.0 + 3 * 40.0 / 11
     assert seconds_left(parts, [0] * 10 + [1], 20.0) == pytest.approx(left / 2)
-    assert seconds_left(parts, [], 0.0) is None
     free = [part("a", 10, 4, 0.0)]  # nothing says what they cost
     assert seconds_left(free, [0, 0], 4.0) == pytest.approx(12.0)
 
