@@ -18,11 +18,12 @@ from mani_skill.examples.motionplanning.base_motionplanner.utils import compute_
 import robocas_ms3  # noqa: F401  (registers RoboCASPick-v1)
 from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.core.poses import inverse, transform
-from robocas_ms3.planning.drops import overhangs, sample_drops
+from robocas_ms3.planning.drops import Inside, overhangs, sample_drops
 from robocas_ms3.planning.grasp_choice import filter_grasps, grip_margins
 from robocas_ms3.planning.motionplanner import PandaArmMotionPlanningSolver
 from robocas_ms3.planning.protocol import AttachedBody
 from robocas_ms3.planning.scene import SPACING, PlanningScene
+from robocas_ms3.scenes.grasping import gripper_is_clear
 
 
 def solve_pick_cube(env, seed=None, debug=False, vis=False):
@@ -97,36 +98,24 @@ def ranked_grasps(env, scene, slot):
     """Return the annotated grasps that touch no other object; firm, central and steep ones first."""
     target, base = env.object_assets[0][slot], scene.arm_base_in_world
     notes, object_in_world = target.annotations, base @ scene.object_in_base(slot)
-    kept = filter_grasps(
-        object_in_world @ notes.grasps_tcp_in_object,
-        notes.grasp_widths,
-        arm_base_in_world=base,
-        object_center_in_world=object_in_world[:3, 3],
-        scene_points_in_world=transform(base, scene.obstacles_in_base(without=slot)),
-    )
+    kept = filter_grasps(notes, object_in_world, base)
+    points = transform(base, scene.obstacles_in_base(without=slot))
     margins = grip_margins(notes.grasps_tcp_in_object[kept.index], kept.widths, target.surface_points(SPACING))
     distance = np.linalg.norm(kept.tcp_in_world[:, :3, 3] - object_in_world[:3, 3], axis=1)
     score = margins + np.exp(-distance / 0.03) - kept.tcp_in_world[:, 2, 2]
-    return [sapien.Pose(kept.tcp_in_world[i]) for i in np.argsort(-score, kind="stable")]
+    score[~gripper_is_clear(kept.tcp_in_world, points)] = -np.inf
+    order = np.argsort(-score, kind="stable")
+    return [sapien.Pose(kept.tcp_in_world[i]) for i in order if np.isfinite(score[i])]
 
 
 def ranked_drops(env, scene, slot, held, rng):
     """Return TCP poses that hold the object above the basket; those where it fits the opening, steep ones first."""
     inner = env.model.basket.asset.inner
-    low, high = np.array(inner.min), np.array(inner.max)
+    inside = Inside(scene.basket_in_base, np.array(inner.min), np.array(inner.max))
     center = np.array([env.object_assets[0][slot].asset.center_of_mass])
     vertices, center = transform(held.object_in_tcp, held.vertices), transform(held.object_in_tcp, center)
-    drops = sample_drops(
-        rng,
-        count=200,
-        container_in_base=scene.basket_in_base,
-        inner_low=low,
-        inner_high=high,
-        vertices_in_tcp=vertices,
-        center_in_tcp=center[0],
-    )
-    margin = np.array([0.03, 0.03, 0])
-    overhang = overhangs(drops, scene.basket_in_base, low + margin, high - margin, vertices)
+    drops = sample_drops(rng, 200, inside, vertices, center[0])
+    overhang = overhangs(drops, inside, vertices, margin=0.03)
     order = np.lexsort((drops[:, 2, 2], np.ceil(overhang / 0.015)))
     return [sapien.Pose(scene.arm_base_in_world @ drops[i]) for i in order]
 

@@ -98,10 +98,7 @@ class ForkedBranches:
     # ------------------------------------------------------------------ this process
 
     def _look(self, play: Callable[[T], float], candidate: T) -> tuple[Child | None, float | PlanningFailed]:
-        """A child that has played a candidate, with what it said; no child in itself, where it shall go on.
-
-        The child has ended where it, or its second try, failed.
-        """
+        """A child that has played a candidate, with what it said; no child in itself, where it shall go on."""
         for last in (False, True):
             child = self._fork()
             if child is None:
@@ -139,11 +136,7 @@ class ForkedBranches:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def _go_on_as(self, child: Child) -> bool:
-        """Let a child be the episode; comes back where that fails, or, with False, where the child is gone.
-
-        Raises:
-            _Success: it did.
-        """
+        """Let a child be the episode; comes back where that fails, or, with False, where the child is gone."""
         try:
             child.tell(self._tally)
             ended_well = self._hear(child, GO_ON_LIMIT)
@@ -159,12 +152,7 @@ class ForkedBranches:
         return True
 
     def _hear(self, child: Child, limit: float) -> Any:
-        """What a child says next; its tally is ours then.
-
-        Raises:
-            ChildCrash: it is gone (`ChildGone`), or says nothing.
-            BaseException: what it ended with, caused by a `RemoteTraceback`.
-        """
+        """What a child says next; its tally is ours then."""
         answer, tally = child.hear(limit)
         if isinstance(answer, RemoteError):
             answer.reraise()

@@ -31,11 +31,7 @@ def complete(arm: Arm, policy: Callable[[Arm], None]) -> None:
     let go of as anything else is.
 
     Args:
-        arm: one attempt's tools, with nothing done yet.
         policy: the scripted one of the task.
-
-    Raises:
-        PlanningFailed: with the stage that could not be done.
     """
     slot = int(arm.env.target_slot[0])
     arm.executor.move_gripper(arm.executor.gripper, arm.at, seconds=BRAKE_SECONDS)
@@ -84,11 +80,7 @@ def _get_free(arm: Arm) -> None:
 
 
 def _plan_off(arm: Arm, tcp_in_base: Array) -> Trajectory:
-    """Plan the shortest straight line off what is touched, through it: back, up, or towards the robot.
-
-    Raises:
-        PlanningFailed: all of them end where the arm touches something.
-    """
+    """Plan the shortest straight line off what is touched, through it: back, up, or towards the robot."""
     arm.planner.set_scene(arm.scene.obstacles())
     for distance in BACK_OUT[::-1]:
         inward = tcp_in_base.copy()

@@ -28,7 +28,7 @@ from robocas_ms3.demos.recordings.versions import versions
 from robocas_ms3.demos.settings import EpisodeSettings, GenerateSettings
 from robocas_ms3.demos.takeover import Takeover
 from robocas_ms3.demos.workers import generate_seeds, shard_name
-from robocas_ms3.planning.backends import BACKENDS
+from robocas_ms3.planning.rrt_connect import BACKENDS
 from robocas_ms3.planning.seconds import Seconds
 from robocas_ms3.robots.table import find_robot
 from robocas_ms3.scenes.config import load_config_of
@@ -227,11 +227,7 @@ class _Run:
         self.ledger.settle([line for seed in sorted(self.earlier) for line in _lines(self.earlier[seed])])
 
     def _read(self, path: Path) -> dict[int, EpisodeResult]:
-        """Return the results of the episodes in a file by seed.
-
-        Raises:
-            DatasetError: `robocas generate` did not write it.
-        """
+        """Return the results of the episodes in a file by seed."""
         results, noted = {}, self.ledger.by_seed()
         for episode in read_json(path)["episodes"]:
             try:

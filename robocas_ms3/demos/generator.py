@@ -26,12 +26,12 @@ from robocas_ms3.demos.resimulation import Resimulation
 from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.demos.takeover import Takeover
 from robocas_ms3.demos.trials import Trials
-from robocas_ms3.planning.backends import make_planner
 from robocas_ms3.planning.chain import ArmChain
 from robocas_ms3.planning.decisions import Decisions, StraightDecisions
 from robocas_ms3.planning.executor import Executor
+from robocas_ms3.planning.kinematics import Reachability
 from robocas_ms3.planning.protocol import Planner
-from robocas_ms3.planning.reachability import Reachability
+from robocas_ms3.planning.rrt_connect import make_planner
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.planning.skills.retreating import back_out
 from robocas_ms3.robots.table import DEFAULT, find_robot
@@ -211,13 +211,7 @@ class _Attempts:
                 self.generator.trials.follow(self.recorder.states, gripper, finished=finished, noisy=self._noisy)
 
     def _finish(self, recoveries: list[dict[str, Any]]) -> None:
-        """Write what a policy says it has done, if it is a demonstration.
-
-        Raises:
-            PlanningFailed: the task has not succeeded.
-            EpisodeLost: it took longer than an episode may, or its own actions do not do it again, or not within the
-                range of ``pd_ee_delta_pose``.
-        """
+        """Write what a policy says it has done, if it is a demonstration."""
         if len(self.executor.actions) > self.generator.horizon:
             raise EpisodeLost("horizon", "too_long")
         if not self.executor.flag("success"):

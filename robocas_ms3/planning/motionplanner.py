@@ -22,16 +22,16 @@ from mani_skill.utils.structs.pose import to_sapien_pose
 
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.core.poses import from_wxyz, inverse
-from robocas_ms3.planning import backends
 from robocas_ms3.planning.protocol import Array, Obstacle, Shape, Trajectory
+from robocas_ms3.planning.rrt_connect import DEFAULT, make_planner
 from robocas_ms3.planning.scene import seen_from
-from robocas_ms3.planning.validation import require_finite
 from robocas_ms3.robots.agent import MobileManipulator
 from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.table import RobotSpec
 from robocas_ms3.robots.urdf import RobotFiles
 
 CONTROL_MODES = ("pd_joint_pos", "pd_joint_pos_vel")
+IGNORED = frozenset({"debug", "visualize_target_grasp_pose", "print_env_info"})
 
 Step = tuple[Any, Any, Any, Any, dict[str, Any]]
 """What ``env.step`` returns: observation, reward, terminated, truncated, info."""
@@ -51,8 +51,8 @@ class PandaArmMotionPlanningSolver:
         vis: whether to show every step in ManiSkill's viewer, which needs a display.
         joint_vel_limits: velocity limit of every arm joint, rad/s.
         joint_acc_limits: acceleration limit of every arm joint, rad/s^2.
-        debug, visualize_target_grasp_pose, print_env_info: arguments of ManiSkill's solver, without effect here.
         backend: name of the motion planner.
+        ignored: arguments of ManiSkill's solver without effect here, see ``IGNORED``.
 
     Attributes:
         planner: the motion planner; its poses are in the frame of the arm's base.
@@ -70,15 +70,15 @@ class PandaArmMotionPlanningSolver:
         self,
         env: gym.Env,
         *,
-        debug: bool = False,
         vis: bool = False,
         base_pose: sapien.Pose | Pose | None = None,
-        visualize_target_grasp_pose: bool = False,
-        print_env_info: bool = False,
         joint_vel_limits: float = 0.9,
         joint_acc_limits: float = 0.9,
-        backend: str = backends.DEFAULT,
+        backend: str = DEFAULT,
+        **ignored: bool,
     ) -> None:
+        if unknown := ignored.keys() - IGNORED:
+            raise TypeError(f"unexpected arguments: {', '.join(sorted(unknown))}")
         self.env, self.base_env, self.vis = env, cast("BaseEnv", env.unwrapped), vis
         if self.base_env.num_envs != 1:
             raise RobocasError(
@@ -107,9 +107,8 @@ class PandaArmMotionPlanningSolver:
         self._joints = [joint.name for joint in self.robot.active_joints]
         self._base_pose = None if base_pose is None else _matrix(base_pose, "base_pose")
         self._obstacles: list[Obstacle] = []
-        self.planner = backends.make_planner(
-            backend, replace(spec, description=self.description), dt=self.base_env.control_timestep
-        )
+        spec = replace(spec, description=self.description)
+        self.planner = make_planner(backend, spec, dt=self.base_env.control_timestep)
         self.gripper_state = self.OPEN
 
     @property
@@ -237,7 +236,7 @@ class PandaArmMotionPlanningSolver:
                 found=points.shape,
                 fix="Put x, y and z of a point into one row.",
             )
-        require_finite(points, "add_collision_pts", "Remove the points, e.g. pts[np.isfinite(pts).all(axis=1)].")
+        _require_finite(points, "add_collision_pts", "Remove the points, e.g. pts[np.isfinite(pts).all(axis=1)].")
         self.add_obstacles([Obstacle("points", Shape(points=points.reshape(-1, 3)), np.eye(4))])
 
     def add_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
@@ -294,8 +293,15 @@ class PandaArmMotionPlanningSolver:
 
 def _matrix(pose: sapien.Pose | Pose, where: str) -> Array:
     matrix = to_sapien_pose(pose).to_transformation_matrix().astype(np.float64)
-    require_finite(matrix, where)
+    _require_finite(matrix, where)
     return matrix
+
+
+def _require_finite(values: Array, where: str, fix: str = "Check how the numbers were computed.") -> None:
+    finite = np.isfinite(values)
+    if not finite.all():
+        found = f"{np.size(finite) - np.count_nonzero(finite)} of {np.size(finite)} are not finite"
+        raise RobocasError("NaN or infinite numbers", where=where, expected="finite numbers", found=found, fix=fix)
 
 
 def _require_count(count: int, where: str, least: int) -> None:

@@ -116,11 +116,7 @@ class PathSearch:
         return rng.uniform(np.maximum(low, self._lower), np.minimum(high, self._upper))
 
     def _extend(self, tree: _Tree, target: Array, *, greedy: bool) -> tuple[int | None, bool]:
-        """Grow a tree towards ``target``, by a step or all the way, as far as it is free.
-
-        Returns:
-            The last new node, or the nearest one where it is there already; and whether it is at ``target``.
-        """
+        """Grow a tree towards ``target``, by a step or all the way, as far as it is free."""
         node = tree.nearest(target)
         here = tree.qpos[node].copy()
         distance = float(np.linalg.norm(target - here))

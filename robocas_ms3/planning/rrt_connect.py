@@ -12,17 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import PlanningFailed, RobocasError
+from robocas_ms3.core.extensions import Registry
 from robocas_ms3.planning.chain import turn_between
 from robocas_ms3.planning.collision import FclWorld
-from robocas_ms3.planning.kinematics import follow_line
+from robocas_ms3.planning.kinematics import Reachability, follow_line
 from robocas_ms3.planning.path_search import PathSearch
-from robocas_ms3.planning.protocol import Array, AttachedBody, Obstacle, Trajectory
-from robocas_ms3.planning.reachability import Reachability
+from robocas_ms3.planning.protocol import Array, AttachedBody, Obstacle, Planner, Trajectory
 from robocas_ms3.planning.timing import JointPath, blended, rounded, stopping, thinned, through, timed
-from robocas_ms3.planning.validation import require_finite
 from robocas_ms3.robots.description import RobotDescription
+from robocas_ms3.robots.table import RobotSpec
 
 CHECKS_PER_SECOND = 10_000  # turns a planning time into a budget of collision checks, which load can't change
+RRT_RANGE = 0.25  # rad, longest extension of a tree
 SPACING = 0.03  # rad between checks while searching
 FINE_SPACING = 0.01  # rad between checks of the final path
 CORNER_RADII = (0.3, 0.1, 0.03)  # rad; smaller ones are tried when a rounded corner touches something
@@ -44,11 +45,7 @@ class RRTConnectPlanner:
         srdf: pairs of its links that need no check.
         robot: description of the robot that carries the arm.
         dt: seconds between rows of a trajectory.
-        velocity_limit: of every joint, rad/s; default: the robot's.
-        acceleration_limit: of every joint, rad/s^2; default: the robot's.
-        rrt_range: longest extension of a tree, rad.
         planning_time: budget of one search, in seconds of a quiet core; counted in collision checks, not by the clock.
-        voxel: edge of the cloud's voxels = spacing of its points, m.
 
     Raises:
         RobotDescriptionError: the URDF, the SRDF or a collision mesh is missing or unusable, or a geometry is not
@@ -63,24 +60,17 @@ class RRTConnectPlanner:
         *,
         robot: RobotDescription,
         dt: float,
-        velocity_limit: float | None = None,
-        acceleration_limit: float | None = None,
-        rrt_range: float = 0.25,
         planning_time: float = 2.0,
-        voxel: float = 0.005,
     ) -> None:
         if not dt > 0:
             raise RobocasError("the time step must be positive", where="dt", found=dt)
-        self._world = FclWorld(urdf, srdf, robot, voxel=voxel)
+        self._world = FclWorld(urdf, srdf, robot)
         self._reachability = Reachability(self._world.chain)
         self._dt = dt
-        self._limits = {
-            "velocity": robot.arm_velocity_limit if velocity_limit is None else velocity_limit,
-            "acceleration": robot.arm_acceleration_limit if acceleration_limit is None else acceleration_limit,
-        }
+        self._limits = {"velocity": robot.arm_velocity_limit, "acceleration": robot.arm_acceleration_limit}
         self._budget = int(planning_time * CHECKS_PER_SECOND)
         chain = self._world.chain
-        self._search = PathSearch(self._world.free_until, chain.lower, chain.upper, step=rrt_range, spacing=SPACING)
+        self._search = PathSearch(self._world.free_until, chain.lower, chain.upper, step=RRT_RANGE, spacing=SPACING)
         self._rng = np.random.default_rng(0)
 
     @property
@@ -122,14 +112,8 @@ class RRTConnectPlanner:
         return self._world.free(np.asarray(qpos, dtype=np.float64).reshape(-1, 7), finger_width=width)
 
     def ik(self, tcp_in_base: Array, near: Array, *, avoid_collisions: bool = True) -> list[Array]:
-        """Solve inverse kinematics; see the protocol.
-
-        Raises:
-            RobocasError: a number of an argument is NaN or infinite.
-        """
+        """Solve inverse kinematics; see the protocol."""
         near = np.asarray(near, dtype=np.float64)
-        require_finite(near, "near")
-        require_finite(tcp_in_base, "tcp_in_base")
         found = self._reachability.solutions(tcp_in_base, near)
         if not avoid_collisions or not found:
             return found
@@ -140,7 +124,6 @@ class RRTConnectPlanner:
 
         Raises:
             PlanningFailed: ``no_ik``, ``goal_in_collision``, or as ``plan_to_qpos``.
-            RobocasError: a number of an argument is NaN or infinite.
         """
         goals = self.ik(tcp_in_base, start, avoid_collisions=False)
         if not goals:
@@ -160,11 +143,9 @@ class RRTConnectPlanner:
             PlanningFailed: ``start_in_collision``, ``start_outside_limits``, ``no_goals`` (the list is empty),
                 ``goal_outside_limits`` (all goals are), ``goal_in_collision`` (all goals within the limits are),
                 ``not_straight``, ``rrt_timeout``, ``path_blocked``, ``timing_failed``.
-            RobocasError: a joint position is NaN or infinite.
         """
         start = self._checked_start(start, stage)
         wanted = np.array(goals, dtype=np.float64).reshape(-1, 7)
-        require_finite(wanted, "goals")
         if not len(wanted):
             raise PlanningFailed(stage, "no_goals")
         lower, upper = self._world.chain.limits.T
@@ -212,10 +193,8 @@ class RRTConnectPlanner:
         Raises:
             PlanningFailed: ``start_in_collision``, ``start_outside_limits``, ``line_unreachable``, ``line_joint_jump``,
                 ``straight_line_blocked``, ``timing_failed``.
-            RobocasError: a number of an argument is NaN or infinite.
         """
         start = self._checked_start(start, stage, obstacles=check_collisions)
-        require_finite(tcp_in_base, "tcp_in_base")
         waypoints = follow_line(self._world.chain, start, np.asarray(tcp_in_base, dtype=np.float64), stage=stage)
         if np.linalg.norm(waypoints[-1] - start) < STILL:
             return Trajectory(waypoints[-1:].copy(), self._dt)
@@ -250,7 +229,6 @@ class RRTConnectPlanner:
 
     def _checked_start(self, start: Array, stage: str, *, obstacles: bool = True) -> Array:
         start = np.asarray(start, dtype=np.float64)
-        require_finite(start, "start")
         lower, upper = self._world.chain.limits.T
         if not np.all((lower - 1e-3 <= start) & (start <= upper + 1e-3)):
             raise PlanningFailed(stage, "start_outside_limits")
@@ -302,3 +280,21 @@ def _dense(points: Array) -> Array:
 
 def _fractions(a: Array, b: Array) -> Array:
     return np.linspace(0, 1, int(np.ceil(np.linalg.norm(b - a) / FINE_SPACING)) + 1, dtype=np.float64)
+
+
+DEFAULT = "rrt_connect"
+BACKENDS: Registry[Callable[..., Planner]] = Registry(
+    "planner", "robocas_ms3.planners", Callable, {DEFAULT: RRTConnectPlanner}
+)
+"""Motion planners by name; other packages add theirs by entry points ``robocas_ms3.planners``."""
+
+
+def make_planner(name: str, robot: RobotSpec, *, dt: float) -> Planner:
+    """Make the planner of a name for a robot's arm, with trajectories of time step ``dt`` (s).
+
+    Raises:
+        ExtensionError: there is no such planner, or another package's can't be loaded.
+        RobocasError: it can't load the robot's files.
+    """
+    backend, files = BACKENDS.find(name, where="planner"), robot.files()
+    return backend(files.arm_urdf, files.arm_srdf, robot=robot.description, dt=dt)

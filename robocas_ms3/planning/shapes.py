@@ -15,11 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from robocas_ms3.planning.octomap import encode_octree
 from robocas_ms3.planning.protocol import Array, Shape
 
 MARGIN = 0.0025  # m that obstacles are larger than they are: about what voxels of 5 mm add on average
 KEPT = 16  # trees of the last clouds and hulls of the last held objects
+DEPTH = 16  # levels of an octree
+OCCUPIED, INNER = 2, 3  # bits per child in octomap's stream; 0: unknown
 
 
 @dataclass(frozen=True)
@@ -130,3 +131,30 @@ def inflated(vertices: Array, margin: float) -> tuple[Array, NDArray[np.int32]]:
 def _normals(vertices: Array, faces: NDArray[np.integer]) -> NDArray[np.floating]:
     a, b, c = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]
     return np.cross(b - a, c - a)
+
+
+def encode_octree(points: Array, voxel: float) -> list[int]:
+    """Encode the voxels that contain points (P, 3) as octomap's stream, in signed bytes as python-fcl wants it.
+
+    A tree holds 2^16 voxels along each axis, centred at the origin; points outside of it are dropped. The stream lists
+    the inner nodes depth first; each is 16 bits, two for each of its 8 children.
+    """
+    keys = np.floor(points / voxel) + (1 << (DEPTH - 1))
+    keys = keys[np.all((keys >= 0) & (keys < 1 << DEPTH), axis=1)].astype(np.int64)
+    if not len(keys):
+        return []
+    codes = np.zeros(len(keys), dtype=np.int64)  # Morton order is the order of a depth-first traversal
+    for bit in range(DEPTH):
+        for axis in range(3):
+            codes |= ((keys[:, axis] >> bit) & 1) << (3 * bit + axis)
+    children = np.unique(codes)
+    masks, codes_of_nodes, depths = [], [], []
+    for depth in range(DEPTH - 1, -1, -1):
+        parents, first_child = np.unique(children >> 3, return_index=True)
+        state = OCCUPIED if depth == DEPTH - 1 else INNER
+        masks.append(np.bitwise_or.reduceat(np.int64(state) << (2 * (children & 7)), first_child))
+        codes_of_nodes.append(parents << (3 * (DEPTH - depth)))  # code of the node's first voxel
+        depths.append(np.full(len(parents), depth))
+        children = parents
+    order = np.lexsort((np.concatenate(depths), np.concatenate(codes_of_nodes)))
+    return np.concatenate(masks)[order].astype("<u2").view(np.int8).tolist()

@@ -24,7 +24,7 @@ def test_it_is_a_planner_by_name(site):
         "-c",
         f"""
 import numpy as np
-from robocas_ms3.planning.backends import BACKENDS, make_planner
+from robocas_ms3.planning.rrt_connect import BACKENDS, make_planner
 from robocas_ms3.robots.table import PANDA
 planner = make_planner("straight", PANDA, dt=0.05)
 print(list(BACKENDS), all(hasattr(planner, name) for name in {members!r}))

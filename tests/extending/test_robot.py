@@ -73,7 +73,7 @@ def test_planners_plan_for_its_arm(site, name):
         TWIN
         + f"""
 import numpy as np
-from robocas_ms3.planning.backends import make_planner
+from robocas_ms3.planning.rrt_connect import make_planner
 planner, rest = make_planner({name!r}, twin, dt=0.05), np.array(twin.description.arm_rest)
 motion = planner.plan_to_qpos(rest, [rest + [1.5, 0, 0, 0, 0, 0, 0]], stage="x")
 print(np.abs(np.diff(motion.qpos, axis=0)).max() / 0.05)

@@ -53,15 +53,6 @@ def test_same_seed_in_one_process_gives_the_same_paths(make_planner):
     assert session(other) == first
 
 
-def test_seed_0_is_a_seed_like_any_other(make_planner):
-    digests = []
-    for _ in range(2):
-        planner = make_planner()
-        planner.seed(0)
-        digests.append(session(planner))
-    assert digests[0] == digests[1]
-
-
 # Where programs run in real time, busy ones that did not step down would take the machine for ever.
 BUSY = """
 import os

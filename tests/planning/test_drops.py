@@ -1,23 +1,15 @@
 import numpy as np
 import pytest
 
-from robocas_ms3.planning.drops import overhangs, sample_drops
+from robocas_ms3.planning.drops import Inside, overhangs, sample_drops
 
 CONTAINER = np.array([[0, -1, 0, 0.6], [1, 0, 0, 0.2], [0, 0, 1, 0.1], [0, 0, 0, 1.0]])  # turned by 90 degrees
-LOW, HIGH = np.array([-0.2, -0.1, -0.1]), np.array([0.2, 0.1, 0.1])
+INSIDE = Inside(CONTAINER, np.array([-0.2, -0.1, -0.1]), np.array([0.2, 0.1, 0.1]))
 BOX = np.array([[x, y, z] for x in (-0.03, 0.03) for y in (-0.02, 0.02) for z in (-0.1, 0.1)]) + [0, 0, 0.05]
 
 
-def drops(**changes):
-    arguments = dict(
-        count=200,
-        container_in_base=CONTAINER,
-        inner_low=LOW,
-        inner_high=HIGH,
-        vertices_in_tcp=BOX,
-        center_in_tcp=np.array([0, 0, 0.05]),
-    )
-    return sample_drops(np.random.default_rng(0), **{**arguments, **changes})
+def drops():
+    return sample_drops(np.random.default_rng(0), 200, INSIDE, BOX, np.array([0, 0, 0.05]))
 
 
 def test_objects_hang_above_the_container_clear_of_its_rim():
@@ -50,5 +42,5 @@ def test_overhang_is_what_sticks_out_sideways():
     pose[:3, 3] = [0.6, 0.2, 0.5]
     bar = np.array([[x, 0, 0] for x in (-0.15, 0.15)])
     turned = pose @ np.array([[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
-    found = overhangs(np.stack([pose, turned]), CONTAINER, LOW, HIGH, bar)
-    assert found == pytest.approx([0.05, 0.0])
+    assert overhangs(np.stack([pose, turned]), INSIDE, bar) == pytest.approx([0.05, 0.0])
+    assert overhangs(np.stack([pose, turned]), INSIDE, bar, 0.06) == pytest.approx([0.11, 0.01])

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from robocas_ms3.planning.executor import CLOSED, OPEN, Executor, Seconds
+from robocas_ms3.planning.executor import CLOSED, OPEN, Executor
 
 
 class Counter:
@@ -72,12 +72,3 @@ def test_a_flag_ends_a_motion():
     made.info = {"success": [False]}
     assert made.follow(motion, until="success")
     assert len(made.actions) == 3
-
-
-def test_time_is_added_up_by_part():
-    seconds = Seconds()
-    for _ in range(2):
-        with seconds.spent_on("planning"):
-            sum(range(200_000))
-    assert seconds.planning > 0
-    assert seconds.simulation == 0

@@ -13,9 +13,9 @@ from robocas_ms3.assets.kinematics import joint_motion
 from robocas_ms3.assets.manifest import Handle, Joint
 from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.planning.chain import ArmChain
+from robocas_ms3.planning.kinematics import Reachability
 from robocas_ms3.planning.protocol import AttachedBody, Obstacle, Shape
 from robocas_ms3.planning.pulling import reached, track, turned_about_bar
-from robocas_ms3.planning.reachability import Reachability
 from robocas_ms3.planning.skills.driving import Surroundings, _routes, body_is_free, free_route
 from robocas_ms3.planning.skills.part import Part
 from robocas_ms3.robots.description import MOBILE_PANDA

@@ -15,7 +15,7 @@ import pytest
 import sapien
 
 import robocas_ms3  # noqa: F401  (registers RoboCASPick-v1)
-from robocas_ms3.core.errors import ExtensionError, PlanningFailed, RobocasError
+from robocas_ms3.core.errors import PlanningFailed, RobocasError
 from robocas_ms3.planning import motionplanner
 from robocas_ms3.planning.motionplanner import PandaArmMotionPlanningSolver
 from robocas_ms3.planning.protocol import Trajectory
@@ -188,12 +188,25 @@ def test_invalid_arguments_raise_at_the_call(joint_env, method, arguments, where
     assert (solver.gripper_state, steps(joint_env)) == (gripper, before)
 
 
-@pytest.mark.parametrize("name", ["joint_vel_limits", "joint_acc_limits"])
-@pytest.mark.parametrize("limit", [0.0, -0.9, np.nan, np.inf])
-def test_limits_that_are_not_positive_raise(joint_env, name, limit):
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *(("joint_vel_limits", limit) for limit in (0.0, np.nan, np.inf)),
+        ("joint_acc_limits", -0.9),
+        ("base_pose", NOWHERE),
+        ("planner", "no_such_planner"),
+    ],
+)
+def test_invalid_options_raise(joint_env, name, value):
     with pytest.raises(RobocasError) as caught:
-        PandaArmMotionPlanningSolver(joint_env, **{name: limit})
+        PandaArmMotionPlanningSolver(joint_env, **{"backend" if name == "planner" else name: value})
     assert caught.value.where == name
+
+
+def test_options_of_maniskills_solver_are_accepted_and_others_are_not(joint_env):
+    PandaArmMotionPlanningSolver(joint_env, debug=True, visualize_target_grasp_pose=True, print_env_info=True)
+    with pytest.raises(TypeError, match="print_info"):
+        PandaArmMotionPlanningSolver(joint_env, print_info=True)
 
 
 def test_a_solution_of_maniskill_solves_its_task(monkeypatch):
@@ -211,12 +224,6 @@ def test_a_solution_of_maniskill_solves_its_task(monkeypatch):
         *_, info = solution.solve(env, seed=seed)
         assert info["success"].item(), seed
     env.close()
-
-
-def test_a_base_pose_with_nan_raises(joint_env):
-    with pytest.raises(RobocasError) as caught:
-        PandaArmMotionPlanningSolver(joint_env, base_pose=NOWHERE)
-    assert caught.value.where == "base_pose"
 
 
 @pytest.mark.parametrize("points", [[], np.zeros((0, 3))])
@@ -256,30 +263,21 @@ def test_vis_shows_every_step(joint_env, monkeypatch):
 
 @pytest.mark.parametrize(
     ("control_mode", "robot", "where"),
-    [("pd_ee_delta_pose", "panda", "control_mode"), ("pd_joint_delta_pos", "panda", "control_mode")]
-    + [("pd_joint_pos", robot, "robot") for robot in ("panda_stick", "fetch")],
+    [
+        ("pd_ee_delta_pose", "panda", "control_mode"),
+        ("pd_joint_pos", "panda_stick", "robot"),
+        ("pd_joint_pos", "fetch", "robot"),
+        ("pd_joint_pos", "panda", "num_envs"),
+    ],
 )
 def test_unsupported_env_is_an_error_with_a_fix(control_mode, robot, where):
-    env = make(control_mode, robot)
+    several = SimpleNamespace(unwrapped=SimpleNamespace(num_envs=4))
+    env = several if where == "num_envs" else make(control_mode, robot)
     with pytest.raises(RobocasError) as caught:
         PandaArmMotionPlanningSolver(env)
-    env.close()
     assert caught.value.where == where
-    assert caught.value.found == (robot if where == "robot" else control_mode)
-    assert caught.value.expected
+    assert caught.value.found == {"robot": robot, "control_mode": control_mode, "num_envs": 4}[where]
     assert caught.value.fix
-
-
-def test_several_envs_are_an_error():
-    env = SimpleNamespace(unwrapped=SimpleNamespace(num_envs=4))
-    with pytest.raises(RobocasError) as caught:
-        PandaArmMotionPlanningSolver(env)
-    assert (caught.value.where, caught.value.found) == ("num_envs", 4)
-
-
-def test_an_unknown_planner_is_an_error(joint_env):
-    with pytest.raises(ExtensionError):
-        PandaArmMotionPlanningSolver(joint_env, backend="no_such_planner")
 
 
 @pytest.mark.parametrize("robot", ["panda_wristcam", "robocas_mobile_panda"])

@@ -5,10 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 
-from robocas_ms3.core.poses import from_wxyz
-from robocas_ms3.planning.scene import FURNITURE_SPACING, SPACING, PlanningScene, seen_from
+from robocas_ms3.planning.scene import PlanningScene, seen_from
 
 
 class Parked(PlanningScene):
@@ -64,32 +62,10 @@ def test_room_is_kept_to_furniture_and_basket_not_to_objects():
     assert [(body.name, body.room) for body in bodies[:3]] == [("table", 0.02), ("basket", 0.02), ("object 0", 0.0)]
 
 
-def test_pose_matrix_agrees_with_scipy():
-    raw = torch.tensor([0.1, -0.2, 0.3, 0.5, -0.1, 0.7, 0.2])  # not quite a unit quaternion
-    pose = from_wxyz(raw)
-    values = raw.numpy().astype(float)
-    assert np.array_equal(pose[:3, :3], Rotation.from_quat(values[[4, 5, 6, 3]]).as_matrix())
-    assert np.array_equal(pose[:, 3], [*values[:3], 1])
-    assert np.array_equal(pose[3], [0, 0, 0, 1])
-
-
 def test_only_what_is_near_a_place_is_sampled():
     scene = Parked(environment([1, 1, 1]))
     assert scene.obstacles_in_base()[:, 2].tolist() == [0, 1]  # within 1.5 m of the arm's base
     assert scene.obstacles_in_base(radius=0.5, around=np.array([0, 0, 2.2]))[:, 2].tolist() == [2]
-
-
-def test_all_that_is_there_is_sampled_ahead_as_clouds_are():
-    env, sampled = environment([1, 0, 1]), []
-    for name, body in {"table": env.model.furniture["table"], "basket": env.model.basket}.items():
-        body.surface_points = lambda spacing, name=name: sampled.append((name, spacing)) or np.zeros((1, 3))
-    for slot, body in enumerate(env.object_assets[0]):
-        body.surface_points = lambda spacing, slot=slot: sampled.append((slot, spacing)) or np.zeros((1, 3))
-    scene = Parked(env)
-    scene.sample_surfaces()
-    ahead, sampled[:] = list(sampled), []
-    scene.obstacles_in_base()
-    assert ahead == sampled == [("table", FURNITURE_SPACING), ("basket", SPACING), (0, SPACING), (2, SPACING)]
 
 
 def test_a_part_has_one_shape_and_a_body_is_seen_from_another_base():

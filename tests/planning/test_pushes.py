@@ -1,15 +1,16 @@
-"""Where pushes begin and end, and where objects are put down: geometry at known places. No simulator."""
+"""Where pushes begin and end, and how objects are put down: geometry at known places. No simulator."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.poses import transform
 from robocas_ms3.planning import pushes as pushing
 from robocas_ms3.planning.skills.looking import sample_views
-from robocas_ms3.planning.skills.removing import free_places
+from robocas_ms3.planning.skills.removing import free_places, turn_to_stand
 
 SURFACE = 0.1  # height of the table, in the arm's base frame
 TABLE = np.eye(4)
@@ -32,11 +33,6 @@ def pushes(target=TARGET, others=NOTHING, points=OBSTACLE, half=HALF, fixed=NOTH
     return list(pushing.candidates(np.random.default_rng(0), points, target, others, (TABLE, half), fixed))
 
 
-def test_the_direction_leads_from_target_to_obstacle_and_is_level():
-    direction = pushing.push_direction(np.random.default_rng(0), np.array([0.5, 0.3, 0.9]), np.array([0.5, 0.1, 0.1]))
-    assert direction == pytest.approx([0, 1, 0])
-
-
 def test_right_above_the_target_the_push_goes_towards_the_robot():
     above = np.array([0.6, 0.005, 0.2])
     angles = []
@@ -46,15 +42,6 @@ def test_right_above_the_target_the_push_goes_towards_the_robot():
         angles.append(np.rad2deg(np.arctan2(-y, -x)))
     assert -30.5 <= min(angles) < -15
     assert 15 < max(angles) <= 30.5
-
-
-def test_extent_behind_is_the_reach_against_the_push_at_that_height():
-    center = OBSTACLE.mean(axis=0)
-    assert pushing.extent_behind(OBSTACLE, center, np.array([0, 1.0, 0]), 0.13) == pytest.approx(0.03)
-    # across a corner: 3 cm * sqrt(2), less half of what the tool is wide
-    diagonal = np.array([1.0, 1.0, 0]) / np.sqrt(2)
-    assert pushing.extent_behind(OBSTACLE, center, diagonal, 0.13) == pytest.approx(0.0424, abs=0.006)
-    assert pushing.extent_behind(OBSTACLE, center, diagonal, 0.3) is None
 
 
 @pytest.mark.parametrize("turn", [30.0, -30.0, 0.0])
@@ -144,3 +131,34 @@ def test_views_look_at_the_point_from_above():
     assert np.allclose(line / distance[:, None], views[:, :3, 0])  # x is forward
     elevation = np.rad2deg(np.arcsin(-line[:, 2] / distance))
     assert np.all((elevation >= 60 - 1e-6) & (elevation <= 90))
+
+
+BRICK = np.array([[x, y, z] for x in (-0.01, 0.01) for y in (-0.02, 0.02) for z in (-0.05, 0.05)])
+
+
+def corners(shift):
+    """A box of 2 x 2 x 4 cm whose top is shifted along x."""
+    return np.array([[x + shift * z / 0.04, y, z] for x in (0, 0.02) for y in (0, 0.02) for z in (0, 0.04)])
+
+
+@pytest.mark.parametrize("turned_deg", [(20, 0, 0), (0, -35, 0), (0, 0, 70)])
+def test_leaning_object_is_turned_upright_about_level_axes(turned_deg):
+    leant = Rotation.from_euler("xyz", turned_deg, degrees=True)
+    expected = leant.inv().as_matrix() if turned_deg[2] == 0 else np.eye(3)
+    turn = turn_to_stand(leant.apply(BRICK), np.zeros(3))
+    np.testing.assert_allclose(turn[:3, :3], expected, atol=1e-9)
+    np.testing.assert_array_equal(turn[:3, 3], 0)
+
+
+def test_beyond_half_of_a_right_angle_it_is_laid_on_the_next_side():
+    leant = Rotation.from_euler("x", 50, degrees=True)
+    turn = turn_to_stand(leant.apply(BRICK), np.zeros(3))
+    np.testing.assert_allclose(turn[:3, :3], Rotation.from_euler("x", 40, degrees=True).as_matrix(), atol=1e-9)
+
+
+def test_face_beside_the_centre_of_mass_is_not_a_standing_face():
+    # its foot reaches to x = 2 cm, its middle is at 1.5 cm, then at 2.5 cm: it falls onto the side (3, 4) cm long
+    np.testing.assert_array_equal(turn_to_stand(corners(0.01), corners(0.01).mean(axis=0)), np.eye(4))
+    turn = turn_to_stand(corners(0.03), corners(0.03).mean(axis=0))
+    expected = Rotation.from_rotvec([0, np.arccos(0.6), 0]).as_matrix()
+    np.testing.assert_allclose(turn[:3, :3], expected, atol=1e-9)

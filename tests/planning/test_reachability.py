@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import time
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from planning_scenes import REST, pose_error, top_down
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.core.errors import RobocasError, RobotDescriptionError
+from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.planning.analytic import PandaGeometry
 from robocas_ms3.planning.chain import ArmChain, turn_between
+from robocas_ms3.planning.kinematics import DISTINCT, Reachability
 from robocas_ms3.planning.pulling import twist
-from robocas_ms3.planning.reachability import DISTINCT, Reachability
 from robocas_ms3.robots.description import MOBILE_PANDA
 
 
@@ -89,16 +86,6 @@ def test_found_configurations_reach_their_poses_inside_the_limits(reachability, 
         assert np.all(found >= reachability.lower) and np.all(found <= reachability.upper)
 
 
-def test_reachable_poses_are_found_and_unreachable_ones_are_not(reachability):
-    reachable = reachability.chain.tcp(anywhere(reachability.chain, 200, 1))
-    far = grasp_poses(50, 2)
-    far[:25, 0, 3] += 1.0  # 1.25 m and more in front of the base
-    far[25:, 2, 3] -= 1.2  # below the floor
-    solved, _ = reachability.reachable(np.concatenate([reachable, far]), REST)
-    assert solved[:200].mean() >= 0.97
-    assert not solved[200:].any()
-
-
 def test_the_preferred_configuration_decides_between_solutions(reachability):
     for near in (REST, REST + [0.3, 0.2, -0.2, 0.1, 0.2, 0.1, -0.5]):
         pose = reachability.chain.tcp(near[None])
@@ -132,31 +119,6 @@ def test_everything_returns_all_configurations_of_all_poses(reachability):
         assert (own == nearest[pose]).all(axis=1).any()
 
 
-def test_turn_between_by_hand():
-    assert turn_between(np.array([0.3, -0.4]), np.zeros(2)) == pytest.approx(0.4 + 0.2 * 0.5)
-
-
-def test_no_poses_and_wrong_files(reachability, tmp_path):
-    solved, qpos = reachability.reachable(np.zeros((0, 4, 4)), REST)
-    assert solved.shape == (0,) and qpos.shape == (0, 7)
-    other = tmp_path / "other.urdf"
-    other.write_text("<robot name='x'><link name='panda_link0'/></robot>")
-    for path in (tmp_path / "none.urdf", other):
-        with pytest.raises(RobotDescriptionError) as caught:
-            ArmChain(path, MOBILE_PANDA)
-        assert caught.value.where == path
-
-
-def test_256_grasps_take_hundredths_of_a_second_and_results_repeat(reachability):
-    poses = grasp_poses(256, 3)
-    start = time.process_time()
-    first = reachability.reachable(poses, REST)
-    assert time.process_time() - start < 0.1  # seconds of processor; it takes 0.012
-    second = reachability.reachable(poses, REST)
-    np.testing.assert_array_equal(first[0], second[0])
-    np.testing.assert_array_equal(first[1], second[1])
-
-
 def test_results_do_not_depend_on_memory_alignment(reachability):
     """numpy's arctan2 of strided numbers does: one call in a hundred differed in the last bit."""
     pose, kept = top_down(0.5, -0.25, 0.2, yaw=0.3), []
@@ -164,22 +126,6 @@ def test_results_do_not_depend_on_memory_alignment(reachability):
     for size in np.random.default_rng(0).integers(1, 400, 600):
         kept = [*kept[-20:], np.zeros(size)]
         np.testing.assert_array_equal(np.array(reachability.solutions(pose, REST)), first)
-
-
-class ElbowsDown(PandaGeometry):
-    """A closed form of a stranger's."""
-
-    def solve(self, tcp_in_base, joint7):
-        return super().solve(tcp_in_base, joint7)[:, :2]
-
-
-def test_description_can_name_another_closed_form(reachability, panda_files):
-    own = replace(MOBILE_PANDA, inverse_kinematics=f"{__name__}:ElbowsDown")
-    poses = grasp_poses(64, 5)
-    _, every = reachability.everything(poses, REST)
-    qpos, some = Reachability(ArmChain(panda_files.arm_urdf, own)).everything(poses, REST)
-    assert 0 < len(some) < len(every)
-    np.testing.assert_allclose(reachability.chain.tcp(qpos), poses[some], atol=1e-9)
 
 
 def test_closed_form_of_another_arm_is_an_error(panda_files):

@@ -17,12 +17,11 @@ from robocas_ms3.planning.decisions import StraightDecisions
 from robocas_ms3.planning.executor import Executor
 from robocas_ms3.planning.protocol import Obstacle, Shape
 from robocas_ms3.planning.pushes import push_direction
-from robocas_ms3.planning.skills import clearing, pushing, removing
+from robocas_ms3.planning.skills import clearing, pushing
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.planning.skills.clearing import Heap, Move
 from robocas_ms3.planning.skills.pushing import push_away
 from robocas_ms3.planning.skills.removing import blockers, clear_grasps, remove
-from robocas_ms3.planning.solvers.search import tries
 
 pytestmark = pytest.mark.slow
 
@@ -94,15 +93,6 @@ def test_ranking_grasps_does_not_change_later_results(generator):
     assert arm.rng.bit_generator.state == state
 
 
-def test_grasps_looked_at_are_spread_over_all(generator, monkeypatch):
-    arm, target, _ = begin(generator, 3)
-    monkeypatch.setattr(removing, "GRASPS_LOOKED_AT", 10**6)
-    passed = removing._grasps_from_above(arm, target)
-    monkeypatch.setattr(removing, "GRASPS_LOOKED_AT", 3)
-    some = removing._grasps_from_above(arm, target)
-    np.testing.assert_array_equal(some, passed[[0, (len(passed) - 1) // 2, len(passed) - 1]])
-
-
 def test_a_push_moves_an_object_away_from_the_target(generator):
     arm, target, slots = begin(generator, 4)
     starts = {slot: surface(arm, slot).mean(axis=0) for slot in [*slots, target]}
@@ -137,16 +127,6 @@ def test_push_that_moves_nothing_is_a_failure(generator, monkeypatch):
         next(heap.moves())
 
 
-def test_a_move_is_worth_what_it_leaves_to_do(generator, monkeypatch):
-    arm, target, slots = begin(generator, 3)
-    heap, work = Heap(arm, target), iter((31.0, 8.0))
-    monkeypatch.setattr(clearing, "push_away", lambda arm, slot, target, *, turn_deg: None)
-    monkeypatch.setattr(clearing, "MOVED", -1.0)
-    monkeypatch.setattr(Heap, "work_left", lambda self: next(work))
-    assert heap.make(Move("push", slots[0])) == pytest.approx(-31.0 - 8.0, abs=1e-6)  # nothing moved, no time was spent
-    assert heap.make(Move("push", slots[0])) == pytest.approx(-8.0 - 8.0, abs=1e-6)
-
-
 def test_moves_begin_with_pushes_of_what_is_highest(generator):
     arm, target, _ = begin(generator, 3)
     heap = Heap(arm, target)
@@ -156,10 +136,6 @@ def test_moves_begin_with_pushes_of_what_is_highest(generator):
     in_the_way = np.flatnonzero(heap.clutter().obstacles[0].numpy()).tolist()
     if in_the_way:
         assert moves[0] == Move("push", max(in_the_way, key=lambda slot: surface(arm, slot)[:, 2].max()))
-
-
-def test_later_decisions_are_tried_less_often():
-    assert [tries(made) for made in range(6)] == [3, 3, 2, 2, 1, 1]
 
 
 def test_after_a_push_the_arm_rises_clear_of_furniture_and_basket(generator, monkeypatch):

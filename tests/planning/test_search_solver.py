@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from robocas_ms3.core.errors import EpisodeLost, PlanningFailed
+from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.planning.decisions import StraightDecisions
 from robocas_ms3.planning.solvers import search
 
@@ -56,16 +56,3 @@ def test_where_nothing_can_be_moved_the_target_is_grasped_as_it_lies(arm):
     heap.make = make
     search.attempt(arm)
     assert done == ["grasp", "carry", "look at the surface", "release"]
-
-
-def test_a_move_that_fails_on_its_way_ends_the_attempt(arm):
-    arm, heap, done = arm
-
-    def make(self, move):
-        done.append("push")
-        raise EpisodeLost("clear", "fell_off_table")
-
-    heap.make = make
-    with pytest.raises(EpisodeLost, match="fell_off_table"):
-        search.attempt(arm)
-    assert done == ["push"]

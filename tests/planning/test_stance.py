@@ -9,7 +9,7 @@ import pytest
 from planning_scenes import REST
 
 from robocas_ms3.planning.chain import ArmChain
-from robocas_ms3.planning.reachability import Reachability
+from robocas_ms3.planning.kinematics import Reachability
 from robocas_ms3.planning.skills import stance
 from robocas_ms3.planning.skills.driving import arm_base_in_world
 from robocas_ms3.robots.description import MOBILE_PANDA

@@ -181,11 +181,7 @@ def _refusal(error: ValidationError, where: object) -> DatasetError:
 
 
 def _check_settings(settings: Any, where: str, deep: int) -> None:
-    """Settings are numbers, words, and few levels of them.
-
-    Raises:
-        DatasetError: they are something else.
-    """
+    """Settings are numbers, words, and few levels of them."""
     if isinstance(settings, dict) and deep:
         for key, value in settings.items():
             _check_settings(value, f"{where}.{key}", deep - 1)

@@ -1,4 +1,4 @@
-"""The arm as skills see it: an environment, a planner, an executor, and where the arm was last told to be."""
+"""The tools of a skill: environment, planner, executor, and the last commanded position of the arm."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ import numpy as np
 from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.planning.decisions import ONE_BY_ONE, TRIES, Decisions, Effort
 from robocas_ms3.planning.executor import CLOSED, OPEN, Executor
+from robocas_ms3.planning.kinematics import Reachability
 from robocas_ms3.planning.protocol import Array, Planner, Trajectory
-from robocas_ms3.planning.reachability import Reachability
 from robocas_ms3.planning.scene import PlanningScene
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.tasks.base import RoboCASEnv
 
 T = TypeVar("T")
+Plan = TypeVar("Plan")
 OPEN_SECONDS, CLOSE_SECONDS = 0.50, 0.50  # a dataset at 5 Hz may give either command 0.2 s later
 # m kept to furniture and basket where there is a way that does, as a robot may be off: on straight ways, while carrying
 ROOM, CARRYING_ROOM = 0.012, 0.024
@@ -35,7 +36,7 @@ class Arm:
         decisions: plays what `choose` is given.
         path: the attempt's number, and which candidate was taken at each decision since.
         rng: source of all randomness, made anew for each candidate: what was tried before must not matter.
-        at: (7,) rad where the arm was last told to be; at first, where it is.
+        at: (7,) rad, last commanded position of the arm; at first its position.
     """
 
     planner: Planner
@@ -121,36 +122,21 @@ class Arm:
         return bool(self.env.grasped()[0, slot])
 
     def first_line(
-        self, start: Array, goals: list[Array], *, stage: str, check_collisions: bool = True, speed: float = 1.0
+        self, start: Array, goals: Iterable[Array], *, stage: str, check_collisions: bool = True
     ) -> Trajectory:
-        """Plan a straight line to the first of several poses that one leads to.
-
-        Raises:
-            PlanningFailed: none of them can be reached on a straight line.
-        """
-        failure = PlanningFailed(stage, "no_goal")
-        for goal in goals:
-            try:
-                return self.planner.plan_straight(
-                    start, goal, stage=stage, check_collisions=check_collisions, speed=speed
-                )
-            except PlanningFailed as error:
-                failure = error
-        raise failure
+        """Plan a straight line to the first of several poses that can be reached on one."""
+        return first_plan(
+            goals,
+            lambda goal: self.planner.plan_straight(start, goal, stage=stage, check_collisions=check_collisions),
+            PlanningFailed(stage, "no_goal"),
+        )
 
     def plan_home(self, start: Array) -> Trajectory:
         """Plan to the rest configuration."""
         return self.planner.plan_to_qpos(start, [np.array(self.robot.arm_rest)], stage="home")
 
     def rise_clear(self, *, without: int | Collection[int] = ()) -> None:
-        """Rise in small steps, through whatever is touched, until arm and held object touch nothing.
-
-        Args:
-            without: slot of the held object.
-
-        Raises:
-            PlanningFailed: it can't rise any further, or still touches something.
-        """
+        """Rise in small steps, through whatever is touched, until arm and held object (``without``) touch nothing."""
         for rises in range(RISES + 1):
             with self.planning():
                 self.planner.set_scene(self.scene.obstacles(without=without))
@@ -169,15 +155,25 @@ class Arm:
         return self.first_line(self.at, [up, inward], stage=stage, check_collisions=False)
 
 
+def first_plan(candidates: Iterable[T], plan: Callable[[T], Plan], failure: PlanningFailed) -> Plan:
+    """Return the first plan of a candidate that succeeds, or raise the last failure; without candidates ``failure``."""
+    for candidate in candidates:
+        try:
+            return plan(candidate)
+        except PlanningFailed as error:
+            failure = error
+    raise failure
+
+
 def raised(tcp_in_base: Array, height: float) -> Array:
-    """A pose moved straight up by ``height`` metres (the arm's base stands upright)."""
+    """Return poses (..., 4, 4) moved straight up by ``height`` metres (the arm's base stands upright)."""
     result = tcp_in_base.copy()
-    result[2, 3] += height
+    result[..., 2, 3] += height
     return result
 
 
 def moved_back(tcp_in_base: Array, distance: float) -> Array:
-    """A pose moved against its approach by ``distance`` metres."""
+    """Return poses (..., 4, 4) moved against their approach by ``distance`` metres."""
     result = tcp_in_base.copy()
-    result[:3, 3] -= distance * tcp_in_base[:3, 2]
+    result[..., :3, 3] -= distance * tcp_in_base[..., :3, 2]
     return result

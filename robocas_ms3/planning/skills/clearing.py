@@ -95,9 +95,6 @@ class Heap:
         """Ways to make room, those first that promise most: of the highest obstacles, then of what blocks grasps.
 
         A push takes less time than a lift.
-
-        Raises:
-            EpisodeLost: enough has been moved.
         """
         if self.moves_made >= MOVES:
             raise EpisodeLost("horizon", "too_many_obstacles")
@@ -119,12 +116,7 @@ class Heap:
         return [slot for slot in order if slot != self.target][:LOOKED_AT]
 
     def make(self, move: Move) -> float:
-        """Make a move; gives what it was worth, in seconds.
-
-        Raises:
-            PlanningFailed: it can't be planned, was in vain, or brought an object to the edge.
-            EpisodeLost: something fell off the surface.
-        """
+        """Make a move; gives what it was worth, in seconds."""
         arm, facts = self.arm, self.arm.executor.facts
         before, target, begun = self.middle(move.slot), self.middle(self.target), len(arm.executor.actions)
         arm.rise_clear()
@@ -152,12 +144,7 @@ class Heap:
             return work + NO_GRASP * (not clear_grasps(self.arm, self.target))
 
     def check_surface(self) -> None:
-        """See that nothing has been moved to the edge, or over it.
-
-        Raises:
-            EpisodeLost: something lies on the floor.
-            PlanningFailed: something is at the edge.
-        """
+        """See that nothing has been moved to the edge, or over it."""
         frame, half = surface_in_base(self.arm)
         present = np.flatnonzero(self.env.present[0].cpu().numpy()).tolist()
         places = np.stack([self.arm.scene.object_in_base(slot)[:3, 3] for slot in present])

@@ -64,11 +64,7 @@ def arm_base_in_world(arm: Arm, base: Array) -> Array:
 
 
 def drive(arm: Arm, *goals: Array) -> None:
-    """Drive straight to one base pose after the other and let the base settle.
-
-    Raises:
-        PlanningFailed: something held it up.
-    """
+    """Drive straight to one base pose after the other and let the base settle."""
     for goal in goals:
         if np.abs(goal - base_at(arm)).max() < 1e-6:
             continue
@@ -99,14 +95,10 @@ def best_route(
     """Base poses that lead to the best of the first few goals where the body is free; the first one that is enough.
 
     Args:
-        arm: the attempt's tools.
         goals: (N, 3), the most promising first.
         around: what is in the way.
         judge: what a base pose (3,) is good for, the more the better; 0: nothing.
         enough: look no further.
-
-    Raises:
-        PlanningFailed: none is any good, or none has a free way there.
     """
     best: tuple[float, list[Array]] = (0.0, [])
     tried = 0
@@ -130,7 +122,6 @@ def free_route(arm: Arm, start: Array, goal: Array, around: Surroundings, *, lea
     """Base poses to drive to one after the other: straight, or by way of a place behind the narrower end.
 
     Args:
-        arm: the attempt's tools; the arm stays as it stands.
         start: (3,).
         goal: (3,).
         around: what is in the way.

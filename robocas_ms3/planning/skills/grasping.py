@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.core.poses import inverse
-from robocas_ms3.planning.grasp_choice import filter_grasps, grip_margins, rank_grasps
+from robocas_ms3.planning.grasp_choice import draw_order, filter_grasps, grip_margins, score_grasps
 from robocas_ms3.planning.protocol import Array, AttachedBody, Trajectory
 from robocas_ms3.planning.scene import SPACING
 from robocas_ms3.planning.skills.arm import ROOM, Arm, moved_back, raised
@@ -48,14 +48,9 @@ def grasp(
     """Plan a grasp of an object, run it, and lift (from the front: lift and withdraw) the object.
 
     Args:
-        arm: the attempt's tools.
-        slot: of the object.
         lift_height: when grasping from above, m (upstream: 0.10 when picking, 0.15 when searching).
         approach: from where the gripper comes; default: as the configuration says.
         other_than: how many kinds of grasps to leave out, the best first.
-
-    Raises:
-        PlanningFailed: no grasp can be planned, or the object was missed or slipped.
     """
     with arm.planning():
         plan = plan_grasp(arm, slot, lift_height, approach or arm.env.task_config.target.approach, other_than)
@@ -69,11 +64,7 @@ def grasp(
 
 
 def plan_grasp(arm: Arm, slot: int, lift_height: float, approach: Approach = "top", other_than: int = 0) -> GraspPlan:
-    """Plan the best grasp that has a way in and out.
-
-    Raises:
-        PlanningFailed: of the grasp that came last.
-    """
+    """Plan the best grasp that has a way in and out."""
     planner, failure = arm.planner, PlanningFailed("grasp_sampling", "no_feasible_grasp")
     everything, others = arm.scene.obstacles(), arm.scene.obstacles(without=slot)
     with_room = arm.scene.obstacles(room=ROOM)
@@ -124,44 +115,28 @@ def candidates(arm: Arm, slot: int, approach: Approach = "top", other_than: int 
     """Grasps worth planning for, best first: TCP poses 4x4.
 
     Args:
-        arm: the attempt's tools.
-        slot: of the object.
         approach: from where the gripper may come.
         other_than: how many kinds of them to leave out, the best first.
-
-    Raises:
-        PlanningFailed: no grasp passes the filters, or none can be reached.
     """
     notes = arm.env.object_assets[0][slot].annotations
     base, object_in_base = arm.scene.arm_base_in_world, arm.scene.object_in_base(slot)
-    kept = filter_grasps(
-        base @ object_in_base @ notes.grasps_tcp_in_object,
-        notes.grasp_widths,
-        arm_base_in_world=base,
-        object_center_in_world=(base @ object_in_base)[:3, 3],
-        scene_points_in_world=np.zeros((0, 3)),  # the dearest test comes last
-        qualities=1.1 - notes.grasp_qualities,  # upstream's scale: more is better
-        approach=approach,
-    )
+    kept = filter_grasps(notes, base @ object_in_base, base, approach)
     tcp_in_base = inverse(base) @ kept.tcp_in_world
-    pregrasp = tcp_in_base.copy()
-    pregrasp[:, :3, 3] -= PREGRASP_DISTANCE * pregrasp[:, :3, 2]
     solved, qpos = arm.reachability.reachable(tcp_in_base, arm.at)
-    solved_before, qpos_before = arm.reachability.reachable(pregrasp, arm.at)
+    solved_before, qpos_before = arm.reachability.reachable(moved_back(tcp_in_base, PREGRASP_DISTANCE), arm.at)
     reachable = np.flatnonzero(solved & solved_before)
     if not len(reachable):
         raise PlanningFailed("grasp_sampling", "unreachable" if len(kept) else "all_filtered")
     surface = arm.env.object_assets[0][slot].surface_points(SPACING)
-    ranks = rank_grasps(
+    scores = score_grasps(
         tcp_in_base[reachable],
         kept.qualities[reachable],
-        object_center=object_in_base[:3, 3],
-        qpos=qpos[reachable],
-        near=arm.at,
-        rng=arm.rng,
-        margins=grip_margins(notes.grasps_tcp_in_object[kept.index[reachable]], kept.widths[reachable], surface),
-        approach=approach,
+        grip_margins(notes.grasps_tcp_in_object[kept.index[reachable]], kept.widths[reachable], surface),
+        np.abs(qpos[reachable] - arm.at).max(axis=1),
+        object_in_base[:3, 3],
+        approach,
     )
+    ranks = draw_order(arm.rng, scores)
     near = arm.scene.obstacles_in_base(without=slot, radius=NEIGHBOURHOOD, around=object_in_base[:3, 3])
     clear = _clear(tcp_in_base, reachable[ranks], near)
     if approach == "front":  # where it is narrow, first those whose arm is free as inverse kinematics found it
@@ -182,10 +157,7 @@ def candidates(arm: Arm, slot: int, approach: Approach = "top", other_than: int 
 
 
 def _of_other_kinds(tcp: Array, count: int) -> list[int]:
-    """Indices of those of the grasps (N, 4, 4) that are none of the first few kinds, in their order.
-
-    A kind is what lies within ``ALIKE`` of a grasp that is of no kind before it, but for a half turn of the wrist.
-    """
+    """Indices of those of the grasps (N, 4, 4) that are none of the first few kinds, in their order."""
     left = np.ones(len(tcp), dtype=bool)
     for _ in range(count):
         if not left.any():
@@ -207,11 +179,7 @@ def _clear(tcp_in_base: Array, order: NDArray[np.int_], points_in_base: Array) -
 def _plan_way_in_and_out(
     arm: Arm, slot: int, qpos: Array, tcp_in_base: Array, lift_height: float, approach: Approach
 ) -> tuple[Trajectory, tuple[Trajectory, ...]]:
-    """Plan straight from a pre-grasp configuration (7,) to a grasp, and out with the object.
-
-    Raises:
-        PlanningFailed: one of them is blocked or out of reach.
-    """
+    """Plan straight from a pre-grasp configuration (7,) to a grasp, and out with the object."""
     inward = arm.planner.plan_straight(qpos, tcp_in_base, stage="approach")
     if approach == "top":
         return inward, (arm.first_line(inward.qpos[-1], _ways_up(tcp_in_base, lift_height), stage="lift"),)
@@ -219,14 +187,7 @@ def _plan_way_in_and_out(
 
 
 def _plan_withdrawal(arm: Arm, slot: int, start: Array, tcp_in_base: Array) -> tuple[Trajectory, Trajectory]:
-    """Plan straight up, as little as leaves a way out, and from there straight and level back with the object.
-
-    While it is lifted the object is no part of the check, since at first it stands on something; whether it hits what
-    is above shows where the way back begins.
-
-    Raises:
-        PlanningFailed: of the lift that came last.
-    """
+    """Plan straight up, as little as leaves a way out, and from there straight and level back with the object."""
     failure = PlanningFailed("withdraw", "no_way_out")
     vertices = np.concatenate(arm.env.object_assets[0][slot].hulls)
     held = AttachedBody(vertices, inverse(tcp_in_base) @ arm.scene.object_in_base(slot))

@@ -14,7 +14,7 @@ from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.core.poses import inverse, transform
 from robocas_ms3.planning.protocol import Array, Obstacle, Shape, Trajectory
 from robocas_ms3.planning.pulling import reached, track, turned_about_bar
-from robocas_ms3.planning.skills.arm import Arm, moved_back
+from robocas_ms3.planning.skills.arm import Arm, first_plan, moved_back
 from robocas_ms3.planning.skills.part import Part
 from robocas_ms3.planning.skills.retreating import plan_step_back
 from robocas_ms3.planning.timing import through, timed
@@ -48,11 +48,7 @@ class PullPlan:
 
 
 def open_part(arm: Arm) -> None:
-    """Open what the task wants opened, by as many pulls as it takes.
-
-    Raises:
-        PlanningFailed: no pull can be planned, the handle was missed or lost.
-    """
+    """Open what the task wants opened, by as many pulls as it takes."""
     part = Part.of(arm)
     for _ in range(PULLS):
         pull(arm, part)
@@ -69,11 +65,7 @@ def is_opened(arm: Arm) -> bool:
 
 
 def pull(arm: Arm, part: Part) -> None:
-    """Take hold of the handle, pull as far as the arm leads, let go and step back.
-
-    Raises:
-        PlanningFailed: it can't be planned, or the handle was missed or lost.
-    """
+    """Take hold of the handle, pull as far as the arm leads, let go and step back."""
     with arm.planning():
         plan = plan_pull(arm, part)
         before, least = part.position(arm), 0.5 * part.least(arm)
@@ -93,15 +85,9 @@ def pull(arm: Arm, part: Part) -> None:
 
 
 def plan_pull(arm: Arm, part: Part) -> PullPlan:
-    """Plan the hold that leads furthest, with the bar deep between the fingers where it fits.
-
-    Raises:
-        PlanningFailed: of the hold that came last.
-    """
-    try:
-        return _plan_pull(arm, part, DEEPER)
-    except PlanningFailed:
-        return _plan_pull(arm, part, 0.0)
+    """Plan the hold that leads furthest, with the bar deep between the fingers where it fits."""
+    failure = PlanningFailed("pull", "no_plan")
+    return first_plan((DEEPER, 0.0), lambda deeper: _plan_pull(arm, part, deeper), failure)
 
 
 def _plan_pull(arm: Arm, part: Part, deeper: float) -> PullPlan:
@@ -120,29 +106,26 @@ def _plan_pull(arm: Arm, part: Part, deeper: float) -> PullPlan:
     order = _fitting(arm, part, paths[0], order, frames, others, deeper)
     if not order:
         raise PlanningFailed("handle", "blocked")
-    failure = PlanningFailed("pull", "no_plan")
-    for index in order[:PULLS_PLANNED]:
+
+    def plan(index: int) -> PullPlan:
         path = paths[: ends[index], index]
-        try:
-            free = _free_length(arm, part, path, frames, others)
-            if free < least:
-                raise PlanningFailed("pull", "blocked")
-            free = _retreatable(arm, path[:free], int(np.ceil(least)))
-            arm.planner.set_scene(everything)
-            away = arm.planner.plan_straight(path[0], moved_back(arm.planner.tcp(path[0]), STANDOFF), stage="approach")
-            reach = arm.planner.plan_to_qpos(arm.at, [away.qpos[-1]], stage="reach")
-            way_in = arm.planner.join(arm.at, reach, _reversed(away, path[0]))
-            return PullPlan(way_in, _timed(path[:free], arm.robot, away.dt))
-        except PlanningFailed as error:
-            failure = error
-    raise failure
+        free = _free_length(arm, part, path, frames, others)
+        if free < least:
+            raise PlanningFailed("pull", "blocked")
+        free = _retreatable(arm, path[:free], int(np.ceil(least)))
+        arm.planner.set_scene(everything)
+        away = arm.planner.plan_straight(path[0], moved_back(arm.planner.tcp(path[0]), STANDOFF), stage="approach")
+        reach = arm.planner.plan_to_qpos(arm.at, [away.qpos[-1]], stage="reach")
+        way_in = arm.planner.join(arm.at, reach, _reversed(away, path[0]))
+        return PullPlan(way_in, _timed(path[:free], arm.robot, away.dt))
+
+    return first_plan(order[:PULLS_PLANNED], plan, PlanningFailed("pull", "no_plan"))
 
 
 def pull_share(arm: Arm, part: Part, arm_base_in_world: Array, others: list[Obstacle]) -> float:
     """How far towards open the arm could pull a part in one go if its base stood elsewhere; 1: comfortably open.
 
     Args:
-        arm: the attempt's tools.
         part: what is opened.
         arm_base_in_world: 4x4.
         others: all but the part, in that base's frame.
@@ -165,11 +148,7 @@ def pull_share(arm: Arm, part: Part, arm_base_in_world: Array, others: list[Obst
 
 
 def _paths(arm: Arm, part: Part, frames: Array, deeper: float = 0.0) -> tuple[Array, NDArray[np.int_], Array]:
-    """Many ways to hold the handle and go with it.
-
-    Returns:
-        Configurations (T, N, 7); how many of the part's T poses (N,) each reaches; rad (N,) turned about the bar.
-    """
+    """Many ways to hold the handle and go with it."""
     goals, starts, beyond = [], [], np.eye(4)
     beyond[2, 3] = deeper
     for shift in SHIFTS:
@@ -197,17 +176,7 @@ def _fitting(
     others: list[Obstacle],
     deeper: float = 0.0,
 ) -> list[int]:
-    """Those of the ways to hold the handle in which it is between the open fingers, which touch nothing.
-
-    Args:
-        arm: the attempt's tools.
-        part: what is opened.
-        starts: (N, 7) of each way; NaN in those that are not in the order.
-        order: of ways.
-        frames: (T, 4, 4) of the part during the pull.
-        others: all but the part.
-        deeper: m by which the bar is farther in than the TCP.
-    """
+    """Those of the ways to hold the handle in which it is between the open fingers, which touch nothing."""
     surface = transform(frames[0], part.surface(arm))
     near = surface[np.linalg.norm(surface - (frames[0] @ part.hold)[:3, 3], axis=1) < NEAR]
     arm.planner.set_scene([*others, part.obstacle(arm, frames[0])])
@@ -247,11 +216,7 @@ def _plan_retreat(arm: Arm, start: Array, *, try_free: bool = False) -> Trajecto
 
 
 def _retreatable(arm: Arm, path: Array, least: int) -> int:
-    """How much of a pull (T, 7) to do so that the gripper can step back at its end; at least the first few.
-
-    Raises:
-        PlanningFailed: as much as is worth it leaves no way back.
-    """
+    """How much of a pull (T, 7) to do so that the gripper can step back at its end; at least the first few."""
     for length in range(len(path), max(least, 1) - 1, -3):
         try:
             _plan_retreat(arm, path[length - 1])

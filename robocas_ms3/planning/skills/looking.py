@@ -23,12 +23,8 @@ def look_at(arm: Arm, point_in_base: Array, distance: tuple[float, float]) -> No
     """Move the gripper's camera to where it looks at a point from above.
 
     Args:
-        arm: the attempt's tools.
         point_in_base: (3,) m.
         distance: least and greatest, m.
-
-    Raises:
-        PlanningFailed: no such view can be reached.
     """
     arm.rise_clear()
     with arm.planning():
@@ -37,11 +33,7 @@ def look_at(arm: Arm, point_in_base: Array, distance: tuple[float, float]) -> No
 
 
 def plan_look(arm: Arm, point_in_base: Array, distance: tuple[float, float]) -> Trajectory:
-    """Plan to one of the nearest views of a point; arguments as in `look_at`.
-
-    Raises:
-        PlanningFailed: no such view can be reached.
-    """
+    """Plan to one of the nearest views of a point; arguments as in `look_at`."""
     tcp_in_camera = inverse(inverse(arm.scene.tcp_in_base) @ camera_in_base(arm))
     for least, greatest in (distance, (NEAR[0], FAR[1])):  # where a high table leaves no such view, any other
         views = sample_views(arm.rng, point_in_base, (least, greatest), count=VIEWS_SAMPLED)

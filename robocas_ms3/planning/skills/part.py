@@ -50,11 +50,7 @@ class Part:
         return arm.scene.joint_positions(self.furniture)[self.joint.name]
 
     def way(self, arm: Arm) -> Array:
-        """Joint positions (T,) of a pull, from where the joint stands to where a pull ends at most.
-
-        Raises:
-            PlanningFailed: it stands there already.
-        """
+        """Joint positions (T,) of a pull, from where the joint stands to where a pull ends at most."""
         start, far = self.position(arm), OPENED_AT_MOST[self.joint.kind] * self.end
         left = (far - start) * np.sign(far)
         if left < STEP[self.joint.kind]:

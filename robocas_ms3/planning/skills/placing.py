@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.core.poses import from_wxyz, inverse, transform
 from robocas_ms3.planning.chain import turn_between
-from robocas_ms3.planning.drops import overhangs, sample_drops
+from robocas_ms3.planning.drops import Inside, overhangs, sample_drops
 from robocas_ms3.planning.protocol import Array, AttachedBody, Trajectory
-from robocas_ms3.planning.skills.arm import CARRYING_ROOM, Arm, moved_back, raised
+from robocas_ms3.planning.skills.arm import CARRYING_ROOM, Arm, first_plan, moved_back, raised
 from robocas_ms3.planning.skills.retreating import plan_step_back
 
 DROPS_SAMPLED, DROPS_CHECKED, DROPS_PLANNED = 192, 64, 10
@@ -21,11 +21,7 @@ RETREAT_HEIGHT = 0.05  # m, upstream's
 
 
 def carry_to_basket(arm: Arm, slot: int) -> None:
-    """Carry a held object to where it hangs above the basket.
-
-    Raises:
-        PlanningFailed: no way there, or the object was lost.
-    """
+    """Carry a held object to where it hangs above the basket."""
     with arm.planning():
         motion = plan_carry(arm, slot)
     arm.follow(motion)
@@ -34,11 +30,7 @@ def carry_to_basket(arm: Arm, slot: int) -> None:
 
 
 def release_into_basket(arm: Arm, slot: int) -> None:
-    """Open the gripper, step back and go home until the task has succeeded.
-
-    Raises:
-        PlanningFailed: no way back, or the object did not end up as it should.
-    """
+    """Open the gripper, step back and go home until the task has succeeded."""
     start = arm.at
     arm.open_gripper()
     with arm.planning():
@@ -56,9 +48,6 @@ def plan_carry(arm: Arm, slot: int) -> Trajectory:
     """Plan from where the arm is to a pose above the basket from which it can also step back.
 
     Where there is such a way, it keeps off basket and furniture by what a robot may miss them: both may be pushed away.
-
-    Raises:
-        PlanningFailed: of the pose that came last.
     """
     drops = drop_poses(arm, slot, arm.scene.arm_base_in_world)
     solved, qpos = arm.reachability.reachable(drops, arm.at)
@@ -67,26 +56,21 @@ def plan_carry(arm: Arm, slot: int) -> Trajectory:
     order = _ranked(arm, slot, drops[solved], qpos[solved])
     drops, qpos = drops[solved][order], qpos[solved][order]
     attach_held(arm, slot)
-    failure = PlanningFailed("transfer", "no_plan")
-    for room in (CARRYING_ROOM, 0.0):
+
+    def plan(room: float) -> Trajectory:
         arm.planner.set_scene(arm.scene.obstacles(without=slot, room=room))
-        try:
-            return _plan_to_one_of(arm, drops, qpos)
-        except PlanningFailed as error:
-            failure = error
-    raise failure
+        return _plan_to_one_of(arm, drops, qpos)
+
+    return first_plan((CARRYING_ROOM, 0.0), plan, PlanningFailed("transfer", "no_plan"))
 
 
 def _ranked(arm: Arm, slot: int, drops: Array, qpos: Array) -> NDArray[np.int_]:
-    """Order of drops (N, 4, 4), reached at (N, 7).
+    """Return the order of drops (N, 4, 4), reached at (N, 7): those that fit through the opening first.
 
-    First those in which the object fits through the opening with room to spare. Of those the ones that are near, not at
-    the end of the arm's reach, and steep: off a leaning gripper an object slides.
+    Of those the near and steep ones, since an object slides off a leaning gripper, and none at the end of the reach.
     """
-    low, high = _inner_box(arm)
-    margin = np.array([DROP_MARGIN, DROP_MARGIN, 0])
-    vertices = transform(*held_object(arm, slot))
-    overhang = overhangs(drops, arm.scene.basket_in_base, low + margin, high - margin, vertices)
+    inside = _inside_basket(arm, arm.scene.arm_base_in_world)
+    overhang = overhangs(drops, inside, transform(*held_object(arm, slot)), DROP_MARGIN)
     lean = np.arccos(np.clip(-drops[:, 2, 2], -1, 1))
     stretched = np.maximum(qpos[:, ELBOW] - STRETCHED, 0)
     cost = turn_between(qpos, arm.at) + LEAN_WEIGHT * lean + STRETCH_WEIGHT * stretched
@@ -94,11 +78,7 @@ def _ranked(arm: Arm, slot: int, drops: Array, qpos: Array) -> NDArray[np.int_]:
 
 
 def _plan_to_one_of(arm: Arm, drops: Array, qpos: Array) -> Trajectory:
-    """Plan to the first of several drops (N, 4, 4), reached at (N, 7), that is free.
-
-    Raises:
-        PlanningFailed: of the drop that came last.
-    """
+    """Plan to the first of several drops (N, 4, 4), reached at (N, 7), that is free."""
     start = arm.at
     chosen = np.flatnonzero(arm.planner.free(qpos[:DROPS_CHECKED], arm.planner.finger_width))[:DROPS_PLANNED]
     if not len(chosen):
@@ -140,32 +120,26 @@ def drop_poses(arm: Arm, slot: int, arm_base_in_world: Array) -> Array:
     """Poses (N, 4, 4) of the TCP that bring the object it holds above the basket.
 
     Args:
-        arm: the attempt's tools.
-        slot: of the held object.
         arm_base_in_world: 4x4, in whose frame the poses are: where the arm's base is, or might be.
     """
     object_in_tcp, vertices = held_object(arm, slot)
-    low, high = _inner_box(arm)
-    basket = arm.env.fixtures.basket
-    assert basket is not None  # the task has one
+    center_of_mass = np.array([arm.env.object_assets[0][slot].asset.center_of_mass])
     return sample_drops(
         arm.rng,
-        count=DROPS_SAMPLED,
-        container_in_base=inverse(arm_base_in_world) @ from_wxyz(basket.pose.raw_pose[0]),
-        inner_low=low,
-        inner_high=high,
-        vertices_in_tcp=transform(object_in_tcp, vertices),
-        center_in_tcp=transform(object_in_tcp, np.array([arm.env.object_assets[0][slot].asset.center_of_mass]))[0],
+        DROPS_SAMPLED,
+        _inside_basket(arm, arm_base_in_world),
+        transform(object_in_tcp, vertices),
+        transform(object_in_tcp, center_of_mass)[0],
     )
 
 
-def _inner_box(arm: Arm) -> tuple[Array, Array]:
-    """Least and greatest corner (3,) of the room inside the basket, in its frame, m."""
+def _inside_basket(arm: Arm, arm_base_in_world: Array) -> Inside:
     basket = arm.env.model.basket
     assert basket is not None  # the task has one
     inner = basket.asset.inner
     assert inner is not None  # the model saw to it
-    return np.array(inner.min), np.array(inner.max)
+    basket_in_base = inverse(arm_base_in_world) @ from_wxyz(arm.env.basket_pose[0])
+    return Inside(basket_in_base, np.array(inner.min), np.array(inner.max))
 
 
 def _ways_off(tcp_in_base: Array) -> list[Array]:

@@ -39,13 +39,8 @@ def push_away(arm: Arm, slot: int, target: int, *, turn_deg: float = 0.0) -> Non
     """Push an object away from the target until it has gone far enough or resists, then rise.
 
     Args:
-        arm: the attempt's tools.
-        slot: of the object.
         target: slot of the target.
         turn_deg: by which the paper's direction is turned.
-
-    Raises:
-        PlanningFailed: no push can be planned.
     """
     arm.rise_clear()
     with arm.planning():
@@ -71,11 +66,7 @@ def _push_on(arm: Arm, push: Trajectory, direction: Array) -> bool:
 
 
 def _plan_lift(arm: Arm, direction: Array) -> Trajectory:
-    """Plan up and back, or straight up, from where a push was cut short, clear of furniture and basket.
-
-    Raises:
-        PlanningFailed: there is no such way.
-    """
+    """Plan up and back, or straight up, from where a push was cut short, clear of furniture and basket."""
     width, arm.planner.finger_width = arm.planner.finger_width, 0.0
     try:
         arm.planner.set_scene(_fixed_bodies(arm))
@@ -107,9 +98,6 @@ def plan_push(arm: Arm, slot: int, target: int, turn_deg: float = 0.0) -> PushPl
 
     The way to the object is clear of everything, the way along of furniture, basket and target in either case, and the
     way up after it of furniture and basket.
-
-    Raises:
-        PlanningFailed: of the push that came last.
     """
     planner = arm.planner
     width, planner.finger_width = planner.finger_width, 0.0
@@ -124,11 +112,7 @@ def plan_push(arm: Arm, slot: int, target: int, turn_deg: float = 0.0) -> PushPl
 
 
 def _begun(arm: Arm, slot: int, target: int, turn_deg: float) -> list[tuple[Push, Array, Trajectory]]:
-    """Pushes whose way down to the object is clear of everything: with a configuration (7,) above, and that way.
-
-    Raises:
-        PlanningFailed: there is none.
-    """
+    """Pushes whose way down to the object is clear of everything: with a configuration (7,) above, and that way."""
     arm.planner.set_scene(arm.scene.obstacles())
     failure, begun = PlanningFailed("push", "no_room"), []
     for push, qpos in reachable_pushes(arm, slot, target, arm.scene.obstacles_in_base(without=slot), turn_deg):
@@ -144,11 +128,7 @@ def _begun(arm: Arm, slot: int, target: int, turn_deg: float) -> list[tuple[Push
 
 
 def _plan_along(arm: Arm, begun: list[tuple[Push, Array, Trajectory]], movable: set[int]) -> PushPlan:
-    """Plan on from where pushes begin, with some objects that may be moved on the way along.
-
-    Raises:
-        PlanningFailed: of the push that came last.
-    """
+    """Plan on from where pushes begin, with some objects that may be moved on the way along."""
     planner, failure = arm.planner, PlanningFailed("push", "no_room")
     along_scene, fixed = arm.scene.obstacles(without=movable), _fixed_bodies(arm)
     ways: list[tuple[Array, Trajectory, Trajectory, Trajectory]] = []
@@ -189,9 +169,7 @@ def reachable_pushes(
     if not pushes:
         return
     starts, ends = np.stack([push.start for push in pushes]), np.stack([push.end for push in pushes])
-    above = starts.copy()
-    above[:, 2, 3] += ABOVE
-    reachable, qpos = arm.reachability.reachable(above, arm.at)
+    reachable, qpos = arm.reachability.reachable(raised(starts, ABOVE), arm.at)
     for poses in (starts, ends):
         reachable[reachable] = arm.reachability.reachable(poses[reachable], arm.at)[0]
     turn = np.repeat(np.arange(len(pushes) // YAWS), YAWS)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 
 import numpy as np
 from scipy.spatial import ConvexHull, KDTree
@@ -13,7 +14,7 @@ from robocas_ms3.core.poses import transform
 from robocas_ms3.planning.protocol import Array, Trajectory
 from robocas_ms3.planning.scene import SPACING
 from robocas_ms3.planning.shapes import convex_hull
-from robocas_ms3.planning.skills.arm import Arm, moved_back, raised
+from robocas_ms3.planning.skills.arm import Arm, first_plan, moved_back, raised
 from robocas_ms3.planning.skills.grasping import grasp
 from robocas_ms3.planning.skills.placing import attach_held
 from robocas_ms3.planning.skills.pushing import surface_in_base
@@ -34,11 +35,7 @@ PLACES_SOLVED, PLACES_PLANNED = 96, 12
 
 
 def remove(arm: Arm, slot: int) -> None:
-    """Grasp an object, put it down on a free place of the surface, step back.
-
-    Raises:
-        PlanningFailed: it can't be grasped, there is no place for it, or it was lost on the way.
-    """
+    """Grasp an object, put it down on a free place of the surface, step back."""
     grasp(arm, slot, lift_height=lift_height(arm, slot))
     hang_clear(arm, slot)
     with arm.planning():
@@ -77,12 +74,7 @@ def clear_grasps(arm: Arm, slot: int) -> int:
 
 
 def blockers(arm: Arm, slot: int) -> list[int]:
-    """Objects in the way of an object's grasps from above, those first that alone block most of them.
-
-    Args:
-        arm: the attempt's tools.
-        slot: of the object to be grasped.
-    """
+    """Objects in the way of an object's grasps from above, those first that alone block most of them."""
     grasps, in_the_way = _grasps_from_above(arm, slot), {}
     for other, used in enumerate(arm.env.present[0].tolist()):
         if used and other != slot:
@@ -108,9 +100,6 @@ def plan_place(arm: Arm, slot: int) -> Trajectory:
 
     In a heap an object leans; let go of as it leant, it would fall over, off its place. So it is turned as little as
     makes it stand, and put down as it is held only where that can't be done.
-
-    Raises:
-        PlanningFailed: of the place that came last.
     """
     scene, asset, held = arm.scene, arm.env.object_assets[0][slot], arm.scene.object_in_base(slot)
     vertices = transform(held, np.concatenate(asset.hulls))
@@ -118,42 +107,35 @@ def plan_place(arm: Arm, slot: int) -> Trajectory:
     others = scene.obstacles_in_base(without=slot)
     arm.planner.set_scene(scene.obstacles(without=slot))
     attach_held(arm, slot)
+
+    def free_poses() -> Iterator[Array]:
+        for turn, margin in itertools.product((standing, np.eye(4)), EDGE_MARGINS):
+            motions = free_places(transform(turn, vertices), others, *surface_in_base(arm), margin) @ turn
+            if len(motions):
+                yield motions @ scene.tcp_in_base
+
     failure = PlanningFailed("remove", "no_free_place")
-    for turn, margin in itertools.product((standing, np.eye(4)), EDGE_MARGINS):
-        motions = free_places(transform(turn, vertices), others, *surface_in_base(arm), margin) @ turn
-        if not len(motions):
-            continue
-        try:
-            return _plan_to_one_of(arm, motions @ scene.tcp_in_base)
-        except PlanningFailed as error:
-            failure = error
-    raise failure
+    return first_plan(free_poses(), lambda places: _plan_to_one_of(arm, places), failure)
 
 
 def _plan_to_one_of(arm: Arm, places: Array) -> Trajectory:
-    """Plan to above one of several TCP poses (N, 4, 4), in the arm's base frame, and down to it.
-
-    Raises:
-        PlanningFailed: of the place that came last.
-    """
+    """Plan to above one of several TCP poses (N, 4, 4), in the arm's base frame, and down to it."""
     start = arm.at
     nearest = np.argsort(np.linalg.norm(places[:, :2, 3] - arm.scene.tcp_in_base[:2, 3], axis=1), kind="stable")
     # near and far ones: all of them would take inverse kinematics seconds
     places = places[nearest[:: max(1, len(places) // PLACES_SOLVED)]]
-    above = places.copy()
-    above[:, 2, 3] += COME_DOWN
+    above = raised(places, COME_DOWN)
     solved, qpos = arm.reachability.reachable(above, start)
     solved[solved] = arm.reachability.reachable(places[solved], start)[0]
     places, above, qpos = places[solved], above[solved], qpos[solved]
-    failure = PlanningFailed("remove", "unreachable")
-    for index in np.argsort(np.abs(qpos - start).max(axis=1), kind="stable")[:PLACES_PLANNED]:
-        try:
-            carry = arm.planner.plan_to_pose(start, above[index], stage="remove")
-            down = arm.planner.plan_straight(carry.qpos[-1], places[index], stage="remove")
-            return arm.planner.join(start, carry, down)
-        except PlanningFailed as error:
-            failure = error
-    raise failure
+
+    def plan(index: int) -> Trajectory:
+        carry = arm.planner.plan_to_pose(start, above[index], stage="remove")
+        down = arm.planner.plan_straight(carry.qpos[-1], places[index], stage="remove")
+        return arm.planner.join(start, carry, down)
+
+    order = np.argsort(np.abs(qpos - start).max(axis=1), kind="stable")[:PLACES_PLANNED]
+    return first_plan(order, plan, PlanningFailed("remove", "unreachable"))
 
 
 def turn_to_stand(vertices: Array, center_of_mass: Array) -> Array:

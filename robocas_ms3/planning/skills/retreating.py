@@ -17,14 +17,10 @@ def plan_step_back(
     """Plan a straight line to the first of several TCP poses that one leads to, through whatever is touched.
 
     Args:
-        arm: the attempt's tools.
         start: (7,) rad.
         goals: 4x4 in the arm's base frame, the best first.
         try_free: first look for a line that touches nothing of the planner's scene.
         only_free: take no other.
-
-    Raises:
-        PlanningFailed: none of them can be reached on such a straight line.
     """
     if try_free or only_free:
         try:
@@ -41,9 +37,6 @@ def back_out(arm: Arm) -> None:
     On what lies open to above the arm rises, through what it touches. Where it reached in level, as into a shelf or
     for a handle, something may be above: it steps straight back, on a way that is free of all but the target, which
     it may still stand against.
-
-    Raises:
-        PlanningFailed: it can't; the attempt has to be undone.
     """
     arm.hold_nothing()
     arm.open_gripper()
@@ -58,11 +51,7 @@ def back_out(arm: Arm) -> None:
 
 
 def plan_back_out(arm: Arm, goals: list[Array]) -> Trajectory:
-    """Plan a straight line, free of all but the target, to the first of several TCP poses that one leads to.
-
-    Raises:
-        PlanningFailed: there is no such line.
-    """
+    """Plan a straight line, free of all but the target, to the first of several TCP poses that one leads to."""
     try:
         return plan_step_back(arm, arm.at, goals, only_free=True)
     except PlanningFailed:

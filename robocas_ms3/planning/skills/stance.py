@@ -13,7 +13,7 @@ from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.core.poses import inverse, transform
 from robocas_ms3.planning.protocol import Array, Obstacle
 from robocas_ms3.planning.scene import seen_from
-from robocas_ms3.planning.skills.arm import Arm
+from robocas_ms3.planning.skills.arm import Arm, moved_back
 from robocas_ms3.planning.skills.driving import (
     THINNED,
     Surroundings,
@@ -43,11 +43,7 @@ COMFORTABLE, PULLED, ABOVE_BASKET = 0.3, 1.0, 0.1
 
 
 def grasp_from_reach(arm: Arm, slot: int) -> None:
-    """Grasp an object from where it is within comfortable reach, from another place if no grasp can be planned there.
-
-    Raises:
-        PlanningFailed: no place to grasp from, or the object was missed or slipped.
-    """
+    """Grasp an object from a place within comfortable reach, or from another place if no grasp can be planned there."""
     kind = arm.path[-1] % KINDS  # not again what has failed before
     _from_some_place(
         arm,
@@ -57,11 +53,7 @@ def grasp_from_reach(arm: Arm, slot: int) -> None:
 
 
 def open_from_reach(arm: Arm) -> None:
-    """Open what the task wants opened, from where its handle is within comfortable reach all the way.
-
-    Raises:
-        PlanningFailed: no place to pull from, or the handle was missed or lost.
-    """
+    """Open what the task wants opened, from where its handle is within comfortable reach all the way."""
     _from_some_place(arm, lambda elsewhere: drive_to_handle(arm, elsewhere=elsewhere), lambda: open_part(arm))
 
 
@@ -82,12 +74,7 @@ def drive_to_object(arm: Arm, slot: int, *, elsewhere: bool = False) -> None:
     """Fold the arm and drive to where an object is within comfortable reach, unless it is already.
 
     Args:
-        arm: the attempt's tools.
-        slot: of the object.
         elsewhere: drive even so, since no grasp could be planned from here.
-
-    Raises:
-        PlanningFailed: there is no such place, or no free way there.
     """
     if not arm.executor.drives:
         return
@@ -120,11 +107,7 @@ def drive_to_handle(arm: Arm, *, elsewhere: bool = False) -> None:
     """Fold the arm and drive to where it can pull what the task wants opened far enough, unless it stands there.
 
     Args:
-        arm: the attempt's tools.
         elsewhere: drive even so, since no pull could be planned from here.
-
-    Raises:
-        PlanningFailed: there is no such place, or no free way there.
     """
     if not arm.executor.drives:
         return
@@ -154,9 +137,6 @@ def drive_to_basket(arm: Arm, slot: int) -> None:
 
     Where there is no free way, or the basket is out of reach from there, stay if it is in reach, else drive to where it
     is.
-
-    Raises:
-        PlanningFailed: no such place, no free way there, or the object was lost.
     """
     if not arm.executor.drives:
         return
@@ -210,7 +190,6 @@ def reach_share(arm: Arm, base: Array, grasps: Array, others: list[Obstacle], *,
     """Share of grasps that the arm reaches from a base pose without touching anything, pre-grasps included.
 
     Args:
-        arm: the attempt's tools.
         base: (3,).
         grasps: (G, 4, 4) from ``clear_grasps``; those that come from the far side count as out of reach.
         others: everything but the object, in the world.
@@ -236,9 +215,7 @@ def _poses_of_some(arm: Arm, frame: Array, grasps: Array, count: int) -> Array:
     chosen = _from_here(arm, frame, grasps)
     chosen = chosen[np.linspace(0, len(chosen) - 1, min(count, len(chosen))).round().astype(int)]
     poses = inverse(frame) @ np.concatenate([chosen, chosen @ HALF_TURN])
-    before = poses.copy()
-    before[:, :3, 3] -= PREGRASP_DISTANCE * before[:, :3, 2]
-    return np.concatenate([poses, before])
+    return np.concatenate([poses, moved_back(poses, PREGRASP_DISTANCE)])
 
 
 def _from_here(arm: Arm, frame: Array, grasps: Array) -> Array:

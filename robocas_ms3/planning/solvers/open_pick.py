@@ -10,11 +10,7 @@ from robocas_ms3.scenes.language.templates import subgoal
 
 
 def attempt(arm: Arm) -> None:
-    """Try once, from wherever the episode stands; returns when the task has succeeded.
-
-    Raises:
-        PlanningFailed: with the stage that could not be done.
-    """
+    """Try once, from wherever the episode stands; returns when the task has succeeded."""
     if not is_opened(arm):
         words = arm.env.target_asset().asset.name, arm.env.task_config.support
         arm.executor.label(**subgoal("operate the target", *words))

@@ -9,11 +9,7 @@ from robocas_ms3.scenes.language.templates import subgoal
 
 
 def attempt(arm: Arm) -> None:
-    """Try once, from wherever the episode stands; returns when the task has succeeded.
-
-    Raises:
-        PlanningFailed: with the stage that could not be done.
-    """
+    """Try once, from wherever the episode stands; returns when the task has succeeded."""
     slot = int(arm.env.target_slot[0])
     words = arm.env.target_asset().asset.name, arm.env.task_config.support
     arm.executor.label(**subgoal("move and grasp", *words))

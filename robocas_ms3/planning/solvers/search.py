@@ -23,11 +23,7 @@ GRASPS = 3  # kinds of grasps of the target that are tried
 
 
 def attempt(arm: Arm) -> None:
-    """Try once, from wherever the episode stands; returns when the task has succeeded.
-
-    Raises:
-        PlanningFailed: with the stage that could not be done.
-    """
+    """Try once, from wherever the episode stands; returns when the task has succeeded."""
     slot = int(arm.env.target_slot[0])
     words = arm.env.target_asset().asset.name, arm.env.task_config.support
     find, take = subgoal("find the object", *words), subgoal("move and grasp", *words)
