@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-from robocas_ms3.assets.gripper import GRIPPER_BOXES
+from robocas_ms3.assets.annotations import GRIPPER_BOXES
 from robocas_ms3.core.errors import AssetError
 
 Array = NDArray[np.float64]

@@ -165,7 +165,7 @@ def test_mesh_tools_are_imported_by_the_assets_command_alone_when_it_runs():
         for name, local in imports(module, path)
         if name.split(".")[0] == "asset_tools"
     }
-    assert users <= {("robocas_ms3.cli.assets_make", True), ("robocas_ms3.cli.assets_show", True)}
+    assert users <= {("robocas_ms3.cli.assets", True), ("robocas_ms3.cli.assets_show", True)}
 
 
 def test_the_builtin_formulas_are_imported_by_their_command_alone():
@@ -178,7 +178,7 @@ def test_the_builtin_formulas_are_imported_by_their_command_alone():
         for name, local in imports(module, path)
         if f"{name}.".startswith("asset_tools.builtin.")
     }
-    assert users == {("robocas_ms3.cli.assets_make", True)}
+    assert users == {("robocas_ms3.cli.assets", True)}
 
 
 def test_mesh_tools_know_only_the_lowest_layers():

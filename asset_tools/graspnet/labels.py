@@ -20,7 +20,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from asset_tools.grasps import Grasps, local_points, spread_out, surface_samples
-from robocas_ms3.assets.gripper import GRIPPER_BOXES
+from robocas_ms3.assets.annotations import GRIPPER_BOXES
 from robocas_ms3.core.errors import AssetError
 
 Array = NDArray[np.float64]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sapien import physx
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.assets.gripper import GRIPPER_BOXES
+from robocas_ms3.assets.annotations import GRIPPER_BOXES
 from robocas_ms3.assets.physics import (
     TIME_STEP,
     Array,

@@ -1,4 +1,4 @@
-"""What is known of an object besides its shape: ``annotations.npz``. Metres, the asset's frame."""
+"""Resting poses, grasps and surface points of an object: ``annotations.npz``. Metres, the asset's frame."""
 
 from __future__ import annotations
 
@@ -13,10 +13,23 @@ from robocas_ms3.assets.hulls import Array
 from robocas_ms3.core.documents import DAMAGED, open_arrays
 from robocas_ms3.core.errors import AssetError
 
+# The open gripper that grasps are annotated for, in the TCP frame (z approach, y closing), one half of it (the other is
+# mirrored at y = 0): low and high corner, m. Upstream uses fingers 0.04..0.045 x +-0.01 x -0.09..0 and a palm +-0.1 x
+# +-0.02 x -0.18..-0.09. These are the same parts of the Panda with 3 cm longer fingers: pads reach 8 mm beyond the TCP;
+# knuckles and hand are wider and lower than upstream's.
+GRIPPER_BOXES = np.array(
+    [
+        ((-0.010, 0.040, -0.040), (0.010, 0.046, 0.0085)),  # tip
+        ((-0.012, 0.040, -0.075), (0.012, 0.067, -0.020)),  # knuckle
+        ((-0.033, 0.000, -0.180), (0.033, 0.104, -0.067)),  # palm
+    ]
+)
+GRIPPER_RADIUS = 0.22  # m from the TCP, holds all boxes
+
 
 @dataclass(frozen=True)
 class Annotations:
-    """What is known of an object besides its shape. S stable poses, G grasps, P surface points; metres, asset frame.
+    """Annotations of an object. S stable poses, G grasps, P surface points; metres, asset frame.
 
     Attributes:
         resting_poses: (S, 4, 4) ``T_plane_object``: the object's frame in a frame whose z = 0 is the plane it rests
@@ -62,7 +75,7 @@ class Annotations:
             raise AssetError("no such resting pose", where="display_pose", found=f"{self.display_pose} of {poses}")
 
     def save(self, path: Path) -> None:
-        """Write them as an ``annotations.npz``."""
+        """Write ``annotations.npz``."""
         arrays: dict[str, Any] = {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}
         np.savez_compressed(path, **arrays)
 
@@ -71,41 +84,28 @@ class Annotations:
         """Read ``annotations.npz``.
 
         Raises:
-            AssetError: it is damaged, or an array is missing or has the wrong shape.
+            AssetError: it is damaged, or an array is missing or has the wrong type or shape.
         """
         try:
             with open_arrays(path) as file:
                 arrays = {f.name: file[f.name] for f in fields(cls)}
-        except (*DAMAGED, KeyError) as error:
-            raise AssetError(
-                "can't read the annotations", where=path, found=error, fix="Make the pack again."
-            ) from error
-        for array in arrays.values():
-            array.setflags(write=False)
-        try:
             for name, array in arrays.items():
+                array.setflags(write=False)
                 if array.dtype.kind not in "fiu" or (array.ndim == 0) is not (name == "display_pose"):
-                    raise AssetError("no such numbers", where=name, found=f"{array.dtype} of shape {array.shape}")
+                    raise ValueError(f"{name} is {array.dtype} of shape {array.shape}")
             return cls(**{**arrays, "display_pose": int(arrays["display_pose"])})
-        except (AssetError, ValueError, OverflowError) as error:
-            raise AssetError(str(error), where=path, fix="Make the pack again.") from error
+        except (*DAMAGED, AssetError, KeyError) as error:
+            fix = "Make the pack again."
+            raise AssetError("can't read the annotations", where=path, found=error, fix=fix) from error
 
     def footprint(self, pose_index: int) -> Array:
-        """The polygon (K, 2) that the object covers in a resting pose, each corner once, m."""
+        """Return the polygon (K, 2) that the object covers in a resting pose, each corner once, m."""
         corners = self.footprints[pose_index]
         return corners[~np.all(corners == np.roll(corners, 1, axis=0), axis=1)]
 
 
 def footprints(hulls: list[Array], poses: Array) -> Array:
-    """What convex hulls cover of the plane in each resting pose.
-
-    Args:
-        hulls: (V, 3) vertices each, m.
-        poses: (S, 4, 4) ``T_plane_object``.
-
-    Returns:
-        (S, K, 2), see `Annotations`.
-    """
+    """Return what convex hulls, vertices (V, 3), cover of the plane in resting poses (S, 4, 4); see `Annotations`."""
     points = np.concatenate(hulls)
     polygons = []
     for pose in poses:

@@ -1,7 +1,7 @@
-"""Whether the physics engine makes of convex hulls what their files say: on a CPU, and as a GPU takes them.
+"""Check what PhysX makes of convex hulls, on a CPU and for a GPU.
 
 PhysX "cooks" hulls: it leaves out detail of up to 0.7 mm, and for a GPU whatever goes beyond 64 vertices or 64 faces,
-which can shrink a hull by millimetres without a word.
+which can shrink a hull by millimetres without a warning.
 """
 
 from __future__ import annotations
@@ -21,17 +21,16 @@ from robocas_ms3.assets.physics import cook
 from robocas_ms3.core.errors import AssetError
 from robocas_ms3.core.workers import FunctionWorker, WorkerPool
 
-# m that a hull may lose anywhere: PhysX leaves out vertices, and makes faces one, within 0.7 mm each
-SHRINKAGE = 0.0015
+SHRINKAGE = 0.0015  # m that a hull may lose anywhere: PhysX merges vertices and faces within 0.7 mm each
 OBLONG = 100  # slenderness from which on PhysX makes no hull for a GPU
 
 
 @dataclass(frozen=True)
 class CookedHull:
-    """What became of a hull.
+    """Result of cooking a hull.
 
     Attributes:
-        lost: m, how far its farthest vertex lies outside of what the engine made; infinite: it made nothing.
+        lost: m, distance of its farthest vertex from the cooked hull; infinite: the engine made none.
         oblong: whether it is too slender for a GPU.
     """
 
@@ -41,13 +40,13 @@ class CookedHull:
 
 @dataclass(frozen=True)
 class CookingFault:
-    """A hull that the engine makes less of than its file says.
+    """A hull that is smaller once cooked.
 
     Attributes:
         asset: its folder in the pack; of a moving part ``<furniture>/links/<link>``.
         hull: its number in the file, from 0 on.
         way: ``CPU`` or ``GPU``.
-        cooked: what became of it.
+        cooked: the result.
     """
 
     asset: str
@@ -66,9 +65,9 @@ class CookingFault:
 
 
 def cooking_faults(folder: Path) -> list[CookingFault]:
-    """Cook all hulls in a pack's folder both ways and say which are not what their files say.
+    """Cook all hulls in a pack's folder for CPU and GPU; return those that shrink or can't be built.
 
-    Boxes are not cooked, in simulation neither. The GPU's way needs no GPU, but a process of its own.
+    Boxes are not cooked, in simulation neither. Cooking for a GPU needs no GPU, but a process of its own.
 
     Raises:
         AssetError: a file of hulls can't be read, or the process died.
@@ -97,7 +96,7 @@ def cooking_faults(folder: Path) -> list[CookingFault]:
 
 
 def cook_hulls(hulls: Sequence[Array]) -> list[CookedHull]:
-    """Let the engine, as this process has it, make something of convex hulls of points (V, 3)."""
+    """Cook convex hulls of points (V, 3) with the engine's settings of this process."""
     material = physx.PhysxMaterial(0.5, 0.5, 0.0)
     results = []
     for vertices in hulls:

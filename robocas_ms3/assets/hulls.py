@@ -1,4 +1,4 @@
-"""Convex hulls of an asset: the ``hulls.obj`` file, and what can be worked out from it. Metres, the asset's frame."""
+"""Convex hulls of an asset: the ``hulls.obj`` file, and geometry of hulls. Metres, the asset's frame."""
 
 from __future__ import annotations
 
@@ -18,20 +18,13 @@ from robocas_ms3.core.words import count_of
 Array = NDArray[np.float64]
 
 _LIMIT = 2**26  # bytes of a file: hulls of 64 vertices have 5 kB each
-# Points of one hull count as hidden when they lie deeper than this in another, m
-_HIDDEN_DEPTH = 0.0005
-# How far the corners of a box may be from where they ought to be, m: files round to a ten thousandth of a millimetre
-_SQUARE = 1e-5
+_HIDDEN_DEPTH = 0.0005  # m; points of one hull that are deeper in another are hidden
+_SQUARE = 1e-5  # m that corners of a box may be off: files round to a ten thousandth of a millimetre
 
 
 @dataclass(frozen=True)
 class Hull:
-    """One convex hull.
-
-    Attributes:
-        vertices: (V, 3) m.
-        faces: (F, 3) indices of ``vertices``.
-    """
+    """A convex hull: vertices (V, 3), m, and faces (F, 3), indices of vertices."""
 
     vertices: Array
     faces: NDArray[np.int64]
@@ -39,22 +32,17 @@ class Hull:
 
 @dataclass(frozen=True)
 class Box:
-    """A hull that is a box.
-
-    Attributes:
-        half_size: (3,) m along its axes.
-        pose: (4, 4) of its axes, through its centre, in the frame of the hull.
-    """
+    """A box: half its size (3,), m, and the pose (4, 4) of its centre and axes in the frame of the hull."""
 
     half_size: Array
     pose: Array
 
 
 def read_hulls(path: Path) -> list[Hull]:
-    """Read ``hulls.obj``: one ``o`` group a hull, triangles only.
+    """Read ``hulls.obj``: an ``o`` group per hull, triangles only.
 
     Raises:
-        AssetError: the file is cut short, is no OBJ, holds no hull, or numbers that are not finite.
+        AssetError: the file is damaged, or holds no hull.
     """
     vertices: list[list[float]] = []
     groups: list[list[list[int]]] = []
@@ -77,21 +65,15 @@ def read_hulls(path: Path) -> list[Hull]:
         if not np.isfinite(points).all():
             raise ValueError("NaN or infinity")
     except (OSError, ValueError, IndexError, OverflowError) as error:
-        raise AssetError(
-            "can't read the convex hulls", where=path, found=str(error), fix="Make the pack again."
-        ) from error
+        fix = "Make the pack again."
+        raise AssetError("can't read the convex hulls", where=path, found=str(error), fix=fix) from error
     if not hulls or any(len(hull.faces) < 4 for hull in hulls):
         raise AssetError("no convex hull in the file", where=path, fix="Make the pack again.")
     return hulls
 
 
 def write_hulls(path: Path, hulls: Sequence[Array]) -> None:
-    """Write ``hulls.obj``, one ``o`` group a hull, faces turned outwards.
-
-    Args:
-        path: the file.
-        hulls: (V, 3) points each, m; their convex hulls are written.
-    """
+    """Write the convex hulls of points (V, 3) as ``hulls.obj``, an ``o`` group per hull, faces turned outwards."""
     lines, offset = [], 1
     for number, points in enumerate(hulls):
         vertices, faces = convex_faces(points)
@@ -103,7 +85,7 @@ def write_hulls(path: Path, hulls: Sequence[Array]) -> None:
 
 
 def convex_faces(points: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Vertices (V, 3) and outward triangles (F, 3) of the convex hull of points (P, 3).
+    """Return vertices (V, 3) and outward triangles (F, 3) of the convex hull of points (P, 3).
 
     Raises:
         AssetError: the points lie in a plane.
@@ -122,9 +104,9 @@ def convex_faces(points: Array) -> tuple[Array, NDArray[np.int64]]:
 
 
 def box_of(vertices: Array) -> Box | None:
-    """The box of which points (8, 3) are the corners, however it is turned; none if they are none of a box's.
+    """Return the box of which points (8, 3) are the corners, however it is turned; None if they are not a box's.
 
-    Its axes are in the order, and look the way, that turns it least: a box along x, y and z is not turned at all.
+    Order and signs of its axes turn it least: a box along x, y and z has no rotation.
     """
     if len(vertices) != 8:
         return None
@@ -157,7 +139,7 @@ def _box_of(corners: bytes) -> Box | None:
 
 
 def _edges(ways: Array) -> Array | None:
-    """The three edges (3, 3) of a box at a corner, of the ways (7, 3) from there to the others."""
+    """Return the three edges (3, 3) of a box at a corner, given the ways (7, 3) from there to the other corners."""
     found: list[Array] = []
     for way in ways[np.argsort(np.linalg.norm(ways, axis=1), kind="stable")]:
         if all(abs(way @ edge) <= _SQUARE * np.linalg.norm(way) for edge in found):
@@ -166,17 +148,14 @@ def _edges(ways: Array) -> Array | None:
 
 
 def slenderness(points: Array) -> float:
-    """How far the convex hull of points (V, 3) reaches along x, y or z, over its least depth, from its centre of mass.
-
-    A cube has 1, as seen from its middle.
-    """
+    """Return reach over least depth of the convex hull of points (V, 3), from its centre of mass; a cube has 1."""
     center = center_of(points)
     depth = -(ConvexHull(points).equations @ np.append(center, 1.0)).max()
     return float(np.abs(points - center).max() / depth)
 
 
 def center_of(points: Array) -> Array:
-    """Centre of mass (3,) of the convex hull of points (V, 3)."""
+    """Return the centre of mass (3,) of the convex hull of points (V, 3)."""
     inside = points.mean(axis=0)
     corners = points[ConvexHull(points).simplices] - inside
     volumes = np.abs(np.linalg.det(corners))
@@ -184,15 +163,7 @@ def center_of(points: Array) -> Array:
 
 
 def sample_surface(hulls: Sequence[Hull], spacing: float) -> Array:
-    """Points on the surface of the union of hulls, about ``spacing`` apart and the same on every call.
-
-    Args:
-        hulls: in one frame.
-        spacing: m.
-
-    Returns:
-        (P, 3) m; points of one hull that lie inside another are left out.
-    """
+    """Return points (P, 3) on the surface of the union of hulls, about ``spacing`` m apart, the same on every call."""
     equations = [ConvexHull(hull.vertices).equations for hull in hulls]
     kept = []
     for index, hull in enumerate(hulls):
@@ -210,7 +181,7 @@ def sample_surface(hulls: Sequence[Hull], spacing: float) -> Array:
 
 
 def sample_triangles(corners: Array, spacing: float) -> Array:
-    """Points (P, 3) of grids on triangles (F, 3, 3), at most ``spacing`` apart, corners and edges included."""
+    """Return points (P, 3) of grids on triangles (F, 3, 3), at most ``spacing`` apart, corners and edges included."""
     lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
     longest = np.argmax(lengths, axis=1)
     rows = np.arange(len(corners))

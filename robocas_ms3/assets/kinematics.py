@@ -1,4 +1,4 @@
-"""Where the moving parts of a piece of furniture are."""
+"""Forward kinematics of furniture."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 
 
 def joint_motion(joint: Joint, position: float) -> Array:
-    """4x4 by which a joint at a position (m or rad) moves its link from where it is at 0, furniture's frame."""
+    """Return 4x4 by which a joint at a position (m or rad) moves its link from its pose at 0, furniture's frame."""
     motion = np.eye(4)
     if joint.kind == "prismatic":
         motion[:3, 3] = np.multiply(joint.axis, position)
@@ -25,7 +25,7 @@ def joint_motion(joint: Joint, position: float) -> Array:
 
 
 def link_poses(links: Sequence[Link], positions: Mapping[str, float]) -> dict[str, Array]:
-    """Poses 4x4 of the links in the furniture's frame; identities where all joints are at 0.
+    """Return poses 4x4 of the links in the furniture's frame; identities where all joints are at 0.
 
     Args:
         links: parents first.
@@ -39,7 +39,7 @@ def link_poses(links: Sequence[Link], positions: Mapping[str, float]) -> dict[st
 
 
 def joint_frame(joint: Joint) -> Array:
-    """4x4 of a frame whose x runs along the joint's axis, at its origin, in the furniture's frame."""
+    """Return 4x4 of a frame at the joint's origin whose x is its axis, in the furniture's frame."""
     x = np.asarray(joint.axis, dtype=float)
     x = x / np.linalg.norm(x)
     y = np.cross(x, np.eye(3)[np.argmin(np.abs(x))])

@@ -176,7 +176,7 @@ class FurnitureQuality(StrictModel):
 
 
 class AssetBase(StrictModel):
-    """What every asset says of itself."""
+    """Fields of every asset."""
 
     id: Name
     name: str = Field(min_length=1, description="for language: 'sugar box'")
@@ -252,7 +252,7 @@ Asset = Annotated[ObjectAsset | FurnitureAsset, Field(discriminator="kind")]
 
 
 class PackManifest(StrictModel):
-    """What a pack's ``manifest.json`` says."""
+    """The content of ``manifest.json``."""
 
     # the default is for writing; `load_pack` insists that the file says it
     schema_version: Annotated[Literal[2], BeforeValidator(_whole)] = SCHEMA_VERSION

@@ -1,4 +1,4 @@
-"""Asset packs, read and checked: see ``manifest.py`` for the format. Needs no SAPIEN."""
+"""Read and check asset packs; ``manifest.py`` has the format. Needs no SAPIEN."""
 
 from __future__ import annotations
 
@@ -29,25 +29,19 @@ VISUALS: dict[VisualLevel, str] = {"fast": "visual_fast.glb", "full": "visual_fu
 LINKS, FINISHES = "links", "finishes"
 
 _FILE_LIMIT = 2**31  # bytes
-# (path, size, mtime) -> sha256, so that only changed files are read again within a process
-_hashes: dict[tuple[str, int, int], str] = {}
-# (manifest path, size, mtime) -> pack, so that its lazy geometry is worked out once a process
-_packs: dict[tuple[str, int, int], Pack] = {}
+_hashes: dict[tuple[str, int, int], str] = {}  # (path, size, mtime) -> sha256: only changed files are read again
+_packs: dict[tuple[str, int, int], Pack] = {}  # (path, size, mtime) -> pack: geometry is computed once per process
 
 
 @dataclass(frozen=True)
 class Part:
-    """The geometry of one body: files to render, hulls for physics.
-
-    Attributes:
-        folder: where its files lie.
-    """
+    """The geometry of one body: a folder with files to render and hulls for physics."""
 
     folder: Path
     _points: dict[float, Array] = field(default_factory=dict, repr=False, compare=False)
 
     def visual(self, level: VisualLevel = "fast") -> Path:
-        """The textured mesh (GLB) at a level of detail."""
+        """Return the textured mesh (GLB) at a level of detail."""
         return self.folder / VISUALS[level]
 
     @property
@@ -66,11 +60,7 @@ class Part:
         return [hull.vertices for hull in self.hull_meshes]
 
     def surface_points(self, spacing: float = 0.005) -> Array:
-        """Points (P, 3) on the surface of the hulls' union, m, in the asset's frame; the same on every call.
-
-        Args:
-            spacing: distance between neighbours, roughly, m.
-        """
+        """Return points (P, 3), about ``spacing`` m apart, on the surface of the hulls' union, in the asset's frame."""
         if spacing not in self._points:
             points = sample_surface(self.hull_meshes, spacing)
             points.setflags(write=False)
@@ -80,11 +70,7 @@ class Part:
 
 @dataclass(frozen=True)
 class LoadedObject(Part):
-    """A thing to pick up.
-
-    Attributes:
-        asset: its entry in the manifest.
-    """
+    """A thing to pick up, with its entry in the manifest."""
 
     asset: ObjectAsset = field(kw_only=True)
 
@@ -96,10 +82,9 @@ class LoadedObject(Part):
 
 @dataclass(frozen=True)
 class LoadedFurniture(Part):
-    """Scenery. As a part, it is the fixed body.
+    """Furniture, a basket or a room, with its entry in the manifest. As a part, it is the fixed body.
 
     Attributes:
-        asset: its entry in the manifest.
         links: its moving parts by name, in the furniture's frame with all joints at 0.
     """
 
@@ -107,11 +92,11 @@ class LoadedFurniture(Part):
     links: dict[str, Part] = field(default_factory=dict, kw_only=True)
 
     def all_surface_points(self, positions: Mapping[str, float] | None = None, spacing: float = 0.005) -> Array:
-        """Points (P, 3) on the surfaces of body and links, m, in the furniture's frame.
+        """Return points (P, 3), about ``spacing`` m apart, on body and links, in the furniture's frame.
 
         Args:
             positions: of the joints by name, m or rad; those not named are at 0.
-            spacing: distance between neighbours, roughly, m.
+            spacing: m.
         """
         pieces = [self.surface_points(spacing)]
         for name, pose in link_poses(self.asset.links, positions or {}).items():
@@ -119,7 +104,7 @@ class LoadedFurniture(Part):
         return np.concatenate(pieces)
 
     def finish(self, part: str, name: str) -> Path:
-        """The textured mesh (GLB) of a part in one of its finishes.
+        """Return the textured mesh (GLB) of a part in one of its finishes.
 
         Raises:
             AssetError: there is no such part or finish.
@@ -133,15 +118,7 @@ class LoadedFurniture(Part):
 
 @dataclass(frozen=True)
 class Pack:
-    """An asset pack, checked.
-
-    Attributes:
-        name: as in the manifest.
-        root: its folder.
-        manifest: what it says of itself.
-        objects: things to pick up, by id.
-        furniture: scenery, by id.
-    """
+    """An asset pack in the folder ``root``: things to pick up and furniture, by id."""
 
     name: str
     root: Path
@@ -151,7 +128,7 @@ class Pack:
 
 
 def pack_folders() -> dict[str, Path]:
-    """Every pack there is: its name and folder, the shipped ones first; a user's pack can't hide a shipped one."""
+    """Return name -> folder of every pack, the shipped ones first; a user's pack can't hide a shipped one."""
     found: dict[str, Path] = {}
     for parent in (builtin_packs_dir(), data_dir() / "packs"):
         if parent.is_dir():
@@ -159,11 +136,6 @@ def pack_folders() -> dict[str, Path]:
                 if (folder / MANIFEST).is_file() and not folder.name.startswith("."):
                     found.setdefault(folder.name, folder)
     return found
-
-
-def available_packs() -> list[str]:
-    """Names of the packs that `load_pack` knows without a path."""
-    return list(pack_folders())
 
 
 def load_pack(name_or_path: str | Path) -> Pack:
@@ -175,18 +147,16 @@ def load_pack(name_or_path: str | Path) -> Pack:
     Raises:
         AssetError: there is no such pack, or a file of it is missing, changed, damaged or not listed.
     """
-    folder = pack_folders().get(str(name_or_path))
-    if folder is None:
-        folder = Path(name_or_path)
-        if not (folder / MANIFEST).is_file():
-            raise AssetError(
-                "no such asset pack",
-                where=name_or_path,
-                expected=f"one of {', '.join(available_packs()) or '(none)'}, or a folder with a {MANIFEST}",
-                fix="See `robocas assets list`, or make one: `robocas assets import-scans` for objects, "
-                "`robocas assets import-partnet` for furniture.",
-            )
-    folder = folder.resolve()
+    known = pack_folders()
+    folder = known.get(str(name_or_path), Path(name_or_path)).resolve()
+    if not (folder / MANIFEST).is_file():
+        raise AssetError(
+            "no such asset pack",
+            where=name_or_path,
+            expected=f"one of {', '.join(known)}, or a folder with a {MANIFEST}",
+            fix="See `robocas assets list`, or make one: `robocas assets import-scans` for objects, "
+            "`robocas assets import-partnet` for furniture.",
+        )
     path = folder / MANIFEST
     status = path.stat()
     key = (str(path), status.st_size, status.st_mtime_ns)
@@ -203,32 +173,23 @@ def verify(pack: Pack) -> None:
         AssetError: naming the file, and whether it is missing, cut short, changed or not listed.
     """
     for asset in pack.manifest.assets:
-        for name in _files(str(pack.root / asset.id)):
+        folder = pack.root / asset.id
+        for name in _files(str(folder)):
             if name not in asset.files:
-                raise AssetError(
-                    "the manifest of the asset pack doesn't list this file",
-                    where=pack.root / asset.id / name,
-                    fix="Remove it, or make the pack again.",
-                )
-        for name, expected in asset.files.items():
-            path = pack.root / asset.id / name
-            fix = f"Restore the file, or make the pack {pack.name!r} again."
+                what = "the manifest of the asset pack doesn't list this file"
+                raise AssetError(what, where=folder / name, fix="Remove it, or make the pack again.")
+        fix = f"Restore the file, or make the pack {pack.name!r} again."
+        for name, wanted in asset.files.items():
+            path = folder / name
             if not path.is_file():
                 raise AssetError("this file of the asset pack is missing", where=path, fix=fix)
-            if path.stat().st_size == 0:
-                raise AssetError("this file of the asset pack is empty", where=path, fix=fix)
             try:
                 found = sha256(path)
             except (OSError, DocumentError) as error:
                 raise AssetError("can't read this file of the asset pack", where=path, found=error, fix=fix) from error
-            if found != expected:
-                raise AssetError(
-                    "this file of the asset pack was changed or cut short",
-                    where=path,
-                    expected=f"sha256 {expected[:12]}...",
-                    found=f"{found[:12]}...",
-                    fix=fix,
-                )
+            if found != wanted:
+                what, expected = "this file of the asset pack was changed or cut short", f"sha256 {wanted[:12]}..."
+                raise AssetError(what, where=path, expected=expected, found=f"{found[:12]}...", fix=fix)
 
 
 def sha256(path: Path) -> str:
@@ -251,7 +212,7 @@ def sha256(path: Path) -> str:
 
 
 def _files(folder: str, prefix: str = "") -> Iterator[str]:
-    """Paths of the files in a folder, relative to it; not of hidden ones, which systems and editors leave."""
+    """Yield paths of the files in a folder, relative to it, but hidden ones, which systems and editors leave."""
     if not os.path.isdir(folder):
         return
     with os.scandir(folder) as entries:
@@ -278,7 +239,7 @@ def _read(folder: Path, path: Path) -> Pack:
     for asset in manifest.assets:
         if asset.id in objects or asset.id in furniture:
             raise AssetError("two assets of the pack have the same id", where=path, found=asset.id)
-        for name in required_files(asset):
+        for name in _required_files(asset):
             if name not in asset.files:
                 raise AssetError("the manifest lists no such file", where=path, expected=f"{asset.id}/{name}")
         home = folder / asset.id
@@ -290,8 +251,7 @@ def _read(folder: Path, path: Path) -> Pack:
     return Pack(manifest.name, folder, manifest, objects, furniture)
 
 
-def required_files(asset: ObjectAsset | FurnitureAsset) -> list[str]:
-    """The files that an asset must have, relative to its folder."""
+def _required_files(asset: ObjectAsset | FurnitureAsset) -> list[str]:
     body = [*VISUALS.values(), HULLS]
     if isinstance(asset, ObjectAsset):
         return [*body, ANNOTATIONS]

@@ -1,4 +1,4 @@
-"""Free bodies in a bare PhysX scene, with the settings that the environments simulate them with."""
+"""Bodies in a bare PhysX scene, with the settings of the environments."""
 
 from __future__ import annotations
 
@@ -29,16 +29,7 @@ SPACING = 10.0  # m between objects that are simulated at once
 
 @dataclass(frozen=True)
 class Solid:
-    """What the engine knows of a free body, in the body's frame; metres, kilograms.
-
-    Attributes:
-        hulls: (V, 3) vertices of each convex collision piece.
-        mass: kg.
-        center_of_mass: (3,).
-        inertia: (3,) principal moments, kg m2.
-        inertia_wxyz: (4,) principal axes.
-        friction: of its surface.
-    """
+    """A free body, in its own frame: hulls of vertices (V, 3), m; mass, kg; principal moments (3,), kg m2, and axes."""
 
     hulls: Sequence[Array]
     mass: float
@@ -50,7 +41,7 @@ class Solid:
 
 @contextmanager
 def engine_settings() -> Iterator[None]:
-    """The environments' settings; the engine keeps them for the whole process, so they are put back afterwards."""
+    """Set the engine up as the environments do; its settings are those of the process, and are restored."""
     scene, body, shape = physx.get_scene_config(), physx.get_body_config(), physx.get_shape_config()
     gravity: Any = np.array([0, 0, -9.81])  # SAPIEN's stubs ask for a shape type that no NumPy array has
     physx.set_scene_config(gravity=gravity)
@@ -65,7 +56,7 @@ def engine_settings() -> Iterator[None]:
 
 
 def new_scene(time_step: float = TIME_STEP) -> sapien.Scene:
-    """An empty scene without a renderer; use it within `engine_settings`."""
+    """Return an empty scene without a renderer; use it within `engine_settings`."""
     scene = sapien.Scene([physx.PhysxCpuSystem()])
     scene.set_timestep(time_step)
     return scene
@@ -93,7 +84,7 @@ def add_body(scene: sapien.Scene, solid: Solid, pose: Array) -> physx.PhysxRigid
 
 
 def solid_of(asset: LoadedObject) -> Solid:
-    """What the engine has to know of an object of a pack."""
+    """Return an object of a pack as a body."""
     facts = asset.asset
     moments, center, axes = (np.array(v) for v in (facts.inertia, facts.center_of_mass, facts.inertia_wxyz))
     return Solid(asset.hulls, facts.mass, center, moments, axes, facts.friction)
@@ -117,14 +108,14 @@ def add_ground(scene: sapien.Scene, origin: Array) -> None:
 
 
 def places(count: int) -> Array:
-    """Origins (N, 3) of objects that are simulated at once: a grid, four a row."""
+    """Return origins (N, 3) of objects that are simulated at once: a grid, four per row."""
     origins = np.zeros((count, 3))
     origins[:, 0], origins[:, 1] = np.arange(count) % 4 * SPACING, np.arange(count) // 4 * SPACING
     return origins
 
 
 def shape_of(vertices: Array, material: physx.PhysxMaterial) -> physx.PhysxCollisionShape:
-    """The engine's shape of a convex hull of points (V, 3): a box if they are one's corners, which is exact and fast.
+    """Return the shape of a convex hull of points (V, 3); a box, which is exact and fast, if they are its corners.
 
     Raises:
         RuntimeError: the engine makes no hull of them.
@@ -134,7 +125,7 @@ def shape_of(vertices: Array, material: physx.PhysxMaterial) -> physx.PhysxColli
 
 
 def cook(vertices: Array, material: physx.PhysxMaterial) -> physx.PhysxCollisionShapeConvexMesh:
-    """What the engine makes of points (V, 3) that are no box's corners; it may leave some out (`cooking`).
+    """Return the engine's convex mesh of points (V, 3); it may leave some out (`cooking`).
 
     Raises:
         RuntimeError: the engine makes no hull of them.
@@ -145,13 +136,13 @@ def cook(vertices: Array, material: physx.PhysxMaterial) -> physx.PhysxCollision
 
 
 def shapes_of(part: Part, material: physx.PhysxMaterial) -> list[physx.PhysxCollisionShape]:
-    """The same of all hulls of an asset; bodies made of one file share what the engine makes of it.
+    """Return the shapes of all hulls of an asset; bodies made of one file share the engine's meshes.
 
     Raises:
         AssetError: the engine makes no shape of a hull.
     """
     boxes = [box_of(hull) for hull in part.hulls]
-    # of a file of boxes nothing is cooked: the engine complains of slender ones on a GPU
+    # a file of boxes is not cooked: the engine rejects slender ones on a GPU
     loaded = [] if all(boxes) else _load(part.hulls_path, material)
     if loaded and len(loaded) != len(boxes):
         raise AssetError(
@@ -186,5 +177,5 @@ def add_component(scene: sapien.Scene, component: physx.PhysxRigidBaseComponent,
 
 
 def pose_matrix(body: physx.PhysxRigidBaseComponent) -> Array:
-    """Pose (4, 4) of a body in the world, double precision."""
+    """Return the pose (4, 4) of a body in the world, double precision."""
     return np.asarray(body.entity_pose.to_transformation_matrix(), float)

@@ -1,8 +1,336 @@
-"""``robocas assets``: look at asset packs, make new ones."""
+"""``robocas assets``: make packs; `assets_show` has the commands that look at them."""
 
 from __future__ import annotations
 
-from robocas_ms3.cli import assets_make, assets_show
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from robocas_ms3.cli import assets_show
+from robocas_ms3.cli.assets_show import mesh_tools
+from robocas_ms3.cli.options import Maybe, Several
+from robocas_ms3.core.words import count_of
+
+CONTACT_SHEET = "contact_sheet.png"
+SHEET = 60  # assets on the contact sheet of an import
+# `asset_tools.pipeline.Job`, which only loads when a command runs
+Job = Any
+
+
+@dataclass(kw_only=True)
+class _Making:
+    jobs: Maybe[int] = None
+    """Processes. Default: one for each CPU core."""
+    skip_bad: bool = False
+    """Leave out models with errors, instead of stopping at the first one."""
+    overwrite: bool = False
+    """Replace a pack of this name that was made from other files or settings; unchanged assets are reused."""
+
+
+@dataclass(kw_only=True)
+class ImportScans(_Making):
+    """Make a pack from a folder of raw scans: one object for each mesh file or subfolder.
+
+    Each scan is repaired, closed, decomposed into convex hulls, decimated for rendering, and annotated with resting
+    poses and grasps. Then it is dropped, grasped and shaken in simulation, and the outcome is stored. Finished objects
+    are cached, so an interrupted import continues where it stopped.
+
+    Example: robocas assets import-scans scans/ --pack mine --units cm
+    """
+
+    source: Annotated[Path, tyro.conf.Positional]
+    """Folder of the scans (OBJ, GLB, PLY, STL, ...)."""
+    pack: str
+    """Name of the new pack."""
+    units: Maybe[Literal["m", "cm", "mm", "inch"]] = None
+    """Unit of the files. Default: guessed from the sizes of all of them."""
+    up: Maybe[Literal["x", "y", "z", "-x", "-y", "-z"]] = None
+    """Axis that points up in the files. Default: guessed for each."""
+    masses: Maybe[Path] = None
+    """YAML file with masses in kg by object id. Default: estimated from the volume."""
+    licence: str = "unknown"
+    """Licence of the scans, for the manifest."""
+    attribution: str = "unknown"
+    """Whom to name, for the manifest."""
+
+
+@dataclass(kw_only=True)
+class ImportGraspNet(_Making):
+    """Make a pack from GraspNet-1Billion as downloaded: models/ and, if there, grasp_label/.
+
+    Objects get the ids that the builtin pack uses for their stand-ins, so that a task configuration runs on either.
+
+    Example: robocas assets import-graspnet downloads/graspnet
+    """
+
+    root: Annotated[Path, tyro.conf.Positional]
+    """GraspNet's folder, with models/NNN/textured.obj and grasp_label/NNN_labels.npz."""
+    pack: str = "graspnet"
+    """Name of the new pack."""
+    ids: Several[int] = ()
+    """GraspNet's numbers. Default: RoboCAS's 46."""
+
+
+@dataclass(kw_only=True)
+class ImportYCB(_Making):
+    """Make a pack from the YCB objects that ManiSkill downloads (python -m mani_skill.utils.download_asset ycb).
+
+    Example: robocas assets import-ycb
+    """
+
+    root: Annotated[Maybe[Path], tyro.conf.Positional] = None
+    """ManiSkill's YCB folder. Default: where ManiSkill puts it."""
+    pack: str = "ycb"
+    """Name of the new pack."""
+    ids: Several[str] = ()
+    """Names such as 005_tomato_soup_can. Default: all."""
+
+
+@dataclass(kw_only=True)
+class ImportPartNet(_Making):
+    """Make a pack of furniture from PartNet-Mobility models.
+
+    Example: robocas assets import-partnet downloads/7179 --annotations annotations
+    """
+
+    models: Annotated[Several[Path], tyro.conf.Positional]
+    """Folders of models, each with a mobility.urdf."""
+    template: bool = False
+    """Import nothing; print an annotation to start from, with the joints of the first model."""
+    pack: str = "partnet"
+    """Name of the new pack."""
+    annotations: Maybe[Path] = None
+    """Folder with <id>.yaml for models that none is shipped for."""
+
+
+@dataclass(kw_only=True)
+class Build:
+    """Make the builtin pack again from its formulas; only in a clone of the repository.
+
+    Example: robocas assets build --ids plate --out packs/plate
+    """
+
+    out: Maybe[Path] = None
+    """Its folder. Default: where the package has it."""
+    ids: Several[str] = ()
+    """Only these assets; needs --out. Default: all."""
+    jobs: Maybe[int] = None
+    """Processes. Default: one for each CPU core."""
+
+
+def import_scans(command: ImportScans) -> int:
+    """Run ``import-scans``."""
+    with mesh_tools():
+        from asset_tools.import_scans import ImportSettings, scan_jobs
+    out, masses = _target(command.pack), _masses(command.masses)
+    settings = ImportSettings(command.units, command.up, masses, command.licence, command.attribution)
+    from robocas_ms3.cli.terminal import say
+
+    with _inspecting(command) as inspect:
+        jobs = scan_jobs(command.source, settings, inspect, lambda reason: say(f"skipped {reason}"))
+    return _make(jobs, command, out, "scan")
+
+
+def import_graspnet(command: ImportGraspNet) -> int:
+    """Run ``import-graspnet``."""
+    with mesh_tools():
+        from asset_tools.graspnet.importer import graspnet_jobs
+    out = _target(command.pack)
+    with _inspecting(command) as inspect:
+        jobs = graspnet_jobs(command.root, command.ids, inspect)
+    return _make(jobs, command, out, "GraspNet object")
+
+
+def import_ycb(command: ImportYCB) -> int:
+    """Run ``import-ycb``."""
+    with mesh_tools():
+        from asset_tools.import_ycb import ycb_jobs
+    out = _target(command.pack)
+    with _inspecting(command) as inspect:
+        jobs = ycb_jobs(command.root, command.ids, inspect)
+    return _make(jobs, command, out, "YCB object")
+
+
+def import_partnet(command: ImportPartNet) -> int:
+    """Run ``import-partnet``."""
+    from robocas_ms3.core.errors import AssetError
+
+    with mesh_tools():
+        from asset_tools.partnet.importer import partnet_jobs
+        from asset_tools.partnet.template import template
+    if not command.models:
+        raise AssetError("no model given", expected="folders with a mobility.urdf", fix="Give at least one.")
+    if command.template:
+        from robocas_ms3.cli.terminal import say_lines
+
+        say_lines(template(command.models[0]))
+        return 0
+    return _make(partnet_jobs(command.models, command.annotations), command, _target(command.pack), "PartNet model")
+
+
+def build(command: Build) -> int:
+    """Run ``build``."""
+    from robocas_ms3.core.errors import AssetError
+    from robocas_ms3.core.paths import builtin_packs_dir
+
+    try:
+        with mesh_tools():
+            from asset_tools.builtin.build import DESCRIPTION, FORMULAS_HASH, NAME, builtin_jobs, formulas_hash
+    except ModuleNotFoundError as error:
+        if error.name != "asset_tools.builtin":
+            raise
+        raise AssetError(
+            "the formulas of the builtin pack are not installed",
+            expected="asset_tools/builtin of the repository",
+            found="an installed wheel",
+            fix="Clone the repository to change them; the pack itself is installed and complete.",
+        ) from error
+    if command.ids and command.out is None:
+        raise AssetError("the shipped pack is made as a whole", found="--ids without --out", fix="Pass --out FOLDER.")
+    out = command.out or builtin_packs_dir() / NAME
+    making = _Making(jobs=command.jobs, overwrite=True)
+    status = _write(builtin_jobs(command.ids), making, out, DESCRIPTION, record=False)
+    if status == 0 and command.out is None:
+        (out / FORMULAS_HASH).write_text(f"{formulas_hash()}\n")
+    return status
+
+
+@contextmanager
+def _inspecting(command: _Making) -> Iterator[Any]:
+    """Yield a function that inspects models before they are imported, with a progress bar."""
+    from asset_tools.inspection import inspect_models
+    from robocas_ms3.cli.bars import bar
+
+    with bar("models read", transient=True) as shown:
+
+        def inspect(models: Mapping[str, Any]) -> Mapping[str, Any]:
+            shown.start(len(models))
+            return inspect_models(models, command.jobs or os.cpu_count() or 1, shown.advance)
+
+        yield inspect
+
+
+def _target(name: str) -> Path:
+    """Return the folder of an imported pack.
+
+    Raises:
+        AssetError: no imported pack may have this name.
+    """
+    from asset_tools.pipeline import check_target
+    from robocas_ms3.core.errors import AssetError
+    from robocas_ms3.core.paths import builtin_packs_dir, data_dir
+
+    if (builtin_packs_dir() / name).exists() or Path(name).name != name:
+        raise AssetError("this can't be the name of an imported pack", found=name, fix="Choose another with --pack.")
+    out = data_dir() / "packs" / name
+    check_target(out)
+    return out
+
+
+def _make(jobs: list[Job], command: _Making, out: Path, what: str) -> int:
+    from asset_tools.pipeline import check_jobs, made_of
+    from robocas_ms3.assets.pack import load_pack
+    from robocas_ms3.cli.terminal import say
+    from robocas_ms3.core.errors import AssetError, OutputExistsError
+
+    if not command.skip_bad:
+        check_jobs(jobs)
+    if made_of(jobs, out, skip_bad=command.skip_bad):
+        try:
+            load_pack(out)
+        except AssetError as error:
+            say(f"making it again: {error}")
+        else:
+            say(f"{out} is up to date")
+            if not (out / CONTACT_SHEET).exists():
+                _draw_sheet(out)
+            return 0
+    elif out.exists() and not command.overwrite:
+        what = "a pack of this name exists; its files, settings or versions were others"
+        fix = "Pass --overwrite to update it, or choose another name with --pack."
+        raise OutputExistsError(what, where=out, fix=fix)
+    return _write(jobs, command, out, count_of(len(jobs), what))
+
+
+def _write(jobs: list[Job], command: _Making, out: Path, description: str, *, record: bool = True) -> int:
+    from asset_tools.pipeline import JobResult, write_pack
+    from robocas_ms3.cli.bars import bar
+    from robocas_ms3.cli.terminal import say
+    from robocas_ms3.core.paths import cache_dir
+
+    with bar(f"assets of {out.name} processed") as shown:
+        shown.start(len(jobs))
+
+        def on_made(made: JobResult) -> None:
+            shown.advance()
+            if made.asset is None:
+                shown.note(f"left out: {made.error}")
+                return
+            for repair in made.asset.repairs:
+                if repair.startswith("warning:"):
+                    shown.note(f"{made.id}: {repair}")
+
+        results = write_pack(
+            jobs,
+            out,
+            cache_dir() / "assets",
+            description=description,
+            processes=command.jobs or os.cpu_count() or 1,
+            skip_bad=command.skip_bad,
+            record=record,
+            on_made=on_made,
+        )
+    assets_show.info(assets_show.Info(pack=str(out)))
+    bad = [made.id for made in results if made.asset is None]
+    left_out = f"; {len(bad)} left out: {', '.join(bad)}" if bad else ""
+    say(f"wrote {out}: {count_of(len(results) - len(bad), 'asset')}{left_out}")
+    if record:
+        _draw_sheet(out)
+    return 0
+
+
+def _draw_sheet(folder: Path) -> None:
+    """Draw the contact sheet of a new pack into its folder, if there is a renderer."""
+    from asset_tools.sheet import contact_sheet
+    from robocas_ms3.assets.pack import load_pack
+    from robocas_ms3.cli.bars import working
+    from robocas_ms3.cli.terminal import say
+    from robocas_ms3.core.errors import AssetError
+
+    pack = load_pack(folder)
+    ids = [asset.id for asset in pack.manifest.assets]
+    try:
+        with working(f"drawing {count_of(len(ids[:SHEET]), 'asset')}"):
+            contact_sheet(pack, folder / CONTACT_SHEET, ids[:SHEET])
+    except AssetError as error:
+        say(f"no contact sheet: {error}")
+        return
+    rest = f"; `robocas assets sheet {folder.name}` draws all {len(ids)}" if len(ids) > SHEET else ""
+    say(f"contact sheet: {folder / CONTACT_SHEET}{rest}")
+
+
+def _masses(path: Path | None) -> dict[str, float]:
+    from robocas_ms3.core.documents import load_yaml
+    from robocas_ms3.core.errors import AssetError
+
+    if path is None:
+        return {}
+    try:
+        data = load_yaml(path)
+        masses = {str(key): float(value) for key, value in data.items()}
+        if not all(0 < mass < 1000 for mass in masses.values()):
+            raise ValueError("masses must be positive")
+        return masses
+    except (OSError, AttributeError, TypeError, ValueError) as error:
+        raise AssetError(
+            "can't read the masses", where=path, expected="a YAML mapping: object id: kg", found=error
+        ) from error
+
 
 DESCRIPTION = "Look at asset packs, and make new ones from scans and datasets. Without a command: list."
 COMMANDS = {
@@ -10,10 +338,10 @@ COMMANDS = {
     "info": assets_show.info,
     "verify": assets_show.verify,
     "sheet": assets_show.sheet,
-    "build": assets_make.build,
-    "import-scans": assets_make.import_scans,
-    "import-graspnet": assets_make.import_graspnet,
-    "import-ycb": assets_make.import_ycb,
-    "import-partnet": assets_make.import_partnet,
+    "build": build,
+    "import-scans": import_scans,
+    "import-graspnet": import_graspnet,
+    "import-ycb": import_ycb,
+    "import-partnet": import_partnet,
 }
 DEFAULT = "list"

@@ -99,29 +99,37 @@ def info(command: Info) -> int:
     from robocas_ms3.cli.terminal import table_console
 
     pack = load_pack(command.pack)
-    console = table_console()
-    if pack.objects:
-        names = ("size (mm)", "mass (g)", "hulls", "overlap", "resting poses", "grasps", "repairs")
-        table = Table(Column("object", no_wrap=True), *names)
-        for loaded in pack.objects.values():
-            asset = loaded.asset
-            table.add_row(
+
+    def show(title: str, names: tuple[str, ...], rows: list[tuple[object, ...]]) -> None:
+        table = Table(Column(title, no_wrap=True), *names)
+        for row in rows:
+            table.add_row(*map(str, row))
+        if rows:
+            table_console().print(table)
+
+    show(
+        "object",
+        ("size (mm)", "mass (g)", "hulls", "overlap", "resting poses", "grasps", "repairs"),
+        [
+            (
                 asset.id,
                 " x ".join(f"{1000 * side:.0f}" for side in asset.extents),
                 f"{1000 * asset.mass:.0f}",
-                str(asset.quality.hull_count),
+                asset.quality.hull_count,
                 f"{asset.quality.volume_iou:.3f}",
-                str(len(loaded.annotations.resting_poses)),
-                str(asset.grasp_count),
+                len(loaded.annotations.resting_poses),
+                asset.grasp_count,
                 "; ".join(asset.repairs),
             )
-        console.print(table)
-    if pack.furniture:
-        names = ("size (mm)", "surfaces", "joints", "handles", "finishes", "repairs")
-        table = Table(Column("furniture", no_wrap=True), *names)
-        for loaded in pack.furniture.values():
-            asset = loaded.asset
-            table.add_row(
+            for loaded in pack.objects.values()
+            for asset in (loaded.asset,)
+        ],
+    )
+    show(
+        "furniture",
+        ("size (mm)", "surfaces", "joints", "handles", "finishes", "repairs"),
+        [
+            (
                 asset.id,
                 " x ".join(f"{1000 * side:.0f}" for side in asset.extents),
                 ", ".join(asset.surfaces),
@@ -130,7 +138,10 @@ def info(command: Info) -> int:
                 "; ".join(f"{part}: {', '.join(finishes)}" for part, finishes in asset.finishes.items()),
                 "; ".join(asset.repairs),
             )
-        console.print(table)
+            for loaded in pack.furniture.values()
+            for asset in (loaded.asset,)
+        ],
+    )
     return 0
 
 

@@ -80,10 +80,10 @@ def planner() -> str:
 
 def packs() -> str:
     """Load and verify every asset pack."""
-    from robocas_ms3.assets.pack import available_packs, load_pack
+    from robocas_ms3.assets.pack import load_pack, pack_folders
     from robocas_ms3.core.words import count_of
 
-    loaded = [load_pack(name) for name in available_packs()]
+    loaded = [load_pack(name) for name in pack_folders()]
     if not any(pack.name == "builtin" for pack in loaded):
         raise RuntimeError("the builtin pack is not installed")
     return ", ".join(f"{pack.name} ({count_of(len(pack.objects), 'object')})" for pack in loaded)

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.assets.gripper import GRIPPER_RADIUS
+from robocas_ms3.assets.annotations import GRIPPER_RADIUS
 from robocas_ms3.assets.pack import LoadedObject
 from robocas_ms3.core.extensions import load
 from robocas_ms3.core.poses import transform

@@ -2,7 +2,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from robocas_ms3.assets.gripper import GRIPPER_BOXES
+from robocas_ms3.assets.annotations import GRIPPER_BOXES
 from robocas_ms3.robots.description import MOBILE_PANDA
 
 

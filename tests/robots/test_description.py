@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robocas_ms3.assets.gripper import GRIPPER_BOXES
+from robocas_ms3.assets.annotations import GRIPPER_BOXES
 from robocas_ms3.core.errors import ExtensionError, RobocasError
 from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.table import DEFAULT, PANDA, ROBOTS, find_robot

@@ -18,7 +18,7 @@ from asset_tools.glb import write_glb
 from asset_tools.inertia import piece_inertia
 from asset_tools.quality.furniture import examine_furniture
 from asset_tools.quality.surfaces import clearances
-from robocas_ms3.assets.gripper import GRIPPER_BOXES
+from robocas_ms3.assets.annotations import GRIPPER_BOXES
 from robocas_ms3.assets.hulls import write_hulls
 from robocas_ms3.assets.kinematics import joint_frame
 
