@@ -95,8 +95,8 @@ def main(args: Args) -> None:
             sim_config={"control_freq": RATE},
             max_episode_steps=10**9,
         )
-        settings = EvaluationSettings(num_envs=args.envs, backend="processes")
-        ours = EvaluationSession(protocol, Waving(), settings)
+        settings = EvaluationSettings(protocol=args.protocol, envs=args.envs, backend="processes")
+        ours = EvaluationSession(Waving(), settings)
         spent: dict[str, list[float]] = {"bare": [], "evaluation": []}
         for _ in range(args.turns):
             spent["bare"].append(alone(bare, [one.seed for one in episodes], args.steps))

@@ -42,7 +42,7 @@ from robocas_ms3.evaluation.harness.vla_eval import state_of
 from robocas_ms3.evaluation.policies.scripted import ScriptedPolicy
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations
 from robocas_ms3.evaluation.protocol import load_protocol
-from robocas_ms3.evaluation.session import EvaluationSession, evaluate
+from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
 
 OURS = "robocas_ms3.evaluation.harness.vla_eval:RoboCAS"
@@ -130,8 +130,8 @@ def main() -> None:
 def remember(out: Path, kept: Path) -> results.Result:
     """What comes of the episodes in an evaluation of ours; what was seen and done there is kept in a file."""
     policy, protocol, arrays = Remembering(), load_protocol("smoke"), {}
-    settings = EvaluationSettings("scripted-motions", 1, "processes", tasks=tuple(TASKS))
-    for outcome in evaluate(EvaluationSession(protocol, policy, settings), out):
+    settings = EvaluationSettings(tuple(TASKS), "scripted-motions", "smoke", out, envs=1, backend="processes")
+    for outcome in EvaluationSession(policy, settings).run():
         steps, episode = policy.kept[outcome.episode], protocol.episodes[outcome.episode]
         number = sum(one.config == episode.config for one in protocol.episodes[: episode.episode])
         for key in steps[0]:

@@ -17,59 +17,53 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class Report:
+class Results:
+    """Results that a command reads."""
+
+    folders: Folders
+    """Folder of a result, or of its parts, such as shards."""
+    protocol: Maybe[str] = None
+    """Folder of the protocol, if it is not a bundled one."""
+
+
+@dataclass
+class Report(Results):
     """Print the tables of a result, and write its page report.html.
 
     Example: robocas eval report eval/pick
     """
 
-    folders: Folders
-    """Folder of the result, or of its parts, such as shards."""
     out: Maybe[Path] = None
     """Folder of the page. Default: the folder of the result; required for several folders."""
-    protocol: Maybe[str] = None
-    """Folder of the protocol, if it is not a bundled one."""
 
 
-@dataclass
-class Merge:
+@dataclass(kw_only=True)
+class Merge(Results):
     """Write the parts of a result, such as shards, as one result.
 
     Example: robocas eval merge eval/0 eval/1 --out eval/pick
     """
 
-    folders: Folders
-    """Folders of the parts."""
     out: Path
     """Folder of the new result."""
-    protocol: Maybe[str] = None
-    """Folder of the protocol, if it is not a bundled one."""
 
 
 @dataclass
-class Compare:
+class Compare(Results):
     """Compare results over the same scenes, by exact tests; the splits of one result with each other.
+
+    Of more than two folders, those with the same settings are parts of one result.
 
     Example: robocas eval compare eval/small eval/rt1
     """
 
-    folders: Folders
-    """Folders of results. Of more than two, those with the same settings are parts of one result."""
-    protocol: Maybe[str] = None
-    """Folder of the protocol, if it is not a bundled one."""
-
 
 @dataclass
-class Verify:
+class Verify(Results):
     """Check that a result is complete and belongs to its protocol; exit code 1 if not.
 
     Example: robocas eval verify eval/pick
     """
-
-    folders: Folders
-    """Folder of the result, or of its parts."""
-    protocol: Maybe[str] = None
-    """Folder of the protocol, if it is not a bundled one."""
 
 
 @dataclass
@@ -93,16 +87,13 @@ def report(cfg: Report) -> int:
     """Run ``report``."""
     from robocas_ms3.cli.terminal import say, say_lines
     from robocas_ms3.evaluation.report.tables import markdown
-    from robocas_ms3.evaluation.results import read
 
-    check_folders(cfg.folders)
-    result = read(*cfg.folders)
+    result = _read(cfg.folders)
     say_lines(markdown(result))
-    first, *others = cfg.folders
-    if cfg.out is None and others:
+    if cfg.out is None and len(cfg.folders) > 1:
         say("Pass --out DIR for the page of several folders.")
     else:
-        write_pages(result, cfg.out or first, cfg.protocol)
+        write_pages(result, cfg.out or result.folder, cfg.protocol)
     return 0
 
 
@@ -111,8 +102,8 @@ def merge(cfg: Merge) -> int:
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.evaluation.results import merge as write
 
-    check_folders(cfg.folders)
-    result = write(list(cfg.folders), cfg.out)
+    _check_folders(cfg.folders)
+    result = write(cfg.folders, cfg.out)
     say(f"{cfg.out}: {count_of(len(result.outcomes), 'episode')}")
     write_pages(result, cfg.out, cfg.protocol)
     return 0
@@ -124,11 +115,11 @@ def compare(cfg: Compare) -> int:
     from robocas_ms3.evaluation.report.comparison import comparison, comparison_of_splits
     from robocas_ms3.evaluation.results import parts_of, read
 
-    check_folders(cfg.folders)
-    groups = [[folder] for folder in cfg.folders] if len(cfg.folders) == 2 else parts_of(list(cfg.folders))
+    _check_folders(cfg.folders)
+    groups = [[folder] for folder in cfg.folders] if len(cfg.folders) == 2 else parts_of(cfg.folders)
     results = [read(*parts) for parts in groups]
     if len(results) == 1:
-        say_lines(comparison_of_splits(results[0], protocol_of(results[0], cfg.protocol)))
+        say_lines(comparison_of_splits(results[0], _protocol_of(results[0], cfg.protocol)))
     else:
         say_lines(comparison(results))
     return 0
@@ -137,12 +128,10 @@ def compare(cfg: Compare) -> int:
 def verify(cfg: Verify) -> int:
     """Run ``verify``."""
     from robocas_ms3.cli.terminal import say
-    from robocas_ms3.evaluation.results import read
     from robocas_ms3.evaluation.verify import problems
 
-    check_folders(cfg.folders)
-    result = read(*cfg.folders)
-    found = problems(result, protocol_of(result, cfg.protocol))
+    result = _read(cfg.folders)
+    found = problems(result, _protocol_of(result, cfg.protocol))
     for problem in found:
         say(problem)
     if broken := result.broken_off():
@@ -163,12 +152,10 @@ def videos(cfg: Videos) -> int:
     from robocas_ms3.core.errors import EvaluationError
     from robocas_ms3.core.strict import check_number
     from robocas_ms3.evaluation.policies import POLICIES, open_policy
-    from robocas_ms3.evaluation.results import read
 
     check_number("count", cfg.count, 1)
-    result = read(cfg.folder)
-    loaded = protocol_of(result, cfg.protocol)
-    name = str(result.run.policy.name)
+    result = _read((cfg.folder,))
+    protocol, name = _protocol_of(result, cfg.protocol), result.run.policy.name
     if name not in {*POLICIES.builtin, *POLICIES.entry_points} and cfg.policy != name:
         fix = f"Name it yourself, if you trust it: --policy {name}"
         raise EvaluationError("this result is of a policy of somebody's own", where=cfg.folder, found=name, fix=fix)
@@ -177,9 +164,9 @@ def videos(cfg: Videos) -> int:
 
     use_one_torch_thread()
     numbers = failed_of_each_kind(result, cfg.count)
-    with open_policy(name) as played, bar("episodes filmed") as shown:
-        for done, filmed in enumerate(film(result, loaded, played, numbers), start=1):
-            say(str(filmed.path) + ("" if filmed.same else ": this time it came out differently"))
+    with open_policy(name) as policy, bar("episodes filmed") as shown:
+        for done, (path, same) in enumerate(film(result, protocol, policy, numbers), start=1):
+            say(str(path) + ("" if same else ": this time it came out differently"))
             shown.at(done, len(numbers))
     if not numbers:
         say("no episode failed")
@@ -187,49 +174,48 @@ def videos(cfg: Videos) -> int:
     return 0
 
 
-def check_folders(folders: tuple[Path, ...]) -> None:
-    """Check that at least one folder of a result is named.
-
-    Raises:
-        EvaluationError: there is none.
-    """
-    from robocas_ms3.core.errors import EvaluationError
-
-    if not folders:
-        raise EvaluationError("missing result folder", where="DIR", expected="the folder of a result, or of its parts")
-
-
-def protocol_of(result: Result, given: str | None) -> LoadedProtocol:
-    """The protocol that was given, or the shipped one that a result names: a result chooses no folder.
-
-    Raises:
-        EvaluationError: none was given, and none of that name is shipped.
-    """
-    from robocas_ms3.core.errors import EvaluationError
-    from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
-
-    name, shipped = result.run.protocol, shipped_protocols()
-    if given is None and name not in shipped:
-        expected, fix = f"one of {', '.join(shipped)}", "Pass --protocol FOLDER."
-        raise EvaluationError(
-            "its protocol is not shipped", where=result.folder, expected=expected, found=name, fix=fix
-        )
-    return load_protocol(shipped[name] if given is None else given)
-
-
-def write_pages(result: Result, out: Path, given: str | None) -> None:
+def write_pages(result: Result, out: Path, protocol: str | None) -> None:
     """Write the report, and say where it is."""
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.core.errors import EvaluationError
     from robocas_ms3.evaluation.report import write_report
 
     try:
-        protocol = protocol_of(result, given)
+        loaded = _protocol_of(result, protocol)
     except EvaluationError:
-        protocol = None  # one of somebody's own, who knows where
-    if protocol is not None and protocol.hash != result.run.protocol_hash:
-        protocol = None
-    written = write_report(result, out, protocol)
+        loaded = None  # one of the user's own
+    matches = loaded is not None and loaded.hash == result.run.protocol_hash
+    written = write_report(result, out, loaded if matches else None)
     say(f"{out}: {', '.join(path.name for path in written)}")
     if not any(path.suffix == ".parquet" for path in written):
         say('no episodes.parquet without pyarrow; in the clone: pip install -e ".[lerobot]"')
+
+
+def _check_folders(folders: tuple[Path, ...]) -> None:
+    from robocas_ms3.core.errors import EvaluationError
+
+    if not folders:
+        raise EvaluationError("missing result folder", where="DIR", expected="the folder of a result, or of its parts")
+
+
+def _read(folders: tuple[Path, ...]) -> Result:
+    from robocas_ms3.evaluation.results import read
+
+    _check_folders(folders)
+    return read(*folders)
+
+
+def _protocol_of(result: Result, given: str | None) -> LoadedProtocol:
+    """Return the given protocol, or the shipped one that a result names: a result chooses no folder.
+
+    Raises:
+        EvaluationError: none is given, and none of that name is shipped.
+    """
+    from robocas_ms3.core.errors import EvaluationError
+    from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
+
+    name, shipped = result.run.protocol, shipped_protocols()
+    if given is None and name not in shipped:
+        what, fix = "its protocol is not shipped", "Pass --protocol FOLDER."
+        raise EvaluationError(what, where=result.folder, expected=f"one of {', '.join(shipped)}", found=name, fix=fix)
+    return load_protocol(shipped[name] if given is None else given)

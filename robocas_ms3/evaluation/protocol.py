@@ -14,7 +14,8 @@ Its hash is that of all these files, so two results of one hash were measured by
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -30,6 +31,7 @@ from robocas_ms3.core.strict import StrictModel, nearest, parse, parse_json
 from robocas_ms3.demos.recordings.seeds import GREATEST_SEED
 from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.policy import PolicySpec
+from robocas_ms3.evaluation.settings import EvaluationSettings
 from robocas_ms3.robots.table import DEFAULT as DEFAULT_ROBOT
 from robocas_ms3.scenes.config.load import check_no_base
 from robocas_ms3.scenes.task_specs import TASKS
@@ -171,6 +173,45 @@ class LoadedProtocol:
                 raise EvaluationError("can't read a file of the protocol", where=path, found=error) from error
             digest.update(f"{path.relative_to(self.folder).as_posix()} {content}\n".encode())
         return digest.hexdigest()
+
+    def choose(self, settings: EvaluationSettings) -> list[Episode]:
+        """Return the episodes that settings choose, at least one.
+
+        Raises:
+            EvaluationError: there is no such task or split, or no episode is left.
+        """
+        splits = (settings.split,) if settings.split else ()
+        for kind, names in (("task", settings.tasks), ("split", splits)):
+            known = dict.fromkeys(str(getattr(episode, kind)) for episode in self.episodes)
+            for name in names:
+                if name not in known:
+                    other = "Name a protocol that has it, or make one: robocas eval freeze."
+                    expected, fix = ", ".join(known), nearest(name, known) or other
+                    raise EvaluationError(f"the protocol has no such {kind}", expected=expected, found=name, fix=fix)
+        index, count = settings.parse_shard()
+        of_config: Counter[str] = Counter()
+        chosen = []
+        for episode in self.episodes:
+            if (settings.tasks and episode.task not in settings.tasks) or settings.split not in ("", episode.split):
+                continue
+            of_config[episode.config] += 1
+            first = settings.episodes is None or of_config[episode.config] <= settings.episodes
+            if first and episode.episode % count == index:
+                chosen.append(episode)
+        if not chosen:
+            raise EvaluationError("no episodes in this shard", where=self.rules.name, found=settings.shard)
+        return chosen
+
+    def check_one_configuration(self, episodes: Sequence[Episode], fix: str = "") -> None:
+        """Check that episodes can run in one batch.
+
+        Raises:
+            EvaluationError: their configurations differ.
+        """
+        configs = list(dict.fromkeys(episode.config for episode in episodes))
+        if len(configs) > 1:
+            what, found = "episodes of several configurations in one batch", ", ".join(configs)
+            raise EvaluationError(what, where=self.rules.name, expected="one", found=found, fix=fix)
 
     def config_file(self, config: str) -> Path:
         """Of a configuration that episodes name."""

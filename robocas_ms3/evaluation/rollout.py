@@ -26,19 +26,13 @@ _WELDS = "welds"  # of `weld`, where there is one
 
 @dataclass
 class Rollout:
-    """An episode that runs or has ended.
+    """An episode that runs or has ended; see `Outcome`.
 
     Attributes:
         start: the episode, and its env.
-        steps: policy steps.
-        seconds: of the scene's time.
-        flags: by name of a stage or rule, the policy step after which it first held, from 1 on; None: never.
-        flag_seconds: the same in the scene's seconds.
-        at_end: whether it held after the last step, by name.
-        measures: sums and extremes (`metrics`).
+        at_end: by flag, whether it held after the last step.
         retrieval: (K, 3) in search, see `metrics.RetrievalOrder.read`.
         inference_seconds: clock time of the policy: of each batch the time per env.
-        error: why it was ended early, such as a policy that failed; empty: it was not.
     """
 
     start: EpisodeSpec
@@ -96,7 +90,7 @@ class EndConditions:
 
 
 class EpisodeBatch:
-    """Runs one episode in each of several envs; the caller chooses the action of every step.
+    """Run one episode in each of several envs; the caller chooses the action of every step.
 
     The result of an episode depends on its seed and its actions only.
 
@@ -109,7 +103,6 @@ class EpisodeBatch:
         refill: whether an env can be reset while others run. In a GPU's batch all envs are reset together.
 
     Attributes:
-        env: the vector environment.
         obs: last observation of the environment, arrays (N, ...).
         running: by env, the episode that it runs. An entry with an ``error`` ends at the next step.
         action_size: number of values of an action.
@@ -127,13 +120,9 @@ class EpisodeBatch:
         self._embed = TextEmbedder() if spec.language == "embedding" else None
 
     def start(self, pairs: list[tuple[int, EpisodeSpec]]) -> list[EpisodeSpec]:
-        """Reset envs to the first state of episodes.
+        """Reset envs to the first state of episodes, and return the episodes, with ``env`` set.
 
-        Args:
-            pairs: an env and its episode. Where envs can't be reset one by one, no other episode may run.
-
-        Returns:
-            The episodes, with ``env`` set.
+        If envs can't be reset one by one, no other episode may run.
         """
         envs = [env for env, _ in pairs]
         seeds = [start.seed for _, start in pairs]
@@ -171,10 +160,9 @@ class EpisodeBatch:
         )
 
     def step(self, actions: NDArray[np.float32]) -> Iterator[Rollout]:
-        """Step all envs once, and yield the episodes that end.
+        """Step all envs once with actions (N, A), and yield the episodes that end.
 
-        Args:
-            actions: (N, A); rows of envs without an episode have no effect on results.
+        Rows of envs without an episode have no effect on results.
         """
         for env in [env for env, played in self.running.items() if played.error]:
             yield self._end(env)
@@ -231,18 +219,10 @@ class EpisodeBatch:
 
 
 def rollout(batch: EpisodeBatch, policy: Policy, episodes: Sequence[EpisodeSpec]) -> Iterator[Rollout]:
-    """Run episodes with a policy.
+    """Run episodes with a policy in envs in which none runs, and yield each episode as it ends, in any order.
 
     In processes an env whose episode has ended starts the next one at once. In a GPU batch, where the objects of all
     envs are built together, it waits until all episodes of the batch have ended.
-
-    Args:
-        batch: envs in which no episode runs.
-        policy: chooses the actions.
-        episodes: to run; their ``env`` is set here.
-
-    Yields:
-        Each episode as it ends, in any order.
     """
     waiting, chunks = list(reversed(episodes)), dict[int, list[NDArray[np.floating]]]()
     while waiting or batch.running:
@@ -296,13 +276,7 @@ def _request_actions(batch: EpisodeBatch, policy: Policy, chunks: dict[int, list
 
 
 def as_chunks(actions: NDArray[np.float32], count: int, size: int, *, where: str) -> NDArray[np.float32]:
-    """Return the actions of ``count`` envs as chunks (E, H, A).
-
-    Args:
-        actions: (E, A), or chunks (E, H, A).
-        count: E.
-        size: A.
-        where: who gave them.
+    """Return actions (E, A) or (E, H, A) as chunks (E, H, A).
 
     Raises:
         EvaluationError: they have another shape.

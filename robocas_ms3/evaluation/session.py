@@ -9,7 +9,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,13 +16,14 @@ from numpy.typing import ArrayLike
 
 from robocas_ms3.assets.pack import MANIFEST, load_pack, sha256
 from robocas_ms3.core.errors import EvaluationError, WorkerDied
+from robocas_ms3.core.workers import Limits
 from robocas_ms3.datasets.writing.render import require_renderer
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, Policy, describe
-from robocas_ms3.evaluation.protocol import Episode, LoadedProtocol
+from robocas_ms3.evaluation.protocol import Episode, load_protocol
 from robocas_ms3.evaluation.rollout import NOT_FINITE, EndConditions, EpisodeBatch, Rollout, as_chunks, rollout
-from robocas_ms3.evaluation.settings import EvaluationSettings, check_one_configuration, choose_episodes
+from robocas_ms3.evaluation.settings import EvaluationSettings
 from robocas_ms3.evaluation.stepping import UPSTREAM_HZ, PolicyStepping, env_kwargs
 from robocas_ms3.evaluation.weld import check_weld
 from robocas_ms3.scenes.table import FrozenLayouts
@@ -37,48 +37,47 @@ _log = logging.getLogger(__name__)
 
 
 class EvaluationSession:
-    """Runs episodes of a protocol, several at a time. Close it at the end.
+    """Run episodes of a protocol, several at a time. Close it at the end.
 
-    `play` runs episodes with the policy. `reset` and `step` let an external loop run them; then each env has one
-    episode. Steps, ends and measures are the same. An environment stays open while the configuration of the episodes
-    stays the same.
+    `run` writes a result; `play` runs some episodes with the policy. `reset` and `step` let an external loop run them:
+    then each env has one episode. Steps, ends and measures are the same. An environment stays open while the
+    configuration of the episodes stays the same.
 
     Args:
-        protocol: whose episodes.
         policy: the policy, or an `ExternalPolicy`.
-        settings: number of envs, where they run, and which episodes.
+        settings: protocol, episodes, number of envs and where they run, and the output folder.
         wrap_env: called with each vector environment that is opened; returns the one to use.
 
     Attributes:
+        protocol: that was read.
         episodes: the episodes of the protocol that the settings choose.
-        rate: control steps per second; with upstream's steps, see `PolicyStepping`.
-        record: what a result says about the evaluation (`results.RunRecord`).
+        rate: control steps per second; with RoboCAS-v0's steps, see `PolicyStepping`.
+        record: what a result says about the evaluation.
+        folder: of the result.
         outcomes: by env, the outcome of each episode that has ended since the last `reset`.
 
     Raises:
-        EvaluationError: the policy or the weld does not fit the protocol, the settings choose no episode, or the object
-            pack is not the protocol's.
+        EvaluationError: there is no such protocol, the policy or the weld does not fit it, the settings choose no
+            episode, or the object pack is not the protocol's.
         DatasetError: the policy uses cameras, and there is no render device.
     """
 
     def __init__(
-        self,
-        protocol: LoadedProtocol,
-        policy: Policy,
-        settings: EvaluationSettings,
-        wrap_env: Callable[[Any], Any] = lambda env: env,
+        self, policy: Policy, settings: EvaluationSettings, wrap_env: Callable[[Any], Any] = lambda env: env
     ) -> None:
-        self.protocol, self.policy, self.settings, self._wrap_env = protocol, policy, settings, wrap_env
-        rules, self.spec = protocol.rules, policy.spec
+        self.policy, self.settings, self._wrap_env = policy, settings, wrap_env
+        self.protocol, self.spec = load_protocol(settings.protocol), policy.spec
+        rules = self.protocol.rules
         rules.check_policy(self.spec)
         self.rate = UPSTREAM_HZ if rules.stepping == "upstream" else rules.rate(self.spec)
         backend = choose_backend(settings.backend)
         if settings.weld:
             check_weld(rules.stepping, backend)
-        self.episodes = choose_episodes(protocol, settings)
+        self.episodes = self.protocol.choose(settings)
         if self.spec.cameras:
             require_renderer()
         self.record = self._record(backend)
+        self.folder = settings.folder(rules.name)
         self.outcomes: dict[int, Outcome] = {}
         self._objects = load_pack(rules.pack).objects
         self._refill = backend != "gpu"
@@ -87,6 +86,29 @@ class EvaluationSession:
         self._open_for: tuple[str, int, int] | None = None  # configuration, number of envs and of steps of `_batch`
         self._current: list[Episode] = []  # by env, of an external loop
         self._observed = 0.0  # clock time at which the external loop received the last observation, s
+
+    def run(self, on_start: Callable[[int], None] = lambda count: None) -> Iterator[Outcome]:
+        """Start or continue a result: run the episodes that it lacks, write and yield each outcome as its episode ends.
+
+        The session is closed at the end.
+
+        Args:
+            on_start: called with the number of episodes to run.
+
+        Raises:
+            OutputExistsError: the result was measured with something else.
+            RobocasError: another process writes to the folder, or somebody removed it.
+        """
+        settings = self.settings
+        opened = results.open_result(
+            self.folder, self.record, overwrite=settings.overwrite, retry_errors=settings.retry_errors
+        )
+        with closing(self), opened as done:
+            missing = [episode for episode in self.episodes if episode.episode not in done]
+            on_start(len(missing))
+            for outcome in self.play(missing):
+                results.append(self.folder, outcome)
+                yield outcome
 
     def max_steps(self, task: str) -> int:
         """Return the maximum number of policy steps per episode of a task."""
@@ -109,14 +131,11 @@ class EvaluationSession:
         )
 
     def play(self, episodes: Sequence[Episode], max_steps: int | None = None) -> Iterator[Outcome]:
-        """Run episodes with the policy, configuration by configuration.
+        """Run episodes with the policy, configuration by configuration, and yield each outcome as its episode ends.
 
         Args:
             episodes: of the protocol.
             max_steps: maximum number of policy steps per episode; None: the protocol's.
-
-        Yields:
-            The outcome of each episode, as it ends.
 
         Raises:
             WorkerDied: a process died in which no episode ran.
@@ -137,15 +156,14 @@ class EvaluationSession:
         Raises:
             EvaluationError: there is no such episode, or the configurations differ.
         """
-        where, known = self.protocol.rules.name, self.protocol.episodes
+        where, known, count = self.protocol.rules.name, self.protocol.episodes, self.settings.envs
         for number in numbers:
             if not 0 <= number < len(known):
                 raise EvaluationError("no such episode", where=where, expected=f"0 to {len(known) - 1}", found=number)
-        count = self.settings.num_envs
         if len(numbers) != count:
             raise EvaluationError("wrong number of episodes", where=where, expected=count, found=len(numbers))
         episodes = [known[number] for number in numbers]
-        check_one_configuration(self.protocol, episodes)
+        self.protocol.check_one_configuration(episodes)
         self._current, self.outcomes = episodes, {}
         batch = self.open(episodes[0], count)
         try:
@@ -228,7 +246,7 @@ class EvaluationSession:
         """Run episodes of one configuration."""
         left, deaths = {episode.episode: episode for episode in episodes}, Counter[int]()
         while left:
-            batch = self.open(episodes[0], min(self.settings.num_envs, len(left)), max_steps)
+            batch = self.open(episodes[0], min(self.settings.envs, len(left)), max_steps)
             try:
                 for ended in rollout(batch, self.policy, [self.episode_spec(episode) for episode in left.values()]):
                     yield self._outcome(ended, left.pop(ended.start.episode))
@@ -271,7 +289,7 @@ class EvaluationSession:
             wrappers=[stepping],
             backend=settings.backend,
             workers=settings.workers,
-            limits=settings.limits,
+            limits=Limits(settings.step_seconds, settings.memory_gb),
             config=str(self.protocol.config_file(episode.config)),
             layouts=str(self.protocol.layouts_file(episode.config)),
             pack=rules.pack,
@@ -281,7 +299,7 @@ class EvaluationSession:
         )
 
     def _record(self, backend: str) -> results.RunRecord:
-        rules, name = self.protocol.rules, self.settings.policy_name
+        rules, name = self.protocol.rules, self.settings.policy
         pack = sha256(load_pack(rules.pack).root / MANIFEST)
         if pack != rules.pack_hash:
             raise EvaluationError(
@@ -301,38 +319,3 @@ class EvaluationSession:
             "machine": {"processor": platform.machine(), "python": platform.python_version()},
         }
         return results.RunRecord.of(values, f"policy {name}")
-
-
-def evaluate(
-    session: EvaluationSession,
-    folder: Path,
-    *,
-    overwrite: bool = False,
-    retry_errors: bool = False,
-    on_start: Callable[[int], None] = lambda count: None,
-) -> Iterator[Outcome]:
-    """Start or continue a result: run the episodes that it lacks, and write each outcome as its episode ends.
-
-    The session is closed.
-
-    Args:
-        session: protocol, policy and episodes.
-        folder: of the result.
-        overwrite: whether to start again, and replace a result that exists.
-        retry_errors: whether to run episodes again that ended with an error.
-        on_start: called with the number of episodes to run.
-
-    Yields:
-        The outcome of each episode.
-
-    Raises:
-        OutputExistsError: the result was measured with something else.
-        RobocasError: another process writes to the folder, or somebody removed it.
-    """
-    opened = results.open_result(folder, session.record, overwrite=overwrite, retry_errors=retry_errors)
-    with closing(session), opened as done:
-        left = [episode for episode in session.episodes if episode.episode not in done]
-        on_start(len(left))
-        for outcome in session.play(left):
-            results.append(folder, outcome)
-            yield outcome

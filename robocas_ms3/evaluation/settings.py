@@ -1,88 +1,90 @@
-"""Settings of an evaluation, and the episodes that they choose."""
+"""Settings of an evaluation: the options of `robocas eval run`. Loads no simulator."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
+import re
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
 
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.core.strict import nearest
-from robocas_ms3.core.workers import NO_LIMITS, Limits
-from robocas_ms3.evaluation.protocol import Episode, LoadedProtocol
-from robocas_ms3.tasks.vector.backend import Backend
+
+_NO_HINT = tyro.conf.arg(help_behavior_hint="")  # the help text says what the default is
 
 
 @dataclass(frozen=True)
 class EvaluationSettings:
-    """How an evaluation runs. Only ``weld`` changes the outcome of an episode.
+    """Measure a policy by a protocol: every episode of its list once, written as it ends.
 
-    Attributes:
-        policy_name: name of the policy in the result, as the user gave it.
-        num_envs: number of envs.
-        backend: where they run, see `make_vec`.
-        workers: number of processes; None: see `make_vec`.
-        limits: time and memory of a process for one step or reset. An episode that exceeds them, or whose process dies,
-            is started again once; then it counts as failed.
-        shard: (index, count): only the episodes whose number modulo ``count`` is ``index``.
-        tasks: only these tasks; empty: all of the protocol.
-        episodes: only the first so many of each configuration.
-        split: only the episodes of this split; empty: all.
-        weld: whether lifted objects are welded to the hand, as RoboCAS-v0 does (`weld`).
-        render_size: (width, height) of the images of the env's ``render``, pixels; None: it renders none.
+    Example: robocas eval pick --policy runs/pick --protocol paper-v1 --out eval/pick
     """
 
-    policy_name: str = ""
-    num_envs: int = 2
-    backend: Backend = "auto"
-    workers: int | None = None
-    limits: Limits = NO_LIMITS
-    shard: tuple[int, int] = (0, 1)
-    tasks: tuple[str, ...] = ()
-    episodes: int | None = None
-    split: str = ""
+    tasks: Annotated[tuple[str, ...], tyro.conf.Positional, _NO_HINT] = ()
+    """Only the episodes of these tasks. Default: all."""
+    policy: str = "scripted"
+    """Policy: scripted (joint targets), scripted-motions (RoboCAS' 7 numbers), scripted-beside (these, off by some
+    cm), random, still, replay:TRAJECTORY.h5, a folder of `robocas train`, module:Class of your own, one that an
+    installed package brings (`robocas list`), or ws://HOST:PORT, a server's (`robocas serve-policy`)."""
+    protocol: str = "ms3-v1"
+    """Name of a bundled protocol, or its folder."""
+    out: Annotated[Path | None, _NO_HINT] = None
+    """Folder to write to. Default: eval/PROTOCOL/POLICY, with the weld eval/PROTOCOL/POLICY_weld."""
+    overwrite: bool = False
+    """Start again. Default: continue a result with the same settings, or add episodes to it."""
+    retry_errors: bool = False
+    """Run episodes again that ended with an error, such as a server that was gone."""
+    envs: int = 2
+    """Envs at a time; the outcome does not depend on it."""
+    workers: Annotated[int | None, _NO_HINT] = None
+    """Processes. Default: one per env, no more than cores."""
+    step_seconds: float = 300.0
+    """Seconds that envs of a process may take for a step or a reset. If they take longer, or more memory, or crash,
+    the episode is run again once; then it counts as failed, with an error. Policies have no limit."""
+    memory_gb: float = 8.0
+    """GB of memory that a process of envs may use."""
+    backend: Literal["auto", "processes", "gpu"] = "auto"
+    """Where envs run. Auto: a GPU if there is one."""
+    shard: str = "0/1"
+    """K/N: only every N-th episode, from the K-th on (K = 0 ... N - 1). `robocas eval merge` joins the results."""
+    split: Annotated[str, _NO_HINT] = ""
+    """Only the episodes of this split, such as `seen`."""
+    episodes: Annotated[int | None, _NO_HINT] = None
+    """Only the first so many of each configuration."""
     weld: bool = False
-    render_size: tuple[int, int] | None = None
+    """Weld what closed fingers have lifted to the hand, as RoboCAS-v0 does, until the gripper is commanded to open.
+    Only in protocols with RoboCAS-v0's steps (paper-v1), in processes; never compare it with results without."""
+    render_size: Annotated[tuple[int, int] | None, tyro.conf.Suppress] = None
+    """Width and height of the images of the env's ``render``, pixels; None: it renders none."""
 
+    def check(self) -> None:
+        """Check the numbers.
 
-def choose_episodes(protocol: LoadedProtocol, settings: EvaluationSettings) -> list[Episode]:
-    """Return the episodes of a protocol that the settings choose, at least one.
+        Raises:
+            RobocasError: one is out of range.
+        """
+        from robocas_ms3.core.strict import check_number  # with pydantic, which `robocas --help` does not wait for
 
-    Raises:
-        EvaluationError: the protocol has no such task or split, or no episode is left.
-    """
-    for what, names in (("task", settings.tasks), ("split", (settings.split,) if settings.split else ())):
-        known = dict.fromkeys(str(getattr(episode, what)) for episode in protocol.episodes)
-        for name in names:
-            if name not in known:
-                other = "Name a protocol that has it, or make one: robocas eval freeze."
-                expected, fix = ", ".join(known), nearest(name, known) or other
-                raise EvaluationError(f"the protocol has no such {what}", expected=expected, found=name, fix=fix)
-    index, count = settings.shard
-    of_config: Counter[str] = Counter()
-    chosen = []
-    for episode in protocol.episodes:
-        if (settings.tasks and episode.task not in settings.tasks) or settings.split not in ("", episode.split):
-            continue
-        of_config[episode.config] += 1
-        if settings.episodes is not None and of_config[episode.config] > settings.episodes:
-            continue
-        if episode.episode % count == index:
-            chosen.append(episode)
-    if not chosen:
-        raise EvaluationError("no episodes in this shard", where=protocol.rules.name, found=f"{index}/{count}")
-    return chosen
+        for name in ("envs", "episodes", "workers"):
+            if (number := getattr(self, name)) is not None:
+                check_number(name, number, 1)
+        check_number("step_seconds", self.step_seconds, 1)
+        check_number("memory_gb", self.memory_gb, 0.1)
+        self.parse_shard()
 
+    def parse_shard(self) -> tuple[int, int]:
+        """Return number K and count N of the shard.
 
-def check_one_configuration(protocol: LoadedProtocol, episodes: Sequence[Episode], fix: str = "") -> None:
-    """Check that episodes can run in one batch.
+        Raises:
+            EvaluationError: it is invalid.
+        """
+        number, _, count = self.shard.partition("/")
+        if not (number.isdecimal() and count.isdecimal() and int(number) < int(count)):
+            raise EvaluationError("invalid shard", where="--shard", expected="K/N with K < N", found=repr(self.shard))
+        return int(number), int(count)
 
-    Raises:
-        EvaluationError: their configurations differ.
-    """
-    configs = list(dict.fromkeys(episode.config for episode in episodes))
-    if len(configs) > 1:
-        where, found = protocol.rules.name, ", ".join(configs)
-        raise EvaluationError(
-            "episodes of several configurations in one batch", where=where, expected="one", found=found, fix=fix
-        )
+    def folder(self, protocol: str) -> Path:
+        """Return the folder of the result, by the name of the protocol."""
+        name = re.sub(r"[^\w.-]+", "_", self.policy) + ("_weld" if self.weld else "")
+        return self.out or (Path("eval") / protocol / name).absolute()

@@ -1,4 +1,4 @@
-"""A vector environment without physics; an env succeeds once the first numbers of its actions add up to `ENOUGH`."""
+"""A vector environment without physics, for the loops that run episodes."""
 
 from __future__ import annotations
 
@@ -6,36 +6,51 @@ from typing import Any
 
 import numpy as np
 
-ENOUGH = 5.0
+from robocas_ms3.core.errors import WorkerDied
+from robocas_ms3.evaluation.metrics import SUMS
+from robocas_ms3.evaluation.policy import EpisodeSpec, Policy
+from robocas_ms3.evaluation.rollout import EndConditions, EpisodeBatch, Rollout, rollout
+
 BREAKS = 13.0  # an action with this number raises
 _POSE = [1, 2, 3, 0.4, 0.1, 0.2, 0.3]  # m; quaternion wxyz
 
 
 class CountingEnv:
-    def __init__(self, config: str, num_envs: int = 1) -> None:
-        self.config, self.num_envs, self.seeds, self.actions, self.closed = config, num_envs, [], [], False
-        self.sums, self.elapsed = np.zeros(num_envs), np.zeros(num_envs, int)
+    """N envs; each succeeds once the first numbers of its actions, or its steps, have added up to its goal.
+
+    Args:
+        num_envs: N.
+        goal: of all envs or of each; None: the seed of its episode.
+        steps: whether steps are counted.
+        config: name of the configuration, for tests.
+    """
+
+    def __init__(self, num_envs: int = 1, goal: Any = 5.0, *, steps: bool = False, config: str = "") -> None:
+        self.num_envs, self.config, self._goal, self._count_steps = num_envs, config, goal, steps
+        self.resets, self.seeds, self.actions, self.closed = [], [], [], False
+        self.sums, self.elapsed, self.seed_of = np.zeros(num_envs), np.zeros(num_envs, int), np.zeros(num_envs, int)
 
     def reset(self, *, seed: list[int], options: dict[str, Any]) -> tuple[Any, dict]:
-        envs = list(options["env_idx"])
+        envs = list(options.get("env_idx", range(self.num_envs)))
         assert len(seed) == len(envs)
+        self.resets.append(envs)
         self.seeds += seed
-        self.sums[envs], self.elapsed[envs] = 0.0, 0
-        return self._seen(), self._info()
+        self.sums[envs], self.elapsed[envs], self.seed_of[envs] = 0.0, 0, seed
+        return self._observation(), self._info()
 
     def step(self, actions: np.ndarray) -> tuple:
         assert np.isfinite(actions).all()
         if (actions[:, 0] == BREAKS).any():
             raise RuntimeError("the env broke")
         self.actions.append(actions.copy())
-        self.sums += actions[:, 0]
+        self.sums += 1 if self._count_steps else actions[:, 0]
         self.elapsed += 1
-        return self._seen(), None, None, None, self._info()
+        return self._observation(), None, None, None, self._info()
 
     def close(self) -> None:
         self.closed = True
 
-    def _seen(self) -> dict[str, Any]:
+    def _observation(self) -> dict[str, Any]:
         count = self.num_envs
         qpos = np.tile(np.arange(12, dtype=np.float32) + 10, (count, 1))
         tcp = np.tile(np.array(_POSE, np.float32), (count, 1))
@@ -43,17 +58,38 @@ class CountingEnv:
         width = np.full((count, 1), 0.05, np.float32)
         return {
             "agent": {"qpos": qpos, "qvel": qpos, "tcp_in_arm_base": tcp, "gripper_width": width},
-            "extra": {"tcp_pose": tcp},
+            "extra": {"seed": self.seed_of[:, None].astype(np.float32), "tcp_pose": tcp},
             "sensor_data": {"base_camera": {"rgb": pixels, "depth": pixels[..., :1].astype(np.int16) * 100}},
         }
 
     def _info(self) -> dict[str, Any]:
-        no = np.zeros(self.num_envs, bool)
-        sums = np.zeros((self.num_envs, 5), np.float32)
+        no, sums = np.zeros(self.num_envs, bool), np.zeros((self.num_envs, len(SUMS)), np.float32)
         sums[:, 0] = self.sums  # the first is the path's length
-        flags = {"reached_any": self.sums > 1, "success": self.sums >= ENOUGH, "fail": no, "success_v0": no}
-        return {
-            "sums": sums,
-            **{name: value.copy() for name, value in flags.items()},
-            "elapsed_steps": self.elapsed.copy(),
-        }
+        done = self.sums >= (self.seed_of if self._goal is None else self._goal)
+        flags = {"reached_any": self.sums > 1, "success": done, "fail": no, "success_v0": no}
+        return {"sums": sums, **flags, "elapsed_steps": self.elapsed.copy()}
+
+
+class Dying(CountingEnv):
+    """Envs in a process that dies in the second step of a seed, as often as ``deaths`` counts down."""
+
+    def __init__(self, num_envs: int, seed: int, deaths: list[int]) -> None:
+        super().__init__(num_envs, None)
+        self.deadly, self.deaths = seed, deaths
+
+    def step(self, actions: np.ndarray) -> tuple:
+        at = [env for env in range(self.num_envs) if self.seed_of[env] == self.deadly and self.elapsed[env] == 1]
+        if at and self.deaths[0] > 0:
+            self.deaths[0] -= 1
+            died = WorkerDied("its process died", found="SIGSEGV")
+            died.envs = tuple(at)
+            raise died
+        return super().step(actions)
+
+
+def play(
+    env: Any, policy: Policy, episodes: list[EpisodeSpec], max_steps: int, *, refill: bool = True
+) -> list[Rollout]:
+    """Run episodes with a policy, 0.05 s per step."""
+    batch = EpisodeBatch(env, policy.spec, EndConditions(max_steps), 0.05, refill=refill)
+    return list(rollout(batch, policy, episodes))

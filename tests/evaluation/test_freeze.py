@@ -4,7 +4,7 @@ import pytest
 import yaml
 
 from robocas_ms3.assets.pack import load_pack
-from robocas_ms3.cli import eval_protocols as command
+from robocas_ms3.cli import eval as command
 from robocas_ms3.core.errors import EvaluationError, OutputExistsError, RobocasError
 from robocas_ms3.evaluation.freeze import Plan, freeze, read_plan
 from robocas_ms3.evaluation.protocol import load_protocol

@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 import pytest
-from counting import Counting, play
+from counting_env import CountingEnv, play
 
 from robocas_ms3.core.errors import EvaluationError, ExtensionError
 from robocas_ms3.evaluation.policies import make_policy, open_policy
@@ -73,11 +73,13 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_looks_are_told_where_they_are_not_every_steps():
-    assert "look_every" not in policy_spec_values(PolicySpec())
+def test_specifications():
+    assert "look_every" not in policy_spec_values(PolicySpec())  # for servers and clients of older versions
     assert policy_spec_values(PolicySpec(look_every=7))["look_every"] == 7
-    with pytest.raises(EvaluationError, match="look_every"):
-        PolicySpec(look_every=0)
+    for wrong in ({"convention": "words"}, {"language": "loud"}, {"reference": "me"}, {"look_every": 0}):
+        with pytest.raises(EvaluationError) as error:
+            PolicySpec(**wrong)
+        assert error.value.where == next(iter(wrong))
 
 
 def test_a_module_in_the_folder_of_the_command(here):
@@ -90,6 +92,8 @@ def test_a_module_in_the_folder_of_the_command(here):
     ("name", "message"),
     [
         ("scriptd", "no such policy .*Did you mean scripted"),
+        ("replay:", "no such policy"),
+        ("json:Nothing", "no such policy"),
         ("http://127.0.0.1:9", "no such policy .*ws://host:port"),
         ("own_policy.py:Mine", "no such policy.*Leave the .py out: own_policy:Mine"),
         ("own_nowhere:Mine", "no such policy .*No module named 'own_nowhere'.*PYTHONPATH"),
@@ -123,7 +127,7 @@ def test_an_error_of_the_policys_own_is_its_own(here):
 def test_a_policy_can_not_end_the_process(here, name):
     with pytest.raises(ExtensionError) as caught, open_policy(name) as policy:
         describe(policy)
-        play(Counting(1), policy, [EpisodeSpec(-1, 0, "pick", "", "", "", 2, "")], 3)
+        play(CountingEnv(1, None), policy, [EpisodeSpec(-1, 0, "pick", "", "", "", 2, "")], 3)
     assert str(caught.value.where).startswith("policy own_")
     assert str(here) in str(caught.value.found)
 

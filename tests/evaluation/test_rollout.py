@@ -1,10 +1,10 @@
-"""The loop that plays episodes, with an environment of nothing but numbers."""
+"""The loop that runs episodes with a policy."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from counting import Counting, play
+from counting_env import CountingEnv, play
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
@@ -41,7 +41,7 @@ SEEDS = [3, 9, 2, 5, 4, 1]
 @pytest.mark.parametrize("count", [1, 2, 4])
 @pytest.mark.parametrize("refill", [True, False])
 def test_every_episode_is_played_once_with_its_own_instruction(count, refill):
-    env, policy = Counting(count), Obedient()
+    env, policy = CountingEnv(count, None), Obedient()
     played = play(env, policy, starts(SEEDS), 7, refill=refill)
     assert sorted(one.start.episode for one in played) == list(range(6))
     for one in played:
@@ -59,28 +59,28 @@ def test_every_episode_is_played_once_with_its_own_instruction(count, refill):
 
 def test_chunks_are_played_to_their_end_before_the_policy_is_asked_again():
     policy = Obedient(chunk=3)
-    played = play(Counting(2), policy, starts([4, 7]), 7)
+    played = play(CountingEnv(2, None), policy, starts([4, 7]), 7)
     assert {one.start.seed: one.steps for one in played} == {4: 4, 7: 7}
     assert policy.asked == [[0, 1], [0, 1], [1]]
 
 
 @pytest.mark.parametrize(("chunk", "looks", "fits"), [(6, 3, True), (1, 3, True), (3, 6, False), (6, 4, False)])
-def test_chunks_begin_with_a_look(chunk, looks, fits):
-    """Whoever acts step by step sees to that himself."""
+def test_chunks_begin_with_images(chunk, looks, fits):
+    """A policy without chunks takes care of that itself."""
     policy = Obedient(chunk)
     policy.spec = PolicySpec(state=True, look_every=looks)
     if fits:
-        assert [one.steps for one in play(Counting(1), policy, starts([4]), 7)] == [4]
+        assert [one.steps for one in play(CountingEnv(1, None), policy, starts([4]), 7)] == [4]
     else:
         with pytest.raises(EvaluationError, match=f"a multiple of {looks} steps"):
-            play(Counting(1), policy, starts([4]), 7)
+            play(CountingEnv(1, None), policy, starts([4]), 7)
 
 
 def test_actions_of_another_shape_are_refused():
     policy = Obedient()
     policy.act = lambda observations: np.zeros((2, 6))
     with pytest.raises(EvaluationError, match=r"expected \(1, 7\) or \(1, chunk, 7\), found \(2, 6\)"):
-        play(Counting(1), policy, starts([4]), 7)
+        play(CountingEnv(1, None), policy, starts([4]), 7)
 
 
 def test_an_action_that_is_no_number_ends_its_own_episode_alone():
@@ -93,7 +93,7 @@ def test_an_action_that_is_no_number_ends_its_own_episode_alone():
         return actions
 
     policy.act = sick
-    played = play(Counting(2), policy, starts([4, 5, 3]), 7)
+    played = play(CountingEnv(2, None), policy, starts([4, 5, 3]), 7)
     errors = {one.start.seed: one.error for one in played}
     assert errors == {4: "the policy's action is not finite", 5: "", 3: ""}
     assert [one.flags["success"] for one in sorted(played, key=lambda one: one.start.seed)] == [3, None, 5]

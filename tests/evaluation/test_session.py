@@ -1,158 +1,221 @@
-"""Episodes in an external loop."""
+"""Episodes of a protocol: run with a policy and continued, or in an external loop."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from counting_env import BREAKS
+import torch
+from counting_env import BREAKS, Dying
 
-from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.evaluation import results
-from robocas_ms3.evaluation.policies.plain import RandomPolicy
-from robocas_ms3.evaluation.policy import EpisodeSpec, ExternalPolicy, PolicySpec
+from robocas_ms3.cli.main import run as cli
+from robocas_ms3.core.errors import DatasetError, EvaluationError, RobocasError, WorkerDied
+from robocas_ms3.core.locks import locked_folder
+from robocas_ms3.evaluation import results, session
+from robocas_ms3.evaluation.policies.plain import StillPolicy
+from robocas_ms3.evaluation.policy import ExternalPolicy, PolicySpec
 from robocas_ms3.evaluation.protocol import load_protocol
-from robocas_ms3.evaluation.session import EvaluationSession, evaluate
+from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
+from robocas_ms3.evaluation.verify import problems
+
+SMOKE = load_protocol("smoke")
+AT_5_HZ = PolicySpec(rate_hz=5)
 
 
 def ones(count: int = 1, value: float = 1.0) -> np.ndarray:
     return np.full((1, count, 7), value)
 
 
-AT_5_HZ = PolicySpec(rate_hz=5)
-
-
-def open_session(protocol: str = "smoke", spec: PolicySpec = AT_5_HZ, num_envs: int = 1):
-    settings = EvaluationSettings(num_envs=num_envs, backend="processes")
-    return EvaluationSession(load_protocol(protocol), ExternalPolicy(spec), settings)
+def open_session(spec: PolicySpec = AT_5_HZ, **settings) -> EvaluationSession:
+    settings = {"protocol": "smoke", "envs": 1, "backend": "processes", **settings}
+    return EvaluationSession(ExternalPolicy(spec), EvaluationSettings(**settings))
 
 
 @pytest.fixture
-def session():
+def external():
     opened = open_session()
     yield opened
     opened.close()
 
 
-def test_an_episode_goes_on_until_the_rules_end_it(made, session):
-    seen = session.reset([1])
-    assert seen.instructions == [load_protocol("smoke").episodes[1].instruction]
-    for step in range(4):
-        assert session.outcomes == {}
-        seen = session.step(ones())
-        assert seen is not None and seen.envs.tolist() == [0], step
-    assert session.step(ones()) is None
-    outcome = session.outcomes[0]
+def test_an_episode_ends_by_the_protocols_rules(made, external):
+    seen = external.reset([1])
+    assert seen.instructions == [SMOKE.episodes[1].instruction]
+    for _ in range(4):
+        assert external.outcomes == {}
+        seen = external.step(ones())
+        assert seen is not None and seen.envs.tolist() == [0]
+    assert external.step(ones()) is None
+    outcome = external.outcomes[0]
     assert (outcome.episode, outcome.success, outcome.steps, outcome.seconds) == (1, True, 5, 1.0)
     assert outcome.flags["reached_any"] == 2
     assert (outcome.config, outcome.seed, outcome.failure_stage) == ("pick_table_scattered", 110001, "")
     with pytest.raises(EvaluationError, match="no episode is running"):
-        session.step(ones())
+        external.step(ones())
 
 
-def test_an_episode_ends_when_its_task_has_no_more_steps(made, session):
-    assert [session.max_steps(task) for task in ("pick", "search")] == [200, 600]
-    session.reset([0])
-    assert session.step(ones(199, 0.0)) is not None
-    assert session.step(ones(1, 0.0)) is None
-    assert (session.outcomes[0].steps, session.outcomes[0].failure_stage) == (200, "reached_any")
+def test_an_episode_ends_when_its_task_has_no_more_steps(made, external):
+    assert [external.max_steps(task) for task in ("pick", "search")] == [200, 600]
+    external.reset([0])
+    assert external.step(ones(199, 0.0)) is not None
+    assert external.step(ones(1, 0.0)) is None
+    assert (external.outcomes[0].steps, external.outcomes[0].failure_stage) == (200, "reached_any")
 
 
-def test_a_chunk_is_played_to_its_end(made, session):
-    session.reset([0])
-    assert session.step(ones(3)) is not None
-    assert session.step(ones(3)) is None
-    assert session.outcomes[0].steps == 5
+def test_a_reset_drops_the_running_episode(made, external):
+    external.reset([0])
+    external.step(ones())
+    external.reset([1])
+    assert external.outcomes == {}
+    assert external.step(ones(3)) is not None  # a chunk is executed to its end
+    assert external.step(ones(3)) is None
+    assert (external.outcomes[0].episode, external.outcomes[0].steps, external.outcomes[0].error) == (1, 5, "")
 
 
-def test_a_reset_drops_the_running_episode(made, session):
-    session.reset([0])
-    session.step(ones())
-    seen = session.reset([1])
-    assert session.outcomes == {}
-    assert seen.instructions == [load_protocol("smoke").episodes[1].instruction]
-    assert session.step(ones(5)) is None
-    assert (session.outcomes[0].episode, session.outcomes[0].steps, session.outcomes[0].error) == (1, 5, "")
-
-
-def test_an_env_stays_as_long_as_its_configuration(made, session):
+def test_an_env_stays_open_as_long_as_its_configuration(made, external):
     for number in (0, 1, 2, 0):
-        session.reset([number])
+        external.reset([number])
     assert [env.config for env in made] == ["pick_table_scattered", "select_table_orderly", "pick_table_scattered"]
     assert [env.seeds for env in made] == [[110000, 110001], [110000], [110000]]
     assert [env.closed for env in made] == [True, True, False]
-    session.close()
+    external.close()
     assert made[-1].closed
 
 
-def test_an_error_of_the_env_is_raised_and_the_next_reset_opens_another(made, session):
-    session.reset([0])
+def test_after_an_error_of_the_env_the_next_reset_opens_another(made, external):
+    external.reset([0])
+    with pytest.raises(EvaluationError, match=r"actions don't fit"):  # which is no error of the env
+        external.step(np.zeros((1, 6)))
     with pytest.raises(RuntimeError, match="the env broke"):
-        session.step(ones(1, BREAKS))
-    assert session.outcomes == {}
-    session.reset([0])
-    assert session.step(ones(5)) is None
-    assert session.outcomes[0].success
+        external.step(ones(1, BREAKS))
+    assert external.outcomes == {}
+    external.reset([0])
+    assert external.step(ones(5)) is None
+    assert external.outcomes[0].success
     assert [env.closed for env in made] == [True, False]
 
 
-def test_actions_of_another_shape_are_refused_and_the_episode_continues(made, session):
-    session.reset([0])
-    with pytest.raises(EvaluationError, match=r"actions don't fit"):
-        session.step(np.zeros((1, 6)))
-    assert session.step(ones(5)) is None
-    assert session.outcomes[0].steps == 5
-
-
 def test_each_env_of_a_batch_ends_by_itself(made):
-    session = open_session(num_envs=3)
-    seen = session.reset([4, 5, 4])
+    batch = open_session(envs=3)
+    seen = batch.reset([4, 5, 4])
     assert seen.envs.tolist() == [0, 1, 2] and seen.instructions[0] == seen.instructions[2] != seen.instructions[1]
     actions = np.zeros((3, 7))
     actions[:, 0] = 1, 2.5, 1
-    seen = session.step(actions)
+    seen = batch.step(actions)
     actions[2] = np.nan
-    seen = session.step(actions)
+    seen = batch.step(actions)
     assert seen is not None and seen.envs.tolist() == [0]
-    assert {env: (one.steps, one.success, one.error) for env, one in session.outcomes.items()} == {
+    assert {env: (one.steps, one.success, one.error) for env, one in batch.outcomes.items()} == {
         1: (2, True, ""),
         2: (1, False, "the policy's action is not finite"),
     }
-    assert session.step(np.tile(ones(3), (3, 1, 1))) is None
-    assert session.outcomes[0].steps == 5
+    assert batch.step(np.tile(ones(3), (3, 1, 1))) is None
+    assert batch.outcomes[0].steps == 5
     assert not np.stack(made[0].actions)[2:, 1:].any()  # ended envs are sent zeros
-    with pytest.raises(EvaluationError, match="several configurations"):
-        session.reset([0, 4, 5])
-    with pytest.raises(EvaluationError, match="wrong number of episodes"):
-        session.reset([0, 1])
+    for numbers, message in (([0, 4, 5], "several configurations"), ([0, 1], "wrong number"), ([0, 1, 8], "no such")):
+        with pytest.raises(EvaluationError, match=message):
+            batch.reset(numbers)
 
 
-@pytest.mark.parametrize("number", [-1, 8])
-def test_an_episode_that_the_protocol_lacks(made, session, number):
-    with pytest.raises(EvaluationError, match="no such episode"):
-        session.reset([number])
+@pytest.mark.parametrize(
+    ("settings", "spec", "message"),
+    [
+        ({"protocol": "paper-v1"}, PolicySpec("joint_positions"), "convention is none of this protocol's"),
+        ({"protocol": "paper-v1"}, PolicySpec(reference="tcp", rate_hz=10), "another rate .*10 Hz"),
+        ({"tasks": ("nothing",)}, AT_5_HZ, "no such task .expected pick, select, search, open_pick, found nothing"),
+        ({"split": "seen"}, AT_5_HZ, "no such split .expected test, found seen"),
+        ({"tasks": ("pick",), "shard": "90/100"}, AT_5_HZ, "no episodes in this shard"),
+        ({"shard": "3/2"}, AT_5_HZ, "invalid shard"),
+    ],
+)
+def test_settings_that_do_not_fit_the_protocol_are_refused_before_anything_is_written(settings, spec, message):
+    with pytest.raises(EvaluationError, match=message):
+        open_session(spec, **settings)
 
 
-def test_what_does_not_fit_the_protocol_is_refused():
-    with pytest.raises(EvaluationError, match="convention is none of this protocol's"):
-        open_session("paper-v1", PolicySpec(convention="joint_positions"))
+def test_a_policy_with_cameras_needs_a_renderer(monkeypatch):
+    def none() -> None:
+        raise DatasetError("no render device")
+
+    monkeypatch.setattr(session, "require_renderer", none)
+    with pytest.raises(DatasetError, match="no render device"):
+        open_session(PolicySpec(cameras={"base_camera": (8, 8)}))
 
 
-@pytest.mark.slow
-def test_real_episodes_come_out_as_in_an_evaluation(tmp_path):
-    class Brief(RandomPolicy):
-        spec = PolicySpec(reference="tcp", language="none", rate_hz=5)
+def test_episodes_are_chosen_by_task_count_and_shard():
+    def chosen(protocol=SMOKE, **settings):
+        return [one.episode for one in protocol.choose(EvaluationSettings(**settings))]
 
-    protocol = load_protocol("smoke")
-    settings = EvaluationSettings("random", 1, "processes", tasks=("pick",), episodes=1)
-    list(evaluate(EvaluationSession(protocol, Brief(), settings), tmp_path))
-    session, policy = open_session(spec=Brief.spec), RandomPolicy()
-    for number, outcome in results.read(tmp_path).outcomes.items():
-        seed = protocol.episodes[number].seed
-        policy.reset([EpisodeSpec(0, number, "", "", "", "", seed, "")])
-        seen = session.reset([number])
-        while seen is not None:
-            seen = session.step(policy.act(seen))
-        assert session.outcomes[0].without_clock() == outcome.without_clock()
-        assert outcome.steps > 100
-    session.close()
+    assert chosen(tasks=("search", "pick")) == [0, 1, 4, 5]
+    assert chosen(episodes=1) == [0, 2, 4, 6]
+    assert chosen(shard="1/3") == [1, 4, 7]
+    assert chosen(load_protocol("objects-v1"), split="new", tasks=("pick",)) == [*range(50, 100)]
+
+
+def evaluate(folder, **settings) -> dict[int, dict]:
+    """Run pick and select with a policy that does nothing, 20 steps each."""
+    settings = {"tasks": ("pick", "select"), "protocol": "smoke", "backend": "processes", **settings}
+    opened = EvaluationSession(StillPolicy(), EvaluationSettings(policy="still", out=folder, **settings))
+    list(opened.run())
+    return {number: one.without_clock() for number, one in results.read(folder).outcomes.items()}
+
+
+@pytest.mark.parametrize("times", [1, 2])
+def test_an_episode_whose_process_dies_runs_again_once_and_then_counts_as_failed(
+    short, tmp_path, monkeypatch, caplog, times
+):
+    protocol, made, deaths, out = load_protocol(short), [], [times], tmp_path / "out"
+
+    def make_vec(env_id, count, **_):
+        made.append(Dying(count, protocol.episodes[1].seed, deaths))
+        return made[-1]
+
+    monkeypatch.setattr(session, "make_vec", make_vec)
+    found = evaluate(out, protocol=str(short))
+    assert sorted(found) == [0, 1, 2, 3]
+    assert [number for number, one in found.items() if one["error"]] == ([1] if times == 2 else [])
+    assert found[1]["error"] == ("its process died: SIGSEGV" if times == 2 else "")
+    assert (found[1]["failure_stage"] == "error") == (times == 2)
+    assert found[0]["steps"] == 20  # from its beginning, whatever happened to the other
+    assert [record.getMessage() for record in caplog.records] == [
+        "episode 1: its process died: SIGSEGV; it is started again"
+    ]
+    assert all(env.closed for env in made)
+    assert not [one for one in problems(results.read(out), protocol) if one.startswith("episode 1:") and times == 2]
+    command = ["eval", "--policy", "still", "--protocol", short, "--backend", "processes", "--out", out]
+    assert cli([str(word) for word in command]) == times - 1  # continues, and does not run the failed episode again
+    assert results.read(out).broken_off() == times - 1
+
+
+def test_a_process_that_dies_without_an_episode_ends_the_run(tmp_path, monkeypatch):
+    def make_vec(env_id, count, **_):
+        raise WorkerDied("its process died", where="env 0", found="SIGSEGV")
+
+    monkeypatch.setattr(session, "make_vec", make_vec)
+    with pytest.raises(WorkerDied, match="env 0: its process died"):
+        evaluate(tmp_path / "out")
+
+
+def test_two_runs_into_one_folder_are_refused(tmp_path):
+    with locked_folder(tmp_path / "out"), pytest.raises(RobocasError, match="out: another process is writing here"):
+        evaluate(tmp_path / "out")
+
+
+def test_an_interrupted_command_tells_how_to_continue_and_it_takes_one_thread(tmp_path, monkeypatch, capsys):
+    threads = []
+
+    def interrupted(*args):
+        threads.append(torch.get_num_threads())
+        raise KeyboardInterrupt
+
+    before = torch.get_num_threads()
+    monkeypatch.setattr(EvaluationSession, "play", interrupted)
+    torch.set_num_threads(2)
+    try:
+        open_session()  # whoever makes a session keeps its threads
+        assert torch.get_num_threads() == 2
+        assert cli(["eval", "--protocol", "smoke", "--policy", "still", "--out", str(tmp_path / "out")]) == 130
+    finally:
+        torch.set_num_threads(before)
+    assert capsys.readouterr().err.splitlines()[-1] == "interrupted; the same command continues"
+    assert threads == [1]

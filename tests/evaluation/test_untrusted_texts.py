@@ -10,7 +10,6 @@ from made_up_results import outcome, write
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.policy import EpisodeSpec, PolicySpec, describe
-from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.remote.server import PolicyServer
 from robocas_ms3.evaluation.report import write_report
 from robocas_ms3.evaluation.report.comparison import comparison
@@ -59,7 +58,7 @@ def test_wants_of_a_policy_are_part_of_its_description():
 
 def test_what_a_description_says_is_read_back_and_does_not_rename_the_policy(tmp_path):
     policy = Policy({"name": 5, "sizes": (1, 2), "note": HOSTILE})
-    run = EvaluationSession(load_protocol("smoke"), policy, EvaluationSettings("mine", backend="processes")).record
+    run = EvaluationSession(policy, EvaluationSettings(policy="mine", protocol="smoke", backend="processes")).record
     with results.open_result(tmp_path / "out", run):
         results.append(tmp_path / "out", outcome(0))
     assert results.read(tmp_path / "out").run.policy.name == "mine"

@@ -5,7 +5,7 @@ Needs lerobot 0.6. LeRobot imports this through the distribution ``lerobot_env_r
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 from lerobot.configs import FeatureType, PolicyFeature  # pyright: ignore[reportMissingImports]
 from lerobot.envs import EnvConfig  # pyright: ignore[reportMissingImports]
@@ -15,9 +15,6 @@ from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.harness.proprioception import KEYS, WIDTHS, depth_key
 from robocas_ms3.evaluation.policy import CAMERAS, PolicySpec, Reference
 from robocas_ms3.evaluation.protocol import load_protocol
-
-if TYPE_CHECKING:
-    from robocas_ms3.tasks.vector.backend import Backend  # imports the simulator
 
 
 @EnvConfig.register_subclass("robocas")
@@ -104,19 +101,23 @@ class RoboCASEnvConfig(EnvConfig):
         from robocas_ms3.evaluation.harness.protocol_env import ProtocolVectorEnv
         from robocas_ms3.evaluation.settings import EvaluationSettings
 
-        protocol = load_protocol(self.protocol)
         tasks = _names(self.task or "", "env.task")
         if tasks == ["all"]:
+            protocol = load_protocol(self.protocol)
             episodes = [episode for episode in protocol.episodes if self.split in ("", episode.split)]
             tasks = list(dict.fromkeys(episode.task for episode in episodes))
         envs: dict[str, dict[int, Any]] = {}
         for task in tasks:
             settings = EvaluationSettings(
-                self.policy_name, n_envs, cast("Backend", self.backend), tasks=(task,), split=self.split
+                (task,),
+                self.policy_name,
+                self.protocol,
+                None if self.results is None else Path(self.results).absolute() / task,
+                envs=n_envs,
+                backend=cast(Any, self.backend),  # checked when it is used
+                split=self.split,
             )
-            folder = None if self.results is None else Path(self.results).absolute() / task
-            made = ProtocolVectorEnv(protocol, self.spec, settings, folder=folder)
-            envs[task] = {0: made}
+            envs[task] = {0: ProtocolVectorEnv(self.spec, settings)}
         return envs
 
 

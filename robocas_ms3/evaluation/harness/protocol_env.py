@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import ExitStack
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -18,9 +17,8 @@ from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.harness.proprioception import WIDTHS, Proprioception, depth_key
 from robocas_ms3.evaluation.policy import ExternalPolicy, PolicySpec
-from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.session import EvaluationSession
-from robocas_ms3.evaluation.settings import EvaluationSettings, check_one_configuration
+from robocas_ms3.evaluation.settings import EvaluationSettings
 from robocas_ms3.robots.table import find_robot
 
 
@@ -37,10 +35,9 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
     same array is in ``info["final_info"]``.
 
     Args:
-        protocol: whose episodes.
         spec: cameras, action convention and rate.
-        settings: ``tasks`` names the task; number of envs, where they run, split, name of the policy.
-        folder: for a result that ``robocas eval report`` reads; None: none is written.
+        settings: protocol; ``tasks`` names the task; number of envs, where they run, split, name of the policy; folder
+            for a result that ``robocas eval report`` reads, if ``out`` names one.
 
     Raises:
         EvaluationError: the protocol has no such task or split, the policy does not fit it, N > 1 and the task has
@@ -49,24 +46,19 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         RobocasError: another process or environment writes to the folder.
     """
 
-    def __init__(
-        self,
-        protocol: LoadedProtocol,
-        spec: PolicySpec,
-        settings: EvaluationSettings,
-        *,
-        folder: Path | None = None,
-    ) -> None:
-        self._session = EvaluationSession(protocol, ExternalPolicy(spec), settings)
+    def __init__(self, spec: PolicySpec, settings: EvaluationSettings) -> None:
+        self._session = EvaluationSession(ExternalPolicy(spec), settings)
         self._episodes = self._session.episodes
-        if settings.num_envs > 1:
+        if settings.envs > 1:
             splits = ", ".join(dict.fromkeys(episode.split for episode in self._episodes))
-            check_one_configuration(protocol, self._episodes, f"Choose one of the splits {splits}, or use one env.")
+            self._session.protocol.check_one_configuration(
+                self._episodes, f"Choose one of the splits {splits}, or use one env."
+            )
         self._task = self._episodes[0].task
         self._max_steps = self._session.max_steps(self._task)
         self._lock = ExitStack()
-        self._folder, self._recorded = folder, set[int]()  # episodes that the result has
-        if folder is not None:
+        self._folder, self._recorded = settings.out, set[int]()  # episodes that the result has
+        if (folder := settings.out) is not None:
             with ExitStack() as lock:
                 if lock.enter_context(results.open_result(folder, self._session.record)):
                     raise EvaluationError("there is a result already", where=folder, fix="Choose another folder.")
@@ -74,7 +66,7 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         self._convention = CONVENTIONS[spec.convention]
         self._proprioception = Proprioception()
         self._spec, self._next = spec, 0
-        count = self.num_envs = settings.num_envs
+        count = self.num_envs = settings.envs
         self.render_mode = "rgb_array"
         rate = self._session.rate
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": rate, "autoreset_mode": AutoresetMode.DISABLED}

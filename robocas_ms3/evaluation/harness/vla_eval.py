@@ -18,7 +18,7 @@ from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.metrics import MEASURES
 from robocas_ms3.evaluation.outcomes import STAGES
 from robocas_ms3.evaluation.policy import ExternalPolicy, Observations
-from robocas_ms3.evaluation.protocol import Episode, load_protocol
+from robocas_ms3.evaluation.protocol import Episode
 from robocas_ms3.evaluation.remote.messages import actions_of, read_policy_spec
 from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
@@ -59,8 +59,8 @@ class RoboCAS:
     ) -> None:
         said = {"cameras": dict(cameras or {}), "convention": convention, "reference": reference, "rate_hz": rate_hz}
         self._spec = read_policy_spec(said, "params")
-        settings = EvaluationSettings(num_envs=1, backend="processes")
-        self._session = EvaluationSession(load_protocol(protocol), ExternalPolicy(self._spec), settings)
+        settings = EvaluationSettings(protocol=protocol, envs=1, backend="processes")
+        self._session = EvaluationSession(ExternalPolicy(self._spec), settings)
         self._of_config: dict[str, list[Episode]] = {}
         for episode in self._session.protocol.episodes:
             self._of_config.setdefault(episode.config, []).append(episode)

@@ -1,10 +1,9 @@
-"""Videos of episodes that failed: they are played again, watched from over the robot's shoulder."""
+"""Videos of failed episodes: they run again, filmed from over the robot's shoulder."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,6 @@ import torch
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.files import make_folder, replacing
 from robocas_ms3.datasets.writing.render import require_renderer
-from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.policy import Policy
 from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.report.failures import VIDEOS, video_name
@@ -28,17 +26,8 @@ _FRAMES = 5  # a second of the scene
 _SPEED = 4  # times as fast as the scene
 
 
-@dataclass(frozen=True)
-class FailureVideo:
-    """A video that was written; ``same``: what came of the episode is what had come of it before."""
-
-    path: Path
-    outcome: Outcome
-    same: bool
-
-
 def failed_of_each_kind(result: Result, count: int) -> list[int]:
-    """Numbers of failed episodes: of each configuration in turn, and there of each failure stage in turn."""
+    """Return numbers of failed episodes: of each configuration in turn, and there of each failure stage in turn."""
     groups: dict[str, dict[str, list[int]]] = {}
     for outcome in result.outcomes.values():
         if not outcome.success:
@@ -50,8 +39,13 @@ def _in_turn(lists: list[list[int]]) -> list[int]:
     return [number for row in zip_longest(*lists) for number in row if number is not None]
 
 
-def film(result: Result, protocol: LoadedProtocol, policy: Policy, episodes: Sequence[int]) -> Iterator[FailureVideo]:
+def film(
+    result: Result, protocol: LoadedProtocol, policy: Policy, episodes: Sequence[int]
+) -> Iterator[tuple[Path, bool]]:
     """Run episodes again, in processes, and write a video of each into the result's ``videos``.
+
+    Yields:
+        The video, and whether the outcome is the same as before.
 
     Raises:
         EvaluationError: the result is of another protocol.
@@ -64,8 +58,10 @@ def film(result: Result, protocol: LoadedProtocol, policy: Policy, episodes: Seq
         )
     require_renderer()
     recorder = _VideoRecorder()
-    settings = EvaluationSettings(num_envs=1, backend="processes", weld=result.run.weld, render_size=SIZE)
-    session = EvaluationSession(protocol, policy, settings, recorder.wrap)
+    settings = EvaluationSettings(
+        protocol=str(protocol.folder), envs=1, backend="processes", weld=result.run.weld, render_size=SIZE
+    )
+    session = EvaluationSession(policy, settings, recorder.wrap)
     recorder.period = max(1, round(session.rate / _FRAMES))
     make_folder(result.folder / VIDEOS)
     with closing(session):
@@ -74,16 +70,11 @@ def film(result: Result, protocol: LoadedProtocol, policy: Policy, episodes: Seq
             # As long as the first time, so that it is the same episode whatever ended it.
             with replacing(path) as tmp, _writer(tmp, session.rate / recorder.period * _SPEED) as recorder.writer:
                 (outcome,) = session.play([protocol.episodes[number]], before.steps)
-            yield FailureVideo(path, outcome, outcome.without_clock() == before.without_clock())
+            yield path, outcome.without_clock() == before.without_clock()
 
 
 class _VideoRecorder:
-    """A wrapper of a vector environment with one env; it adds images to a video, at the reset and every few steps.
-
-    Attributes:
-        writer: of the video.
-        period: number of policy steps per image.
-    """
+    """A wrapper of a vector environment with one env; it adds an image to ``writer`` every ``period`` policy steps."""
 
     num_envs = 1
 
@@ -106,7 +97,7 @@ class _VideoRecorder:
         return result
 
     def step(self, actions: Any) -> Any:
-        """Execute one policy step, and add an image every few."""
+        """Execute one policy step."""
         result = self._env.step(actions)
         self._steps += 1
         if self._steps % self.period == 0:

@@ -21,7 +21,7 @@ from lerobot.scripts.lerobot_eval import rollout
 
 from robocas_ms3.core.errors import EvaluationError, VectorEnvError
 from robocas_ms3.datasets.lerobot import schema
-from robocas_ms3.evaluation import results, session
+from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.harness.lerobot import RoboCASEnvConfig
 
 HUB_FILE = Path(__file__).resolve().parents[3] / "examples" / "lerobot_hub" / "env.py"
@@ -33,12 +33,6 @@ SMALL = {
     "observation_width": 6,
     "observation_height": 4,
 }
-
-
-@pytest.fixture
-def no_physics(made, monkeypatch):
-    monkeypatch.setattr(session, "require_renderer", lambda: None)
-    return made
 
 
 @pytest.fixture
@@ -72,7 +66,7 @@ class Adder(torch.nn.Module):
 
 
 @pytest.mark.parametrize("depth", [False, True])
-def test_observations_have_the_names_and_shapes_of_the_policys_features(no_physics, depth):
+def test_observations_have_the_names_and_shapes_of_the_policys_features(made, depth):
     config = RoboCASEnvConfig(depth=depth, **SMALL)
     features = env_to_policy_features(config)
     env = make_env(config, n_envs=2)["pick"][0]
@@ -87,7 +81,7 @@ def test_observations_have_the_names_and_shapes_of_the_policys_features(no_physi
     assert features["action"].shape == (7,)
 
 
-def test_lerobots_rollout_reads_success_tasks_and_ends(no_physics, tmp_path):
+def test_lerobots_rollout_reads_success_tasks_and_ends(made, tmp_path):
     config = RoboCASEnvConfig(task="search", results=str(tmp_path / "results"), **SMALL)
     env, policy, same = make_env(config, n_envs=2)["search"][0], Adder(), PolicyProcessorPipeline(steps=[])
     found = rollout(env, policy, same, same, same, lambda action: action, seeds=[0, 1])
@@ -101,7 +95,7 @@ def test_lerobots_rollout_reads_success_tasks_and_ends(no_physics, tmp_path):
     assert len(set(tasks)) == 2 and all(isinstance(task, str) for task in tasks)
 
 
-def test_all_tasks_of_a_protocol_or_of_a_split(no_physics):
+def test_all_tasks_of_a_protocol_or_of_a_split(made):
     assert EnvConfig.get_choice_class("robocas") is RoboCASEnvConfig
     assert list(make_env(RoboCASEnvConfig(task="all", **SMALL))) == ["pick", "select", "search", "open_pick"]
     assert list(make_env(RoboCASEnvConfig(task=" search,pick ", **SMALL))) == ["search", "pick"]
@@ -122,12 +116,12 @@ def test_all_tasks_of_a_protocol_or_of_a_split(no_physics):
         (dict(backend="threads"), VectorEnvError, "no such backend"),
     ],
 )
-def test_settings_that_do_not_exist_are_refused(no_physics, settings, error, words):
+def test_settings_that_do_not_exist_are_refused(made, settings, error, words):
     with pytest.raises(error, match=words):
         make_env(RoboCASEnvConfig(**{**SMALL, **settings}))
 
 
-def test_the_hub_file_makes_the_environments_of_its_settings(no_physics, hub):
+def test_the_hub_file_makes_the_environments_of_its_settings(made, hub):
     envs = make_env("someone/robocas", n_envs=2, hub_cache_dir=str(hub), trust_remote_code=True)
     env = envs["pick"][0]
     assert env.num_envs == 2 and env.call("_max_episode_steps")[0] > 0
@@ -136,7 +130,7 @@ def test_the_hub_file_makes_the_environments_of_its_settings(no_physics, hub):
         make_env("someone/robocas", hub_cache_dir=str(hub))
 
 
-def test_the_hub_file_ignores_the_defaults_of_a_configuration(no_physics, hub):
+def test_the_hub_file_ignores_the_defaults_of_a_configuration(made, hub):
     plain = HubEnvConfig(hub_path="someone/robocas")
     assert (plain.task, plain.fps) == (None, 30)
     envs = make_env(plain, n_envs=1, hub_cache_dir=str(hub), trust_remote_code=True)
@@ -148,7 +142,7 @@ def test_the_hub_file_ignores_the_defaults_of_a_configuration(no_physics, hub):
     assert envs["select"][0].metadata["render_fps"] == 10
 
 
-def test_the_hub_file_takes_the_settings_of_a_configuration(no_physics, hub):
+def test_the_hub_file_takes_the_settings_of_a_configuration(made, hub):
     @dataclass
     class OfTheHub(HubEnvConfig):
         hub_path: str | None = "someone/robocas"

@@ -13,7 +13,6 @@ pytest.importorskip("websockets")
 pytest.importorskip("msgpack")
 
 from robocas_ms3.core.errors import EvaluationError, WireError
-from robocas_ms3.evaluation import session
 from robocas_ms3.evaluation.harness.vla_eval import RoboCAS
 from robocas_ms3.evaluation.protocol import load_protocol
 
@@ -31,8 +30,7 @@ class Recorder:
 
 
 @pytest.fixture
-def benchmark(made, monkeypatch):
-    monkeypatch.setattr(session, "require_renderer", lambda: None)
+def benchmark(made):
     benchmark = RoboCAS(cameras={"base_camera": [6, 4]}, rate_hz=5)
     yield benchmark
     benchmark.cleanup()

@@ -1,4 +1,4 @@
-"""A fake observation, servers in threads that are over with their test, and a vector environment without physics."""
+"""A fake observation, and servers in threads that end with their test."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from robocas_ms3.core.paths import protocols_dir
-from robocas_ms3.evaluation.metrics import SUMS
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 
 CAMERA = (6, 4)  # width, height
@@ -90,34 +89,6 @@ def talking(talk: Callable[[Any], None], port: int = 0) -> Iterator[str]:
             yield f"ws://127.0.0.1:{server.socket.getsockname()[1]}"
         finally:
             server.shutdown()
-
-
-class StandIn:
-    """A vector environment in which an episode succeeds after so many steps."""
-
-    def __init__(self, num_envs: int, steps: int = 4) -> None:
-        self.num_envs, self._needed = num_envs, steps
-        self._steps = np.zeros(num_envs, int)
-
-    def reset(self, seed: Any, options: dict[str, Any]) -> tuple[dict, dict]:
-        self._steps[options["env_idx"]] = 0
-        return self._now()
-
-    def step(self, actions: np.ndarray) -> tuple[dict, None, None, None, dict]:
-        self._steps += 1
-        obs, info = self._now()
-        return obs, None, None, None, info
-
-    def _now(self) -> tuple[dict, dict]:
-        count = self.num_envs
-        agent = {
-            "qpos": np.zeros((count, 12)),
-            "tcp_in_arm_base": np.ones((count, 7)),
-            "gripper_width": np.ones((count, 1)),
-        }
-        sums = np.zeros((count, len(SUMS)))
-        info = {"success": self._steps >= self._needed, "elapsed_steps": self._steps.copy(), "sums": sums}
-        return {"agent": agent, "extra": {}}, info
 
 
 IN_A_HURRY = "timeout_s=0.5&connect_s=0.5"  # options of an address: as long as a test can wait

@@ -10,7 +10,8 @@ import pytest
 pytest.importorskip("websockets")
 pytest.importorskip("msgpack")
 
-from remote_ends import IN_A_HURRY, StandIn, Told, a_start, serving, some_observations, talking
+from counting_env import CountingEnv
+from remote_ends import IN_A_HURRY, Told, a_start, serving, some_observations, talking
 
 from robocas_ms3.core.errors import EvaluationError, PolicyFailed
 from robocas_ms3.evaluation.policy import PolicySpec
@@ -150,7 +151,7 @@ class Stumbling(Told):
 
 
 def play(policy, count=7, envs=2):
-    batch = EpisodeBatch(StandIn(envs), policy.spec, EndConditions(10), 0.05, refill=True)
+    batch = EpisodeBatch(CountingEnv(envs, 4, steps=True), policy.spec, EndConditions(10), 0.05, refill=True)
     starts = [a_start(-1, episode=number) for number in range(count)]
     return {one.start.episode: one for one in rollout(batch, policy, starts)}
 

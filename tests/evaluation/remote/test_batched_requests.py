@@ -8,7 +8,8 @@ import pytest
 pytest.importorskip("websockets")
 pytest.importorskip("msgpack")
 
-from remote_ends import IN_A_HURRY, StandIn, Told, a_start, serving, some_observations, talking
+from counting_env import CountingEnv
+from remote_ends import IN_A_HURRY, Told, a_start, serving, some_observations, talking
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
@@ -43,21 +44,9 @@ class SharedNoise(Told):
         return noise * observations.tcp_in_base[:, None] + noise.mean()
 
 
-class Recording(StandIn):
-    """Record the actions of all steps."""
-
-    def __init__(self, steps) -> None:
-        super().__init__(len(steps), np.array(steps))
-        self.actions: list[np.ndarray] = []
-
-    def step(self, actions):
-        self.actions.append(actions.copy())
-        return super().step(actions)
-
-
 def play(policy):
     """Play eight episodes in three envs that end after different numbers of steps."""
-    env = Recording([3, 4, 7])
+    env = CountingEnv(3, np.array([3, 4, 7]), steps=True)
     starts = [a_start(-1, episode=number, seed=number) for number in range(8)]
     batch = EpisodeBatch(env, policy.spec, EndConditions(9), 0.05, refill=True)
     return [replace(one, inference_seconds=0.0) for one in rollout(batch, policy, starts)], env.actions

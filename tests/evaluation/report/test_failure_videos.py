@@ -5,13 +5,14 @@ import numpy as np
 import pytest
 from made_up_results import of_protocol, outcome, write
 
-from robocas_ms3.cli.eval import Run, run
+from robocas_ms3.cli.eval import run
 from robocas_ms3.cli.eval_results import Videos, videos
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.freeze import Plan, freeze
 from robocas_ms3.evaluation.policies.plain import RandomPolicy
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.report.videos import SIZE, failed_of_each_kind, film
+from robocas_ms3.evaluation.settings import EvaluationSettings
 
 
 def test_all_kinds_of_failures_have_their_turn(tmp_path):
@@ -54,7 +55,7 @@ def test_a_failure_is_filmed_and_linked(tmp_path, needs_renderer, capsys):
     plan = {"rules": rules, "parts": [{"config": "pick_table_scattered", "count": 1, "first_seed": 110000}]}
     list(freeze(Plan.model_validate(plan), tmp_path / "tiny"))
     out, protocol = tmp_path / "result", str(tmp_path / "tiny")
-    assert run(Run(policy="random", protocol=protocol, out=out, backend="processes")) == 0
+    assert run(EvaluationSettings((), "random", protocol, out, backend="processes")) == 0
     assert videos(Videos(out, protocol=protocol)) == 0
     said = capsys.readouterr().out
     assert "episode_00000.mp4" in said and "differently" not in said

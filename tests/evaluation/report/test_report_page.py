@@ -161,7 +161,7 @@ def test_commands_on_parts(tmp_path, capsys):
         write(part, [outcome(number)], **({"policy": {"name": "other"}} if part.name == "c" else {}))
     assert report(Report((*parts[:2],))) == 0
     assert "2 episodes" in capsys.readouterr().out
-    assert merge(Merge((*parts[:2],), tmp_path / "all")) == 0
+    assert merge(Merge((*parts[:2],), out=tmp_path / "all")) == 0
     assert (tmp_path / "all" / "report.html").is_file()
     write(tmp_path / "d", [outcome(1)], policy={"name": "other"})
     assert compare(Compare((*parts, tmp_path / "d"))) == 0
@@ -172,7 +172,7 @@ def test_commands_on_parts(tmp_path, capsys):
     ("command", "settings", "where"),
     [
         (report, Report(()), "DIR"),
-        (merge, Merge((), Path("o")), "DIR"),
+        (merge, Merge((), out=Path("o")), "DIR"),
         (compare, Compare((Path("a"),)), Path("a")),
         (compare, Compare((Path("ok"),)), Path("ok")),
         (verify, Verify((Path("a"),)), Path("a")),
