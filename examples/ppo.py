@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 import tyro
 
-from robocas_ms3.baselines.training.session import Progress, train_run
+from robocas_ms3.baselines.training.session import Progress, RunOptions, train_run
 
 
 @dataclass
@@ -38,7 +38,7 @@ def main(args: Args) -> None:
     torch.set_num_threads(1)
     train = {"seed": args.seed, "steps": args.steps, "batch_size": args.batch}
     more = {"envs": args.envs, "workers": args.workers, "layouts": args.layouts, "trials": args.trials}
-    train_run("ppo", None, args.out, {**more, "train": train}, overwrite=True, progress=Progress(note=print))
+    train_run(RunOptions("ppo", None, args.out, {**more, "train": train}, overwrite=True), Progress(note=print))
 
 
 if __name__ == "__main__":

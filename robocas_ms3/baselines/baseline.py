@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal, Protocol
 import torch
 from pydantic import Field
 
+from robocas_ms3.core.errors import EmptySplitError
 from robocas_ms3.core.strict import StrictModel
 from robocas_ms3.evaluation.policy import Policy
 
@@ -34,6 +35,12 @@ class Progress:
     note: Callable[[str], None] = lambda text: None
     read: OnRead = lambda done, total: None
     step: Callable[[int, int], None] = lambda done, total: None
+
+
+def no_episodes(path: Path, split: Split) -> EmptySplitError:
+    """Return the error of a split without episodes."""
+    fix = "Add episodes: a tenth of them validates."
+    return EmptySplitError("this split holds no episodes", where=path, expected=f"some in {split}", fix=fix)
 
 
 class TrainSettings(StrictModel):

@@ -12,7 +12,7 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.manage.repairs import eef_turn
 from robocas_ms3.datasets.sources.protocol import EpisodeSource
 
-_STANDING = 0.005  # m or rad; a base that stands trembles by less than a tenth of a mm
+_MAX_BASE_MOTION = 0.005  # m or rad; a base that stands trembles by less than a tenth of a mm
 
 
 @dataclass(frozen=True)
@@ -83,13 +83,13 @@ def check_base_stands(motion: NDArray[np.floating], where: object) -> None:
     Raises:
         DatasetError: it drives, in one step or slowly.
     """
-    away = np.cumsum(motion, axis=0, dtype=np.float64)
-    furthest = float(np.abs(np.concatenate([motion, away])).max(initial=0))
-    if not furthest <= _STANDING:  # NaN is refused too
+    path = np.cumsum(motion, axis=0, dtype=np.float64)
+    furthest = float(np.abs(np.concatenate([motion, path])).max(initial=0))
+    if not furthest <= _MAX_BASE_MOTION:  # NaN is refused too
         raise DatasetError(
             "the base drives, which actions of 7 numbers leave out",
             where=where,
-            expected=f"at most {_STANDING:g} m or rad away from its first pose",
+            expected=f"at most {_MAX_BASE_MOTION:g} m or rad away from its first pose",
             found=f"{furthest:.3g}",
             fix="Train on a configuration without base_motion.",
         )
@@ -110,7 +110,7 @@ def check_tcp_frame(source: EpisodeSource, number: int) -> None:
             "the frame of the actions is not known",
             where=episode.where,
             expected=f"{camera}, or the scene.json of robocas convert",
-            fix="robocas import-robocas makes a dataset of it that tells.",
+            fix="robocas import-robocas makes a dataset of it with a known frame.",
         )
     turn = eef_turn(episode.camera_in_parent(camera))
     if turn:
@@ -119,5 +119,5 @@ def check_tcp_frame(source: EpisodeSource, number: int) -> None:
             where=source.root,
             expected="ManiSkill's TCP",
             found=f"one that is turned by {-turn} degrees about z",
-            fix="robocas import-robocas, without --no-turn-eef, makes a dataset of it that is.",
+            fix="robocas import-robocas, without --no-turn-eef, turns them.",
         )

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.baselines.registry import find_baseline
-from robocas_ms3.baselines.training.record import BUNDLED, RUN, WEIGHTS, RunRecord, hash_weights, read_run
+from robocas_ms3.baselines.training.record import BUNDLED, RUN, WEIGHTS, hash_weights, read_run
 from robocas_ms3.core.errors import TrainingError
 from robocas_ms3.core.strict import parse
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, Policy, PolicySpec
@@ -43,20 +43,28 @@ class RunPolicy:
                 where=folder,
                 expected=baseline.version,
                 found=record.version,
-                fix="Train anew, or use the release that it was trained with.",
+                fix="Train again, or use the release that it was trained with.",
             )
         config = parse(baseline.Config, record.config, TrainingError, where=folder / RUN)
-        chosen = device if device != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
-        expected = {"baseline": record.baseline, "version": str(record.version), "dataset": record.data.hash}
-        tensors, about = checkpoints.load(folder / WEIGHTS, expected)
+        weights = checkpoints.load(folder / WEIGHTS, record.metadata)
+        if device == "auto":
+            device = "cuda" if torch.cuda.is_available() else "cpu"
         with _damaged_facts(folder / RUN):
             model = baseline.model(config, record.facts)
-        checkpoints.load_weights(model, tensors, folder / WEIGHTS)
-        model = model.to(chosen).eval()
+        weights.load_model(model)
+        model = model.to(device).eval()
         with _damaged_facts(folder / RUN):
             self._policy: Policy = baseline.policy(config, record.facts, model)
-        step = checkpoints.read_step(about, folder / WEIGHTS)
-        self._about = {**_describe(record, step), "weights": hash_weights(folder)}
+        self._about = {
+            "baseline": record.baseline,
+            "version": record.version,
+            "steps": weights.step,
+            "data": record.data.model_dump(),
+            "config": record.config,
+            "start": record.start,
+            "trained_with": record.versions,
+            "weights": hash_weights(folder),
+        }
 
     @property
     def spec(self) -> PolicySpec:
@@ -65,8 +73,7 @@ class RunPolicy:
 
     def describe(self) -> dict[str, Any]:
         """Return what results record about the policy: baseline, data, steps and weights."""
-        more = getattr(self._policy, "describe", dict)
-        return {**self._about, **more()}
+        return {**self._about, **getattr(self._policy, "describe", dict)()}
 
     def reset(self, starts: list[EpisodeSpec]) -> None:
         """Start episodes."""
@@ -86,15 +93,3 @@ def _damaged_facts(path: Path) -> Iterator[None]:
         found = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         what = "no network can be built from this configuration and these facts"
         raise TrainingError(what, where=path, found=found) from error
-
-
-def _describe(record: RunRecord, step: int) -> dict[str, Any]:
-    return {
-        "baseline": record.baseline,
-        "version": record.version,
-        "steps": step,
-        "data": record.data.model_dump(),
-        "config": record.config,
-        "start": record.start,
-        "trained_with": record.versions,
-    }

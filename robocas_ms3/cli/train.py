@@ -137,7 +137,7 @@ DEFAULT = "small"
 def train(baseline: str, cfg: Training, data: Path | None) -> int:
     """Train a baseline, with a progress bar."""
     from robocas_ms3.baselines.training.record import find_run
-    from robocas_ms3.baselines.training.session import Progress, train_run
+    from robocas_ms3.baselines.training.session import Progress, RunOptions, train_run
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.terminal import say
 
@@ -151,8 +151,16 @@ def train(baseline: str, cfg: Training, data: Path | None) -> int:
 
         first = os.environ.get("RANK", "0") == "0"  # one of several processes writes to the terminal
         progress = Progress(stepping.note, reading.at, step) if first else Progress()
-        options: dict[str, Any] = {"start": start, "device": cfg.device, "overwrite": cfg.overwrite}
-        train_run(baseline, data, out.absolute(), changes_of(cfg), progress=progress, **options)
+        options = RunOptions(
+            baseline,
+            data,
+            out.absolute(),
+            changes_of(cfg),
+            start=start,
+            device=cfg.device,
+            overwrite=cfg.overwrite,
+        )
+        train_run(options, progress)
     if first:
         say(f"{out}: trained. Next: robocas eval TASK --policy {out} --protocol {'paper-v1' if data else 'P'}")
     return 0

@@ -17,10 +17,9 @@ from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.sources.protocol import EpisodeSource, Kind
 from robocas_ms3.demos.ledger import Failure
 from robocas_ms3.demos.recordings.seeds import one_seed
-from robocas_ms3.viewer import damage
-from robocas_ms3.viewer.damage import attempt, readable, together
+from robocas_ms3.viewer.damage import attempt, join_reasons, read_scene, readable
 from robocas_ms3.viewer.episode import facts_of, rounded, show_arrays
-from robocas_ms3.viewer.pictures import Picture, encode_jpeg
+from robocas_ms3.viewer.images import EncodedImage, encode_jpeg
 from robocas_ms3.viewer.table import Failures, Row, describe, stages
 
 CAMERA_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,79}")
@@ -31,6 +30,12 @@ class PageContent:
     """Episodes as the page shows them, for several threads. Damaged values are left out, and the row says so.
 
     Subclasses add what a format has beyond `EpisodeSource`.
+
+    Args:
+        source: reader of the episodes.
+        kind: name of its format, for people.
+        notes: remarks on the dataset, for people.
+        split: ``train`` or ``val`` by episode; None: as the source says.
     """
 
     scene_name = schema.SCENE_FILE
@@ -41,14 +46,6 @@ class PageContent:
     def __init__(
         self, source: EpisodeSource, kind: str, *, notes: Sequence[str] = (), split: Mapping[int, str] | None = None
     ) -> None:
-        """Show a source.
-
-        Args:
-            source: reader of the episodes.
-            kind: name of its format, for people.
-            notes: remarks on the dataset, for people.
-            split: ``train`` or ``val`` by episode; None: as the source says.
-        """
         self.root, self.source, self._kind, self._split = source.root, source, kind, split
         self.failures = Failures.read(self.root if self.root.is_dir() else self.root.parent)
         self._note = " ".join(filter(None, (*notes, self.failures.note)))
@@ -88,24 +85,21 @@ class PageContent:
             if shown["steps"] < 1:
                 raise DatasetError("this episode has no steps", where=where)
             return {
+                **shown,
                 "n": number,
-                "instruction": shown["instruction"],
-                "steps": shown["steps"],
                 "times": rounded(np.arange(shown["steps"]) / self.source.rate_hz),
-                "subgoals": shown["subgoals"],
                 "plots": [one for one in shown["plots"] if one["series"]],
-                "trace": shown["trace"],
                 "facts": {name: value for name, value in shown["facts"].items() if value not in (None, "", {}, [])},
                 "failures": describe(self._failures(scene), scene.get("recorded") or {}),
             }
 
-    def rgb(self, number: int, camera: str, step: int) -> Picture:
+    def rgb(self, number: int, camera: str, step: int) -> EncodedImage:
         """Return an image, as it is stored if it is stored encoded.
 
         Raises:
             DatasetError: there is none.
         """
-        return encode_jpeg(self._picture(number, camera, "rgb", step))
+        return encode_jpeg(self._image(number, camera, "rgb", step))
 
     def depth(self, number: int, camera: str, step: int) -> NDArray[np.uint16]:
         """Return (H, W) depth in mm; 0: no measurement.
@@ -113,12 +107,12 @@ class PageContent:
         Raises:
             DatasetError: there is none.
         """
-        return self._picture(number, camera, "depth", step)
+        return self._image(number, camera, "depth", step)
 
     def _row(self, number: int, steps: int, split: str) -> tuple[Row, Any]:
         """Return the row of an episode, and its environment as far as it is known."""
         scene, wrong = self._scene(number)
-        entry, wrong_entry = self._entry(number)
+        entry, wrong_entry = read_scene(lambda: self._entry(number), self.entry_name)
         wrong_steps = ""
         if steps < 1:
             steps, wrong_steps = attempt(lambda: self.source.episode(number).steps, 0)
@@ -137,23 +131,19 @@ class PageContent:
             split=split,
             stages=stages(self._failures(scene), recorded),
             attempts=recorded.get("attempts"),
-            damage=together(wrong, wrong_entry, wrong_steps),
+            damage=join_reasons(wrong, wrong_entry, wrong_steps),
         )
         return row, scene.get("env_info")
 
     def _scene(self, number: int) -> tuple[dict[str, Any], str]:
         """Return the valid values of how an episode was made, and what is wrong with the others."""
-        return damage.scene(lambda: self.source.episode(number).scene, self.scene_name)
+        return read_scene(lambda: self.source.episode(number).scene, self.scene_name)
 
-    def _entry(self, number: int) -> tuple[dict[str, Any], str]:
-        """Return what the overview of the dataset says of an episode, and what is wrong with it."""
-
-        def read() -> Any:
-            entry = self.source.entry(number)
-            known = ("seed", "success", "target")
-            return {key: entry[key] for key in known if key in entry} if isinstance(entry, Mapping) else entry
-
-        return damage.scene(read, self.entry_name)
+    def _entry(self, number: int) -> Any:
+        """Return what the overview of the dataset says of an episode."""
+        entry = self.source.entry(number)
+        known = ("seed", "success", "target")
+        return {key: entry[key] for key in known if key in entry} if isinstance(entry, Mapping) else entry
 
     def _sides(self) -> Mapping[int, str]:
         if self._split is not None:
@@ -167,10 +157,10 @@ class PageContent:
         return self.failures.of_seed(one_seed(scene.get("seed")), scene.get("env_info"))
 
     def _show(self, number: int, scene: Mapping[str, Any]) -> dict[str, Any]:
-        """Return what is shown of an episode, see `show_motion`; may replace ``facts``."""
+        """Return what is shown of an episode, see `show_arrays`; may replace ``facts``."""
         return show_arrays(self.source.episode(number).arrays, scene)
 
-    def _picture(self, number: int, camera: str, kind: Kind, step: int) -> NDArray:
+    def _image(self, number: int, camera: str, kind: Kind, step: int) -> NDArray:
         """Return a decoded image."""
         with readable(f"{self.root.name}, episode {number}"), self._reading:
             episode = self.source.episode(number)

@@ -1,4 +1,4 @@
-"""Reads what may be damaged: what can be used of it, and what is wrong with the rest, in words for people."""
+"""Read what may be damaged: what can be used of it, and what is wrong with the rest, for people."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from robocas_ms3.datasets.sources.records import RateRecord
 
 T = TypeVar("T")
 _WRONG = (*DAMAGED, ArithmeticError, AttributeError, AssertionError, LookupError, RecursionError, TypeError)
-"""What comes of values of another kind than expected."""
+"""Errors that values of another kind than expected raise."""
 
 
 @contextmanager
 def readable(where: object) -> Iterator[None]:
-    """Turn whatever damage may raise into an error that says where it is.
+    """Turn any error that damage may raise into one that says where it is.
 
     Raises:
         DatasetError: something could not be read.
@@ -35,7 +35,7 @@ def readable(where: object) -> Iterator[None]:
 
 
 def attempt(read: Callable[[], T], otherwise: T) -> tuple[T, str]:
-    """What can be read and nothing, else the other value and what is wrong."""
+    """Return the result and an empty text; if it can't be read, the other value and what is wrong."""
     try:
         with readable(""):
             return read(), ""
@@ -44,21 +44,21 @@ def attempt(read: Callable[[], T], otherwise: T) -> tuple[T, str]:
 
 
 def reason(error: DatasetError) -> str:
-    """What an error says of what is wrong, without where."""
+    """Return what is wrong according to an error, without the place."""
     return f"{error.what}, {error.found}" if str(error.found) else error.what
 
 
-def together(*said: str) -> str:
-    """What is wrong, each thing once."""
-    kept: list[str] = []
-    for text in said:
-        if not any(text in other for other in kept):
-            kept.append(text)
-    return "; ".join(filter(None, kept))
+def join_reasons(*reasons: str) -> str:
+    """Return all that is wrong, each thing once."""
+    different: list[str] = []
+    for text in reasons:
+        if not any(text in other for other in different):
+            different.append(text)
+    return "; ".join(filter(None, different))
 
 
-def table(read: Callable[[], Any], name: str) -> tuple[dict[Any, Any], str]:
-    """A JSON object of a dataset; empty where it is damaged, with the reason."""
+def read_object(read: Callable[[], Any], name: str) -> tuple[dict[Any, Any], str]:
+    """Return a JSON object of a dataset, and a note; an empty object if it is damaged."""
     try:
         with readable(name):
             found = read()
@@ -67,29 +67,29 @@ def table(read: Callable[[], Any], name: str) -> tuple[dict[Any, Any], str]:
     return (found, "") if isinstance(found, dict) else ({}, f"`{name}` is damaged: it holds no object.")
 
 
-def scene(read: Callable[[], Any], name: str) -> tuple[dict[str, Any], str]:
-    """A ``scene.json``, or what else has some of its keys, without the values that are wrong, and those in words."""
+def read_scene(read: Callable[[], Any], name: str) -> tuple[dict[str, Any], str]:
+    """Return the valid values of a ``scene.json``, or of what has some of its keys, and what is wrong with the rest."""
     (found, wrong), failed = attempt(lambda: sound(read(), name), ({}, ""))
     return found, f"{name}: {failed}" if failed else wrong
 
 
 def rate_of(settings: Mapping[str, Any], name: str, default: float) -> tuple[float, str]:
-    """Steps a second, and what is wrong with what the settings say of it."""
+    """Return the steps per second of the settings, and a note; the default if they are damaged."""
     wrong = check_form(RateRecord, settings, "")
     if not wrong:
         return float(settings["rate_hz"]), ""
-    said = f"`rate_hz` of `{name}`: expected {wrong[0].expected}, found {wrong[0].found}; {default:g} Hz is assumed."
-    return default, said if "rate_hz" in settings else ""
+    note = f"`rate_hz` of `{name}`: expected {wrong[0].expected}, found {wrong[0].found}; {default:g} Hz is assumed."
+    return default, note if "rate_hz" in settings else ""
 
 
 def split_of(info: Mapping[str, Any]) -> dict[int, str]:
-    """Side of each episode that a dataset lists, "train" or "val"; the others are on neither."""
+    """Return the side of each episode that a dataset lists, "train" or "val"."""
     sides = {side: info.get(f"{side}_eps") for side in ("train", "val")}
     return {n: side for side, listed in sides.items() if isinstance(listed, list) for n in listed if type(n) is int}
 
 
 def without_nan(value: Any) -> Any:
-    """The same with None where a number is not finite, as JSON knows no other."""
+    """Return JSON values with None for NaN and infinite numbers."""
     if isinstance(value, dict):
         return {key: without_nan(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -12,68 +12,69 @@ from scipy.spatial.transform import Rotation
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import from_xyzw
 from robocas_ms3.core.words import called
-from robocas_ms3.demos.recordings.subgoals import SubGoal, subgoal_runs
+from robocas_ms3.demos.recordings.subgoals import subgoal_runs
 
 XYZ = ("x", "y", "z")
 ROLL_PITCH_YAW = ("roll", "pitch", "yaw")
 ARM = tuple(f"j{i}" for i in range(1, 8))
 _OPEN_WIDTH = 0.08  # m
-NEEDED = (
+_NEEDED = (
     *("ee_pos", "ee_orn", "base_pos", "base_orn", "rel_pos", "rel_orn", "robot_joints", "gripper_width"),
     *("step_goal_type", "step_lang_goals"),
 )
-"""Arrays that an episode must have to be shown."""
+
+Plot = dict[str, Any]
 
 
-def show_arrays(a: Mapping[str, NDArray], scene: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what is shown of the arrays of an episode; objects where they were at the start.
+def show_arrays(
+    a: Mapping[str, NDArray],
+    scene: Mapping[str, Any],
+    *,
+    actions: list[Plot] | None = None,
+    moving: list[dict[str, Any]] | None = None,
+) -> dict[str, Any]:
+    """Return what is shown of the arrays of an episode.
 
     Args:
         a: arrays by the keys of the schema.
         scene: ``scene.json`` without invalid values; empty without such a file.
+        actions: plots of the recorded actions; None: of the motion of the TCP.
+        moving: objects as {name, target, path}, with paths in the world (T, 3), or (1, 3) of one that does not move;
+            None: where they were at the start, according to the scene.
 
     Raises:
         DatasetError: an array is missing.
         ValueError: arrays have different lengths.
     """
-    missing = sorted(set(NEEDED) - set(a))
+    missing = sorted(set(_NEEDED) - set(a))
     if missing:
         found = f"without {', '.join(missing)}"
         raise DatasetError("this episode can't be read", found=found, fix="robocas validate says what is wrong.")
-    lengths = {len(a[key]) for key in NEEDED}
+    lengths = {len(a[key]) for key in _NEEDED}
     if len(lengths) > 1:
         raise ValueError(f"arrays of different lengths: {sorted(lengths)}")
-    turns = np.degrees(Rotation.from_quat(a["rel_orn"]).as_euler("xyz"))
-    actions = [
-        plot("Action: TCP translation a step", "mm", XYZ, a["rel_pos"] * 1000),
-        plot("Action: TCP rotation a step", "deg", ROLL_PITCH_YAW, turns),
-    ]
+    if actions is None:
+        turns = np.degrees(Rotation.from_quat(a["rel_orn"]).as_euler("xyz"))
+        actions = [
+            plot("Action: TCP translation a step", "mm", XYZ, a["rel_pos"] * 1000),
+            plot("Action: TCP rotation a step", "deg", ROLL_PITCH_YAW, turns),
+        ]
     goals = subgoal_runs([str(v) for v in a["step_goal_type"]], [str(v) for v in a["step_lang_goals"]])
-    return show_motion(a, goals, actions, _objects(scene), moving=False)
-
-
-def show_motion(
-    a: Mapping[str, NDArray], goals: Sequence[SubGoal], actions: list[dict], objects: list[dict], *, moving: bool
-) -> dict[str, Any]:
-    """Return what is shown of the motion of the robot and of the objects.
-
-    Args:
-        a: arrays by the keys of the schema.
-        goals: sub-goals over the steps.
-        actions: plots of the actions.
-        objects: {name, target, path}: path in the world (T, 3), or (1, 3) of an object that does not move.
-        moving: whether the motion of the objects is known.
-    """
     base = from_xyzw(a["base_pos"].astype(float), a["base_orn"].astype(float))
     tcp = base @ from_xyzw(a["ee_pos"].astype(float), a["ee_orn"].astype(float))
-    is_open = a.get("gripper_status")
+    objects = _objects(scene) if moving is None else moving
     return {
         "instruction": str(a.get("language_goal", "")),
         "steps": len(a["ee_pos"]),
-        "subgoals": [_goal(goal) for goal in goals],
+        "subgoals": [
+            {"type": goal.goal_type, "text": goal.goal_description, "first": goal.first, "last": goal.last}
+            for goal in goals
+        ],
         "plots": [
-            *motion_plots(a["ee_pos"], a["ee_orn"], a["robot_joints"]),
-            gripper_plot(a["gripper_width"], None if is_open is None else np.asarray(is_open, bool)),
+            plot("TCP position, arm base", "m", XYZ, a["ee_pos"]),
+            plot("TCP orientation, arm base", "quaternion", ("x", "y", "z", "w"), continuous(a["ee_orn"])),
+            plot("Arm joints", "rad", ARM, a["robot_joints"]),
+            gripper_plot(a["gripper_width"], a.get("gripper_status")),
             *actions,
             *(base_plot(a["agv_pose"]) if "agv_pose" in a else []),
         ],
@@ -81,22 +82,17 @@ def show_motion(
             "tcp": rounded(tcp[:, :3, 3]),
             "approach": rounded(tcp[:, :3, 2]),
             "objects": [{**thing, "path": rounded(thing["path"])} for thing in objects],
-            "moving": moving,
+            "moving": moving is not None,
         },
     }
-
-
-def _goal(goal: SubGoal) -> dict[str, Any]:
-    return {"type": goal.goal_type, "text": goal.goal_description, "first": goal.first, "last": goal.last}
 
 
 def _objects(scene: Mapping[str, Any]) -> list[dict[str, Any]]:
     layout, target = scene.get("layout") or {}, (scene.get("target") or {}).get("slot")
     names = {thing["slot"]: called(thing["id"], thing["name"]) for thing in scene.get("objects") or ()}
-    poses = layout.get("poses") or ()
     found = [
         {"name": names[slot], "target": slot == target, "path": [pose[:3]]}
-        for slot, pose in enumerate(poses)
+        for slot, pose in enumerate(layout.get("poses") or ())
         if slot in names
     ]
     basket = layout.get("basket_pose")
@@ -119,42 +115,30 @@ def facts_of(scene: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def motion_plots(position: NDArray, xyzw: NDArray, arm_joints: NDArray) -> list[dict[str, Any]]:
-    """Plot the TCP pose and the joint positions.
-
-    Args:
-        position: (T, 3) m, TCP in the arm's base.
-        xyzw: (T, 4) quaternions, orientation of the TCP in that frame.
-        arm_joints: (T, 7) rad.
-    """
+def continuous(xyzw: NDArray) -> NDArray:
+    """Return quaternions (T, 4) of the same orientations, with signs that do not jump."""
     if len(xyzw) and xyzw[0][np.abs(xyzw[0]).argmax()] < 0:
         xyzw = -xyzw
-    # q and -q are the same orientation: choose signs without jumps
     flips = np.cumsum(np.sum(xyzw[1:] * xyzw[:-1], axis=1) < 0) % 2
-    xyzw = np.concatenate([xyzw[:1], xyzw[1:] * np.where(flips, -1, 1)[:, None]])
-    return [
-        plot("TCP position, arm base", "m", XYZ, position),
-        plot("TCP orientation, arm base", "quaternion", ("x", "y", "z", "w"), xyzw),
-        plot("Arm joints", "rad", ARM, arm_joints),
-    ]
+    return np.concatenate([xyzw[:1], xyzw[1:] * np.where(flips, -1, 1)[:, None]])
 
 
-def gripper_plot(width: NDArray, is_open: NDArray | None) -> dict[str, Any]:
+def gripper_plot(width: NDArray, is_open: NDArray | None) -> Plot:
     """Plot the width in mm, and the command as the commanded width."""
-    if is_open is None:
-        return plot("Gripper", "mm", ("width",), np.ravel(width)[:, None] * 1000)
-    command = np.where(is_open, _OPEN_WIDTH, 0.0)
-    return plot("Gripper", "mm", ("width", "command"), np.column_stack([width, command]) * 1000)
+    columns = {"width": np.ravel(width)}
+    if is_open is not None:
+        columns["command"] = np.where(np.asarray(is_open, bool), _OPEN_WIDTH, 0.0)
+    return plot("Gripper", "mm", list(columns), np.column_stack(list(columns.values())) * 1000)
 
 
-def base_plot(pose: NDArray) -> list[dict[str, Any]]:
+def base_plot(pose: NDArray) -> list[Plot]:
     """Plot the pose of the mobile base (T, 3): x, y in m, yaw in rad. No plot if it does not move."""
     pose = np.column_stack([pose[:, :2], np.unwrap(pose[:, 2])])
     moves = len(pose) > 0 and np.ptp(pose, axis=0).max() > 1e-3
     return [plot("Mobile base, world", "m, rad", ("x", "y", "yaw"), pose)] if moves else []
 
 
-def plot(title: str, unit: str, names: Sequence[str], values: NDArray, *, steps: bool = False) -> dict[str, Any]:
+def plot(title: str, unit: str, names: Sequence[str], values: NDArray, *, steps: bool = False) -> Plot:
     """Return a plot of (T, N) values; ``steps`` draws each value until the next one."""
     columns = np.atleast_2d(np.asarray(values, float).T)
     series = [{"name": name, "values": rounded(column)} for name, column in zip(names, columns, strict=True)]

@@ -1,4 +1,4 @@
-"""Writes the viewer as a folder that opens from disk, without a server."""
+"""Write the viewer as a folder that opens from disk, without a server."""
 
 from __future__ import annotations
 
@@ -9,14 +9,10 @@ from typing import Any
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import make_folder, replacing_folder
-from robocas_ms3.viewer import pictures
 from robocas_ms3.viewer.content import PageContent
-from robocas_ms3.viewer.damage import readable, reason, together
-from robocas_ms3.viewer.pictures import Picture
+from robocas_ms3.viewer.damage import join_reasons, readable, reason
+from robocas_ms3.viewer.images import EncodedImage, depth_image, shrink_image
 from robocas_ms3.viewer.routes import PAGE_FILES, make_thumbnail, page_file, script
-
-WIDTH = 480
-"""Pixels of a written picture; a static page is for sharing, so it is kept small."""
 
 
 def export(
@@ -24,27 +20,25 @@ def export(
     out: Path,
     *,
     episodes: Sequence[int] = (),
-    width: int = WIDTH,
+    width: int = 480,
     depth: bool = True,
-    on_episode: Callable[[int, int], None] = lambda done, all: None,
+    on_episode: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[int, dict[int, str]]:
-    """Write ``index.html`` and all it needs.
-
-    What is damaged is left out; the table of the page says so.
+    """Write ``index.html`` and all it needs. Damaged values are left out; the table of the page says so.
 
     Args:
         source: what to show.
-        out: folder; one that exists is replaced whole, so the caller makes sure that it may be.
+        out: folder; an existing one is replaced, so the caller makes sure that it may be.
         episodes: numbers; default: all.
-        width: of the pictures, pixels.
+        width: of the images, pixels.
         depth: whether depth is written too.
-        on_episode: told (done, all).
+        on_episode: called with the number of episodes written, and of all.
 
     Returns:
-        The number of episodes, and of the damaged ones, what is wrong.
+        The number of episodes, and what is wrong with the damaged ones.
 
     Raises:
-        DatasetError: an episode that was asked for is not there.
+        DatasetError: an episode that was asked for does not exist.
     """
     index = source.index()
     known = [entry["n"] for entry in index["episodes"] if entry["n"] is not None]
@@ -52,27 +46,27 @@ def export(
     if missing:
         raise DatasetError("no such episode", where=source.root, expected=f"{known[:1]} to {known[-1:]}", found=missing)
     chosen = [number for number in known if not episodes or number in set(episodes)]
+    rows = [e for e in index["episodes"] if e["n"] in set(chosen) or (e["n"] is None and not episodes)]
     index = {**index, "depth": index["depth"] and depth}
-    index["episodes"] = [e for e in index["episodes"] if e["n"] in set(chosen) or (e["n"] is None and not episodes)]
+    damaged = {row["n"]: row["damage"] for row in rows if row["damage"]}
     with replacing_folder(out) as folder:
         for name in PAGE_FILES:
             target = folder / name if name == "index.html" else make_folder(folder / "page") / name
             target.write_bytes(page_file(name))
         make_folder(folder / "data")
-        damaged = {entry["n"]: entry["damage"] for entry in index["episodes"] if entry["damage"]}
         for done, number in enumerate(chosen):
             on_episode(done, len(chosen))
             wrong = _write_episode(source, index, number, folder, width)
             if wrong:
-                damaged[number] = together(damaged.get(number, ""), wrong)
-        index["episodes"] = [{**entry, "damage": damaged.get(entry["n"], "")} for entry in index["episodes"]]
+                damaged[number] = join_reasons(damaged.get(number, ""), wrong)
+        index["episodes"] = [{**row, "damage": damaged.get(row["n"], "")} for row in rows]
         (folder / "data" / "index.js").write_bytes(script("index", index))
         on_episode(len(chosen), len(chosen))
     return len(chosen), damaged
 
 
 def _write_episode(source: PageContent, index: dict[str, Any], number: int, folder: Path, width: int) -> str:
-    """Write one, and say what of it can't be read."""
+    """Write an episode, and return what of it can't be read."""
     lost = ""
     if index["cameras"]:
         lost = _write(folder / "thumbnails" / f"{number}.jpg", lambda: make_thumbnail(source, index, number))
@@ -81,23 +75,23 @@ def _write_episode(source: PageContent, index: dict[str, Any], number: int, fold
     except DatasetError as error:
         return reason(error)
     (folder / "data" / f"episode_{number}.js").write_bytes(script(f"episode_{number}", content))
-    make = {"rgb": lambda *place: pictures.shrunk(source.rgb(number, *place), width)}
+    make = {"rgb": lambda *place: shrink_image(source.rgb(number, *place), width)}
     if index["depth"]:
-        make["depth"] = lambda *place: pictures.depth_picture(source.depth(number, *place), width)
+        make["depth"] = lambda *place: depth_image(source.depth(number, *place), width)
     for camera in index["cameras"]:
         for step in range(content["steps"]):
-            for kind, picture in make.items():
+            for kind, image in make.items():
                 path = folder / "pictures" / str(number) / camera / kind / f"{step}.jpg"
-                lost = _write(path, partial(picture, camera, step)) or lost
+                lost = _write(path, partial(image, camera, step)) or lost
     return lost
 
 
-def _write(path: Path, make: Callable[[], Picture]) -> str:
-    """Write a picture, or say why there is none."""
+def _write(path: Path, make: Callable[[], EncodedImage]) -> str:
+    """Write an image, or return why there is none."""
     try:
         with readable(path.name):
-            picture = make()
+            image = make()
     except DatasetError as error:
         return f"pictures: {error.what}"
-    (make_folder(path.parent) / path.name).write_bytes(picture.data)
+    (make_folder(path.parent) / path.name).write_bytes(image.data)
     return ""

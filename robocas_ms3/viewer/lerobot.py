@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Mapping
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -15,37 +15,36 @@ from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.sources.protocol import Kind
 from robocas_ms3.viewer.content import PageContent
-from robocas_ms3.viewer.damage import readable, split_of, table
+from robocas_ms3.viewer.damage import read_object, readable, split_of
 from robocas_ms3.viewer.episode import plot
-from robocas_ms3.viewer.pictures import inside
+from robocas_ms3.viewer.images import check_inside
 
 _AT_ONCE = 8  # images decoded together: a video opens and seeks slowly, and the next step is asked for next
-_CACHED = 16  # such groups in memory: 118 MB at 640 x 480
+_CACHE_BYTES = 128e6  # of decoded images
 
 
 class LeRobotContent(PageContent):
-    """A dataset's folder; pictures are decoded from its videos."""
+    """The folder of a dataset; images are decoded from its videos.
+
+    Raises:
+        DatasetError: it is of another version, or damaged; damaged additions of ours are left out with a note.
+        MissingExtraError: pyarrow or av is missing.
+    """
 
     entry_name = schema.CONVERSION_FILE
 
     def __init__(self, root: Path) -> None:
-        """Open it; damaged additions of ours are left out, and the page says so.
-
-        Raises:
-            DatasetError: it is of another version, or damaged.
-            MissingExtraError: pyarrow or av is missing.
-        """
         with readable(root):
             self.dataset = dataset = LeRobotDataset(root)
             _ = dataset.is_ours, dataset.lengths, dataset.rate_hz, dataset.cameras, dataset.has_depth
-        dataset.settings, wrong_settings = table(lambda: dataset.settings, schema.CONVERSION_FILE)
-        dataset.described, wrong_scenes = table(lambda: dataset.described, schema.SCENES_FILE)
+        dataset.settings, wrong_settings = read_object(lambda: dataset.settings, schema.CONVERSION_FILE)
+        dataset.described, wrong_scenes = read_object(lambda: dataset.described, schema.SCENES_FILE)
         notes = wrong_scenes, wrong_settings
         super().__init__(dataset, "LeRobot dataset", notes=notes, split=split_of(dataset.settings))
-        self._decoded = lru_cache(maxsize=_CACHED)(self._decode)
+        self._decoded: OrderedDict[tuple[int, str, Kind, int], NDArray] = OrderedDict()  # the last used is last
 
     def _show(self, number: int, scene: Mapping[str, Any]) -> dict[str, Any]:
-        """As a RoboCAS folder is shown, or each numeric column as a plot."""
+        """Show ours like a RoboCAS folder, others by a plot per numeric column."""
         if self.dataset.is_ours:
             return super()._show(number, scene)
         episode = self.dataset.episode(number)
@@ -63,20 +62,25 @@ class LeRobotContent(PageContent):
             "facts": {"Robot": self.dataset.info.get("robot_type")},
         }
 
-    def _picture(self, number: int, camera: str, kind: Kind, step: int) -> NDArray:
-        if not 0 <= step < self.dataset.episode(number).steps:
+    def _image(self, number: int, camera: str, kind: Kind, step: int) -> NDArray:
+        episode = self.dataset.episode(number)
+        if not 0 <= step < episode.steps:
             raise DatasetError("no such step", where=f"{self.root}, episode {number}", found=step)
+        first = step - step % _AT_ONCE
+        key = number, camera, kind, first
         with self._reading:
-            return self._decoded(number, camera, kind, step // _AT_ONCE)[step % _AT_ONCE]
-
-    def _decode(self, number: int, camera: str, kind: Kind, group: int) -> list[NDArray]:
-        episode, first = self.dataset.episode(number), group * _AT_ONCE
-        inside(episode.video(camera, kind)[0], self.root)
-        return list(episode.frames(camera, kind, first, min(_AT_ONCE, episode.steps - first)))
+            if key not in self._decoded:
+                check_inside(episode.video(camera, kind)[0], self.root)
+                frames = episode.frames(camera, kind, first, min(_AT_ONCE, episode.steps - first))
+                self._decoded[key] = np.stack(list(frames))
+            self._decoded.move_to_end(key)
+            while len(self._decoded) > 1 and sum(images.nbytes for images in self._decoded.values()) > _CACHE_BYTES:
+                self._decoded.popitem(last=False)
+            return self._decoded[key][step - first]
 
 
 def _names(feature: dict[str, Any], width: int) -> list[str]:
-    """Names of a feature's numbers; datasets give a list, a dictionary of lists, or nothing."""
+    """Return the names of a feature's numbers; datasets have a list, a dictionary of lists, or nothing."""
     names = feature.get("names")
     if isinstance(names, dict):
         names = [str(word) for part in names.values() for word in (part if isinstance(part, list) else [part])]

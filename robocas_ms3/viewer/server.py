@@ -1,4 +1,4 @@
-"""Serves the viewer to browsers on this machine, and to nobody else."""
+"""Serve the viewer to browsers on this machine, and to nobody else."""
 
 from __future__ import annotations
 
@@ -23,21 +23,19 @@ _POLICY = "default-src 'self'; base-uri 'none'; form-action 'none'; frame-ancest
 class Viewer(ThreadingHTTPServer):
     """The server; use it in a ``with`` statement, and ``serve_forever``.
 
-    At its end all its threads have ended: one that the interpreter takes down inside OpenCV takes the process along.
+    All its threads end with it: the interpreter would crash if it ended one inside OpenCV.
+
+    Args:
+        source: what to show.
+        port: of 127.0.0.1; 0 takes a free one.
+
+    Raises:
+        RobocasError: the port is taken.
     """
 
     daemon_threads = False
 
     def __init__(self, source: PageContent, port: int = 0) -> None:
-        """Take a port of 127.0.0.1.
-
-        Args:
-            source: what to show.
-            port: 0 takes a free one.
-
-        Raises:
-            RobocasError: the port is taken.
-        """
         self.routes = Routes(source)
         self._connections: set[Any] = set()
         self._warming = threading.Thread(target=self.routes.respond, args=("/data/index.js",), daemon=True)
@@ -50,7 +48,7 @@ class Viewer(ThreadingHTTPServer):
 
     @property
     def url(self) -> str:
-        """Where the page is."""
+        """Address of the page."""
         return f"http://{HOST}:{self.server_port}/"
 
     def warm_up(self) -> None:
@@ -58,28 +56,28 @@ class Viewer(ThreadingHTTPServer):
         self._warming.start()
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Note the connection, which a browser keeps open; refuse it where there are too many, as each has a thread."""
+        """Keep the connection, which a browser keeps open; refuse too many, as each has a thread."""
         if len(self._connections) >= MAX_CONNECTIONS:
             return self.shutdown_request(request)
         self._connections.add(request)
         super().process_request(request, client_address)
 
     def shutdown_request(self, request: Any) -> None:
-        """Forget it."""
+        """Forget the connection."""
         self._connections.discard(request)
         super().shutdown_request(request)
 
     def server_close(self) -> None:
-        """End: cut the connections, and wait for what is being answered."""
+        """Cut the connections, and wait for responses that are being made."""
         for connection in list(self._connections):
             with suppress(OSError):
                 connection.shutdown(socket.SHUT_RDWR)
         super().server_close()
         if self._warming.is_alive():
-            self._warming.join(5.0)  # an index takes a second or so
+            self._warming.join(5.0)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Say nothing of browsers that went away."""
+        """Ignore browsers that went away."""
         error = sys.exc_info()[1]
         if error is not None and not isinstance(error, ConnectionError | TimeoutError):
             print_traceback(type(error), error, error.__traceback__)
@@ -99,23 +97,18 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _answer(self, *, body: bool) -> None:
         assert isinstance(self.server, Viewer)
-        # A page elsewhere whose name was made to point here (DNS rebinding) must not read the dataset.
-        allowed = {f"{name}:{self.server.server_port}" for name in (HOST, "localhost")}
-        if self.headers.get("Host") not in allowed:
-            response = Response(403, "text/plain; charset=utf-8", b"for this machine only\n")
-        else:
-            try:
-                response = self.server.routes.respond(urlsplit(self.path).path)
-            except Exception as error:  # a broken episode must not end the connection of all others
-                text = printable(f"{type(error).__name__}: {error}") + "\n"
-                response = Response(500, "text/plain; charset=utf-8", text.encode())
+        response = self._respond(self.server)
+        headers = {
+            "Content-Type": response.media_type,
+            "Content-Length": str(len(response.data)),
+            "Cache-Control": f"max-age={response.max_age}" if response.max_age else "no-cache",
+            "Content-Security-Policy": _POLICY,
+            "X-Content-Type-Options": "nosniff",
+            "Cross-Origin-Resource-Policy": "same-origin",
+        }
         self.send_response(response.status)
-        self.send_header("Content-Type", response.kind)
-        self.send_header("Content-Length", str(len(response.data)))
-        self.send_header("Cache-Control", f"max-age={response.keep_s}" if response.keep_s else "no-cache")
-        self.send_header("Content-Security-Policy", _POLICY)
-        self.send_header("X-Content-Type-Options", "nosniff")
-        self.send_header("Cross-Origin-Resource-Policy", "same-origin")
+        for name, value in headers.items():
+            self.send_header(name, value)
         self.end_headers()
         if body:
             try:
@@ -123,5 +116,15 @@ class _Handler(BaseHTTPRequestHandler):
             except (BrokenPipeError, ConnectionResetError):
                 self.close_connection = True  # the browser moved on to another step
 
+    def _respond(self, server: Viewer) -> Response:
+        # A page elsewhere whose name was made to point here (DNS rebinding) must not read the dataset.
+        if self.headers.get("Host") not in {f"{name}:{server.server_port}" for name in (HOST, "localhost")}:
+            return Response(403, "text/plain; charset=utf-8", b"for this machine only\n")
+        try:
+            return server.routes.respond(urlsplit(self.path).path)
+        except Exception as error:  # a broken episode must not end the connection of all others
+            text = printable(f"{type(error).__name__}: {error}") + "\n"
+            return Response(500, "text/plain; charset=utf-8", text.encode())
+
     def log_message(self, format: str, *args: object) -> None:
-        """Say nothing: thousands of pictures are no news."""
+        """Log nothing: a page asks for thousands of images."""

@@ -2,56 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.poses import from_xyzw, inverse, transform
+from robocas_ms3.core.words import called
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.formats import format_of
 from robocas_ms3.datasets.pictures.headers import read_picture_bytes
+from robocas_ms3.datasets.sources.provenance import task_of, unread_entry
 from robocas_ms3.datasets.sources.reader import DEFAULT_RATE, Dataset
+from robocas_ms3.datasets.sources.trajectory import TrajectorySource
+from robocas_ms3.demos.recordings.reading import Recording, TrajectoryFile
 from robocas_ms3.viewer.content import PageContent
-from robocas_ms3.viewer.damage import attempt, rate_of, split_of, table
-from robocas_ms3.viewer.pictures import Picture, inside
-from robocas_ms3.viewer.trajectory import TrajectoryContent
+from robocas_ms3.viewer.damage import attempt, rate_of, read_object, readable, split_of
+from robocas_ms3.viewer.episode import ARM, ROLL_PITCH_YAW, XYZ, Plot, facts_of, plot, show_arrays
+from robocas_ms3.viewer.images import EncodedImage, check_inside
 
 MEDIA_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".webp": "image/webp"}
-
-
-class FolderContent(PageContent):
-    """A RoboCAS folder, of this package or of RoboCAS-v0; images are sent as they are stored."""
-
-    def __init__(self, root: Path) -> None:
-        """Open it.
-
-        Raises:
-            DatasetError: there are no episodes.
-        """
-        self.dataset = dataset = Dataset(root)
-        # damaged values of the overviews are left out from here on
-        dataset.settings, wrong_settings = table(lambda: dataset.settings, schema.CONVERSION_FILE)
-        dataset.info, wrong_info = table(lambda: dataset.info, schema.DATA_INFO_FILE)
-        dataset.rate_hz, wrong_rate = rate_of(dataset.settings, schema.CONVERSION_FILE, DEFAULT_RATE)
-        dataset.cameras, _ = attempt(lambda: dataset.cameras, dataset.episode(dataset.numbers[0]).cameras)
-        notes = wrong_settings, wrong_rate, wrong_info
-        super().__init__(dataset, "RoboCAS folder", notes=notes, split=split_of(dataset.info))
-
-    def rgb(self, number: int, camera: str, step: int) -> Picture:
-        """Return the file of an image, not decoded."""
-        path = inside(self.dataset.episode(number).image_path(camera, "rgb", step), self.root)
-        try:
-            return Picture(MEDIA_TYPES[path.suffix], read_picture_bytes(path))
-        except (OSError, ValueError) as error:
-            found = getattr(error, "strerror", None) or error
-            raise DatasetError("can't read this picture", where=path, found=found) from error
-
-    def depth(self, number: int, camera: str, step: int) -> NDArray[np.uint16]:
-        """Return (H, W) depth in mm; 0: no measurement."""
-        episode = self.dataset.episode(number)
-        inside(episode.image_path(camera, "depth", step), self.root)
-        return episode.depth(camera, step)
+_NO_IMAGES = (
+    "A trajectory file holds states, no pictures: `robocas convert {name} --to robocas --out DIR` renders them."
+)
+_STILL = 0.002  # m: an object that moves less is drawn as one point
+_PARKED = 5.0  # m from the arm: objects there take no part
 
 
 def open_source(path: Path | str) -> PageContent:
@@ -81,3 +59,102 @@ def open_source(path: Path | str) -> PageContent:
 
         return LeRobotContent(path)
     return PageContent(found.part("reader")(path), found.title)
+
+
+class FolderContent(PageContent):
+    """A RoboCAS folder, of this package or of RoboCAS-v0; images are sent as they are stored.
+
+    Raises:
+        DatasetError: there are no episodes.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.dataset = dataset = Dataset(root)
+        # damaged values of the overviews are left out from here on
+        dataset.settings, wrong_settings = read_object(lambda: dataset.settings, schema.CONVERSION_FILE)
+        dataset.info, wrong_info = read_object(lambda: dataset.info, schema.DATA_INFO_FILE)
+        dataset.rate_hz, wrong_rate = rate_of(dataset.settings, schema.CONVERSION_FILE, DEFAULT_RATE)
+        dataset.cameras, _ = attempt(lambda: dataset.cameras, dataset.episode(dataset.numbers[0]).cameras)
+        notes = wrong_settings, wrong_rate, wrong_info
+        super().__init__(dataset, "RoboCAS folder", notes=notes, split=split_of(dataset.info))
+
+    def rgb(self, number: int, camera: str, step: int) -> EncodedImage:
+        """Return the file of an image, not decoded."""
+        path = check_inside(self.dataset.episode(number).image_path(camera, "rgb", step), self.root)
+        try:
+            return EncodedImage(MEDIA_TYPES[path.suffix], read_picture_bytes(path))
+        except (OSError, ValueError) as error:
+            found = getattr(error, "strerror", None) or error
+            raise DatasetError("can't read this picture", where=path, found=found) from error
+
+    def depth(self, number: int, camera: str, step: int) -> NDArray[np.uint16]:
+        """Return (H, W) depth in mm; 0: no measurement."""
+        episode = self.dataset.episode(number)
+        check_inside(episode.image_path(camera, "depth", step), self.root)
+        return episode.depth(camera, step)
+
+
+class TrajectoryContent(PageContent):
+    """A trajectory file at its control frequency: no images, but recorded actions and the motion of the objects.
+
+    Raises:
+        DatasetError: a file is missing, damaged, or they do not match.
+    """
+
+    scene_name = entry_name = "its entry of the JSON"
+
+    def __init__(self, path: Path) -> None:
+        with readable(path):
+            with TrajectoryFile(path) as file:
+                task = task_of(file.env_info["env_id"])
+                self._entries = [{"task": task, **unread_entry(file, index)} for index in range(len(file.episodes))]
+            self.recordings = TrajectorySource(path, rate_hz=file.control_freq, include_failed=True)
+        super().__init__(self.recordings, "trajectory file", notes=[_NO_IMAGES.format(name=path.name)], split={})
+
+    def _entry(self, number: int) -> dict[str, Any]:
+        """Return what is known of an episode even if its recording is damaged."""
+        return {key: self._entries[number][key] for key in ("task", "seed", "success", "target")}
+
+    def _show(self, number: int, scene: Mapping[str, Any]) -> dict[str, Any]:
+        episode = self.recordings.episode(number)
+        recording, arrays = episode.recording(), episode.arrays
+        base = from_xyzw(arrays["base_pos"][:1].astype(float), arrays["base_orn"][:1].astype(float))[0]
+        objects = _object_paths(recording, scene, self.recordings.info(number).objects, base)
+        shown = show_arrays(arrays, scene, actions=_action_plots(recording), moving=objects)
+        return {**shown, "facts": facts_of({**scene, "source": None})}  # which is this file
+
+
+def _action_plots(recording: Recording) -> list[Plot]:
+    """Plot recorded actions: arm, gripper, and base if it moves. The last state has none; it shows the one before."""
+    values = np.concatenate([recording.actions, recording.actions[-1:]])
+    arm = {7: 6, 8: 7, 10: 6, 11: 7}.get(values.shape[1])  # 6: end-effector deltas
+    if arm is None:
+        return [plot("Actions", "", [f"a{i + 1}" for i in range(values.shape[1])], values, steps=True)]
+    names = ARM if arm == 7 else (*XYZ, *ROLL_PITCH_YAW)
+    unit = "rad" if recording.control_mode == "pd_joint_pos" else ""
+    plots = [
+        plot(f"Action: arm, {recording.control_mode}", unit, names, values[:, :arm], steps=True),
+        plot("Action: gripper, 1 opens", "", ("gripper",), values[:, arm : arm + 1], steps=True),
+    ]
+    base = values[:, arm + 1 :]
+    return plots + ([plot("Action: mobile base", "", ("x", "y", "yaw"), base, steps=True)] if base.any() else [])
+
+
+def _object_paths(
+    recording: Recording, scene: Mapping[str, Any], ids: Any, base_in_world: NDArray
+) -> list[dict[str, Any]]:
+    """Return the objects with their paths, thinned to one point if they stand still, without those that are parked."""
+    target = scene.get("target") or {}
+    target_actor = f"object_{target['slot']}" if target else ""
+    names = {thing["slot"]: thing["name"] for thing in scene.get("objects") or ()}
+    shown = {f"object_{slot}": called(str(asset), names.get(slot, "")) for slot, asset in enumerate(ids or ())}
+    shown[target_actor] = called(target.get("asset_id") or "", target.get("name") or "")
+    found = []
+    for actor, states in recording.states.get("actors", {}).items():
+        path = states[:, :3].astype(float)
+        if actor in ("ground", "room") or np.linalg.norm(transform(inverse(base_in_world), path[:1])) > _PARKED:
+            continue
+        still = np.ptp(path, axis=0).max() < _STILL
+        name = shown.get(actor, actor.replace("_", " "))
+        found.append({"name": name, "target": actor == target_actor, "path": path[:1] if still else path})
+    return found

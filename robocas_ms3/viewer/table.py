@@ -20,7 +20,7 @@ class Row:
     Attributes:
         n: episode; None: a seed without an episode.
         steps: number of steps.
-        instruction: what the robot was told to do.
+        instruction: of the episode.
         task: its name.
         object: name of the target.
         seed: of the scene.
@@ -46,11 +46,7 @@ class Row:
 
 @dataclass(frozen=True)
 class FailedAttempt(Failure):
-    """A line of ``failures.jsonl``.
-
-    Attributes:
-        task, environment: of the run, where a dataset may be of several; None: unknown.
-    """
+    """A line of ``failures.jsonl``, with the task and environment of the run; None: unknown."""
 
     task: str | None = None
     environment: str | None = None
@@ -64,12 +60,7 @@ class FailedAttempt(Failure):
 
 @dataclass(frozen=True)
 class Failures:
-    """The lines of ``failures.jsonl``.
-
-    Attributes:
-        by_seed: failures by seed.
-        note: which lines are damaged, for people.
-    """
+    """The lines of ``failures.jsonl`` by seed, and a note on damaged ones."""
 
     by_seed: Mapping[int, list[FailedAttempt]] = field(default_factory=dict)
     note: str = ""
@@ -85,7 +76,14 @@ class Failures:
         for line in lines:
             if line.record is not None:
                 found[line.record.seed].append(line.record)
-        return cls(dict(found), _damaged([str(line.number) for line in lines if line.record is None]))
+        damaged = [str(line.number) for line in lines if line.record is None]
+        if not damaged:
+            return cls(dict(found))
+        which = f"Line {damaged[0]} of `{FAILURES_FILE}` is damaged and left out."
+        if len(damaged) > 1:
+            listed = ", ".join(damaged[:5]) + (", ..." if len(damaged) > 5 else "")
+            which = f"{len(damaged)} lines of `{FAILURES_FILE}` are damaged and left out: {listed}"
+        return cls(dict(found), which)
 
     def of_seed(self, seed: int | None, env_info: Any = None) -> list[FailedAttempt]:
         """Return the failures of a seed in an environment; none if the seed is unknown."""
@@ -119,19 +117,10 @@ class Failures:
         return lost
 
 
-def _damaged(lines: list[str]) -> str:
-    if not lines:
-        return ""
-    if len(lines) == 1:
-        return f"Line {lines[0]} of `{FAILURES_FILE}` is damaged and left out."
-    named = ", ".join(lines[:5]) + (", ..." if len(lines) > 5 else "")
-    return f"{len(lines)} lines of `{FAILURES_FILE}` are damaged and left out: {named}"
-
-
 def stages(failures: Iterable[Failure], recorded: Mapping[str, Any]) -> list[str]:
     """Return the stages at which attempts at an episode failed."""
     named = {failure.stage for failure in failures if not failure.gave_up}
-    return sorted(named | {kept["stage"] for kept in recorded.get("recoveries") or ()})
+    return sorted(named | {recovery["stage"] for recovery in recorded.get("recoveries") or ()})
 
 
 def describe(failures: Iterable[Failure], recorded: Mapping[str, Any]) -> list[dict[str, str]]:
@@ -141,8 +130,8 @@ def describe(failures: Iterable[Failure], recorded: Mapping[str, Any]) -> list[d
         for f in failures
         if not f.gave_up
     ]
-    for kept in recorded.get("recoveries") or ():
-        first, last = kept["range"]
+    for recovery in recorded.get("recoveries") or ():
+        first, last = recovery["range"]
         text = f"recovered from, control steps {first} to {last}"
-        lines.append({"stage": kept["stage"], "reason": kept["reason"], "text": text})
+        lines.append({"stage": recovery["stage"], "reason": recovery["reason"], "text": text})
     return lines

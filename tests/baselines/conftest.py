@@ -7,9 +7,9 @@ import pytest
 import yaml
 from made_up_baseline import MadeUp
 from made_up_dataset import made_up_dataset
+from made_up_runs import train
 
 from robocas_ms3.baselines.registry import BASELINES
-from robocas_ms3.baselines.training.session import train_run
 from robocas_ms3.cli.main import run
 from robocas_ms3.cli.train import COMMANDS, other
 
@@ -51,7 +51,7 @@ def usual_umask():
 
 @pytest.fixture
 def whole(usual_umask, made_up, data, tmp_path):
-    train_run("made-up", data, tmp_path / "whole", device="cpu")
+    train("made-up", data, tmp_path / "whole")
     return tmp_path / "whole"
 
 

@@ -32,7 +32,7 @@ def test_they_are_a_start_by_name_as_they_are_a_policy(tmp_path, monkeypatch):
     """Also where a folder is called so, which a longer path names."""
     monkeypatch.chdir(tmp_path)
     begun = load_initial_weights(BASELINE, Path("small"), None, tmp_path / "out")
-    assert begun is not None and begun.tensors
+    assert begun is not None and begun.weights
     assert begun.record == read_run(BUNDLED / "small")
     Path("small").mkdir()
     again = load_initial_weights(BASELINE, Path("small"), None, tmp_path / "out")

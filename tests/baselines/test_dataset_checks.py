@@ -10,8 +10,8 @@ from rt1_sizes import SIZES
 from small_sizes import TINY
 from synthetic import write_trajectory
 
-from robocas_ms3.baselines.bc_state.config import BcStateConfig
-from robocas_ms3.baselines.bc_state.data import StateSamples
+from robocas_ms3.baselines.bc_state import BASELINE as BC_STATE
+from robocas_ms3.baselines.bc_state import BcStateConfig
 from robocas_ms3.baselines.dataset_checks import check_base_stands, check_tcp_frame
 from robocas_ms3.baselines.rt1 import BASELINE as RT1
 from robocas_ms3.baselines.rt1.config import RT1Config
@@ -96,5 +96,5 @@ def test_bc_state_refuses_it_before_it_makes_an_environment(tmp_path, monkeypatc
         states = file["traj_0/env_states/articulations/robocas_mobile_panda"]
         states[:, 13] = np.linspace(0, 0.5, len(states))
     with pytest.raises(DatasetError, match="F.h5, episode 0: the base drives"):
-        StateSamples(BcStateConfig(), path, "train")
+        BC_STATE.data(BcStateConfig(), path, "train", lambda done, total: None)
     assert not (tmp_path / "cache" / "bc-state").exists()

@@ -5,8 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from robocas_ms3.baselines.bc_state.config import BcStateConfig
-from robocas_ms3.baselines.bc_state.data import StateSamples
+from robocas_ms3.baselines.bc_state import BASELINE, BcStateConfig
 from robocas_ms3.cli.main import run
 
 SEED = 510_000
@@ -40,9 +39,9 @@ def test_bc_state(demos, tmp_path, monkeypatch):
     said = json.loads((tmp_path / "eval" / "run.json").read_text())["policy"]
     assert (said["baseline"], said["steps"], said["wants"]["state"]) == ("bc-state", 5, True)
 
-    samples = StateSamples(BcStateConfig(), demos, "train")
+    samples = BASELINE.data(BcStateConfig(), demos, "train", lambda done, total: None)
     batch = samples.__getitems__(list(range(len(samples))))
-    towards = batch["told"][:, -19:-16].numpy()  # tcp_to_target; then 3 towards the goal, 3 extents, 10 of the arm
+    towards = batch["inputs"][:, -19:-16].numpy()  # tcp_to_target; then 3 towards the goal, 3 extents, 10 of the arm
     assert np.linalg.norm(towards[0]) > 0.1  # it begins away from the target,
     assert np.linalg.norm(towards, axis=1).min() < 0.03  # and takes it
 

@@ -194,6 +194,8 @@ torch = pytest.importorskip("torch", reason="needs torch")
 
 
 def test_a_training_run_and_its_checkpoint(tmp_path):
+    from safetensors.torch import save_file
+
     from robocas_ms3.baselines.policy import RunPolicy
     from robocas_ms3.baselines.training import checkpoints
     from robocas_ms3.baselines.training.record import BUNDLED, read_run
@@ -207,14 +209,9 @@ def test_a_training_run_and_its_checkpoint(tmp_path):
         with pytest.raises(TrainingError):
             RunPolicy(root, "cpu")
     (root / "run.json").write_text(json.dumps(whole))
-    tensors, about = checkpoints.load(root / "weights.safetensors", {})
-    checkpoints.save(root / "weights.safetensors", tensors, {**about, "step": "nan"})
-    with pytest.raises(TrainingError):
-        RunPolicy(root, "cpu")
-    for step in ("", "x", "-1", "nan", "1e308", "9" * 5000):
+    small = root / "small.safetensors"
+    for metadata in ({"step": ""}, {"step": "-1"}, {"step": "nan"}, {"step": "1e308"}, {"step": "9" * 5000}, {}):
+        save_file({"a": torch.zeros(1)}, small, metadata)
         with pytest.raises(TrainingError) as error:
-            checkpoints.read_step({"step": step}, root)
+            checkpoints.load(small, {})
         assert len(str(error.value)) < 500
-    with pytest.raises(TrainingError):
-        checkpoints.read_step({}, root)
-    assert checkpoints.read_step({"step": "12"}, root) == 12

@@ -4,10 +4,10 @@ import json
 
 import numpy as np
 import pytest
+from made_up_runs import stop_at, train
 from rt1_sizes import SIZES
 
 from robocas_ms3.baselines.policy import RunPolicy
-from robocas_ms3.baselines.training.session import Progress, train_run
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations
 
 VIEW = {"rendered": [64, 48], "size": [64, 48]}
@@ -18,20 +18,12 @@ CHANGES = {
 TRAIN = {"steps": 6, "batch_size": 4, "log_every": 2, "check_every": 3, "save_every": 2, "workers": 0}
 
 
-def stop_at(step):
-    def look(done, of):
-        if done == step:
-            raise KeyboardInterrupt
-
-    return Progress(step=look)
-
-
 def check(dataset, tmp_path, name, precision, device):
     out = tmp_path / "run"
     changes = {**CHANGES[name], "train": {**TRAIN, "precision": precision}}
     with pytest.raises(KeyboardInterrupt):
-        train_run(name, dataset, out, changes, device=device, progress=stop_at(3))
-    record = train_run(name, dataset, out, device=device)
+        train(name, dataset, out, changes, device=device, progress=stop_at(3, KeyboardInterrupt()))
+    record = train(name, dataset, out, device=device)
     assert (record.device, record.resumed) == (device, [])
     rows = (out / "metrics.csv").read_text().splitlines()
     assert [row.split(",")[:2] for row in rows[1:]] == [

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from made_up_runs import stop_at, train
 
 from robocas_ms3.baselines.baseline import BaselineConfig, TrainSettings
 from robocas_ms3.baselines.registry import BASELINES
-from robocas_ms3.baselines.training.session import Progress, train_run
 from robocas_ms3.core.errors import DatasetError, EmptySplitError
 from robocas_ms3.evaluation.policy import PolicySpec
 
@@ -96,19 +96,11 @@ class MadeUp:
         return MadeUpPolicy(model)
 
 
-def crash_at(step):
-    def look(done, of):
-        if done == step:
-            raise RuntimeError("gone")
-
-    return Progress(step=look)
-
-
 if __name__ == "__main__":
     BASELINES.builtin["made-up"] = MadeUp
     data, out = map(Path, sys.argv[1:])
-    train_run("made-up", data, out / "whole", device="cpu")
+    train("made-up", data, out / "whole")
     try:
-        train_run("made-up", data, out / "again", device="cpu", progress=crash_at(17))
+        train("made-up", data, out / "again", progress=stop_at(17, RuntimeError("stopped")))
     except RuntimeError:
-        train_run("made-up", data, out / "again", device="cpu")
+        train("made-up", data, out / "again")

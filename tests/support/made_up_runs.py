@@ -6,7 +6,11 @@ import json
 import torch
 from safetensors.torch import load_file
 
-from robocas_ms3.baselines.training.session import Progress
+from robocas_ms3.baselines.training.session import Progress, RunOptions, train_run
+
+
+def train(name, data, out, changes=None, *, progress=None, device="cpu", **options):
+    return train_run(RunOptions(name, data, out, changes or {}, device=device, **options), progress)
 
 
 def stop_at(step, error):

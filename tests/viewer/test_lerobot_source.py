@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.datasets.lerobot.reader import LeRobotEpisode
 from robocas_ms3.datasets.lerobot.schema import MAX_DEPTH_MM
 from robocas_ms3.datasets.sources.reader import Dataset
-from robocas_ms3.viewer.lerobot import LeRobotContent
-from robocas_ms3.viewer.pictures import decode
+from robocas_ms3.viewer.images import decode
 from robocas_ms3.viewer.source import open_source
 
 
@@ -45,10 +45,10 @@ def test_pictures_are_those_of_that_step(lerobot, folder):
         source.rgb(3, "static_camera", 0)
 
 
-def test_few_decoded_images_are_kept_in_memory(lerobot, monkeypatch):
-    monkeypatch.setattr("robocas_ms3.viewer.lerobot._CACHED", 2)
-    decoded, decode = [], LeRobotContent._decode
-    monkeypatch.setattr(LeRobotContent, "_decode", lambda self, *key: decoded.append(key[0]) or decode(self, *key))
+def test_the_memory_of_decoded_images_is_bounded(lerobot, monkeypatch):
+    decoded, frames = [], LeRobotEpisode.frames
+    monkeypatch.setattr(LeRobotEpisode, "frames", lambda self, *key: decoded.append(self.number) or frames(self, *key))
+    monkeypatch.setattr("robocas_ms3.viewer.lerobot._CACHE_BYTES", 2 * 7 * 64 * 48 * 3)  # two episodes of a camera
     source = open_source(lerobot)
     for number in (0, 1, 0, 2, 0, 1):
         source.rgb(number, "base_camera", 3)

@@ -6,7 +6,7 @@ import pytest
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import formats
 from robocas_ms3.datasets.sources.reader import Dataset
-from robocas_ms3.viewer.pictures import decode
+from robocas_ms3.viewer.images import decode
 from robocas_ms3.viewer.routes import Routes
 from robocas_ms3.viewer.source import open_source
 
@@ -72,7 +72,7 @@ def test_it_lists_what_its_source_knows(page, known):
 def test_an_episode_is_shown_by_its_arrays(page, known, folder):
     assert page().episode(1) == known.episode(1)
     picture, stored = page().rgb(1, "base_camera", 2), Dataset(folder).episode(1)
-    assert picture.kind == "image/jpeg"
+    assert picture.media_type == "image/jpeg"
     assert np.abs(decode(picture).astype(float) - stored.rgb("base_camera", 2)).mean() < 6
     assert (page().depth(1, "base_camera", 2) == stored.depth("base_camera", 2)).all()
 

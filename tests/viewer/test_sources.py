@@ -10,7 +10,7 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.datasets.writing.settings import ConversionSettings
-from robocas_ms3.viewer.episode import base_plot, motion_plots, plot, rounded
+from robocas_ms3.viewer.episode import base_plot, continuous, plot, rounded
 from robocas_ms3.viewer.source import open_source
 
 ROW = {"n", "steps", "instruction", "task", "object", "seed", "success", "split", "stages", "attempts", "damage"}
@@ -37,17 +37,15 @@ def test_camera_names_that_would_be_paths_are_left_out(folder):
 
 def test_orientation_and_yaw_do_not_jump():
     turn = np.array([[0.0, 0, 0, 1], [0, 0, -0.1, -0.995], [0, 0, 0.2, 0.98]])
-    (_, orientation, _) = motion_plots(np.zeros((3, 3)), turn, np.zeros((3, 7)))
-    assert [s["values"] for s in orientation["series"]][2:] == [[0.0, 0.1, 0.2], [1.0, 0.995, 0.98]]
-    (_, other, _) = motion_plots(np.zeros((3, 3)), -turn, np.zeros((3, 7)))
-    assert other == orientation  # whichever of the two a recording begins with
+    expected = [[0, 0, 0, 1], [0, 0, 0.1, 0.995], [0, 0, 0.2, 0.98]]
+    assert continuous(turn).tolist() == continuous(-turn).tolist() == expected  # whichever sign a recording begins with
     (base,) = base_plot(np.array([[0, 0, 3.1], [0, 0, -3.1]]))
     assert base["series"][2]["values"] == [3.1, round(2 * np.pi - 3.1, 5)]
     assert base_plot(np.ones((3, 3))) == []
 
 
 def test_a_trajectory_lists_episodes_and_seeds_that_were_given_up(run_folder):
-    index = open_source(run_folder / "trajectory.h5").index()
+    index = open_source(run_folder).index()  # the folder is its trajectory
     assert index == json.loads(json.dumps(index, allow_nan=False))
     assert all(set(row) == ROW for row in index["episodes"])
     assert [row["n"] for row in index["episodes"]] == [0, 1, 2, None]
@@ -59,10 +57,6 @@ def test_a_trajectory_lists_episodes_and_seeds_that_were_given_up(run_folder):
     assert index["episodes"][0]["object"] == "cube 3 (cube)"
     assert (index["cameras"], index["depth"], index["rate_hz"]) == ([], False, 20)
     assert "`robocas convert trajectory.h5" in index["note"]
-
-
-def test_a_run_folder_is_its_trajectory(run_folder):
-    assert open_source(run_folder).index()["kind"] == "trajectory file"
 
 
 def test_an_episode_of_a_trajectory(run_folder, made_up):
@@ -165,7 +159,7 @@ def test_an_episode_of_a_folder(folder):
 def test_pictures_are_those_of_the_folder(folder):
     source = open_source(folder)
     picture = source.rgb(2, "static_camera", 3)
-    assert picture.kind == "image/png"
+    assert picture.media_type == "image/png"
     assert picture.data == (folder / "episode_0000002/static_camera/rgb/0003.png").read_bytes()
     assert (source.depth(2, "base_camera", 0) == Dataset(folder).episode(2).depth("base_camera", 0)).all()
 
@@ -219,20 +213,6 @@ def test_a_folder_without_our_additions_is_shown_too(folder, tmp_path):
     episode = source.episode(0)
     assert episode["trace"]["objects"] == []
     assert episode["instruction"].startswith("grasp the cube 3")
-
-
-def test_damage_is_an_error_of_that_episode_alone(folder, tmp_path):
-    spoilt = shutil.copytree(folder, tmp_path / "spoilt")
-    (spoilt / "episode_0000000/episode_info.npz").write_bytes(b"PK\x03\x04 cut")
-    (spoilt / "episode_0000000/scene.json").write_text("{")
-    source = open_source(spoilt)
-    rows = source.index()["episodes"]
-    assert [row["n"] for row in rows] == [0, 1, 2, None]
-    assert rows[0]["damage"].startswith("scene.json: this JSON is damaged")
-    assert [row["damage"] for row in rows[1:]] == ["", "", ""]
-    with pytest.raises(DatasetError, match="episode_0000000"):
-        source.episode(0)
-    assert source.episode(1)["n"] == 1
 
 
 def test_a_link_that_leads_out_is_refused(folder, tmp_path):

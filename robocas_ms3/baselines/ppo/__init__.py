@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from robocas_ms3.baselines.ppo.agent import Agent
+from robocas_ms3.baselines.ppo.agent import Agent, PpoPolicy
 from robocas_ms3.baselines.ppo.config import PpoConfig
 from robocas_ms3.baselines.ppo.environments import PpoEnvironments
-from robocas_ms3.baselines.ppo.policy import PpoPolicy
 from robocas_ms3.baselines.ppo.train import train_ppo
 from robocas_ms3.baselines.training.run_folder import RunFolder
 

@@ -11,8 +11,7 @@ from robocas_ms3.baselines.ppo.agent import Agent
 from robocas_ms3.baselines.ppo.config import PpoConfig
 from robocas_ms3.baselines.ppo.environments import FIRST_TEST_SEED, PpoEnvironments
 from robocas_ms3.baselines.ppo.rollouts import OUTCOMES, Rollout, RolloutCollector, read_outcomes, steps_per_env
-from robocas_ms3.baselines.training import checkpoints
-from robocas_ms3.baselines.training.checkpoints import Checkpoint, with_prefix
+from robocas_ms3.baselines.training.checkpoints import Checkpoint, join_parts, optimizer_tensors
 from robocas_ms3.baselines.training.run_folder import RunFolder
 from robocas_ms3.core.errors import TrainingError
 from robocas_ms3.core.exits import deferred_interrupts
@@ -41,12 +40,9 @@ def train_ppo(run: RunFolder, agent: Agent, config: PpoConfig, environments: Ppo
         found, fix = f"{run.accelerator.num_processes} processes", "Run it without `accelerate launch`."
         raise TrainingError("ppo trains in one process", where=run.record.baseline, found=found, fix=fix)
     settings = config.train
-    checkpoint = run.load_checkpoint()
-    state = _TrainingState(agent, config)
-    if checkpoint is not None:
-        state.restore(checkpoint)
-        run.repair_weights(state.step, agent.state_dict())
-    run.start(state.step, agent, f"{len(environments)} steps in {environments.episodes} layouts")
+    state = _TrainingState(agent, config, run.checkpoint)
+    size = f"{len(environments)} steps in {environments.episodes} layouts"
+    run.start(state.step, agent, agent.state_dict(), size)
 
     def log(split: str, outcomes: torch.Tensor, metrics: dict[str, float]) -> None:
         epoch = state.episodes / config.layouts
@@ -135,36 +131,34 @@ class _TrainingState:
         is_tested: whether the test at the end is done.
     """
 
-    def __init__(self, agent: Agent, config: PpoConfig) -> None:
+    def __init__(self, agent: Agent, config: PpoConfig, checkpoint: Checkpoint | None) -> None:
         self.optimizer = torch.optim.Adam(agent.parameters(), lr=config.train.learning_rate, eps=1e-5)
         self.step, self.episodes, self.is_tested = 0, 0, False
         self.outcomes = torch.empty(0, len(OUTCOMES))
         self._agent = agent
-
-    def tensors(self) -> dict[str, torch.Tensor]:
-        """Return the tensors of a checkpoint."""
-        tensors = {
-            **with_prefix("model.", self._agent.state_dict()),
-            **with_prefix("optimizer.", checkpoints.optimizer_tensors(self.optimizer)),
-            "episodes.played": torch.tensor(self.episodes),
-            "episodes.last": self.outcomes,
-            "tried_out": torch.tensor(self.is_tested),
-            "random.cpu": torch.get_rng_state(),
-        }
-        if self._agent.mean.is_cuda:
-            tensors["random.cuda"] = torch.cuda.get_rng_state()
-        return tensors
-
-    def restore(self, checkpoint: Checkpoint) -> None:
-        """Restore a checkpoint."""
+        if checkpoint is None:
+            return
         tensors = checkpoint.tensors
-        checkpoints.load_weights(self._agent, checkpoint.part("model."), checkpoint.path)
-        checkpoints.load_optimizer(self.optimizer, checkpoint.part("optimizer."))
+        checkpoint.load_model(agent, "model")
+        checkpoint.load_optimizer(self.optimizer)
         self.episodes, self.outcomes = int(tensors["episodes.played"]), tensors["episodes.last"]
         self.step, self.is_tested = checkpoint.step, bool(tensors["tried_out"])
         torch.set_rng_state(tensors["random.cpu"])
-        if "random.cuda" in tensors and self._agent.mean.is_cuda:
+        if "random.cuda" in tensors and agent.mean.is_cuda:
             torch.cuda.set_rng_state(tensors["random.cuda"])
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """Return the tensors of a checkpoint."""
+        random = {"cpu": torch.get_rng_state()}
+        if self._agent.mean.is_cuda:
+            random["cuda"] = torch.cuda.get_rng_state()
+        parts = join_parts(
+            model=self._agent.state_dict(),
+            optimizer=optimizer_tensors(self.optimizer),
+            episodes={"played": torch.tensor(self.episodes), "last": self.outcomes},
+            random=random,
+        )
+        return {**parts, "tried_out": torch.tensor(self.is_tested)}
 
 
 def _check_finite(run: RunFolder, losses: dict[str, float], step: int) -> None:

@@ -18,13 +18,13 @@ import psutil
 import torch
 from numpy.typing import NDArray
 
-from robocas_ms3.baselines.baseline import Batch, OnRead, Split
-from robocas_ms3.baselines.chunks.poses import encode, next_keys, spread, state_of
+from robocas_ms3.baselines.baseline import Batch, OnRead, Split, no_episodes
+from robocas_ms3.baselines.chunks import encode, next_keys, spread, state_of
 from robocas_ms3.baselines.dataset_checks import DatasetNeeds, check_dataset
 from robocas_ms3.baselines.small.config import SmallConfig, View
 from robocas_ms3.baselines.small.pointing import places_of
 from robocas_ms3.baselines.small.standing import Standing, calibration, looks_alike, seen_from, standing
-from robocas_ms3.core.errors import DatasetError, EmptySplitError
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import Array, from_xyzw
 from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.datasets.sources.protocol import EpisodeSource
@@ -63,8 +63,7 @@ class SmallSamples:
         check_dataset(source, numbers, needs)
         self.episodes = len(numbers)
         if not numbers:
-            fix = "Add episodes: a tenth of them validates."
-            raise EmptySplitError("this split holds no episodes", where=path, expected=f"some in {split}", fix=fix)
+            raise no_episodes(path, split)
         seen = source.episode(numbers[0])
         first_pictures = {camera: seen.rgb(camera, 0) for camera in config.views}
         sizes = {camera: (picture.shape[1], picture.shape[0]) for camera, picture in first_pictures.items()}
@@ -181,7 +180,7 @@ class SmallSamples:
             with closing(episode.frames(camera, "rgb", 0, length)) as pictures:
                 stored = (0, 0)
                 for row, picture in enumerate(pictures, start=first):
-                    self._pictures[camera][row] = torch.from_numpy(looked_at(picture, view, source.root))
+                    self._pictures[camera][row] = torch.from_numpy(crop_image(picture, view, source.root))
                     stored = picture.shape[1], picture.shape[0]
             self._check(config, camera, calibration(episode, camera, arrays, stored, view), episode.where)
             points = seen_from(camera, at_keys[:, None], poses, arrays)[:, 0]
@@ -239,7 +238,7 @@ def _spread_of_words(words: NDArray[np.floating]) -> dict[str, Any]:
     return {"mean": words.mean(0).tolist(), "deviation": np.maximum(words.std(0), _LEAST_WORD).tolist()}
 
 
-def looked_at(picture: NDArray[Any], view: View, where: object = "") -> NDArray[Any]:
+def crop_image(picture: NDArray[Any], view: View, where: object = "") -> NDArray[Any]:
     """The part (h, w, 3) of a picture (H, W, 3) that is looked at, scaled by areas.
 
     Raises:

@@ -16,8 +16,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from robocas_ms3.baselines.baseline import Batch
-from robocas_ms3.baselines.chunks.loss import chunk_losses
-from robocas_ms3.baselines.chunks.poses import ROW, Scale
+from robocas_ms3.baselines.chunks import ROW, Scale, chunk_losses
 from robocas_ms3.baselines.small.config import SmallConfig, View
 from robocas_ms3.baselines.small.lifting import FAR, SAID, Lift, heights_of, tcp_of
 from robocas_ms3.baselines.small.pointing import CELL, NOWHERE, Pointer, cells_of, pointing_losses

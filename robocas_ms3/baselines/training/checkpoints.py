@@ -13,19 +13,16 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as to_bytes
 
-from robocas_ms3.baselines.training.record import CHECKPOINT, WEIGHTS
+from robocas_ms3.baselines.training.record import WEIGHTS
 from robocas_ms3.core.errors import TrainingError
 from robocas_ms3.core.files import replacing
 
-_FIXES = {
-    CHECKPOINT: "It is damaged, or of another program: start again with --overwrite.",
-    WEIGHTS: "It is damaged, or of another program: `robocas train` into this folder writes it again.",
-}
+Tensors = Mapping[str, torch.Tensor]
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """The state of a training at a step.
+    """The tensors of a file, as of a step of a training.
 
     Attributes:
         path: of the file.
@@ -37,17 +34,56 @@ class Checkpoint:
     step: int
     tensors: dict[str, torch.Tensor]
 
-    def part(self, prefix: str) -> dict[str, torch.Tensor]:
-        """Return the tensors whose names start with a prefix, without it."""
-        parts = {name: tensor for name, tensor in self.tensors.items() if name.startswith(prefix)}
-        return {name.removeprefix(prefix): tensor for name, tensor in parts.items()}
+    def part(self, name: str) -> dict[str, torch.Tensor]:
+        """Return the tensors of a part, see `join_parts`."""
+        prefix = f"{name}."
+        return {key.removeprefix(prefix): value for key, value in self.tensors.items() if key.startswith(prefix)}
+
+    def load_model(self, model: torch.nn.Module, part: str = "") -> None:
+        """Load weights into a network.
+
+        Raises:
+            TrainingError: they are of another network.
+        """
+        own, tensors = model.state_dict(), self.part(part) if part else self.tensors
+        missing, more = own.keys() - tensors.keys(), tensors.keys() - own.keys()
+        shapes = [name for name in own if name in tensors and own[name].shape != tensors[name].shape]
+        for name in (sorted(missing) or sorted(more) or sorted(shapes))[:1]:
+            raise TrainingError(
+                "not the weights of this model",
+                where=f"{self.path}, {name}",
+                expected=list(own[name].shape) if name in own else "none",
+                found=list(tensors[name].shape) if name in tensors else "none",
+                fix="They fit the configuration that they were trained with: leave out options that change sizes.",
+            )
+        model.load_state_dict(dict(tensors))
+
+    def load_optimizer(self, optimizer: torch.optim.Optimizer) -> None:
+        """Load the part ``optimizer``, see `optimizer_tensors`."""
+        state: dict[int, dict[str, torch.Tensor]] = {}
+        for name, tensor in self.part("optimizer").items():
+            number, _, key = name.partition(".")
+            state.setdefault(int(number), {})[key] = tensor
+        optimizer.load_state_dict({**optimizer.state_dict(), "state": state})
 
 
-def save(path: Path, tensors: Mapping[str, torch.Tensor], about: Mapping[str, str]) -> None:
-    """Write tensors and metadata; an existing file stays whole until the new one is."""
+def optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, torch.Tensor]:
+    """Return the state of an optimiser by ``number of the parameter.name``."""
+    state: dict[int, dict[str, Any]] = optimizer.state_dict()["state"]
+    return {f"{number}.{name}": torch.as_tensor(value) for number, of in state.items() for name, value in of.items()}
+
+
+def join_parts(**parts: Tensors) -> dict[str, torch.Tensor]:
+    """Return the tensors of all parts by ``part.name``."""
+    return {f"{part}.{name}": tensor for part, tensors in parts.items() for name, tensor in tensors.items()}
+
+
+def save(path: Path, tensors: Tensors, metadata: Mapping[str, str], step: int) -> None:
+    """Write tensors; an existing file stays whole until the new one is."""
     copies = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
+    content = _sort_header(to_bytes(copies, {**metadata, "step": str(step)}))
     with replacing(path, sync=True) as tmp:
-        tmp.write_bytes(_sort_header(to_bytes(copies, dict(about))))  # save_file writes files that only the owner reads
+        tmp.write_bytes(content)  # save_file writes files that only the owner reads
 
 
 def _sort_header(content: bytes) -> bytes:
@@ -58,8 +94,8 @@ def _sort_header(content: bytes) -> bytes:
     return len(header).to_bytes(8, "little") + header + content[end:]
 
 
-def load(path: Path, expected: Mapping[str, str]) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
-    """Read tensors and metadata.
+def load(path: Path, expected: Mapping[str, str]) -> Checkpoint:
+    """Read the tensors of a file.
 
     Args:
         path: of the file.
@@ -73,76 +109,17 @@ def load(path: Path, expected: Mapping[str, str]) -> tuple[dict[str, torch.Tenso
         raise TrainingError("no such file", where=path, fix=fix)
     try:
         with safe_open(path, "pt") as file:
-            about = file.metadata() or {}
+            metadata = file.metadata() or {}
             for key, value in expected.items():
-                if about.get(key) != value:
-                    found = about.get(key, "none")[:80]
+                if metadata.get(key) != value:
+                    found = metadata.get(key, "none")[:80]
                     raise TrainingError(f"another {key.replace('_', ' ')}", where=path, expected=value, found=found)
-            return {name: file.get_tensor(name) for name in file.keys()}, about  # noqa: SIM118  (no mapping)
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  (no mapping)
     except (SafetensorError, OSError) as error:
-        fix = _FIXES.get(path.name, _FIXES[CHECKPOINT])
+        is_weights = path.name == WEIGHTS
+        fix = "`robocas train` into this folder writes it again." if is_weights else "Start again with --overwrite."
         raise TrainingError("can't be read", where=path, found=error, fix=fix) from error
-
-
-def load_checkpoint(path: Path, expected: Mapping[str, str]) -> Checkpoint:
-    """Read the checkpoint of a run.
-
-    Raises:
-        TrainingError: see `load`.
-    """
-    tensors, about = load(path, expected)
-    return Checkpoint(path, read_step(about, path), tensors)
-
-
-def read_step(about: Mapping[str, str], path: Path) -> int:
-    """Return the step in the metadata of a file.
-
-    Raises:
-        TrainingError: there is none.
-    """
-    step = about.get("step", "")
+    step = metadata.get("step", "")
     if not re.fullmatch(r"[0-9]{1,12}", step):
         raise TrainingError("no step of a training", where=path, expected="a whole number", found=repr(step[:40]))
-    return int(step)
-
-
-def load_weights(model: torch.nn.Module, tensors: Mapping[str, torch.Tensor], where: object) -> None:
-    """Load weights into a network.
-
-    Raises:
-        TrainingError: they are of another network.
-    """
-    own = model.state_dict()
-    missing, more = own.keys() - tensors.keys(), tensors.keys() - own.keys()
-    shapes = [name for name in own if name in tensors and own[name].shape != tensors[name].shape]
-    for names, expected, found in ((missing, own, {}), (more, {}, tensors), (shapes, own, tensors)):
-        if names:
-            name = sorted(names)[0]
-            raise TrainingError(
-                "not the weights of this model",
-                where=f"{where}, {name}",
-                expected=list(expected[name].shape) if name in expected else "none",
-                found=list(found[name].shape) if name in found else "none",
-                fix="They fit the configuration that they were trained with: leave out options that change sizes.",
-            )
-    model.load_state_dict(dict(tensors))
-
-
-def optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, torch.Tensor]:
-    """Return the state of an optimiser by ``number of the parameter.name``."""
-    state: dict[int, dict[str, Any]] = optimizer.state_dict()["state"]
-    return {f"{number}.{name}": torch.as_tensor(value) for number, of in state.items() for name, value in of.items()}
-
-
-def load_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, torch.Tensor]) -> None:
-    """Load the state of `optimizer_tensors` into an optimiser."""
-    state: dict[int, dict[str, torch.Tensor]] = {}
-    for name, tensor in tensors.items():
-        number, _, key = name.partition(".")
-        state.setdefault(int(number), {})[key] = tensor
-    optimizer.load_state_dict({**optimizer.state_dict(), "state": state})
-
-
-def with_prefix(prefix: str, tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Return tensors with a prefix before their names, see `Checkpoint.part`."""
-    return {f"{prefix}{name}": tensor for name, tensor in tensors.items()}
+    return Checkpoint(path, int(step), tensors)

@@ -1,4 +1,4 @@
-"""The device of a run and its precision."""
+"""The device of a training run and its precision."""
 
 from __future__ import annotations
 
@@ -44,9 +44,11 @@ def make_accelerator(device: str, precision: Precision) -> Accelerator:
     )
 
 
-def count_threads(accelerator: Accelerator) -> int:
-    """Return the number of threads that torch uses on a CPU; 0 on a GPU."""
-    return torch.get_num_threads() if accelerator.device.type == "cpu" else 0
+def describe_hardware(accelerator: Accelerator) -> dict[str, Any]:
+    """Return the values of a `RunRecord` on which rounding depends: device, precision, and threads of the CPU."""
+    device = accelerator.device.type
+    threads = torch.get_num_threads() if device == "cpu" else 0
+    return {"device": device, "precision": str(accelerator.mixed_precision), "threads": threads}
 
 
 def _keep_freed_memory() -> None:

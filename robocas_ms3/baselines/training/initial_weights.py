@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from robocas_ms3.baselines.baseline import AnyBaseline
 from robocas_ms3.baselines.training.record import CHECKPOINT, WEIGHTS, RunRecord, find_run, hash_weights, read_run
 from robocas_ms3.core.errors import TrainingError
+
+if TYPE_CHECKING:
+    from robocas_ms3.baselines.training.checkpoints import Checkpoint
 
 _INPUTS = ("rate_hz", "pictures", "cameras", "calibration", "observed", "acted")
 """Facts that have to be the same in both runs. Others, such as scales, need the same shape."""
@@ -24,12 +27,12 @@ class InitialWeights:
     Attributes:
         record: of that run.
         name: of its folder, with a hash of its weights.
-        tensors: the weights; None if the new run has a checkpoint already.
+        weights: None if the new run has a checkpoint already.
     """
 
     record: RunRecord
     name: str
-    tensors: dict[str, Any] | None
+    weights: Checkpoint | None
 
 
 def load_initial_weights(
@@ -57,10 +60,9 @@ def load_initial_weights(
         return None
     start = find_run(start)
     record = read_run(start)
-    name = f"{start.resolve().name}, {hash_weights(start)[:12]}"
     expected = {"baseline": baseline.name, "version": str(baseline.version)}
-    tensors = None if has_checkpoint else checkpoints.load(start / WEIGHTS, expected)[0]
-    return InitialWeights(record, name, tensors)
+    weights = None if has_checkpoint else checkpoints.load(start / WEIGHTS, expected)
+    return InitialWeights(record, f"{start.resolve().name}, {hash_weights(start)[:12]}", weights)
 
 
 def combine_facts(own: dict[str, Any], initial: InitialWeights | None, data: Path | None) -> dict[str, Any]:

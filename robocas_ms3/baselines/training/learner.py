@@ -4,71 +4,53 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 from typing import Any
 
 import torch
-from accelerate import Accelerator
 from torch.optim.swa_utils import AveragedModel
 
 from robocas_ms3.baselines.baseline import Batch, TrainSettings
-from robocas_ms3.baselines.training import checkpoints
-from robocas_ms3.baselines.training.checkpoints import Checkpoint, with_prefix
+from robocas_ms3.baselines.training.checkpoints import Checkpoint, join_parts, optimizer_tensors
 from robocas_ms3.baselines.training.metrics import means_of_sums, sum_of_batch
+from robocas_ms3.baselines.training.run_folder import RunFolder
 from robocas_ms3.core.errors import TrainingError
-
-
-class NotFiniteError(Exception):
-    """A loss or gradient is NaN or infinite.
-
-    Args:
-        name: which of the two.
-        step: number of the step.
-    """
-
-    def __init__(self, name: str, step: int) -> None:
-        super().__init__(f"the {name} is NaN or infinite")
-        self.step = step
 
 
 class Learner:
     """Takes optimiser steps, averages weights and metrics, and saves and restores all of that.
 
     Args:
-        model: on the device of the accelerator.
+        run: folder of the run, with the checkpoint to continue from.
+        model: on the device of the run.
         settings: of the training.
-        accelerator: of the run.
-        checkpoint: to continue from.
 
     Attributes:
         step: number of steps done.
     """
 
-    def __init__(
-        self, model: torch.nn.Module, settings: TrainSettings, accelerator: Accelerator, checkpoint: Checkpoint | None
-    ) -> None:
+    def __init__(self, run: RunFolder, model: torch.nn.Module, settings: TrainSettings) -> None:
         self.step = 0
-        self._settings, self._accelerator = settings, accelerator
+        self._run, self._accelerator, self._settings = run, run.accelerator, settings
         self._bare = model
         self._average = AveragedModel(model, multi_avg_fn=self._update_average) if settings.ema else None
         self._sums: dict[str, torch.Tensor] = {}  # of metrics since the last line of the log
-        self._norms = torch.zeros((), dtype=torch.float64, device=accelerator.device)  # sum of all gradients' norms
-        if checkpoint is None:
-            torch.manual_seed(settings.seed + 1 + accelerator.process_index)
+        self._norms = torch.zeros((), dtype=torch.float64, device=self._accelerator.device)  # sum of gradients' norms
+        if run.checkpoint is None:
+            torch.manual_seed(settings.seed + 1 + self._accelerator.process_index)
         else:
-            self._restore(checkpoint)
+            self._restore(run.checkpoint)
         optimizer = torch.optim.AdamW(_parameter_groups(model, settings.weight_decay), lr=1.0, betas=settings.betas)
-        self._model, self._optimizer = accelerator.prepare(model, optimizer)
+        self._model, self._optimizer = self._accelerator.prepare(model, optimizer)
         if (
-            checkpoint is not None
-        ):  # not before: `prepare` moves the optimiser's counts to the GPU, which steps wait for
-            checkpoints.load_optimizer(self._optimizer, checkpoint.part("optimizer."))
+            run.checkpoint is not None
+        ):  # after `prepare`, which moves the optimiser's counts to the GPU: steps would wait
+            run.checkpoint.load_optimizer(self._optimizer)
 
     def update(self, batch: Batch, learning_rate: float) -> None:
         """Take a step of the optimiser.
 
         Raises:
-            NotFiniteError: the loss or the gradient is NaN or infinite. On a GPU `take_means` raises it.
+            TrainingError: the loss or the gradient is NaN or infinite. On a GPU `take_means` raises it.
         """
         for group in self._optimizer.param_groups:
             group["lr"] = learning_rate
@@ -92,7 +74,7 @@ class Learner:
         """Return the means of the metrics since the last call, over all processes.
 
         Raises:
-            NotFiniteError: the loss or a gradient was NaN or infinite.
+            TrainingError: the loss or a gradient was NaN or infinite.
         """
         means = means_of_sums(self._reduce(self._sums))
         self._sums = {}
@@ -120,42 +102,41 @@ class Learner:
         """Check that values of a step are finite.
 
         Raises:
-            NotFiniteError: one is not.
+            TrainingError: one is not.
         """
         for name, value in values.items():
             if not math.isfinite(value):
-                raise NotFiniteError(name, step)
+                raise self._run.error(f"the {name} is NaN or infinite", step)
 
     def weights(self) -> dict[str, torch.Tensor]:
         """Return the weights that a policy acts with."""
         return self._acting_model().state_dict()
 
-    def state(self) -> dict[str, torch.Tensor] | None:
-        """Return the tensors of a checkpoint; all processes have to call this.
+    def save(self) -> None:
+        """Write a checkpoint; all processes have to call this.
 
-        None: some are NaN or infinite. Then the next `take_means` ends the run, and the last checkpoint stays.
+        Not if a value is NaN or infinite: then the next `take_means` ends the run, and the last checkpoint stays.
         """
         random, sums = self._random_states(), self._reduce(self._sums)
-        if any(not torch.isfinite(value).all() for value in (*self._sums.values(), self._norms)):
-            return None
-        average = {} if self._average is None else with_prefix("average.", self._average.state_dict())
-        return {
-            **with_prefix("model.", self._bare.state_dict()),
-            **average,
-            **with_prefix("optimizer.", checkpoints.optimizer_tensors(self._optimizer)),
-            **with_prefix("sums.", sums),
-            **with_prefix("random.", random),
-        }
+        if all(torch.isfinite(value).all() for value in (*self._sums.values(), self._norms)):
+            state = join_parts(
+                model=self._bare.state_dict(),
+                average={} if self._average is None else self._average.state_dict(),
+                optimizer=optimizer_tensors(self._optimizer),
+                sums=sums,
+                random=random,
+            )
+            self._run.save(self.step, state, self.weights())
 
     def _restore(self, checkpoint: Checkpoint) -> None:
         """Restore all but the optimiser."""
-        checkpoints.load_weights(self._bare, checkpoint.part("model."), checkpoint.path)
+        checkpoint.load_model(self._bare, "model")
         if self._average is not None:
-            checkpoints.load_weights(self._average, checkpoint.part("average."), checkpoint.path)
+            checkpoint.load_model(self._average, "average")
         is_main = float(self._accelerator.is_main_process)  # the sums are those of all processes
         device = self._accelerator.device
-        self._sums = {name: is_main * value.to(device) for name, value in checkpoint.part("sums.").items()}
-        self._restore_random(checkpoint.part("random."), checkpoint.path)
+        self._sums = {name: is_main * value.to(device) for name, value in checkpoint.part("sums").items()}
+        self._restore_random(checkpoint)
         self.step = checkpoint.step
 
     def _acting_model(self) -> torch.nn.Module:
@@ -183,12 +164,13 @@ class Learner:
         }
         return {f"{kind}.{number}": state for kind, rows in gathered.items() for number, state in enumerate(rows)}
 
-    def _restore_random(self, states: dict[str, torch.Tensor], where: Path) -> None:
+    def _restore_random(self, checkpoint: Checkpoint) -> None:
+        states = checkpoint.part("random")
         processes = sum(name.startswith("cpu.") for name in states)
         if processes != self._accelerator.num_processes:
             raise TrainingError(
                 "a run continues in as many processes as it started with",
-                where=where,
+                where=checkpoint.path,
                 expected=processes,
                 found=self._accelerator.num_processes,
                 fix=f"accelerate launch --num_processes {processes}, or start again with --overwrite.",

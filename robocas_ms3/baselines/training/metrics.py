@@ -103,9 +103,7 @@ class MetricsLog:
 
 
 class TensorBoardWriter:
-    """Writes TensorBoard events without a thread, so that a full disk is an error of the training.
-
-    TensorBoard's own writer would print a traceback from its thread, and the training would fail later.
+    """Writes TensorBoard events without the thread of TensorBoard's own writer, whose errors would come late.
 
     Args:
         folder: of the files; a new one is added.

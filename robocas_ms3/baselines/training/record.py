@@ -72,6 +72,11 @@ class RunRecord(StrictModel):
     resumed: list[str] = []
     start: str = ""
 
+    @property
+    def metadata(self) -> dict[str, str]:
+        """Metadata of the files with tensors, by which they are of this run."""
+        return {"baseline": self.baseline, "version": str(self.version), "dataset": self.data.hash}
+
 
 def find_run(run: Path) -> Path:
     """Return the folder of a run: a single name is that of bundled weights, if there are such."""

@@ -9,11 +9,12 @@ from types import TracebackType
 
 import torch
 from accelerate import Accelerator
+from accelerate.utils import broadcast_object_list
 
 from robocas_ms3.baselines.baseline import Progress
 from robocas_ms3.baselines.training import checkpoints
-from robocas_ms3.baselines.training.checkpoints import Checkpoint
-from robocas_ms3.baselines.training.devices import count_threads
+from robocas_ms3.baselines.training.checkpoints import Checkpoint, Tensors
+from robocas_ms3.baselines.training.devices import describe_hardware
 from robocas_ms3.baselines.training.metrics import MetricsLog
 from robocas_ms3.baselines.training.record import CHECKPOINT, WEIGHTS, RunRecord
 from robocas_ms3.core.errors import TrainingError
@@ -36,14 +37,17 @@ class RunFolder:
         record: of the run.
         accelerator: that it is trained on.
         progress: functions to report to.
+        checkpoint: to continue from; None: the run starts from step 0.
     """
 
     def __init__(self, output: OutputFolder, record: RunRecord, accelerator: Accelerator, progress: Progress) -> None:
         self.record, self.accelerator, self.progress = record, accelerator, progress
         self._output = output
-        self._about = {"baseline": record.baseline, "version": str(record.version), "dataset": record.data.hash}
         self._log: MetricsLog | None = None
         self._started_at = 0.0
+        path = output.path / CHECKPOINT
+        is_continued = output.recorded is not None and path.is_file()
+        self.checkpoint: Checkpoint | None = checkpoints.load(path, record.metadata) if is_continued else None
 
     def __enter__(self) -> RunFolder:
         return self
@@ -53,29 +57,16 @@ class RunFolder:
     ) -> None:
         if self._log is None:
             return
-        if error is None:
+        with suppress(*([OSError] if error else [])):  # the first error counts
             self._log.close()
-        else:
-            with suppress(OSError):
-                self._log.close()
 
-    def load_checkpoint(self) -> Checkpoint | None:
-        """Return the checkpoint of a run that continues; None: there is none, and the run starts from step 0.
-
-        Raises:
-            TrainingError: it is damaged or of something else.
-        """
-        path = self._output.path / CHECKPOINT
-        if self._output.recorded is None or not path.is_file():
-            return None
-        return checkpoints.load_checkpoint(path, self._about)
-
-    def start(self, step: int, model: torch.nn.Module, size: str) -> None:
-        """Write the record, open the log and report what is trained.
+    def start(self, step: int, model: torch.nn.Module, weights: Tensors, size: str) -> None:
+        """Write the record and open the log; weights of another step than the checkpoint are written again.
 
         Args:
             step: of the checkpoint, or 0.
             model: to train.
+            weights: of the policy at this step.
             size: of the data, for the report.
         """
         accelerator, record = self.accelerator, self.record
@@ -85,6 +76,8 @@ class RunFolder:
             self.progress.note(f"continues {record.resumed[-1]}: results differ from those of an uninterrupted run")
         if accelerator.is_main_process:
             self._output.start(record.model_dump(mode="json"))
+            if self.checkpoint is not None:
+                self._repair_weights(step, weights)
         accelerator.wait_for_everyone()
         parameters = sum(parameter.numel() for parameter in model.parameters()) / 1e6
         precision = "bf16" if accelerator.mixed_precision == "bf16" else "fp32"
@@ -95,8 +88,8 @@ class RunFolder:
         self._started_at = time.monotonic() - (self._log.seconds if self._log else 0.0)
 
     def has_logged(self, step: int, split: str) -> bool:
-        """Return whether a run that continues has logged a line before; always False in other processes."""
-        return self._log is not None and self._log.has(step, split)
+        """Return whether a run that continues has logged a line before; all processes have to call this."""
+        return broadcast_object_list([self._log is not None and self._log.has(step, split)])[0]
 
     def log(self, step: int, split: str, metrics: Mapping[str, float], *, epoch: float, learning_rate: float) -> None:
         """Log metrics.
@@ -110,7 +103,7 @@ class RunFolder:
         seconds = time.monotonic() - self._started_at
         self._log.add(step, split, {"epoch": epoch, "seconds": seconds, "learning_rate": learning_rate}, metrics)
 
-    def save(self, step: int, state: Mapping[str, torch.Tensor], weights: Mapping[str, torch.Tensor]) -> None:
+    def save(self, step: int, state: Tensors, weights: Tensors) -> None:
         """Write the weights of the policy, then the checkpoint: the weights of the last step are never missing.
 
         Raises:
@@ -119,20 +112,9 @@ class RunFolder:
         if not self.accelerator.is_main_process:
             return
         self._output.check_exists()
-        about = {**self._about, "step": str(step)}
         with deferred_interrupts(second_ends=False):
-            checkpoints.save(self._output.path / WEIGHTS, weights, about)
-            checkpoints.save(self._output.path / CHECKPOINT, state, about)
-
-    def repair_weights(self, step: int, weights: Mapping[str, torch.Tensor]) -> None:
-        """Write the weights of the policy if they are missing, damaged, or of another step than the checkpoint."""
-        if not self.accelerator.is_main_process:
-            return
-        path, about = self._output.path / WEIGHTS, {**self._about, "step": str(step)}
-        try:
-            checkpoints.load(path, about)
-        except TrainingError:
-            checkpoints.save(path, weights, about)
+            checkpoints.save(self._output.path / WEIGHTS, weights, self.record.metadata, step)
+            checkpoints.save(self._output.path / CHECKPOINT, state, self.record.metadata, step)
 
     def error(self, message: str, step: int) -> TrainingError:
         """Return an error about NaN or infinite values at a step."""
@@ -142,12 +124,15 @@ class RunFolder:
             fix="Start another run from this one (--start), with a lower train.learning_rate.",
         )
 
+    def _repair_weights(self, step: int, weights: Tensors) -> None:
+        path = self._output.path / WEIGHTS
+        try:
+            checkpoints.load(path, {**self.record.metadata, "step": str(step)})
+        except TrainingError:
+            checkpoints.save(path, weights, self.record.metadata, step)
+
 
 def _hardware_changes(record: RunRecord, accelerator: Accelerator) -> str:
     """Return how this hardware differs from that of the record, which changes results; empty: it does not."""
-    now = {
-        "device": str(accelerator.device.type),
-        "precision": str(accelerator.mixed_precision),
-        "threads": count_threads(accelerator) if record.threads else 0,
-    }
+    now = describe_hardware(accelerator) | ({} if record.threads else {"threads": 0})
     return ", ".join(f"{name} {value}" for name, value in now.items() if getattr(record, name) != value)

@@ -1,4 +1,7 @@
-"""Supervised training on a CPU, a GPU or several (``accelerate launch``)."""
+"""Supervised training on a CPU, a GPU or several (``accelerate launch``).
+
+Samples and learning rate are functions of the step alone, so that a run can continue at any step.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +10,11 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 import torch
-from accelerate.utils import broadcast_object_list
 from torch.utils.data import DataLoader
 
 from robocas_ms3.baselines.baseline import Batch, Samples, TrainSettings
-from robocas_ms3.baselines.training.learner import Learner, NotFiniteError
+from robocas_ms3.baselines.training.learner import Learner
 from robocas_ms3.baselines.training.run_folder import RunFolder
-from robocas_ms3.baselines.training.schedule import Batches, epoch_at, learning_rate
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.core.exits import deferred_interrupts, exit_error
 
@@ -35,17 +36,13 @@ def train_supervised(
         RobocasError: somebody removed the folder.
         KeyboardInterrupt: Ctrl-C; the steps done are saved, with several processes up to the last checkpoint.
     """
-    accelerator = run.accelerator
-    checkpoint = run.load_checkpoint()
-    learner = Learner(model, settings, accelerator, checkpoint)
-    if checkpoint is not None:
-        run.repair_weights(learner.step, learner.weights())
-    run.start(learner.step, model, f"{len(samples)} samples of {samples.episodes} episodes")
+    accelerator, count = run.accelerator, len(samples)
+    learner = Learner(run, model, settings)
+    run.start(learner.step, model, learner.weights(), f"{count} samples of {samples.episodes} episodes")
 
     def log(split: str, metrics: dict[str, float]) -> None:
-        epoch = epoch_at(learner.step, len(samples), settings)
-        rate = learning_rate(learner.step - 1, len(samples), settings)
-        run.log(learner.step, split, metrics, epoch=epoch, learning_rate=rate)
+        rate = learning_rate(learner.step - 1, count, settings)
+        run.log(learner.step, split, metrics, epoch=epoch_at(learner.step, count, settings), learning_rate=rate)
 
     def validate() -> None:
         if validation is None or not learner.step:
@@ -54,39 +51,82 @@ def train_supervised(
             metrics = learner.evaluate(_validation_batches(run, validation, settings))
             log("val", metrics)
             text = ", ".join(f"{name} {value:.4g}" for name, value in metrics.items() if math.isfinite(value))
-            epoch = epoch_at(learner.step, len(samples), settings)
+            epoch = epoch_at(learner.step, count, settings)
             run.progress.note(f"step {learner.step}, epoch {epoch:.1f}, validation: {text}")
-
-    def save() -> None:
-        state = learner.state()
-        if state is not None:
-            run.save(learner.step, state, learner.weights())
 
     run.progress.step(learner.step, settings.steps)
     saved_step = learner.step
     try:
-        (is_validated,) = broadcast_object_list([run.has_logged(learner.step, "val")])
-        if not is_validated:  # it was interrupted
+        if not run.has_logged(learner.step, "val"):  # it was interrupted
             validate()
         process = (accelerator.process_index, accelerator.num_processes)
-        batches = Batches(len(samples), settings, learner.step, process)
-        for batch in _read_batches(run, samples, batches, settings.workers):
+        indices = batch_indices(count, settings, learner.step, process)
+        for batch in _read_batches(run, samples, indices, settings.workers):
             with deferred_interrupts():  # after a step everything is as a checkpoint has it
-                learner.update(batch, learning_rate(learner.step, len(samples), settings))
+                learner.update(batch, learning_rate(learner.step, count, settings))
                 is_last = learner.step == settings.steps
                 if is_last or learner.step % settings.log_every == 0:
                     log("train", learner.take_means())
                 if is_last or learner.step % settings.save_every == 0:
-                    save()
+                    learner.save()
                     saved_step = learner.step
             validate()
             run.progress.step(learner.step, settings.steps)
-    except NotFiniteError as error:
-        raise run.error(str(error), error.step) from error
     except KeyboardInterrupt:
         if learner.step > saved_step and accelerator.num_processes == 1:  # several may be at different steps
-            save()
+            learner.save()
         raise
+
+
+def batch_indices(
+    count: int, settings: TrainSettings, first: int = 0, process: tuple[int, int] = (0, 1)
+) -> Iterator[list[int]]:
+    """Yield the indices of batches, from permutations by (seed, epoch).
+
+    The rest of an epoch is the beginning of the first batch of the next.
+
+    Args:
+        count: number of samples, at least 1.
+        settings: seed, batch size, number of steps.
+        first: step to begin at.
+        process: (number, count) of the processes that share each batch.
+    """
+    size, (number, processes) = settings.batch_size, process
+    epoch, order = -1, torch.empty(0, dtype=torch.int64)
+    for step in range(first, settings.steps):
+        indices: list[int] = []
+        for place in range(step * size, (step + 1) * size):
+            if place // count != epoch:
+                epoch = place // count
+                generator = torch.Generator().manual_seed((settings.seed * 1_000_003 + epoch) % 2**63)
+                order = torch.randperm(count, generator=generator)
+            indices.append(int(order[place % count]))
+        yield indices[number::processes]
+
+
+def epoch_at(step: int, count: int, settings: TrainSettings) -> float:
+    """Return how often each of ``count`` samples has been drawn after so many steps."""
+    return step * settings.batch_size / count
+
+
+def learning_rate(step: int, count: int, settings: TrainSettings) -> float:
+    """Return the learning rate after ``step`` steps of training on ``count`` samples.
+
+    ``restarts`` is cosine annealing with warm restarts (Loshchilov and Hutter 2017), a period in epochs.
+    """
+    if step < settings.warmup_steps:
+        return settings.learning_rate * (step + 1) / settings.warmup_steps
+    if settings.schedule == "constant":
+        return settings.learning_rate
+    if settings.schedule == "cosine":
+        fraction = (step - settings.warmup_steps) / max(settings.steps - settings.warmup_steps, 1)
+    else:
+        epoch, period = epoch_at(step, count, settings), settings.restart_epochs
+        while epoch >= period:
+            epoch, period = epoch - period, period * settings.restart_factor
+        fraction = epoch / period
+    low = min(settings.min_learning_rate, settings.learning_rate)
+    return low + (settings.learning_rate - low) * (1 + math.cos(math.pi * min(fraction, 1.0))) / 2
 
 
 def _validation_batches(run: RunFolder, samples: Samples, settings: TrainSettings) -> Iterator[tuple[int, Batch]]:

@@ -3,12 +3,12 @@
 import pytest
 import torch
 from made_up_envs import LeftOrRight, MadeUpEnvironments
-from made_up_runs import read_log, stop_at
+from made_up_runs import read_log, stop_at, train
 from safetensors.torch import load_file
 
 from robocas_ms3.baselines.policy import RunPolicy
 from robocas_ms3.baselines.ppo import BASELINE
-from robocas_ms3.baselines.training.session import Progress, train_run
+from robocas_ms3.baselines.training.session import Progress
 from robocas_ms3.core.errors import OutputExistsError, TrainingError
 
 SMALL = {"width": 16, "envs": 4, "trials": 20, "layouts": 10, "train": {"steps": 1280, "batch_size": 64}}
@@ -21,7 +21,7 @@ def made_up(monkeypatch):
 
 
 def test_it_learns(made_up, tmp_path):
-    record = train_run("ppo", None, tmp_path / "run", SMALL, device="cpu")
+    record = train("ppo", None, tmp_path / "run", SMALL)
     assert (record.data.name, record.data.hash, record.data.episodes) == ("left or right", "1234", 10)
     rows = read_log(tmp_path / "run", "train")
     assert [int(row["step"]) for row in rows] == list(range(64, 1281, 64))
@@ -34,20 +34,20 @@ def test_it_learns(made_up, tmp_path):
 def test_ctrl_c_keeps_what_was_learned(made_up, tmp_path):
     run = tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):
-        train_run("ppo", None, run, SMALL, device="cpu", progress=stop_at(640, KeyboardInterrupt()))
+        train("ppo", None, run, SMALL, progress=stop_at(640, KeyboardInterrupt()))
     kept, weights = load_file(run / "checkpoint.safetensors"), load_file(run / "weights.safetensors")
     assert not read_log(run, "val")
     assert weights["count"].item() == pytest.approx(640, abs=1e-3)
     assert int(kept["episodes.played"]) == 640 // LeftOrRight.STEPS
     steps = []
-    train_run("ppo", None, run, device="cpu", progress=Progress(step=lambda done, of: steps.append(done)))
+    train("ppo", None, run, progress=Progress(step=lambda done, of: steps.append(done)))
     assert steps == list(range(640, 1281, 64))
     assert [int(row["step"]) for row in read_log(run, "train")] == list(range(64, 1281, 64))
     assert load_file(run / "weights.safetensors")["count"].item() == pytest.approx(1280, abs=1e-3)
     first, second = (envs.seeds[0] for envs in MadeUpEnvironments.made)
     assert (first, second) == (0, 640 // LeftOrRight.STEPS % 10)  # the layouts after those that were played
     before = (run / "weights.safetensors").read_bytes()
-    train_run("ppo", None, run, device="cpu")  # what is done is done
+    train("ppo", None, run)  # what is done is done
     assert (run / "weights.safetensors").read_bytes() == before
     assert len(read_log(run, "val")) == 1
 
@@ -55,10 +55,10 @@ def test_ctrl_c_keeps_what_was_learned(made_up, tmp_path):
 def test_what_goes_on_is_what_was_there(made_up, tmp_path):
     run = tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):
-        train_run("ppo", None, run, SMALL, device="cpu", progress=stop_at(640, KeyboardInterrupt()))
+        train("ppo", None, run, SMALL, progress=stop_at(640, KeyboardInterrupt()))
     before = load_file(run / "checkpoint.safetensors")
     with pytest.raises(KeyboardInterrupt):
-        train_run("ppo", None, run, device="cpu", progress=stop_at(640, KeyboardInterrupt()))  # before the next update
+        train("ppo", None, run, progress=stop_at(640, KeyboardInterrupt()))  # before the next update
     again = load_file(run / "checkpoint.safetensors")
     assert before.keys() == again.keys()
     assert any(name.startswith("optimizer.") for name in before)
@@ -79,32 +79,32 @@ def test_a_gradient_that_is_no_number_is_not_saved(made_up, monkeypatch, tmp_pat
     monkeypatch.setattr(torch.nn.utils, "clip_grad_norm_", spoil)
     changes = {**SMALL, "train": {**SMALL["train"], "save_every": 64}}
     with pytest.raises(TrainingError, match="gradient"):
-        train_run("ppo", None, tmp_path / "run", changes, device="cpu")
+        train("ppo", None, tmp_path / "run", changes)
     saved = load_file(tmp_path / "run" / "checkpoint.safetensors")
     assert all(tensor.isfinite().all() for tensor in saved.values())
 
 
 def test_data_is_refused(made_up, tmp_path):
     with pytest.raises(TrainingError) as caught:
-        train_run("ppo", tmp_path, tmp_path / "run", SMALL, device="cpu")
+        train("ppo", tmp_path, tmp_path / "run", SMALL)
     assert caught.value.where == "--data"
     with pytest.raises(TrainingError) as caught:
-        train_run("small", None, tmp_path / "run", device="cpu")
+        train("small", None, tmp_path / "run")
     assert caught.value.where == "--data"
 
 
 def test_other_scenes_do_not_go_on(made_up, monkeypatch, tmp_path):
-    train_run("ppo", None, tmp_path / "run", SMALL | {"trials": 0}, device="cpu")
+    train("ppo", None, tmp_path / "run", SMALL | {"trials": 0})
     monkeypatch.setattr(MadeUpEnvironments, "hash", "5678")
     with pytest.raises(OutputExistsError):
-        train_run("ppo", None, tmp_path / "run", device="cpu")
+        train("ppo", None, tmp_path / "run")
 
 
 @pytest.mark.slow
 def test_a_short_run_in_the_simulator(tmp_path):
     run = tmp_path / "run"
     small = {"envs": 2, "workers": 1, "layouts": 2, "trials": 2, "epochs": 1, "train": {"steps": 128, "batch_size": 64}}
-    train_run("ppo", None, run, small, device="cpu")
+    train("ppo", None, run, small)
     rows = read_log(run, "train")
     assert [row["step"] for row in rows] == ["64", "128"]
     assert 0 < float(rows[-1]["return"]) < 20

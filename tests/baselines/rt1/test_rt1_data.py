@@ -6,14 +6,13 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from made_up_runs import assert_same, stop_at
+from made_up_runs import assert_same, stop_at, train
 from rt1_sizes import SIZES
 from torch.utils.data import DataLoader
 
 from robocas_ms3.baselines.rt1 import BASELINE
 from robocas_ms3.baselines.rt1.config import RT1Config
 from robocas_ms3.baselines.rt1.policy import scaled
-from robocas_ms3.baselines.training.session import train_run
 from robocas_ms3.core.errors import DatasetError, TrainingError
 from robocas_ms3.core.strict import parse
 from robocas_ms3.datasets.formats import open_source
@@ -139,10 +138,10 @@ def test_it_goes_on_to_the_bit(folder, tmp_path):
     """With what is random in it: crops and dropout."""
     few = {"steps": 4, "batch_size": 2, "save_every": 2, "log_every": 1, "workers": 0}
     changes = {**RT1Config(**SIZES).model_dump(), "train": few}
-    train_run("rt1", folder, tmp_path / "whole", changes, device="cpu")
+    train("rt1", folder, tmp_path / "whole", changes)
     with pytest.raises(RuntimeError):
-        train_run("rt1", folder, tmp_path / "again", changes, device="cpu", progress=stop_at(3, RuntimeError("gone")))
-    train_run("rt1", folder, tmp_path / "again", device="cpu")
+        train("rt1", folder, tmp_path / "again", changes, progress=stop_at(3, RuntimeError("gone")))
+    train("rt1", folder, tmp_path / "again")
     assert_same(tmp_path / "whole", tmp_path / "again")
 
 

@@ -7,7 +7,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.baselines.chunks.poses import state_of
+from robocas_ms3.baselines.chunks import state_of
 from robocas_ms3.baselines.small.config import View
 from robocas_ms3.baselines.small.lifting import SAID, Lift, heights_of, tcp_of
 from robocas_ms3.baselines.small.pointing import places_of

@@ -7,18 +7,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from made_up_runs import assert_same, stop_at
+from made_up_runs import assert_same, stop_at, train
 from pydantic import ValidationError
 from small_sizes import TINY, VIEW
 
-from robocas_ms3.baselines.chunks.poses import decode
+from robocas_ms3.baselines.chunks import decode
 from robocas_ms3.baselines.small import BASELINE, data
 from robocas_ms3.baselines.small.config import SmallConfig, View
-from robocas_ms3.baselines.small.data import looked_at
+from robocas_ms3.baselines.small.data import crop_image
 from robocas_ms3.baselines.small.model import shifted
 from robocas_ms3.baselines.small.pointing import CELL, NOWHERE, pointing_losses
 from robocas_ms3.baselines.small.standing import Standing
-from robocas_ms3.baselines.training.session import merge_configs, train_run
+from robocas_ms3.baselines.training.session import merge_configs
 from robocas_ms3.core.errors import DatasetError, TrainingError
 from robocas_ms3.core.poses import to_wxyz
 from robocas_ms3.core.strict import parse
@@ -115,7 +115,7 @@ def test_samples_are_the_datasets(samples, folder):
     assert (samples.episodes, len(samples)) == (5, 35)
     arrays = source.episode(numbers[2]).arrays
     batch = samples.__getitems__([2 * 7 + 4])
-    expected = looked_at(source.episode(numbers[2]).rgb("gripper_camera", 4), VIEW)
+    expected = crop_image(source.episode(numbers[2]).rgb("gripper_camera", 4), VIEW)
     assert np.array_equal(batch["gripper_camera"][0].numpy(), expected)
     assert batch["state"][0, :3].tolist() == pytest.approx(arrays["ee_pos"][4].tolist())
     assert batch["state"][0, 9].item() == pytest.approx(float(arrays["gripper_width"][4]) / 0.08)
@@ -167,10 +167,10 @@ def test_a_part_is_cut_and_scaled():
     picture = np.zeros((48, 64, 3), np.uint8)
     picture[24:, 32:] = 200
     view = View(rendered=(64, 48), part=(0.5, 0.5, 1.0, 1.0), size=(16, 16))
-    assert (looked_at(picture, view) == 200).all()
-    assert looked_at(picture, view).shape == (16, 16, 3)
+    assert (crop_image(picture, view) == 200).all()
+    assert crop_image(picture, view).shape == (16, 16, 3)
     larger = np.repeat(np.repeat(picture, 2, 0), 2, 1)
-    assert (looked_at(larger, view) == 200).all()  # scaled to what is rendered first
+    assert (crop_image(larger, view) == 200).all()  # scaled to what is rendered first
 
 
 def test_shifts_move_pictures_as_a_whole():
@@ -346,11 +346,11 @@ def test_it_goes_on_to_the_bit(folder, tmp_path, precision):
     """With what is random in it: shifts, light and dropout."""
     few = {"steps": 6, "batch_size": 8, "save_every": 2, "check_every": 3, "log_every": 1, "precision": precision}
     changes = {**SmallConfig(**{**TINY, "dropout": 0.1, "shift": 3, "brightness": 0.2}).model_dump(), "train": few}
-    train_run("small", folder, tmp_path / "whole", changes, device="cpu")
+    train("small", folder, tmp_path / "whole", changes)
     with pytest.raises(RuntimeError):
         said = stop_at(5, RuntimeError("gone"))
-        train_run("small", folder, tmp_path / "again", changes, device="cpu", progress=said)
-    train_run("small", folder, tmp_path / "again", device="cpu")
+        train("small", folder, tmp_path / "again", changes, progress=said)
+    train("small", folder, tmp_path / "again")
     assert_same(tmp_path / "whole", tmp_path / "again")
 
 

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 import torch
 from made_up_baseline import MadeUp
-from made_up_runs import assert_same, change_record, stop_at
+from made_up_runs import assert_same, change_record, stop_at, train
 from safetensors.torch import load_file
 
 from robocas_ms3.baselines.training.initial_weights import combine_facts, load_initial_weights
-from robocas_ms3.baselines.training.session import Progress, merge_configs, train_run
+from robocas_ms3.baselines.training.session import Progress, merge_configs
 from robocas_ms3.core.errors import OutputExistsError, TrainingError
 from robocas_ms3.evaluation.policies import make_policy
 
@@ -56,7 +56,7 @@ def test_other_inputs_are_refused(whole, made_up, facts, own, where):
 
 
 def test_options_leave_the_other_defaults(made_up, data, tmp_path):
-    record = train_run("made-up", data, tmp_path / "run", {"train": {"steps": 3}}, device="cpu")
+    record = train("made-up", data, tmp_path / "run", {"train": {"steps": 3}})
     assert record.config["train"]["steps"] == 3
     assert record.config["train"]["batch_size"] == 4  # the baseline's, not TrainSettings'
 
@@ -64,7 +64,7 @@ def test_options_leave_the_other_defaults(made_up, data, tmp_path):
 @pytest.mark.parametrize("changes", [{"widht": 3}, {"train": {"steps": 0}}, {"width": "wide"}], ids=str)
 def test_wrong_options(made_up, data, tmp_path, changes):
     with pytest.raises(TrainingError):
-        train_run("made-up", data, tmp_path / "run", changes, device="cpu")
+        train("made-up", data, tmp_path / "run", changes)
     assert not (tmp_path / "run").exists()
 
 
@@ -82,7 +82,7 @@ def test_wrong_options(made_up, data, tmp_path, changes):
 def test_a_run_of_something_else_is_not_continued(whole, data, change, where):
     change(whole, data)
     with pytest.raises((TrainingError, OutputExistsError)) as error:
-        train_run("made-up", data, whole, device="cpu")
+        train("made-up", data, whole)
     assert error.value.where == whole / where
     assert (whole / "weights.safetensors").is_file()
 
@@ -90,13 +90,13 @@ def test_a_run_of_something_else_is_not_continued(whole, data, change, where):
 def test_a_run_starts_from_the_weights_of_another(whole, data, tmp_path):
     data.write_text("more")
     changes = {"train": {"steps": 1, "learning_rate": 1e-9, "ema": 0}}
-    record = train_run("made-up", data, tmp_path / "next", changes, start=whole, device="cpu")
+    record = train("made-up", data, tmp_path / "next", changes, start=whole)
     first, second = (load_file(folder / "weights.safetensors") for folder in (whole, tmp_path / "next"))
     assert all(torch.allclose(first[key], second[key], atol=1e-6) for key in first)
     assert record.start.startswith("whole, ")
     for start, options in ((tmp_path, {}), (whole, {"width": 5})):  # no run; other sizes
         with pytest.raises(TrainingError):
-            train_run("made-up", data, tmp_path / "other", options, start=start, device="cpu")
+            train("made-up", data, tmp_path / "other", options, start=start)
     assert not (tmp_path / "other").exists()
 
 
@@ -104,32 +104,32 @@ def test_a_run_that_started_from_weights_continues_with_the_same(whole, data, tm
     other = shutil.copytree(whole, tmp_path / "other")
     out, few = tmp_path / "next", {"train": {"steps": 12}}
     with pytest.raises(RuntimeError):
-        train_run("made-up", data, out, few, start=whole, device="cpu", progress=stop_at(11, RuntimeError("gone")))
+        train("made-up", data, out, few, start=whole, progress=stop_at(11, RuntimeError("gone")))
     for folder in (out, whole):
         with pytest.raises(OutputExistsError, match="start: "):
-            train_run("made-up", data, folder, start=other, device="cpu")
-    train_run("made-up", data, out, start=whole, device="cpu")
-    train_run("made-up", data, out, device="cpu")
-    train_run("made-up", data, tmp_path / "unbroken", few, start=whole, device="cpu")
+            train("made-up", data, folder, start=other)
+    train("made-up", data, out, start=whole)
+    train("made-up", data, out)
+    train("made-up", data, tmp_path / "unbroken", few, start=whole)
     assert_same(tmp_path / "unbroken", out)
 
 
 def test_a_run_without_a_checkpoint_needs_its_initial_weights_again(whole, data, tmp_path):
     out, few = tmp_path / "next", {"train": {"steps": 12}}
     with pytest.raises(RuntimeError):
-        train_run("made-up", data, out, few, start=whole, device="cpu", progress=stop_at(3, RuntimeError("gone")))
+        train("made-up", data, out, few, start=whole, progress=stop_at(3, RuntimeError("gone")))
     with pytest.raises(TrainingError) as caught:
-        train_run("made-up", data, out, device="cpu")
+        train("made-up", data, out)
     assert caught.value.where == out and "--start" in caught.value.fix
-    train_run("made-up", data, out, start=whole, device="cpu")
-    train_run("made-up", data, tmp_path / "unbroken", few, start=whole, device="cpu")
+    train("made-up", data, out, start=whole)
+    train("made-up", data, tmp_path / "unbroken", few, start=whole)
     assert_same(tmp_path / "unbroken", out)
 
 
 def test_other_options_are_refused_with_their_values(whole, data):
     options = {"width": 5, "train": {"learning_rate": 9e-4}}
     with pytest.raises(OutputExistsError) as error:
-        train_run("made-up", data, whole, options, device="cpu")
+        train("made-up", data, whole, options)
     assert sorted(error.value.found.split("; ")) == [
         "config.train.learning_rate: 0.001 -> 0.0009",
         "config.width: 4 -> 5",
@@ -140,7 +140,7 @@ def test_an_option_that_is_newer_than_the_run_has_its_default(whole, data):
     config = json.loads((whole / "run.json").read_text())["config"]
     del config["width"]
     change_record(whole, config=config)
-    train_run("made-up", data, whole, device="cpu")
+    train("made-up", data, whole)
 
 
 @pytest.mark.parametrize(
@@ -154,17 +154,15 @@ def test_an_option_that_is_newer_than_the_run_has_its_default(whole, data):
 def test_other_hardware_is_recorded(whole, data, recorded, changes):
     change_record(whole, **recorded)
     notes = []
-    train_run("made-up", data, whole, device="cpu", progress=Progress(note=notes.append))
+    train("made-up", data, whole, progress=Progress(note=notes.append))
     assert json.loads((whole / "run.json").read_text())["resumed"] == changes
     assert all(any(change in note for note in notes) for change in changes)
 
 
 def test_the_configuration_of_the_run_to_start_from_is_below_the_options(made_up, data, tmp_path):
     changes = {"width": 8, "train": {"steps": 8, "learning_rate": 0.002}}
-    train_run("made-up", data, tmp_path / "first", changes, device="cpu")
-    record = train_run(
-        "made-up", data, tmp_path / "more", {"train": {"steps": 4}}, device="cpu", start=tmp_path / "first"
-    )
+    train("made-up", data, tmp_path / "first", changes)
+    record = train("made-up", data, tmp_path / "more", {"train": {"steps": 4}}, start=tmp_path / "first")
     assert (record.config["width"], record.config["train"]["learning_rate"]) == (8, 0.002)
     assert record.config["train"]["steps"] == 4
     about = make_policy(str(tmp_path / "more")).describe()
@@ -175,7 +173,7 @@ def test_the_configuration_of_the_run_to_start_from_is_below_the_options(made_up
 def test_a_run_on_other_images_is_refused_as_a_start(whole, made_up, data, tmp_path):
     change_record(whole, facts={"inputs": 3, "pictures": {"base_camera": [64, 48]}})
     with pytest.raises(TrainingError):
-        train_run("made-up", data, tmp_path / "more", device="cpu", start=whole)
+        train("made-up", data, tmp_path / "more", start=whole)
     assert not (tmp_path / "more").exists()
 
 

@@ -14,13 +14,13 @@ from types import SimpleNamespace
 import made_up_baseline
 import pytest
 import torch
-from made_up_runs import assert_finite, assert_same, change_record, read_log, stop_at
+from made_up_runs import assert_finite, assert_same, change_record, read_log, stop_at, train
 from safetensors.torch import load_file
 
 from robocas_ms3.baselines.policy import RunPolicy
 from robocas_ms3.baselines.training import checkpoints, devices
 from robocas_ms3.baselines.training.learner import Learner
-from robocas_ms3.baselines.training.session import Progress, merge_configs, train_run
+from robocas_ms3.baselines.training.session import Progress, merge_configs
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import DatasetError, ExtensionError, OutputExistsError, RobocasError, TrainingError
 from robocas_ms3.evaluation.policies import make_policy
@@ -57,8 +57,8 @@ def test_a_run_that_was_stopped_continues_to_the_bit(whole, data, tmp_path, step
     """Ctrl-C loses nothing, a crash the steps after the last checkpoint."""
     out, steps = tmp_path / "again", []
     with pytest.raises(error):
-        train_run("made-up", data, out, device="cpu", progress=stop_at(step, error("stopped")))
-    train_run("made-up", data, out, device="cpu", progress=Progress(step=lambda done, total: steps.append(done)))
+        train("made-up", data, out, progress=stop_at(step, error("stopped")))
+    train("made-up", data, out, progress=Progress(step=lambda done, total: steps.append(done)))
     assert steps[0] == continued_at
     assert_same(whole, out)
 
@@ -68,17 +68,17 @@ def test_a_run_that_was_stopped_continues_to_the_bit(whole, data, tmp_path, step
 def test_a_checkpoint_without_room_on_the_disk_is_written_later(whole, data, tmp_path, monkeypatch, name, step):
     save = checkpoints.save
 
-    def full(path, tensors, about):
-        if path.name == name and about["step"] == str(step):
+    def full(path, tensors, metadata, at):
+        if path.name == name and at == step:
             raise OSError(errno.ENOSPC, "No space left on device", str(path))
-        save(path, tensors, about)
+        save(path, tensors, metadata, at)
 
     out = tmp_path / "again"
     with monkeypatch.context() as patch:
         patch.setattr(checkpoints, "save", full)
         with pytest.raises(OSError, match=name):
-            train_run("made-up", data, out, device="cpu")
-    train_run("made-up", data, out, device="cpu")
+            train("made-up", data, out)
+    train("made-up", data, out)
     assert_same(whole, out)
 
 
@@ -88,7 +88,7 @@ def test_weights_are_repaired_from_the_checkpoint(whole, data, damage):
     damage(whole / "weights.safetensors")
     with pytest.raises(TrainingError):
         RunPolicy(whole)
-    train_run("made-up", data, whole, device="cpu")
+    train("made-up", data, whole)
     assert (whole / "weights.safetensors").read_bytes() == before
 
 
@@ -123,32 +123,32 @@ def test_an_interrupted_validation_is_repeated(whole, data, tmp_path, monkeypatc
     with monkeypatch.context() as patch:
         patch.setattr(Learner, "evaluate", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            train_run("made-up", data, tmp_path / "again", device="cpu")
+            train("made-up", data, tmp_path / "again")
     assert str(step) not in {row["step"] for row in read_log(tmp_path / "again", "val")}
-    train_run("made-up", data, tmp_path / "again", device="cpu")
+    train("made-up", data, tmp_path / "again")
     assert_same(whole, tmp_path / "again")
 
 
 def test_a_finished_run_stays_as_it_is(whole, data):
     before = (whole / "weights.safetensors").read_bytes()
-    train_run("made-up", data, whole, device="cpu")
+    train("made-up", data, whole)
     assert (whole / "weights.safetensors").read_bytes() == before
 
 
 def test_seeds_differ(whole, data, tmp_path):
-    train_run("made-up", data, tmp_path / "other", {"train": {"seed": 1}}, device="cpu")
+    train("made-up", data, tmp_path / "other", {"train": {"seed": 1}})
     first, second = (load_file(folder / "weights.safetensors") for folder in (whole, tmp_path / "other"))
     assert not torch.equal(first["net.0.weight"], second["net.0.weight"])
 
 
 def test_no_such_baseline(data, tmp_path):
     with pytest.raises(TrainingError, match="small"):
-        train_run("smal", data, tmp_path / "run")
+        train("smal", data, tmp_path / "run")
 
 
 def test_no_data(made_up, tmp_path):
     with pytest.raises(TrainingError) as caught:
-        train_run("made-up", tmp_path / "none.h5", tmp_path / "run", device="cpu")
+        train("made-up", tmp_path / "none.h5", tmp_path / "run")
     assert caught.value.where == tmp_path / "none.h5"
     assert not (tmp_path / "run").exists()
 
@@ -161,13 +161,13 @@ def test_a_folder_of_something_else_is_refused(made_up, data, tmp_path, overwrit
     (out / ".draft.tmp.txt").write_text("mine")
     (out / "metrics.csv").write_text("epoch,loss\n3,0.5\n")
     with pytest.raises(OutputExistsError):
-        train_run("made-up", data, out, device="cpu", overwrite=overwrite)
+        train("made-up", data, out, overwrite=overwrite)
     assert (out / "metrics.csv").read_text() == "epoch,loss\n3,0.5\n"
     assert len(list(out.iterdir())) == 2
 
 
 def test_overwrite_starts_again(whole, data):
-    train_run("made-up", data, whole, {"train": {"steps": 4}}, device="cpu", overwrite=True)
+    train("made-up", data, whole, {"train": {"steps": 4}}, overwrite=True)
     assert len(read_log(whole)) == 2
 
 
@@ -180,10 +180,10 @@ def test_a_nan_ends_the_run_and_the_last_checkpoint_stays(made_up, data, tmp_pat
     changes = merge_configs(changes, {"train": {"save_every": 1}})
     progress = Progress(step=lambda step, _: done.append(step))
     with pytest.raises(TrainingError):
-        train_run("made-up", data, out, changes, device="cpu", progress=progress)
+        train("made-up", data, out, changes, progress=progress)
     assert_finite(out)
     for name in ("checkpoint", "weights"):
-        assert int(checkpoints.load(out / f"{name}.safetensors", {})[1]["step"]) == done[-1] > 0
+        assert checkpoints.load(out / f"{name}.safetensors", {}).step == done[-1] > 0
     assert load_file(out / "checkpoint.safetensors")["optimizer.0.step"] == done[-1]
 
 
@@ -191,7 +191,7 @@ def test_a_nan_that_was_not_checked_is_not_saved(made_up, data, tmp_path, monkey
     """As on a GPU, where steps are not waited for, and without lines of the log, which end the run."""
     monkeypatch.setattr(Learner, "check_finite", lambda self, step, **values: None)
     changes = {"steep_at": 7, "train": {"save_every": 1, "log_every": 100, "check_every": 100}}
-    train_run("made-up", data, tmp_path / "run", changes, device="cpu")
+    train("made-up", data, tmp_path / "run", changes)
     assert_finite(tmp_path / "run")
 
 
@@ -203,23 +203,23 @@ def test_a_removed_folder_is_an_error(made_up, data, tmp_path, monkeypatch):
         if done == 5:
             shutil.rmtree(out)
 
-    def remove_and_save(path, tensors, about):
+    def remove_and_save(path, *what):
         shutil.rmtree(out, ignore_errors=True)
-        save(path, tensors, about)
+        save(path, *what)
 
     with pytest.raises(RobocasError) as caught:
-        train_run("made-up", data, out, device="cpu", progress=Progress(step=remove))
+        train("made-up", data, out, progress=Progress(step=remove))
     assert caught.value.where == out
     monkeypatch.setattr(checkpoints, "save", remove_and_save)
     with pytest.raises(RobocasError) as caught:
-        train_run("made-up", data, out, device="cpu")
+        train("made-up", data, out)
     assert caught.value.where == out
 
 
 def test_a_baseline_can_not_end_the_process(made_up, data, tmp_path, monkeypatch):
     monkeypatch.setattr(made_up, "model", lambda self, config, facts: sys.exit(0))
     with pytest.raises(ExtensionError) as caught:
-        train_run("made-up", data, tmp_path / "run", device="cpu")
+        train("made-up", data, tmp_path / "run")
     assert caught.value.where == "baseline made-up"
 
 
@@ -235,20 +235,20 @@ def test_a_baseline_that_changes_the_working_directory(made_up, data, tmp_path, 
 
 def test_without_validation(made_up, data, tmp_path):
     data.write_text("few")
-    train_run("made-up", data, tmp_path / "run", device="cpu")
+    train("made-up", data, tmp_path / "run")
     assert {row["split"] for row in read_log(tmp_path / "run")} == {"train"}
 
 
 def test_a_damaged_validation_split_is_an_error(made_up, data, tmp_path):
     data.write_text("damaged")
     with pytest.raises(DatasetError):
-        train_run("made-up", data, tmp_path / "run", device="cpu")
+        train("made-up", data, tmp_path / "run")
 
 
 def test_processes_share_a_batch_evenly(made_up, data, tmp_path, monkeypatch):
     monkeypatch.setattr(devices, "make_accelerator", lambda *_: SimpleNamespace(num_processes=3))
     with pytest.raises(TrainingError) as caught:
-        train_run("made-up", data, tmp_path / "run", device="cpu")
+        train("made-up", data, tmp_path / "run")
     assert caught.value.where == "train.batch_size"
 
 
@@ -258,13 +258,13 @@ def test_leftovers_of_a_kill_are_removed(whole, made_up, data, tmp_path):
     (tmp_path / "run" / ".run.123.tmp.json").write_text("{")
     (whole / ".checkpoint.123.tmp.safetensors").write_bytes(b"half")
     for out, changes in ((tmp_path / "run", {"train": {"steps": 4}}), (whole, {})):
-        train_run("made-up", data, out, changes, device="cpu")
+        train("made-up", data, out, changes)
         assert not list(out.glob(".*"))
 
 
 def test_an_error_of_a_worker_is_that_of_the_samples(made_up, data, tmp_path):
     with pytest.raises(DatasetError) as caught:
-        train_run("made-up", data, tmp_path / "run", {"damaged_at": 7, "train": {"workers": 1}}, device="cpu")
+        train("made-up", data, tmp_path / "run", {"damaged_at": 7, "train": {"workers": 1}})
     assert caught.value.where == "sample 7"
 
 
@@ -327,4 +327,4 @@ def test_each_process_continues_with_its_own_random_state(shared):
 @pytest.mark.slow
 def test_a_run_continues_in_as_many_processes(made_up, shared):
     with pytest.raises(TrainingError, match="num_processes 2"):
-        train_run("made-up", shared / "data.h5", shared / "whole", device="cpu")
+        train("made-up", shared / "data.h5", shared / "whole")

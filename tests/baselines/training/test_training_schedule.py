@@ -6,7 +6,7 @@ from collections import Counter
 import pytest
 
 from robocas_ms3.baselines.baseline import TrainSettings
-from robocas_ms3.baselines.training.schedule import Batches, epoch_at, learning_rate
+from robocas_ms3.baselines.training.supervised import batch_indices, epoch_at, learning_rate
 
 
 def settings(**values):
@@ -14,21 +14,21 @@ def settings(**values):
 
 
 def test_an_epoch_has_every_sample_once_and_runs_into_the_next():
-    batches = list(Batches(10, settings(steps=5, batch_size=4)))  # 20 places: two epochs
+    batches = list(batch_indices(10, settings(steps=5, batch_size=4)))  # 20 places: two epochs
     places = [index for batch in batches for index in batch]
     assert Counter(places[:10]) == Counter(range(10)) == Counter(places[10:])
     assert places[:10] != places[10:]
 
 
 def test_batches_follow_from_seed_and_step():
-    whole = list(Batches(10, settings(steps=6, batch_size=4)))
-    assert list(Batches(10, settings(steps=6, batch_size=4), first=3)) == whole[3:]
-    assert list(Batches(10, settings(steps=6, batch_size=4, seed=1))) != whole
+    whole = list(batch_indices(10, settings(steps=6, batch_size=4)))
+    assert list(batch_indices(10, settings(steps=6, batch_size=4), first=3)) == whole[3:]
+    assert list(batch_indices(10, settings(steps=6, batch_size=4, seed=1))) != whole
 
 
 def test_processes_share_a_batch():
-    whole = list(Batches(10, settings(steps=3, batch_size=4)))
-    parts = [list(Batches(10, settings(steps=3, batch_size=4), process=(number, 2))) for number in (0, 1)]
+    whole = list(batch_indices(10, settings(steps=3, batch_size=4)))
+    parts = [list(batch_indices(10, settings(steps=3, batch_size=4), process=(number, 2))) for number in (0, 1)]
     assert [sorted(one + other) for one, other in zip(*parts, strict=True)] == [sorted(batch) for batch in whole]
 
 

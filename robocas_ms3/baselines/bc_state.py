@@ -1,0 +1,278 @@
+"""`bc-state`: chunks of poses from the privileged state of the simulator, an upper bound without vision."""
+
+from __future__ import annotations
+
+import hashlib
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import Field
+from torch import nn
+
+from robocas_ms3.baselines.baseline import BaselineConfig, Batch, OnRead, Split, TrainSettings, no_episodes
+from robocas_ms3.baselines.chunks import ROW, ChunkPolicy, Scale, chunk_losses, encode, next_keys, spread, state_of
+from robocas_ms3.baselines.dataset_checks import check_base_stands
+from robocas_ms3.baselines.training.record import hash_dataset
+from robocas_ms3.core.documents import DAMAGED
+from robocas_ms3.core.errors import DatasetError, EvaluationError
+from robocas_ms3.core.files import replacing
+from robocas_ms3.core.paths import cache_dir
+from robocas_ms3.core.poses import from_wxyz
+from robocas_ms3.datasets.sources.split import split_by_seed
+from robocas_ms3.demos.recordings.motion import sample_states, sample_stride
+from robocas_ms3.demos.recordings.reading import TrajectoryFile
+from robocas_ms3.demos.recordings.versions import versions
+from robocas_ms3.evaluation.policy import Observations, PolicySpec, privileged
+from robocas_ms3.robots.description import RobotDescription
+
+_CACHE_VERSION = 3
+_PACKAGES = ("robocas-ms3", "mani_skill", "sapien")
+_MIN_DEVIATION = 1e-2  # of an input: a quantity that hardly changes must not be blown up
+
+
+class BcStateConfig(BaselineConfig):
+    """Configuration of `bc-state`.
+
+    Attributes:
+        rate_hz: steps per second.
+        chunk: number of predicted steps.
+        width: of the layers.
+        blocks: residual blocks of two layers each.
+        dropout: within the blocks.
+        noise: deviation of the noise on the inputs in training, in deviations of the inputs.
+        keys_weight, gripper_weight, near: see `SmallConfig`.
+        play: steps of a chunk before the next one is predicted.
+        fade: decay of the weight of older predictions, see `ChunkPolicy`.
+        train: see `TrainSettings`.
+    """
+
+    rate_hz: float = Field(default=5.0, gt=0, le=100)
+    chunk: int = Field(default=8, ge=1, le=1000)
+    width: int = Field(default=384, ge=8, le=16384)
+    blocks: int = Field(default=4, ge=1, le=1000)
+    dropout: float = Field(default=0.1, ge=0, lt=1)
+    noise: float = Field(default=0.02, ge=0)
+    keys_weight: float = Field(default=0.5, ge=0)
+    gripper_weight: float = Field(default=0.5, ge=0)
+    near: float = Field(default=0.0, ge=0)
+    play: int = Field(default=1, ge=1, le=1000)
+    fade: float = Field(default=0.5, ge=0)
+    train: TrainSettings = TrainSettings(
+        steps=20_000, batch_size=256, learning_rate=1e-3, weight_decay=0.01, precision="fp32"
+    )
+
+
+class StateSamples:
+    """Samples of `bc-state`: a batch has ``inputs`` (B, D), ``chunk`` (B, K, 10) and ``key`` (B, 9).
+
+    Args:
+        config: see `BcStateConfig`.
+        path: ``trajectory.h5``.
+        split: of its seeds, as in a conversion.
+        on_read: see `Baseline.data`.
+
+    Raises:
+        DatasetError: it is no trajectory file, its scenes hold different numbers of objects, or its base drives.
+    """
+
+    def __init__(self, config: BcStateConfig, path: Path, split: Split, on_read: OnRead) -> None:
+        arrays = load_states(path, config.rate_hz, on_read)
+        sides = split_by_seed(dict(enumerate(arrays["seeds"].tolist())))
+        numbers = sides[0 if split == "train" else 1]
+        self.episodes = len(numbers)
+        if not numbers:
+            raise no_episodes(path, split)
+        ends = np.cumsum(arrays["lengths"])
+        rows = [slice(int(ends[number] - arrays["lengths"][number]), int(ends[number])) for number in numbers]
+        poses, opened = arrays["poses"], arrays["opened"]
+        self._chunks = _concatenate([encode(poses[row], opened[row], config.chunk) for row in rows])
+        self._keys = _concatenate([next_keys(poses[row], opened[row]) for row in rows])
+        self._inputs = _concatenate(
+            [inputs_of(arrays["state"][row], poses[row], arrays["widths"][row]) for row in rows]
+        )
+        values = self._inputs.numpy()
+        deviation = np.maximum(values.std(0), _MIN_DEVIATION)
+        self.facts: dict[str, Any] = {
+            "rate_hz": config.rate_hz,
+            "inputs": {"mean": values.mean(0).tolist(), "deviation": deviation.tolist()},
+            "chunk": spread(self._chunks[..., :9].numpy()),
+            "keys": spread(self._keys.numpy()),
+        }
+
+    def __len__(self) -> int:
+        return len(self._inputs)
+
+    def __getitems__(self, indices: list[int]) -> Batch:
+        rows = torch.tensor(indices)
+        return {"inputs": self._inputs[rows], "chunk": self._chunks[rows], "key": self._keys[rows]}
+
+
+def inputs_of(
+    state: NDArray[np.floating], poses: NDArray[np.floating], widths: NDArray[np.floating]
+) -> NDArray[np.float32]:
+    """Return the inputs (N, D + 10) of the network: privileged state (N, D) and proprioception, see `state_of`."""
+    return np.concatenate([state, state_of(poses, widths)], axis=1).astype(np.float32)
+
+
+def _concatenate(parts: list[NDArray[np.float32]]) -> torch.Tensor:
+    return torch.from_numpy(np.concatenate(parts))
+
+
+def load_states(path: Path, rate_hz: float, on_read: OnRead) -> dict[str, NDArray[Any]]:
+    """Return the arrays of `read_states`, which take minutes for a thousand episodes and are therefore cached."""
+    if path.is_dir() or path.suffix != ".h5":
+        fix = "Name the trajectory.h5 of robocas generate."
+        raise DatasetError("bc-state learns from recorded states", where=path, expected="a trajectory.h5", fix=fix)
+    cached = _cache_path(path, rate_hz)
+    if cached.is_file():
+        with suppress(*DAMAGED), np.load(cached) as arrays:
+            return dict(arrays)
+    arrays = read_states(path, rate_hz, on_read)
+    with replacing(cached) as tmp:
+        np.savez(tmp, **arrays)  # pyright: ignore[reportArgumentType]  (its stub takes no mapping)
+    return arrays
+
+
+def _cache_path(path: Path, rate_hz: float) -> Path:
+    digest = hashlib.sha256(f"{_CACHE_VERSION} {rate_hz!r}\n".encode())
+    for file in (path, path.with_suffix(".json")):
+        digest.update(f"{hash_dataset(file) if file.is_file() else None}\n".encode())
+    for package in _PACKAGES:
+        digest.update(f"{package} {versions()[package]}\n".encode())
+    return cache_dir() / "bc-state" / f"{digest.hexdigest()[:32]}.npz"
+
+
+def read_states(path: Path, rate_hz: float, on_read: OnRead) -> dict[str, NDArray[Any]]:
+    """Return the privileged state at each step of the successful episodes, from their environment.
+
+    Returns:
+        ``state`` (N, D), ``poses`` (N, 4, 4), ``opened`` (N,), ``widths`` (N,) of all steps; ``lengths``, ``seeds``
+        by episode.
+    """
+    parts: dict[str, list[NDArray[Any]]] = {name: [] for name in ("state", "poses", "opened", "widths")}
+    lengths, seeds, env = [], [], None
+    with TrajectoryFile(path) as file:
+        stride = sample_stride(file.control_freq, rate_hz)
+        try:
+            for index, entry in enumerate(file.episodes):
+                on_read(index, len(file.episodes))
+                if not entry.get("success", True):
+                    continue
+                recording = file.recording(index)
+                where = f"{path}, episode {recording.episode_id}"
+                samples = sample_states(recording.control_steps, stride)
+                motion = recording.motion(samples)
+                check_base_stands(np.diff(motion.qpos[:, RobotDescription.base_slice], axis=0), where)
+                if env is None:
+                    env = file.env.make(obs_mode="state_dict", render_backend="none", reward_mode="none")
+                env.reset(seed=recording.seed, options=dict(recording.reset_options))
+                rows = [_privileged_state(env.unwrapped, recording.state(int(sample))) for sample in samples]
+                if parts["state"] and parts["state"][0].shape[1] != len(rows[0]):
+                    expected = parts["state"][0].shape[1]
+                    what = "another number of objects in this scene"
+                    raise DatasetError(what, where=where, expected=expected, found=len(rows[0]))
+                parts["state"].append(np.stack(rows))
+                parts["poses"].append(motion.tcp_in_base)
+                parts["opened"].append(motion.gripper_open)
+                parts["widths"].append(motion.qpos[:, -2:].sum(1))
+                lengths.append(len(samples))
+                seeds.append(recording.seed)
+        finally:
+            if env is not None:
+                env.close()
+    if not lengths:
+        raise DatasetError("no successful episodes", where=path)
+    arrays = {name: np.concatenate(part) for name, part in parts.items()}
+    for name, array in arrays.items():
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise DatasetError("NaN or infinite value", where=f"{path}, {name}", fix="robocas validate says more.")
+    return {**arrays, "lengths": np.array(lengths), "seeds": np.array(seeds)}
+
+
+def _privileged_state(env: Any, state: dict[str, dict[str, NDArray[np.float32]]]) -> NDArray[np.float32]:
+    env.set_state_dict({kind: {k: torch.from_numpy(v) for k, v in arrays.items()} for kind, arrays in state.items()})
+    return privileged(env.get_obs({})["extra"])[0]
+
+
+class BcStateModel(nn.Module):
+    """Residual layers from the privileged state to a chunk and the next key pose."""
+
+    def __init__(self, config: BcStateConfig, facts: dict[str, Any]) -> None:
+        super().__init__()
+        self.config, width = config, config.width
+        self.input_scale = Scale(**facts["inputs"])
+        self.chunk_scale, self.key_scale = Scale(**facts["chunk"]), Scale(**facts["keys"])
+        self.into = nn.Linear(len(facts["inputs"]["mean"]), width)
+        self.blocks = nn.ModuleList(
+            nn.Sequential(
+                nn.LayerNorm(width),
+                nn.Linear(width, 2 * width),
+                nn.GELU(),
+                nn.Dropout(config.dropout),
+                nn.Linear(2 * width, width),
+            )
+            for _ in range(config.blocks)
+        )
+        self.out = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, config.chunk * ROW + 9))
+
+    def predict(self, inputs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return normalised chunks (B, K, 10) with logits of the commands, and normalised key poses (B, 9)."""
+        scaled = self.input_scale(inputs).clamp(-5, 5)
+        if self.training and self.config.noise:
+            scaled = scaled + self.config.noise * torch.randn_like(scaled)
+        hidden = self.into(scaled)
+        for block in self.blocks:
+            hidden = hidden + block(hidden)
+        out = self.out(hidden).float()
+        return out[:, :-9].reshape(len(inputs), self.config.chunk, ROW), out[:, -9:]
+
+    def forward(self, batch: Batch) -> dict[str, torch.Tensor]:
+        """Return the losses, see `chunk_losses`."""
+        return chunk_losses(self, batch, *self.predict(batch["inputs"]))
+
+    def act(self, inputs: torch.Tensor) -> torch.Tensor:
+        """Return chunks (B, K, 10): poses, and probabilities that the gripper opens."""
+        chunk, _ = self.predict(inputs)
+        return torch.cat([self.chunk_scale.back(chunk[..., :9]), chunk[..., 9:].sigmoid()], dim=-1)
+
+
+class BcState:
+    """See `Baseline`."""
+
+    name, version = "bc-state", 1
+    about = "privileged state of the simulator; chunks of poses by residual layers"
+    Config = BcStateConfig
+
+    def data(self, config: BcStateConfig, folder: Path, split: Split, on_read: OnRead) -> StateSamples:
+        """Read the samples of a ``trajectory.h5``."""
+        return StateSamples(config, folder, split, on_read)
+
+    def model(self, config: BcStateConfig, facts: dict[str, Any]) -> BcStateModel:
+        """Build the network."""
+        return BcStateModel(config, facts)
+
+    def policy(self, config: BcStateConfig, facts: dict[str, Any], model: BcStateModel) -> ChunkPolicy:
+        """Return the policy."""
+        device, size = next(model.parameters()).device, len(facts["inputs"]["mean"])
+
+        def predict(seen: Observations, row: int) -> NDArray[np.floating]:
+            assert seen.state is not None
+            one = slice(row, row + 1)
+            inputs = inputs_of(seen.state[one], from_wxyz(seen.tcp_in_base[one]), seen.gripper_width.reshape(-1)[one])
+            if inputs.shape[1] != size:
+                what, fix = "the policy was trained in other scenes", "Evaluate it in the task and scenes of its data."
+                raise EvaluationError(
+                    what, where="bc-state", expected=f"{size} numbers", found=inputs.shape[1], fix=fix
+                )
+            with torch.inference_mode():
+                return model.act(torch.from_numpy(inputs).to(device))[0].cpu().numpy()
+
+        spec = PolicySpec("robocas", reference="tcp", rate_hz=facts["rate_hz"], state=True, language="none")
+        return ChunkPolicy(spec, predict, min(config.play, config.chunk), config.fade)
+
+
+BASELINE = BcState()

@@ -1,0 +1,83 @@
+"""Images as the page wants them: depth in colours, and small ones for the table."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.datasets.pictures.video import colour_depth
+
+THUMBNAIL = (96, 72)
+"""Width and height: twice what the table shows, for dense screens."""
+_QUALITY = 85
+
+
+@dataclass(frozen=True)
+class EncodedImage:
+    """An image as a file.
+
+    Attributes:
+        media_type: ``image/png``, ``image/jpeg`` or ``image/webp``.
+        data: content of the file.
+    """
+
+    media_type: str
+    data: bytes
+
+
+def check_inside(path: Path, root: Path) -> Path:
+    """Return the path of an image, if it is no link that leads out of the dataset.
+
+    Raises:
+        DatasetError: it is such a link.
+    """
+    if not path.resolve().is_relative_to(root.resolve()):
+        raise DatasetError("this link leads out of the dataset", where=path)
+    return path
+
+
+def depth_image(depth: NDArray[np.uint16], width: int | None = None) -> EncodedImage:
+    """Return depth in colours on a logarithmic scale, at most this wide: near is red, far is blue, nothing is black."""
+    return encode_jpeg(_shrink(colour_depth(depth), width))
+
+
+def shrink_image(image: EncodedImage, width: int) -> EncodedImage:
+    """Return an image as JPEG, at most this wide."""
+    return encode_jpeg(_shrink(decode(image), width))
+
+
+def thumbnail(image: EncodedImage) -> EncodedImage:
+    """Return a small JPEG."""
+    small = cv2.resize(decode(image, cv2.IMREAD_REDUCED_COLOR_4), THUMBNAIL, interpolation=cv2.INTER_AREA)
+    return encode_jpeg(np.asarray(small, np.uint8))
+
+
+def decode(image: EncodedImage, flags: int = cv2.IMREAD_COLOR) -> NDArray[np.uint8]:
+    """Return (H, W, 3) RGB.
+
+    Raises:
+        DatasetError: the image is damaged.
+    """
+    pixels = cv2.imdecode(np.frombuffer(image.data, np.uint8), flags) if image.data else None
+    if pixels is None:
+        raise DatasetError("this picture is damaged", fix="robocas validate lists all that is wrong.")
+    return np.asarray(pixels[..., ::-1], np.uint8)
+
+
+def encode_jpeg(image: NDArray[np.uint8]) -> EncodedImage:
+    """Return (H, W, 3) RGB as JPEG."""
+    _, data = cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    return EncodedImage("image/jpeg", data.tobytes())
+
+
+def _shrink(image: NDArray[np.uint8], width: int | None) -> NDArray[np.uint8]:
+    height, now = image.shape[:2]
+    if width is None or now <= width:
+        return image
+    size = (width, max(1, round(height * width / now)))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)

@@ -1,0 +1,190 @@
+"""Chunks of poses: their encoding, what they are trained by, and how a policy follows them."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from made_up_observations import observe, start
+from scipy.spatial.transform import Rotation
+
+from robocas_ms3.baselines.chunks import ChunkPolicy, Scale, chunk_losses, decode, encode, next_keys, spread
+from robocas_ms3.evaluation.policy import PolicySpec
+
+
+def test_a_chunk_by_hand():
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    quarter = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]  # about z
+    poses[0, :3, :3] = quarter
+    poses[1, :3, 3] = poses[2, :3, 3] = 0, 0.5, 0.25
+    rows = encode(poses, [True, True, False], 3)
+    # along y of the base is along x of a TCP that is turned by a quarter; its x axis then points along the base's y
+    assert np.allclose(rows[0, 0], [0.5, 0, 0.25, 0, -1, 0, 1, 0, 0, 1])
+    assert np.allclose(rows[0, 1, 9], 0)
+    assert np.allclose(rows[0, 2], rows[0, 1])  # beyond the end it stays
+    assert np.allclose(rows[2], [0, 0, 0, 1, 0, 0, 0, 1, 0, 0])
+
+
+@given(st.integers(0, 10_000), st.integers(1, 6), st.integers(1, 5))
+def test_decoding_inverts_encoding(seed, length, steps):
+    rng = np.random.default_rng(seed)
+    poses = np.tile(np.eye(4), (length, 1, 1))
+    poses[:, :3, :3] = Rotation.random(length, random_state=seed).as_matrix()
+    poses[:, :3, 3] = rng.normal(size=(length, 3))
+    opened = rng.random(length) > 0.5
+    found, commands = decode(encode(poses, opened, steps), poses[:, None])
+    for t in range(length):
+        for k in range(steps):
+            at = min(t + k + 1, length - 1)
+            assert np.allclose(found[t, k], poses[at], atol=1e-5)
+            assert commands[t, k] == opened[at]
+
+
+@given(st.integers(0, 10_000))
+def test_any_prediction_becomes_a_rotation(seed):
+    poses, _ = decode(np.random.default_rng(seed).normal(size=(4, 10)), np.eye(4))
+    assert np.allclose(poses[:, :3, :3] @ poses[:, :3, :3].swapaxes(1, 2), np.eye(3), atol=1e-6)
+    assert np.allclose(np.linalg.det(poses[:, :3, :3]), 1)
+
+
+def test_key_poses_are_where_the_gripper_moves_next():
+    poses = np.tile(np.eye(4), (7, 1, 1))
+    poses[:, 0, 3] = [0, 1, 2, 3, 4, 5, 6]
+    # commanded to close between steps 2 and 3, to open between 4 and 5: it does so at 2 and 4; then the end
+    keys = next_keys(poses, [1, 1, 1, 0, 0, 1, 1])
+    assert keys[:, 0].tolist() == [2, 1, 0, 1, 0, 1, 0]
+
+
+def test_scale_and_back():
+    motions = np.array([[[0.0] * 9], [[1.0] * 9]])  # two samples of one step: mean 0.5, deviation 0.5
+    scale = Scale(**spread(motions))
+    assert torch.allclose(scale(torch.ones(1, 9)), torch.ones(1, 9))
+    assert torch.allclose(scale.back(scale(torch.full((1, 9), 0.3))), torch.full((1, 9), 0.3))
+    assert min(spread(np.zeros((2, 1, 9)))["deviation"][0]) > 0
+
+
+def losses(near):
+    """Of two samples with one step: the first reaches 0.1 m, and is off by 0.3 m; the second 0.3 m, and is right."""
+    weights, one = SimpleNamespace(near=near, gripper_weight=0.5, keys_weight=2.0), Scale([0.0] * 9, [1.0] * 9)
+    model = SimpleNamespace(config=weights, chunk_scale=one, key_scale=one)
+    chunk, key = torch.zeros(2, 1, 10), torch.zeros(2, 9)
+    chunk[0, 0, 0], chunk[1, 0, 0], key[:, 1] = 0.1, 0.3, 0.04
+    found = chunk.clone()
+    found[0, 0, 0] += 0.3
+    return chunk_losses(model, {"chunk": chunk, "key": key}, found, key + 0.003)
+
+
+def test_losses_by_hand():
+    found = losses(near=0.0)
+    assert found["motion"].item() == pytest.approx(0.3 / 9 / 2)
+    assert found["gripper"].item() == pytest.approx(0.693147)  # even odds
+    assert found["keys"].item() == pytest.approx(0.003)
+    assert found["loss"].item() == pytest.approx(0.3 / 18 + 0.5 * 0.693147 + 2 * 0.003)
+    assert found["first_mm"].item() == found["last_mm"].item() == pytest.approx(150)
+    assert found["near_mm"].tolist() == [2 * found["key_mm"].item(), 2.0]  # of both
+    assert found["key_mm"].item() == pytest.approx(3 * 3**0.5)
+    assert losses(near=0.1)["motion"].item() == pytest.approx(0.3 / 9 * 2 / 3)  # with 0.1 m, weights are 1/2 and 1/4
+
+
+def row(x=0.0, opened=1.0):
+    return [x, 0, 0, 1, 0, 0, 0, 1, 0, opened]
+
+
+HERE = [0.5, 0, 0.3, 1, 0, 0, 0]
+
+
+def policy(*chunks, play=1, fade=0.0, reopen=0.0):
+    """A policy of envs 0 and 1 that predicts given chunks, one after the other."""
+    rest = iter(chunks)
+    made = ChunkPolicy(PolicySpec(), lambda observations, _: np.array(next(rest), float), play, fade, reopen)
+    made.reset([start(0), start(1)])
+    return made
+
+
+def act(policy, *tcps, envs=(0,), width=0.0):
+    tcps = np.float32(tcps or [HERE] * len(envs))
+    widths = np.full((len(envs), 1), width, np.float32)
+    return policy.act(observe(envs, tcp_in_base=tcps, gripper_width=widths))
+
+
+def test_a_first_chunk_is_followed():
+    acting = policy([row(0.1), row(0.2)])
+    assert act(acting) == pytest.approx(np.array([[0.1, 0, 0, 0, 0, 0, 1]]), abs=1e-6)
+
+
+def test_older_predictions_are_of_the_same_step_and_frame():
+    """Sent to 0.1 then 0.2, it stays where it was; then sent to 0.4: the mean of 0.2, predicted before, and 0.4."""
+    acting = policy([row(0.1), row(0.2)], [row(0.4), row(0.5)])
+    act(acting)
+    assert act(acting)[0, 0] == pytest.approx(0.3)
+    acting = policy([row(0.1), row(0.2)], [row(0.1), row(0.2)])
+    act(acting)
+    late = [0.56, *HERE[1:]]  # 0.04 short of where it was to be: before 0.7 was wanted now, and now 0.66
+    assert act(acting, late)[0, 0] == pytest.approx((0.7 + 0.66) / 2 - 0.56)
+
+
+def test_newer_predictions_weigh_more():
+    acting = policy([row(), row(0.0, 0.0)], [row(0.4, 1.0), row()], fade=np.log(3))  # 3 to 1
+    act(acting)
+    action = act(acting)[0]
+    assert action[0] == pytest.approx(0.3)
+    assert action[6] == 1.0
+
+
+def test_a_chunk_is_followed_before_the_next():
+    """For two of three steps; then the mean of its third row and the first of the next."""
+    acting = policy([row(0.1), row(0.2), row(0.3)], [row(0.5), row(), row()], play=2)
+    assert acting.spec.look_every == 2
+    assert [act(acting)[0, 0] for _ in range(3)] == pytest.approx([0.1, 0.2, 0.4])
+
+
+def test_each_env_has_its_own_chunks():
+    """A reset forgets those of one env."""
+    acting = policy(*[[row(0.2), row(0.2)]] * 2, *[[row(0.4), row()]] * 2)
+    act(acting, envs=(0, 1))
+    acting.reset([start(1)])
+    assert act(acting, envs=(0, 1))[:, 0].tolist() == pytest.approx([0.3, 0.4])
+    acting = policy([row(0.1), row(0.2)], [row(0.3), row(0.4)], [row(0.5), row(0.6)], play=2)
+    assert act(acting, envs=(0, 1))[:, 0].tolist() == pytest.approx([0.1, 0.3])
+    acting.reset([start(1)])
+    assert act(acting, envs=(0, 1))[:, 0].tolist() == pytest.approx([0.2, 0.5])
+
+
+CLOSED = [row(0.0, 0.0), row(0.0, 0.0)]
+
+
+@pytest.mark.parametrize(
+    ("reopen", "width", "moved", "opened"),
+    [
+        (0.02, 0.001, 0.015, 1.0),  # it closed on nothing and waits
+        (0.0, 0.001, 0.0, 0.0),  # switched off
+        (0.02, 0.03, 0.0, 0.0),  # it holds something
+        (0.02, 0.001, 0.025, 0.0),  # it pushes
+    ],
+)
+def test_the_reopen_heuristic(reopen, width, moved, opened):
+    acting = policy(CLOSED, CLOSED, fade=2.0, reopen=reopen)
+    assert act(acting, width=width)[0, 6] == 0.0
+    assert act(acting, [HERE[0] + moved, *HERE[1:]], width=width)[0, 6] == opened
+
+
+def test_older_chunks_do_not_keep_an_empty_gripper_closed():
+    """All predictions have the same weight, and five of six want it closed."""
+    acting = policy(*[[row(0.0, 0.0)] * 8] * 6, reopen=0.02)
+    path = [[HERE[0] + 0.1 * place, *HERE[1:]] for place in range(5)]  # it moves, then stays
+    assert [act(acting, here)[0, 6] for here in [*path, path[-1]]] == [0, 0, 0, 0, 0, 1]
+
+
+def test_the_reopen_heuristic_forgets_where_another_episode_ended():
+    acting = policy(CLOSED, CLOSED, fade=2.0, reopen=0.02)
+    for _ in range(2):
+        acting.reset([start(0)])
+        assert act(acting)[0, 6] == 0.0
+
+
+def test_motions_are_in_the_frame_of_the_tcp():
+    turned = [0.5, 0, 0.3, np.sqrt(0.5), 0, 0, np.sqrt(0.5)]  # a quarter about z
+    quarter = [0.1, 0, 0, 0, 1, 0, -1, 0, 0, 0.2]  # on by 0.1 along its x, and turned by a quarter about its z
+    assert act(policy([quarter]), turned)[0] == pytest.approx([0.1, 0, 0, 0, 0, np.pi / 2, 0], abs=1e-6)
