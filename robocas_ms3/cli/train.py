@@ -146,7 +146,7 @@ def train(baseline: str, cfg: Training, data: Path | None) -> int:
     with bar("episodes read", transient=True) as reading, bar("steps trained") as stepping:
 
         def step(done: int, of: int) -> None:
-            reading.stop()  # a terminal has room for one
+            reading.close()  # a terminal has room for one
             stepping.at(done, of)
 
         first = os.environ.get("RANK", "0") == "0"  # one of several processes writes to the terminal
