@@ -11,14 +11,11 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
-import unicodedata
 
 import numpy as np
 import pytest
 import trimesh
 from PIL import Image
-from trimesh.visual.material import PBRMaterial
-from trimesh.visual.texture import TextureVisuals
 
 from asset_tools.prepare import prepare
 from asset_tools.visual import to_display
@@ -143,27 +140,6 @@ def test_other_units_and_y_up(tmp_path, scale, unit, words):
     check_bottle(type(scan)(*turned, scan.up, scan.unit, scan.repairs))
 
 
-def test_a_wrong_unit_is_an_error(tmp_path):
-    path = write_obj(tmp_path, scale=1000)
-    with pytest.raises(AssetError, match=r"no size that can be picked up.*160 m, taking its 160 for metres.*--units"):
-        prepare(path, unit="m")
-
-
-def test_faces_inwards(tmp_path):
-    vertices, uv, faces = bottle()
-    scan = prepare(write_obj(tmp_path, (vertices, uv, faces[:, ::-1])))
-    assert scan.repairs == ("turned inside out",)
-    check_bottle(scan)
-
-
-def test_faces_turned_at_random(tmp_path):
-    vertices, uv, faces = bottle()
-    turned = np.random.default_rng(0).random(len(faces)) < 0.3
-    scan = prepare(write_obj(tmp_path, (vertices, uv, np.where(turned[:, None], faces[:, ::-1], faces))))
-    assert scan.repairs == (f"turned {turned.sum()} faces outwards",)
-    check_bottle(scan)
-
-
 def test_normals_inwards(tmp_path):
     scan = prepare(write_obj(tmp_path, normals="inwards"))
     assert scan.repairs == ("dropped normals that look inwards",)
@@ -253,14 +229,6 @@ def test_colours_of_vertices_only(tmp_path):
     check_bottle(scan, volume=0.01)
 
 
-def test_no_colours(tmp_path):
-    vertices, _, faces = bottle()
-    trimesh.Trimesh(vertices, faces).export(tmp_path / "scan.stl")
-    scan = prepare(tmp_path / "scan.stl")
-    assert "has no colours" in scan.repairs
-    check_bottle(scan, colors=False)
-
-
 @pytest.mark.parametrize(
     ("named", "texture", "repair"),
     [
@@ -289,14 +257,6 @@ def test_names_with_accents(tmp_path, encoding):
     check_bottle(scan)
 
 
-def test_names_in_other_scripts_and_accents_written_apart(tmp_path):
-    check_bottle(prepare(write_obj(tmp_path / "瓶", name="瓶子", mtl="材质", texture="标签.png")))
-    apart = unicodedata.normalize("NFD", "étiquette.png")
-    scan = prepare(write_obj(tmp_path / "b", texture=apart, named=unicodedata.normalize("NFC", apart)))
-    assert len(scan.repairs) == 1 and scan.repairs[0].startswith("took ")
-    check_bottle(scan)
-
-
 def test_several_materials(tmp_path):
     """Each quarter has a texture of its own."""
     vertices, uv, faces = bottle()
@@ -312,26 +272,6 @@ def test_several_materials(tmp_path):
     path.write_text("\n".join(lines))
     (tmp_path / "scan.mtl").write_text(mtl)
     check_bottle(prepare(path, up="z"))
-
-
-def test_glb_has_y_up_and_its_huge_texture_is_shrunk(tmp_path):
-    vertices, uv, faces = bottle()
-    material = PBRMaterial(baseColorTexture=picture((8192, 64)).convert("RGB"))
-    mesh = trimesh.Trimesh(
-        vertices[:, [1, 2, 0]], faces, visual=TextureVisuals(uv=uv, material=material), process=False
-    )
-    mesh.export(tmp_path / "scan.glb")
-    scan = prepare(tmp_path / "scan.glb")
-    assert scan.up == "y"
-    assert "shrank the texture from 8192 x 64 to 4096 x 32" in scan.repairs
-    assert scan.closed.volume == pytest.approx(VOLUME, rel=0.005)
-
-
-def test_glb_compressed_is_an_error(tmp_path):
-    path = tmp_path / "scan.gltf"
-    path.write_text('{"extensionsRequired": ["KHR_draco_mesh_compression"]}')
-    with pytest.raises(AssetError, match=r"compressed in a way.*KHR_draco_mesh_compression.*without compression"):
-        prepare(path)
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from asset_tools.import_ycb import default_root, ycb_id, ycb_jobs, ycb_source
+from asset_tools.import_ycb import ycb_id, ycb_jobs, ycb_source
 from robocas_ms3.core.errors import AssetError
 
 SIZES = {
@@ -65,12 +65,6 @@ def test_the_scale_counts(root):
     assert ycb_jobs(root, ["003_cracker_box"])[0].content != before
 
 
-def test_all_or_some(root):
-    ids = ["colored_wood_blocks_a", "cracker_box", "tomato_soup_can", "toy_airplane_a"]
-    assert sorted(job.id for job in ycb_jobs(root)) == ids
-    assert [job.id for job in ycb_jobs(root, ["003_cracker_box"])] == ["cracker_box"]
-
-
 def test_what_is_not_there_is_one_error(root, tmp_path, monkeypatch):
     with pytest.raises(AssetError, match=r"python -m mani_skill\.utils\.download_asset ycb"):
         ycb_jobs(tmp_path / "nowhere")
@@ -99,15 +93,6 @@ def test_an_invalid_scale_fails_that_object_alone(root, scales):
     (job,) = ycb_jobs(root)
     with pytest.raises(AssetError):
         job.make(root / "out")
-
-
-def test_the_default_folder_is_maniskills():
-    import mani_skill
-    from mani_skill.utils.assets.data import DATA_SOURCES, initialize_data_sources
-
-    if not DATA_SOURCES:
-        initialize_data_sources()
-    assert default_root() == mani_skill.ASSET_DIR / DATA_SOURCES["ycb"].target_path
 
 
 def test_a_real_model(shared_dir, root):

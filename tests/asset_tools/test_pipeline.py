@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from asset_tools import pipeline
-from asset_tools.pipeline import Job, content_hash, made_of, make_assets, write_pack
+from asset_tools.pipeline import Job, content_hash, made_of, write_pack
 from robocas_ms3.assets.hulls import write_hulls
 from robocas_ms3.assets.manifest import FurnitureAsset, FurnitureQuality
 from robocas_ms3.assets.pack import HULLS, VISUALS, load_pack, sha256
@@ -123,28 +122,6 @@ def test_content_counts_files_settings_and_code(tmp_path):
     assert first != content_hash("m", files=[path], packages=["builtin"])
     path.write_text("v 0 0 1")
     assert first != content_hash("m", files=[path])
-
-
-def test_content_counts_yaml_beside_the_code(tmp_path, monkeypatch):
-    monkeypatch.setattr(pipeline, "__file__", str(tmp_path / "pipeline.py"))
-    (tmp_path / "products").mkdir()
-    found = []
-    for name, text in (("toys.yaml", "a: 1"), ("toys.yaml", "a: 2"), ("toys.py", "A = 2"), ("notes.txt", "none")):
-        (tmp_path / "products" / name).write_text(text)
-        pipeline._code.cache_clear()
-        found.append(pipeline._code("products"))
-    pipeline._code.cache_clear()
-    assert len(set(found)) == 3 and found[2] == found[3]  # notes make nothing
-
-
-def test_assets_not_asked_for_in_months_are_forgotten(tmp_path):
-    log, kept = tmp_path / "log", tmp_path / "kept"
-    (tmp_path / "one").mkdir()
-    list(make_assets(jobs(log, a="1" * 64), tmp_path / "one", kept))
-    (place,) = kept.iterdir()
-    os.utime(place, (0, 0))
-    list(make_assets([], tmp_path / "one", kept))
-    assert not place.exists()
 
 
 def trip(folder):

@@ -11,7 +11,6 @@ from asset_tools.prepare import prepare
 from asset_tools.resting import resting_poses
 from robocas_ms3.core.errors import AssetError
 
-QUARTER = trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0])
 HOPE = ["alphabet_soup", "bbq_sauce", "butter", "chocolate_pudding", "cream_cheese", "ketchup", "orange_juice"]
 
 
@@ -48,24 +47,6 @@ def test_a_bulging_base_is_pressed_flat():
     again: list[str] = []
     level_base(mesh, closed, again)
     assert again == []
-
-
-@pytest.mark.parametrize(
-    "body",
-    [
-        carton(0.0),
-        carton(-0.003),  # hollowed: it stands on its edges
-        trimesh.creation.icosphere(4, 0.04),
-        trimesh.creation.capsule(0.1, 0.02),
-        trimesh.creation.cylinder(0.03, 0.1, sections=64, transform=QUARTER),
-    ],
-    ids=["flat", "hollow", "ball", "capsule", "lying"],
-)
-def test_other_bases_stay(body):
-    repairs: list[str] = []
-    mesh, closed = level_base(body.copy(), body, repairs)
-    assert repairs == []
-    assert closed is body and mesh.volume == pytest.approx(body.volume)
 
 
 def test_axis_and_unit_can_be_given(tmp_path):

@@ -37,35 +37,12 @@ def test_faces_turned_at_random_are_made_consistent(can):
     assert closed_volume(mixed, f"turned {turned.sum()} faces outwards") == pytest.approx(can.volume, rel=1e-6)
 
 
-def test_a_can_without_lid_and_bottom_is_filled(can):
-    volume = can.volume
-    can.update_faces(np.abs(can.triangles_center[:, 2]) < 0.49 * HEIGHT)
-    assert closed_volume(can, "filled 2 holes") == pytest.approx(volume, rel=1e-6)
-
-
 def test_a_shell_becomes_solid(can):
     inner = trimesh.creation.cylinder(RADIUS - 0.001, HEIGHT - 0.002, sections=48)
     inner.invert()
     shell = trimesh.util.concatenate([can, inner])
     assert shell.volume < 0.1 * can.volume
     assert closed_volume(shell, "inner") == pytest.approx(can.volume, rel=1e-6)
-
-
-def test_dirt_is_dropped(can):
-    fin = trimesh.Trimesh([[0.05, 0, 0], [0.05, 0, 0.01], [0.06, 0, 0]], [[0, 1, 2]])
-    assert closed_volume(trimesh.util.concatenate([can, fin]), "loose") == pytest.approx(can.volume, rel=1e-6)
-
-
-def test_bodies_that_overlap_count_once(can):
-    box = trimesh.creation.box([0.02, 0.02, 0.02])  # lies with half of itself on the lid
-    box.apply_translation([0, 0, HEIGHT / 2])
-    assert closed_volume(trimesh.util.concatenate([can, box]), "") == pytest.approx(can.volume + 4e-6, rel=1e-4)
-
-
-def test_seams_of_the_texture_are_no_holes(can):
-    split = trimesh.Trimesh(can.triangles.reshape(-1, 3), np.arange(3 * len(can.faces)).reshape(-1, 3), process=False)
-    assert not split.is_watertight
-    assert closed_volume(split, "duplicate vertices") == pytest.approx(can.volume, rel=1e-4)
 
 
 @pytest.mark.slow
@@ -83,11 +60,6 @@ def test_what_encloses_nothing_is_an_error():
     for mesh in (plate, cap, trimesh.Trimesh(confetti, np.arange(300).reshape(-1, 3), process=False)):
         with pytest.raises(AssetError, match="can't be closed to a solid"):
             close(mesh)
-
-
-def test_faces_without_size_are_an_error():
-    with pytest.raises(AssetError, match="no faces of any size"):
-        close(trimesh.Trimesh([[0, 0, 0], [1, 0, 0]], [[0, 1, 1], [0, 0, 1]], process=False))
 
 
 def test_winding_number_of_a_ball_with_and_without_a_cap():

@@ -11,17 +11,12 @@ from asset_tools.sheet import (
     LABEL,
     LARGE,
     contact_sheet,
-    frame_faces,
-    gripper_faces,
-    hull_bodies,
-    standing,
 )
 from asset_tools.studio import PAPER, Body, Studio, box_faces
 from robocas_ms3.assets.annotations import Annotations, footprints
-from robocas_ms3.assets.hulls import Hull, write_hulls
+from robocas_ms3.assets.hulls import write_hulls
 from robocas_ms3.assets.manifest import FurnitureAsset, FurnitureQuality, ObjectAsset, ObjectQuality, PackManifest
 from robocas_ms3.assets.pack import LINKS, load_pack, sha256
-from robocas_ms3.core.errors import AssetError
 
 SIZE = np.array([0.04, 0.10, 0.06])
 BASE = {"source": "test", "licence": "MIT", "attribution": "none", "category": "test"}
@@ -159,14 +154,6 @@ def test_a_sheet_shows_every_asset(pack, tmp_path, studio):
 
 
 @pytest.mark.slow
-def test_some_assets_only(pack, tmp_path, studio):
-    contact_sheet(pack, tmp_path / "sheet.png", ids=["red_box"])
-    assert Image.open(tmp_path / "sheet.png").size == (CELLS * LARGE + 2 * GAP, CAPTION + LARGE + LABEL + 2 * GAP)
-    with pytest.raises(AssetError, match="found blue_box"):
-        contact_sheet(pack, tmp_path / "sheet.png", ids=["blue_box"])
-
-
-@pytest.mark.slow
 def test_the_camera_looks_from_where_it_is_told(studio):
     # a red and a blue cube, side by side along y: from +x red, which stands at +y, is on the right
     cubes = [
@@ -185,46 +172,3 @@ def test_the_camera_looks_from_where_it_is_told(studio):
     # 4 m and a margin of 6 % across 64 pixels, so that a cube of 1 m is 15 pixels high
     rows = np.asarray(right)[:, 20, 2] < 100
     assert rows.sum() == pytest.approx(15, abs=2)
-
-
-def test_copies_stand_apart_on_the_slab():
-    points = trimesh.creation.box(SIZE).vertices
-    upright = np.eye(4)
-    upright[2, 3] = 0.03
-    *copies, slab = standing(Body(points), np.array([upright] * 3))
-    placed = [body.points @ body.pose[:3, :3].T + body.pose[:3, 3] for body in copies]
-    assert [cloud[:, 2].min() for cloud in placed] == pytest.approx([0, 0, 0])
-    assert placed[1][:, 0].min() > placed[0][:, 0].max()
-    assert placed[2][:, 1].min() > placed[0][:, 1].max()
-    assert slab.points[:, 2].max() == 0
-    for cloud in placed:
-        assert (cloud[:, :2].min(axis=0) > slab.points[:, :2].min(axis=0)).all()
-        assert (cloud[:, :2].max(axis=0) < slab.points[:, :2].max(axis=0)).all()
-
-
-def test_grippers_leave_their_width_free():
-    points = gripper_faces(0.05).reshape(-1, 3)
-    tips = points[points[:, 2] > 0]
-    assert np.abs(tips[:, 1]).min() == pytest.approx(0.025)
-    assert points[:, 2].max() == pytest.approx(0.0085)
-
-
-def test_a_frame_runs_along_the_edges_of_a_box():
-    bars = frame_faces(np.zeros(3), np.array([1.0, 2.0, 3.0]), 0.01)
-    mesh = trimesh.Trimesh(bars.reshape(-1, 3), np.arange(3 * len(bars)).reshape(-1, 3), process=True)
-    assert mesh.bounds == pytest.approx(np.array([[-0.01] * 3, [1.01, 2.01, 3.01]]))
-    # four bars 0.02 thick in each direction, each as long as the box and its ends
-    assert mesh.volume == pytest.approx(4 * 0.02**2 * (1.02 + 2.02 + 3.02))
-
-
-def test_a_box_has_outward_faces():
-    faces = box_faces((0, 0, 0), (1, 2, 3))
-    mesh = trimesh.Trimesh(faces.reshape(-1, 3), np.arange(36).reshape(-1, 3), process=True)
-    assert mesh.is_watertight
-    assert mesh.volume == pytest.approx(6)
-
-
-def test_hulls_have_colours_of_their_own():
-    box = trimesh.creation.box(SIZE)
-    hulls = [Hull(np.asarray(box.vertices), np.asarray(box.faces, dtype=np.int64))] * 12
-    assert len({body.colour for body in hull_bodies(hulls)}) == 12

@@ -1,25 +1,19 @@
-import io
 from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
-from PIL import Image
 from scipy.spatial import KDTree
 from shapely import MultiPoint, Point
 
 from asset_tools.builtin import blends
 from asset_tools.builtin.catalogue import products
-from asset_tools.builtin.models import Model, Part, paint_in_space, unwrapped
 from asset_tools.builtin.toys import STICKERS, scrambled
 from asset_tools.decompose import GPU_LIMIT, flat_faces
 from asset_tools.glb import write_glb
 from asset_tools.grasps import sample_grasps
 from asset_tools.quality.hulls import volume_iou
-from robocas_ms3.assets.cooking import cooking_faults
-from robocas_ms3.assets.hulls import write_hulls
-from robocas_ms3.assets.pack import HULLS
 
 TOYS = [p for p in products().values() if p.model or p.category in ("ball", "toy")]
 IDS = [spec.id for spec in TOYS]
@@ -28,22 +22,6 @@ QUICK = {"padlock", "scissors", "small_elephant", "rubiks_cube", "racquetball"}
 each = pytest.mark.parametrize(
     "spec", [pytest.param(s, marks=() if s.id in QUICK else pytest.mark.slow) for s in TOYS], ids=IDS
 )
-GRASPNET = {
-    "power_drill": 8,
-    "scissors": 9,
-    "flat_screwdriver": 20,
-    "racquetball": 21,
-    "toy_airplane_a": 24,
-    "toy_airplane_c": 25,
-    "toy_airplane_k": 31,
-    "padlock": 32,
-    "white_mouse": 47,
-    "large_elephant": 51,
-    "rhinoceros": 52,
-    "small_elephant": 53,
-    "monkey": 54,
-    "rubiks_cube": 71,
-}
 
 
 @cache
@@ -58,21 +36,6 @@ def picture(name):
 
 def share_near(pixels, colour, reach=60):
     return float((np.linalg.norm(pixels - np.array(colour), axis=-1) < reach).mean())
-
-
-def test_table():
-    assert {spec.id: spec.graspnet_id for spec in TOYS} == GRASPNET
-    names = [spec.name for spec in TOYS]
-    assert len(set(names)) == len(names)
-    assert all("_" not in name for name in names)
-    assert {spec.id for spec in TOYS if spec.hollow} == {
-        "scissors",
-        "toy_airplane_a",
-        "toy_airplane_c",
-        "toy_airplane_k",
-    }
-    for spec in TOYS:
-        assert 0.03 <= spec.mass <= 0.9
 
 
 @each
@@ -118,16 +81,6 @@ def test_pieces_fill_the_body(spec):
     assert distance.mean() < 0.0025
 
 
-@pytest.mark.parametrize(
-    "names", [QUICK, pytest.param(set(IDS) - QUICK, marks=pytest.mark.slow)], ids=["quick", "rest"]
-)
-def test_pieces_are_cooked_as_they_are(names, tmp_path):
-    for name in names:
-        (tmp_path / name).mkdir()
-        write_hulls(tmp_path / name / HULLS, list(built(name)[0].pieces))
-    assert cooking_faults(tmp_path) == []
-
-
 @pytest.mark.parametrize("name", sorted(QUICK))
 def test_can_be_grasped(name):
     """The others as they are shipped: test_builtin_pack."""
@@ -158,14 +111,6 @@ def test_holes_are_open():
     assert scissors.euler_number == -2  # two rings, nothing else
     for point in rings:  # nor does any collision piece close them
         assert not any(trimesh.convex.convex_hull(p).contains([point])[0] for p in built("scissors")[0].pieces)
-
-
-@pytest.mark.slow
-def test_biplane_has_room_between_its_wings():
-    shape = built("toy_airplane_k")[0]
-    gap = [[0.015, 0.025, 0.010], [0.015, -0.025, 0.010]]
-    assert not shape.closed().contains(gap).any()
-    assert not any(trimesh.convex.convex_hull(p).contains(gap).any() for p in shape.pieces)
 
 
 @pytest.mark.parametrize(
@@ -199,15 +144,6 @@ def test_cube_is_solvable_and_scrambled():
     assert columns == {"front": {STICKERS["bottom"]}, "top": {STICKERS["front"]}}
 
 
-def test_same_bytes_twice(tmp_path):
-    files = []
-    for i in range(2):
-        _, mesh = products()["padlock"].build()
-        write_glb(mesh, tmp_path / f"{i}.glb")
-        files.append((tmp_path / f"{i}.glb").read_bytes())
-    assert files[0] == files[1]
-
-
 def test_volumes_by_hand():
     """A ball, a capsule, a cylinder and a plate, against their formulas."""
     low, high = (-22.0, -22.0, -22.0), (22.0, 22.0, 22.0)
@@ -225,40 +161,3 @@ def test_volumes_by_hand():
     assert volume(two) == pytest.approx(2 * 480, rel=0.02)
     holed = blends.cut(blends.box((0, 0, 0), (30, 30, 10)), blends.cylinder("z", (0, 0, 0), 20, 6))
     assert volume(holed) == pytest.approx(9000 - np.pi * 36 * 10, rel=0.015)
-
-
-def test_smooth_min():
-    # Equal distances: a quarter of the reach is added; farther apart than the reach: the lesser.
-    np.testing.assert_allclose(
-        blends.smooth_min(np.array([1.0, 1.0, 0.0]), np.array([1.0, 9.0, 2.0]), 4.0), [0.0, 1.0, -0.25]
-    )
-    np.testing.assert_allclose(blends.smooth_min(np.array([2.0]), np.array([1.0]), 0), [1.0])
-
-
-def test_body_must_fit_its_box():
-    with pytest.raises(ValueError, match="not inside"):
-        blends.mesh_of(blends.ellipsoid((0, 0, 0), (10, 10, 10)), (-8, -12, -12), (12, 12, 12), step=1, triangles=500)
-
-
-def test_model_says_when_its_size_is_off():
-    model = Model((Part(blends.ellipsoid((0, 0, 0), (10, 10, 10)), (9, 9, 9)),), (-14, -14, -14), (14, 14, 14))
-    with pytest.raises(ValueError, match="the parts give"):
-        model.shape((0.02, 0.02, 0.03))
-
-
-def test_paint_lands_where_it_should():
-    """Colours given by position come back at each vertex's place in the texture."""
-    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.03)
-    shape = unwrapped(np.asarray(ball.vertices), np.asarray(ball.faces), 128)
-    image = paint_in_space(shape, lambda points, normals: 127.5 + 127.5 * points / 0.03)
-    pixels = np.asarray(Image.open(io.BytesIO(_png(image))), float)
-    column = np.clip(np.floor(shape.uv[:, 0] * 128), 0, 127).astype(int)
-    row = np.clip(np.floor((1 - shape.uv[:, 1]) * 128), 0, 127).astype(int)
-    error = np.abs(pixels[row, column] - (127.5 + 127.5 * shape.vertices / 0.03)).max(1)
-    assert np.median(error) < 4 and error.max() < 30
-
-
-def _png(image):
-    data = io.BytesIO()
-    image.save(data, "PNG")
-    return data.getvalue()

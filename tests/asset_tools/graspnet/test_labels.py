@@ -170,6 +170,16 @@ def test_a_damaged_file_is_one_error_that_names_it(tmp_path, damage, words):
     assert "000_labels.npz" in str(error.value)
 
 
+def test_checksums_tell_label_files_apart(tmp_path):
+    one = label_checksums(write(tmp_path / "one.npz"))
+    assert label_checksums(write(tmp_path / "same.npz")) == one
+    other = label_checksums(write(tmp_path / "other.npz", [((0, 0, 0, 0), (0, 0.01, 0.05, 0.3, False))]))
+    assert [name for name, *_ in other] == [name for name, *_ in one]
+    assert [a[0] for a, b in zip(one, other, strict=True) if a != b] == ["offsets.npy", "scores.npy"]
+    (tmp_path / "cut.npz").write_bytes((tmp_path / "one.npz").read_bytes()[:-10])
+    assert label_checksums(tmp_path / "cut.npz")[0][0] == "cut.npz"
+
+
 MEASURE = """
 import resource, sys
 from pathlib import Path
@@ -193,13 +203,3 @@ def test_a_large_file_is_read_in_little_memory(tmp_path):
     count, growth = done.stdout.split()
     assert int(count) == 20_000
     assert float(growth) < 150  # MB
-
-
-def test_checksums_tell_label_files_apart(tmp_path):
-    one = label_checksums(write(tmp_path / "one.npz"))
-    assert label_checksums(write(tmp_path / "same.npz")) == one
-    other = label_checksums(write(tmp_path / "other.npz", [((0, 0, 0, 0), (0, 0.01, 0.05, 0.3, False))]))
-    assert [name for name, *_ in other] == [name for name, *_ in one]
-    assert [a[0] for a, b in zip(one, other, strict=True) if a != b] == ["offsets.npy", "scores.npy"]
-    (tmp_path / "cut.npz").write_bytes((tmp_path / "one.npz").read_bytes()[:-10])
-    assert label_checksums(tmp_path / "cut.npz")[0][0] == "cut.npz"

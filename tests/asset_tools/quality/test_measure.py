@@ -8,7 +8,7 @@ import trimesh
 from asset_tools.grasps import sample_grasps
 from asset_tools.quality import measure
 from asset_tools.quality.drops import DropReport
-from asset_tools.quality.measure import HEADER, differences, judge, measure_object, rows, top_grasps
+from asset_tools.quality.measure import differences, judge, measure_object, rows
 from asset_tools.resting import resting_poses
 from robocas_ms3.assets.annotations import Annotations, footprints
 from robocas_ms3.assets.manifest import ObjectAsset, ObjectQuality
@@ -104,13 +104,6 @@ def test_an_object_without_grasps(block):
     assert rows({"cube": quality})[0][-1] == "-"
 
 
-def test_top_grasps_go_by_friction_then_by_order(block):
-    mesh, solid = trimesh.creation.box((0.05, 0.08, 0.12)), block(0.05, 0.08, 0.12)
-    notes = annotate(mesh, solid, count=4)
-    notes = Annotations(**{**vars(notes), "grasp_qualities": np.array([0.3, 0.1, 0.2, 0.1])})
-    assert top_grasps(notes, 3).tolist() == [1, 3, 2]
-
-
 @pytest.mark.parametrize(
     ("change", "what"),
     [
@@ -126,11 +119,6 @@ def test_top_grasps_go_by_friction_then_by_order(block):
 def test_each_limit_of_an_object(change, what):
     pack = {"a": asset(), "b": asset(), "bad": but(**change)}
     assert [(broken.asset, broken.what) for broken in judge(pack)] == [("bad", what)]
-
-
-def test_limits_hold_for_the_right_kind():
-    assert judge({"a": but(surface_p95=0.01)}) == []
-    assert judge({"a": but(compact=False, volume_iou=0.3)}) == []
 
 
 def test_medians_of_the_pack():
@@ -176,12 +164,3 @@ def test_a_drop_that_moves_on_is_jitter_unless_it_rolls(block):
         quality = measure_object(mesh, solid, notes)
     assert (quality.rest_share, quality.rolling_share) == (0.6667, 0.3333)
     assert quality.jitter == pytest.approx(0.006 / 0.2)  # J of the second drop, kg
-
-
-def test_table():
-    table = rows({"a": GOOD, "b": GOOD.model_copy(update=dict(volume_iou=0.85, compact=False))})
-    assert [len(row) for row in table] == [len(HEADER)] * 3
-    assert table[0] == ("a", "compact", "4", "0.95", "1.0", "100", "0", "0.50", "0.50", "0.001", "90")
-    assert table[1][:4] == ("b", "thin", "4", "0.85")
-    assert table[2][:4] == ("median", "", "4", "0.95")
-    assert rows({}) == []

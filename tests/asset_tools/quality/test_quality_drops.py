@@ -23,11 +23,6 @@ def standing(height):
     return pose
 
 
-def ball(radius, subdivisions=2):
-    mesh = trimesh.creation.icosphere(subdivisions, radius)
-    return Solid([np.asarray(mesh.vertices)], 0.1, np.zeros(3), np.full(3, 0.4 * 0.1 * radius**2), IDENTITY)
-
-
 def can(radius, height, sections=24):
     mesh = trimesh.creation.cylinder(radius, height, sections=sections)
     across = 0.2 / 12 * (3 * radius**2 + height**2)
@@ -49,16 +44,6 @@ def test_a_box_comes_to_rest_on_its_faces(block):
         assert np.argmax(np.abs(end[2, :3])) == np.argmax(np.abs(poses[match, 2, :3]))
 
 
-def test_an_unlisted_face_is_noticed(block):
-    solid = block(0.05, 0.08, 0.12)
-    everywhere = drop_test(solid, listed(solid))
-    edgewise = np.array([pose for pose in listed(solid) if abs(pose[2, 1]) > 0.9])  # y up: the middle pair of faces
-    report = drop_test(solid, edgewise)
-    up = np.argmax(np.abs(everywhere.ends[:, 2, :3]), axis=1)
-    np.testing.assert_array_equal(report.good, up == 1)
-    assert 0 < report.good.sum() < 20
-
-
 def test_a_pose_listed_at_the_wrong_height_or_tilt_matches_nothing(block):
     cube = block(0.06, 0.06, 0.06)
     assert drop_test(cube, standing(0.03)[None]).good.all()  # all six faces are alike
@@ -66,12 +51,6 @@ def test_a_pose_listed_at_the_wrong_height_or_tilt_matches_nothing(block):
     tilted = standing(0.03)
     tilted[:3, :3] = trimesh.transformations.rotation_matrix(np.radians(15), [1, 0, 0])[:3, :3]
     assert not drop_test(cube, tilted[None]).good.any()
-
-
-def test_a_ball_rests_however_it_lies():
-    report = drop_test(ball(0.035), standing(0.035)[None])
-    assert (report.matches == 0).all()
-    assert report.good.mean() >= 0.9
 
 
 def test_a_can_may_roll_but_not_rock():

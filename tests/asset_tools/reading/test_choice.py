@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
-from models import Gltf, box, image_file, write_obj
+from models import box, image_file, write_obj
 
 from asset_tools.import_scans import ImportSettings, find_scans, scan_jobs
 from asset_tools.reading.model import read_model
@@ -29,11 +29,6 @@ def test_a_collision_mesh_is_ignored_and_reported(tmp_path, name):
     assert f"ignored {name}.obj" in notes_of(model) and "used model.obj" in notes_of(model)
 
 
-def test_collision_meshes_alone_are_read(tmp_path):
-    box().export(tmp_path / "collision.stl")
-    assert len(read_model(tmp_path).mesh.faces) == 12
-
-
 @pytest.mark.parametrize(
     ("others", "used"),
     [
@@ -51,12 +46,6 @@ def test_of_several_versions_the_textured_one_is_taken(tmp_path, others, used):
     model = read_model(tmp_path)
     assert len(model.mesh.faces) == 12 and f"used {used}" in notes_of(model)
     assert all(f"ignored {name}" in notes_of(model) for name in others)
-
-
-def test_of_versions_without_texture_the_most_detailed_one_is_taken(tmp_path):
-    mug().export(tmp_path / "a.ply")
-    mug().subdivide().export(tmp_path / "b.ply")
-    assert len(read_model(tmp_path).mesh.faces) == 48
 
 
 def test_a_version_that_cannot_be_read_is_left_out(tmp_path):
@@ -149,19 +138,6 @@ def test_two_scans_with_one_id_fail_alone(tmp_path):
         jobs["mug"].make(tmp_path / "out")
 
 
-def test_a_gltf_next_to_its_own_files_is_one_model(tmp_path):
-    Gltf(mug()).write(tmp_path / "mug.glb")
-    image_file(tmp_path / "preview.png")
-    assert len(read_model(tmp_path).mesh.faces) == 12
-
-
-def test_a_collision_mesh_above_the_folder_of_the_visual_one(tmp_path):
-    write_obj(tmp_path / "visual", "mug", mug())
-    box().export(tmp_path / "collision.obj")
-    model = read_model(tmp_path)
-    assert any(path.name == "skin.png" for path in model.files) and "ignored collision.obj" in notes_of(model)
-
-
 def test_versions_in_several_folders(tmp_path):
     write_obj(tmp_path / "meshes", "mug", mug())
     mug().export(tmp_path / "mug.stl")
@@ -193,32 +169,7 @@ def test_parts_that_look_like_versions(tmp_path, names, sizes, middles):
     np.testing.assert_allclose(model.mesh.area, sum(part.area for part in parts), rtol=1e-5)
 
 
-def test_a_textured_label_around_a_can(tmp_path):
-    trimesh.creation.cylinder(0.03, 0.1, sections=48).export(tmp_path / "can.ply")
-    wall = trimesh.creation.cylinder(0.03, 0.1, sections=48)
-    wall.update_faces(np.abs(wall.face_normals[:, 2]) < 0.5)
-    write_obj(tmp_path, "label", wall)
-    model = read_model(tmp_path)
-    assert len(model.mesh.faces) > len(wall.faces) and any(path.name == "skin.png" for path in model.files)
-
-
-@pytest.mark.parametrize("name", ["UCX_mug", "mug_decomp_3", "mug_cvx"])
-def test_more_names_of_collision_meshes(tmp_path, name):
-    write_obj(tmp_path, "mug", mug())
-    mug().export(tmp_path / f"{name}.stl")
-    assert f"ignored {name}.stl: a collision mesh" in notes_of(read_model(tmp_path))
-
-
 def test_only_a_folder_of_collision_meshes(tmp_path):
     (tmp_path / "collision").mkdir()
     mug().export(tmp_path / "collision" / "a.stl")
     assert len(read_model(tmp_path).mesh.faces) == 12
-
-
-def test_versions_with_other_units_and_axes(tmp_path):
-    write_obj(tmp_path, "mug", box((0.05, 0.06, 0.1), (0, 0, 0.05)))
-    turned = box((0.05, 0.06, 0.1), (0, 0, 0.05))
-    turned.vertices = 100 * turned.vertices[:, [0, 2, 1]] * [1, 1, -1]
-    turned.export(tmp_path / "mug.glb")
-    model = read_model(tmp_path)
-    assert "used mug.obj" in notes_of(model) and "ignored mug.glb: another version" in notes_of(model)
