@@ -1,63 +1,44 @@
-"""Decisions that are undone: what is tried, in which order, and when a decision is given up.
+"""The order in which the candidates of a decision are tried, and when the decision is given up.
 
-How a moment is come back to is another matter: `branches` forks there, `resimulation` runs the attempt again from its
-reset. Both play the same candidates in the same order, so that the episodes are the same.
+`branches` comes back to the moment of a decision by forking there, `resimulation` by running the attempt again from its
+reset. Both play the same candidates in the same order, so the episodes are the same.
 """
 
 from __future__ import annotations
 
 from collections.abc import Generator, Iterable
-from typing import Any, Protocol, TypeVar
+from typing import TypeVar
 
 from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.demos.ledger import EpisodeResult
 from robocas_ms3.planning.decisions import Effort
 
 T = TypeVar("T")
 
 
-class Tally(Protocol):
-    """What survives what is undone: where time went and what failed. Whoever is running has the only valid one."""
-
-    @property
-    def exhausted(self) -> bool:
-        """Whether no further attempt may be made."""
-        ...
-
-    def failed(self, error: PlanningFailed) -> None:
-        """Note a failed attempt."""
-        ...
-
-    def adopt(self, other: Any) -> None:
-        """Become what another process sent."""
-        ...
-
-
-class DeadEnd(Exception):  # noqa: N818  (no error: the attempts from here have failed, and are noted already)
-    """Every way from here was gone, in vain: the decision before has to be made otherwise."""
+class DeadEnd(Exception):  # noqa: N818
+    """All candidates failed later, and their failures are noted: the decision before must be made otherwise."""
 
 
 def turns(
-    candidates: Iterable[T], effort: Effort, tally: Tally
+    candidates: Iterable[T], effort: Effort, result: EpisodeResult
 ) -> Generator[tuple[T, bool], float | PlanningFailed | None, None]:
-    """Which candidate is due, and whether to go on from it, or only to look how well it can be played.
+    """Yield which candidate is next, and whether to continue from it, or only to play it for its score.
 
-    A few are compared and gone on from, the best first; then the next few.
+    A few are compared, and the episode continues from the best first; then from the next few. The caller sends the
+    score of a played candidate, or why it can't be played; nothing after continuing, which has failed then.
 
     Args:
         candidates: of a decision, taken as they are needed.
-        effort: how many are compared, and gone on from.
-        tally: of the episode.
-
-    Yields:
-        The candidate, and whether to go on from it. After a look its score is to be sent, or why it can't be played;
-        after going on, which has failed then, nothing.
+        effort: how many are compared and continued from.
+        result: of the episode so far.
 
     Raises:
-        DeadEnd: some were gone on from, and no other shall be.
-        PlanningFailed: none can be played; of the one that came last.
+        DeadEnd: the episode continued from some candidates, and from no other it shall.
+        PlanningFailed: none can be played; of the last one.
     """
-    failure, gone_on, left = PlanningFailed("decision", "no_candidate"), 0, iter(candidates)
-    while gone_on < effort.tries and not tally.exhausted:
+    failure, continued, left = PlanningFailed("decision", "no_candidate"), 0, iter(candidates)
+    while continued < effort.tries and not result.exhausted:
         compared: list[tuple[float, T]] = []
         for candidate in left:
             outcome = yield candidate, False
@@ -72,7 +53,7 @@ def turns(
             break
         for _, candidate in sorted(compared, key=lambda scored: -scored[0]):
             yield candidate, True
-            gone_on += 1
-            if gone_on == effort.tries or tally.exhausted:
+            continued += 1
+            if continued == effort.tries or result.exhausted:
                 break
-    raise DeadEnd if gone_on else failure
+    raise DeadEnd if continued else failure

@@ -31,28 +31,28 @@ class ChildGone(ChildCrash):
 
 @dataclass(frozen=True)
 class Child:
-    """A forked process, as its parent has it: its process id, and the pipe to it."""
+    """A forked process: its id, and the pipe to it."""
 
     pid: int
     pipe: Connection
 
-    def tell(self, message: Any) -> None:
-        """Send something.
+    def send(self, message: Any) -> None:
+        """Send a message.
 
         Raises:
-            ChildGone: there is no child any more.
+            ChildGone: the child has ended.
         """
         try:
             self.pipe.send(message)
         except OSError as error:
             raise ChildGone("crashed") from error
 
-    def hear(self, limit: float) -> Any:
-        """What it says within so many seconds.
+    def receive(self, limit: float) -> Any:
+        """Return the child's next message, within ``limit`` seconds.
 
         Raises:
-            ChildGone: there is no child any more.
-            ChildCrash: it says nothing.
+            ChildGone: the child has ended.
+            ChildCrash: no message in time.
         """
         try:
             if not self.pipe.poll(limit):
@@ -69,7 +69,7 @@ class Child:
 
 
 def fork() -> Child | Connection:
-    """Fork this process, which then has the child, while the child has a pipe to this one.
+    """Fork this process; return the child, or in the child the pipe to this process.
 
     Raises:
         RobocasError: the system allows no more processes, memory or open files.
@@ -91,7 +91,7 @@ def fork() -> Child | Connection:
 
 
 def set_up_child(parent: int) -> None:
-    """Set right what a child has to before anything else; the system kills it when the process ``parent`` ends."""
+    """Set up a child before anything else; the system kills it when the process ``parent`` ends."""
     die_with_parent(parent)
     gc.freeze()  # a collection that walks all objects would copy all of the parent's memory
     # Threads that are not here may hold the locks of the parent's streams. A line is written as soon as it ends, since
@@ -102,11 +102,7 @@ def set_up_child(parent: int) -> None:
 
 
 def why_not_fork(*, renders: bool) -> str:
-    """Why this process can't be forked safely; empty where it can.
-
-    Args:
-        renders: whether a renderer is open.
-    """
+    """Return why this process, with or without an open renderer, can't be forked safely; empty where it can."""
     if sys.platform != "linux":
         return "this is not Linux"
     if renders:
@@ -118,5 +114,5 @@ def why_not_fork(*, renders: bool) -> str:
 
 @cache
 def say_once(reason: str) -> None:
-    """Tell the user that undoing takes longer here."""
+    """Warn the user that undoing takes longer here."""
     _log.warning("can't fork (%s): what fails is undone by simulating everything again", reason)

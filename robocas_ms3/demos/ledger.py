@@ -13,7 +13,7 @@ from pydantic import Field
 
 from robocas_ms3.core import ledger
 from robocas_ms3.core.errors import PlanningFailed
-from robocas_ms3.demos.recordings.seeds import GREATEST_SEED
+from robocas_ms3.demos.recordings.entries import GREATEST_SEED
 from robocas_ms3.planning.seconds import Seconds
 
 FAILURES_FILE = "failures.jsonl"
@@ -46,7 +46,7 @@ class Failure:
 
 @dataclass
 class EpisodeResult:
-    """Result of a seed; forked processes send it on (`backtracking.Tally`).
+    """Result of a seed; forked processes send theirs back.
 
     Attributes:
         seed: of the episode.

@@ -13,12 +13,13 @@ import gymnasium as gym
 import numpy as np
 import torch
 from mani_skill.envs.utils.observations import ALL_VISUAL_TEXTURES, parse_obs_mode_to_struct
+from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import DatasetError, RobocasError
 from robocas_ms3.core.files import make_folder
 from robocas_ms3.core.outputs import check_replaceable
+from robocas_ms3.core.poses import from_wxyz, inverse
 from robocas_ms3.core.strict import check_number
-from robocas_ms3.demos.convert_actions import CONVERTIBLE, convert_action
 from robocas_ms3.demos.recorded import Recorded
 from robocas_ms3.demos.recordings.entries import read_json
 from robocas_ms3.demos.recordings.environment import RecordedEnv, read_env
@@ -26,7 +27,13 @@ from robocas_ms3.demos.recordings.merging import merge
 from robocas_ms3.demos.recordings.stored import open_trajectory
 from robocas_ms3.demos.recordings.writing import EpisodeRecorder
 from robocas_ms3.demos.settings import ReplaySettings
+from robocas_ms3.robots.ee_controller import RoboCASEEPoseController
+from robocas_ms3.robots.ee_deltas import to_ee_delta_action
+from robocas_ms3.robots.forward import chain
 from robocas_ms3.tasks.base import RoboCASEnv
+
+_JOINT_DELTA_SCALE = 0.1  # rad at |action| = 1 of pd_joint_delta_pos
+CONVERTIBLE = ("pd_joint_pos", "pd_joint_delta_pos", "pd_ee_delta_pose", "pd_ee_pose")
 
 
 @dataclass(frozen=True)
@@ -133,11 +140,34 @@ def _replay_one(env: gym.Env, settings: ReplaySettings, episode: dict[str, Any])
     elif settings.use_env_states or recorded.taken_over:
         base_env.set_state_dict(recorded.states[0])
     for action, state in zip(recorded.actions, recorded.states[1:], strict=True):
-        *_, info = env.step(convert_action(action, base_env) if converted else action)
+        *_, info = env.step(_convert_action(action, base_env) if converted else action)
         if settings.use_env_states:
             base_env.set_state_dict(state)
     error = None if converted else state_distance(cast(Any, base_env.get_state_dict()), recorded.states[-1])
     return Replay(episode["episode_id"], recorded.seed, bool(info["success"][0]), error)
+
+
+def _convert_action(action: np.ndarray, env: RoboCASEnv) -> np.ndarray:
+    """Convert ``pd_joint_pos`` targets (8,) to an action of the environment's mode, within its bounds, at its state.
+
+    ManiSkill's own converter wants end-effector deltas in the root's axes and measures them in the world's.
+    """
+    arm, gripper, robot = action[:7].astype(float), action[7:], env.robot_spec.description
+    if env.control_mode == "pd_joint_pos":
+        return action
+    if env.control_mode == "pd_joint_delta_pos":
+        now = env.agent.robot.get_qpos()[0, robot.arm_slice].cpu().numpy()
+        return np.append(np.clip((arm - now) / _JOINT_DELTA_SCALE, -1, 1), gripper).astype(np.float32)
+    tcp_in_base = chain(env.robot_spec.files().urdf, robot.arm_base_link, robot.tcp_link, arm[None])[0]
+    if env.control_mode == "pd_ee_pose":
+        euler = Rotation.from_matrix(tcp_in_base[:3, :3]).as_euler("XYZ")
+        return np.concatenate([tcp_in_base[:3, 3], euler, gripper]).astype(np.float32)
+    agent: Any = env.agent
+    controller = agent.controller.controllers["arm"]
+    assert isinstance(controller, RoboCASEEPoseController)
+    motion = inverse(from_wxyz(controller.reference_pose().raw_pose[0].cpu())) @ tcp_in_base
+    delta = to_ee_delta_action(motion[:3, 3], Rotation.from_matrix(motion[:3, :3]))
+    return np.append(np.clip(delta, -1, 1), gripper).astype(np.float32)
 
 
 def state_distance(state: dict[str, Any], recorded: dict[str, Any]) -> float:

@@ -9,7 +9,7 @@ from robocas_ms3.core.documents import DocumentError, load_json
 from robocas_ms3.core.errors import PlanError
 from robocas_ms3.core.outputs import FolderKind, setting_changes
 from robocas_ms3.core.strict import parse
-from robocas_ms3.demos.recordings.versions import versions
+from robocas_ms3.demos.recordings.entries import versions
 from robocas_ms3.plans.plan import Plan
 
 PLAN, REPORT, UNITS = "plan.json", "report.json", "units"

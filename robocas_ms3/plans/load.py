@@ -14,7 +14,7 @@ from robocas_ms3.core.documents import DocumentError, load_yaml
 from robocas_ms3.core.errors import MissingExtraError, PlanError, RobocasError
 from robocas_ms3.core.paths import plans_dir
 from robocas_ms3.core.strict import nearest, parse
-from robocas_ms3.demos.recordings.seeds import GREATEST_SEED
+from robocas_ms3.demos.recordings.entries import GREATEST_SEED
 from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.plans.plan import PartConfig, Plan
 from robocas_ms3.scenes.config import load_config_of, shipped_configs

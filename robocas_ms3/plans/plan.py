@@ -9,7 +9,7 @@ from pydantic import Field, field_validator, model_validator
 from robocas_ms3.core.strict import StrictModel
 from robocas_ms3.datasets.lerobot.variants import NEWEST, Version
 from robocas_ms3.datasets.pictures.stored import Pictures
-from robocas_ms3.demos.recordings.seeds import GREATEST_SEED
+from robocas_ms3.demos.recordings.entries import GREATEST_SEED
 
 Side = Literal["train", "val"]
 Stage = Literal["layouts", "demonstrations", "datasets", "statistics"]

@@ -23,7 +23,7 @@ from robocas_ms3.core.files import flush_to_disk, make_folder
 from robocas_ms3.core.ledger import Ledger
 from robocas_ms3.core.strict import validate_json
 from robocas_ms3.datasets.schema import episode_folder
-from robocas_ms3.demos.recordings.seeds import GREATEST_SEED
+from robocas_ms3.demos.recordings.entries import GREATEST_SEED
 from robocas_ms3.plans.folder import UNITS
 from robocas_ms3.plans.plan import Plan
 

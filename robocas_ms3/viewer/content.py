@@ -16,7 +16,7 @@ from robocas_ms3.core.words import called
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.sources.protocol import EpisodeSource, Kind
 from robocas_ms3.demos.ledger import Failure
-from robocas_ms3.demos.recordings.seeds import one_seed
+from robocas_ms3.demos.recordings.entries import one_seed
 from robocas_ms3.viewer.damage import attempt, join_reasons, read_scene, readable
 from robocas_ms3.viewer.episode import facts_of, rounded, show_arrays
 from robocas_ms3.viewer.images import EncodedImage, encode_jpeg

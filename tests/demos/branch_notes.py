@@ -1,26 +1,19 @@
-"""A tally for tests of branches."""
+"""A result for tests of branches, with failures as text."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.demos.ledger import EpisodeResult
 
 
 @dataclass
-class Notes:
-    """Failures so far, and what the episode came to."""
-
-    most: int = 100
-    failures: list[str] = field(default_factory=list)
+class Notes(EpisodeResult):
+    seed: int = 0
+    success: bool = False
+    max_attempts: int = 100
     outcome: str = ""
 
     @property
-    def exhausted(self) -> bool:
-        return len(self.failures) >= self.most
-
-    def failed(self, error: PlanningFailed) -> None:
-        self.failures.append(f"{error.stage}: {error.reason}")
-
-    def adopt(self, other) -> None:
-        vars(self).update(vars(other))
+    def texts(self) -> list[str]:
+        return [f"{failure.stage}: {failure.reason}" for failure in self.failures]

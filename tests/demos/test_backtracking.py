@@ -31,7 +31,7 @@ def test_a_few_are_compared_and_gone_on_from_the_best_first():
 
 
 def test_an_attempt_too_many_ends_it():
-    assert play("abc", dict.fromkeys("abc", 0.0), Effort(ahead=3), Notes(most=2)) == ("abcAB", "")
+    assert play("abc", dict.fromkeys("abc", 0.0), Effort(ahead=3), Notes(max_attempts=2)) == ("abcAB", "")
 
 
 def test_where_none_can_be_played_the_last_failure_says_why():

@@ -50,7 +50,7 @@ def test_a_child_that_crashes_is_played_once_more_and_passed_over(signal_, tmp_p
 
     ended, notes = forked(decide)
     assert ended
-    assert notes.failures == []  # it was never gone on from
+    assert notes.texts == []  # it was never gone on from
     assert (tmp_path / "played").read_text() == "aab"
 
 
@@ -61,7 +61,7 @@ def test_a_crash_further_on_is_a_failed_attempt():
 
     ended, notes = forked(decide)
     assert ended
-    assert notes.failures == ["branch: crashed"]
+    assert notes.texts == ["branch: crashed"]
 
 
 @pytest.mark.parametrize("moment", ["it plays", "it goes on", "it waits"])
@@ -98,7 +98,7 @@ def test_a_child_that_is_killed_once_changes_nothing(tmp_path, moment):
     assert ended
     assert (tmp_path / "killed").exists()
     assert (tmp_path / "outcome").read_text() == "bc"
-    assert notes.failures == ["end: ba", "end: bb"]
+    assert notes.texts == ["end: ba", "end: bb"]
 
 
 def test_a_child_that_takes_too_long_is_ended(monkeypatch):
@@ -129,7 +129,7 @@ def test_a_child_that_dies_in_the_middle_of_a_message_is_gone():
         assert runner.choose("ab", play) == "b"
 
     ended, notes = forked(decide)
-    assert (ended, notes.failures) == (True, [])
+    assert (ended, notes.texts) == (True, [])
 
 
 def test_a_broken_pipe_of_the_attempt_is_its_error_not_a_crash(tmp_path):
@@ -157,7 +157,7 @@ def test_without_standard_streams_branches_work(monkeypatch):
     monkeypatch.setattr(sys, "stdout", None)
     monkeypatch.setattr(sys, "stderr", None)
     ended, notes = forked(lambda runner: runner.choose("a", lambda letter: 0.0))
-    assert (ended, notes.failures) == (True, [])
+    assert (ended, notes.texts) == (True, [])
 
 
 def test_an_interrupt_while_a_child_says_its_last_word_ends_the_child(monkeypatch, tmp_path):
@@ -183,7 +183,7 @@ def test_an_interrupt_while_a_child_says_its_last_word_ends_the_child(monkeypatc
         (tmp_path / "escaped").touch()
         os._exit(0)
     assert not (tmp_path / "escaped").exists()
-    assert (ended, notes.failures) == (True, [])
+    assert (ended, notes.texts) == (True, [])
 
 
 def test_threads_that_write_do_not_hold_up_branches(capfd):
@@ -213,7 +213,7 @@ def test_threads_that_write_do_not_hold_up_branches(capfd):
         over.set()
         for writer in writers:
             writer.join()
-    assert (ended, notes.failures) == (True, [])
+    assert (ended, notes.texts) == (True, [])
     assert time.monotonic() - start < 60
     assert capfd.readouterr().err.count("in a branch\n") >= 40
 

@@ -27,7 +27,7 @@ def search(decide, good, *, most=100, **how):
     """Run an attempt that `decide`s; the outcome and the failures."""
     found = []
     for make in RUNNERS:
-        notes, world = Notes(most), World()
+        notes, world = Notes(max_attempts=most), World()
         runner = make(notes)
 
         def attempt(world=world, runner=runner, notes=notes):
@@ -38,7 +38,7 @@ def search(decide, good, *, most=100, **how):
             notes.outcome = world.done
 
         ended = runner.run(attempt)
-        found.append((ended, notes.outcome, notes.failures))
+        found.append((ended, notes.outcome, notes.texts))
     assert found[0] == found[1], "both ways come to the same"
     return found[0]
 

@@ -246,15 +246,15 @@ def test_the_way_back_to_a_decision_leaves_no_trace(tmp_path, monkeypatch, searc
 
 def test_forked_or_not_a_search_is_the_same_and_replays_bit_for_bit(tmp_path, monkeypatch, search_generator):
     """Even where a branch is killed from outside while it goes on."""
-    tell = Child.tell
+    send = Child.send
 
-    def tell_and_kill_the_first(child, tally):
-        tell(child, tally)
+    def send_and_kill_the_first(child, result):
+        send(child, result)
         if not (tmp_path / "killed").exists():
             (tmp_path / "killed").touch()
             os.kill(child.pid, signal.SIGKILL)
 
-    monkeypatch.setattr(Child, "tell", tell_and_kill_the_first)
+    monkeypatch.setattr(Child, "send", send_and_kill_the_first)
     episodes = []
     for fork in (True, False):
         monkeypatch.setattr(search_generator, "_fork", fork)

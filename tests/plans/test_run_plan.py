@@ -27,8 +27,8 @@ from plan_stages import (
 from robocas_ms3.core.errors import MissingExtraError, OutputExistsError, PlanError, RobocasError
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.demos.recordings.entries import versions
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
-from robocas_ms3.demos.recordings.versions import versions
 from robocas_ms3.plans.executors.local import LocalExecutor
 from robocas_ms3.plans.progress import parse_shard
 from robocas_ms3.plans.run import Callbacks, join_plan, run_shard

@@ -16,9 +16,8 @@ from robocas_ms3.datasets.actions import episode_actions
 from robocas_ms3.datasets.sources.reader import Dataset, Episode
 from robocas_ms3.datasets.sources.tolerant import first_line
 from robocas_ms3.demos.open_loop import OpenLoop
-from robocas_ms3.demos.recordings.entries import read_reset_options, was_taken_over
+from robocas_ms3.demos.recordings.entries import one_seed, read_reset_options, was_taken_over
 from robocas_ms3.demos.recordings.environment import read_env
-from robocas_ms3.demos.recordings.seeds import one_seed
 
 _SAME_PLACE = 1e-3  # m
 _BASE_STILL = 1e-3  # m that the base may move in all: 7-D actions do not move it

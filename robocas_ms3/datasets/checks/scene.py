@@ -12,7 +12,7 @@ from robocas_ms3.datasets.checks.violation import Violation, check_form, read_ob
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.records import ConversionRecord, SceneRecord
 from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, arrays_fingerprint, first_line
-from robocas_ms3.demos.recordings.seeds import one_seed
+from robocas_ms3.demos.recordings.entries import one_seed
 
 FILE = schema.CONVERSION_FILE
 _UNKNOWN = {**dict.fromkeys(schema.SCENE), "schema_version": schema.SCHEMA_VERSION, "rate_hz": 1.0, "source": {}}

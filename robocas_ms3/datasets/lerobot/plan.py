@@ -16,7 +16,7 @@ from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.datasets.writing.inputs import ConversionInput
 from robocas_ms3.datasets.writing.output import with_versions
 from robocas_ms3.datasets.writing.plan import LEFT_OUT
-from robocas_ms3.demos.recordings.versions import versions
+from robocas_ms3.demos.recordings.entries import versions
 
 PARTS = ".parts"
 """Folder of the episodes done so far; gone when the dataset is there."""

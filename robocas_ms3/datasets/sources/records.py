@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, NonNegativeInt, PlainValidator, StringConstraints
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.demos.recordings.seeds import one_seed
+from robocas_ms3.demos.recordings.entries import one_seed
 from robocas_ms3.demos.recordings.subgoals import SubGoalRecord
 
 

@@ -30,7 +30,7 @@ from robocas_ms3.datasets.writing.plan import (
 )
 from robocas_ms3.datasets.writing.settings import Conversion, ConversionSettings, WrittenEpisode
 from robocas_ms3.datasets.writing.workers import WriteJob, write_missing
-from robocas_ms3.demos.recordings.versions import versions
+from robocas_ms3.demos.recordings.entries import versions
 
 _FIX = "The dataset is complete without, and valid; the same command tries again, --leave-out takes it as it is."
 _log = logging.getLogger(__name__)

@@ -21,7 +21,7 @@ from robocas_ms3.datasets.sources.reader import Dataset, Episode
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.datasets.sources.tolerant import first_line, read_arrays
 from robocas_ms3.demos.ledger import FAILURES_FILE
-from robocas_ms3.demos.recordings.seeds import one_seed
+from robocas_ms3.demos.recordings.entries import one_seed
 from robocas_ms3.demos.recordings.subgoals import SubGoal, subgoal_runs
 
 

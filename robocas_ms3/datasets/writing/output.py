@@ -6,7 +6,7 @@ from typing import Any
 
 from robocas_ms3.core.outputs import FolderKind
 from robocas_ms3.datasets import schema
-from robocas_ms3.demos.recordings.versions import versions
+from robocas_ms3.demos.recordings.entries import versions
 
 MARKS = (schema.CONVERSION_FILE, schema.DATA_INFO_FILE)
 """A folder with one of these is a RoboCAS dataset, whole or not."""

@@ -18,8 +18,7 @@ from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.records import ConversionRecord, SettingsRecord
 from robocas_ms3.datasets.sources.split import SPLIT_RULE, split_by_seed
-from robocas_ms3.demos.recordings.seeds import one_seed
-from robocas_ms3.demos.recordings.versions import versions
+from robocas_ms3.demos.recordings.entries import one_seed, versions
 
 Entries = Sequence[dict[str, Any]]
 """What is to be converted, see `players.Player.entries`."""

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,10 +17,23 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat,
 from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.strict import parse
-from robocas_ms3.demos.recordings.seeds import GREATEST_SEED, one_seed
 from robocas_ms3.demos.recordings.subgoals import SubGoal, SubGoalsRecord
 
+GREATEST_SEED = 2**32 - 1  # numpy's older generators, which ManiSkill uses, take no greater one
 _ENTRY = "the JSON's entry"
+
+
+@cache  # it reads the packages' descriptions
+def versions() -> dict[str, str]:
+    """Return the versions of the packages that an episode depends on."""
+    return {name: version(name) for name in ("robocas-ms3", "mani_skill", "sapien", "python-fcl", "torch", "numpy")}
+
+
+def one_seed(value: Any) -> int | None:
+    """Return a seed as an integer, also from a list of one as ManiSkill writes it; None where it is neither."""
+    if isinstance(value, list) and len(value) == 1:
+        value = value[0]
+    return value if type(value) is int else None
 
 
 class _Record(BaseModel):
@@ -111,11 +126,7 @@ class Entry:
 
 
 def read_entry(episode: Mapping[str, Any], where: object) -> Entry:
-    """Return what a trajectory's JSON says of an episode.
-
-    Raises:
-        DatasetError: it says something else, or more than a file may choose.
-    """
+    """Return what a trajectory's JSON says of an episode."""
     found = parse(EpisodeRecord, episode, DatasetError, where=where, about=_ENTRY)
     goals = found.robocas.goals
     steps = found.elapsed_steps
@@ -140,21 +151,13 @@ def was_taken_over(episode: Mapping[str, Any]) -> bool:
 
 
 def read_reset(episode: Mapping[str, Any], where: object) -> tuple[int, dict[str, Any]]:
-    """Return seed and options of ``env.reset`` that an episode begins with.
-
-    Raises:
-        DatasetError: there is no such seed, or the options do more than a file may.
-    """
+    """Return seed and options of ``env.reset`` that an episode begins with."""
     found = parse(BeginRecord, episode, DatasetError, where=where, about=_ENTRY)
     return found.episode_seed, _options(found.reset_kwargs)
 
 
 def read_reset_options(options: Any, where: object) -> dict[str, Any]:
-    """Return options of ``env.reset`` in a file.
-
-    Raises:
-        DatasetError: they do more than a file may.
-    """
+    """Return options of ``env.reset`` in a file."""
     return _options(parse(ResetRecord, {"options": options or None}, DatasetError, where=where))
 
 
@@ -163,11 +166,7 @@ def _options(reset: ResetRecord | None) -> dict[str, Any]:
 
 
 def read_json(trajectory: Path) -> dict[str, Any]:
-    """Read the JSON of a trajectory in the form of `TrajectoryRecord`.
-
-    Raises:
-        DatasetError: it is missing or damaged.
-    """
+    """Read the JSON of a trajectory in the form of `TrajectoryRecord`."""
     path, about = trajectory.with_suffix(".json"), "not a trajectory's JSON"
     if not path.is_file():
         raise DatasetError("the JSON that belongs to this trajectory is missing", where=path)

@@ -93,11 +93,7 @@ class RecordedEnv:
         return replace(self, kwargs={**self.kwargs, "pack": named})
 
     def robot(self, where: object = "robot_uids") -> RobotSpec:
-        """The robot that it was.
-
-        Raises:
-            DatasetError: none of its name is installed.
-        """
+        """The robot that it was."""
         try:
             return find_robot(self.kwargs.get("robot_uids"), where=where)
         except ExtensionError as error:
@@ -109,10 +105,6 @@ class RecordedEnv:
 
         Args:
             kwargs: further ones of ``gym.make``, which win over its own.
-
-        Raises:
-            DatasetError: no such task is registered, configuration shipped, or robot or pack installed; what lies in
-                the folder where we run is none, whatever its name.
         """
         import gymnasium as gym
 
@@ -139,11 +131,7 @@ def read_env(info: Any, where: object, *, pack: str | Path | None = None) -> Rec
 
     Args:
         info: ``{"env_id": ..., "env_kwargs": {...}}``.
-        where: it stands, for messages.
         pack: name or folder, instead of what the file names.
-
-    Raises:
-        DatasetError: it says something else, or more than a file may choose.
     """
     if pack is not None and isinstance(info, Mapping) and isinstance(info.get("env_kwargs"), Mapping):
         info = {**info, "env_kwargs": {**info["env_kwargs"], "pack": "builtin"}}

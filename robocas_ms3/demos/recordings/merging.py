@@ -8,10 +8,8 @@ from typing import Any
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import replacing, write_json
-from robocas_ms3.demos.recordings.entries import read_json
-from robocas_ms3.demos.recordings.seeds import one_seed
-from robocas_ms3.demos.recordings.stored import copy_episode, open_episode, open_trajectory, readable
-from robocas_ms3.demos.recordings.whole import reserved
+from robocas_ms3.demos.recordings.entries import one_seed, read_json
+from robocas_ms3.demos.recordings.stored import copy_episode, open_episode, open_trajectory, readable, reserved
 
 _MARGIN = 4096  # bytes an episode may need in a file of many beyond those of its own
 
@@ -24,9 +22,6 @@ def merge(shards: list[Path], out: Path) -> None:
     Args:
         shards: HDF5 files, each with its JSON beside it.
         out: HDF5 file to write; its JSON is written beside it.
-
-    Raises:
-        DatasetError: a file can't be read.
     """
     merged: dict[str, Any] = {}
     episodes: list[dict[str, Any]] = []

@@ -26,11 +26,7 @@ _JOINTS = RobotDescription.finger_slice.stop
 
 
 def sample_stride(control_freq: float, rate_hz: float) -> int:
-    """Control steps between two dataset steps.
-
-    Raises:
-        DatasetError: the rate does not divide the control frequency.
-    """
+    """Control steps between two dataset steps."""
     stride = round(control_freq / rate_hz) if rate_hz > 0 else 0
     if stride < 1 or abs(stride * rate_hz - control_freq) > 1e-6 * control_freq:
         rates = [f"{control_freq / k:g}" for k in range(1, 21) if (control_freq / k).is_integer()]
@@ -66,6 +62,7 @@ def gripper_open(
         commands: (S,) gripper actions in [-1, 1].
         samples: (T,) from ``sample_states``.
         initial_width: of the gripper at reset, m, which is its target until the first action.
+
 
     Returns:
         (T,) bool.

@@ -58,6 +58,7 @@ class TrajectoryFile:
         path: the HDF5 file.
         pack: name or folder of the objects' pack, instead of what the file names.
 
+
     Attributes:
         path: the HDF5 file.
         env_info: ``env_id``, ``env_kwargs``, ... of the JSON.
@@ -69,11 +70,7 @@ class TrajectoryFile:
     """
 
     def __init__(self, path: str | Path, *, pack: str | Path | None = None) -> None:
-        """Open both files and check that they belong together.
-
-        Raises:
-            DatasetError: a file is missing, damaged, or they do not match; or it chooses what no file may.
-        """
+        """Open both files and check that they belong together."""
         self.path = Path(path)
         metadata_path = self.path.with_suffix(".json")
         if self.path.is_dir():
@@ -123,11 +120,7 @@ class TrajectoryFile:
         self._file.close()
 
     def reopened(self) -> TrajectoryFile:
-        """The same file, open again, by the JSON as it was read.
-
-        Raises:
-            DatasetError: the HDF5 file is missing or damaged.
-        """
+        """The same file, open again, by the JSON as it was read."""
         file = copy(self)
         file._file = open_trajectory(self.path)
         return file
@@ -141,9 +134,6 @@ class TrajectoryFile:
 
         Args:
             index: position in ``episodes``.
-
-        Raises:
-            DatasetError: it says something else, or more than a file may choose.
         """
         return read_entry(self.episodes[index], self._where(index))
 
@@ -153,9 +143,6 @@ class TrajectoryFile:
         Args:
             index: position in ``episodes``.
             bodies: whether to read the states of all, not only of the robot.
-
-        Raises:
-            DatasetError: it is damaged, or contradicts the JSON.
         """
         where, uid = self._where(index), self.robot.description.uid
         group = open_episode(self._file, self.episodes[index]["episode_id"])

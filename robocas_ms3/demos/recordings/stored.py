@@ -1,13 +1,16 @@
-"""Trajectories as HDF5 stores them: opened, and read only where they lie in their own file.
+"""HDF5 files of trajectories: written without harm by a full disk, and read only from within the file itself.
 
-HDF5 lets a file name others: by links, as the place of an array's bytes, as pieces of an array. A recording is
-somebody's data and chooses no paths: what does is refused, and nothing of it read.
+HDF5 ends the process where it can't write what it holds, so files are made in memory or on reserved space. HDF5 lets a
+file name others: by links, as the place of an array's bytes, as pieces of an array. A recording is somebody's data and
+chooses no paths: what does is refused, and nothing of it is read.
 """
 
 from __future__ import annotations
 
+import errno
 import math
-from collections.abc import Iterator
+import os
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -29,13 +32,40 @@ _LIMIT = 2**30  # bytes of an episode's states: ten thousand steps of forty bodi
 _DEEP = 4  # groups in groups that states may have
 
 
-@contextmanager
-def readable(where: object, what: str = "this episode is damaged") -> Iterator[None]:
-    """Read of an HDF5 file.
+def write_whole(path: Path, fill: Callable[[h5py.File], None]) -> None:
+    """Make a file in memory and write it at once.
 
     Raises:
-        DatasetError: it is damaged, whatever HDF5 says of that.
+        OSError: it can't be written.
     """
+    with h5py.File(path.name, "w", driver="core", backing_store=False) as file:
+        fill(file)
+        file.flush()
+        image = file.id.get_file_image()
+    path.write_bytes(image)
+
+
+@contextmanager
+def reserved(path: Path, size: int) -> Iterator[h5py.File]:
+    """Open a new file of which so many bytes have their place on the disk; what is not needed is given back.
+
+    Raises:
+        OSError: there is no room for them.
+    """
+    write_whole(path, lambda file: None)
+    with path.open("r+b") as file:
+        try:
+            os.posix_fallocate(file.fileno(), 0, max(size, 1))
+        except OSError as error:
+            if error.errno not in (errno.EOPNOTSUPP, errno.EINVAL):  # a file system that reserves nothing
+                raise
+    with h5py.File(path, "r+") as file:
+        yield file
+
+
+@contextmanager
+def readable(where: object, what: str = "this episode is damaged") -> Iterator[None]:
+    """Read of an HDF5 file."""
     try:
         yield
     except (OSError, KeyError, RuntimeError, AttributeError, ValueError, TypeError, MemoryError) as error:
@@ -43,11 +73,7 @@ def readable(where: object, what: str = "this episode is damaged") -> Iterator[N
 
 
 def open_trajectory(path: Path) -> h5py.File:
-    """Open an HDF5 trajectory for reading.
-
-    Raises:
-        DatasetError: it is missing, damaged or no HDF5 file.
-    """
+    """Open an HDF5 trajectory for reading."""
     try:
         check_regular(path)
         return h5py.File(path, "r")
@@ -63,11 +89,7 @@ def open_trajectory(path: Path) -> h5py.File:
 
 
 def open_episode(file: h5py.File, number: int) -> h5py.Group:
-    """Find an episode of an open trajectory, and see that no link in it leads elsewhere.
-
-    Raises:
-        DatasetError: it is missing or damaged, or leads out of its file.
-    """
+    """Find an episode of an open trajectory, and see that no link in it leads elsewhere."""
     name = f"traj_{number}"
     where = f"{file.filename}, {name}"
     astray: list[bytes] = []
@@ -88,11 +110,7 @@ def open_episode(file: h5py.File, number: int) -> h5py.Group:
 
 
 def copy_episode(source: h5py.File, number: int, target: h5py.File, new_number: int) -> None:
-    """Copy an episode to another trajectory.
-
-    Raises:
-        DatasetError: it is missing or damaged, or leads out of its file.
-    """
+    """Copy an episode to another trajectory."""
     group = open_episode(source, number)
     with readable(f"{source.filename}, traj_{number}"):
         group.visititems(lambda _, item: _check_own(item) if isinstance(item, h5py.Dataset) else None)
@@ -100,14 +118,7 @@ def copy_episode(source: h5py.File, number: int, target: h5py.File, new_number: 
 
 
 def read_actions(episode: h5py.Group) -> NDArray[np.float32]:
-    """Actions (S, A) of an episode.
-
-    Args:
-        episode: of `open_episode`.
-
-    Raises:
-        DatasetError: there are none, they are something else, no numbers, or lead out of the file.
-    """
+    """Actions (S, A) of an episode."""
     where = _where(episode)
     with readable(where):
         actions = np.asarray(_read(_found(episode["actions"], 0)), np.float32)
@@ -122,10 +133,6 @@ def check_finite(rows: NDArray[Any], where: object) -> None:
 
     Args:
         rows: (S, ...), a step each.
-        where: they stand, for the message.
-
-    Raises:
-        DatasetError: NaN or infinity.
     """
     finite = np.isfinite(rows)
     if not finite.all():
@@ -135,14 +142,7 @@ def check_finite(rows: NDArray[Any], where: object) -> None:
 
 
 def read_states(episode: h5py.Group) -> dict[str, Any]:
-    """All of the states: by kind and name, the steps first; what is kept beside bodies may be nested deeper.
-
-    Args:
-        episode: of `open_episode`.
-
-    Raises:
-        DatasetError: there are none, they are something else, or lead out of the file.
-    """
+    """All of the states: by kind and name, the steps first; what is kept beside bodies may be nested deeper."""
     with readable(_where(episode)):
         return _read(_found(episode["env_states"], _DEEP))
 
@@ -151,11 +151,7 @@ def read_bodies(episode: h5py.Group, *, only: str | None = None) -> dict[str, di
     """States of bodies: by kind and name, (S + 1, D) each.
 
     Args:
-        episode: of `open_episode`.
         only: name of the one to read; default: all.
-
-    Raises:
-        DatasetError: there are none, they are something else, or lead out of the file.
     """
     with readable(_where(episode)):
         states: Any = episode["env_states"]
@@ -174,10 +170,6 @@ def check_bodies(states: dict[str, Any], where: object) -> None:
 
     Args:
         states: of `read_states`.
-        where: they stand, for messages.
-
-    Raises:
-        DatasetError: they are something else.
     """
     for kind in BODIES:
         if not isinstance(bodies := states.get(kind, {}), dict):

@@ -70,11 +70,7 @@ class SubGoalsRecord(BaseModel):
 
 
 def read_subgoals(entries: Any, where: object) -> list[SubGoal]:
-    """Read sub-goals from their JSON, a list of `SubGoal.as_json`.
-
-    Raises:
-        DatasetError: they are something else.
-    """
+    """Read sub-goals from their JSON, a list of `SubGoal.as_json`."""
     return parse(SubGoalsRecord, {"subgoals": entries}, DatasetError, where=where, about="damaged sub-goals").goals
 
 
@@ -88,11 +84,9 @@ def sample_subgoals(subgoals: Sequence[SubGoal], samples: NDArray[np.int64]) -> 
         subgoals: ranges over the actions 0..S-1, in order, without gaps.
         samples: from `motion.sample_states`.
 
+
     Returns:
         Ranges over the sampled steps, in order, without gaps.
-
-    Raises:
-        DatasetError: the ranges do not cover the actions.
     """
     actions = int(samples[-1])
     expected_first = 0

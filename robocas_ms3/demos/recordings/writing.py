@@ -16,9 +16,9 @@ from mani_skill.utils.wrappers.record import parse_env_info
 from numpy.typing import NDArray
 
 from robocas_ms3.core.files import replacing, write_json
+from robocas_ms3.demos.recordings.entries import versions
 from robocas_ms3.demos.recordings.environment import recorded_id
-from robocas_ms3.demos.recordings.versions import versions
-from robocas_ms3.demos.recordings.whole import write_whole
+from robocas_ms3.demos.recordings.stored import write_whole
 from robocas_ms3.tasks.base import RoboCASEnv
 
 # Settings of one machine or one run; a trajectory has to replay without them.

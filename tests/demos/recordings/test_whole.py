@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from robocas_ms3.core.files import replacing
-from robocas_ms3.demos.recordings.whole import reserved, write_whole
+from robocas_ms3.demos.recordings.stored import reserved, write_whole
 
 DATA = np.arange(50_000, dtype=np.float64)
 
