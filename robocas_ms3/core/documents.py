@@ -27,14 +27,14 @@ ARRAYS_LIMIT = 2**31
 """Bytes that the arrays of an ``.npz`` may have: compressed, they can be a thousandth of that."""
 INTEGER_LIMIT = 2**63
 """Integers are smaller in magnitude: NumPy, torch and Parquet hold 64 bits."""
-_NUMBER_LENGTH = 64  # characters of a YAML number; the time to read base 60 ("1:1:1") grows with their square
 JSON_DEPTH = YAML_DEPTH = 64
+YAML_NODES = 500_000
+"""Values, those that aliases stand for counted each time: nine aliases of nine aliases of ... are a billion."""
 _TOO_DEEP = f"nested more than {JSON_DEPTH} deep"
+_INTEGER_LENGTH = 64  # characters; the time to read base 60 ("1:1:1") grows with their square
 _SHOWN_KEYS = 8  # of the way to a wrong value
 _CONTAINERS = (dict, list, tuple)
 _SURROGATE = re.compile(r"[\ud800-\udfff]")  # no encoding has one
-YAML_NODES = 500_000
-"""Values, those that aliases stand for counted each time: nine aliases of nine aliases of ... are a billion."""
 
 DAMAGED = (
     *(OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error),
@@ -56,7 +56,7 @@ class DocumentError(ValueError):
 
 
 @contextmanager
-def _of(path: Path) -> Iterator[None]:
+def _reading(path: Path) -> Iterator[None]:
     try:
         yield
     except DocumentError as error:
@@ -71,7 +71,7 @@ def load_json(path: Path) -> Any:
         DocumentError: the file is not regular or not JSON, is too large or deep, or has a number out of range.
         OSError: the file cannot be read.
     """
-    with _of(path):
+    with _reading(path):
         return json_values(read_text(path, JSON_LIMIT))
 
 
@@ -82,7 +82,7 @@ def json_values(text: str | bytes) -> Any:
         DocumentError: the text is not JSON, is nested too deeply, or has a value that `json_fault` names.
     """
     try:
-        values = json.loads(text, parse_constant=_no_number, parse_float=_finite, parse_int=_integer)
+        values = json.loads(text)
     except ValueError as error:
         raise DocumentError(str(error)) from error
     except RecursionError as error:
@@ -120,21 +120,21 @@ def _scalar_fault(value: Any) -> str:
     if isinstance(value, str):
         return "" if value.isascii() or not _SURROGATE.search(value) else f"{value!r:.80} is not Unicode text"
     if isinstance(value, float):
-        return "" if isfinite(value) else f"{value} is not finite"
+        return "" if isfinite(value) else f"{value} is not a finite number"
     if isinstance(value, int):
         return "" if abs(value) < INTEGER_LIMIT else f"an integer of {value.bit_length()} bits"
     return "" if value is None else f"{value!r:.80} ({type(value).__name__})"
 
 
 def load_yaml(path: Path) -> Any:
-    """Read a YAML file; a key given twice in a mapping is an error.
+    """Read a YAML file; a key given twice in a mapping is an error, infinity and NaN are not.
 
     Raises:
         DocumentError: the file is not regular or not YAML, is too large or deep, has a number out of range, or its
             aliases stand for too many values.
         OSError: the file cannot be read.
     """
-    with _of(path):
+    with _reading(path):
         text = read_text(path, YAML_LIMIT)
         try:
             return yaml.load(text, Loader=_Loader)  # noqa: S506  (a SafeLoader)
@@ -157,7 +157,7 @@ def open_arrays(path: Path) -> Any:
         raise DocumentError("one array, not an archive of several")
     if file.zip is not None and sum(info.file_size for info in file.zip.infolist()) > ARRAYS_LIMIT:
         file.close()
-        raise DocumentError(f"more than {ARRAYS_LIMIT >> 20} MB of arrays")
+        raise DocumentError(_too_large(ARRAYS_LIMIT))
     return file
 
 
@@ -180,12 +180,8 @@ def load_array(path: Path, limit: int = ARRAYS_LIMIT) -> Any:
 def check_regular(path: Path, limit: int | None = None) -> None:
     """Refuse a pipe, a device or a socket, on which a read may never end; a folder is left to ``open``.
 
-    Args:
-        path: of the file.
-        limit: bytes that the file may have; None: any number.
-
     Raises:
-        DocumentError: the path leads to one of these, or the file is larger.
+        DocumentError: the path leads to one of these, or the file has more than ``limit`` bytes.
         OSError: the path cannot be read.
     """
     status = path.stat()
@@ -202,7 +198,7 @@ def read_bytes(path: Path, limit: int) -> bytes:
         DocumentError: the file is not regular or is larger.
         OSError: the file cannot be read.
     """
-    with _of(path):
+    with _reading(path):
         check_regular(path, limit)
         with path.open("rb") as file:
             content = file.read(limit + 1)
@@ -212,13 +208,8 @@ def read_bytes(path: Path, limit: int) -> bytes:
 
 
 def read_text(path: Path, limit: int) -> str:
-    """Read a text in UTF-8 of at most ``limit`` bytes.
-
-    Raises:
-        DocumentError: the file is not regular or not UTF-8, or is larger.
-        OSError: the file cannot be read.
-    """
-    with _of(path):
+    """Read a text in UTF-8 of at most ``limit`` bytes; raises as `read_bytes`, and DocumentError if it is not UTF-8."""
+    with _reading(path):
         try:
             return read_bytes(path, limit).decode("utf-8")
         except UnicodeDecodeError as error:
@@ -227,22 +218,6 @@ def read_text(path: Path, limit: int) -> str:
 
 def _too_large(limit: int) -> str:
     return f"more than {limit >> 20} MB" if limit >= 2**20 else f"more than {limit} bytes"
-
-
-def _no_number(word: str) -> float:
-    raise DocumentError(f"{word} is no number of JSON")
-
-
-def _finite(word: str) -> float:
-    number = float(word)
-    return number if isfinite(number) else _no_number(word[:40])
-
-
-def _integer(word: str) -> int:
-    number = int(word) if len(word) <= _NUMBER_LENGTH else INTEGER_LIMIT
-    if abs(number) >= INTEGER_LIMIT:
-        raise DocumentError(f"integer {word[:24]}{'...' if len(word) > 24 else ''} has more than 64 bits")
-    return number
 
 
 class _Loader(yaml.SafeLoader):
@@ -281,17 +256,10 @@ class _Loader(yaml.SafeLoader):
 
     def construct_yaml_int(self, node: Any) -> int:
         """Return an integer of at most 64 bits."""
-        number = INTEGER_LIMIT if len(node.value) > _NUMBER_LENGTH else super().construct_yaml_int(node)
+        number = INTEGER_LIMIT if len(node.value) > _INTEGER_LENGTH else super().construct_yaml_int(node)
         if abs(number) >= INTEGER_LIMIT:
             raise DocumentError(f"integer {node.value[:24]} has more than 64 bits")
         return number
 
-    def construct_yaml_float(self, node: Any) -> float:
-        """Return a number; infinity and NaN stay, for the forms that take them."""
-        if len(node.value) > _NUMBER_LENGTH:
-            raise DocumentError(f"number {node.value[:24]}... has more than {_NUMBER_LENGTH} characters")
-        return super().construct_yaml_float(node)
-
 
 _Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
-_Loader.add_constructor("tag:yaml.org,2002:float", _Loader.construct_yaml_float)

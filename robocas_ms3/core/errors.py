@@ -48,7 +48,7 @@ class SimulationError(RobocasError):
 
 
 class OutputExistsError(RobocasError):
-    """The output is there already and may not be replaced: no flag said so, or it is not what the command makes."""
+    """The output exists and may not be replaced: no flag allows it, or another command wrote it."""
 
 
 class DatasetError(RobocasError):
@@ -60,11 +60,7 @@ class EmptySplitError(DatasetError):
 
 
 class IncompleteError(DatasetError):
-    """Some episodes of a dataset can't be written; the others are.
-
-    Attributes:
-        reasons: why, by name of the episode's folder.
-    """
+    """Some episodes of a dataset can't be written; ``reasons`` has why, by name of the episode's folder."""
 
     reasons: Mapping[str, str] = {}
 
@@ -74,7 +70,7 @@ class PlanError(RobocasError):
 
 
 class MissingExtraError(RobocasError):
-    """An optional dependency is needed; the message names the extra that brings it."""
+    """An optional dependency is needed; the message names its extra."""
 
 
 class WorkerCrashed(RobocasError):
@@ -86,21 +82,17 @@ class WorkerStartError(RobocasError):
 
 
 class VectorEnvError(RobocasError):
-    """Several environments at once can't be made, or can't go on."""
+    """A vector environment can't be made, or can't continue."""
 
 
 class WorkerDied(VectorEnvError):
-    """A process that ran some of several environments is no more.
-
-    Attributes:
-        envs: those it was at, or all that it had.
-    """
+    """A worker of a vector environment died; ``envs`` are those that it was stepping, or all that it had."""
 
     envs: tuple[int, ...] = ()
 
 
 class EvaluationError(RobocasError):
-    """A protocol, policy, result or figure of an evaluation is not what it should be."""
+    """A protocol, policy, result or figure of an evaluation is invalid."""
 
 
 class WireError(EvaluationError):
@@ -112,8 +104,8 @@ class PolicyFailed(EvaluationError):
 
     Args:
         reasons: why, by number of env.
-        actions: (E, A) or (E, H, A) as `Policy.act` gives them, for all envs it was asked about; rows of those that
-            failed are not looked at. None: all failed.
+        actions: (E, A) or (E, H, A) as `Policy.act` returns them, for all envs that it was asked about; rows of those
+            that failed are ignored. None: all failed.
     """
 
     def __init__(self, reasons: Mapping[int, str], actions: Any = None) -> None:
@@ -122,7 +114,7 @@ class PolicyFailed(EvaluationError):
 
 
 class TrainingError(RobocasError):
-    """A baseline can't be trained: its configuration, its run, its checkpoint or what it learns from is wrong."""
+    """A baseline can't be trained: its configuration, run, checkpoint or dataset is wrong."""
 
 
 class RobotDescriptionError(RobocasError):
@@ -130,7 +122,7 @@ class RobotDescriptionError(RobocasError):
 
 
 class PlanningFailed(RobocasError):
-    """A scripted policy could not go on.
+    """A scripted policy could not continue.
 
     Args:
         stage: the step of the policy: ``grasp_sampling``, ``reach``, ``approach``, ``grasp``, ``lift``, ...
@@ -147,4 +139,4 @@ class PlanningFailed(RobocasError):
 
 
 class EpisodeLost(PlanningFailed):
-    """What a scripted policy did can't lead to a success any more: it has to be undone."""
+    """The episode can't succeed any more after what a scripted policy did, which has to be undone."""

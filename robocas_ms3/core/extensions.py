@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping
-from difflib import get_close_matches
 from functools import cached_property
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
@@ -12,6 +11,7 @@ from typing import Any, TypeVar
 
 from robocas_ms3.core.errors import ExtensionError
 from robocas_ms3.core.exits import no_exit
+from robocas_ms3.core.words import nearest
 
 _log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -65,9 +65,8 @@ class Registry(Mapping[str, T]):
         if name in self:
             return self[name]
         known = list(self)
-        near = get_close_matches(name, known, n=3, cutoff=0.7)
-        fix = f"Did you mean {' or '.join(near)}?" if near else ""
-        raise ExtensionError(f"no such {self.kind}", where=where, expected=f"one of {known}", found=repr(name), fix=fix)
+        what, expected, fix = f"no such {self.kind}", f"one of {known}", nearest(name, known)
+        raise ExtensionError(what, where=where, expected=expected, found=repr(name), fix=fix)
 
     @cached_property
     def entry_points(self) -> dict[str, list[EntryPoint]]:
@@ -95,8 +94,7 @@ class Registry(Mapping[str, T]):
             message = " ".join(f"{type(error).__name__}: {error}".split())
             raise ExtensionError(f"this {self.kind} can't be loaded", where=where, found=message, fix=fix) from error
         if not isinstance(found, self.type):
-            expected = f"a {self.type.__name__}"
-            what = f"not a {self.kind}"
+            expected, what = f"a {self.type.__name__}", f"not a {self.kind}"
             raise ExtensionError(what, where=where, expected=expected, found=type(found).__name__, fix=fix)
         return found
 

@@ -1,4 +1,4 @@
-"""Files appear whole or not at all: write beside the target, then rename."""
+"""Files appear whole or not at all: they are written next to the target, then renamed."""
 
 from __future__ import annotations
 
@@ -22,17 +22,20 @@ from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.core.paths import variable_of
 
 _Error = TypeVar("_Error", bound=RobocasError)
-FULL = frozenset({errno.ENOSPC, errno.EDQUOT})  # what the system says of a disk without room
+FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
+"""Error numbers of a disk without room."""
+ABANDONED = 86400.0
+"""Age in s, since the last change, of files that a killed run left."""
 _SHOWN_KEYS = 8  # of the way to a wrong value, in a message
 _NAME_BYTES = 96  # of stem and of suffix that a temporary name repeats: file systems allow 255 in all
-ABANDONED = 86400.0  # s without a change: what a killed run left
+_TRIES = 5  # to rename a folder onto one that others replace
 
 
 @contextmanager
 def naming(path: Path | str) -> Iterator[None]:
     """Give errors of the system a path where they have none: writing into an open file says no name.
 
-    What copies a file names the one it reads, and that of a full disk too: then it is this one.
+    An error of copying names the file that was read, that of a full disk too: then it is this one.
     """
     try:
         yield
@@ -45,18 +48,19 @@ def naming(path: Path | str) -> Iterator[None]:
 
 @contextmanager
 def replacing(path: Path | str, *, sync: bool = False) -> Iterator[Path]:
-    """Yield a temporary path beside ``path``; on success it replaces ``path``, on failure it is removed.
+    """Yield a temporary path next to ``path``; on success it replaces ``path``, on failure it is removed.
 
     The temporary name keeps the suffix, since many writers choose their format by it. Nobody can predict the name, so
     nobody can put a symbolic link there first.
 
     Args:
         path: of the file.
-        sync: whether it survives a power cut from then on, and none leaves half of it under its name.
+        sync: whether a power cut leaves no half of the file under its name.
     """
     path = Path(path)
     make_folder(path.parent)
-    tmp = path.parent / f".{_shortened(path.stem)}.{secrets.token_hex(8)}.tmp{_shortened(path.suffix)}"
+    stem, suffix = (os.fsencode(part)[:_NAME_BYTES].decode(errors="ignore") for part in (path.stem, path.suffix))
+    tmp = path.parent / f".{stem}.{secrets.token_hex(8)}.tmp{suffix}"
     try:
         with naming(path):
             yield tmp
@@ -66,14 +70,8 @@ def replacing(path: Path | str, *, sync: bool = False) -> Iterator[Path]:
             if sync:
                 _sync(path.parent)
     finally:
-        if tmp.is_dir():
-            shutil.rmtree(tmp, ignore_errors=True)
-        else:
-            tmp.unlink(missing_ok=True)
-
-
-def _shortened(name: str) -> str:
-    return os.fsencode(name)[:_NAME_BYTES].decode(errors="ignore")
+        with suppress(FileNotFoundError):
+            remove(tmp)
 
 
 def open_for_append(path: Path) -> BufferedRandom:
@@ -84,25 +82,22 @@ def open_for_append(path: Path) -> BufferedRandom:
         OSError: the file can't be opened.
     """
     flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    found = "a pipe or device"
     try:
         descriptor = os.open(path, flags, 0o666)
-    except OSError as error:
-        if error.errno == errno.ELOOP:
-            raise _not_regular(path, f"a symbolic link to {os.readlink(path)}") from error
-        raise
-    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        if stat.S_ISREG(os.fstat(descriptor).st_mode):
+            return BufferedRandom(FileIO(descriptor, "r+"))
         os.close(descriptor)
-        raise _not_regular(path, "a pipe or device")
-    return BufferedRandom(FileIO(descriptor, "r+"))
-
-
-def _not_regular(path: Path, found: str) -> RobocasError:
+    except OSError as error:
+        if error.errno != errno.ELOOP:
+            raise
+        found = f"a symbolic link to {os.readlink(path)}"
     what, fix = "refusing to write to this file", "Remove it, or choose another output folder."
-    return RobocasError(what, where=path, expected="a regular file", found=found, fix=fix)
+    raise RobocasError(what, where=path, expected="a regular file", found=found, fix=fix)
 
 
 def _sync(path: Path) -> None:
-    """Wait until a file is on the disk, or what a folder says of its files."""
+    """Wait until a file, or a folder's list of its files, is on the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -112,9 +107,9 @@ def _sync(path: Path) -> None:
 
 @contextmanager
 def replacing_folder(path: Path | str, *, sync: bool = False) -> Iterator[Path]:
-    """Yield a fresh folder beside ``path``; on success it becomes ``path`` (an older one goes), else it is removed.
+    """Yield a new folder next to ``path``; on success it replaces ``path``, on failure it is removed.
 
-    A folder that has to stay where it is, see `is_fixed`, gets the new one's content, one entry after the other.
+    A folder that can't be renamed, see `is_fixed`, gets the content of the new one, one entry after the other.
 
     Args:
         path: of the folder.
@@ -123,7 +118,7 @@ def replacing_folder(path: Path | str, *, sync: bool = False) -> Iterator[Path]:
     path = Path(path)
     fixed = is_fixed(path)
     home = make_folder(path if fixed else path.parent)
-    _sweep(path)
+    _restore_and_sweep(path)
     tmp = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".tmp", dir=home))
     tmp.chmod(0o755)
     try:
@@ -142,12 +137,12 @@ def replacing_folder(path: Path | str, *, sync: bool = False) -> Iterator[Path]:
 
 
 def is_fixed(folder: Path) -> bool:
-    """Whether a folder can be written into and not renamed: a mount point, or one in a folder that is read-only."""
+    """Return whether a folder can't be renamed: a mount point, or one in a folder that is read-only."""
     return folder.is_dir() and (os.path.ismount(folder) or not os.access(folder.resolve().parent, os.W_OK | os.X_OK))
 
 
 def empty_folder(folder: Path, but: Path | None = None) -> None:
-    """Delete what is in a folder, ``but`` one entry."""
+    """Delete the content of a folder, ``but`` one entry."""
     for entry in folder.iterdir():
         if entry != but:
             remove(entry)
@@ -161,29 +156,27 @@ def remove(path: Path) -> None:
         path.unlink()
 
 
-def _move_in(tmp: Path, path: Path, tries: int = 5) -> None:
-    """Rename a folder onto another, which may be there, or come between."""
-    for left in reversed(range(tries)):
-        old = None
-        if path.exists():
-            old = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".old", dir=path.parent))
-            with suppress(FileNotFoundError):
-                os.replace(path, old / "old")
+def _move_in(tmp: Path, path: Path) -> None:
+    """Rename a folder onto another, which other runs may replace at the same time."""
+    for tries_left in reversed(range(_TRIES)):
+        old = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".old", dir=path.parent))
         try:
+            if path.exists():
+                with suppress(FileNotFoundError):
+                    os.replace(path, old / "old")
             os.replace(tmp, path)
             return
-        except OSError as error:  # another run has moved its own in
-            if not left or error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+        except OSError as error:
+            if not tries_left or error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
                 raise
         finally:
-            if old is not None:
-                shutil.rmtree(old, ignore_errors=True)
+            shutil.rmtree(old, ignore_errors=True)
 
 
-def _sweep(path: Path) -> None:
-    """Mend what killed runs left beside a folder: one killed between its two renames gets the old folder back."""
+def _restore_and_sweep(path: Path) -> None:
+    """Put back a folder of a run that was killed between the two renames of `_move_in`; delete older leftovers."""
     name = glob.escape(path.name)
-    with suppress(OSError):  # another run may be at it too
+    with suppress(OSError):  # another run may do the same
         for old in path.parent.glob(f".{name}.*.old/old"):
             if not path.exists():
                 os.replace(old, path)
@@ -201,21 +194,18 @@ def make_folder(path: Path | str) -> Path:
     path = Path(path)
     try:
         path.mkdir(parents=True, exist_ok=True)
+        if os.access(path, os.W_OK | os.X_OK):
+            return path
+        what, found = "this folder is not writable", ""
     except OSError as error:
-        raise RobocasError("can't make this folder", where=path, found=error.strerror, fix=_another(path)) from error
-    if not os.access(path, os.W_OK | os.X_OK):
-        fix = f"{_another(path)[:-1]}, or change its permissions."
-        raise RobocasError("this folder is not writable", where=path, fix=fix)
-    return path
-
-
-def _another(path: Path) -> str:
+        what, found = "can't make this folder", error.strerror or ""
     variable = variable_of(path)
-    return f"Set {variable} to a folder that can be written to." if variable else "Choose another."
+    fix = f"Set {variable} to a folder that can be written to." if variable else "Choose another."
+    raise RobocasError(what, where=path, found=found, fix=fix)
 
 
 def flush_to_disk(folder: Path | str) -> None:
-    """See that what was written on a folder's file system survives a power cut: one call for hundreds of files.
+    """Write all files of a folder's file system to the disk, in one call: they survive a power cut.
 
     Raises:
         OSError: it can't be written, naming the folder.
@@ -233,11 +223,7 @@ def flush_to_disk(folder: Path | str) -> None:
 
 
 def write_json(path: Path | str, data: Any, *, sync: bool = False) -> None:
-    """Write JSON whole or not at all; ``sync`` is that of `replacing`.
-
-    Raises:
-        RobocasError: see `json_text`.
-    """
+    """Write JSON whole or not at all; ``sync`` is that of `replacing`. Raises as `json_text` does."""
     text = json_text(data, path, indent=2) + "\n"
     with replacing(path, sync=sync) as tmp:
         tmp.write_text(text, encoding="utf-8")

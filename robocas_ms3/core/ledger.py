@@ -1,4 +1,4 @@
-"""Files of JSON lines that grow by a record at a time, as runs and evaluations keep what came of their parts.
+"""Files of JSON lines that grow by a record at a time, such as the outcomes of episodes.
 
 A run may be killed while it writes: a last line that was cut off is no line, and is written over. One with a number
 that is NaN or infinite is damaged.
@@ -31,7 +31,7 @@ class Line(Generic[Record]):
 
     Attributes:
         number: from 1 on.
-        record: what it says; None: it is damaged.
+        record: its content; None: it is damaged.
         problem: pydantic's, of a damaged one.
         cut_off: whether a kill may have cut it off: it is the last one, and has no end.
     """
@@ -42,17 +42,15 @@ class Line(Generic[Record]):
     cut_off: bool = False
 
 
-@lru_cache
-def _form_of(record: Any) -> TypeAdapter[Any]:
-    return TypeAdapter(record)
+_form_of = lru_cache(TypeAdapter)
 
 
 class Ledger(Generic[Record]):
     """The file.
 
     Args:
-        path: of the file, which may not be there yet.
-        record: what a line is: a dataclass, or a type of JSON. Types are checked; keys it does not know are left out.
+        path: of the file, which may not exist yet.
+        record: what a line is: a dataclass, or a type of JSON. Types are checked; unknown keys are ignored.
     """
 
     def __init__(self, path: Path, record: Any) -> None:
@@ -60,7 +58,7 @@ class Ledger(Generic[Record]):
         self._form: TypeAdapter[Record] = _form_of(record)
 
     def lines(self) -> list[Line[Record]]:
-        """All lines but empty ones, the damaged ones too; none where there is no file.
+        """Return all lines but empty ones, the damaged ones too; none if there is no file.
 
         Raises:
             OSError: the file cannot be read.
@@ -73,42 +71,36 @@ class Ledger(Generic[Record]):
         return [self._read(number, piece, len(pieces)) for number, piece in enumerate(pieces, 1) if piece.strip()]
 
     def read(self) -> list[Record]:
-        """What the lines say; damaged ones are left out."""
+        """Return the records of all lines that are not damaged."""
         return [line.record for line in self.lines() if line.record is not None]
 
     def append(self, records: Iterable[Record], *, sync: bool = False) -> None:
         """Add lines.
 
         Args:
-            records: what they say, in finite numbers; if there are none, the file is not touched.
+            records: of finite numbers; if there are none, the file is not touched.
             sync: whether they are on the disk when this returns.
 
         Raises:
-            RobocasError: a record has no place in JSON, or the file is a symbolic link.
+            RobocasError: a record can't be written as JSON, or the file is a symbolic link.
         """
         text = _text(records, self.path)
         if not text:
             return
         with naming(self.path), open_for_append(self.path) as file:
-            self._end(file)
+            self._end_last_line(file)
             file.write(text)
             file.flush()
             if sync:
                 os.fsync(file.fileno())
 
     def rewrite(self, records: Iterable[Record]) -> None:
-        """Write the file anew, whole or not at all."""
+        """Replace the file, whole or not at all."""
         with replacing(self.path) as tmp:
             tmp.write_bytes(_text(records, self.path))
 
     def refusal(self, line: Line[Record], error: type[_Error], about: str) -> _Error:
-        """What is wrong with a damaged line, as an error of ours.
-
-        Args:
-            line: of this file.
-            error: to be made.
-            about: what the line isn't, such as "no outcome of an episode".
-        """
+        """Return an error of ours for a damaged line of this file; ``about`` is what it isn't, such as "no outcome"."""
         assert line.problem is not None
         return refusal(line.problem, self._form, error, where=f"{self.path}:{line.number}", about=about)
 
@@ -118,19 +110,17 @@ class Ledger(Generic[Record]):
         except ValidationError as problem:
             return Line(number, None, problem, cut_off=number == last)
 
-    def _end(self, file: Any) -> None:
-        """See that the last line has an end: one that was cut off goes."""
-        if not file.seek(0, os.SEEK_END):
-            return
-        file.seek(-1, os.SEEK_END)
-        if file.read(1) == b"\n":
+    def _end_last_line(self, file: Any) -> None:
+        """Remove a last line that was cut off; end one that only lacks its end."""
+        if file.seek(0, os.SEEK_END):
+            file.seek(-1, os.SEEK_END)
+        if file.read() in (b"", b"\n"):
             return
         file.seek(0)
-        content = file.read()
-        rest = content[content.rfind(b"\n") + 1 :]
-        if rest and self._read(1, rest, 1).record is None:
-            file.truncate(len(content) - len(rest))
-        elif rest:
+        rest = file.read().rpartition(b"\n")[2]
+        if self._read(1, rest, 1).record is None:
+            file.truncate(file.tell() - len(rest))
+        else:
             file.write(b"\n")
 
 

@@ -37,7 +37,8 @@ def locked_folder(path: Path | str) -> Iterator[bool]:
     """
     path = Path(path)
     new = [folder for folder in path.parents if not folder.exists()]
-    lock = _lock_path(path)
+    real = path.resolve()  # one lock file whatever link leads to the folder, and outside if the folder may be replaced
+    lock = path / LOCK if is_fixed(path) else real.parent / f".{real.name}.lock"
     try:
         file, held = _open_locked(lock, path)
         with file:
@@ -67,29 +68,20 @@ def lock_file(file: IO[Any], path: Path, *, wait: bool) -> bool:
         RobocasError: another process holds the lock, or locking failed.
     """
     until = time.monotonic() + _DYING
-    try:
-        while True:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-                return True
-            except BlockingIOError as error:
-                if time.monotonic() > until:
-                    what, fix = "another process is writing here", "Wait until it is done."
-                    raise RobocasError(what, where=path, fix=fix) from error
-                time.sleep(0.02)
-    except OSError as error:
-        if error.errno not in _NO_LOCKS:
-            raise RobocasError("can't lock this folder", where=path, found=error.strerror) from error
-        _log.warning("%s: its file system has no locks (%s): see that no other run writes there", path, error.strerror)
-        return False
-
-
-def _lock_path(path: Path) -> Path:
-    """Return the lock file: the same one through any symbolic link, and outside of a folder that may be replaced."""
-    if is_fixed(path):
-        return path / LOCK
-    path = path.resolve()
-    return path.parent / f".{path.name}.lock"
+    while True:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+            return True
+        except BlockingIOError as error:
+            if time.monotonic() > until:
+                what, fix = "another process is writing here", "Wait until it is done."
+                raise RobocasError(what, where=path, fix=fix) from error
+            time.sleep(0.02)
+        except OSError as error:
+            if error.errno not in _NO_LOCKS:
+                raise RobocasError("can't lock this folder", where=path, found=error.strerror) from error
+            _log.warning("%s: its file system has no locks (%s): run one command at a time", path, error.strerror)
+            return False
 
 
 def _open_locked(lock: Path, path: Path) -> tuple[IO[bytes], bool]:

@@ -1,4 +1,4 @@
-"""Where things lie: shipped data, the user's data, caches."""
+"""Folders of bundled data, of the user's data and of the cache."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _log = logging.getLogger(__name__)
 
 
 def data_dir() -> Path:
-    """Return the folder of asset packs the user made: ``$ROBOCAS_DATA``, by default the user's data folder.
+    """Return the folder of the user's asset packs: ``$ROBOCAS_DATA``, by default the user's data folder.
 
     Raises:
         RobocasError: the variable is not set, and the user has no home folder.
@@ -30,9 +30,9 @@ def data_dir() -> Path:
 
 
 def cache_dir() -> Path:
-    """Return the folder of files that can be made again: ``$ROBOCAS_CACHE``, by default the user's cache folder.
+    """Return the cache folder: ``$ROBOCAS_CACHE``, by default the user's cache folder.
 
-    Where nobody chose one and the user's can't be written to, it is a private one among the temporary files.
+    If the variable is not set and the user's folder is not writable, it is a private one among the temporary files.
 
     Raises:
         RobocasError: the variable is not set, and the user has no home folder.
@@ -76,21 +76,21 @@ def _cache_of_user(usual: Path) -> Path:
 
 
 def temporary_cache() -> Path | None:
-    """A cache among the temporary files that is this user's alone; none if somebody else has put something there."""
+    """Return a cache folder among the temporary files that is this user's alone; None if somebody else made it."""
     folder = Path(tempfile.gettempdir()) / f"robocas-{os.getuid()}"
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
-        about = folder.lstat()
+        status = folder.lstat()
     except OSError:
         return None
-    private = about.st_uid == os.getuid() and not about.st_mode & 0o077
+    private = status.st_uid == os.getuid() and not status.st_mode & 0o077
     return folder if private and folder.is_dir() and not folder.is_symlink() else None
 
 
 def is_writable(folder: Path) -> bool:
-    """Whether a folder can be written to, or be made. Makes none."""
-    there = next(parent for parent in (folder, *folder.parents) if os.path.lexists(parent))
-    return there.is_dir() and os.access(there, os.W_OK | os.X_OK)
+    """Return whether a folder can be written to, or be made."""
+    existing = next(parent for parent in (folder, *folder.parents) if os.path.lexists(parent))
+    return existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)
 
 
 def variable_of(path: Path | str) -> str:
@@ -104,21 +104,21 @@ def variable_of(path: Path | str) -> str:
 
 
 def task_configs_dir() -> Path:
-    """The shipped task configurations: in the wheel inside the package, in a checkout at its top level."""
-    shipped = PACKAGE_DIR / "data" / "task_configs"
-    return shipped if shipped.is_dir() else PACKAGE_DIR.parent / "task_configs"
+    """Return the folder of bundled task configurations: inside the package in the wheel, at the top in a checkout."""
+    bundled = PACKAGE_DIR / "data" / "task_configs"
+    return bundled if bundled.is_dir() else PACKAGE_DIR.parent / "task_configs"
 
 
 def builtin_packs_dir() -> Path:
-    """The asset packs that travel with the package."""
+    """Return the folder of bundled asset packs."""
     return PACKAGE_DIR / "data" / "packs"
 
 
 def protocols_dir() -> Path:
-    """The evaluation protocols that travel with the package."""
+    """Return the folder of bundled evaluation protocols."""
     return PACKAGE_DIR / "data" / "protocols"
 
 
 def plans_dir() -> Path:
-    """The plans that travel with the package."""
+    """Return the folder of bundled plans."""
     return PACKAGE_DIR / "data" / "plans"

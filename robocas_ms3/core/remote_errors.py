@@ -51,14 +51,14 @@ class RemoteError:
                 return cls(error, *place)
         return cls(otherwise(f"{type(error).__name__}: {error}"), *place)
 
-    def reraise(self) -> NoReturn:
-        """Raise the error in this process."""
-        raise self.with_traceback()
-
     def with_traceback(self) -> BaseException:
         """Return the error with a `RemoteTraceback` as its cause."""
         self.error.__cause__ = RemoteTraceback(self.where, self.traceback)
         return self.error
+
+    def reraise(self) -> NoReturn:
+        """Raise the error in this process."""
+        raise self.with_traceback()
 
 
 class RemoteTraceback(Exception):  # noqa: N818  (the cause of an error, as in `concurrent.futures`)

@@ -1,4 +1,4 @@
-"""Data and numbers of others read strictly: the base of all declared forms, and pydantic's complaints in our words.
+"""Data of others read strictly: the base of all declared forms, and pydantic's errors in our words.
 
 A message names the key, what was expected and what was found; of a mistyped key or word also the nearest known ones.
 """
@@ -8,21 +8,21 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from difflib import get_close_matches
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError, model_validator
 
 from robocas_ms3.core.documents import DocumentError, json_values
 from robocas_ms3.core.errors import RobocasError
+from robocas_ms3.core.words import nearest
 
 _Model = TypeVar("_Model", bound=BaseModel)
-_Value = TypeVar("_Value")
 _Error = TypeVar("_Error", bound=RobocasError)
-
-# pydantic's words for what it wanted, where its message alone doesn't say it
+GREATEST_NUMBER = 1e12
+"""No number of a declared form is larger: products of numbers like 1e308 are infinite."""
+# where pydantic's message alone does not say what was expected
 _EXPECTED = {
     "extra_forbidden": "no such key",
     "missing": "this key",
@@ -37,10 +37,6 @@ _EXPECTED = {
 }
 _FOUND_LENGTH = 80  # of a wrong value in a message
 _OUT_OF_RANGE = re.compile(rb"NaN|Infinity|\d[eE]\+?\d{3}|\d{19}")  # may be a number that `json_values` refuses
-
-
-GREATEST_NUMBER = 1e12
-"""No number of a declared form is larger: products of numbers like 1e308 are infinite."""
 
 
 class StrictModel(BaseModel):
@@ -61,16 +57,16 @@ def _too_large(value: Any) -> float | None:
     if isinstance(value, int | float):
         return value if abs(value) > GREATEST_NUMBER else None
     inside = value.values() if isinstance(value, Mapping) else value if isinstance(value, list | tuple) else ()
-    return next((wrong for one in inside if (wrong := _too_large(one)) is not None), None)
+    return next((wrong for each in inside if (wrong := _too_large(each)) is not None), None)
 
 
 @dataclass(frozen=True)
 class Mistake:
-    """Something wrong with a value, in one line each.
+    """An invalid value, in one line each.
 
     Attributes:
         key: where, as the file has it; empty: at the top.
-        kind: pydantic's name of it.
+        kind: pydantic's type of the error.
         what: is wrong.
         expected, found: in a file; empty where ``what`` says it all.
         fix: the nearest known words, where there are some.
@@ -89,14 +85,14 @@ class Mistake:
 
 
 def parse(model: type[_Model], data: Any, error: type[RobocasError], *, where: object, about: str = "") -> _Model:
-    """Values, as YAML has them, in a declared form.
+    """Return values, as YAML has them, in a declared form.
 
     Args:
         model: the form.
         data: a mapping.
         error: to be raised.
         where: file or option of the values, for messages; or a function that returns it for the key of a mistake.
-        about: what they aren't then, such as "no rules of a protocol".
+        about: what the values aren't then, such as "not a valid plan".
 
     Raises:
         RobocasError: ``error``, for the first mistake; the count of further ones is in the message.
@@ -114,29 +110,27 @@ def parse(model: type[_Model], data: Any, error: type[RobocasError], *, where: o
 def parse_json(
     model: type[_Model], text: str | bytes, error: type[RobocasError], *, where: object, about: str = ""
 ) -> _Model:
-    """The same of JSON."""
+    """Return the values of a JSON text in a declared form; see `parse`."""
     try:
         return validate_json(model, text)
     except ValidationError as problem:
         raise refusal(problem, model, error, where=where, about=about) from problem
 
 
-def validate_json(form: type[_Model] | TypeAdapter[_Value], text: str | bytes) -> Any:
+def validate_json(form: type[BaseModel] | TypeAdapter[Any], text: str | bytes) -> Any:
     """Read JSON strictly in a declared form; every number is finite and every integer has at most 64 bits.
 
     Raises:
-        ValidationError: it says something else.
+        ValidationError: it has another form.
     """
-    if isinstance(form, TypeAdapter):
-        found: Any = form.validate_json(text, strict=True)
-    else:
-        found = form.model_validate_json(text, strict=True)
+    validate = form.validate_json if isinstance(form, TypeAdapter) else form.model_validate_json
+    found = validate(text, strict=True)
     if _OUT_OF_RANGE.search(text.encode() if isinstance(text, str) else text):  # hardly ever: then it is read once more
         try:
             json_values(text)
         except DocumentError as problem:
-            said: Any = {"type": "json_invalid", "loc": (), "input": "", "ctx": {"error": str(problem)}}
-            raise ValidationError.from_exception_data("JSON", [said]) from problem
+            details: Any = {"type": "json_invalid", "loc": (), "input": "", "ctx": {"error": str(problem)}}
+            raise ValidationError.from_exception_data("JSON", [details]) from problem
     return found
 
 
@@ -149,22 +143,14 @@ def refusal(
     about: str = "",
     fix: str = "",
 ) -> _Error:
-    """What pydantic complains of as one of our errors: its first mistake, and how many more there are.
-
-    Args:
-        problem: pydantic's.
-        form: that was asked for.
-        error: to be made.
-        where, about: see `parse`.
-        fix: what to do, besides.
-    """
+    """Return pydantic's error as one of ours: its first mistake, and how many more there are; see `parse`."""
     first, *others = mistakes(problem, form)
-    # what may be of several types has a mistake for each, at its own place or further out
+    # a union has a mistake for each of its types, at its own place or further out
     more = sum(not f"{first.key}.".startswith(f"{other.key}." if other.key else "") for other in others)
-    said = (first.fix, f"{more} more after this one." if more else "", fix)
+    fixes = (first.fix, f"{more} more after this one." if more else "", fix)
     what = f"{about}: {first.what}" if about else first.what
     where = where(first.key) if callable(where) else where
-    return error(what, where=where, expected=first.expected, found=first.found, fix=" ".join(filter(None, said)))
+    return error(what, where=where, expected=first.expected, found=first.found, fix=" ".join(filter(None, fixes)))
 
 
 def mistakes(
@@ -172,20 +158,21 @@ def mistakes(
     form: type[BaseModel] | TypeAdapter[Any] | None = None,
     words: Mapping[str, str] | None = None,
 ) -> list[Mistake]:
-    """What pydantic complains of, one mistake a key, unknown keys first.
+    """Return pydantic's errors, one mistake per key, unknown keys first.
 
     Args:
         problem: pydantic's.
         form: that was asked for; None: one without unions, whose alternatives pydantic takes for keys.
-        words: for what was expected, by pydantic's kinds of mistakes, instead of ours.
+        words: for what was expected, by pydantic's types of errors, in addition to ours.
     """
-    schema = {} if form is None else _schema(form)
-    found: dict[str, list[tuple[Any, dict[str, Any]]]] = {}
+    schema: dict[str, Any] = {}
+    if form is not None:
+        schema = form.json_schema() if isinstance(form, TypeAdapter) else form.model_json_schema()
+    found: dict[str, list[Any]] = {}
     for details in problem.errors(include_url=False):
-        keys, node = _place(details["loc"], schema)
-        found.setdefault(".".join(keys), []).append((details, node))
-    said = [_mistake(key, same, schema, {**_EXPECTED, **(words or {})}) for key, same in found.items()]
-    return sorted(said, key=lambda mistake: mistake.kind != "extra_forbidden")  # it may be why another is missing
+        found.setdefault(".".join(_place(details["loc"], schema)[0]), []).append(details)
+    made = [_mistake(key, same, schema, {**_EXPECTED, **(words or {})}) for key, same in found.items()]
+    return sorted(made, key=lambda mistake: mistake.kind != "extra_forbidden")  # it may be why another is missing
 
 
 def check_number(name: str, value: float, least: float, greatest: int | None = None) -> None:
@@ -199,38 +186,31 @@ def check_number(name: str, value: float, least: float, greatest: int | None = N
         raise RobocasError("this number is out of range", where=name, expected=expected, found=value)
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
-    """A question that names the known words most like a wrong one, best first; empty where none is like it."""
-    found = get_close_matches(name, list(known), n=3, cutoff=0.7)
-    return f"Did you mean {' or '.join(found)}?" if found else ""
-
-
-def _mistake(
-    key: str, same: list[tuple[Any, dict[str, Any]]], schema: dict[str, Any], words: Mapping[str, str]
-) -> Mistake:
-    details, node = same[0]
+def _mistake(key: str, same: list[Any], schema: dict[str, Any], words: Mapping[str, str]) -> Mistake:
+    details = same[0]
     kind, value, context = details["type"], details["input"], details.get("ctx", {})
+    what, expected, found, fix = f"wrong value for {key or '(top level)'!r}", "", "", ""
     if kind == "extra_forbidden":
         name, known = str(details["loc"][-1]), sorted(_place(details["loc"][:-1], schema)[1].get("properties", {}))
-        expected = f"one of {known}" if known else "no such key"
-        return Mistake(key, kind, f"unknown key {key!r}", expected, repr(name), nearest(name, known), value, context)
-    if kind in {"union_tag_invalid", "union_tag_not_found"}:
-        tag, kinds = node["discriminator"]["propertyName"], sorted(node["discriminator"]["mapping"])
-        said = str(context.get("tag", ""))
-        what = f"wrong value for '{f'{key}.{tag}' if key else tag}'"
-        found = repr(said) if said else "nothing"
-        return Mistake(key, kind, what, f"one of {kinds}", found, nearest(said, kinds), value, context)
-    if kind == "value_error":
-        what = _line(details["msg"].removeprefix("Value error, "))
-        found = repr(value)[:_FOUND_LENGTH] if isinstance(value, (str, int, float)) and str(value) not in what else ""
-        return Mistake(key, kind, f"{key}: {what}" if key else what, "", found, "", value, context)
-    if kind == "json_invalid":
-        return Mistake(key, kind, "this is not valid JSON", "", _line(context["error"]), "", value, context)
-    expected = " or ".join(dict.fromkeys(_expected(details, words) for details, _ in same))
-    found = "nothing" if kind == "missing" else repr(value)
-    if len(found) > _FOUND_LENGTH:
-        found = found[:_FOUND_LENGTH] + "..."
-    return Mistake(key, kind, f"wrong value for {key or '(top level)'!r}", expected, found, "", value, context)
+        what, expected = f"unknown key {key!r}", f"one of {known}" if known else "no such key"
+        found, fix = repr(name), nearest(name, known)
+    elif kind in {"union_tag_invalid", "union_tag_not_found"}:
+        discriminator = _place(details["loc"], schema)[1]["discriminator"]
+        tag, kinds = discriminator["propertyName"], sorted(discriminator["mapping"])
+        name = str(context.get("tag", ""))
+        what, expected = f"wrong value for '{f'{key}.{tag}' if key else tag}'", f"one of {kinds}"
+        found, fix = repr(name) if name else "nothing", nearest(name, kinds)
+    elif kind == "value_error":
+        message = _line(details["msg"].removeprefix("Value error, "))
+        what = f"{key}: {message}" if key else message
+        found = repr(value)[:_FOUND_LENGTH] if isinstance(value, str | int | float) and str(value) not in what else ""
+    elif kind == "json_invalid":
+        what, found = "this is not valid JSON", _line(context["error"])
+    else:
+        expected = " or ".join(dict.fromkeys(_expected(details, words) for details in same))
+        found = "nothing" if kind == "missing" else repr(value)
+        found = found if len(found) <= _FOUND_LENGTH else f"{found[:_FOUND_LENGTH]}..."
+    return Mistake(key, kind, what, expected, found, fix, value, context)
 
 
 def _expected(details: Any, words: Mapping[str, str]) -> str:
@@ -239,21 +219,14 @@ def _expected(details: Any, words: Mapping[str, str]) -> str:
         return f"at least {place[-1] + 1} items in this list"
     if kind == "string_pattern_mismatch":
         return f"a string like {details['ctx']['pattern']}"
-    said = re.sub(r"^(Value error, )?(Input|List|Tuple|Dictionary|String) should (be |have )?", "", details["msg"])
-    return words.get(kind, _line(said.replace(" after validation", "")))
-
-
-def _schema(form: type[BaseModel] | TypeAdapter[Any]) -> dict[str, Any]:
-    return form.json_schema() if isinstance(form, TypeAdapter) else form.model_json_schema()
+    message = re.sub(r"^(Value error, )?(Input|List|Tuple|Dictionary|String) should (be |have )?", "", details["msg"])
+    return words.get(kind, _line(message.replace(" after validation", "")))
 
 
 def _place(location: tuple[int | str, ...], schema: dict[str, Any]) -> tuple[list[str], dict[str, Any]]:
-    """Where a mistake is, for messages.
+    """Return the keys that lead to a mistake, as the file has them, and the JSON schema of what belongs there, or {}.
 
-    Returns:
-        The keys that lead there, as the file has them (pydantic adds the kind where a block comes in several, the
-        type where a value may be of several, and "[key]" where a key itself is wrong), and the JSON schema of what
-        belongs there; empty where it is not known.
+    pydantic adds the kind of a block that comes in several, the type of a value, and "[key]" where a key is wrong.
     """
     node = _resolved(schema, schema)
     keys: list[str] = []

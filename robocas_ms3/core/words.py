@@ -7,6 +7,8 @@ import re
 import sys
 import threading
 import traceback
+from collections.abc import Iterable
+from difflib import get_close_matches
 from types import TracebackType
 from typing import Any
 
@@ -64,27 +66,27 @@ def print_traceback(kind: type[BaseException], error: BaseException | None, at: 
 def escape_tracebacks() -> None:
     """Show control characters in errors that nothing catches as escapes, in all threads of this process."""
     sys.excepthook = print_traceback
-    threading.excepthook = _print_of_thread
-    sys.unraisablehook = _print_unraisable
+    threading.excepthook = sys.unraisablehook = _print_error
 
 
-def _print_of_thread(args: threading.ExceptHookArgs) -> None:
-    if not issubclass(args.exc_type, SystemExit):  # which ends a thread, and is no error, as Python has it
+def _print_error(args: threading.ExceptHookArgs | sys.UnraisableHookArgs) -> None:
+    if not issubclass(args.exc_type, SystemExit):  # which ends a thread, and is no error
         print_traceback(args.exc_type, args.exc_value, args.exc_traceback)
 
 
-def _print_unraisable(args: sys.UnraisableHookArgs) -> None:
-    sys.stderr.write(printable(f"{args.err_msg or 'Exception ignored in'}: {args.object!r}") + "\n")
-    print_traceback(args.exc_type, args.exc_value, args.exc_traceback)
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Return a question that names the known words most like a wrong one, best first; empty if none is like it."""
+    found = get_close_matches(name, list(known), n=3, cutoff=0.7)
+    return f"Did you mean {' or '.join(found)}?" if found else ""
 
 
 def count_of(count: int, noun: str) -> str:
-    """``1 episode``, ``2 episodes``."""
+    """Return ``1 episode``, ``2 episodes``."""
     return f"{count} {noun}" + ("" if count == 1 else "s")
 
 
 def called(asset_id: str, name: str = "") -> str:
-    """What people read of an object: what instructions call it, and its id where that says something else.
+    """Return the name of an object in instructions, and its id where that differs.
 
     Args:
         asset_id: of its pack; empty: not known.

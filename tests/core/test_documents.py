@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import time
 
 import pytest
@@ -77,7 +76,7 @@ def test_json_nested_too_deeply(file, before, depth):
 
 @pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e999", "-2.5E+400", "9" * 400 + ".0"])
 def test_json_knows_finite_numbers_only(file, number):
-    with pytest.raises(DocumentError, match=f"^{re.escape(number[:40])} is no number of JSON$"):
+    with pytest.raises(DocumentError, match="is not a finite number$"):
         load_json(file(f'{{"a": [1, {number}]}}'))
     assert load_json(file(f'["{number}", 1e300]')) == [number, 1e300]
 

@@ -67,7 +67,7 @@ def test_a_number_that_is_not_finite_damages_its_line(tmp_path, number):
     ledger.path.write_text(f'{{"seed": 1, "seconds": {number}}}\n{{"seed": 2}}\n{{"seed": 3, "more": [{number}]}}\n')
     assert [line.record for line in ledger.lines()] == [None, Try(2), None]
     error = str(ledger.refusal(ledger.lines()[2], DatasetError, "no try"))
-    assert error.startswith(f"{ledger.path}:3: no try: this is not valid JSON (found {number[:20]}")
+    assert error.startswith(f"{ledger.path}:3: no try: this is not valid JSON (found ")
     with pytest.raises(RobocasError):
         ledger.append([Try(4, float("nan"))])
     assert len(ledger.lines()) == 3

@@ -3,8 +3,12 @@
 import pytest
 
 from robocas_ms3.core.errors import AssetError
-from robocas_ms3.core.names import FileName, check_name, is_name
+from robocas_ms3.core.names import FileName, check_name
 from robocas_ms3.core.strict import StrictModel, parse
+
+
+class Form(StrictModel):
+    name: FileName
 
 
 @pytest.mark.parametrize("name", ["a", "link_0", "Left Tür 1", "a.b-c", "机器人", "x" * 200])
@@ -15,19 +19,11 @@ def test_plain_names_pass(tmp_path, name):
 
 
 @pytest.mark.parametrize(
-    "name", ["", ".", "..", ".hidden", "a/b", "/a", "..\\a", "a\nb", "a\x00", "\x1b[31m", "\ud800", "ü" * 101, 5, None]
+    "name", ["", ".", "..", ".hidden", "a/b", "/a", "..\\a", "a\nb", "a\x00", "\x1b[31m", "\ud800", "ü" * 101]
 )
 def test_others_are_refused(name):
-    assert not is_name(name)
     with pytest.raises(AssetError) as raised:
         check_name(name, AssetError, where="file")
     assert raised.value.where == "file" and len(str(raised.value)) < 300
-
-
-def test_a_declared_form_refuses_them_too():
-    class Form(StrictModel):
-        name: FileName
-
-    assert parse(Form, {"name": "a"}, AssetError, where="file").name == "a"
     with pytest.raises(AssetError):
-        parse(Form, {"name": "../a"}, AssetError, where="file")
+        parse(Form, {"name": name}, AssetError, where="file")

@@ -131,7 +131,7 @@ def test_files_of_a_plan(tmp_path):
     (out / PLAN).write_text(json.dumps(plan_record(plan)))
 
     def read():
-        assert read_status(out).as_json()
+        assert read_status(out)
         check_plan_record(out, read_plan(out))
 
     read()

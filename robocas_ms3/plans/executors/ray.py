@@ -41,6 +41,7 @@ PIECE = 16 * 2**20  # bytes that are sent at once
 _PIECES = 4  # that wait in the object store, of each task
 _APPEARS = 20.0  # s until a file is seen on another node
 _CONNECT = 10.0  # s
+_CANCEL = 5.0  # s until tasks have ended
 _TEMPORARY = "robocas-ray-"
 _log = logging.getLogger(__name__)
 OpenWorker = Callable[[Plan, Path], UnitWorker]
@@ -118,9 +119,12 @@ class RayExecutor(ThreadExecutor):
     def __exit__(self, *error: object) -> None:
         with deferred_interrupts(second_ends=False):
             self.threads.shutdown(wait=False, cancel_futures=True)
-            for task in list(self._tasks):
-                with suppress(Exception):  # it has just ended
-                    ray.cancel(task, force=True)
+            until = time.monotonic() + _CANCEL
+            while self._tasks and time.monotonic() < until:  # Ray crashes where a thread waits for a task meanwhile
+                for task in list(self._tasks):
+                    with suppress(Exception):  # it has just ended
+                        ray.cancel(task, force=True)
+                time.sleep(0.1)
             if self._disconnects:
                 ray.shutdown()
 
