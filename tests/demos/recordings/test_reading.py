@@ -154,7 +154,7 @@ def test_a_frequency_that_is_none(own, freq):
 def test_a_number_that_is_not_finite(own, number):
     file = own.with_suffix(".json")
     file.write_text(file.read_text().replace('"elapsed_steps"', f'"more": {{"deep": [{number}]}}, "elapsed_steps"'))
-    fails(own, f"not a trajectory's JSON .*is not a finite number")
+    fails(own, "not a trajectory's JSON .*is not a finite number")
 
 
 def test_reconfiguring_is_an_option(own):
