@@ -155,7 +155,7 @@ def test_scenes_that_are_no_objects():
         (FILE, {"seed": [99]}, f"{FILE}, seed: expected 5 (conversion.json), found 99"),
         (FILE, {"rate_hz": 10}, f"{FILE}, rate_hz: expected 5.0 (conversion.json), found 10"),
         (FILE, {"rate_hz": "5"}, f'{FILE}, rate_hz: expected a number, found "5"'),
-        (FILE, {"recorded": {"facts": {"x": float("nan")}}}, f"{FILE}: expected JSON, found NaN is no number"),
+        (FILE, {"recorded": {"facts": {"x": float("nan")}}}, f"{FILE}: expected JSON, found"),
         ("conversion.json", {"rate_hz": None}, "conversion.json, rate_hz: expected a number, found null"),
         ("conversion.json", {"image_size": [64]}, "conversion.json, image_size: expected 2 values, found 1"),
         ("conversion.json", {"cameras": "base_camera"}, "conversion.json, cameras: expected a list"),
