@@ -60,12 +60,12 @@ def run(settings: EvaluationSettings) -> int:
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.terminal import say, say_lines
     from robocas_ms3.core.workers import use_one_torch_thread
-    from robocas_ms3.evaluation.policies import check_policy, open_policy
+    from robocas_ms3.evaluation.policies import find_policy, open_policy
     from robocas_ms3.evaluation.protocol import load_protocol
     from robocas_ms3.evaluation.report.tables import markdown
     from robocas_ms3.evaluation.results import read
 
-    check_policy(settings.policy)
+    find_policy(settings.policy)
     load_protocol(settings.protocol)
     from robocas_ms3.evaluation.session import EvaluationSession
 

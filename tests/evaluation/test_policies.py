@@ -9,7 +9,7 @@ from counting_env import CountingEnv, play
 from robocas_ms3.core.errors import EvaluationError, ExtensionError
 from robocas_ms3.evaluation.policies import make_policy, open_policy
 from robocas_ms3.evaluation.policies.plain import StillPolicy
-from robocas_ms3.evaluation.policies.scripted import BESIDE, beside
+from robocas_ms3.evaluation.policies.scripted import OFFSETS, offset
 from robocas_ms3.evaluation.policy import EpisodeSpec, PolicySpec, describe, policy_spec_values
 
 GOOD = """
@@ -132,10 +132,10 @@ def test_a_policy_can_not_end_the_process(here, name):
     assert str(here) in str(caught.value.found)
 
 
-def test_how_far_beside_follows_from_the_seed():
-    drawn = np.array([beside(seed) for seed in range(200)])
-    far = np.linalg.norm(drawn, axis=1)
-    assert far.min() >= BESIDE[0] and far.max() <= BESIDE[1]
-    assert np.ptp(far) > 0.9 * (BESIDE[1] - BESIDE[0])
+def test_offsets_follow_from_the_seed():
+    drawn = np.array([offset(seed) for seed in range(200)])
+    lengths = np.linalg.norm(drawn, axis=1)
+    assert lengths.min() >= OFFSETS[0] and lengths.max() <= OFFSETS[1]
+    assert np.ptp(lengths) > 0.9 * (OFFSETS[1] - OFFSETS[0])
     assert set(zip(*np.sign(drawn).T, strict=True)) == {(1, 1), (1, -1), (-1, 1), (-1, -1)}
-    assert np.array_equal(beside(7), drawn[7])
+    assert np.array_equal(offset(7), drawn[7])

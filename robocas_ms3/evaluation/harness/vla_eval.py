@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -188,7 +189,7 @@ class RoboCAS:
         return {
             **{name: step is not None for name, step in outcome.flags.items()},
             **outcome.measures,
-            **vars(outcome),
+            **asdict(outcome),
             "instruction": episode.instruction,
             **self._session.record.model_dump(include={"protocol", "protocol_hash", "versions"}),
         }

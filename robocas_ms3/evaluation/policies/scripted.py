@@ -1,4 +1,4 @@
-"""The demonstrator in the evaluation's own loop."""
+"""The scripted policy that records demonstrations, in the evaluation's loop."""
 
 from __future__ import annotations
 
@@ -14,50 +14,46 @@ from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.recordings.motion import sample_stride
 from robocas_ms3.demos.settings import EpisodeSettings
-from robocas_ms3.evaluation.policies.tracks import Followers, JointTrack, PoseTrack, Track
-from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
+from robocas_ms3.evaluation.policies.tracks import JointTrack, PoseTrack, TrackPolicy
+from robocas_ms3.evaluation.policy import EpisodeSpec, PolicySpec
 from robocas_ms3.robots.table import find_robot
 from robocas_ms3.scenes.task_specs import TASKS
 
-BESIDE = (0.01, 0.05)  # m sideways, least and most: a finger on top of what is meant, or what stands next to it
-_FREQ = 20  # Hz, at which it plans
+OFFSETS = (0.01, 0.05)  # m sideways, least and most: a finger on top of the target, or of an object next to it
+_FREQ = 20  # Hz, control rate of the plans
 _MAX_GENERATORS = 4  # environments that are open at a time
-_BESIDE = 411  # stream of an episode's seed
+_OFFSET_STREAM = 411  # of an episode's seed
 
 
-class ScriptedPolicy:
-    """Plans each episode in an environment of its own, by what only a simulator knows, and does it again here.
+class ScriptedPolicy(TrackPolicy):
+    """Plan each episode in an environment of its own, with privileged state, and repeat it.
 
-    What it scores is what the scripted policies and their planner can do, in the very loop that learned policies are
-    measured in. An episode for which no demonstration is found is played standing still. Its base does not drive.
+    Its score is what the scripted policies and their planner reach in the loop in which learned policies are measured.
+    It does not move in an episode for which no demonstration is found. Its base does not drive.
 
     Args:
-        speaks: joint targets at 20 Hz, as it planned them; or RoboCAS' motions from where the TCP is, at 5 Hz.
-        beside: those motions are off sideways, as those of a policy that does not see well: see `beside`.
+        convention: joint targets at 20 Hz, as planned; or RoboCAS' motions from where the TCP is, at 5 Hz.
+        perturbed: shift these motions sideways (`offset`), like those of a policy that misjudges positions.
     """
 
     def __init__(
-        self, speaks: Literal["joint_positions", "robocas"] = "joint_positions", *, beside: bool = False
+        self, convention: Literal["joint_positions", "robocas"] = "joint_positions", *, perturbed: bool = False
     ) -> None:
-        self._beside = beside
-        self.spec = PolicySpec(
-            speaks, reference="tcp", rate_hz=20 if speaks == "joint_positions" else 5, language="none"
-        )
+        super().__init__()
+        self._perturbed = perturbed
+        rate = _FREQ if convention == "joint_positions" else 5
+        self.spec = PolicySpec(convention, reference="tcp", rate_hz=rate, language="none")
         self._generators: dict[EpisodeSettings, EpisodeGenerator] = {}  # the one used last is the last
-        self._followers = Followers()
 
-    def reset(self, starts: list[EpisodeSpec]) -> None:
-        """Plan the episodes; seconds each."""
-        for start in starts:
-            self._followers.begin(start.env, self._plan(start))
+    def track(self, start: EpisodeSpec) -> JointTrack | PoseTrack:
+        """Plan an episode, which takes seconds.
 
-    def act(self, observations: Observations) -> NDArray[np.floating]:
-        """(E, A) actions of what it speaks."""
-        return self._followers.act(observations)
-
-    def _plan(self, start: EpisodeSpec) -> Track:
-        generator = self._generator_of(start)
+        Raises:
+            EvaluationError: the episode does not name files of this machine, as of a client of a server.
+            ExtensionError: it names a task or a robot that this machine lacks.
+        """
         actions, states = np.zeros((0, 8)), np.zeros((1, 37))
+        generator = self._generator_of(start)
         with tempfile.TemporaryDirectory() as folder:
             if generator.generate(start.seed, Path(folder), "episode").success:
                 with h5py.File(Path(folder) / "episode.h5") as file:
@@ -66,26 +62,21 @@ class ScriptedPolicy:
                     states = np.array(group["env_states"]["articulations"][start.robot])
         if self.spec.convention == "joint_positions":
             return JointTrack(actions)
-        if not len(actions):
-            return PoseTrack(np.zeros((0, 4, 4)), np.zeros(0, dtype=bool))
         track = PoseTrack.of(find_robot(start.robot), states, actions[:, 7], sample_stride(_FREQ, 5))
-        if self._beside:
-            track.poses[:, :2, 3] += beside(start.seed)
+        if self._perturbed:
+            track.poses[:, :2, 3] += offset(start.seed)
         return track
 
-    def _generator_of(self, start: EpisodeSpec) -> EpisodeGenerator:
-        """Return the generator of a start's scenes; of several the one used longest ago is closed.
+    def close(self) -> None:
+        """Close the environments that it plans in."""
+        for generator in self._generators.values():
+            generator.close()
 
-        Raises:
-            EvaluationError: the start does not name files of this machine, as of a client of a server.
-            ExtensionError: it names a task or a robot that this machine lacks.
-        """
+    def _generator_of(self, start: EpisodeSpec) -> EpisodeGenerator:
+        """Return the generator of an episode's scenes; of several the one used longest ago is closed."""
         for name in ("config_file", "layouts_file", "pack"):
             if not getattr(start, name):
-                what, fix = (
-                    "unknown configuration or scene",
-                    "Start the server with --protocol FOLDER.",
-                )
+                what, fix = "unknown configuration or scene", "Start the server with --protocol FOLDER."
                 expected = "a file of a shipped protocol, or of one that the server was started with"
                 raise EvaluationError(what, where=f"start.{name}", expected=expected, fix=fix)
         TASKS.find(start.task, where="start.task")
@@ -105,14 +96,9 @@ class ScriptedPolicy:
             self._generators.pop(next(iter(self._generators))).close()
         return generator
 
-    def close(self) -> None:
-        """Close the environments that it plans in."""
-        for generator in self._generators.values():
-            generator.close()
 
-
-def beside(seed: int) -> NDArray[np.floating]:
-    """(2,) m in the arm's base frame, of which an episode's poses are off: anywhere, by as much as `BESIDE` says."""
-    generator = np.random.default_rng([seed, _BESIDE])
-    angle, far = generator.uniform(0, 2 * np.pi), generator.uniform(*BESIDE)
-    return far * np.array([np.cos(angle), np.sin(angle)])
+def offset(seed: int) -> NDArray[np.floating]:
+    """Return the shift (2,) of an episode's poses, m in the arm's base frame: in any direction, as far as `OFFSETS`."""
+    generator = np.random.default_rng([seed, _OFFSET_STREAM])
+    angle, distance = generator.uniform(0, 2 * np.pi), generator.uniform(*OFFSETS)
+    return distance * np.array([np.cos(angle), np.sin(angle)])

@@ -1,103 +1,95 @@
-"""Policies that follow a track: joint targets, or poses of the TCP, that were found or recorded before."""
+"""Policies that follow a track that was planned or recorded before: joint targets, or poses of the TCP."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.demos.recordings.motion import Motion, sample_states
-from robocas_ms3.evaluation.policy import Observations
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.robots.table import RobotSpec
 
 Array = NDArray[np.floating]
 
 
-class Track(Protocol):
-    """What to do in an episode, a policy step after the other."""
-
-    def next(self, observations: Observations, row: int) -> Array:
-        """(A,) the next action, where row ``row`` shows what is so; after the last one, what holds still."""
-        ...
-
-
 @dataclass
 class JointTrack:
-    """Joint targets.
-
-    Attributes:
-        actions: (S, 8); none: it stays where it is.
-        played: how many of them are over.
-    """
+    """Joint targets (S, 8), of which the last one is held; without any the arm stays where it is."""
 
     actions: Array
-    played: int = 0
+    step: int = 0
 
     def next(self, observations: Observations, row: int) -> Array:
-        """(8,) joint targets; see `Track`."""
+        """Return the next action (8,) of a row's env."""
         if not len(self.actions):
             self.actions = np.append(observations.qpos[row, RobotDescription.arm_slice], 1.0)[None]
-        action = self.actions[min(self.played, len(self.actions) - 1)]
-        self.played += 1
+        action = self.actions[min(self.step, len(self.actions) - 1)]
+        self.step += 1
         return action
 
 
 @dataclass
 class PoseTrack:
-    """Poses that the TCP is to be at, one a policy step: each action leads there from where the TCP is by then.
+    """Poses of the TCP, one per policy step: each action leads there from where the TCP is by then.
 
     Attributes:
-        poses: (S, 4, 4) in the arm's base frame; none: it stays where it is.
-        open: (S,) bool, the gripper's commands.
-        played: how many of them are over.
+        poses: (S, 4, 4) in the arm's base frame; without any the arm stays where it is.
+        open: (S,) bool, commands of the gripper.
     """
 
     poses: Array
     open: NDArray[np.bool_]
-    played: int = 0
+    step: int = 0
 
     @classmethod
     def of(cls, robot: RobotSpec, robot_states: Array, gripper: Array, stride: int) -> PoseTrack:
-        """The track of a recording.
+        """Return the track of a recording.
 
         Args:
-            robot: whose it is.
+            robot: that was recorded.
             robot_states: (S + 1, 37) after the reset and after each control step.
             gripper: (S,) commands in [-1, 1].
-            stride: control steps a policy step.
+            stride: control steps per policy step.
         """
-        samples = sample_states(len(gripper), stride)
-        motion = Motion.of(robot, robot_states, gripper, samples)
+        if not len(gripper):
+            return cls(np.zeros((0, 4, 4)), np.zeros(0, dtype=bool))
+        motion = Motion.of(robot, robot_states, gripper, sample_states(len(gripper), stride))
         return cls(motion.tcp_in_base[1:], motion.gripper_open[1:])
 
     def next(self, observations: Observations, row: int) -> Array:
-        """(7,) a motion in RoboCAS' convention; see `Track`."""
-        place = min(self.played, len(self.poses) - 1)
-        self.played += 1
+        """Return the next action (7,) of a row's env, in RoboCAS' convention."""
+        place = min(self.step, len(self.poses) - 1)
+        self.step += 1
         if place < 0:
             return np.array([0, 0, 0, 0, 0, 0, 1.0])
-        here = observations.tcp_in_base[row].astype(np.float64)
-        turn = Rotation.from_quat(here[[4, 5, 6, 3]]).inv()
-        motion = turn.apply(self.poses[place, :3, 3] - here[:3])
+        tcp = observations.tcp_in_base[row].astype(np.float64)
+        turn = Rotation.from_quat(tcp[[4, 5, 6, 3]]).inv()
+        motion = turn.apply(self.poses[place, :3, 3] - tcp[:3])
         angles = (turn * Rotation.from_matrix(self.poses[place, :3, :3])).as_euler("xyz")
         return np.array([*motion, *angles, float(self.open[place])])
 
 
-class Followers:
-    """The tracks of all envs."""
+class TrackPolicy(ABC):
+    """Follow a track in each episode."""
 
     def __init__(self) -> None:
-        self._tracks: dict[int, Track] = {}
+        self._tracks: dict[int, JointTrack | PoseTrack] = {}  # by env
 
-    def begin(self, env: int, track: Track) -> None:
-        """Set out on an episode's track in an env."""
-        self._tracks[env] = track
+    @abstractmethod
+    def track(self, start: EpisodeSpec) -> JointTrack | PoseTrack:
+        """Return the track of an episode."""
+
+    def reset(self, starts: list[EpisodeSpec]) -> None:
+        """Start the tracks of episodes."""
+        for start in starts:
+            self._tracks[start.env] = self.track(start)
 
     def act(self, observations: Observations) -> Array:
-        """(E, A) actions."""
+        """Return (E, A) actions."""
         envs = observations.envs.tolist()
         return np.stack([self._tracks[env].next(observations, row) for row, env in enumerate(envs)])

@@ -1,4 +1,4 @@
-"""A result for people: ``report.md``, ``report.html``, and ``episodes.parquet`` for their notebooks."""
+"""A result for people: ``report.md``, ``report.html``, and ``episodes.parquet`` for notebooks."""
 
 from __future__ import annotations
 
@@ -14,20 +14,22 @@ from robocas_ms3.evaluation.report.tables import markdown
 from robocas_ms3.evaluation.results import Result
 
 MARKDOWN, PAGE, PARQUET = "report.md", "report.html", "episodes.parquet"
-_TEXTS = ("task", "config", "split", "failure_stage", "error")
-_TRUTHS = ("success", "success_at_end", "success_v0")
-_WHOLE = ("episode", "seed", "steps")
-_REAL = ("seconds", "inference_ms", "p_vis")
-_INSIDE = {"flags": "int64", "flag_seconds": "float64", "measures": "float64"}  # flags.success and so on
+_COLUMNS = {
+    "int64": ("episode", "seed", "steps"),
+    "string": ("task", "config", "split", "failure_stage", "error"),
+    "bool_": ("success", "success_at_end", "success_v0"),
+    "float64": ("seconds", "inference_ms", "p_vis"),
+}
+_NESTED = {"flags": "int64", "flag_seconds": "float64", "measures": "float64"}  # flags.success and so on
 
 
 def write_report(result: Result, folder: Path, protocol: LoadedProtocol | None = None) -> list[Path]:
-    """Write a result's tables, page and columns; the last only where pyarrow is installed.
+    """Write the tables, the page and the columns of a result, the columns only if pyarrow is installed.
 
     Args:
-        result: of which.
-        folder: that they come into; the page links videos that lie in its ``videos``.
-        protocol: that it was measured by, if it is at hand; the page then tells how many episodes are missing.
+        result: of an evaluation.
+        folder: of the files; the page links the videos in its ``videos``.
+        protocol: that the result was measured by, if it is at hand; the page then names missing episodes.
 
     Returns:
         The files.
@@ -46,22 +48,23 @@ def write_report(result: Result, folder: Path, protocol: LoadedProtocol | None =
 
 
 def write_parquet(result: Result, path: Path) -> None:
-    """Write a table of a result; its columns have the names and units of `Outcome`."""
+    """Write a result as a table whose columns have the names and units of `Outcome`."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     rows = [asdict(outcome) for outcome in result.outcomes.values()]
-    columns = {}
-    for names, kind in ((_WHOLE, pa.int64()), (_TEXTS, pa.string()), (_TRUTHS, pa.bool_()), (_REAL, pa.float64())):
-        for name in names:
-            columns[name] = pa.array([row[name] for row in rows], kind)
-    for outer, kind in _INSIDE.items():
+    columns = {
+        name: pa.array([row[name] for row in rows], getattr(pa, kind)())
+        for kind, names in _COLUMNS.items()
+        for name in names
+    }
+    for outer, kind in _NESTED.items():
         for name in dict.fromkeys(name for row in rows for name in row[outer]):
-            columns[f"{outer}.{name}"] = pa.array([row[outer].get(name) for row in rows], kind)
-    orders = [row["retrieval"] or {} for row in rows]
+            columns[f"{outer}.{name}"] = pa.array([row[outer].get(name) for row in rows], getattr(pa, kind)())
+    orders = [outcome.retrieval for outcome in result.outcomes.values()]
     if any(orders):
-        moved = [None if not order else len(order["moved"]) for order in orders]
-        columns["retrieval.score"] = pa.array([order.get("score") for order in orders], pa.float64())
-        columns["retrieval.moved"] = pa.array(moved, pa.int64())
-        columns["retrieval.left"] = pa.array([order.get("left") for order in orders], pa.int64())
+        for name, kind in (("score", "float64"), ("moved", "int64"), ("left", "int64")):
+            values = [None if order is None else getattr(order, name) for order in orders]
+            values = [len(value) if isinstance(value, list) else value for value in values]
+            columns[f"retrieval.{name}"] = pa.array(values, getattr(pa, kind)())
     pq.write_table(pa.table(columns), path)

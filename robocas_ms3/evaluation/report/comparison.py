@@ -18,13 +18,7 @@ ALL = "all"
 
 @dataclass(frozen=True)
 class Row:
-    """Two runs over the scenes of a configuration or task.
-
-    Attributes:
-        where: name of that; `ALL`: of all of them together.
-        pair: what the runs are called.
-        found: the second one's successes against the first one's.
-    """
+    """Two runs over the scenes of a configuration or task, or of `ALL`; compares the second with the first."""
 
     where: str
     pair: tuple[str, str]
@@ -32,7 +26,7 @@ class Row:
 
 
 def comparison(results: Sequence[Result]) -> str:
-    """Two or more results, over the episodes that all have; as Markdown.
+    """Return the comparison of two or more results, over the episodes that all have, as Markdown.
 
     Raises:
         EvaluationError: they are of different protocols, some are with the weld, or they have no episodes in common.
@@ -40,12 +34,9 @@ def comparison(results: Sequence[Result]) -> str:
     first = results[0]
     for other in results[1:]:
         if first.run.protocol_hash != other.run.protocol_hash:
-            raise EvaluationError(
-                "results of different protocols can't be compared",
-                where=other.folder,
-                expected=first.run.protocol_hash[:16],
-                found=other.run.protocol_hash[:16],
-            )
+            expected, found = first.run.protocol_hash[:16], other.run.protocol_hash[:16]
+            what = "results of different protocols can't be compared"
+            raise EvaluationError(what, where=other.folder, expected=expected, found=found)
         if first.run.weld != other.run.weld:
             welded = (first if first.run.weld else other).folder
             raise EvaluationError("a result with upstream's weld can't be compared with one without", where=welded)
@@ -75,15 +66,13 @@ def comparison(results: Sequence[Result]) -> str:
 
 
 def comparison_of_splits(result: Result, protocol: LoadedProtocol) -> str:
-    """The splits of one result whose scenes are the same, each against the first one; as Markdown.
+    """Return the comparison of a result's splits with the same scenes, each with the first one, as Markdown.
 
     Raises:
         EvaluationError: no two splits have the same scenes.
     """
-    if result.run.protocol_hash != protocol.hash:
-        raise EvaluationError(
-            "it is of another protocol", where=result.folder, expected=protocol.hash, found=result.run.protocol_hash
-        )
+    if (found := result.run.protocol_hash) != protocol.hash:
+        raise EvaluationError("it is of another protocol", where=result.folder, expected=protocol.hash, found=found)
     scenes: dict[tuple[str, bytes], list[tuple[str, str]]] = {}  # (split, configuration) of those with the same scenes
     for task, split, config in dict.fromkeys((one.task, one.split, one.config) for one in protocol.episodes):
         scenes.setdefault((task, protocol.layouts_file(config).read_bytes()), []).append((split, config))
@@ -106,10 +95,10 @@ def comparison_of_splits(result: Result, protocol: LoadedProtocol) -> str:
 
 
 def _table(head: str, where: str, rows: list[Row]) -> str:
-    """Rows of one family of claims, and those over all configurations, which are a family of their own."""
+    """Return rows of one family of claims, and those over all configurations, which are a family of their own."""
     adjusted: dict[int, tuple[float, int]] = {}
-    for together in (False, True):
-        family = [number for number, row in enumerate(rows) if (row.where == ALL) == together]
+    for pooled in (False, True):
+        family = [number for number, row in enumerate(rows) if (row.where == ALL) == pooled]
         for number, p in zip(family, holm([rows[number].found.p_value for number in family]), strict=True):
             adjusted[number] = p, len(family)
     lines = [
@@ -121,14 +110,12 @@ def _table(head: str, where: str, rows: list[Row]) -> str:
     ]
     warnings = []
     for number, row in enumerate(rows):
-        found, (p, claims) = row.found, adjusted[number]
-        change = f"{100 * found.difference:+.1f} ({100 * found.low:+.1f} to {100 * found.high:+.1f})"
-        lines.append(
-            f"| {in_markdown(row.where)} | {in_markdown(', '.join(row.pair))} | "
-            f"{found.n} | {found.successes_b} | {found.successes_a} | "
-            f"{found.only_b} | {found.only_a} | {change} | {found.p_value:.3g} | {p:.3g} |"
-        )
-        warning = None if p <= _ALPHA else too_few(found, alpha=_ALPHA / claims)
+        c, (p, claims) = row.found, adjusted[number]
+        change = f"{100 * c.difference:+.1f} ({100 * c.low:+.1f} to {100 * c.high:+.1f})"
+        counts = (c.n, c.successes_b, c.successes_a, c.only_b, c.only_a, change, f"{c.p_value:.3g}", f"{p:.3g}")
+        names = (in_markdown(row.where), in_markdown(", ".join(row.pair)))
+        lines.append(f"| {' | '.join(map(str, (*names, *counts)))} |")
+        warning = None if p <= _ALPHA else too_few(c, alpha=_ALPHA / claims)
         if warning:
             pair = "" if len({row.pair for row in rows}) == 1 else f", {', '.join(row.pair)}"
             warnings.append(f"- {in_markdown(f'{row.where}{pair}')}: {warning}")

@@ -1,75 +1,126 @@
-"""A result as Markdown."""
+"""The tables of a result, and a result as Markdown."""
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 from robocas_ms3.core.words import count_of, in_markdown
 from robocas_ms3.evaluation.outcomes import STAGES, Outcome, summarize_retrieval
 from robocas_ms3.evaluation.results import Result
 from robocas_ms3.evaluation.statistics import Share, success_by
+from robocas_ms3.scenes.task_specs import STAGES as DEFAULT_STAGES
+from robocas_ms3.scenes.task_specs import TASKS
 
 P_VIS_EDGES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 WELDED = (
     "With upstream's weld: what closed fingers had lifted hung on the hand until the gripper was told to open. "
     "Never compare this with results without it."
 )
+_STAGE_NOTE = "RA, PA: any object reached, lifted; RR: the target reached; CO: what hid it cleared."
+STAGE_NAMES = {
+    "furniture_opened": "furniture opened",
+    "reached_any": "an object touched (RA)",
+    "picked_any": "an object picked (PA)",
+    "obstacles_cleared": "obstacles cleared (CO)",
+    "reached_target": "target touched (RR)",
+    "target_grasped": "target grasped",
+    "target_lifted": "target lifted",
+    "target_in_basket": "target in basket",
+    "success": "success",
+}
+"""In the order in which stages are usually reached."""
+FAILURE_NAMES = {
+    **{stage: name.split(" (")[0] for stage, name in STAGE_NAMES.items() if stage != "success"},
+    "placed": "placed, at rest",
+    "error": "broken off",
+}
+"""By the first stage not reached (`outcomes.failure_stage`)."""
 
 
-def title(result: Result) -> str:
-    """Return what a result is of, in a line of plain text."""
-    how = " with upstream's weld" if result.run.weld else ""
-    return f"{result.run.policy.name} by {result.run.protocol}{how}"
+@dataclass(frozen=True)
+class Fraction:
+    """A count out of n, shown as the count on a background as strong as its share."""
+
+    count: int
+    n: int
+
+
+Cell = str | Share | Fraction | None
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of a report.
+
+    Attributes:
+        title: of its section.
+        note: how to read it; plain text.
+        heads: of the columns. One that ends with ``#`` is of numbers, with ``%`` of rates with their intervals.
+        rows: cells of plain text and rates.
+    """
+
+    title: str
+    note: str
+    heads: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
+
+
+def tables(result: Result) -> Iterator[Table]:
+    """Yield the tables of a result with at least one episode."""
+    yield _success(result)
+    if len(result.by("split")) > 1:
+        yield _splits(result)
+    yield _failures(result)
+    hidden = [one for one in first_splits(result) if one.p_vis is not None]
+    if hidden:
+        yield _occlusion(hidden)
+    yield from _retrieval(result)
 
 
 def markdown(result: Result) -> str:
-    """The tables of a result."""
+    """Return the tables of a result as Markdown."""
     run, broken = result.run, result.broken_off()
+    versions = ", ".join(f"{name} {number}" for name, number in run.versions.items())
     lines = [
         f"# {in_markdown(title(result))}",
         "",
         *([f"**{WELDED}**", ""] if run.weld else []),
         f"Protocol hash {in_markdown(run.protocol_hash[:16])}, {count_of(len(result.outcomes), 'episode')}, "
-        f"{in_markdown(run.backend)}; "
-        + in_markdown(", ".join(f"{name} {number}" for name, number in run.versions.items()))
-        + ". Intervals are Clopper-Pearson's, 95 %. RA, PA: any object reached, lifted; RR: the target reached; "
-        "CO: what hid it cleared.",
+        f"{in_markdown(run.backend)}; {in_markdown(versions)}. Intervals are Clopper-Pearson's, 95 %. {_STAGE_NOTE}",
         *(["", f"**Broken off by an error: {count_of(broken, 'episode')}, counted as failed.**"] if broken else []),
-        "",
-        "| configuration | n | success | at the end | upstream's | " + " | ".join(STAGES) + " | steps | s |",
-        "|---|---|---|---|---|" + "---|" * (len(STAGES) + 2),
     ]
-    for config, outcomes in result.by("config").items():
-        cells = [
-            in_markdown(config),
-            str(len(outcomes)),
-            percent(result.rate("success", outcomes)),
-            percent(result.rate("success_at_end", outcomes), interval=False),
-            _stage(result, "success_v0", outcomes),
-            *(_stage(result, stage, outcomes) for stage in STAGES.values()),
-            f"{_mean([one.steps for one in outcomes]):.0f}",
-            f"{_mean([one.seconds for one in outcomes]):.1f}",
-        ]
-        lines.append("| " + " | ".join(cells) + " |")
-    lines += _splits(result)
-    lines += ["", "## Where episodes failed", "", "| configuration | first stage not reached |", "|---|---|"]
-    for config, outcomes in result.by("config").items():
-        found = Counter(one.failure_stage for one in outcomes if one.failure_stage)
-        said = ", ".join(f"{stage} {count}" for stage, count in found.most_common())
-        lines.append(f"| {in_markdown(config)} | {in_markdown(said) or 'none failed'} |")
-    hidden = [one for one in first_splits(result) if one.p_vis is not None]
-    if hidden:
-        lines += ["", "## By what is seen of the target (p_vis)", "", "| p_vis | n | success |", "|---|---|---|"]
-        for found in success_by([one.p_vis or 0.0 for one in hidden], [one.success for one in hidden], P_VIS_EDGES):
-            rate = "" if found.share is None else percent(found.share)
-            lines.append(
-                f"| {found.low:g} to {found.high:g} | {0 if found.share is None else found.share.n} | {rate} |"
-            )
-    return "\n".join([*lines, *_retrieval(result)]) + "\n"
+    for table in tables(result) if result.outcomes else ():
+        heads = " | ".join(in_markdown(head.rstrip("#%")) for head in table.heads)
+        lines += ["", f"## {table.title}", "", f"| {heads} |", "|" + "---|" * len(table.heads)]
+        for row in table.rows:
+            cells = (_markdown_cell(cell, head) for cell, head in zip(row, table.heads, strict=True))
+            lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def title(result: Result) -> str:
+    """Return the title of a report, plain text."""
+    weld = " with upstream's weld" if result.run.weld else ""
+    return f"{result.run.policy.name} by {result.run.protocol}{weld}"
+
+
+def stages_of(task: str) -> dict[str, str]:
+    """Return the names of a task's stages in their order; stages of another package by their own names."""
+    row = TASKS.get(task)
+    if row is None or row.stages == DEFAULT_STAGES:
+        return STAGE_NAMES
+    return {stage: STAGE_NAMES.get(stage, stage.replace("_", " ")) for stage in (*row.stages, "success")}
+
+
+def failure_name(stage: str) -> str:
+    """Return the name of a first stage not reached."""
+    return FAILURE_NAMES.get(stage, stage.replace("_", " "))
 
 
 def first_splits(result: Result) -> list[Outcome]:
-    """The outcomes; where scenes may be there several times, those of each task's first split alone."""
+    """Return the outcomes; if scenes occur several times, those of each task's first split."""
     if not result.repeats():
         return list(result.outcomes.values())
     first: dict[str, str] = {}
@@ -78,48 +129,94 @@ def first_splits(result: Result) -> list[Outcome]:
     return [one for one in result.outcomes.values() if one.split == first[one.task]]
 
 
-def _splits(result: Result) -> list[str]:
-    splits = result.by("split")
-    if len(splits) < 2:
-        return []
-    heads = " | ".join(map(in_markdown, splits))
-    lines = ["", "## By split", "", f"| task | {heads} |", "|---|" + "---|" * len(splits)]
-    for task in result.by("task"):
-        cells = []
-        for outcomes in splits.values():
-            of_task = [one for one in outcomes if one.task == task]
-            cells.append(f"{percent(result.rate('success', of_task))} of {len(of_task)}" if of_task else "")
-        lines.append(f"| {in_markdown(task)} | {' | '.join(cells)} |")
-    return lines
+def mean(values: Sequence[float]) -> float:
+    """Return the mean of at least one number."""
+    return sum(values) / len(values)
 
 
-def _retrieval(result: Result) -> list[str]:
-    found = {
-        config: summarize_retrieval(one.retrieval for one in group) for config, group in result.by("config").items()
-    }
-    if not any(found.values()):
-        return []
-    lines = ["", "## What was moved before the target", ""]
-    lines += [
-        "| configuration | target held | order score | moved | needed of these | left |",
-        "|---|---|---|---|---|---|",
-    ]
-    for config, one in found.items():
-        if one is not None:
-            shares = f"{one.score:.2f} | {one.moved:.1f} | {100 * one.needed:.0f} %"
-            lines.append(f"| {in_markdown(config)} | {one.held} | {shares} | {one.left:.1f} |")
-    return lines
+def _success(result: Result) -> Table:
+    def rate(flag: str, outcomes: list[Outcome]) -> Share | None:
+        known = any(flag in outcome.flags for outcome in outcomes)
+        return result.rate(flag, outcomes) if known else None
+
+    groups, rows = result.by("config"), []
+    for config, outcomes in groups.items() if result.repeats() else _with_all(groups):
+        ends = (result.rate("success_at_end", outcomes), rate("success_v0", outcomes))
+        stages = (rate(stage, outcomes) for stage in STAGES.values())
+        steps, seconds = mean([one.steps for one in outcomes]), mean([one.seconds for one in outcomes])
+        share = result.rate("success", outcomes)
+        rows.append((config, str(share.n), share, *ends, *stages, f"{steps:.0f}", f"{seconds:.1f}"))
+    note = (
+        f"Success held at some step; at the last one; upstream's rule at the last one. {_STAGE_NOTE} Intervals are "
+        "Clopper and Pearson's, 95 %. Steps and seconds of the scene are means over all episodes"
+        + ("." if result.repeats() else ", as is the last row.")
+    )
+    heads = ("configuration", "n#", "success%", "at the end#", "upstream's#", *(f"{name}#" for name in STAGES))
+    return Table("Success", note, (*heads, "steps#", "s#"), rows)
 
 
-def percent(share: Share, *, interval: bool = True) -> str:
-    """A share in words: ``72 % (65 to 78)``."""
-    text = f"{100 * share.k / share.n:.0f} %"
-    return f"{text} ({100 * share.low:.0f} to {100 * share.high:.0f})" if interval else text
+def _splits(result: Result) -> Table:
+    splits, rows = result.by("split"), []
+    for task, outcomes in _with_all(result.by("task")):
+        row: list[Cell] = [task]
+        for split in splits:
+            chosen = [outcome for outcome in outcomes if outcome.split == split]
+            row += [str(len(chosen)), result.rate("success", chosen) if chosen else None]
+        rows.append(row)
+    heads = [head for split in splits for head in (f"{split}, n#", f"{split}%")]
+    return Table("Splits", "Success, side by side.", ["task", *heads], rows)
 
 
-def _stage(result: Result, stage: str, outcomes: list[Outcome]) -> str:
-    return percent(result.rate(stage, outcomes), interval=False) if stage in outcomes[0].flags else ""
+def _failures(result: Result) -> Table:
+    groups = result.by("config")
+    counts = {config: Counter(one.failure_stage for one in outcomes) for config, outcomes in groups.items()}
+    found = {stage for count in counts.values() for stage in count} - {""}
+    stages = [*(stage for stage in FAILURE_NAMES if stage in found), *sorted(found - FAILURE_NAMES.keys())]
+    rows = []
+    for config, count in counts.items():
+        n = count.total()
+        cells = (Fraction(count[stage], n) for stage in stages)
+        rows.append((config, str(n), str(n - count[""]), *cells))
+    heads = ("configuration", "n#", "failed#", *(f"{failure_name(stage)}#" for stage in stages))
+    note = "Episodes by the first stage not reached after the furthest one that was reached."
+    return Table("Where episodes failed", note, heads, rows)
 
 
-def _mean(values: list[float] | list[int]) -> float:
-    return sum(values) / max(len(values), 1)
+def _occlusion(hidden: list[Outcome]) -> Table:
+    bins = success_by([one.p_vis or 0.0 for one in hidden], [one.success for one in hidden], P_VIS_EDGES)
+    rows = [(f"{b.low:g} to {b.high:g}", str(b.share.n if b.share else 0), b.share) for b in bins]
+    configs = ", ".join(sorted({outcome.config for outcome in hidden}))
+    note = f"By p_vis, the share of the target that is visible from above at the start; episodes of {configs}."
+    return Table("Success by occlusion", note, ("p_vis", "n#", "success%"), rows)
+
+
+def _retrieval(result: Result) -> Iterator[Table]:
+    rows = []
+    for config, outcomes in result.by("config").items():
+        found = summarize_retrieval(outcome.retrieval for outcome in outcomes)
+        if found is not None:
+            needed = f"{100 * found.needed:.0f} %"
+            rows.append(
+                (config, str(found.held), f"{found.score:.2f}", f"{found.moved:.1f}", needed, f"{found.left:.1f}")
+            )
+    note = (
+        "Objects that were moved before the target was first held. Needed: they hid or hemmed it in, or lay over one "
+        "that did. The score is the share, of what was moved or left in the way, that was needed and moved from the "
+        "top down."
+    )
+    heads = ("configuration", "target held#", "order score#", "moved, mean#", "needed of these#", "left, mean#")
+    if rows:
+        yield Table("Retrieval order", note, heads, rows)
+
+
+def _with_all(groups: dict[str, list[Outcome]]) -> list[tuple[str, list[Outcome]]]:
+    """Return the groups, and if there are several, all of them together."""
+    every = [outcome for outcomes in groups.values() for outcome in outcomes]
+    return [*groups.items(), *([("all together", every)] if len(groups) > 1 else [])]
+
+
+def _markdown_cell(cell: Cell, head: str) -> str:
+    if isinstance(cell, Share):
+        text = f"{100 * cell.rate:.0f} %"
+        return f"{text} ({100 * cell.low:.0f} to {100 * cell.high:.0f})" if head.endswith("%") else text
+    return in_markdown(str(cell.count or "") if isinstance(cell, Fraction) else cell or "")

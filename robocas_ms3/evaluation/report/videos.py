@@ -16,7 +16,7 @@ from robocas_ms3.core.files import make_folder, replacing
 from robocas_ms3.datasets.writing.render import require_renderer
 from robocas_ms3.evaluation.policy import Policy
 from robocas_ms3.evaluation.protocol import LoadedProtocol
-from robocas_ms3.evaluation.report.failures import VIDEOS, video_name
+from robocas_ms3.evaluation.report.page import VIDEOS, video_name
 from robocas_ms3.evaluation.results import Result
 from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings

@@ -13,6 +13,7 @@ from robocas_ms3.demos.recorded import Recorded
 from robocas_ms3.demos.recordings.merging import merge
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
 from robocas_ms3.evaluation.policies.replay import ReplayPolicy
+from robocas_ms3.evaluation.policy import EpisodeSpec
 
 CUBE = "traj_0/env_states/actors/object_1"
 SECRET = np.full((STEPS + 1, 13), 7, np.float32)
@@ -68,7 +69,7 @@ def by_replay(path):
 
 
 def by_policy(path):
-    return ReplayPolicy(path)._actions(3)
+    return ReplayPolicy(path).track(EpisodeSpec(0, 0, "", "", "", "", 3, "")).actions
 
 
 def refused(read, path, *words):

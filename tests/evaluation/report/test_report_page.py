@@ -14,9 +14,8 @@ from robocas_ms3.cli.eval_results import Compare, Merge, Report, Verify, compare
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.report import PARQUET, write_report
-from robocas_ms3.evaluation.report.failures import video_name
 from robocas_ms3.evaluation.report.html import round_up
-from robocas_ms3.evaluation.report.page import page
+from robocas_ms3.evaluation.report.page import page, video_name
 
 VOID = {"meta", "rect", "path"}  # of HTML, and those that SVG closes at once
 
@@ -64,8 +63,8 @@ def result(tmp_path):
 def test_numbers_of_the_headline(result):
     read = Reader(page(result))
     # 2 of 4, 6.8 to 93.2; 2 of 2, 0.025 ** (1 / 2) = 15.8
-    assert read.after("table", 4) == ["pick", "4", "50 %", "7 to 93"]
-    assert read.after("heap", 4) == ["pick", "2", "100 %", "16 to 100"]
+    assert read.after("table", 3) == ["4", "50 %", "7 to 93"]
+    assert read.after("heap", 3) == ["2", "100 %", "16 to 100"]
     assert "2 of 4: 50.0 %, 6.8 to 93.2" in read.texts  # of the bar
     assert read.after("all together", 2) == ["6", "67 %"]
 

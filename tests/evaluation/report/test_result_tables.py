@@ -26,7 +26,9 @@ def test_a_configuration_is_a_row(result):
 
 
 def test_failure_stages_are_counted(result):
-    assert "| table | placed 1, reached_any 1 |" in markdown(result)
+    said = markdown(result).partition("Where episodes failed")[2]
+    assert row(said, "configuration") == ["configuration", "n", "failed", "an object touched", "placed, at rest"]
+    assert row(said, "table") == ["table", "4", "2", "1", "1"]
 
 
 def test_bins_of_occlusion(result):
@@ -46,19 +48,18 @@ def test_the_weld_is_named(tmp_path):
     assert "weld" not in markdown(write(tmp_path / "b", [outcome(0)]))
 
 
-def test_splits_stand_side_by_side(tmp_path):
+def test_splits_are_side_by_side(tmp_path):
     outcomes = [outcome(0), outcome(1, 0), outcome(2, 0, split="new"), outcome(3, task="select", split="new")]
-    # as the protocol has them, what is seen first
-    said = markdown(write(tmp_path / "a", outcomes))
-    assert "| task | test | new |" in said
-    assert row(said, "pick") == ["pick", "50 % (1 to 99) of 2", "0 % (0 to 98) of 1"]
-    assert row(said, "select") == ["select", "", "100 % (3 to 100) of 1"]
-    assert "By split" not in markdown(write(tmp_path / "b", outcomes[:2]))
+    said = markdown(write(tmp_path / "a", outcomes)).partition("## Splits")[2]
+    assert "| task | test, n | test | new, n | new |" in said  # in the protocol's order
+    assert row(said, "pick") == ["pick", "2", "50 % (1 to 99)", "1", "0 % (0 to 98)"]
+    assert row(said, "select") == ["select", "0", "", "1", "100 % (3 to 100)"]
+    assert "Splits" not in markdown(write(tmp_path / "b", outcomes[:2]))
 
 
-def test_what_was_moved_before_the_target_is_summed_up(tmp_path):
+def test_objects_moved_before_the_target_are_summed_up(tmp_path):
     move = {"object": "lid", "step": 3, "needed": True, "in_order": True}
     order = {"moved": [move, {**move, "needed": False, "in_order": False}], "needed": ["lid"], "left": 0, "score": 0.5}
     said = markdown(write(tmp_path / "a", [outcome(0, retrieval=order), outcome(1)]))
-    assert row(said.partition("moved before")[2], "table") == ["table", "1", "0.50", "2.0", "50 %", "0.0"]
-    assert "moved before" not in markdown(write(tmp_path / "b", [outcome(1)]))
+    assert row(said.partition("Retrieval order")[2], "table") == ["table", "1", "0.50", "2.0", "50 %", "0.0"]
+    assert "Retrieval order" not in markdown(write(tmp_path / "b", [outcome(1)]))
