@@ -74,7 +74,8 @@ class StandIn:
         """All in one place."""
         from robocas_ms3.datasets.sources.protocol import CameraModel
 
-        return {name: CameraModel(np.array([24.0, 24.0, 32.0, 24.0]), np.eye(4)) for name in self.pictures.cameras}
+        model = CameraModel(np.array([24.0, 24.0, 32.0, 24.0]), np.eye(4), "world")
+        return dict.fromkeys(self.pictures.cameras, model)
 
     def scene(self) -> dict[str, Any]:
         """Nothing is known."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.manage.repairs import eef_turn
 from robocas_ms3.datasets.sources.protocol import EpisodeSource
+from robocas_ms3.robots.cameras import EE_CAMERA
 
 _MAX_BASE_MOTION = 0.005  # m or rad; a base that stands trembles by less than a tenth of a mm
 
@@ -102,7 +103,7 @@ def check_tcp_frame(source: EpisodeSource, number: int) -> None:
         DatasetError: they are in RoboCAS-v0's frame, which is turned about z; or the frame is not known, as there is
             neither that camera nor the scene description of converted episodes.
     """
-    camera, episode = "gripper_camera", source.episode(number)
+    camera, episode = EE_CAMERA, source.episode(number)
     if camera not in source.cameras:
         if episode.scene:
             return

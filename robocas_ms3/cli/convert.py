@@ -45,12 +45,8 @@ class Convert:
     lerobot)."""
     all_videos: bool = False
     """Write videos and contact sheet of more than 20 episodes too."""
-    cameras: tuple[Literal["base_camera", "gripper_camera", "static_camera"], ...] = (
-        "base_camera",
-        "gripper_camera",
-        "static_camera",
-    )
-    """Cameras to render."""
+    cameras: tuple[str, ...] = ()
+    """Cameras to render, or to take from the dataset. Default: all that there are."""
     size: Maybe[tuple[int, int]] = None
     """Width and height of the images. Default: those of the cameras, 640 480."""
     depth: bool = True

@@ -7,7 +7,7 @@
     episode_0000000/
       scene.json                      how the episode was made, see SCENE; the released loader ignores it
       episode_info.npz                arrays over T steps, see EPISODE_INFO; holds no pickles
-      gripper_camera/, base_camera/, static_camera/
+      <camera>/                       of each camera, see `robots.cameras`
         cam_pos_wrt_<parent>.npy      4x4 OpenCV camera frame (x right, y down, z forward) in its parent; the paper's
         cam_pose_wrt_<parent>.npy     name and upstream's, the same content
         intrinsic.npy                 (4,) fx, fy, cx, cy in pixels
@@ -19,6 +19,7 @@ Metres and radians; quaternions are xyzw.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -26,6 +27,7 @@ from typing import Any, Literal
 import numpy as np
 
 from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.robots.cameras import CAMERA_NAME, PARENT_FRAMES, STANDARD_CAMERAS, Parent, standard_parent
 from robocas_ms3.scenes.language.embed import DIMENSIONS
 from robocas_ms3.scenes.language.templates import GOAL_TYPES
 
@@ -82,32 +84,6 @@ class ArraySpec:
         """Values as an array of the declared type."""
         return np.asarray(values, dtype=np.str_ if self.dtype == "str" else self.dtype)
 
-
-@dataclass(frozen=True)
-class CameraSpec:
-    """One camera.
-
-    Attributes:
-        name: its folder.
-        parent: name of its parent frame in file names.
-        parent_frame: that frame, for people.
-    """
-
-    name: str
-    parent: Literal["ee", "arm_base", "world"]
-    parent_frame: str
-
-    @property
-    def pose_files(self) -> tuple[str, str]:
-        """Both names of the file with the camera's pose."""
-        return f"cam_pos_wrt_{self.parent}.npy", f"cam_pose_wrt_{self.parent}.npy"
-
-
-CAMERAS: tuple[CameraSpec, ...] = (
-    CameraSpec("base_camera", "arm_base", "arm base (panda_link0)"),
-    CameraSpec("gripper_camera", "ee", "EEF: ManiSkill's TCP, z approach, y closing"),
-    CameraSpec("static_camera", "world", "world"),
-)
 
 _EE = "EEF (TCP) in the arm base frame (panda_link0)"
 _BASE = "arm base in the world"
@@ -200,6 +176,26 @@ def check_version(found: object, where: Path, what: str = "a dataset") -> None:
         )
 
 
+def pose_files(parent: Parent) -> tuple[str, str]:
+    """Return both names of the file with the pose of a camera, by the frame that the pose is in."""
+    return f"cam_pos_wrt_{parent}.npy", f"cam_pose_wrt_{parent}.npy"
+
+
+def camera_parent(folder: Path) -> Parent:
+    """Return the frame that the pose in a camera's folder is in, by the name of its file; without one, the usual."""
+    for parent in PARENT_FRAMES:
+        if any((folder / name).exists() for name in pose_files(parent)):
+            return parent
+    return standard_parent(folder.name)
+
+
+def camera_names(episode: Path) -> tuple[str, ...]:
+    """Return the cameras that have a folder in an episode's folder, sorted."""
+    if not episode.is_dir():
+        return ()
+    return tuple(sorted(p.name for p in episode.iterdir() if re.fullmatch(CAMERA_NAME, p.name) and p.is_dir()))
+
+
 def episode_folder(number: int) -> str:
     """Name of an episode's folder."""
     return f"episode_{number:07d}"
@@ -226,7 +222,8 @@ def markdown() -> str:
         rows.append(f"| `{spec.name}` | {spec.dtype} | {shape} | {spec.unit} | {spec.meaning} |")
     rows += ["", "| camera | parent | pose files |", "|---|---|---|"]
     rows += [
-        f"| `{c.name}` | {c.parent_frame} | " + ", ".join(f"`{name}`" for name in c.pose_files) + " |" for c in CAMERAS
+        f"| `{c.name}` | {PARENT_FRAMES[c.parent]} | " + ", ".join(f"`{name}`" for name in pose_files(c.parent)) + " |"
+        for c in STANDARD_CAMERAS
     ]
     for file, keys in ((DATA_INFO_FILE, DATA_INFO), (SCENE_FILE, SCENE)):
         rows += ["", f"| key of `{file}` | value |", "|---|---|"]

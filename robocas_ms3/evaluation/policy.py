@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
@@ -16,13 +17,13 @@ from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.exits import no_exit
 from robocas_ms3.core.files import json_text
 from robocas_ms3.evaluation.actions import CONVENTIONS
+from robocas_ms3.robots.cameras import CAMERA_NAME
 from robocas_ms3.robots.table import DEFAULT
 
 Language = Literal["none", "text", "embedding"]
 Reference = Literal["tcp", "target"]
 Side = Annotated[int, Field(ge=1, le=4096)]
 """Of an image, pixels."""
-CAMERAS = ("base_camera", "gripper_camera", "static_camera")
 
 
 @dataclass(frozen=True)
@@ -58,12 +59,15 @@ class PolicySpec:
             ("convention", self.convention, sorted(CONVENTIONS)),
             ("reference", self.reference, ["tcp", "target"]),
             ("language", self.language, ["none", "text", "embedding"]),
-            *(("cameras", camera, list(CAMERAS)) for camera in self.cameras),
         ):
             if value not in known:
                 raise EvaluationError(
                     "a policy can't want that", where=name, expected=f"one of {known}", found=repr(value)
                 )
+        for camera in self.cameras:
+            if not re.fullmatch(CAMERA_NAME, camera):
+                expected = "names like side_camera"
+                raise EvaluationError("a policy can't want that", where="cameras", expected=expected, found=camera)
         if self.look_every < 1:
             raise EvaluationError(
                 "a policy can't want that", where="look_every", expected="1 or more", found=self.look_every

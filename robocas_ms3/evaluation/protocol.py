@@ -33,7 +33,8 @@ from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.settings import EvaluationSettings
 from robocas_ms3.robots.table import DEFAULT as DEFAULT_ROBOT
-from robocas_ms3.scenes.config.load import check_no_base
+from robocas_ms3.robots.table import find_robot
+from robocas_ms3.scenes.config.load import check_no_base, load_task_config
 from robocas_ms3.scenes.task_specs import TASKS
 
 NO_RULES = "no rules of a protocol"
@@ -201,6 +202,21 @@ class LoadedProtocol:
         if not chosen:
             raise EvaluationError("no episodes in this shard", where=self.rules.name, found=settings.shard)
         return chosen
+
+    def check_cameras(self, spec: PolicySpec, episodes: Sequence[Episode]) -> None:
+        """Check that episodes have the cameras that a policy uses.
+
+        Raises:
+            EvaluationError: a configuration lacks one.
+        """
+        robot = find_robot(self.rules.robot).description
+        for config in dict.fromkeys(episode.config for episode in episodes):
+            known = [camera.name for camera in load_task_config(self.config_file(config)).cameras_of(robot)]
+            for name in spec.cameras:
+                if name not in known:
+                    where, expected = f"{self.rules.name}, {config}", f"some of {', '.join(known)}"
+                    fix = nearest(name, known)
+                    raise EvaluationError("no such camera", where=where, expected=expected, found=name, fix=fix)
 
     def check_one_configuration(self, episodes: Sequence[Episode], fix: str = "") -> None:
         """Check that episodes can run in one batch.

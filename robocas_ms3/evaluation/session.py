@@ -75,6 +75,7 @@ class EvaluationSession:
             check_weld(rules.stepping, backend)
         self.episodes = self.protocol.choose(settings)
         if self.spec.cameras:
+            self.protocol.check_cameras(self.spec, self.episodes)
             require_renderer()
         self.record = self._record(backend)
         self.folder = settings.folder(rules.name)

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.actions import CONVENTIONS, Motion
 from robocas_ms3.evaluation.metrics import EpisodeMetrics
-from robocas_ms3.evaluation.policy import CAMERAS, PolicySpec
+from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.weld import Weld
 from robocas_ms3.robots.ee_deltas import to_ee_delta_action
 
@@ -190,9 +190,9 @@ def env_kwargs(spec: PolicySpec, rate: int, *, renders: bool = False) -> dict[st
     if not spec.cameras:
         return {**common, "obs_mode": "state_dict", **({} if renders else {"render_backend": "none"})}
     modes = ["rgb", *(["depth"] if spec.depth else []), *(["state_dict"] if spec.state else [])]
-    sizes = {name: spec.cameras.get(name, (_UNUSED, _UNUSED)) for name in CAMERAS}
-    cameras = {name: {"width": width, "height": height} for name, (width, height) in sizes.items()}
-    return {**common, "obs_mode": "+".join(modes), "sensor_configs": cameras}
+    cameras = {name: {"width": width, "height": height} for name, (width, height) in spec.cameras.items()}
+    others = {"width": _UNUSED, "height": _UNUSED}
+    return {**common, "obs_mode": "+".join(modes), "sensor_configs": {**others, **cameras}}
 
 
 def _pose(pose: Pose) -> tuple[np.ndarray, Rotation]:

@@ -10,6 +10,7 @@ from robocas_ms3.core.strict import StrictModel
 from robocas_ms3.datasets.lerobot.variants import NEWEST, Version
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.demos.recordings.entries import GREATEST_SEED
+from robocas_ms3.robots.cameras import STANDARD_NAMES
 
 Side = Literal["train", "val"]
 Stage = Literal["layouts", "demonstrations", "datasets", "statistics"]
@@ -58,7 +59,7 @@ class PicturesConfig(StrictModel):
 
     def chosen(self) -> Pictures:
         """Return the settings as dataset writers take them."""
-        cameras = Pictures.cameras if self.cameras is None else tuple(self.cameras)
+        cameras = STANDARD_NAMES if self.cameras is None else tuple(self.cameras)
         return Pictures(cameras=cameras, size=self.size, depth=self.depth, image_format=self.image_format)
 
 

@@ -11,9 +11,10 @@ from mani_skill.agents.base_agent import BaseAgent, Keyframe
 from mani_skill.agents.controllers import deepcopy_dict
 from mani_skill.agents.registration import register_agent
 from mani_skill.sensors.camera import CameraConfig
-from mani_skill.utils import common
+from mani_skill.utils import common, sapien_utils
 from mani_skill.utils.structs import Actor, Link, Pose
 
+from robocas_ms3.robots.cameras import CameraSpec
 from robocas_ms3.robots.combined import RobotController, State
 from robocas_ms3.robots.control_modes import control_modes
 from robocas_ms3.robots.description import RobotDescription
@@ -27,18 +28,6 @@ class _GeneratedUrdf:
 
     def __get__(self, instance: object, owner: type[MobileManipulator]) -> str:
         return str(owner.spec.files().urdf)
-
-
-def _camera(
-    uid: str, p: tuple[float, ...], rpy: tuple[float, ...], *, near: float, far: float, link: str | None
-) -> CameraConfig:
-    """640 x 480, vertical field of view 90 deg; mounted on a link, or in the world.
-
-    The shader is the cheapest one, which matters where a CPU renders; ``sensor_configs`` of ``gym.make`` changes it.
-    """
-    pose = sapien.Pose(p)
-    pose.set_rpy(rpy)
-    return CameraConfig(uid, Pose.create(pose), 640, 480, np.pi / 2, near, far, entity_uid=link, shader_pack="minimal")
 
 
 def _keyframe(robot: RobotDescription, arm: tuple[float, ...]) -> Keyframe:
@@ -64,15 +53,15 @@ class MobileManipulator(BaseAgent):
     base_stiffness, base_damping, base_force_limit = 4e5, 2e4, 4e3
     base_max_speed = 0.5  # m/s and rad/s
 
-    static_camera_pose: sapien.Pose | None = None
-    """World pose of ``static_camera``; none: upstream's, which looks at a table before the robot."""
+    cameras: tuple[CameraSpec, ...]
+    """Those of the description, until the environment sets those of its task."""
 
     def __init_subclass__(cls, spec: RobotSpec | None = None, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         if spec is None:
             return
         robot = spec.description
-        cls.spec, cls.description, cls.uid = spec, robot, robot.uid
+        cls.spec, cls.description, cls.uid, cls.cameras = spec, robot, robot.uid, robot.cameras
         rubber = dict(static_friction=robot.finger_friction, dynamic_friction=robot.finger_friction, restitution=0.0)
         finger = dict(material="gripper", patch_radius=0.1, min_patch_radius=0.1)
         cls.urdf_config = dict(_materials=dict(gripper=rubber), link={name: finger for name in robot.finger_links})
@@ -93,15 +82,28 @@ class MobileManipulator(BaseAgent):
 
     @property
     def _sensor_configs(self) -> list[CameraConfig]:
-        static = _camera("static_camera", (1, 1.5, 1.5), (0, np.pi / 3, -np.pi / 2), near=0.05, far=10, link=None)
-        if self.static_camera_pose is not None:
-            static.pose = Pose.create(self.static_camera_pose)
-        base, hand = self.description.base_link, self.description.hand_link
-        return [
-            _camera("base_camera", (0, -0.3, 1.2), (0, 0.43633, 0), near=0.005, far=5, link=base),
-            _camera("gripper_camera", (0.05, 0, 0.05), (np.pi, -np.pi / 2, 0), near=0.001, far=5, link=hand),
-            static,
-        ]
+        return [self.camera_config(camera) for camera in self.cameras]
+
+    def camera_config(self, camera: CameraSpec) -> CameraConfig:
+        """Return a camera in ManiSkill's form, with the cheapest shader; ``sensor_configs`` of ``gym.make`` wins."""
+        if camera.look_at is None:
+            pose = sapien.Pose(camera.position)
+            pose.set_rpy(camera.rpy)
+        else:
+            pose = sapien_utils.look_at(camera.position, camera.look_at).sp
+        return CameraConfig(
+            uid=camera.name,
+            pose=Pose.create(pose),
+            width=camera.width,
+            height=camera.height,
+            fov=camera.fov,
+            near=camera.near,
+            far=camera.far,
+            entity_uid={"world": None, "base": self.description.base_link, "hand": self.description.hand_link}[
+                camera.mount
+            ],
+            shader_pack="minimal",
+        )
 
     def _after_init(self) -> None:
         links: dict[str, Link] = self.robot.links_map

@@ -11,6 +11,7 @@ from math import pi
 from typing import ClassVar
 
 from robocas_ms3.core.errors import RobocasError
+from robocas_ms3.robots.cameras import STANDARD_CAMERAS, CameraSpec
 
 Limits = tuple[tuple[float, float], ...]
 _OF_EACH_JOINT = ("joints", "limits")
@@ -62,6 +63,7 @@ class RobotDescription:
         finger_friction: of the finger tips.
         inverse_kinematics: import path of the arm's closed form (`planning.analytic`).
         envelope: the room it takes; None: scenes are not checked for it.
+        cameras: that it has, or that stand by it; the task configuration may change them and add others.
 
     Raises:
         RobocasError: it has another number of joints.
@@ -100,6 +102,7 @@ class RobotDescription:
     finger_friction: float
     inverse_kinematics: str = "robocas_ms3.planning.analytic:PandaGeometry"
     envelope: Envelope | None = None
+    cameras: tuple[CameraSpec, ...] = STANDARD_CAMERAS
 
     def __post_init__(self) -> None:
         parts = {"base": self.base_slice, "arm": self.arm_slice, "finger": self.finger_slice}

@@ -39,6 +39,7 @@ _NOT_OF_LAYOUTS = {
     "language",
     "base_motion",
     "static_camera",
+    "cameras",
     "room",
 }
 _LOOKS = {"room", "finishes", "lights", "cameras"}

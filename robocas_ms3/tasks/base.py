@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, cast
 
@@ -19,6 +20,7 @@ from robocas_ms3.core.arrays import as_tensor, native
 from robocas_ms3.core.errors import ConfigError
 from robocas_ms3.core.extensions import load
 from robocas_ms3.robots.agent import MobileManipulator
+from robocas_ms3.robots.cameras import CameraSpec, Vec3
 from robocas_ms3.robots.table import DEFAULT, find_robot
 from robocas_ms3.scenes import build
 from robocas_ms3.scenes.cache import layout_source
@@ -70,6 +72,7 @@ class RoboCASEnv(BaseEnv):
         present: (N, K) bool, which object slots are in use.
         target_slot: (N,) slot of the target; ``is_target`` (N, K) bool has the same as flags.
         start_poses: (N, K, 7) poses of the objects at the start of the episode; ``basket_at_start`` (N, 7).
+        cameras: their specifications, in the order of their randomisation.
     """
 
     SPEC: ClassVar[TaskSpec]
@@ -101,6 +104,7 @@ class RoboCASEnv(BaseEnv):
         self.robot_spec = find_robot(robot_uids, where="robot_uids")
         load(self.robot_spec.agent)  # registers it with ManiSkill
         robot = self.robot_spec.description
+        self.cameras = self.task_config.cameras_of(robot)
         self.model = SceneModel.load(self.task_config, load_pack(pack), load_pack(furniture_pack), robot=robot)
         self._visual_level: VisualLevel = visual_level
         self._resets = 0
@@ -131,8 +135,8 @@ class RoboCASEnv(BaseEnv):
 
     def _setup_sensors(self, options: dict) -> None:
         super()._setup_sensors(options)
-        cameras = [sensor.camera for _, sensor in sorted(cast("dict[str, Any]", self._sensors).items())]
-        build.shift_cameras(cameras, self.task_config, self.scene_seeds)
+        sensors = cast("dict[str, Any]", self._sensors)
+        build.shift_cameras([sensors[spec.name].camera for spec in self.cameras], self.task_config, self.scene_seeds)
 
     @property
     def scene_seeds(self) -> list[int]:
@@ -166,10 +170,16 @@ class RoboCASEnv(BaseEnv):
 
     def _load_agent(self, options: dict, *args: Any, **kwargs: Any) -> None:
         super()._load_agent(options, sapien.Pose(self.model.robot_pose))
-        if self.task_config.static_camera == "overview":
-            eye, target = self.overview()
-            eye = target + 0.75 * (eye - target)  # nearer than the render camera: it sees 90 deg instead of 60
-            self.agent.static_camera_pose = sapien_utils.look_at(eye.tolist(), target.tolist()).sp
+        self.agent.cameras = tuple(self._placed(camera) for camera in self.cameras)
+
+    def _placed(self, camera: CameraSpec) -> CameraSpec:
+        """Return a camera as it is; an overview camera at the viewpoint of the task."""
+        if not camera.overview:
+            return camera
+        eye, target = self.overview()
+        eye = target + 0.75 * (eye - target)  # nearer than the render camera: it sees 90 deg instead of 60
+        position, look_at = cast("list[Vec3]", [tuple(eye.tolist()), tuple(target.tolist())])
+        return replace(camera, mount="world", position=position, look_at=look_at, overview=False)
 
     def _load_scene(self, options: dict) -> None:
         self.fixtures = build.build_fixtures(self.scene, self.model, self._visual_level, self.scene_seeds)

@@ -32,6 +32,7 @@ from robocas_ms3.plans.folder import PLAN, check_plan_record, plan_record, read_
 from robocas_ms3.plans.load import load_plan, shipped_plans
 from robocas_ms3.plans.status import read_status
 from robocas_ms3.plans.units import OUTCOME, OUTCOMES, Outcome, Unit
+from robocas_ms3.robots.cameras import STANDARD_NAMES
 
 MOST = 40  # changes of a file that are tried: the same ones each time
 
@@ -178,7 +179,7 @@ def test_the_json_of_a_trajectory(tmp_path):
 
 def test_the_settings_of_a_conversion_that_continues(tmp_path):
     entry = {"trajectory": "F.h5", "trajectory_episode": 0, "seed": 3, "success": True, "recording": "ab", "source": 0}
-    settings = dataset_settings(5, Pictures(), False)
+    settings = dataset_settings(5, Pictures(STANDARD_NAMES), False)
     (tmp_path / "episode_0000000").write_text("an episode")
     whole = {"schema_version": 2, "made_with": {}, **settings, "episodes": {"0": entry}}
 

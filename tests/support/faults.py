@@ -24,6 +24,7 @@ from robocas_ms3.demos.ledger import FAILURES_FILE, Ledger
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
 from robocas_ms3.demos.recordings.stored import open_trajectory
 from robocas_ms3.evaluation import results
+from robocas_ms3.robots.cameras import STANDARD_NAMES
 
 ROOT = Path(__file__).resolve().parents[2]
 SITE = Path(__file__).resolve().parent / "fault_site"
@@ -112,7 +113,7 @@ def readable(command, out):
         return sum(bool(json.loads(line)) for line in lines if line.endswith(b"\n"))
     folders = sorted(out.glob("episode_*" if command.name == "convert" else "units/*/*/[0-9]*/episode_*"))
     for folder in folders:
-        assert find_damaged(folder, Pictures(size=(64, 48), depth=False)) is None, folder
+        assert find_damaged(folder, Pictures(STANDARD_NAMES, (64, 48), depth=False)) is None, folder
     return len(folders)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from robocas_ms3.datasets.pictures.boxes import box_of
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.protocol import CameraModel, Frame
+from robocas_ms3.robots.cameras import STANDARD_NAMES, standard_parent
 from robocas_ms3.robots.description import MOBILE_PANDA
 
 STEPS = 22  # control steps: with a stride of 4 the last dataset step is a short one
@@ -56,7 +57,7 @@ class RayCaster:
     """A ``Renderer``: floor, room, table and a cube for each actor."""
 
     def __init__(self, env_info, control_mode, pictures=None):
-        self.pictures = pictures or Pictures()
+        self.pictures = (pictures or Pictures()).choose(STANDARD_NAMES, "here")
         self.size = self.pictures.size or SIZE
         self.closed = False
 
@@ -67,7 +68,10 @@ class RayCaster:
         self.closed = True
 
     def cameras(self):
-        return {name: CameraModel(self.intrinsic(), CAMERA_IN_PARENT[name]) for name in self.pictures.cameras}
+        return {
+            name: CameraModel(self.intrinsic(), CAMERA_IN_PARENT[name], standard_parent(name))
+            for name in self.pictures.cameras
+        }
 
     def scene(self):
         return {

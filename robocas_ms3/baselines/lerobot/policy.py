@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import re
 from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -13,7 +14,8 @@ from numpy.typing import NDArray
 
 from robocas_ms3.baselines.lerobot.observations import DIMENSIONS, EMBEDDING, STATE, STATE_NAMES, scaled, state_of
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.evaluation.policy import CAMERAS, EpisodeSpec, Observations, PolicySpec
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
+from robocas_ms3.robots.cameras import CAMERA_NAME
 from robocas_ms3.robots.description import RobotDescription
 
 _IMAGES = "observation.images."
@@ -51,7 +53,7 @@ class LeRobotPolicy:
         self._inputs = dict(inputs)
         cameras = {}
         for key, shape in self._inputs.items():
-            if key.removeprefix(_IMAGES) in CAMERAS and len(shape) == 3:
+            if re.fullmatch(f"{_IMAGES}{CAMERA_NAME}", key) and len(shape) == 3:
                 cameras[key.removeprefix(_IMAGES)] = (shape[2], shape[1])
             elif {STATE: (len(STATE_NAMES),), EMBEDDING: (DIMENSIONS,)}.get(key) != tuple(shape):
                 fix = "Train on a dataset that robocas_ms3.baselines.lerobot.prepare made."

@@ -183,7 +183,7 @@ class SmallSamples:
                     self._pictures[camera][row] = torch.from_numpy(crop_image(picture, view, source.root))
                     stored = picture.shape[1], picture.shape[0]
             self._check(config, camera, calibration(episode, camera, arrays, stored, view), episode.where)
-            points = seen_from(camera, at_keys[:, None], poses, arrays)[:, 0]
+            points = seen_from(episode.camera_parent(camera), at_keys[:, None], poses, arrays)[:, 0]
             looks[camera] = partial(
                 places_of,
                 camera=episode.camera_in_parent(camera),

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from robocas_ms3.baselines.small.config import View
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import Array, from_xyzw, inverse, transform
-from robocas_ms3.datasets.schema import CAMERAS, SCENE_FILE
+from robocas_ms3.datasets.schema import SCENE_FILE
 from robocas_ms3.datasets.sources.protocol import SourceEpisode
+from robocas_ms3.robots.cameras import Parent
 
 _ALIKE = {"mount": 1e-3, "intrinsic": 1e-2}
-_PARENTS = {camera.name: camera.parent for camera in CAMERAS}
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,10 @@ def standing(
     in_base = transform(inverse(_base(arrays)), points[None])
     opened = arrays["gripper_status"].reshape(-1)
     still = np.logical_and.accumulate(opened == opened[0])
-    places = {camera: look(seen_from(camera, in_base, tcp_in_base, arrays)) for camera, look in looks.items()}
+    places = {
+        camera: look(seen_from(episode.camera_parent(camera), in_base, tcp_in_base, arrays))
+        for camera, look in looks.items()
+    }
     for seen in places.values():
         seen[~still] = np.nan
     return Standing(steps, meant, kinds, places, in_base[0])
@@ -86,7 +89,7 @@ def calibration(
     episode: SourceEpisode, camera: str, arrays: Mapping[str, NDArray[Any]], stored: tuple[int, int], view: View
 ) -> dict[str, Any]:
     """How a camera looks, see `lifting.Lift`; of one that is fixed in the world where the arm's base stands first."""
-    mount, parent = episode.camera_in_parent(camera), _PARENTS[camera]
+    mount, parent = episode.camera_in_parent(camera), episode.camera_parent(camera)
     if parent == "world":
         mount = inverse(_base(arrays))[0] @ mount
     left, top, right, bottom = np.array(view.box()) / np.tile(view.rendered, 2)
@@ -100,9 +103,8 @@ def looks_alike(one: dict[str, Any], other: dict[str, Any], keys: Sequence[str] 
     return all(np.allclose(one[key], other[key], rtol=0, atol=_ALIKE[key]) for key in keys)
 
 
-def seen_from(camera: str, points: Array, tcp_in_base: Array, arrays: Mapping[str, NDArray[Any]]) -> Array:
+def seen_from(parent: Parent, points: Array, tcp_in_base: Array, arrays: Mapping[str, NDArray[Any]]) -> Array:
     """(T, N, 3) points in the arm's base, in the frame that a camera is fixed to; ``tcp_in_base`` is (T, 4, 4)."""
-    parent = _PARENTS[camera]
     if parent == "ee":
         return transform(inverse(tcp_in_base), points)
     return transform(_base(arrays), points) if parent == "world" else points

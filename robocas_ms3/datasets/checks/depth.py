@@ -26,7 +26,6 @@ JUMP = 0.2  # m between neighbours that are not of one surface
 MIN_POINTS = 100  # fewer say nothing
 FLOOR_TOLERANCE = 0.03  # m
 FLOOR_BAND = 0.15  # m; what is level and within it is taken for the floor
-INTO_FURNITURE = "gripper_camera"
 LEVEL = np.cos(np.deg2rad(20))  # of the angle between a surface's normal and the vertical: not a wall's foot
 SEEN_THROUGH = 0.05  # share of points
 AGREEING = 0.1  # share of points, at the step and with the camera where it is highest; the rest may be hidden
@@ -42,12 +41,14 @@ class View:
         depth: (H, W) uint16, mm, 0 = nothing.
         intrinsic: (4,) fx, fy, cx, cy.
         camera_in_world: (4, 4), OpenCV frame.
+        on_hand: whether the gripper carries it, which looks into furniture.
     """
 
     camera: str
     depth: NDArray[np.uint16]
     intrinsic: Array
     camera_in_world: Array
+    on_hand: bool = False
 
     def points(self) -> Array:
         """Return the seen points (N, 3) in the world, m; of large images every few pixels."""
@@ -140,7 +141,7 @@ def _floor(view: View, points: Array) -> Iterator[tuple[str, str, str]]:
     below = np.mean(heights < -FLOOR_TOLERANCE)
     if below > 0.01:
         yield view.camera, "nothing below the floor", f"{below:.0%} of the depth, down to {heights.min():.2f} m"
-    if view.camera == INTO_FURNITURE:
+    if view.on_hand:
         return
     level = np.abs(view.level_points()[:, 2])
     near = level[level < FLOOR_BAND]

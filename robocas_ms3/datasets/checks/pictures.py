@@ -21,6 +21,7 @@ from robocas_ms3.datasets.pictures.headers import PictureHeader, read_header
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.files import CAMERA_LIMIT
 from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, first_line
+from robocas_ms3.robots.cameras import Parent
 
 SURPLUS = "a file beyond them"
 SOUND = "a sound picture"
@@ -35,28 +36,29 @@ ReadHeader = Callable[[Path], PictureHeader | None]
 
 def check_cameras(folder: Path, pictures: Pictures) -> Iterator[Violation]:
     """Check that each camera has valid intrinsics and its pose under both names, and that there are no others."""
-    for camera in schema.CAMERAS:
-        if camera.name not in pictures.cameras and (folder / camera.name).exists():
+    for camera in schema.camera_names(folder):
+        if camera not in pictures.cameras:
             expected = f"the cameras of {schema.CONVERSION_FILE} only"
-            yield Violation(f"{folder.name}/{camera.name}", "", expected, "another camera")
-    for camera in pictures.specs:
+            yield Violation(f"{folder.name}/{camera}", "", expected, "another camera")
+    for camera in pictures.cameras:
         poses: list[NDArray] = []
-        for name in (schema.INTRINSIC_FILE, *camera.pose_files):
-            file = f"{folder.name}/{camera.name}/{name}"
+        pose_files = schema.pose_files(schema.camera_parent(folder / camera))
+        for name in (schema.INTRINSIC_FILE, *pose_files):
+            file = f"{folder.name}/{camera}/{name}"
             try:
-                found = load_array(folder / camera.name / name, CAMERA_LIMIT)
+                found = load_array(folder / camera / name, CAMERA_LIMIT)
             except FileNotFoundError:
                 yield Violation(file, "", "this file", NO_FILE)
                 continue
             except DAMAGED as error:
                 yield Violation(file, "", "a numpy array", first_line(error))
                 continue
-            wrong = list(check_camera_file(file, found, pose=name in camera.pose_files))
+            wrong = list(check_camera_file(file, found, pose=name in pose_files))
             yield from wrong
-            poses += [found] if name in camera.pose_files and not wrong else []
+            poses += [found] if name in pose_files and not wrong else []
         if len(poses) == 2 and not np.allclose(poses[0], poses[1], atol=1e-6):
-            file = f"{folder.name}/{camera.name}/{camera.pose_files[1]}"
-            yield Violation(file, "", f"the same as {camera.pose_files[0]}", "another pose")
+            file = f"{folder.name}/{camera}/{pose_files[1]}"
+            yield Violation(file, "", f"the same as {pose_files[0]}", "another pose")
 
 
 def check_camera_file(file: str, array: NDArray, *, pose: bool) -> Iterator[Violation]:
@@ -130,20 +132,21 @@ def check_depth(folder: Path, stored: EpisodeArrays, pictures: Pictures) -> Iter
     arrays = {key: array.astype(np.float64) for key, array in stored.arrays.items() if array.dtype.kind == "f"}
     base = from_xyzw(arrays["base_pos"], arrays["base_orn"])
     ee = base @ from_xyzw(arrays["ee_pos"], arrays["ee_orn"])
+    parent_of: dict[str, Parent] = {camera: schema.camera_parent(folder / camera) for camera in pictures.cameras}
     cameras = {
-        camera.name: [
-            np.asarray(load_array(folder / camera.name / name, CAMERA_LIMIT), np.float64)
-            for name in (schema.INTRINSIC_FILE, camera.pose_files[0])
+        camera: [
+            np.asarray(load_array(folder / camera / name, CAMERA_LIMIT), np.float64)
+            for name in (schema.INTRINSIC_FILE, schema.pose_files(parent)[0])
         ]
-        for camera in pictures.specs
+        for camera, parent in parent_of.items()
     }
     steps = sorted({round(step) for step in np.linspace(0, stored.steps - 1, _GEOMETRY_STEPS)})
     views: list[list[geometry.View]] = []
     for step in steps:
         parents = {"ee": ee[step], "arm_base": base[step], "world": np.eye(4)}
         views.append([])
-        for camera in pictures.specs:
-            path = schema.image_path(folder, camera.name, "depth", step)
+        for camera, parent in parent_of.items():
+            path = schema.image_path(folder, camera, "depth", step)
             file = f"{folder.name}/{path.relative_to(folder)}"
             image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)  # `check_images` has checked file and size
             if image is None:
@@ -151,8 +154,8 @@ def check_depth(folder: Path, stored: EpisodeArrays, pictures: Pictures) -> Iter
                 return
             if not image.any():
                 yield Violation(file, "", "depth", "only zeros")
-            intrinsic, pose = cameras[camera.name]
-            view = geometry.View(camera.name, image.astype(np.uint16), intrinsic, parents[camera.parent] @ pose)
-            views[-1].append(view)
+            intrinsic, pose = cameras[camera]
+            placed = parents[parent] @ pose
+            views[-1].append(geometry.View(camera, image.astype(np.uint16), intrinsic, placed, parent == "ee"))
     for index, camera_name, expected, found in geometry.check(views):
         yield Violation(f"{folder.name}/{camera_name}/depth/{steps[index]:04d}.png", "", expected, found)

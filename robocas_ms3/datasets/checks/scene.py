@@ -13,8 +13,10 @@ from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.records import ConversionRecord, SceneRecord
 from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, arrays_fingerprint, first_line
 from robocas_ms3.demos.recordings.entries import one_seed
+from robocas_ms3.robots.cameras import STANDARD_NAMES
 
 FILE = schema.CONVERSION_FILE
+STANDARD = Pictures(STANDARD_NAMES)
 _UNKNOWN = {**dict.fromkeys(schema.SCENE), "schema_version": schema.SCHEMA_VERSION, "rate_hz": 1.0, "source": {}}
 
 
@@ -45,18 +47,19 @@ def _usable(content: Mapping[str, Any], wrong: list[Violation]) -> dict[str, Any
 def read_settings(root: Path) -> tuple[dict[str, Any], Pictures, list[Violation]]:
     """Read ``conversion.json``: its usable content, the images that it promises, and what is wrong with it.
 
-    If it does not say which images there are, all are promised. Nothing of another schema version is used.
+    If it does not say which images there are, those of the standard cameras are promised. Nothing of another schema
+    version is used.
     """
     absent = "this file (robocas import-robocas writes one)"
     content, wrong = read_object(root, FILE, expected="settings of a dataset", absent=absent)
     if wrong:
-        return {}, Pictures(), wrong
+        return {}, STANDARD, wrong
     version = content.get("schema_version", 1)
     if version != schema.SCHEMA_VERSION:
         expected = f"{schema.SCHEMA_VERSION} (convert it again from its recording)"
-        return {}, Pictures(), [Violation(FILE, "schema_version", expected, str(version))]
+        return {}, STANDARD, [Violation(FILE, "schema_version", expected, str(version))]
     wrong = check_form(ConversionRecord, content, FILE)
-    usable, pictures = _usable(content, wrong), Pictures()
+    usable, pictures = _usable(content, wrong), STANDARD
     if usable.keys() >= {"cameras", "image_size", "depth", "image_format"}:
         size = tuple(content["image_size"]) if content["image_size"] else None
         try:

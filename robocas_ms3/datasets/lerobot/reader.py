@@ -47,6 +47,7 @@ from robocas_ms3.datasets.sources.protocol import EpisodeSource, Kind, Side, Sou
 from robocas_ms3.datasets.sources.reader import check_rate
 from robocas_ms3.datasets.sources.tolerant import first_line
 from robocas_ms3.demos.recordings.subgoals import SubGoal, subgoal_runs
+from robocas_ms3.robots.cameras import Parent, standard_parent
 
 
 class LeRobotDataset(Metadata, EpisodeSource):
@@ -286,6 +287,10 @@ class LeRobotEpisode(SourceEpisode):
     def camera_in_parent(self, camera: str) -> NDArray[np.float64]:
         """(4, 4) OpenCV camera frame in its parent."""
         return np.array(self._camera(camera).camera_in_parent)
+
+    def camera_parent(self, camera: str) -> Parent:
+        """Return the frame that the pose of a camera is in."""
+        return self._camera(camera).parent or standard_parent(camera)
 
     def video(self, camera: str, kind: Kind) -> tuple[Path, int]:
         """Return the file of a camera's video and the number of its first frame there."""

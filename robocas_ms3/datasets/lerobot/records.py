@@ -16,6 +16,7 @@ from robocas_ms3.datasets.lerobot.tables import INTEGER, INTEGERS, NUMBER, NUMBE
 from robocas_ms3.datasets.lerobot.variants import CHUNK_FILES, LAYOUTS
 from robocas_ms3.datasets.sources.records import EntryRecord
 from robocas_ms3.datasets.sources.tolerant import first_line
+from robocas_ms3.robots.cameras import Parent
 
 MAX_EPISODES = 10**6
 MAX_FRAMES = 10**9
@@ -157,6 +158,7 @@ class CameraRecord(_Record):
     camera_in_parent: Annotated[
         list[Annotated[list[Number], Field(min_length=4, max_length=4)]], Field(min_length=4, max_length=4)
     ]
+    parent: Parent | None = Field(default=None, description="None: that of the standard camera of this name")
 
 
 class CamerasRecord(_Record):

@@ -26,9 +26,10 @@ from robocas_ms3.datasets.lerobot.variants import Variant
 from robocas_ms3.datasets.lerobot.video import CODINGS, Coding, Encoder
 from robocas_ms3.datasets.pictures.boxes import Box
 from robocas_ms3.datasets.schema import episode_folder
-from robocas_ms3.datasets.sources.protocol import Frame, Kind
+from robocas_ms3.datasets.sources.protocol import CameraModel, Frame, Kind
 from robocas_ms3.datasets.writing.inputs import ConversionInput, complete_arrays
 from robocas_ms3.datasets.writing.settings import Timing, WrittenEpisode
+from robocas_ms3.robots.cameras import standard_parent
 
 FRAMES_FILE, EPISODE_FILE = "frames.parquet", "episode.json"
 SUBGOAL = "subgoal"  # column of texts, which become numbers when parts are joined
@@ -107,13 +108,7 @@ class PartWriter:
                 "steps": steps,
                 "instruction": str(arrays["language_goal"]),
                 "scene": scene,
-                "cameras": {
-                    name: {
-                        "intrinsic": np.asarray(episode.intrinsic(name)).tolist(),
-                        "camera_in_parent": np.asarray(episode.camera_in_parent(name)).tolist(),
-                    }
-                    for name in given.pictures.cameras
-                },
+                "cameras": {name: _camera(name, episode.camera(name)) for name in given.pictures.cameras},
                 "depth": given.pictures.depth,
                 "depth_clipped": videos.clipped,
                 "levels": {key: levels.counts.tolist() for key, levels in videos.levels.items()},
@@ -141,6 +136,12 @@ class PartWriter:
             events = [event_rows(found, target) if target.strip() else [] for found in boxes]
             columns[EVENTS] = pa.array(events, EVENTS_TYPE)
         return pa.table(columns)
+
+
+def _camera(name: str, model: CameraModel) -> dict[str, Any]:
+    """Return a camera as `records.CameraRecord`."""
+    pose = {"intrinsic": model.intrinsic.tolist(), "camera_in_parent": np.asarray(model.camera_in_parent).tolist()}
+    return pose if model.parent == standard_parent(name) else {**pose, "parent": model.parent}
 
 
 class _Videos:

@@ -117,10 +117,11 @@ def _write(folder: Path, episode: Episode, read: ImportedEpisode, surveyed: Surv
     pictures, stored = read.pictures, read.stored
     cameras: dict[str, CameraModel] = {}
     for camera in pictures.cameras:
-        pose = np.asarray(episode.camera_in_parent(camera), dtype=np.float64)
-        if camera == "gripper_camera" and read.turn_deg:
+        model = episode.camera(camera)
+        pose = np.asarray(model.camera_in_parent, dtype=np.float64)
+        if model.parent == "ee" and read.turn_deg:
             pose = about_z(-read.turn_deg) @ pose
-        cameras[camera] = CameraModel(np.asarray(episode.intrinsic(camera), dtype=np.float64), pose)
+        cameras[camera] = CameraModel(np.asarray(model.intrinsic, dtype=np.float64), pose, model.parent)
         for kind in pictures.kinds:
             (folder / camera / kind).mkdir(parents=True)
             for step in range(stored.steps):

@@ -29,6 +29,7 @@ from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.files import said_of
 from robocas_ms3.datasets.sources.reader import Dataset, Episode
 from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, arrays_fingerprint, completed, load_arrays
+from robocas_ms3.robots.cameras import EE_CAMERA
 
 _FULL_SIZE = (640, 480)
 _SHOWN_IMAGES = 3  # findings per folder of images
@@ -204,8 +205,8 @@ def read_episode(
     if read.usable:
         cameras = [Finding(number, f"{name}/{file}", text, "left out") for file, text in _check_cameras(episode)]
         read = read.extended(cameras)
-    if read.usable and turn_eef and "gripper_camera" in episode.cameras:
-        turn = eef_turn(episode.camera_in_parent("gripper_camera"))
+    if read.usable and turn_eef and EE_CAMERA in episode.cameras:
+        turn = eef_turn(episode.camera_in_parent(EE_CAMERA))
         if turn:
             text = f"EEF frame turned by {turn} degrees about z, to be ManiSkill's TCP"
             found = finding(read.stored, "ee_orn, rel_pos, rel_orn", "mended", text)
@@ -287,9 +288,10 @@ def _missing_files(dataset: Dataset, taken: Sequence[int], rate_hz: float) -> It
         files: list[tuple[str, str, Outcome]] = [
             (schema.SCENE_FILE, "no file: seed, target, layout and configuration are not known", "noted")
         ]
-        for camera in (camera for camera in schema.CAMERAS if camera.name in episode.cameras):
-            for name, other in zip(camera.pose_files, camera.pose_files[::-1], strict=True):
-                files.append((f"{camera.name}/{name}", f"no file: a copy of {other}", "mended"))
+        for camera in episode.cameras:
+            names = schema.pose_files(episode.camera_parent(camera))
+            for name, other in zip(names, names[::-1], strict=True):
+                files.append((f"{camera}/{name}", f"no file: a copy of {other}", "mended"))
         for key in files:
             if not (episode.folder / key[0]).is_file():
                 lacking.setdefault(key, []).append(number)

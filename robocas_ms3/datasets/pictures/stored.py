@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import time
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -14,6 +16,7 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.headers import LARGEST, read_picture_bytes
 from robocas_ms3.datasets.pictures.png import encode_png
+from robocas_ms3.robots.cameras import CAMERA_NAME, STANDARD_NAMES
 
 _QUALITY = {
     "jpg": [cv2.IMWRITE_JPEG_QUALITY, 95],
@@ -26,14 +29,14 @@ class Pictures:
     """What is rendered and stored.
 
     Attributes:
-        cameras: names, in the order of ``schema.CAMERAS``.
+        cameras: names; empty: all that there are. The standard cameras come first, in their order.
         size: width and height in pixels; None: the cameras' own, 640 x 480.
         depth: whether depth is stored beside RGB.
         image_format: of RGB.
         boxes: whether the box of the target is determined in each image.
     """
 
-    cameras: tuple[str, ...] = tuple(camera.name for camera in schema.CAMERAS)
+    cameras: tuple[str, ...] = ()
     size: tuple[int, int] | None = None
     depth: bool = True
     image_format: schema.ImageFormat = "png"
@@ -43,12 +46,11 @@ class Pictures:
         """Put cameras in order, and check them.
 
         Raises:
-            DatasetError: no camera, or one that there is not; no such format; a size below 16 pixels.
+            DatasetError: a name that no camera can have; no such format; a size below 16 pixels.
         """
-        known = [camera.name for camera in schema.CAMERAS]
-        wrong = sorted(set(self.cameras) - set(known))
-        if wrong or not self.cameras:
-            raise DatasetError("no such camera", where="cameras", expected=f"some of {', '.join(known)}", found=wrong)
+        wrong = [name for name in self.cameras if not re.fullmatch(CAMERA_NAME, name)]
+        if wrong:
+            raise DatasetError("no such camera", where="cameras", expected="names like side_camera", found=wrong)
         if self.image_format not in schema.IMAGE_FORMATS:
             raise DatasetError(
                 "no such picture format",
@@ -67,12 +69,23 @@ class Pictures:
             raise DatasetError(
                 "pictures this small show nothing", where="size", expected=">= 16 x 16", found=list(self.size)
             )
-        object.__setattr__(self, "cameras", tuple(name for name in known if name in self.cameras))
+        names = [*STANDARD_NAMES, *self.cameras]
+        object.__setattr__(self, "cameras", tuple(name for name in dict.fromkeys(names) if name in self.cameras))
 
-    @property
-    def specs(self) -> list[schema.CameraSpec]:
-        """What the schema says of these cameras."""
-        return [camera for camera in schema.CAMERAS if camera.name in self.cameras]
+    def choose(self, cameras: Sequence[str], where: object) -> Pictures:
+        """Return the same of those cameras that there are, in their order.
+
+        Args:
+            cameras: names of those that there are.
+            where: they are, for messages.
+
+        Raises:
+            DatasetError: a camera is not there.
+        """
+        wrong = sorted(set(self.cameras) - set(cameras))
+        if wrong:
+            raise DatasetError("no such camera", where=where, expected=f"some of {', '.join(cameras)}", found=wrong)
+        return replace(self, cameras=tuple(name for name in cameras if name in (self.cameras or cameras)))
 
     @property
     def kinds(self) -> tuple[str, ...]:

@@ -23,6 +23,7 @@ from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.demos.recordings.entries import one_seed
 from robocas_ms3.demos.recordings.subgoals import SubGoal, subgoal_runs
+from robocas_ms3.robots.cameras import Parent, standard_parent
 
 Side = Literal["train", "val", "all"]
 """Of the split into training and validation."""
@@ -37,10 +38,12 @@ class CameraModel:
     Attributes:
         intrinsic: (4,) fx, fy, cx, cy, pixels.
         camera_in_parent: (4, 4) OpenCV camera frame.
+        parent: the frame of that pose.
     """
 
     intrinsic: NDArray[np.float64]
     camera_in_parent: NDArray[np.float64]
+    parent: Parent
 
 
 @dataclass(frozen=True)
@@ -158,12 +161,16 @@ class SourceEpisode(Protocol):
         raise _no_images(self)
 
     def camera_in_parent(self, camera: str) -> NDArray[np.float64]:
-        """(4, 4) OpenCV camera frame in its parent, see ``schema.CAMERAS``."""
+        """(4, 4) OpenCV camera frame in its parent."""
         raise _no_images(self)
+
+    def camera_parent(self, camera: str) -> Parent:
+        """Return the frame that the pose of a camera is in; here by the names of the standard cameras."""
+        return standard_parent(camera)
 
     def camera(self, name: str) -> CameraModel:
         """Return the model of a camera."""
-        return CameraModel(self.intrinsic(name), self.camera_in_parent(name))
+        return CameraModel(self.intrinsic(name), self.camera_in_parent(name), self.camera_parent(name))
 
 
 def _no_images(episode: SourceEpisode) -> DatasetError:

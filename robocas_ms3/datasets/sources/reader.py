@@ -7,6 +7,7 @@ what is there (`tolerant`), either name of a camera's pose will do.
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -23,6 +24,7 @@ from robocas_ms3.datasets.sources.files import SEE_VALIDATE, no_dataset, read_ar
 from robocas_ms3.datasets.sources.protocol import EpisodeSource, Side, SourceEpisode
 from robocas_ms3.datasets.sources.tolerant import completed, is_declared, load_arrays, read_arrays
 from robocas_ms3.demos.recordings.subgoals import SubGoal, read_subgoals
+from robocas_ms3.robots.cameras import CAMERA_NAME, Parent
 
 DEFAULT_RATE = 5.0  # upstream's, Hz
 _SPLIT = "robocas split --in-place --val-share 0.1 makes a new one."
@@ -111,7 +113,7 @@ class Episode(SourceEpisode):
     @cached_property
     def cameras(self) -> tuple[str, ...]:
         """Names of the cameras that are there."""
-        return tuple(camera.name for camera in schema.CAMERAS if (self.folder / camera.name).is_dir())
+        return schema.camera_names(self.folder)
 
     @cached_property
     def has_depth(self) -> bool:
@@ -149,16 +151,20 @@ class Episode(SourceEpisode):
         return np.array([array[0, 0], array[1, 1], array[0, 2], array[1, 2]]) if array.shape == (3, 3) else array
 
     def camera_in_parent(self, camera: str) -> NDArray[np.float64]:
-        """(4, 4) OpenCV camera frame in its parent (see ``schema.CAMERAS``), under either name.
+        """(4, 4) OpenCV camera frame in its parent, under either name.
 
         Raises:
             DatasetError: there is neither file, or it is damaged.
         """
-        spec = next(spec for spec in schema.CAMERAS if spec.name == camera)
-        for name in spec.pose_files:
+        names = schema.pose_files(self.camera_parent(camera))
+        for name in names:
             if (self.folder / camera / name).is_file():
                 return read_array(self.folder / camera / name)
-        raise DatasetError("no pose of this camera", where=self.folder / camera, expected=" or ".join(spec.pose_files))
+        raise DatasetError("no pose of this camera", where=self.folder / camera, expected=" or ".join(names))
+
+    def camera_parent(self, camera: str) -> Parent:
+        """Return the frame that the pose of a camera is in."""
+        return schema.camera_parent(self.folder / camera)
 
 
 class Dataset(EpisodeSource):
@@ -238,7 +244,7 @@ class Dataset(EpisodeSource):
             DatasetError: it says something else.
         """
         said = self.settings.get("cameras", self._first.cameras)
-        if isinstance(said, list | tuple) and all(isinstance(name, str) for name in said):
+        if isinstance(said, list | tuple) and all(re.fullmatch(CAMERA_NAME, str(name)) for name in said):
             return tuple(said)
         raise self._damaged_settings(f"cameras {said!r}")
 

@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, NonNegativeInt, 
 from robocas_ms3.datasets import schema
 from robocas_ms3.demos.recordings.entries import one_seed
 from robocas_ms3.demos.recordings.subgoals import SubGoalRecord
+from robocas_ms3.robots.cameras import CAMERA_NAME
 
 
 def _seed(value: Any) -> Any:
@@ -18,6 +19,7 @@ def _seed(value: Any) -> Any:
 
 
 Rate = Annotated[FiniteFloat, Field(gt=0)]
+CameraName = Annotated[str, StringConstraints(pattern=f"^{CAMERA_NAME}$")]
 EpisodeNumber = Annotated[str, StringConstraints(pattern=r"^[0-9]{1,7}$")]
 """A key of JSON."""
 Pose = Annotated[list[FiniteFloat], Field(min_length=7, max_length=7)]
@@ -108,7 +110,7 @@ class EpisodesRecord(_Part):
 class SettingsRecord(RateRecord):
     """The settings of ``conversion.json``, which all episodes of a dataset share."""
 
-    cameras: list[str]
+    cameras: Annotated[list[CameraName], Field(min_length=1)]
     image_size: Annotated[list[int], Field(min_length=2, max_length=2)] | None
     image_format: str
     depth: bool

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.actions import ACTION_ARRAYS, episode_actions
 from robocas_ms3.datasets.sources.protocol import EpisodeSource
 from robocas_ms3.datasets.sources.tolerant import first_line
@@ -22,7 +21,7 @@ def check_holds(source: EpisodeSource, cameras: Sequence[str], *, depth: bool, e
     Raises:
         DatasetError: it does not.
     """
-    pictures = [camera.name for camera in schema.CAMERAS if camera.name in source.cameras]
+    pictures = source.cameras
     wrong = [camera for camera in cameras if camera not in pictures]
     if wrong and not pictures:
         raise DatasetError(

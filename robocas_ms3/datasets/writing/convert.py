@@ -65,11 +65,12 @@ def convert(
     start, out = time.perf_counter(), settings.out
     with ExitStack() as stack:
         source = stack.enter_context(closing(open_trajectory(settings)))
-        stored = dataset_settings(source.rate_hz, settings.pictures, settings.embeddings)
+        pictures = source.pictures
+        stored = dataset_settings(source.rate_hz, pictures, settings.embeddings)
         recorded_settings = {**stored, "made_with": versions()}
         output = stack.enter_context(OutputFolder(out, DATASET, recorded_settings, overwrite=settings.overwrite))
         # Everything that may fail comes before the output is touched.
-        entries = ConversionInput(source, settings.pictures, settings.include_failed).entries()
+        entries = ConversionInput(source, pictures, settings.include_failed).entries()
         plan = plan_episodes(output, entries, stored, append=settings.append)
         if settings.needs_device:
             from robocas_ms3.datasets.writing.render import require_renderer
@@ -80,7 +81,7 @@ def convert(
         sweep(out / schema.PREVIEW_FOLDER)
         before = _split_before(out)
         for folder in (out / schema.episode_folder(number) for number, _ in plan.tasks):
-            if folder.is_dir() and (path := find_damaged(folder, settings.pictures)):
+            if folder.is_dir() and (path := find_damaged(folder, pictures)):
                 _log.warning("%s: cut off, or gone, since it was written; its episode is written again", path)
                 shutil.rmtree(folder)
         missing = [task for task in plan.tasks if not (out / schema.episode_folder(task[0])).is_dir()]

@@ -108,13 +108,11 @@ class TextVectors:
 
 def write_cameras(folder: Path, cameras: Mapping[str, CameraModel]) -> None:
     """Write intrinsics and poses into an episode's folder."""
-    for camera in schema.CAMERAS:
-        if camera.name in cameras:
-            model = cameras[camera.name]
-            (folder / camera.name).mkdir(exist_ok=True)
-            np.save(folder / camera.name / schema.INTRINSIC_FILE, model.intrinsic)
-            for name in camera.pose_files:
-                np.save(folder / camera.name / name, model.camera_in_parent)
+    for camera, model in cameras.items():
+        (folder / camera).mkdir(exist_ok=True)
+        np.save(folder / camera / schema.INTRINSIC_FILE, model.intrinsic)
+        for name in schema.pose_files(model.parent):
+            np.save(folder / camera / name, model.camera_in_parent)
 
 
 class _Encoders:
@@ -169,8 +167,9 @@ def find_damaged(folder: Path, pictures: Pictures) -> Path | None:
     if steps is None or steps.ndim:
         return folder / schema.EPISODE_FILE
     small = [folder / schema.SCENE_FILE]
-    for camera in pictures.specs:
-        small += [folder / camera.name / name for name in (schema.INTRINSIC_FILE, *camera.pose_files)]
+    for camera in pictures.cameras:
+        files = (schema.INTRINSIC_FILE, *schema.pose_files(schema.camera_parent(folder / camera)))
+        small += [folder / camera / name for name in files]
     images = (
         schema.image_path(folder, camera, kind, step, pictures.image_format)
         for camera in pictures.cameras

@@ -123,7 +123,8 @@ def open_input(settings: ConversionSettings) -> ConversionInput:
         DatasetError: it is neither a trajectory file nor a dataset, can't be read, or the settings don't suit it.
     """
     if settings.is_trajectory:
-        return ConversionInput(open_trajectory(settings), settings.pictures, settings.include_failed)
+        rendered = open_trajectory(settings)
+        return ConversionInput(rendered, rendered.pictures, settings.include_failed)
     return _open_dataset(open_source(settings.source), settings)
 
 
@@ -149,20 +150,19 @@ def _open_dataset(source: EpisodeSource, settings: ConversionSettings) -> Conver
         fix = "Convert the trajectory at this rate."
         raise DatasetError("a dataset keeps its rate", where=where, expected=expected, found=found, fix=fix)
     first = source.episode(source.numbers[0])
-    cameras = tuple(camera for camera in wanted.cameras if camera in first.cameras)
-    if not cameras:
-        raise DatasetError("none of these cameras", where=where, expected=first.cameras, found=wanted.cameras)
-    sizes = {camera: _size(first.rgb(camera, 0)) for camera in cameras}
-    width, height = size = sizes[cameras[0]]
+    pictures = wanted.choose(first.cameras, where)
+    sizes = {camera: _size(first.rgb(camera, 0)) for camera in pictures.cameras}
+    different = sorted(set(sizes.values()))
+    size = different[0] if len(different) == 1 else None
     if wanted.size not in (None, size):
         raise DatasetError(
             "a dataset keeps the size of its images",
             where=where,
-            expected=f"{width} x {height}",
+            expected=", ".join(f"{width} x {height}" for width, height in different),
             found=list(wanted.size or ()),
             fix="Convert the trajectory with this size.",
         )
-    pictures = replace(wanted, cameras=cameras, size=size, depth=wanted.depth and source.has_depth)
+    pictures = replace(pictures, size=size, depth=wanted.depth and source.has_depth)
     return ConversionInput(source, pictures, settings.include_failed, sizes)
 
 

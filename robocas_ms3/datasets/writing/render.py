@@ -43,7 +43,7 @@ class EnvRenderer:
             DatasetError: there is no render device, or no such environment.
         """
         sensors = dict(env.kwargs.get("sensor_configs") or {})
-        self._pictures = pictures or Pictures()
+        self._pictures = (pictures or Pictures()).choose([camera.name for camera in env.cameras()], env.env_id)
         if self._pictures.size is not None:
             sensors["width"], sensors["height"] = self._pictures.size
         require_renderer()
@@ -132,7 +132,9 @@ class EnvRenderer:
         agent = self._base.agent
         parents = {"ee": agent.tcp.pose, "arm_base": agent.arm_base_link.pose}
         models = {}
-        for spec in self._pictures.specs:
+        for spec in self._base.cameras:
+            if spec.name not in self._pictures.cameras:
+                continue
             camera = self._base.scene.sensors[spec.name].camera
             world_in_camera = np.vstack([camera.get_extrinsic_matrix()[0].cpu().numpy(), [0, 0, 0, 1]])
             parent_in_world = _matrix(parents[spec.parent]) if spec.parent in parents else np.eye(4)
@@ -140,6 +142,7 @@ class EnvRenderer:
             models[spec.name] = CameraModel(
                 intrinsic=np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2]]),
                 camera_in_parent=inverse(parent_in_world) @ inverse(world_in_camera.astype(np.float64)),
+                parent=spec.parent,
             )
         return models
 

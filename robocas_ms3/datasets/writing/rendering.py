@@ -19,6 +19,7 @@ from robocas_ms3.datasets.sources.trajectory import RecordedEpisode, TrajectoryS
 from robocas_ms3.demos.recordings.environment import RecordedEnv
 from robocas_ms3.demos.recordings.motion import sample_states
 from robocas_ms3.demos.recordings.reading import Recording, TrajectoryFile
+from robocas_ms3.robots.cameras import Parent
 
 
 class Renderer(Protocol):
@@ -68,8 +69,11 @@ class RenderedSource(TrajectorySource):
         pack: name or folder of the object pack, instead of the one that the file names.
         open_renderer: opens the renderer.
 
+    Attributes:
+        pictures: the same, with the names of its cameras.
+
     Raises:
-        DatasetError: the file can't be read, or the rate does not divide its control frequency.
+        DatasetError: the file can't be read, a camera is not there, or the rate does not divide its control frequency.
     """
 
     def __init__(
@@ -82,8 +86,9 @@ class RenderedSource(TrajectorySource):
         open_renderer: OpenRenderer = open_env,
     ) -> None:
         super().__init__(path, rate_hz=rate_hz, include_failed=True, pack=pack)
-        self.cameras, self.has_depth = pictures.cameras, pictures.depth
-        self._pack, self._pictures, self._open_renderer = pack, pictures, open_renderer
+        self.pictures = pictures.choose([camera.name for camera in self.file.env.cameras()], path)
+        self.cameras, self.has_depth = self.pictures.cameras, pictures.depth
+        self._pack, self._open_renderer = pack, open_renderer
         self._renderer: Renderer | None = None
         self._control_mode = ""
 
@@ -129,7 +134,7 @@ class RenderedSource(TrajectorySource):
             raise DatasetError("too many steps", where=where, expected=f"<= {schema.MAX_STEPS}", found=len(samples))
         if self._renderer is None or recording.control_mode != self._control_mode:
             self.close()
-            self._renderer = self._open_renderer(self.file.env, recording.control_mode, self._pictures)
+            self._renderer = self._open_renderer(self.file.env, recording.control_mode, self.pictures)
             self._control_mode = recording.control_mode
         self._renderer.load(recording)
         return RenderedEpisode(self, number, recording, self._renderer)
@@ -176,3 +181,7 @@ class RenderedEpisode(RecordedEpisode):
     def camera_in_parent(self, camera: str) -> NDArray[np.float64]:
         """(4, 4) OpenCV camera frame in its parent."""
         return self._models[camera].camera_in_parent
+
+    def camera_parent(self, camera: str) -> Parent:
+        """Return the frame that the pose of a camera is in."""
+        return self._models[camera].parent

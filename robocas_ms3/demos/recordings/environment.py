@@ -16,10 +16,12 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, PositiveInt, ValidationError
 
 from robocas_ms3.assets.pack import pack_folders
-from robocas_ms3.core.errors import DatasetError, ExtensionError
+from robocas_ms3.core.errors import DatasetError, ExtensionError, RobocasError
 from robocas_ms3.core.strict import StrictModel, mistakes
+from robocas_ms3.robots.cameras import STANDARD_CAMERAS, CameraSpec
 from robocas_ms3.robots.table import RobotSpec, find_robot
-from robocas_ms3.scenes.config.load import shipped_configs
+from robocas_ms3.scenes.config.load import load_config_of, shipped_configs
+from robocas_ms3.scenes.task_specs import TASKS
 
 _PREFIX = "robocas_ms3:"  # lets gymnasium import this package by itself: ManiSkill's own tools then work
 _DEEP = 3  # dicts in dicts that settings of simulation and cameras may have
@@ -100,6 +102,18 @@ class RecordedEnv:
             fix = error.fix or "Install the package that has it."
             raise DatasetError(error.what, where=where, expected=error.expected, found=error.found, fix=fix) from error
 
+    def cameras(self) -> tuple[CameraSpec, ...]:
+        """Return the cameras of its task and robot; the standard ones of what can't be made."""
+        config = self.kwargs.get("config")
+        try:
+            if isinstance(config, str) and config not in shipped_configs():
+                return STANDARD_CAMERAS
+            spec = next((spec for spec in TASKS.values() if spec.env_id == self.env_id), None)
+            robot = self.robot().description
+            return load_config_of(spec, config).cameras_of(robot) if spec else robot.cameras
+        except RobocasError:
+            return STANDARD_CAMERAS
+
     def make(self, **kwargs: Any) -> Any:
         """Make it.
 
@@ -107,8 +121,6 @@ class RecordedEnv:
             kwargs: further ones of ``gym.make``, which win over its own.
         """
         import gymnasium as gym
-
-        from robocas_ms3.tasks import TASKS
 
         known = sorted(spec.env_id for spec in TASKS.values())
         if self.env_id not in known:

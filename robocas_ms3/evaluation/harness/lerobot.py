@@ -13,8 +13,9 @@ from lerobot.envs import EnvConfig  # pyright: ignore[reportMissingImports]
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.harness.proprioception import KEYS, WIDTHS, depth_key
-from robocas_ms3.evaluation.policy import CAMERAS, PolicySpec, Reference
+from robocas_ms3.evaluation.policy import PolicySpec, Reference
 from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.robots.cameras import STANDARD_NAMES
 
 
 @EnvConfig.register_subclass("robocas")
@@ -40,7 +41,7 @@ class RoboCASEnvConfig(EnvConfig):
     fps: int = 5
     protocol: str = "ms3-v1"
     split: str = ""
-    cameras: str = ",".join(CAMERAS)
+    cameras: str = ",".join(STANDARD_NAMES)
     observation_width: int = 640
     observation_height: int = 480
     depth: bool = False

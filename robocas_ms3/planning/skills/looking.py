@@ -10,10 +10,10 @@ from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.core.poses import from_wxyz, inverse
 from robocas_ms3.planning.protocol import Array, Trajectory
 from robocas_ms3.planning.skills.arm import Arm
+from robocas_ms3.robots.cameras import CameraSpec
 from robocas_ms3.scenes.randomise import draw_camera_shift
 from robocas_ms3.scenes.visibility import PinholeCamera, Scenery, object_mesh, ray_scene
 
-CAMERA = "gripper_camera"
 FAR, NEAR = (0.4, 0.5), (0.2, 0.3)  # m from the camera to what it looks at: at first; between two removals (upstream's)
 ELEVATION_DEG = (60.0, 90.0)  # of the camera above what it looks at (upstream's)
 VIEWS_SAMPLED, VIEWS_PLANNED = 96, 6
@@ -89,13 +89,15 @@ def _shift(arm: Arm) -> Array:
     by = arm.env.task_config.randomisation.cameras
     if by is None:
         return np.eye(4)
-    # numbered as in the environment's `_setup_sensors`
-    number = sorted(config.uid for config in arm.env.agent._sensor_configs).index(CAMERA)
-    return draw_camera_shift(by, number, arm.env.scene_seeds[0])
+    return draw_camera_shift(by, arm.env.agent.cameras.index(_hand_camera(arm)), arm.env.scene_seeds[0])
+
+
+def _hand_camera(arm: Arm) -> CameraSpec:
+    return next(camera for camera in arm.env.agent.cameras if camera.mount == "hand")
 
 
 def _camera_config(arm: Arm) -> CameraConfig:
-    return next(config for config in arm.env.agent._sensor_configs if config.uid == CAMERA)
+    return arm.env.agent.camera_config(_hand_camera(arm))
 
 
 def sample_views(

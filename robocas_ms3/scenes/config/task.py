@@ -9,6 +9,9 @@ from pydantic import AfterValidator, Field, StrictInt, model_validator
 from robocas_ms3.core.errors import ConfigError, ExtensionError
 from robocas_ms3.core.extensions import load
 from robocas_ms3.core.strict import StrictModel
+from robocas_ms3.robots.cameras import CameraSpec
+from robocas_ms3.robots.description import RobotDescription
+from robocas_ms3.scenes.config.cameras import CameraConfig, CamerasConfig, changed_cameras
 from robocas_ms3.scenes.config.randomisation import RandomisationConfig
 from robocas_ms3.scenes.relations import RELATIONS, Relation
 from robocas_ms3.scenes.task_specs import TASKS
@@ -238,6 +241,11 @@ class TaskConfig(StrictModel):
         default="upstream",
         description="upstream: at (1, 1.5, 1.5), which looks at a table; overview: from aside, wherever the task is",
     )
+    cameras: CamerasConfig = Field(
+        default={},
+        exclude_if=lambda cameras: not cameras,  # files of configurations without stay as they are
+        description="changes of the robot's cameras, and further cameras",
+    )
     base_motion: bool = Field(default=False, description="scripted policies may drive the base; actions then hold it")
     randomisation: RandomisationConfig = RandomisationConfig()
 
@@ -269,6 +277,15 @@ class TaskConfig(StrictModel):
                 f"randomisation.count {list(count)} must rise and end at objects.count {self.objects.count}"
             )
         return self
+
+    def cameras_of(self, robot: RobotDescription) -> tuple[CameraSpec, ...]:
+        """Return the cameras of a robot in this task.
+
+        Raises:
+            ConfigError: a camera that the robot does not have is not placed.
+        """
+        overview = [("static_camera", CameraConfig(overview=True))] if self.static_camera == "overview" else []
+        return changed_cameras(robot.cameras, [*overview, *self.cameras.items()])
 
     @property
     def leaves_slots_empty(self) -> bool:

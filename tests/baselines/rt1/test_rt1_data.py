@@ -150,7 +150,6 @@ def test_it_goes_on_to_the_bit(folder, tmp_path):
     [
         ({"crop_height": 300}, "crop_height 300 is more than the picture's 256 rows"),
         ({"cameras": ["base_camera", "base_camera"]}, "each once"),
-        ({"cameras": ["wrist"]}, "base_camera, gripper_camera, static_camera"),
         ({"cameras": []}, "each once"),
         ({"picture": [16, 256]}, "at least 32 pixels"),
         ({"image_std": [0.2, 0.0, 0.2]}, "above 0"),

@@ -8,6 +8,7 @@ import pytest
 from robocas_ms3.baselines.small.standing import seen_from, standing
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import from_parts
+from robocas_ms3.robots.cameras import standard_parent
 
 STEPS = 5
 BASE = [2.0, 1.0, 0.5]  # of the arm in the world, turned by 90 degrees about z
@@ -25,7 +26,8 @@ LOOKS = {camera: lambda points: points[..., :2].astype(np.float32) for camera in
 
 
 def episode(layout=LAYOUT, target="lemon"):
-    return SimpleNamespace(where="here", layout=layout, scene={"target": {"asset_id": target}})
+    scene = {"target": {"asset_id": target}}
+    return SimpleNamespace(where="here", layout=layout, scene=scene, camera_parent=standard_parent)
 
 
 def tcp(heights):
@@ -51,7 +53,7 @@ def test_what_may_have_been_moved_is_not_known_any_more():
 
 def test_a_camera_in_the_world():
     points = np.zeros((STEPS, 1, 3))
-    assert seen_from("static_camera", points, tcp([1] * STEPS), ARRAYS)[0, 0].tolist() == pytest.approx(BASE)
+    assert seen_from("world", points, tcp([1] * STEPS), ARRAYS)[0, 0].tolist() == pytest.approx(BASE)
 
 
 @pytest.mark.parametrize("layout", [{}, {"object_ids": ["apple"], "present": [True]}])

@@ -159,7 +159,7 @@ def test_scenes_that_are_no_objects():
         ("conversion.json", {"rate_hz": None}, "conversion.json, rate_hz: expected a number, found null"),
         ("conversion.json", {"image_size": [64]}, "conversion.json, image_size: expected 2 values, found 1"),
         ("conversion.json", {"cameras": "base_camera"}, "conversion.json, cameras: expected a list"),
-        ("conversion.json", {"cameras": []}, "conversion.json: expected settings of a dataset, found cameras: no such"),
+        ("conversion.json", {"cameras": []}, "conversion.json, cameras: expected 1 values, found 0"),
         ("conversion.json", {"depth": "yes"}, 'conversion.json, depth: expected true or false, found "yes"'),
         ("conversion.json", {"episodes": []}, "conversion.json, episodes: expected an object, found []"),
         ("conversion.json", {"episodes": {"0": {}, "1": 3}}, "conversion.json, episodes.1: expected an object"),

@@ -18,6 +18,7 @@ from robocas_ms3.datasets.pictures.stored import Pictures, read_picture
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.episode_folder import find_damaged
 from robocas_ms3.demos.recordings.stored import open_trajectory
+from robocas_ms3.robots.cameras import STANDARD_NAMES
 from robocas_ms3.viewer.source import open_source
 
 EPISODE = "episode_0000001"
@@ -61,7 +62,7 @@ def test_readers_of_other_files(dataset, tmp_path):
         with pytest.raises(DocumentError):
             FilePlacer(link=False).place(replace_file(tmp_path / "F.h5", kind), tmp_path / "copy")
         path = replace_file(dataset / EPISODE / PICTURES[0], kind)
-        assert find_damaged(dataset / EPISODE, Pictures()) == path
+        assert find_damaged(dataset / EPISODE, Pictures(STANDARD_NAMES)) == path
         path.unlink()
         shutil.copy(path.with_name("0001.png"), path)
 

@@ -58,7 +58,7 @@ def test_its_episode_is_written_again(whole, trajectory, tmp_path, caplog, name,
 
 @pytest.mark.parametrize("image_format", ["png", "jpg", "webp"])
 def test_pictures_of_each_format(trajectory, tmp_path, image_format):
-    pictures = Pictures(image_format=image_format, depth=False)
+    pictures = Pictures(("base_camera",), image_format=image_format, depth=False)
     run(trajectory, tmp_path / "out", pictures=pictures)
     folder = tmp_path / "out" / "episode_0000000"
     assert find_damaged(folder, pictures) is None

@@ -162,7 +162,10 @@ def test_depth_agrees_with_the_cameras(source, recording):
         parents = {"gripper_camera": motion.tcp_in_world[0], "base_camera": motion.arm_base_in_world[0]}
         steps.append(
             [
-                geometry.View(n, frame.depth[n], m.intrinsic, parents.get(n, np.eye(4)) @ m.camera_in_parent)
+                geometry.View(
+                    *(n, frame.depth[n], m.intrinsic, parents.get(n, np.eye(4)) @ m.camera_in_parent),
+                    on_hand=m.parent == "ee",
+                )
                 for n, m in source.cameras().items()
             ]
         )

@@ -5,10 +5,13 @@ import runpy
 import shlex
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from robocas_ms3.cli.main import run
+from robocas_ms3.core.errors import ConfigError
 from robocas_ms3.evaluation.freeze import read_plan
+from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.language.texts import synonym_texts
 
@@ -31,6 +34,24 @@ def test_the_files_load(tmp_path, monkeypatch):
     assert list(shelf.furniture) == ["shelf", "side_table"]
     assert (shelf.objects.count, shelf.target.approach) == (6, "front")
     assert load_task_config("mine.yaml", changes={"objects": {"count": 8}}).objects.count == 8
+
+
+def test_the_cameras_of_the_page(tmp_path):
+    (text,) = blocks("yaml", "Cameras")
+    (tmp_path / "five_cameras.yaml").write_text(text)
+    base, hand, static, side, wrist = load_task_config(tmp_path / "five_cameras.yaml").cameras_of(MOBILE_PANDA)
+    assert (base.name, base.width, base.height, base.position) == ("base_camera", 320, 240, (0, -0.3, 1.2))
+    assert (hand, static) == MOBILE_PANDA.cameras[1:]
+    assert (side.parent, side.fov, side.look_at) == ("world", pytest.approx(np.pi / 3), (1.2, 0.7, 0.6))
+    assert (wrist.name, wrist.parent, wrist.rpy) == ("wrist_camera", "ee", pytest.approx((np.pi, -np.pi / 2, 0)))
+
+
+@pytest.mark.parametrize(
+    "change", ["bse_camera.width=320", "base_camera.widht=320", "top.position=[0,0,2]", "base_camera.width=321"]
+)
+def test_wrong_cameras(change):
+    with pytest.raises(ConfigError):
+        load_task_config("pick_table_scattered", overrides=[f"cameras.{change}"]).cameras_of(MOBILE_PANDA)
 
 
 def test_the_commands_set_keys_that_there_are():

@@ -1,0 +1,74 @@
+"""The cameras of a robot. Agents, task configurations, datasets, policies and documentation read this list."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import pi
+from typing import Literal
+
+Vec3 = tuple[float, float, float]
+Mount = Literal["world", "base", "hand"]
+Parent = Literal["world", "arm_base", "ee"]
+PARENTS: Mapping[Mount, Parent] = {"world": "world", "base": "arm_base", "hand": "ee"}
+"""Mount of a camera -> frame in which datasets hold its pose, which is constant there."""
+PARENT_FRAMES: Mapping[Parent, str] = {
+    "arm_base": "arm base (panda_link0)",
+    "ee": "EEF: ManiSkill's TCP, z approach, y closing",
+    "world": "world",
+}
+CAMERA_NAME = "[a-z][a-z0-9_]{0,40}_camera"
+"""Regular expression of names, which become folders and keys of datasets."""
+
+
+@dataclass(frozen=True)
+class CameraSpec:
+    """A camera. Its frame is SAPIEN's: x forward, y left, z up.
+
+    Attributes:
+        name: matches `CAMERA_NAME`.
+        mount: what it is fixed to: the world, the base link or the hand link of the robot.
+        position: in the frame of the mount, m.
+        rpy: roll, pitch and yaw in that frame, rad.
+        look_at: point in that frame that it looks at, m; None: it looks along ``rpy``.
+        overview: whether the task places it, where it sees the whole scene.
+        fov: vertical field of view, rad.
+        width, height: pixels.
+        near, far: range of the depth, m.
+    """
+
+    name: str
+    mount: Mount = "world"
+    position: Vec3 = (0.0, 0.0, 0.0)
+    rpy: Vec3 = (0.0, 0.0, 0.0)
+    look_at: Vec3 | None = None
+    overview: bool = False
+    fov: float = pi / 2
+    width: int = 640
+    height: int = 480
+    near: float = 0.01
+    far: float = 10.0
+
+    @property
+    def parent(self) -> Parent:
+        """Frame in which datasets hold its pose."""
+        return PARENTS[self.mount]
+
+
+STANDARD_CAMERAS = (
+    CameraSpec("base_camera", "base", (0, -0.3, 1.2), (0, 0.43633, 0), near=0.005, far=5),
+    CameraSpec("gripper_camera", "hand", (0.05, 0, 0.05), (pi, -pi / 2, 0), near=0.001, far=5),
+    CameraSpec("static_camera", "world", (1, 1.5, 1.5), (0, pi / 3, -pi / 2), near=0.05),
+)
+"""Cameras of RoboCAS-v0. The static camera looks at a table in front of the robot."""
+STANDARD_NAMES = tuple(camera.name for camera in STANDARD_CAMERAS)
+EE_CAMERA = next(camera.name for camera in STANDARD_CAMERAS if camera.mount == "hand")
+"""Camera whose pose tells how the EEF frame of a dataset is turned."""
+
+
+def standard_parent(camera: str) -> Parent:
+    """Return the parent of a camera by the names of the standard cameras; others are fixed in the world."""
+    for spec in STANDARD_CAMERAS:
+        if spec.name == camera:
+            return spec.parent
+    return "world"
