@@ -27,16 +27,16 @@ def spawn(
     finishes: Mapping[str, str] | None = None,
     scene_idxs: Sequence[int] | None = None,
 ) -> Actor:
-    """Build an asset as one actor: a free body if it has a mass, else a static one.
+    """Build an asset without moving parts as one actor: a free body if it has a mass, else a static one.
 
     Args:
         scene: the ManiSkill scene.
-        asset: what to build; has no moving parts.
+        asset: the asset.
         name: unique name of the actor.
         pose: initial pose of the asset's frame in the world.
-        level: of detail of what is rendered.
+        level: of detail of the visual mesh.
         finishes: part -> finish, of rooms; parts not named get their default.
-        scene_idxs: sub-scenes to build it in; none: all.
+        scene_idxs: sub-scenes to build it in; default: all.
 
     Raises:
         AssetError: the physics engine refused a hull, or there is no such finish.

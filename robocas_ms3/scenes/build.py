@@ -1,4 +1,4 @@
-"""Put a configuration's room, furniture, basket and objects into a ManiSkill scene."""
+"""Build a configuration's room, furniture, basket, lights and objects into a ManiSkill scene."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _SHADOW_NEAR = -2.0  # m along the light from the origin; farther back, ceiling 
 
 @dataclass(frozen=True)
 class Fixtures:
-    """What stays the same in all scenes of a configuration."""
+    """Actors that stay the same in all scenes of a configuration."""
 
     room: Actor
     furniture: dict[str, Actor | Articulation]
@@ -33,14 +33,7 @@ class Fixtures:
 def build_fixtures(
     scene: ManiSkillScene, model: SceneModel, level: VisualLevel = "fast", seeds: Sequence[int] = (0,)
 ) -> Fixtures:
-    """Build room, furniture and basket into every sub-scene; joints of furniture are closed.
-
-    Args:
-        scene: the ManiSkill scene.
-        model: what to build.
-        level: of detail of what is rendered.
-        seeds: one a sub-scene, of the finishes of its room.
-    """
+    """Build room, furniture and basket into every sub-scene, whose seeds decide the finishes of its room."""
     furniture: dict[str, Actor | Articulation] = {}
     for name, asset in model.furniture.items():
         build_one = spawn_articulation if asset.links else spawn
@@ -63,14 +56,7 @@ def _build_room(scene: ManiSkillScene, model: SceneModel, level: VisualLevel, se
 
 
 def build_lights(scene: ManiSkillScene, config: TaskConfig, seeds: Sequence[int], *, shadow: bool) -> None:
-    """Light every sub-scene.
-
-    Args:
-        scene: the ManiSkill scene.
-        config: the configuration.
-        seeds: one a sub-scene.
-        shadow: let the slanted light cast shadows.
-    """
+    """Light every sub-scene by its seed; the slanted light may cast shadows."""
     for i, seed in enumerate(seeds):
         lights = draw_lights(config, seed)
         scene.sub_scenes[i].ambient_light = [lights.ambient] * 3
@@ -88,13 +74,7 @@ def build_lights(scene: ManiSkillScene, config: TaskConfig, seeds: Sequence[int]
 
 
 def shift_cameras(cameras: Sequence[RenderCamera], config: TaskConfig, seeds: Sequence[int]) -> None:
-    """Move the cameras of every sub-scene as the configuration's randomisation wants it.
-
-    Args:
-        cameras: in an order that is always the same.
-        config: the configuration.
-        seeds: one a sub-scene.
-    """
+    """Move the cameras of every sub-scene by its seed; the order of the cameras counts."""
     by = config.randomisation.cameras
     if by is None:
         return
@@ -106,11 +86,7 @@ def shift_cameras(cameras: Sequence[RenderCamera], config: TaskConfig, seeds: Se
 def build_object_slot(
     scene: ManiSkillScene, slot: int, assets: list[LoadedObject], level: VisualLevel = "fast"
 ) -> Actor:
-    """Build one slot of objects, env i's being ``assets[i]``, as one actor whose bodies are in the order of envs.
-
-    Each asset is built once for all envs that have it. Until the layout puts them in place they hang apart from each
-    other, high above the room.
-    """
+    """Build one slot of objects, env i's being ``assets[i]``, as one actor whose bodies are in the order of envs."""
     name, waiting = f"object_{slot}", sapien.Pose([slot * 0.5, 0, 20.0])
     envs_of: dict[str, list[int]] = {}
     for env, asset in enumerate(assets):
@@ -133,7 +109,7 @@ def build_object_slot(
 
 
 def build_parking(scene: ManiSkillScene, slots: int) -> Actor:
-    """Build the plane, far below the floor, on which slots wait that an episode does not use."""
+    """Build the plane, far below the floor, for slots that an episode does not use."""
     builder: Any = scene.create_actor_builder()
     half_size = [(slots + 1) / 2, 1.0, 0.1]
     center = sapien.Pose([(slots - 1) / 4, 0, PARKING_HEIGHT - half_size[2]])

@@ -1,8 +1,4 @@
-"""Which annotated grasps come from the right side and are clear: geometry only, no simulator.
-
-A grasp is a pose of the TCP: z approach, y closing direction. Turned by 180 deg about its approach it is the same grasp
-with another turn of the wrist, so both are candidates.
-"""
+"""Which annotated grasps, poses of the TCP, come from the robot's side and are clear: geometry only, no simulator."""
 
 from __future__ import annotations
 
@@ -27,14 +23,11 @@ FRONT_ELEVATION_DEG = (-60.0, 10.0)  # of a front approach above the horizontal
 FREE_LEAN_DEG = 15.0  # an approach this close to straight down has no horizontal direction to speak of
 PREGRASP_DISTANCE = 0.1  # m
 
-# m to either side that a free grasp leaves: planners take what stands around for larger than it is.
-SIDE_CLEARANCE = 0.005
+SIDE_CLEARANCE = 0.005  # m to either side that a free grasp leaves: planners inflate obstacles
 NEIGHBOURHOOD = 0.5  # m from an object's centre, beyond which the gripper at one of its grasps does not reach
-
-SPARSE = 16  # every so manieth point is tested against the gripper before all of them
+SPARSE = 16  # each 16th point is tested against the gripper before all of them
 TESTED_AT_ONCE = 1 << 16  # pairs of grasp and point
-
-HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # of the wrist, about the approach
+HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # of the wrist, about the approach: the same grasp
 
 
 def directions_ok(
@@ -42,13 +35,10 @@ def directions_ok(
 ) -> dict[str, NDArray[np.bool_]]:
     """Test the directions of grasps against gravity and the robot.
 
-    The robot reaches an object from its own side: the approach's horizontal part may deviate at most 45 deg from the
-    horizontal direction base -> object. From above, approaches within 15 deg of straight down pass, since they come
-    from no side. From the front, the approach points at most 60 deg down and at most 10 deg up.
-
     Args:
         tcp_in_world: (G, 4, 4).
-        base_to_object: (3,) or (2,) in the world; only the horizontal part counts.
+        base_to_object: (3,) or (2,) in the world; only the horizontal part counts. Approaches deviate from it by at
+            most `MAX_SIDEWAYS_DEG`, but those that are nearly vertical (`FREE_LEAN_DEG`).
         approach: from where the gripper may come.
 
     Returns:
@@ -72,7 +62,7 @@ def directions_ok(
 def gripper_is_clear(
     tcp_in_world: Array, points_in_world: Array, sweep: float = PREGRASP_DISTANCE, side_clearance: float = 0.0
 ) -> NDArray[np.bool_]:
-    """Say for each grasp (G, 4, 4) whether no point (P, 3) lies in the open gripper, from pre-grasp to grasp.
+    """Return for each grasp (G, 4, 4) whether no point (P, 3) is in the open gripper, from pre-grasp to grasp.
 
     Args:
         tcp_in_world: (G, 4, 4).
@@ -92,7 +82,7 @@ def gripper_is_clear(
     if len(points) == 0:
         return clear
     left = np.flatnonzero(np.all((first <= points.max(0)) & (last >= points.min(0)), axis=1))
-    for some in (points[::SPARSE], points):  # few points tell of most of the grasps that are not clear
+    for some in (points[::SPARSE], points):  # few points rule out most of the grasps that are not clear
         batch = max(1, TESTED_AT_ONCE // len(some))
         for start in range(0, len(left), batch):
             part = left[start : start + batch]
@@ -102,7 +92,7 @@ def gripper_is_clear(
 
 
 def _bounds_around(tcp_in_world: Array, low: Array, high: Array) -> tuple[Array, Array]:
-    """Low and high corners (G, 3) of what is between ``low`` and ``high`` (3,) and, mirrored at y = 0, at each TCP."""
+    """Return low and high corners (G, 3) of the box ``low`` to ``high`` and its mirror image (y = 0) at each TCP."""
     low = np.array([low[0], -high[1], low[2]])
     rotations = tcp_in_world[:, :3, :3]
     centers = rotations @ ((low + high) / 2) + tcp_in_world[:, :3, 3]
@@ -111,7 +101,7 @@ def _bounds_around(tcp_in_world: Array, low: Array, high: Array) -> tuple[Array,
 
 
 def _any_inside(tcp: Array, points: Array, low: Array, high: Array) -> NDArray[np.bool_]:
-    """Say for each TCP (G, 4, 4) whether a point (P, 3) is in one of the boxes (B, 3), or in their mirror image."""
+    """Return for each TCP (G, 4, 4) whether a point (P, 3) is in one of the boxes (B, 3), or in their mirror image."""
     x, y, z = seen_from(tcp, points)
     y = np.abs(y)
     inside = np.zeros(len(tcp), dtype=bool)
@@ -121,10 +111,8 @@ def _any_inside(tcp: Array, points: Array, low: Array, high: Array) -> NDArray[n
 
 
 def seen_from(tcp: Array, points: Array) -> Iterator[Array]:
-    """Coordinates x, y, z, (G, P) each, of points (P, 3) in the frames of TCPs (G, 4, 4).
-
-    No BLAS, whose threads may change the last bits.
-    """
+    """Yield coordinates x, y, z, (G, P) each, of points (P, 3) in the frames of TCPs (G, 4, 4)."""
+    # no BLAS, whose threads may change the last bits
     a, b, c = (points[:, i] - tcp[:, i, 3, None] for i in range(3))
     for axis in range(3):
         yield tcp[:, 0, axis, None] * a + tcp[:, 1, axis, None] * b + tcp[:, 2, axis, None] * c
@@ -139,7 +127,7 @@ def has_free_grasps(
     *,
     at_least: int,
 ) -> bool:
-    """Say whether enough of an object's grasps come from the robot's side and pass clear of everything else.
+    """Return whether enough of an object's grasps come from the robot's side and pass clear of everything else.
 
     Args:
         asset: the object.
@@ -168,7 +156,7 @@ def has_free_grasps(
 
 
 def _swept_bounds(tcp_in_world: Array) -> tuple[Array, Array]:
-    """Low and high corner (3,) of all that the open gripper passes on its way to grasps (G, 4, 4)."""
+    """Return low and high corner (3,) of the volume that the open gripper sweeps on its way to grasps (G, 4, 4)."""
     high = GRIPPER_BOXES[:, 1].max(axis=0) + (SIDE_CLEARANCE, SIDE_CLEARANCE, 0)
     low = np.array([-high[0], -high[1], GRIPPER_BOXES[:, 0, 2].min() - PREGRASP_DISTANCE])
     corners = np.array(list(itertools.product(*zip(low, high, strict=True))))

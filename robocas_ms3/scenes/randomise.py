@@ -1,8 +1,4 @@
-"""How a scene looks under a seed: finishes of the room, lights, cameras. Pure draws; nothing here builds anything.
-
-What stands where is drawn in ``sample.py``. Each draw has a stream of its own, so that turning one block on leaves the
-others, and the layouts, as they were.
-"""
+"""Draw the looks of a scene: finishes of the room, lights, cameras; each from a stream of its own."""
 
 from __future__ import annotations
 
@@ -29,7 +25,7 @@ class Lights:
 
 
 def draw_finishes(config: TaskConfig, room: LoadedFurniture, seed: int) -> dict[str, str]:
-    """Finish of each part of the room that has one other than its default."""
+    """Draw the finish of each part of the room that has one other than its default."""
     finishes = dict(config.room.finishes)
     rng = np.random.default_rng([seed, _ROOM])
     for part in sorted(config.randomisation.room or ()):
@@ -39,7 +35,7 @@ def draw_finishes(config: TaskConfig, room: LoadedFurniture, seed: int) -> dict[
 
 
 def draw_lights(config: TaskConfig, seed: int) -> Lights:
-    """Brightness and direction of the lights."""
+    """Draw brightness and direction of the lights."""
     lights, by = config.lights, config.randomisation.lights
     direction = np.array(lights.direction) / np.linalg.norm(lights.direction)
     if by is None:
@@ -51,13 +47,7 @@ def draw_lights(config: TaskConfig, seed: int) -> Lights:
 
 
 def draw_camera_shift(by: CameraRandomisation, camera: int, seed: int) -> Array:
-    """4x4 of a camera's new pose in its old one.
-
-    Args:
-        by: how far.
-        camera: its number among the cameras.
-        seed: of the episode.
-    """
+    """Draw 4x4 of a camera's new pose in its old one; ``camera`` is its number."""
     rng = np.random.default_rng([seed, _CAMERAS, camera])
     shift = np.eye(4)
     shift[:3, 3] = _either_way(rng.uniform(-by.position, by.position, 3), by.min_position, by.position)
@@ -67,11 +57,10 @@ def draw_camera_shift(by: CameraRandomisation, camera: int, seed: int) -> Array:
 
 
 def _either_way(drawn: Array, least: float, most: float) -> Array:
-    """Numbers of at most a size, whichever sign, as numbers between that and a least size."""
+    """Scale numbers of at most a magnitude to magnitudes between ``least`` and that."""
     return drawn if least == 0 else np.copysign(least + np.abs(drawn) * (1 - least / most), drawn)
 
 
 def _in_ball(rng: np.random.Generator) -> Array:
-    """(3,) of any direction, no longer than 1."""
     vector = rng.normal(size=3)
     return vector / np.linalg.norm(vector) * rng.uniform()

@@ -1,7 +1,4 @@
-"""The tasks: one frozen row each, which everything that differs from task to task is read from.
-
-Other packages add rows by entry points ``robocas_ms3.tasks``.
-"""
+"""The tasks: a frozen row each. Other packages add rows by entry points ``robocas_ms3.tasks``."""
 
 from __future__ import annotations
 
@@ -17,24 +14,22 @@ STAGES = ("furniture_opened", "reached_any", "obstacles_cleared", "reached_targe
 
 @dataclass(frozen=True)
 class TaskSpec:
-    """A task. What it is made of is named by import path, ``package.module:name``, and loaded where it is used.
+    """A task. Its parts are import paths, ``package.module:name``, so that reading a row imports no simulator.
 
     Attributes:
         name: short name, as in ``robocas generate pick``.
         env_id: gymnasium id.
-        env: its class, a `tasks.base.RoboCASEnv` whose ``SPEC`` is this.
-        default_config: task configuration used when none is given: name of a shipped one, or path of a YAML file.
-        target: how its target is chosen, a `scenes.targets.TargetRule`.
-        solver: its scripted policy, a function of an `Arm` that tries once.
+        env: path of its class, a `tasks.base.RoboCASEnv` whose ``SPEC`` is this.
+        default_config: name of a shipped task configuration, or path of a YAML file.
+        target: path of a `scenes.targets.TargetRule`.
+        solver: path of its scripted policy, a function of an `Arm` that tries once.
         seconds: horizon; upstream allows 200 steps of 5 Hz.
         training_seconds: horizon to train with where the base stands still (`rl_kwargs`).
-        summary: one line for people.
-        slots: what its instructions have besides object and support: ``relation``, which may be left out, ``part``.
-        checks: what its configurations have to be besides well-formed: functions that raise ValueError.
-        instructions: its templates by split, ``upstream``, ``train`` and ``held_out``; default: those of
-            ``language/instructions.yaml``.
-        stages: those of its environment that an episode comes through, in order; an evaluation names the one that it
-            did not come to. Default: the benchmark's, of which an environment may lack some.
+        summary: one line for `robocas list`.
+        slots: of its instructions besides object and support: ``relation``, which may be left out, ``part``.
+        checks: paths of functions of a `TaskConfig` that raise ValueError where it does not suit the task.
+        instructions: its templates by split; default: those of ``language/instructions.yaml``.
+        stages: that an episode comes through, in order; an evaluation names the first not reached.
     """
 
     name: str
@@ -52,12 +47,12 @@ class TaskSpec:
     stages: tuple[str, ...] = STAGES
 
     def steps(self, control_freq: int) -> int:
-        """The horizon in control steps at a rate, Hz."""
+        """Return the horizon in control steps at a rate, Hz."""
         return self.seconds * control_freq
 
     @property
     def max_episode_steps(self) -> int:
-        """The horizon at the standard rate, which gymnasium is told, whatever the rate."""
+        """Horizon at the standard rate, which gymnasium registers."""
         return self.steps(STANDARD_FREQ)
 
 

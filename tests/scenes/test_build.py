@@ -11,29 +11,11 @@ from robocas_ms3.assets.spawn import spawn
 from robocas_ms3.core.errors import ConfigError
 from robocas_ms3.core.paths import task_configs_dir
 from robocas_ms3.scenes import build
-from robocas_ms3.scenes.config import TaskConfig
-from robocas_ms3.scenes.lookup import find_objects, furniture_pose
 
 
 def pick_config(**changes):
     data = yaml.safe_load((task_configs_dir() / "pick_table_scattered.yaml").read_text(encoding="utf-8"))
     return {**data, **changes}
-
-
-def objects_of(ids):
-    return find_objects(load_pack("builtin"), TaskConfig.model_validate(pick_config(objects={"ids": ids, "count": 2})))
-
-
-def test_objects_by_id_or_by_graspnet_number():
-    assert objects_of([5, "apple", 31]) == ["banana", "apple", "toy_airplane_k"]
-    assert len(objects_of("all")) == 46
-
-
-def test_furniture_stands_on_its_lowest_point():
-    pack = load_pack("builtin")
-    config = TaskConfig.model_validate(pick_config())
-    pose = furniture_pose(config.basket, pack.furniture["basket"])
-    np.testing.assert_allclose(pose[:3, 3], [1.3, 0.9, 0.61 + 0.096])
 
 
 CABINET = {"asset": "cabinet", "pose": {"position": [-1.5, -1.0, 0.0], "yaw_deg": 0.0}}

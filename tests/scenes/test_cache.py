@@ -15,24 +15,16 @@ import numpy as np
 import psutil
 import pytest
 from sapien import physx
+from scene_models import load_scene
 
-from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.errors import SimulationError
 from robocas_ms3.scenes import cache as cache_module
 from robocas_ms3.scenes.cache import LayoutCache, Sampler, count_layouts, layout_source, pairs_of
-from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.layout import Layout
-from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.sample import sample_layout
 from robocas_ms3.scenes.table import State
 
 NO_TARGET = {"target": {"max_distance": 0.1}, "objects": {"ids": "all", "count": 2}}
-
-
-def model(**changes) -> SceneModel:
-    pack = load_pack("builtin")
-    data = {**load_task_config("pick_table_scattered").model_dump(mode="json"), **changes}
-    return SceneModel.load(load_task_config(data), pack, pack)
 
 
 def assert_same(one: Layout, two: Layout) -> None:
@@ -43,7 +35,7 @@ def assert_same(one: Layout, two: Layout) -> None:
 
 
 def test_a_layout_is_made_once_and_comes_back_the_same(tmp_path, monkeypatch):
-    scene = model()
+    scene = load_scene()
     made = LayoutCache(scene, tmp_path).get(1, 1)
     assert_same(made, sample_layout(scene, 1, 1))
     assert_same(layout_source(scene, None)(1, 1), made)
@@ -55,7 +47,7 @@ def test_a_layout_is_made_once_and_comes_back_the_same(tmp_path, monkeypatch):
 
 
 def test_objects_of_one_seed_and_arrangement_of_another_are_kept_apart(tmp_path):
-    cache = LayoutCache(model(), tmp_path)
+    cache = LayoutCache(load_scene(), tmp_path)
     assert not np.allclose(cache.get(1, 1).object_poses, cache.get(1, 2).object_poses)
     assert cache.get(1, 2).object_ids == cache.get(1, 1).object_ids
     assert cache.missing([(2, 2), (1, 2)]) == [(2, 2)]
@@ -74,11 +66,11 @@ def test_objects_of_one_seed_and_arrangement_of_another_are_kept_apart(tmp_path)
     ],
 )
 def test_what_layouts_depend_on_is_in_the_name(tmp_path, changes, same):
-    assert (LayoutCache(model(**changes), tmp_path).folder == LayoutCache(model(), tmp_path).folder) is same
+    assert (LayoutCache(load_scene(**changes), tmp_path).folder == LayoutCache(load_scene(), tmp_path).folder) is same
 
 
 def test_changed_furniture_has_layouts_of_its_own(tmp_path):
-    scene = model()
+    scene = load_scene()
     table = scene.furniture["table"]
     top = table.asset.surfaces["top"]
     higher = table.asset.model_copy(update={"surfaces": {"top": top.model_copy(update={"z": top.z + 0.05})}})
@@ -86,13 +78,8 @@ def test_changed_furniture_has_layouts_of_its_own(tmp_path):
     assert LayoutCache(changed, tmp_path).folder != LayoutCache(scene, tmp_path).folder
 
 
-def test_several_envs_want_each_objects_with_every_seed_and_their_own():
-    assert pairs_of([0, 1]) == [(0, 0), (1, 1)]
-    assert pairs_of([0, 1], [1, 7]) == [(1, 1), (1, 0), (7, 7), (7, 0), (7, 1)]
-
-
 def test_a_table_keeps_what_an_earlier_one_holds_and_what_is_known_of_it(tmp_path):
-    cache = LayoutCache(model(), tmp_path)
+    cache = LayoutCache(load_scene(), tmp_path)
     assert cache.table("cpu") is None
     for pair in ((0, 0), (0, 1), (2, 1)):
         cache.get(*pair)
@@ -111,7 +98,7 @@ def test_a_table_keeps_what_an_earlier_one_holds_and_what_is_known_of_it(tmp_pat
 
 
 def test_a_table_is_changed_by_one_process_at_a_time(tmp_path):
-    cache, other = LayoutCache(model(), tmp_path), LayoutCache(model(), tmp_path)
+    cache, other = LayoutCache(load_scene(), tmp_path), LayoutCache(load_scene(), tmp_path)
     cache.get(0, 0)
     cache.get(1, 1)
     with cache._locked():
@@ -127,7 +114,7 @@ def test_a_table_is_changed_by_one_process_at_a_time(tmp_path):
 
 @pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_objects_that_can_not_be_laid_out_are_tried_once_and_leave_nothing_behind(jobs, tmp_path):
-    cache = LayoutCache(model(**NO_TARGET), tmp_path)
+    cache = LayoutCache(load_scene(**NO_TARGET), tmp_path)
     problems = dict(cache.fill(pairs_of([0, 1, 2], [1]), jobs))
     assert problems.keys() == {(1, 1), (1, 0), (1, 2)}
     assert len(set(problems.values())) == 1
@@ -138,7 +125,7 @@ def test_objects_that_can_not_be_laid_out_are_tried_once_and_leave_nothing_behin
 def test_without_a_cache_the_objects_of_a_seed_are_looked_for_once(monkeypatch):
     asked = []
     monkeypatch.setattr(cache_module, "sample_layout", lambda *order: asked.append(order[1:]) or sample_layout(*order))
-    layouts = layout_source(model(), None)
+    layouts = layout_source(load_scene(), None)
     ids = layouts(1, 2).object_ids
     assert layouts(1, 3).object_ids == layouts(1, 1).object_ids == ids
     assert asked == [(1, 1, None), (1, 2, ids), (1, 3, ids), (1, 1, None)]
@@ -153,7 +140,7 @@ def gpu(monkeypatch):
 
 
 def test_the_worker_samples_the_same_layouts_is_replaced_and_ends_with_its_object(gpu):
-    scene, before = model(), psutil.Process().children()
+    scene, before = load_scene(), psutil.Process().children()
     sampler = Sampler(scene)
 
     def worker() -> psutil.Process:
@@ -183,12 +170,12 @@ def kill_this_process():
 
 def test_a_process_that_dies_twice_is_not_a_missing_layout(gpu):
     with pytest.raises(SimulationError) as caught:
-        Sampler(model()).make(0, 1, Deadly())  # pyright: ignore[reportArgumentType]
+        Sampler(load_scene()).make(0, 1, Deadly())  # pyright: ignore[reportArgumentType]
     assert (caught.value.where, caught.value.found) == ("seed 1", "SIGSEGV")
 
 
 def test_after_an_interruption_no_layout_is_taken_for_another(gpu):
-    scene = model()
+    scene = load_scene()
     sampler = Sampler(scene)
     sampler(1, 1)
     threading.Timer(0.05, _thread.interrupt_main).start()

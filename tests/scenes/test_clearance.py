@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from scene_models import load_scene
 
 from robocas_ms3.assets.hulls import Hull
 from robocas_ms3.assets.pack import load_pack
@@ -15,12 +16,6 @@ from robocas_ms3.robots.table import PANDA
 from robocas_ms3.scenes.clearance import overlap
 from robocas_ms3.scenes.config import load_task_config, shipped_configs
 from robocas_ms3.scenes.model import SceneModel
-
-
-def load(name: str = "pick_table_scattered", **changes) -> SceneModel:
-    data = load_task_config(name).model_dump(mode="json")
-    pack = load_pack("builtin")
-    return SceneModel.load(load_task_config(data | changes), pack, pack)
 
 
 def at(x: float, y: float, z: float = 0.0, yaw: float = 0.0) -> dict:
@@ -53,26 +48,26 @@ TABLE = {"asset": "table", "pose": at(0.9, 1.0, yaw=-90)}
 )
 def test_what_can_not_be_is_refused(changes, said):
     with pytest.raises(ConfigError, match=said):
-        load(**changes)
+        load_scene(**changes)
 
 
 def test_an_arm_that_begins_inside_of_something_is_refused():
     above = {"asset": "side_table", "pose": at(0.7, 0.15, 0.62)}
     with pytest.raises(ConfigError, match=r"arm begins inside of something \(found furniture.above\). Move or turn"):
-        load(furniture={"table": TABLE, "above": above})
+        load_scene(furniture={"table": TABLE, "above": above})
 
 
 def test_a_base_that_drives_reaches_farther():
     far = {"asset": "basket", "pose": at(1.9, -0.3)}
     with pytest.raises(ConfigError, match="the basket is out of the arm's reach"):
-        load(basket=far)
-    load(basket=far, base_motion=True)
+        load_scene(basket=far)
+    load_scene(basket=far, base_motion=True)
     with pytest.raises(ConfigError, match=r"Move it or the robot: \d\.\d\d m"):
-        load(basket={"asset": "basket", "pose": at(3.7, 0.15)}, base_motion=True)
+        load_scene(basket={"asset": "basket", "pose": at(3.7, 0.15)}, base_motion=True)
 
 
 def test_what_a_seed_moves_is_not_judged_by_where_it_is_configured():
-    load(basket={"asset": "basket", "pose": at(1.3, 0.9, 0.5)}, randomisation={"basket": {"position": 0.1}})
+    load_scene(basket={"asset": "basket", "pose": at(1.3, 0.9, 0.5)}, randomisation={"basket": {"position": 0.1}})
 
 
 def test_all_that_is_shipped_can_be():

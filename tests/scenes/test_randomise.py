@@ -26,14 +26,6 @@ def test_nothing_is_drawn_unless_asked_for():
         np.testing.assert_allclose(lights.direction * np.linalg.norm(plain.lights.direction), plain.lights.direction)
 
 
-def test_finishes_of_the_named_parts_vary_with_the_seed():
-    room = load_pack("builtin").furniture["room"]
-    drawn = [draw_finishes(config(room=["floor"]), room, seed) for seed in range(40)]
-    assert {tuple(d) for d in drawn} == {("floor",)}
-    assert {d["floor"] for d in drawn} == set(room.asset.finishes["floor"])
-    assert drawn[3] == draw_finishes(config(room=["floor"], lights={}), room, 3)  # other blocks change nothing
-
-
 def test_finishes_may_be_some_of_those_there_are():
     room = load_pack("builtin").furniture["room"]
     asked = config(room=["floor", "wall"], finishes={"floor": ["carpet", "checker"]})

@@ -2,19 +2,16 @@
 
 import numpy as np
 import pytest
+from scene_models import load_scene
 
-from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.poses import planar
 from robocas_ms3.scenes import settle as settle_module
-from robocas_ms3.scenes.config import load_task_config
-from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.settle import settle
 
 
 @pytest.fixture(scope="module")
-def model() -> SceneModel:
-    pack = load_pack("builtin")
-    return SceneModel.load(load_task_config("pick_table_scattered"), pack, pack)
+def model():
+    return load_scene()
 
 
 def on_table(model, name: str, x: float = 0.9, y: float = 0.9, lift: float = 0.0) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy.spatial import ConvexHull
 
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.errors import LayoutError
@@ -48,16 +47,6 @@ def test_objects_lie_on_the_plane_and_on_each_other():
         shares = Scenery([object_mesh(a) for a in assets], poses).visible_shares(camera)
         assert (shares < 0.9).sum() >= 2  # something is hidden
     assert sum(on_others) >= len(on_others)
-
-
-def test_an_outline_is_the_object_but_for_its_hollows():
-    assets = load_pack("builtin").objects
-    for name in ("sugar_box", "mug", "apple"):
-        points, outline = np.concatenate(assets[name].hulls), stacked.outline(assets[name])
-        assert len(outline) <= 64
-        planes = ConvexHull(outline).equations
-        depth = (points @ planes[:, :3].T + planes[:, 3]).max(axis=1)
-        assert depth.max() < 0.002  # nothing of the object stands out of it farther than that
 
 
 def test_a_heap_that_runs_over_is_an_error():

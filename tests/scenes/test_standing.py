@@ -2,20 +2,13 @@
 
 import numpy as np
 import pytest
+from scene_models import load_scene
 
-from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.core.poses import planar
-from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.sample import sample_layout
 from robocas_ms3.scenes.standing import _moved, basket_stands, body_is_free, place_basket, place_robot
-
-
-def model(name: str = "pick_table_scattered", **randomisation) -> SceneModel:
-    data = load_task_config(name).model_dump(mode="json")
-    pack = load_pack("builtin")
-    return SceneModel.load(load_task_config({**data, "randomisation": randomisation}), pack, pack)
 
 
 def shifted(pose: np.ndarray, x: float = 0, y: float = 0, z: float = 0) -> np.ndarray:
@@ -25,7 +18,7 @@ def shifted(pose: np.ndarray, x: float = 0, y: float = 0, z: float = 0) -> np.nd
 
 
 def test_a_basket_stands_where_all_that_lies_in_it_has_something_below():
-    scene = model()
+    scene = load_scene()
     table = scene.furniture["table"].asset.surfaces["top"]
     edge = (scene.support_pose @ [*table.max_xy, 0, 1])[0]  # in x
     inner = scene.basket.asset.inner.max[0]  # from its middle to its wall
@@ -35,12 +28,12 @@ def test_a_basket_stands_where_all_that_lies_in_it_has_something_below():
     assert not basket_stands(scene, shifted(at_edge, x=-0.02))  # not with something on the wrong side
     assert not basket_stands(scene, shifted(at_edge, x=0.05))
     assert not basket_stands(scene, shifted(scene.basket_pose, z=0.1))  # in the air
-    on_floor = model("pick_side_table_scattered")
+    on_floor = load_scene("pick_side_table_scattered")
     assert basket_stands(on_floor, on_floor.basket_pose)
 
 
 def test_a_basket_that_would_hang_over_the_edge_is_drawn_again():
-    scene = model(basket={"position": 0.5, "yaw_deg": 20})
+    scene = load_scene(randomisation={"basket": {"position": 0.5, "yaw_deg": 20}})
     by = scene.config.randomisation.basket
     redrawn = 0
     for seed in range(8):
@@ -56,14 +49,14 @@ def test_a_basket_that_would_hang_over_the_edge_is_drawn_again():
 
 
 def test_a_basket_that_stands_nowhere_says_what_to_change():
-    scene = model(basket={"position": 0.0})
+    scene = load_scene(randomisation={"basket": {"position": 0.0}})
     air = SceneModel(**{**scene.__dict__, "basket_pose": shifted(scene.basket_pose, z=0.5)})
     with pytest.raises(LayoutError, match=r"randomisation.basket: the basket can't stand.*50 places.*Lower random"):
         place_basket(air, scene.robot_pose, np.random.default_rng(0))
 
 
 def test_a_robot_that_would_stand_in_furniture_is_drawn_again():
-    scene = model(robot={"position": 0.5, "yaw_deg": 10})
+    scene = load_scene(randomisation={"robot": {"position": 0.5, "yaw_deg": 10}})
     redrawn = 0
     for seed in range(30):
         first = _moved(scene.robot_pose, scene.config.randomisation.robot, np.random.default_rng(seed))
@@ -75,7 +68,7 @@ def test_a_robot_that_would_stand_in_furniture_is_drawn_again():
 
 
 def test_what_nothing_moves_stays_and_draws_nothing():
-    scene, rng = model(), np.random.default_rng(0)
+    scene, rng = load_scene(), np.random.default_rng(0)
     assert place_robot(scene, rng) is scene.robot_pose
     assert place_basket(scene, scene.robot_pose, rng) is scene.basket_pose
     assert rng.uniform() == np.random.default_rng(0).uniform()

