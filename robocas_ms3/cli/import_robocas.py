@@ -54,7 +54,7 @@ def main(cfg: ImportRobocas) -> int:
     from robocas_ms3.datasets.manage.copying import CopyOptions, check_apart
     from robocas_ms3.datasets.manage.importing import import_robocas
     from robocas_ms3.datasets.manage.survey import survey
-    from robocas_ms3.datasets.writing.output import DATASET
+    from robocas_ms3.datasets.writing.plan import DATASET
 
     if cfg.out is not None:
         check_apart(cfg.out, [cfg.dataset])
@@ -85,7 +85,7 @@ def _table(found: Survey) -> None:
     from rich.table import Table
 
     from robocas_ms3.cli.terminal import say, table_console
-    from robocas_ms3.core.words import count_of
+    from robocas_ms3.core.words import count_of, format_ranges
 
     rows: dict[tuple[str, str, str], list[int]] = defaultdict(list)
     for finding in found.findings:
@@ -98,20 +98,7 @@ def _table(found: Survey) -> None:
         for name in ("episodes", "what", "where", "problem"):
             table.add_column(name, overflow="fold", no_wrap=False)
         for (outcome, place, problem), numbers in sorted(rows.items()):
-            table.add_row(ranges(numbers) or "all", outcome, place, problem)
+            table.add_row(format_ranges(numbers) or "all", outcome, place, problem)
         table_console().print(table)
     counts = f"can be taken: {len(found.taken)}, left out: {len(found.left_out)}"
     say(f"{found.root}: {count_of(found.episodes, 'episode')}, {counts}")
-
-
-def ranges(numbers: list[int], most: int = 6) -> str:
-    """Format numbers as ``0-3, 7``."""
-    runs: list[list[int]] = []
-    for number in sorted(set(numbers)):
-        if runs and number == runs[-1][1] + 1:
-            runs[-1][1] = number
-        else:
-            runs.append([number, number])
-    texts = [str(a) if a == b else f"{a}-{b}" for a, b in runs]
-    more = f" and {sum(b - a + 1 for a, b in runs[most:])} more" if len(runs) > most else ""
-    return ", ".join(texts[:most]) + more

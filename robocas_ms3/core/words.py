@@ -26,6 +26,19 @@ _MARKDOWN = re.compile(
 )
 
 
+def format_ranges(numbers: Iterable[int], most: int = 6) -> str:
+    """Format numbers as ``0-3, 7``, with at most so many ranges."""
+    runs: list[list[int]] = []
+    for number in sorted(set(numbers)):
+        if runs and number == runs[-1][1] + 1:
+            runs[-1][1] = number
+        else:
+            runs.append([number, number])
+    texts = [str(a) if a == b else f"{a}-{b}" for a, b in runs]
+    more = f" and {sum(b - a + 1 for a, b in runs[most:])} more" if len(runs) > most else ""
+    return ", ".join(texts[:most]) + more
+
+
 def printable(text: str, *, lines: bool = False) -> str:
     r"""Return a text with control characters as escapes (``\u001b``, valid in JSON too), for terminals and reports.
 

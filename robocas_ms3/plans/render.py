@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +19,11 @@ from robocas_ms3.plans.load import opening_part
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.units import SeedFiles
 
+if TYPE_CHECKING:
+    from robocas_ms3.datasets.writing.render import EnvRenderer
 
-def open_env(env: RecordedEnv, control_mode: str, pictures: Pictures) -> rendering.Renderer:
+
+def open_env(env: RecordedEnv, control_mode: str, pictures: Pictures) -> EnvRenderer:
     """Open the environment that recorded an episode."""
     use_one_torch_thread()
     return rendering.open_env(env, control_mode, pictures)
@@ -60,7 +63,7 @@ class Renderer:
             self._source.turn_to(files.recording)
         return self._source
 
-    def _open(self, env: RecordedEnv, control_mode: str, pictures: Pictures) -> rendering.Renderer:
+    def _open(self, env: RecordedEnv, control_mode: str, pictures: Pictures) -> EnvRenderer:
         assert self._part is not None
         with opening_part(self._plan, self._part):
             return self._open_renderer(env, control_mode, pictures)

@@ -17,8 +17,7 @@ from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.provenance import recorded_scene, recording_entry
 from robocas_ms3.datasets.sources.trajectory import TrajectorySource
 from robocas_ms3.datasets.statistics.collect import collect
-from robocas_ms3.datasets.writing.output import DATASET
-from robocas_ms3.datasets.writing.plan import dataset_settings, plan_episodes
+from robocas_ms3.datasets.writing.plan import DATASET, dataset_settings, plan_episodes
 from robocas_ms3.demos.generate import OUTPUT
 from robocas_ms3.demos.ledger import Ledger, count_by_stage
 from robocas_ms3.demos.recordings.reading import TrajectoryFile

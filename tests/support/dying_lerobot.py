@@ -7,7 +7,7 @@ from dying import die_at
 from synthetic import RayCaster
 
 from robocas_ms3.core import files, outputs
-from robocas_ms3.datasets.lerobot import assemble, convert, stage, table_writing, video
+from robocas_ms3.datasets.lerobot import convert, video, writer
 from robocas_ms3.datasets.writing.settings import ConversionSettings
 
 PLACES = {  # moment -> (module, name of the function or method's owner and it, which call is the last)
@@ -15,8 +15,8 @@ PLACES = {  # moment -> (module, name of the function or method's owner and it, 
     "part": (files, "_move_in", 2),
     "plan": (outputs, "write_json", 1),
     "join": (video.Joiner, "add", 7),
-    "table": (table_writing.RollingTable, "add", 4),
-    "overview": (assemble, "write_json", 2),
+    "table": (writer.RollingTable, "add", 4),
+    "overview": (writer, "write_json", 2),
     "rename": (convert.os, "replace", 3),  # plan, data, videos: the third
     "joined": (Path, "rmdir", 1),
     "sweep": (convert.shutil, "rmtree", 1),
@@ -24,6 +24,5 @@ PLACES = {  # moment -> (module, name of the function or method's owner and it, 
 
 if __name__ == "__main__":
     moment, trajectory, out = sys.argv[1:]
-    assert stage
     die_at(*PLACES[moment])
     convert.convert_lerobot(ConversionSettings(Path(trajectory), Path(out), open_renderer=RayCaster))

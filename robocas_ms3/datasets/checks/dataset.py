@@ -17,7 +17,7 @@ from robocas_ms3.datasets.checks.violation import Violation, read_object
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import no_dataset
 from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, read_arrays
-from robocas_ms3.datasets.writing.output import MARKS
+from robocas_ms3.datasets.writing.plan import MARKS
 
 _EMBEDDINGS = {spec.name for spec in schema.EPISODE_INFO if spec.embedding}
 

@@ -1,4 +1,4 @@
-"""Check a LeRobot dataset against its own declarations: lengths, numbers, times, videos, texts, statistics."""
+"""Checks a LeRobot dataset against its own declarations: lengths, numbers, times, videos, texts, statistics."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ from robocas_ms3.datasets.checks.dataset import Report
 from robocas_ms3.datasets.checks.scene import check_values
 from robocas_ms3.datasets.checks.violation import Violation, read_object
 from robocas_ms3.datasets.lerobot import schema
+from robocas_ms3.datasets.lerobot.check_content import check_statistics, check_videos
 from robocas_ms3.datasets.lerobot.check_frames import check_data
-from robocas_ms3.datasets.lerobot.check_statistics import check_statistics
-from robocas_ms3.datasets.lerobot.check_videos import check_videos
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.records import (
     MAX_EPISODES,
@@ -25,15 +24,9 @@ from robocas_ms3.datasets.lerobot.records import (
     episode_columns,
     read_lines,
     unknown_numbers,
-    wrong_shapes,
 )
 from robocas_ms3.datasets.lerobot.tables import faults, open_table
 from robocas_ms3.datasets.sources.tolerant import first_line
-
-
-def is_lerobot(root: Path) -> bool:
-    """Whether a folder holds a LeRobot dataset, whole or not."""
-    return (root / schema.INFO_FILE).is_file()
 
 
 def check_lerobot(
@@ -42,13 +35,13 @@ def check_lerobot(
     """Check a dataset; datasets made elsewhere are checked as far as they have what ours have.
 
     Args:
-        root: the dataset.
-        decode: decode every frame too; without, frames are counted. Damage inside a video shows by the checksums, which
-            datasets made elsewhere lack; FFmpeg's decoders conceal it.
+        root: folder of the dataset.
+        decode: decode every frame; otherwise frames are counted. FFmpeg's decoders conceal damage inside a video, which
+            shows by the checksums that datasets made here have.
         on_episode: called with the number of episodes done and of all.
 
     Returns:
-        What is wrong; empty for a valid dataset.
+        Violations; empty for a valid dataset.
 
     Raises:
         MissingExtraError: the ``lerobot`` extra is not installed.
@@ -56,9 +49,11 @@ def check_lerobot(
     schema.require_extra()
     root = Path(root)
     info, wrong = read_object(root, schema.INFO_FILE, InfoRecord, absent="JSON")
-    if not wrong:
-        shapes = wrong_shapes(info["features"])
-        wrong = [Violation(schema.INFO_FILE, key, str(expected), str(found)) for key, expected, found in shapes]
+    features = {} if wrong else info["features"]
+    if set(schema.OUR_KEYS) <= set(features):
+        for own in schema.FEATURES:
+            if (shape := features[own.key]["shape"]) != [own.width]:
+                wrong.append(Violation(schema.INFO_FILE, f"features.{own.key}.shape", str([own.width]), str(shape)))
     if wrong:
         return wrong
     try:
@@ -69,12 +64,12 @@ def check_lerobot(
             return [*totals, *wrong]
         totals += _check_totals(dataset)
         texts = {"task_index": dataset.tasks}
-        if schema.SUBTASK_INDEX.key in dataset.info["features"]:
+        if schema.SUBTASK_INDEX.key in features:
             texts[schema.SUBTASK_INDEX.key] = dataset.subtasks
     except DatasetError as error:
-        return [_violation("meta", "readable tables", error)]
+        return [Violation("meta", "", "readable tables", first_line(error))]
     data, ranges = check_data(dataset, texts, on_episode or (lambda *_: None))
-    videos = [key for key, feature in dataset.info["features"].items() if feature["dtype"] == "video"]
+    videos = [key for key, feature in features.items() if feature["dtype"] == "video"]
     return [
         *totals,
         *data,
@@ -84,10 +79,6 @@ def check_lerobot(
         *_check_scenes(dataset),
         *_check_checksums(root),
     ]
-
-
-def _violation(file: str, expected: str, error: DatasetError) -> Violation:
-    return Violation(file, "", expected, first_line(error))
 
 
 def _check_counts(dataset: LeRobotDataset) -> Iterator[Violation]:
@@ -122,7 +113,7 @@ def _check_rows(dataset: LeRobotDataset) -> Iterator[Violation]:
     for path, table in dataset.tables_of_episodes():
         name = str(path.relative_to(dataset.root))
         wrong = list(faults(table, episode_columns(table.column_names, dataset.info["features"])))
-        yield from (Violation(name, key, expected, found) for key, expected, found in wrong)
+        yield from (Violation(name, *fault) for fault in wrong)
         numbers += table.column("episode_index").to_pylist() if not wrong else []
     if len(set(numbers)) < len(numbers):
         yield Violation("meta/episodes", "episode_index", "each episode once", "some twice")
@@ -148,26 +139,24 @@ def _check_checksums(root: Path) -> Iterator[Violation]:
     if (root / schema.CHECKSUMS_FILE).is_file():
         yield from wrong
     for name, expected in sums.items():
+        inside = PurePosixPath(name).parts[0] in schema.CONTENT and ".." not in Path(name).parts
         if not isinstance(expected, str):
             yield Violation(schema.CHECKSUMS_FILE, name, "a SHA-256", type(expected).__name__)
-        elif PurePosixPath(name).parts[:1] not in {(folder,) for folder in schema.CONTENT} or ".." in Path(name).parts:
+        elif not inside:
             yield Violation(schema.CHECKSUMS_FILE, name, f"a file in {', '.join(schema.CONTENT)}", "another path")
         elif not (root / name).exists():
             yield Violation(name, "", "a file", "none")
-        elif (found := _checksum(root / name)) != expected:
-            yield Violation(name, "", f"the bytes that were written, SHA-256 {expected}", found)
-
-
-def _checksum(path: Path) -> str:
-    """Return the SHA-256 of a file, or why it cannot be read."""
-    try:
-        return schema.checksum(path)
-    except (OSError, DocumentError) as error:
-        return first_line(error)
+        else:
+            try:
+                found = schema.checksum(root / name)
+            except (OSError, DocumentError) as error:
+                found = first_line(error)
+            if found != expected:
+                yield Violation(name, "", f"the bytes that were written, SHA-256 {expected}", found)
 
 
 def _check_conversion(dataset: LeRobotDataset) -> Iterator[Violation]:
-    """Check how the dataset says it was made, where it does."""
+    """Check how the dataset says it was made, if it does."""
     if not (dataset.root / schema.CONVERSION_FILE).exists():
         return
     made, wrong = read_object(dataset.root, schema.CONVERSION_FILE, ConversionRecord)
@@ -178,11 +167,11 @@ def _check_conversion(dataset: LeRobotDataset) -> Iterator[Violation]:
 
 
 def _check_scenes(dataset: LeRobotDataset) -> Iterator[Violation]:
-    """Check scenes and cameras of the episodes, where the dataset has them."""
+    """Check scenes and cameras of the episodes, if the dataset has them."""
     try:
         described = dataset.described
     except DatasetError as error:
-        yield _violation(schema.SCENES_FILE, "a readable table", error)
+        yield Violation(schema.SCENES_FILE, "", "a readable table", first_line(error))
         return
     if described and described.keys() != dataset.row_of.keys():
         found = sorted(described.keys() ^ dataset.row_of.keys())[:5]
@@ -194,19 +183,19 @@ def _check_scenes(dataset: LeRobotDataset) -> Iterator[Violation]:
             for camera in dataset.cameras:
                 episode.intrinsic(camera)
         except DatasetError as error:
-            yield _violation(schema.SCENES_FILE, "scene and cameras", error)
+            yield Violation(schema.SCENES_FILE, "", "scene and cameras", first_line(error))
 
 
 def report_lerobot(root: Path, *, on_episode: Callable[[int, int], None] | None = None) -> Report:
-    """`check_lerobot`, with how many episodes and steps were looked at."""
-    looked = 0
+    """Check a dataset; return the violations and the numbers of episodes and steps."""
+    checked = 0
 
     def count(done: int, total: int) -> None:
-        nonlocal looked
-        looked = done
+        nonlocal checked
+        checked = done
         if on_episode:
             on_episode(done, total)
 
     violations = check_lerobot(root, on_episode=count)
     steps = read_object(root, schema.INFO_FILE)[0].get("total_frames")
-    return Report(looked, steps if isinstance(steps, int) else 0, violations)
+    return Report(checked, steps if isinstance(steps, int) else 0, violations)

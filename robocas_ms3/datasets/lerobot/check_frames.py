@@ -1,10 +1,9 @@
-"""Check the frames of a LeRobot dataset: lengths, indices, times, texts, and that features agree with each other."""
+"""Checks the frames of a LeRobot dataset: lengths, indices, times, texts, and that features agree with each other."""
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,41 +18,24 @@ from robocas_ms3.datasets.checks import arrays as laws
 from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.arrays import robocas_arrays
-from robocas_ms3.datasets.lerobot.check_language import check_language
-from robocas_ms3.datasets.lerobot.check_videos import TOLERANCE
+from robocas_ms3.datasets.lerobot.language import EVENTS, PERSISTENT, Row, box_in, read_rows_of
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.records import frame_columns
 from robocas_ms3.datasets.lerobot.tables import faults, numbers, open_table, read_rows
 from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, first_line
 
-Ranges = Mapping[str, tuple[NDArray, NDArray, int]]
+TOLERANCE = 1e-4
+"""Of times, s: what LeRobot tolerates."""
+Ranges = dict[str, tuple[NDArray, NDArray, int]]
 """Feature -> minimum and maximum of each of its numbers, and the number of frames."""
 Texts = Mapping[str, list[str]]
 """Name of an index column, such as ``task_index`` -> the texts that it numbers."""
-
-
-@dataclass(frozen=True)
-class Frames:
-    """The frames of an episode.
-
-    Attributes:
-        file: path of their table in the dataset.
-        row: of the episode in ``meta/episodes``.
-        count: number of frames.
-        columns: numeric features (T, D).
-        types: types of the sub-goals (T,); empty without that column.
-    """
-
-    file: str
-    row: Mapping[str, Any]
-    count: int
-    columns: Mapping[str, NDArray]
-    types: list[Any]
-
-    def violation(self, key: str, expected: object, found: object) -> Violation:
-        """Return a violation in this episode."""
-        where = f"episode {self.row['episode_index']}"
-        return Violation(self.file, f"{where}, {key}" if key else where, str(expected), str(found))
+Columns = Mapping[str, NDArray]
+Fault = tuple[str, str, str]
+"""Key, expected and found."""
+_PERSISTENT_STYLES = {"subtask", "plan", "memory", "motion", "task_aug"}
+_EVENT_STYLES = {"interjection", "vqa", "trace", None}
+_CAMERA_STYLES = {"vqa", "trace"}
 
 
 def check_data(
@@ -81,43 +63,36 @@ def check_data(
             if names != wanted or found != count:
                 continue
             for row in inside:  # one at a time: memory does not grow with the file
-                table = read_rows(path, row["episode_index"])
+                table, where = read_rows(path, row["episode_index"]), f"episode {row['episode_index']}"
                 wrong = list(faults(table, frame_columns(features)))
                 if wrong:
-                    violations += [Violation(name, key, expected, found) for key, expected, found in wrong]
+                    violations += [Violation(name, *fault) for fault in wrong]
                     break
-                frames = _frames(table, name, row, features)
-                violations += check_frames(frames, dataset.info, texts)
+                numeric = [key for key, feature in features.items() if feature["dtype"] not in schema.NOT_NUMERIC]
+                columns = {key: numbers(table.column(key)) for key in numeric}
+                wrong = list(_check_episode(table, columns, row, dataset.info, texts))
                 if dataset.has_language:
-                    violations += check_language(table, name, row["episode_index"], dataset.info)
-                ranges = _widened(ranges, frames, features)
+                    wrong += check_language(table, name, dataset.info)
+                violations += [Violation(name, f"{where}, {key}" if key else where, *rest) for key, *rest in wrong]
+                _widen(ranges, columns, features)
                 done += 1
                 on_episode(done, len(dataset.rows))
         except DatasetError as error:
             violations.append(Violation(name, "", "a readable table", first_line(error)))
     others = sorted(path for path in (root / "data").rglob("*") if path.is_file() and path not in by_file)
-    extra = (Violation(str(path.relative_to(root)), "", "files of episodes only", "of none") for path in others)
-    return [*violations, *extra], ranges
+    violations += [Violation(str(path.relative_to(root)), "", "files of episodes only", "of none") for path in others]
+    return violations, ranges
 
 
-def _frames(table: pa.Table, name: str, row: Mapping[str, Any], features: Mapping[str, Any]) -> Frames:
-    numeric = [key for key, feature in features.items() if feature["dtype"] not in schema.NOT_NUMERIC]
-    key = schema.SUBGOAL_TYPE.key
-    types = table.column(key).to_pylist() if key in table.column_names else []
-    return Frames(name, row, len(table), {key: numbers(table.column(key)) for key in numeric}, types)
-
-
-def _widened(ranges: Ranges, frames: Frames, features: Mapping[str, Any]) -> Ranges:
-    """Return the ranges extended by an episode; features with NaN or infinite values are ignored."""
-    wide = dict(ranges)
-    for key, values in frames.columns.items():
-        if len(values) and not _fault(values, features[key]):
+def _widen(ranges: Ranges, columns: Columns, features: Mapping[str, Any]) -> None:
+    """Extend the ranges by an episode; features with NaN or infinite values are ignored."""
+    for key, values in columns.items():
+        if len(values) and not _number_fault(values, features[key]):
             low, high, count = ranges.get(key, (values[0], values[0], 0))
-            wide[key] = np.minimum(low, values.min(axis=0)), np.maximum(high, values.max(axis=0)), count + len(values)
-    return wide
+            ranges[key] = np.minimum(low, values.min(axis=0)), np.maximum(high, values.max(axis=0)), count + len(values)
 
 
-def _fault(values: NDArray, feature: Mapping[str, Any]) -> tuple[str, str] | None:
+def _number_fault(values: NDArray, feature: Mapping[str, Any]) -> tuple[str, str] | None:
     """Return expected and found, if the width is wrong or a number is NaN or infinite."""
     if values.shape[1] != int(np.prod(feature["shape"])):
         return f"{feature['shape']} numbers", str(values.shape[1])
@@ -125,72 +100,134 @@ def _fault(values: NDArray, feature: Mapping[str, Any]) -> tuple[str, str] | Non
     return ("finite numbers", f"{values[wrong[0, 0]]} at frame {wrong[0, 0]}") if len(wrong) else None
 
 
-def check_frames(frames: Frames, info: Mapping[str, Any], texts: Texts) -> Iterator[Violation]:
-    """Check the indices, timestamps, texts and outcome of an episode's frames, and that features are consistent."""
-    length, columns = frames.row["length"], frames.columns
-    if frames.count != length or length == 0:
-        yield frames.violation("", count_of(length, "frame") if length else "frames", frames.count or "none")
+def _check_episode(
+    table: pa.Table, columns: Columns, row: Mapping[str, Any], info: Mapping[str, Any], texts: Texts
+) -> Iterator[Fault]:
+    """Check indices, timestamps, texts and outcome of an episode, and that features are consistent.
+
+    Args:
+        table: frames of the episode.
+        columns: their numeric features (T, D).
+        row: of the episode in ``meta/episodes``.
+        info: of the dataset.
+        texts: that the index columns number.
+    """
+    length = row["length"]
+    if len(table) != length or length == 0:
+        yield "", count_of(length, "frame") if length else "frames", str(len(table) or "none")
         return
-    faults = [(key, fault) for key, found in columns.items() if (fault := _fault(found, info["features"][key]))]
-    yield from (frames.violation(key, *fault) for key, fault in faults)
+    wrong = [(key, *fault) for key, found in columns.items() if (fault := _number_fault(found, info["features"][key]))]
+    yield from wrong
     steps = np.arange(length)
-    start, index = frames.row["dataset_from_index"], frames.row["episode_index"]
+    start, index = row["dataset_from_index"], row["episode_index"]
     expected = {"frame_index": steps, "index": start + steps, "episode_index": np.full(length, index)}
     for key, values in expected.items():
         if not np.array_equal(columns[key][:, 0], values):
-            yield frames.violation(key, f"{values[0]} to {values[-1]}", "others")
+            yield key, f"{values[0]} to {values[-1]}", "others"
     late = np.abs(columns["timestamp"][:, 0] - steps / info["fps"])
     if not (late < TOLERANCE).all():
         step = int(late.argmax())
-        found = f"{columns['timestamp'][step, 0]} s"
-        yield frames.violation(f"timestamp {step}", f"{step / info['fps']} s", found)
-    unknown = list(_check_texts(frames, texts))
+        yield f"timestamp {step}", f"{step / info['fps']} s", f"{columns['timestamp'][step, 0]} s"
+    unknown = list(_check_texts(columns, row["tasks"], texts))
     yield from unknown
-    yield from _check_outcome(frames)
-    if not faults and not unknown:
-        yield from _check_content(frames)
+    yield from _check_outcome(columns)
+    if not wrong and not unknown:
+        key = schema.SUBGOAL_TYPE.key
+        types = table.column(key).to_pylist() if key in table.column_names else []
+        yield from _check_content(columns, types, next(iter(row["tasks"]), ""))
 
 
-def _check_outcome(frames: Frames) -> Iterator[Violation]:
+def _check_outcome(columns: Columns) -> Iterator[Fault]:
     """Check that an episode ends in its last frame, and succeeds there or nowhere."""
-    columns, last = frames.columns, np.arange(frames.count) == frames.count - 1
     if any(feature.key not in columns for feature in schema.OUTCOME):
         return
     reward, success, done = (columns[feature.key][:, 0] for feature in schema.OUTCOME)
+    last = np.arange(len(done)) == len(done) - 1
     if not np.array_equal(done != 0, last):
-        yield frames.violation(schema.DONE.key, "true in the last frame only", "another")
+        yield schema.DONE.key, "true in the last frame only", "another"
     if (success[~last] != 0).any():
-        yield frames.violation(schema.SUCCESS.key, "true in the last frame only", "true before")
+        yield schema.SUCCESS.key, "true in the last frame only", "true before"
     if not np.array_equal(reward, success.astype(np.float64)):
-        yield frames.violation(schema.REWARD.key, "1 where next.success, else 0", "another")
+        yield schema.REWARD.key, "1 where next.success, else 0", "another"
 
 
-def _check_texts(frames: Frames, texts: Texts) -> Iterator[Violation]:
+def _check_texts(columns: Columns, tasks: list[str], texts: Texts) -> Iterator[Fault]:
     for key, known in texts.items():
-        used = set(frames.columns[key][:, 0].tolist()) if key in frames.columns else set()
+        used = set(columns[key][:, 0].tolist()) if key in columns else set()
         if not used <= set(range(len(known))):
-            yield frames.violation(key, f"0 to {len(known) - 1}", sorted(used))
-        elif key == "task_index" and {known[i] for i in used} != set(frames.row["tasks"]):
-            expected = str([known[i] for i in used])
-            yield replace(frames.violation("tasks", expected, frames.row["tasks"]), file="meta/episodes")
+            yield key, f"0 to {len(known) - 1}", str(sorted(used))
+        elif key == "task_index" and {known[i] for i in used} != set(tasks):
+            yield key, f"the tasks of meta/episodes, {tasks}", str([known[i] for i in used])
 
 
-def _check_content(frames: Frames) -> Iterator[Violation]:
+def _check_content(columns: Columns, types: list[Any], instruction: str) -> Iterator[Fault]:
     """Check the values by the rules for RoboCAS folders, and that each action leads to the next state."""
-    columns, key = frames.columns, schema.SUBGOAL_TYPE.key
-    arrays: dict[str, NDArray] = {"step_goal_type": np.array([str(kind) for kind in frames.types], np.str_)}
-    if {feature.key for feature in schema.FEATURES} <= set(columns):
+    arrays: dict[str, NDArray] = {"step_goal_type": np.array([str(kind) for kind in types], np.str_)}
+    if set(schema.OUR_KEYS) <= set(columns):
         state, command, status = columns["observation.state"], columns["action"], columns["observation.gripper_open"]
         if not np.array_equal(command[:, 6], np.append(status[1:], status[-1:])):
-            yield frames.violation("action", "the gripper's command of the next step", "another")
+            yield "action", "the gripper's command of the next step", "another"
         if not np.array_equal(columns["action.joint"][:, :7], np.concatenate([state[1:, 7:14], state[-1:, 7:14]])):
-            yield frames.violation("action.joint", "the next step's joints", "others")
+            yield "action.joint", "the next step's joints", "others"
         quaternions = np.linalg.norm([state[:, 3:7], columns["observation.arm_base"][:, 3:]], axis=-1)
         if quaternions.min() < 0.5:
-            yield frames.violation("observation.state, observation.arm_base", "unit quaternions", "others")
+            yield "observation.state, observation.arm_base", "unit quaternions", "others"
             return
         turns = Rotation.from_euler("xyz", command[:, 3:6]).as_quat()
-        instruction, types = next(iter(frames.row["tasks"]), ""), arrays["step_goal_type"].tolist()
-        arrays = {**robocas_arrays(dict(columns), instruction, [], types), "rel_orn": turns}
-    for wrong in laws.violations_of(EpisodeArrays(Path(frames.file), arrays), (laws.check_units, *laws.CONTENT)):
-        yield frames.violation(key if wrong.key == "step_goal_type" else wrong.key, wrong.expected, wrong.found)
+        whole = robocas_arrays(dict(columns), instruction, [], arrays["step_goal_type"].tolist())
+        arrays = {**whole, "rel_orn": turns}
+    for wrong in laws.violations_of(EpisodeArrays(Path(), arrays), (laws.check_units, *laws.CONTENT)):
+        key = schema.SUBGOAL_TYPE.key if wrong.key == "step_goal_type" else wrong.key
+        yield key, wrong.expected, wrong.found
+
+
+def check_language(table: pa.Table, file: str, info: Mapping[str, Any]) -> Iterator[Fault]:
+    """Check the language rows of an episode, those of ``lerobot-annotate`` too.
+
+    Args:
+        table: frames of the episode.
+        file: name of the file, for messages.
+        info: of the dataset.
+    """
+    persistent, events = (read_rows_of(table, key, file) for key in (PERSISTENT, EVENTS))
+    if any(rows != persistent[0] for rows in persistent[1:]):
+        yield PERSISTENT, "the same rows in each frame", "others"
+        return
+    for key, expected, found in _check_persistent(persistent[0] if persistent else [], len(table), info["fps"]):
+        yield f"{PERSISTENT}, {key}", expected, found
+    for step, rows in enumerate(events):
+        for expected, found in _check_events(rows, info["features"]):
+            yield f"{EVENTS}, frame {step}", expected, found
+
+
+def _check_persistent(rows: list[Row], count: int, fps: int) -> Iterator[Fault]:
+    for row in rows:
+        if row["style"] not in _PERSISTENT_STYLES:
+            yield "style", ", ".join(sorted(_PERSISTENT_STYLES)), str(row["style"])
+        step = row["timestamp"] * fps
+        if abs(step - round(step)) > TOLERANCE * fps or not 0 <= round(step) < count:
+            yield "timestamp", f"that of a frame, 0 to {(count - 1) / fps:g} s", f"{row['timestamp']:g} s"
+    starts = [row["timestamp"] for row in rows if row["style"] == "subtask"]
+    if starts and min(starts) > TOLERANCE:
+        yield "subtask", "one from the first frame on", f"the first at {min(starts):g} s"
+    if len(set(starts)) < len(starts):
+        yield "subtask", "one at a time", "several at once"
+
+
+def _check_events(rows: list[Row], features: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    for row in rows:
+        style, camera = row["style"], row["camera"]
+        if style not in _EVENT_STYLES:
+            yield "style interjection, vqa, trace or none", str(style)
+        elif style not in _CAMERA_STYLES:
+            continue
+        elif camera not in features or features[camera]["dtype"] not in ("video", "image"):
+            yield "a camera of the dataset", str(camera)
+        elif row["role"] == "assistant" and (box := box_in(row["content"])):
+            height, width = features[camera]["shape"][:2]
+            left, top, right, bottom = box
+            if not (0 <= left <= right < width and 0 <= top <= bottom < height):
+                yield f"a box in {width} x {height} pixels", str(list(box))
+    pairs = Counter((row["style"], row["role"], row["camera"]) for row in rows if row["style"] == "vqa")
+    if any(count > 1 for count in pairs.values()):
+        yield "one question and answer per camera", "several"

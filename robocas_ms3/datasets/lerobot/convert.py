@@ -1,38 +1,50 @@
-"""Convert a trajectory, or a dataset of another format, to a LeRobot dataset."""
+"""Converts a trajectory, or a dataset of another format, to a LeRobot dataset."""
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from robocas_ms3.core.errors import IncompleteError
+from robocas_ms3.core.errors import DatasetError, IncompleteError, OutputExistsError
 from robocas_ms3.core.files import flush_to_disk, make_folder, naming, remove
-from robocas_ms3.core.outputs import OutputFolder, sweep
-from robocas_ms3.datasets.lerobot.plan import OUTPUT, PARTS, check_episodes, only, plan_of
+from robocas_ms3.core.outputs import FolderKind, OutputFolder, sweep
+from robocas_ms3.core.strict import parse
+from robocas_ms3.core.words import count_of
 from robocas_ms3.datasets.lerobot.schema import (
     CONTENT,
+    CONVERSION_FILE,
     INFO_FILE,
     STAGING,
-    Limits,
+    FileLimits,
     check_video_size,
     require_extra,
     whole_rate,
 )
 from robocas_ms3.datasets.lerobot.variants import Variant, find_variant
-from robocas_ms3.datasets.writing.inputs import open_input
+from robocas_ms3.datasets.sources.split import split_by_seed
+from robocas_ms3.datasets.writing.inputs import ConversionInput, open_input
+from robocas_ms3.datasets.writing.plan import LEFT_OUT, with_versions
 from robocas_ms3.datasets.writing.settings import Conversion, ConversionSettings, WrittenEpisode
-from robocas_ms3.datasets.writing.workers import WriteJob, write_missing
+from robocas_ms3.datasets.writing.workers import WriteJob, write_episodes
+from robocas_ms3.demos.recordings.entries import versions
 
-FILE_LIMITS = Limits()
-"""Sizes of files: LeRobot's."""
-_JOINED = ".joined"
+FILE_LIMITS = FileLimits()
+_PARTS, _JOINED = ".parts", ".joined"  # the finished episodes; the dataset that is being made of them
+_OUTPUT = FolderKind(
+    "robocas convert --to lerobot",
+    (f"{_PARTS}/plan.json", CONVERSION_FILE),
+    "settings",
+    marks=(INFO_FILE, _PARTS),
+    upgrade=with_versions,
+)
 _FOLDERS = (*CONTENT, STAGING, "meta")  # meta comes last: where it is, the dataset is whole
 _FIX = "The same command tries again; with --leave-out, the others make the dataset where that fails."
 _log = logging.getLogger(__name__)
@@ -68,11 +80,10 @@ def convert_lerobot(
     start, variant, out = time.perf_counter(), find_variant(settings.lerobot_version), settings.out
     settings = replace(settings, pictures=replace(settings.pictures, boxes=variant.language))
     with closing(open_input(settings)) as given:
-        fps = whole_rate(given.source.rate_hz)
-        plan = plan_of(given, fps, settings.codec, variant.version)
+        plan = _plan(given, settings.codec, variant)
         recorded_settings = {key: plan[key] for key in ("settings", "made_with")}
-        with OutputFolder(out, OUTPUT, recorded_settings, overwrite=settings.overwrite) as output:
-            check_episodes(output, plan)  # everything that may fail comes before the output is touched
+        with OutputFolder(out, _OUTPUT, recorded_settings, overwrite=settings.overwrite) as output:
+            _check_episodes(output, plan)  # everything that may fail comes before the output is touched
             if settings.needs_device:
                 from robocas_ms3.datasets.writing.render import require_renderer
 
@@ -81,62 +92,111 @@ def convert_lerobot(
             joining = 0.0
             if output.recorded is None or not (out / INFO_FILE).is_file():
                 output.start(plan)
-                _sweep(out)
-                job = _missing(settings, variant, plan)
+                for name in (_JOINED, *_FOLDERS):  # left half joined by a conversion that was killed
+                    if os.path.lexists(out / name):
+                        remove(out / name)
+                sweep(out / _PARTS)
+                job = _missing_parts(settings, variant, len(plan["episodes"]), plan)
                 if on_start:
                     on_start(len(job.tasks))
-                written, incomplete = write_missing(job, output, on_episode)
+                written, incomplete = write_episodes(job, output, on_episode)
                 if incomplete and not settings.leave_out:
                     raise incomplete
                 if incomplete:
                     _log.warning("%s", incomplete)
                 staged = time.perf_counter()
-                plan = _join(out, plan, fps, incomplete)
+                plan = _join(out, plan, incomplete)
                 joining = time.perf_counter() - staged
-            for name in (PARTS, _JOINED):
+            for name in (_PARTS, _JOINED):
                 shutil.rmtree(out / name, ignore_errors=True)
     return Conversion(written, len(plan["episodes"]) - len(written), time.perf_counter() - start, joining)
 
 
-def _missing(settings: ConversionSettings, variant: Variant, plan: dict[str, Any]) -> WriteJob:
-    """Return the parts that are missing; one that is damaged is removed, and is missing."""
-    from robocas_ms3.datasets.lerobot.stage import PartWriter, is_whole, part_folder
+def _plan(given: ConversionInput, codec: str, variant: Variant) -> dict[str, Any]:
+    """Return ``conversion.json``: settings, episodes, split."""
+    entries, pictures = given.entries(), given.pictures
+    place = {entry["source"]: i for i, entry in enumerate(entries)}
+    before_train, before_val = ([place[n] for n in side if n in place] for side in given.source.settled_split())
+    seeds = {i: i if e["seed"] is None else _seed(e["seed"]) for i, e in enumerate(entries)}
+    train, val = split_by_seed(seeds, (before_train, before_val))
+    plan = {
+        "format": "lerobot",
+        "made_with": versions(),
+        "settings": {
+            "lerobot_version": variant.version,
+            "rate_hz": whole_rate(given.source.rate_hz),
+            "cameras": list(pictures.cameras),
+            "depth": pictures.depth,
+            "codec": codec,
+            "size": pictures.size,
+        },
+        "train_eps": train,
+        "val_eps": val,
+        "episodes": entries,
+    }
+    return json.loads(json.dumps(plan))
 
-    parts, entries = settings.out / PARTS, plan["episodes"]
-    for folder in (part_folder(parts, index) for index in range(len(entries))):
-        if folder.is_dir() and not is_whole(folder):
+
+def _seed(seed: Any) -> int:
+    return int(seed[0] if isinstance(seed, list) else seed)
+
+
+def _check_episodes(output: OutputFolder, plan: Mapping[str, Any]) -> None:
+    """Check that a dataset that is continued is of the same episodes; recordings may have been repaired."""
+    from robocas_ms3.datasets.lerobot.records import ConversionRecord
+
+    if output.recorded is None:
+        return
+    parse(ConversionRecord, output.recorded, DatasetError, where=output.path)
+    recorded, now = output.recorded.get("episodes", []), plan["episodes"]
+    listed = sorted([*recorded, *output.recorded.get(LEFT_OUT, [])], key=lambda entry: entry.get("source") or 0)
+    if len(listed) != len(now) or not all(map(_is_same, listed, now)):
+        what, expected = "a dataset of other episodes", count_of(len(recorded), "episode")
+        fix = "Choose another folder, or pass --overwrite to start again."
+        raise OutputExistsError(what, where=output.path, expected=expected, found=f"{len(now)}", fix=fix)
+
+
+def _is_same(before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
+    keys = ["source", "trajectory", "trajectory_episode", "seed"]
+    if before.get("recording") is not None:
+        keys.append("recording")
+    return all(before.get(key) == now[key] for key in keys)
+
+
+def _missing_parts(settings: ConversionSettings, variant: Variant, count: int, plan: Mapping[str, Any]) -> WriteJob:
+    """Return the parts that are missing; damaged ones are removed."""
+    from robocas_ms3.datasets.lerobot.parts import Part, PartWriter, part_folder
+
+    parts = settings.out / _PARTS
+    folders = [part_folder(parts, index) for index in range(count)]
+    for folder in folders:
+        if folder.is_dir() and not Part(folder).is_whole:
             _log.warning("%s: damaged since it was written; it is written again", folder)
             shutil.rmtree(folder)
-    missing = [(i, e["source"]) for i, e in enumerate(entries) if not part_folder(parts, i).is_dir()]
-    writer = PartWriter(parts, settings.codec, variant)
-    return WriteJob(settings, writer, missing, len(missing) < len(entries), _FIX)
+    missing = [(i, plan["episodes"][i]["source"]) for i, folder in enumerate(folders) if not folder.is_dir()]
+    return WriteJob(settings, PartWriter(parts, settings.codec, variant), missing, len(missing) < count, _FIX)
 
 
-def _join(out: Path, plan: dict[str, Any], fps: int, incomplete: IncompleteError | None) -> dict[str, Any]:
+def _join(out: Path, plan: dict[str, Any], incomplete: IncompleteError | None) -> dict[str, Any]:
     """Make the dataset of the parts that are there; return the plan of those."""
-    from robocas_ms3.datasets.lerobot.assemble import assemble
-    from robocas_ms3.datasets.lerobot.stage import part_folder
+    from robocas_ms3.datasets.lerobot.parts import part_folder
+    from robocas_ms3.datasets.lerobot.writer import join_parts
 
-    folders = {index: part_folder(out / PARTS, index) for index in range(len(plan["episodes"]))}
+    folders = {index: part_folder(out / _PARTS, index) for index in range(len(plan["episodes"]))}
     if incomplete:
-        why = incomplete.reasons
-        reasons = {index: why[folder.name] for index, folder in folders.items() if folder.name in why}
+        why = {index: incomplete.reasons.get(folder.name) for index, folder in folders.items()}
         folders = {index: folder for index, folder in folders.items() if folder.is_dir()}
-        plan = only(plan, list(folders), reasons)
+        place = {index: new for new, index in enumerate(folders)}
+        sides = {side: [place[i] for i in plan[side] if i in place] for side in ("train_eps", "val_eps")}
+        episodes = list(enumerate(plan["episodes"]))
+        left_out = [{**entry, "why": why[i]} for i, entry in episodes if i not in place]
+        plan = {**plan, **sides, "episodes": [entry for i, entry in episodes if i in place], LEFT_OUT: left_out}
     joined = make_folder(out / _JOINED)
     with naming(joined):
-        assemble(list(folders.values()), plan, fps, joined, FILE_LIMITS)
+        join_parts(list(folders.values()), plan, joined, FILE_LIMITS)
         flush_to_disk(joined)  # before the parts go
     for name in _FOLDERS:
         if (joined / name).is_dir():
             os.replace(joined / name, out / name)
     joined.rmdir()
     return plan
-
-
-def _sweep(out: Path) -> None:
-    """Remove what a killed conversion left half written or half joined."""
-    for name in (_JOINED, *_FOLDERS):
-        if os.path.lexists(out / name):
-            remove(out / name)
-    sweep(out / PARTS)

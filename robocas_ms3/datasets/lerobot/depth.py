@@ -1,6 +1,6 @@
-"""Depth as LeRobot's native video (LeRobot 0.6 and later): 12-bit levels that stand for a range of depths.
+"""Depth as the native video of LeRobot 0.6 and later: 12-bit levels of a range of depths.
 
-Written here: level = depth in mm, so depths up to 4095 mm are exact and farther ones are stored as 4095 mm.
+Levels written here are mm, so depths up to 4095 mm are exact and farther ones are stored as 4095 mm.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.strict import parse
 from robocas_ms3.datasets.lerobot.schema import MAX_DEPTH_MM
 
-LEVELS = 4096
+_LEVELS = 4096
 DEPTH_INFO: Mapping[str, Any] = {
     "is_depth_map": True,
     "depth_unit": "mm",
@@ -28,12 +28,12 @@ DEPTH_INFO: Mapping[str, Any] = {
     "video.preset": "ultrafast",
     "video.extra_options": {"x265-params": "lossless=1"},
 }
-"""What ``info.json`` says of a depth video besides its stream: range in m, and how LeRobot's tools encode it again."""
+"""Entries of a depth video in ``info.json``: range in m, and how LeRobot's tools encode it again."""
 _Metres = Annotated[float, Field(gt=-1e6, lt=1e6, allow_inf_nan=False)]
 
 
 class _Range(BaseModel):
-    """The range of depth that the levels of a video cover; the defaults are LeRobot's."""
+    """Range of depth of a video; the defaults are LeRobot's."""
 
     model_config = ConfigDict(strict=True)
 
@@ -62,13 +62,10 @@ def to_depth(levels: NDArray[np.uint16], info: Mapping[str, Any]) -> NDArray[np.
     Args:
         levels: 0 to 4095.
         info: ``info`` of the video's feature; missing values are LeRobot's defaults.
-
-    Raises:
-        DatasetError: a value of the range has the wrong type, or the range is empty.
     """
     values = parse(_Range, dict(info), DatasetError, where="info", about="invalid range of a depth video")
     low, high, shift = values.depth_min, values.depth_max, values.shift
-    share = levels.astype(np.float64) / (LEVELS - 1)
+    share = levels.astype(np.float64) / (_LEVELS - 1)
     if values.use_log:
         first, last = np.log(low + shift), np.log(high + shift)
         metres = np.exp(first + share * (last - first)) - shift

@@ -155,11 +155,7 @@ def box_in(answer: str | None) -> Box | None:
 
 
 def read_rows_of(table: pa.Table, key: str, where: object) -> list[list[Row]]:
-    """Return the rows of a language column, those of each frame.
-
-    Raises:
-        DatasetError: the column is missing, or its values are no such rows.
-    """
+    """Return the rows of a language column, those of each frame."""
     fields = {*("role", "content", "style", "camera"), *(("timestamp",) if key == PERSISTENT else ())}
     kind = table.schema.field(key).type if key in table.column_names else pa.null()
     is_list = pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)

@@ -11,7 +11,6 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.strict import parse
 from robocas_ms3.datasets.lerobot import schema
@@ -22,7 +21,6 @@ from robocas_ms3.datasets.lerobot.records import (
     InfoRecord,
     TaskLine,
     episode_columns,
-    of_our_shapes,
     read_lines,
 )
 from robocas_ms3.datasets.lerobot.tables import (
@@ -34,32 +32,23 @@ from robocas_ms3.datasets.lerobot.tables import (
     read_texts,
 )
 from robocas_ms3.datasets.lerobot.variants import CHUNK_FILES, LAYOUTS, Layout
-from robocas_ms3.datasets.sources.tolerant import first_line
+from robocas_ms3.datasets.sources.files import read_json
 
 
 class Metadata:
-    """The ``meta`` folder of a dataset; each file is read at its first use.
-
-    Attributes:
-        root: folder of the dataset.
-    """
+    """The ``meta`` folder of a dataset; each file is read at its first use."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
 
     @cached_property
     def info(self) -> dict[str, Any]:
-        """``meta/info.json``.
-
-        Raises:
-            DatasetError: it is missing or damaged, or of another version.
-        """
+        """``meta/info.json``."""
         path = self.root / schema.INFO_FILE
-        try:
-            found = load_json(path)
-        except (OSError, ValueError) as error:
-            raise DatasetError("no LeRobot dataset here", where=path, found=type(error).__name__) from error
-        version = found.get("codebase_version") if isinstance(found, dict) else None
+        found = read_json(path)
+        if not found:
+            raise DatasetError("no LeRobot dataset here", where=path, found="no file")
+        version = found.get("codebase_version")
         if not isinstance(version, str) or version not in LAYOUTS:
             what = "a LeRobot dataset of another version"
             raise DatasetError(what, where=self.root, expected=" or ".join(LAYOUTS), found=version)
@@ -68,16 +57,9 @@ class Metadata:
 
     @cached_property
     def settings(self) -> dict[str, Any]:
-        """``meta/robocas/conversion.json``; empty where there is none.
-
-        Raises:
-            DatasetError: it is damaged.
-        """
+        """``meta/robocas/conversion.json``; empty where there is none."""
         path = self.root / schema.CONVERSION_FILE
-        try:
-            found = load_json(path) if path.exists() else {}
-        except (OSError, ValueError) as error:
-            raise DatasetError("this JSON is damaged", where=path, found=first_line(error)) from error
+        found = read_json(path)
         parse(ConversionRecord, found, DatasetError, where=path)
         return found
 
@@ -114,16 +96,16 @@ class Metadata:
     @property
     def is_ours(self) -> bool:
         """Whether it has all columns of a dataset that ``robocas convert`` writes."""
-        return of_our_shapes(self.info["features"])
+        features = self.info["features"]
+        return all(features.get(own.key, {}).get("shape") == [own.width] for own in schema.FEATURES)
 
     @cached_property
     def rows(self) -> list[dict[str, Any]]:
-        """The rows of ``meta/episodes``, without statistics.
-
-        Raises:
-            DatasetError: a table is damaged, too long, or lacks a column; or two rows are of one episode.
-        """
-        found = [row for path, table in self.tables_of_episodes() for row in self._checked(path, table).to_pylist()]
+        """The rows of ``meta/episodes``, without statistics."""
+        found: list[dict[str, Any]] = []
+        for path, table in self.tables_of_episodes():
+            check_columns(table, episode_columns(table.column_names, self.info["features"]), path)
+            found += table.to_pylist()
         numbers = [row["episode_index"] for row in found]
         if len(set(numbers)) < len(numbers):
             raise DatasetError("two rows of one episode", where=self.root / "meta/episodes")
@@ -134,11 +116,7 @@ class Metadata:
         return found
 
     def tables_of_episodes(self) -> Iterator[tuple[Path, pa.Table]]:
-        """Yield path and table of the files of ``meta/episodes``, without statistics.
-
-        Raises:
-            DatasetError: one is damaged, or they have more rows than there are episodes.
-        """
+        """Yield path and table of the files of ``meta/episodes``, without statistics."""
         left = self.info["total_episodes"]
         if self.layout.one_file_per_episode:
             yield self.root / schema.EPISODES_LINES, self._table_of_lines(left)
@@ -170,17 +148,9 @@ class Metadata:
         empty = {key: [] for key in episode_columns((), features)}
         return pa.Table.from_pylist(rows) if rows else pa.table(empty)
 
-    def _checked(self, path: Path, table: pa.Table) -> pa.Table:
-        check_columns(table, episode_columns(table.column_names, self.info["features"]), path)
-        return table
-
     @cached_property
     def tasks(self) -> list[str]:
-        """Instructions, by ``task_index``.
-
-        Raises:
-            DatasetError: they are damaged, or their numbers are not 0, 1, 2, ...
-        """
+        """Instructions, by ``task_index``."""
         if self.layout.one_file_per_episode:
             path = self.root / schema.TASKS_LINES
             lines = sorted(read_lines(path, TaskLine, self.info["total_tasks"]), key=lambda line: line.task_index)
@@ -196,11 +166,7 @@ class Metadata:
         return read_texts(self.root / schema.SUBTASKS_FILE, "subtask_index", self.info["total_frames"])
 
     def subtask_texts(self, places: NDArray, where: object) -> list[str]:
-        """Return the texts of sub-goals by their numbers.
-
-        Raises:
-            DatasetError: there is no text of such a number.
-        """
+        """Return the texts of sub-goals by their numbers."""
         known = len(self.subtasks)
         wrong = places[~((places >= 0) & (places < known) & (places == np.floor(places)))]
         if len(wrong):

@@ -1,9 +1,11 @@
-"""Read the parts of a conversion: the tables and descriptions that `stage` wrote."""
+"""Parts of a conversion: each episode is written by itself, and read when all are joined. A folder appears whole."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -12,38 +14,184 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict
 
-from robocas_ms3.core.documents import load_json
+from robocas_ms3.core.documents import JSON_LIMIT, read_text
 from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.files import json_text, replacing_folder
 from robocas_ms3.datasets.lerobot import schema
+from robocas_ms3.datasets.lerobot.arrays import frame_columns
+from robocas_ms3.datasets.lerobot.depth import to_levels
 from robocas_ms3.datasets.lerobot.language import (
     EVENTS,
     EVENTS_TYPE,
     PERSISTENT,
     PERSISTENT_TYPE,
     Row,
+    event_rows,
     paraphrases,
     persistent_rows,
 )
-from robocas_ms3.datasets.lerobot.stage import EPISODE_FILE, FRAMES_FILE, SUBGOAL
-from robocas_ms3.datasets.lerobot.stats import Range
-from robocas_ms3.datasets.lerobot.table_writing import column
-from robocas_ms3.datasets.lerobot.tables import numbers
+from robocas_ms3.datasets.lerobot.records import CameraRecord
+from robocas_ms3.datasets.lerobot.stats import Levels
+from robocas_ms3.datasets.lerobot.tables import as_column, numbers
 from robocas_ms3.datasets.lerobot.variants import Variant
+from robocas_ms3.datasets.lerobot.video import Encoder, coding_of
+from robocas_ms3.datasets.pictures.boxes import Box
+from robocas_ms3.datasets.schema import episode_folder
+from robocas_ms3.datasets.sources.protocol import Frame, Kind
+from robocas_ms3.datasets.writing.inputs import ConversionInput, complete_arrays
+from robocas_ms3.datasets.writing.settings import Timing, WrittenEpisode
 from robocas_ms3.demos.recordings.subgoals import subgoal_runs
 
+FRAMES_FILE, EPISODE_FILE = "frames.parquet", "episode.json"
+SUBGOAL = "subgoal"  # column of texts, which become numbers when parts are joined
 
-@dataclass
-class Texts:
-    """Texts and their numbers, in the order in which they occur.
+
+class EpisodeRecord(BaseModel):
+    """``episode.json`` of a part.
 
     Attributes:
-        tasks: instructions.
-        subgoals: texts of sub-goals.
+        instruction: of the episode.
+        scene: content of ``scene.json``.
+        cameras: by name.
+        depth: whether there are videos of depth.
+        depth_clipped: whether depth was out of the range of a native depth video.
+        levels: counts of the levels of each video feature, see `stats.Levels`.
+        sizes: bytes of the other files of the part.
     """
 
-    tasks: dict[str, int] = field(default_factory=dict)
-    subgoals: dict[str, int] = field(default_factory=dict)
+    model_config = ConfigDict(strict=True)
+
+    instruction: str
+    scene: dict[str, Any]
+    cameras: dict[str, CameraRecord]
+    depth: bool
+    depth_clipped: bool
+    levels: dict[str, list[list[int]]]
+    sizes: dict[str, int]
+
+
+def part_folder(parts: Path, index: int) -> Path:
+    """Return the folder of the part of an episode."""
+    return parts / episode_folder(index)
+
+
+def video_name(camera: str, kind: Kind, codec: str, variant: Variant) -> str:
+    """Return the name of a video in a part."""
+    return f"{kind}_{camera}{coding_of(kind, codec, variant).suffix}"
+
+
+def _sizes(folder: Path) -> dict[str, int]:
+    return {file.name: file.stat().st_size for file in sorted(folder.iterdir()) if file.name != EPISODE_FILE}
+
+
+@dataclass(frozen=True)
+class PartWriter:
+    """Writes the parts of a LeRobot dataset; can be sent to another process.
+
+    Attributes:
+        parts: folder of the parts.
+        codec: of RGB.
+        variant: of the dataset.
+    """
+
+    parts: Path
+    codec: str
+    variant: Variant
+
+    def write(self, number: int, given: ConversionInput, source: int) -> WrittenEpisode:
+        """Write episode ``source`` of the input as part ``number``."""
+        start, timing, fps = time.perf_counter(), Timing(), schema.whole_rate(given.source.rate_hz)
+        with replacing_folder(part_folder(self.parts, number), sync=True) as folder:
+            with timing.measure("load"):
+                episode = given.source.episode(source)
+                arrays = complete_arrays(episode)
+            with _Videos(folder, self, fps, timing) as videos, closing(given.frames(episode)) as frames:
+                for frame in timing.each(given.stage, frames):
+                    videos.add(frame)
+            begin_write, steps, scene = time.perf_counter(), int(arrays["episode_length"]), episode.scene
+            if len(videos.boxes) != steps:
+                what = "images and arrays differ in length"
+                raise DatasetError(what, where=source, expected=steps, found=len(videos.boxes))
+            pq.write_table(self._table(arrays, videos.boxes, scene, fps), folder / FRAMES_FILE)
+            record = EpisodeRecord(
+                instruction=str(arrays["language_goal"]),
+                scene=scene,
+                cameras={name: CameraRecord.of(name, episode.camera(name)) for name in given.pictures.cameras},
+                depth=given.pictures.depth,
+                depth_clipped=videos.clipped,
+                levels={key: levels.counts.tolist() for key, levels in videos.levels.items()},
+                sizes=_sizes(folder),
+            )
+            text = json_text(record.model_dump(), f"episode {source}", error=DatasetError)
+            (folder / EPISODE_FILE).write_text(text, encoding="utf-8")
+            size = sum(file.stat().st_size for file in folder.iterdir())
+        timing.write += time.perf_counter() - begin_write  # with the renaming of the folder
+        timing.total += time.perf_counter() - start
+        return WrittenEpisode(number, steps, size, timing)
+
+    def _table(
+        self, arrays: dict[str, NDArray], boxes: list[dict[str, Box]], scene: dict[str, Any], fps: int
+    ) -> pa.Table:
+        """Return the frames, without the numbers that depend on other episodes."""
+        steps = int(arrays["episode_length"])
+        columns: dict[str, Any] = {key: as_column(values) for key, values in frame_columns(arrays).items()}
+        columns[schema.SUBGOAL_TYPE.key] = pa.array(arrays["step_goal_type"].tolist(), pa.string())
+        columns["timestamp"] = pa.array((np.arange(steps) / fps).astype(np.float32))
+        columns["frame_index"] = pa.array(np.arange(steps))
+        columns[SUBGOAL] = pa.array(arrays["step_lang_goals"].tolist(), pa.string())
+        if self.variant.language:
+            target = str((scene.get("target") or {}).get("name") or "")
+            events = [event_rows(found, target) if target.strip() else [] for found in boxes]
+            columns[EVENTS] = pa.array(events, EVENTS_TYPE)
+        return pa.table(columns)
+
+
+class _Videos:
+    """Encodes the images of an episode: one encoder per camera and kind, opened with the first frame.
+
+    Attributes:
+        levels, clipped: see `EpisodeRecord`.
+        boxes: of each frame.
+    """
+
+    def __init__(self, folder: Path, writer: PartWriter, fps: int, timing: Timing) -> None:
+        self._folder, self._writer, self._fps, self._timing = folder, writer, fps, timing
+        self._encoders: dict[str, Encoder] = {}
+        self._stack = ExitStack()
+        self.levels: dict[str, Levels] = {}
+        self.boxes: list[dict[str, Box]] = []
+        self.clipped = False
+
+    def __enter__(self) -> _Videos:
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        with self._timing.measure("encode"):
+            self._stack.__exit__(*error)
+
+    def add(self, frame: Frame) -> None:
+        with self._timing.measure("encode"):
+            for camera, image in frame.rgb.items():
+                self._encode("rgb", camera, image)
+                self.levels.setdefault(schema.image_key(camera), Levels.rgb()).add(image)
+            for camera, image in frame.depth.items():
+                if self._writer.variant.native_depth:
+                    self.clipped = self.clipped or bool(image.max() > schema.MAX_DEPTH_MM)
+                    image = to_levels(image)  # noqa: PLW2901
+                    self.levels.setdefault(schema.depth_key(camera), Levels.depth()).add(image)
+                self._encode("depth", camera, image)
+        self.boxes.append(frame.boxes)
+
+    def _encode(self, kind: Kind, camera: str, image: NDArray) -> None:
+        name = video_name(camera, kind, self._writer.codec, self._writer.variant)
+        if name not in self._encoders:
+            height, width = image.shape[:2]
+            coding = coding_of(kind, self._writer.codec, self._writer.variant)
+            encoder = Encoder(self._folder / name, coding, self._fps, (width, height))
+            self._encoders[name] = self._stack.enter_context(encoder)
+        self._encoders[name].add(image)
 
 
 @dataclass(frozen=True)
@@ -58,112 +206,90 @@ class Part:
     """
 
     folder: Path
-    index: int
-    start: int
-    success: bool
+    index: int = 0
+    start: int = 0
+    success: bool = False
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether its files are as large as when they were written."""
+        try:
+            return self.record.sizes == _sizes(self.folder)
+        except (DatasetError, OSError):
+            return False
 
     @cached_property
-    def about(self) -> dict[str, Any]:
-        """What `stage` says of it.
+    def record(self) -> EpisodeRecord:
+        """Its ``episode.json``.
 
         Raises:
             DatasetError: it is damaged.
         """
         path = self.folder / EPISODE_FILE
         try:
-            return load_json(path)
+            return EpisodeRecord.model_validate_json(read_text(path, JSON_LIMIT))
         except (OSError, ValueError) as error:
             raise _damaged(path) from error
 
     @cached_property
     def table(self) -> pa.Table:
-        """Its frames.
-
-        Raises:
-            DatasetError: they are damaged.
-        """
+        """Its frames."""
         path = self.folder / FRAMES_FILE
         try:
             return pq.read_table(path)
         except (OSError, pa.ArrowException) as error:
             raise _damaged(path) from error
 
-    @property
-    def steps(self) -> int:
-        """Number of frames."""
-        return len(self.table)
-
-    def columns(self, variant: Variant, texts: Texts) -> dict[str, NDArray]:
-        """Return the numeric features (T, D), with the numbers that follow from the episodes before."""
-        steps = self.steps
-        found = {key: numbers(self.table.column(key)) for key in numeric(variant) if key in self.table.column_names}
+    def columns(self, variant: Variant, tasks: dict[str, int], subgoals: dict[str, int]) -> dict[str, NDArray]:
+        """Return the numeric features (T, D), with the numbers that depend on the episodes before."""
+        steps = len(self.table)
         last = np.arange(steps)[:, None] == steps - 1
         made = {
             "episode_index": np.full((steps, 1), self.index, np.int64),
             "index": np.arange(self.start, self.start + steps)[:, None],
-            "task_index": np.full((steps, 1), texts.tasks[self.about["instruction"]], np.int64),
+            "task_index": np.full((steps, 1), tasks[self.record.instruction], np.int64),
             schema.REWARD.key: (last & self.success).astype(np.float32),
             schema.SUCCESS.key: last & self.success,
             schema.DONE.key: last,
         }
         if not variant.language:
-            places = [texts.subgoals[text] for text in self.table.column(SUBGOAL).to_pylist()]
+            places = [subgoals[text] for text in self.table.column(SUBGOAL).to_pylist()]
             made[schema.SUBTASK_INDEX.key] = np.array(places, np.int64)[:, None]
-        return {key: {**found, **made}[key] for key in numeric(variant)}
+        keys = numeric_keys(variant)
+        return {key: made[key] if key in made else numbers(self.table.column(key)) for key in keys}
 
     def persistent(self, fps: int) -> list[Row]:
         """Return the persistent language rows of the episode."""
         types, goals = (self.table.column(key).to_pylist() for key in (schema.SUBGOAL_TYPE.key, SUBGOAL))
-        return persistent_rows(
-            subgoal_runs(types, goals), paraphrases(self.about["scene"], self.about["instruction"]), fps
-        )
+        texts = paraphrases(self.record.scene, self.record.instruction)
+        return persistent_rows(subgoal_runs(types, goals), texts, fps)
 
     def data(self, variant: Variant, columns: dict[str, NDArray], persistent: list[Row]) -> pa.Table:
         """Return the rows of the data, columns in the order of the features."""
-        made: dict[str, Any] = {feature.key: column(columns[feature.key]) for feature in schema.FEATURES}
+        made: dict[str, Any] = {feature.key: as_column(columns[feature.key]) for feature in schema.FEATURES}
         for feature in schema.single_features(variant):
             is_text = feature.dtype == "string"
-            made[feature.key] = self.table.column(feature.key) if is_text else column(columns[feature.key])
+            made[feature.key] = self.table.column(feature.key) if is_text else as_column(columns[feature.key])
         if variant.language:
-            same = pa.array(np.zeros(self.steps, np.int64))  # every frame has all rows of its episode
+            same = pa.array(np.zeros(len(self.table), np.int64))  # every frame has all rows of its episode
             made[PERSISTENT] = pa.array([persistent], PERSISTENT_TYPE).take(same)
             made[EVENTS] = self.table.column(EVENTS).cast(EVENTS_TYPE)
-        for key in schema.INDICES:
-            made[key] = column(columns[key])
-        return pa.table(made)
+        return pa.table(made | {key: as_column(columns[key]) for key in schema.INDICES})
 
 
-def numeric(variant: Variant) -> tuple[str, ...]:
+def numeric_keys(variant: Variant) -> tuple[str, ...]:
     """Return the keys of the numeric features that are stored in tables."""
     single = (feature.key for feature in schema.single_features(variant) if feature.dtype != "string")
-    return (*(feature.key for feature in schema.FEATURES), *single, *schema.INDICES)
+    return (*schema.OUR_KEYS, *single, *schema.INDICES)
 
 
 def read_parts(folders: Sequence[Path], entries: Sequence[dict[str, Any]]) -> Iterator[Part]:
-    """Yield the parts of a plan in order, one in memory at a time.
-
-    Args:
-        folders: of the parts.
-        entries: of ``conversion.json``, which say which episodes succeeded.
-    """
+    """Yield parts in order, one in memory at a time; entries of ``conversion.json`` say which episodes succeeded."""
     start = 0
     for index, (folder, entry) in enumerate(zip(folders, entries, strict=True)):
         part = Part(folder, index, start, entry.get("success") is True)
         yield part
-        start += part.steps
-
-
-def survey(parts: Iterable[Part], variant: Variant) -> tuple[Texts, dict[str, Range]]:
-    """Number texts as they come, and find the range of every feature, which histograms need beforehand."""
-    texts, ranges = Texts(), {key: Range() for key in numeric(variant)}
-    for part in parts:
-        texts.tasks.setdefault(part.about["instruction"], len(texts.tasks))
-        for text in part.table.column(SUBGOAL).to_pylist():
-            texts.subgoals.setdefault(text, len(texts.subgoals))
-        columns = part.columns(variant, texts)
-        for key, found in ranges.items():
-            found.add(columns[key])
-    return texts, ranges
+        start += len(part.table)
 
 
 def _damaged(path: Path) -> DatasetError:

@@ -1,4 +1,4 @@
-"""Open a LeRobot dataset; needs no ``lerobot``. What only those made here have is read where it is there."""
+"""Reads LeRobot datasets without ``lerobot``; those made here have more than others."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ from robocas_ms3.robots.cameras import Parent, standard_parent
 
 
 class LeRobotDataset(Metadata, EpisodeSource):
-    """A dataset's folder.
+    """A LeRobot dataset.
 
     Raises:
         DatasetError: no LeRobot dataset there, or one of another version.
@@ -70,7 +70,7 @@ class LeRobotDataset(Metadata, EpisodeSource):
 
     @cached_property
     def row_of(self) -> dict[int, dict[str, Any]]:
-        """The same by number, whichever are there."""
+        """Number -> row of ``meta/episodes``."""
         return {row["episode_index"]: row for row in self.rows}
 
     @cached_property
@@ -84,11 +84,7 @@ class LeRobotDataset(Metadata, EpisodeSource):
         return {row["episode_index"]: int(row["length"]) for row in self.rows}
 
     def split(self, side: Side) -> list[int]:
-        """Numbers of one side, as the conversion divided them; all of another's dataset train.
-
-        Raises:
-            DatasetError: the conversion names an episode that is not there.
-        """
+        """Return the numbers of one side; all episodes of a dataset made elsewhere train."""
         if side == "all" or (side == "train" and "train_eps" not in self.settings):
             return self.numbers
         sides = {f"{side}_eps": self.settings.get(f"{side}_eps", [])}
@@ -98,17 +94,13 @@ class LeRobotDataset(Metadata, EpisodeSource):
         return list(sides[f"{side}_eps"])
 
     def entry(self, number: int) -> dict[str, Any]:
-        """What the conversion said of it."""
+        """Return the entry of an episode in ``conversion.json``."""
         entries = self.settings.get("episodes", [])
         return entries[number] if number < len(entries) else {}
 
     @cached_property
     def goals(self) -> dict[int, list[SubGoal]]:
-        """Number -> sub-goals over the steps, in one pass over the tables; empty where they are not ours.
-
-        Raises:
-            DatasetError: one is damaged.
-        """
+        """Number -> sub-goals over the steps, in one pass over the tables; empty for datasets made elsewhere."""
         goals: dict[int, list[SubGoal]] = {}
         for path in sorted((self.root / "data").glob("*/*.parquet")) if self.is_ours else ():
             for number, types, texts in self._subgoals(path):
@@ -143,11 +135,7 @@ class LeRobotDataset(Metadata, EpisodeSource):
                     yield int(numbers[first]), types, goals_of(rows, len(types), self.info["fps"])
 
     def episode(self, number: int) -> LeRobotEpisode:
-        """Open an episode.
-
-        Raises:
-            DatasetError: there is none of this number.
-        """
+        """Open an episode."""
         if number not in self.row_of:
             raise DatasetError("no such episode", where=self.root, expected=f"0 to {len(self.rows) - 1}", found=number)
         return LeRobotEpisode(self, number)
@@ -155,19 +143,19 @@ class LeRobotDataset(Metadata, EpisodeSource):
 
 @dataclass(frozen=True)
 class LeRobotEpisode(SourceEpisode):
-    """One of its episodes."""
+    """An episode of a LeRobot dataset."""
 
     dataset: LeRobotDataset
     number: int
 
     @property
     def where(self) -> str:
-        """Dataset and number."""
+        """Dataset and number, for messages."""
         return f"{self.dataset.root}, episode {self.number}"
 
     @property
     def row(self) -> dict[str, Any]:
-        """What ``meta/episodes`` says of it."""
+        """Row of ``meta/episodes``."""
         return self.dataset.row_of[self.number]
 
     @property
@@ -192,11 +180,7 @@ class LeRobotEpisode(SourceEpisode):
 
     @cached_property
     def table(self) -> pa.Table:
-        """Its rows of the data.
-
-        Raises:
-            DatasetError: the file is damaged, or has another number of rows of this episode.
-        """
+        """Frames of the episode."""
         row, layout = self.row, self.dataset.layout
         path = layout.path(self.dataset.root, layout.data, row["data/chunk_index"], row["data/file_index"])
         table = read_rows(path, self.number, self.dataset.info["total_frames"])
@@ -213,11 +197,7 @@ class LeRobotEpisode(SourceEpisode):
 
     @cached_property
     def arrays(self) -> dict[str, NDArray]:
-        """Arrays of ``episode_info.npz`` but the embeddings, by the schema's keys.
-
-        Raises:
-            DatasetError: the dataset has other columns than those written here, or they are damaged.
-        """
+        """Arrays of ``episode_info.npz`` without embeddings."""
         if not self.dataset.is_ours:
             raise DatasetError("not of our columns", where=self.where, expected=", ".join(schema.OUR_KEYS))
         check_columns(self.table, frame_columns(self.dataset.info["features"]), Path(self.where))
@@ -332,12 +312,7 @@ def _depths(levels: Generator[NDArray, None, None], info: dict[str, Any]) -> Gen
 
 
 def open_lerobot(root: Path, *, rate_hz: float | None = None, include_failed: bool = False) -> LeRobotDataset:
-    """Open a dataset; failed episodes are in it where it was made so.
-
-    Raises:
-        DatasetError: there is none, or it is of another version or rate.
-        MissingExtraError: pyarrow or av is missing.
-    """
+    """Open a dataset; failed episodes are in it where it was made so."""
     dataset = LeRobotDataset(root)
     check_rate(dataset, rate_hz)
     return dataset

@@ -1,22 +1,24 @@
-"""Declared forms of a LeRobot dataset's JSON files and tables; reader and checker share them."""
+"""Declared forms of the JSON files and tables of a LeRobot dataset; writer, reader and checks share them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
+import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, NonNegativeInt, StringConstraints, model_validator
 
 from robocas_ms3.core.documents import JSON_LIMIT, json_values, read_text
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.strict import parse
 from robocas_ms3.datasets.lerobot import schema
-from robocas_ms3.datasets.lerobot.tables import INTEGER, INTEGERS, NUMBER, NUMBERS, TEXT, TEXTS, Column, Kind
+from robocas_ms3.datasets.lerobot.tables import INTEGER, INTEGERS, NUMBER, NUMBERS, TEXT, TEXTS, Column
 from robocas_ms3.datasets.lerobot.variants import CHUNK_FILES, LAYOUTS
+from robocas_ms3.datasets.sources.protocol import CameraModel
 from robocas_ms3.datasets.sources.records import EntryRecord
 from robocas_ms3.datasets.sources.tolerant import first_line
-from robocas_ms3.robots.cameras import Parent
+from robocas_ms3.robots.cameras import Parent, standard_parent
 
 MAX_EPISODES = 10**6
 MAX_FRAMES = 10**9
@@ -24,11 +26,11 @@ _MAX_FILES = 10**6
 _MAX_SECONDS = 1e6  # of a video's timestamps
 
 Name = Annotated[str, StringConstraints(pattern=r"^[^\x00-\x1f\x7f/\\.][^\x00-\x1f\x7f/\\]*$", max_length=200)]
-"""A feature's key: it is part of paths, so LeRobot too refuses one with a slash."""
+"""Key of a feature, which is part of paths."""
 Dtype = Annotated[
     str, StringConstraints(pattern=r"^(video|image|string|language|bool|float(16|32|64)|u?int(8|16|32|64))$")
 ]  # fmt: skip
-Number = Annotated[float, Field(allow_inf_nan=False)]
+_Four = Annotated[list[Annotated[float, Field(allow_inf_nan=False)]], Field(min_length=4, max_length=4)]
 
 
 class _Record(BaseModel):
@@ -114,16 +116,7 @@ _Line = TypeVar("_Line", bound=_Record)
 
 
 def read_lines(path: Path, form: type[_Line], most: int) -> list[_Line]:
-    """Read a file of JSON lines.
-
-    Args:
-        path: of the file.
-        form: of each line.
-        most: number of lines; more are refused.
-
-    Raises:
-        DatasetError: the file is missing, damaged, or has more lines.
-    """
+    """Read a file of at most so many JSON lines."""
     try:
         lines = [line for line in read_text(path, JSON_LIMIT).split("\n") if line.strip()]
         if len(lines) > most:
@@ -135,7 +128,7 @@ def read_lines(path: Path, form: type[_Line], most: int) -> list[_Line]:
 
 
 class SourceEntryRecord(EntryRecord):
-    """The recording of an episode, and its number in the source of the conversion."""
+    """Recording of an episode, and its number in the source of the conversion."""
 
     source: NonNegativeInt | None = None
 
@@ -152,13 +145,18 @@ class ConversionRecord(_Record):
 
 
 class CameraRecord(_Record):
-    """A camera of an episode in ``meta/robocas/episodes.parquet``."""
+    """A camera of an episode in ``meta/robocas/episodes.parquet``; see `CameraModel`."""
 
-    intrinsic: Annotated[list[Number], Field(min_length=4, max_length=4)]
-    camera_in_parent: Annotated[
-        list[Annotated[list[Number], Field(min_length=4, max_length=4)]], Field(min_length=4, max_length=4)
-    ]
+    intrinsic: _Four
+    camera_in_parent: Annotated[list[_Four], Field(min_length=4, max_length=4)]
     parent: Parent | None = Field(default=None, description="None: that of the standard camera of this name")
+
+    @classmethod
+    def of(cls, name: str, model: CameraModel) -> CameraRecord:
+        """Return the record of a camera."""
+        intrinsic, pose = (np.asarray(array).tolist() for array in (model.intrinsic, model.camera_in_parent))
+        parent = None if model.parent == standard_parent(name) else model.parent
+        return cls(intrinsic=intrinsic, camera_in_parent=pose, parent=parent)
 
 
 class CamerasRecord(_Record):
@@ -177,12 +175,7 @@ SUBGOALS: Mapping[str, Column] = {
 
 
 def episode_columns(names: Iterable[str], features: Mapping[str, Any]) -> dict[str, Column]:
-    """Return the columns that ``meta/episodes`` has to have.
-
-    Args:
-        names: of the columns that are there; those of depth are optional.
-        features: of ``info.json``.
-    """
+    """Return the columns of ``meta/episodes``; those of depth are optional, by the ``names`` that are there."""
     columns = {
         "episode_index": Column(INTEGER, greatest=MAX_EPISODES - 1),
         "tasks": Column(TEXTS),
@@ -204,34 +197,15 @@ def episode_columns(names: Iterable[str], features: Mapping[str, Any]) -> dict[s
 
 
 def frame_columns(features: Mapping[str, Any]) -> dict[str, Column]:
-    """Return the columns that the data have to have; numbers themselves are checked per episode."""
-    apart = ("image", "video", "language")
-    stored = {key: feature["dtype"] for key, feature in features.items() if feature["dtype"] not in apart}
-    columns = {key: Column(_kind_of(dtype)) for key, dtype in stored.items()}
-    return {**columns, **{key: Column(INTEGER, greatest=MAX_FRAMES) for key in schema.INDICES if key != "timestamp"}}
-
-
-def _kind_of(dtype: str) -> Kind:
-    if dtype == "string":
-        return TEXT
-    return NUMBERS if dtype.startswith("float") else INTEGERS  # booleans too
-
-
-def of_our_shapes(features: Mapping[str, Any]) -> bool:
-    """Return whether the features are those of datasets written here, in their shapes."""
-    return all(features.get(own.key, {}).get("shape") == [own.width] for own in schema.FEATURES)
-
-
-def wrong_shapes(features: Mapping[str, Any]) -> Iterator[tuple[str, list[int], list[int]]]:
-    """Yield key, expected and found shape of features that all have our names but not our shapes."""
-    if set(schema.OUR_KEYS) <= set(features):
-        for own in schema.FEATURES:
-            if features[own.key]["shape"] != [own.width]:
-                yield f"features.{own.key}.shape", [own.width], features[own.key]["shape"]
+    """Return the columns of the data."""
+    columns: dict[str, Column] = {}
+    for key, dtype in ((key, feature["dtype"]) for key, feature in features.items()):
+        if dtype not in ("image", "video", "language"):
+            columns[key] = Column(TEXT if dtype == "string" else NUMBERS if dtype.startswith("float") else INTEGERS)
+    return columns | {key: Column(INTEGER, greatest=MAX_FRAMES) for key in schema.INDICES if key != "timestamp"}
 
 
 def unknown_numbers(sides: Mapping[str, Sequence[int]], known: Iterable[int]) -> dict[str, list[int]]:
     """Return, by side of a split, the episode numbers that are not known."""
     there = set(known)
-    found = {side: [number for number in numbers if number not in there] for side, numbers in sides.items()}
-    return {side: numbers for side, numbers in found.items() if numbers}
+    return {side: unknown for side, numbers in sides.items() if (unknown := [n for n in numbers if n not in there])}

@@ -35,15 +35,14 @@ Metres and radians; quaternions are xyzw.
 from __future__ import annotations
 
 import hashlib
+import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from robocas_ms3.core.documents import check_regular
-from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.errors import DatasetError, MissingExtraError
 from robocas_ms3.datasets.lerobot.variants import Variant
 from robocas_ms3.robots.table import DEFAULT
 
@@ -67,14 +66,13 @@ _FILE_LIMIT = 2**34  # bytes
 
 
 @dataclass(frozen=True)
-class Limits:
-    """When a new file begins; an episode is never divided.
+class FileLimits:
+    """Sizes beyond which a new file begins; an episode is never divided.
 
     Attributes:
         data_mb, video_mb: size of a file, 2^20 bytes; LeRobot's own.
-        video_seconds: length of a video. LeRobot looks frames up by float32 seconds refuses what is off by more than
-            0.1 ms, which float32 resolves up to 1024 s. At rates up to 20 Hz longer videos happen to round the same way
-            (checked up to 8192 s), but nothing is gained by them.
+        video_seconds: length of a video. LeRobot finds frames by float32 seconds to 0.1 ms, which float32 resolves up
+            to 1024 s.
     """
 
     data_mb: float = 100
@@ -100,11 +98,11 @@ class Feature:
 
     @property
     def width(self) -> int:
-        """How many numbers."""
+        """Number of numbers."""
         return len(self.names)
 
     def as_json(self) -> dict[str, Any]:
-        """Its form in ``info.json``."""
+        """Return its entry in ``info.json``."""
         return {"dtype": self.dtype, "shape": [self.width], "names": list(self.names)}
 
 
@@ -136,7 +134,7 @@ FEATURES: tuple[Feature, ...] = (
 """Numeric features. The keys in their meanings are those of ``episode_info.npz``."""
 
 OUR_KEYS = tuple(feature.key for feature in FEATURES)
-"""By which a dataset written here is known."""
+"""A dataset with these keys was written here."""
 
 SUBGOAL_TYPE = Feature("subgoal_type", ("type",), "type of the sub-goal pursued at this step", "string")
 SUBTASK_INDEX = Feature("subtask_index", ("index",), "row of meta/subtasks.parquet: text of that sub-goal", "int64")
@@ -176,17 +174,11 @@ def is_depth(feature: dict[str, Any]) -> bool:
 
 
 def robot_type(scene: dict[str, Any]) -> str:
-    """LeRobot's word for the robot of an episode's scene."""
+    """Return LeRobot's name of the robot of a scene."""
     env_info = scene.get("env_info")
     kwargs = env_info.get("env_kwargs") if isinstance(env_info, dict) else None
     named = kwargs.get("robot_uids") if isinstance(kwargs, dict) else None
     return ROBOT_TYPE if named in (None, DEFAULT) else str(named)
-
-
-def video_feature(video: dict[str, Any]) -> dict[str, Any]:
-    """Return the entry of a video in ``features``, from its description by `video.describe`."""
-    shape = [video["video.height"], video["video.width"], video["video.channels"]]
-    return {"dtype": "video", "shape": shape, "names": ["height", "width", "channels"], "info": video}
 
 
 def features_json(variant: Variant, videos: dict[str, dict[str, Any]]) -> dict[str, Any]:
@@ -194,10 +186,12 @@ def features_json(variant: Variant, videos: dict[str, dict[str, Any]]) -> dict[s
 
     Args:
         variant: what is written.
-        videos: description of each video by its feature's key.
+        videos: key of the feature -> description from `video.packet_times`.
     """
     features = {feature.key: feature.as_json() for feature in FEATURES}
-    features |= {key: video_feature(video) for key, video in videos.items()}
+    for key, video in videos.items():
+        shape = [video["video.height"], video["video.width"], video["video.channels"]]
+        features[key] = {"dtype": "video", "shape": shape, "names": ["height", "width", "channels"], "info": video}
     for feature in single_features(variant):
         features[feature.key] = {**feature.as_json(), "names": None}
     if variant.language:
@@ -218,37 +212,35 @@ def modality_json(cameras: Sequence[str]) -> dict[str, Any]:
     """Return ``meta/modality.json``, by which GR00T reads a dataset of format v2.1."""
     state = {"ee_pos": 3, "ee_orn": 4, "robot_joints": 7, "gripper_width": 1, "agv_pose": 3}
     action = {"rel_pos": 3, "rel_orn": 3, "gripper_open": 1}
+    slices = {"state": {}, "action": {}}
+    for name, widths in (("state", state), ("action", action)):
+        end = 0
+        for key, width in widths.items():
+            slices[name][key] = {"start": end, "end": (end := end + width)}
     return {
-        "state": _slices(state),
-        "action": _slices(action),
+        **slices,
         "video": {camera: {"original_key": image_key(camera)} for camera in cameras},
         "annotation": {"human.task_description": {"original_key": "task_index"}},
     }
 
 
-def _slices(widths: dict[str, int]) -> dict[str, dict[str, int]]:
-    ends = np.cumsum(list(widths.values())).tolist()
-    return {key: {"start": end - width, "end": end} for (key, width), end in zip(widths.items(), ends, strict=True)}
-
-
 def whole_rate(rate_hz: float) -> int:
-    """LeRobot's frames a second.
+    """Return the frames per second of LeRobot.
 
     Raises:
-        DatasetError: not a whole number.
+        DatasetError: the rate is not a whole number.
     """
     if rate_hz < 1 or abs(rate_hz - round(rate_hz)) > 1e-9:
-        raise DatasetError(
-            "LeRobot takes a whole number of frames a second", where="rate", expected="1, 2, 4, 5, ...", found=rate_hz
-        )
+        what, expected = "LeRobot takes a whole number of frames a second", "1, 2, 4, 5, ..."
+        raise DatasetError(what, where="rate", expected=expected, found=rate_hz)
     return round(rate_hz)
 
 
 def check_video_size(size: tuple[int, int] | None) -> None:
-    """Check a width and height, pixels; None is the cameras' own size.
+    """Check width and height in pixels; None is the size of the cameras.
 
     Raises:
-        DatasetError: one is odd, which the codecs of the videos can't encode.
+        DatasetError: one is odd, which the codecs can't encode.
     """
     if size is not None and (size[0] % 2 or size[1] % 2):
         expected, found = "even width and height", f"{size[0]} x {size[1]}"
@@ -256,20 +248,15 @@ def check_video_size(size: tuple[int, int] | None) -> None:
 
 
 def require_extra() -> None:
-    """Check that pyarrow and PyAV are there.
+    """Check that pyarrow and PyAV are installed.
 
     Raises:
         MissingExtraError: one is not.
     """
-    import importlib.util
-
-    from robocas_ms3.core.errors import MissingExtraError
-
     missing = [name for name in ("pyarrow", "av") if importlib.util.find_spec(name) is None]
     if missing:
-        raise MissingExtraError(
-            f"LeRobot datasets need {' and '.join(missing)}", fix='In the clone: pip install -e ".[lerobot]"'
-        )
+        fix = 'In the clone: pip install -e ".[lerobot]"'
+        raise MissingExtraError(f"LeRobot datasets need {' and '.join(missing)}", fix=fix)
 
 
 def checksum(path: Path) -> str:
@@ -288,5 +275,5 @@ def checksum(path: Path) -> str:
 
 
 def content_files(root: Path) -> list[Path]:
-    """Files of data, videos and depth, sorted."""
+    """Return the files of data, videos and depth, sorted."""
     return sorted(path for name in CONTENT for path in (root / name).rglob("*") if path.is_file())

@@ -5,19 +5,19 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 _BINS = 5000
-_LEAST_WIDTH = np.finfo(np.float64).tiny  # below it bins are no numbers to divide by: all in one
-_FINE = 300  # longer pictures are thinned for statistics, as LeRobot does it
+_LEAST_WIDTH = np.finfo(np.float64).tiny  # of a bin, as values are divided by it
+_FINE = 300  # larger images are subsampled for statistics, as LeRobot does it
 _THINNED = 150
 
 Stats = dict[str, Any]
 
 
 def vector_stats(values: NDArray) -> Stats:
-    """Of an episode's feature (T, D): lists of D numbers."""
+    """Return the statistics of a feature (T, D) of an episode: lists of D numbers."""
     values = values.astype(np.int64) if values.dtype == bool else values
     numbers = values.astype(np.float64)
     quantiles = np.quantile(numbers, list(QUANTILES.values()), axis=0)
@@ -32,14 +32,14 @@ def vector_stats(values: NDArray) -> Stats:
 
 
 class Range:
-    """Count, mean, spread, smallest and largest of a feature over many episodes, which come one at a time."""
+    """Count, mean, spread and range of a feature over episodes that are added one at a time."""
 
     def __init__(self) -> None:
         self.count = 0
         self.low = self.high = self._mean = self._squares = np.zeros(0)
 
     def add(self, values: NDArray) -> None:
-        """Take an episode's (T, D)."""
+        """Add the values (T, D) of an episode."""
         numbers = values.astype(np.float64)
         count, mean = len(numbers), numbers.mean(axis=0)
         squares = ((numbers - mean) ** 2).sum(axis=0)
@@ -53,7 +53,7 @@ class Range:
         self.low, self.high, self.count = np.minimum(self.low, low), np.maximum(self.high, high), total
 
     def stats(self, histogram: Histogram, integer: bool) -> Stats:
-        """Of all of them; the quantiles come from a histogram of the same."""
+        """Return the statistics of all values; the quantiles come from their histogram."""
         whole = np.int64 if integer else np.float64
         return {
             "min": self.low.astype(whole).tolist(),
@@ -66,7 +66,7 @@ class Range:
 
 
 class Histogram:
-    """Counts of a feature between its smallest and largest number, for quantiles over any number of episodes."""
+    """Counts of a feature within its range, for quantiles over any number of episodes."""
 
     def __init__(self, low: NDArray, high: NDArray) -> None:
         width = (high - low) / _BINS
@@ -74,13 +74,13 @@ class Histogram:
         self._counts = np.zeros((len(low), _BINS), np.int64)
 
     def add(self, values: NDArray) -> None:
-        """Take an episode's (T, D)."""
+        """Add the values (T, D) of an episode."""
         bins = np.clip((values - self._low) / self._width, 0, _BINS - 1).astype(np.int64)
         for column in range(len(self._counts)):
             self._counts[column] += np.bincount(bins[:, column], minlength=_BINS)
 
     def quantiles(self) -> dict[str, list[float]]:
-        """Each to 1/5000 of the range."""
+        """Return the quantiles, exact to 1/5000 of the range."""
         total = self._counts.sum(axis=1, keepdims=True)
         below = np.cumsum(self._counts, axis=1)
         return {
@@ -90,47 +90,43 @@ class Histogram:
 
 
 class Levels:
-    """Count how often each level of each channel occurs: exact statistics of any number of images.
+    """Counts of the levels of each channel: exact statistics of any number of images.
 
-    Attributes:
-        counts: (channels, levels).
-        pictures: number of images.
+    RGB images have 3 channels, with statistics between 0 and 1; depth images have one, with statistics in mm.
+
+    Args:
+        counts: (channels, levels) of the images so far.
+        images: number of these images.
     """
 
-    def __init__(self, counts: NDArray, pictures: int = 0, unit: float = 1 / 255) -> None:
-        """Start from counts.
-
-        Args:
-            counts: (channels, levels) of the images so far.
-            pictures: number of these images.
-            unit: what one level stands for in the statistics.
-        """
-        self.counts, self.pictures, self._unit = np.array(counts, np.int64), pictures, unit
+    def __init__(self, counts: ArrayLike, images: int = 0) -> None:
+        self.counts, self.images = np.array(counts, np.int64), images
+        self._unit = 1.0 if len(self.counts) == 1 else 1 / 255
 
     @classmethod
     def rgb(cls) -> Levels:
-        """Return empty counts of RGB images, with statistics between 0 and 1."""
-        return cls(np.zeros((3, 256), np.int64))
+        """Return empty counts of RGB images."""
+        return cls(np.zeros((3, 256)))
 
     @classmethod
     def depth(cls) -> Levels:
-        """Return empty counts of 12-bit depth images, with statistics in mm."""
-        return cls(np.zeros((1, 4096), np.int64), unit=1.0)
+        """Return empty counts of 12-bit depth images."""
+        return cls(np.zeros((1, 4096)))
 
-    def add(self, picture: NDArray) -> None:
-        """Take (H, W, C) or (H, W); of large images every few pixels."""
-        longest = max(picture.shape[:2])
+    def add(self, image: NDArray) -> None:
+        """Add (H, W, C) or (H, W); of large images every few pixels."""
+        longest = max(image.shape[:2])
         step = longest // _THINNED if longest >= _FINE else 1
         channels, levels = self.counts.shape
-        thinned = picture[::step, ::step].reshape(-1, channels)
+        thinned = image[::step, ::step].reshape(-1, channels)
         for channel in range(channels):
             self.counts[channel] += np.bincount(thinned[:, channel], minlength=levels)
-        self.pictures += 1
+        self.images += 1
 
     def merge(self, other: Levels) -> None:
-        """Take another's."""
+        """Add the counts of other images."""
         self.counts += other.counts
-        self.pictures += other.pictures
+        self.images += other.images
 
     def stats(self) -> Stats:
         """Return the statistics, each of shape (channels, 1, 1); ``count`` is that of images."""
@@ -148,7 +144,7 @@ class Levels:
         for name, share in QUANTILES.items():
             found[name] = values[(below < share * total[:, None]).sum(axis=1)]
         shaped = {name: row.reshape(-1, 1, 1).tolist() for name, row in found.items()}
-        return {**shaped, "count": [self.pictures]}
+        return {**shaped, "count": [self.images]}
 
 
 def shape_of(value: Any) -> tuple[int, ...] | str:

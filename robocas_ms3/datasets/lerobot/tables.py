@@ -1,4 +1,4 @@
-"""Read Parquet files of unknown origin within bounds: columns of numbers, rows of an episode, tables of texts."""
+"""Tables in Parquet: columns of numbers, and files of unknown origin that are read within bounds."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.documents import check_regular
 from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.datasets.sources.files import SEE_VALIDATE
+from robocas_ms3.datasets.sources.tolerant import first_line
 
-ARRAYS_LIMIT = 2**29
-"""Bytes that the columns of one reading may have as arrays: 40 million rows of one value are 1 MB as a file."""
+_ARRAYS_LIMIT = 2**29  # bytes of arrays that are read at once: 40 million equal rows are a file of 1 MB
 OBJECTS_LIMIT = 2**26
-"""The same where the values become Python objects, each of which takes about ten times as much."""
+"""Bytes of values that are read at once to become Python objects, which take about ten times as much."""
 INTEGER, NUMBER, TEXT = "integers", "numbers", "texts"
 INTEGERS, NUMBERS, TEXTS = "integers or lists of integers", "numbers or lists of numbers", "lists of texts"
 Kind = Literal[
@@ -34,19 +35,18 @@ Kind = Literal[
 ]
 TEXT_INDEX = "__index_level_0__"  # pandas' name of an index without one
 _EPISODE = "episode_index"
-_SEE_VALIDATE = "robocas validate lists all that is wrong."
 
 
 @dataclass(frozen=True)
 class Column:
-    """What a column of a table holds: a kind of values and, of integers and numbers, their range."""
+    """Declaration of a column: a kind of values and, of integers and numbers, their range."""
 
     kind: Kind
     least: float = 0
     greatest: float = 2**53
 
     def fault(self, values: pa.ChunkedArray) -> tuple[str, str] | None:
-        """Return what is expected of a column's values and what is found, if that differs."""
+        """Return expected and found, if values break the declaration."""
         if not _is_kind(values.type, self.kind):
             return self.kind, str(values.type)
         if values.null_count:
@@ -62,7 +62,7 @@ class Column:
 
 
 def faults(table: pa.Table, columns: Mapping[str, Column]) -> Iterator[tuple[str, str, str]]:
-    """Yield key, expected and found of columns that are missing or hold other values than declared."""
+    """Yield key, expected and found of columns that are missing or break their declaration."""
     for key, column in columns.items():
         if key not in table.column_names:
             yield key, "a column", "nothing"
@@ -88,14 +88,21 @@ def open_table(path: Path, *, most_rows: float = np.inf) -> Iterator[pq.ParquetF
         with pq.ParquetFile(path, metadata=footer, read_dictionary=texts) as file:
             names = file.schema_arrow.names
             if len(set(names)) < len(names):
-                raise DatasetError("two columns of this table have the same name", where=path, fix=_SEE_VALIDATE)
+                raise DatasetError("two columns of this table have the same name", where=path, fix=SEE_VALIDATE)
             if footer.num_rows > most_rows:
                 what, expected = "this table has too many rows", f"{most_rows:g} at most"
-                raise DatasetError(what, where=path, expected=expected, found=footer.num_rows, fix=_SEE_VALIDATE)
+                raise DatasetError(what, where=path, expected=expected, found=footer.num_rows, fix=SEE_VALIDATE)
             yield file
     except (OSError, ValueError, LookupError, MemoryError, pa.ArrowException) as error:
-        found = next(iter(str(error).strip().splitlines()), type(error).__name__)
-        raise DatasetError("this table can't be read", where=path, found=found, fix=_SEE_VALIDATE) from error
+        what, found = "this table can't be read", first_line(error)
+        raise DatasetError(what, where=path, found=found, fix=SEE_VALIDATE) from error
+
+
+def as_column(values: NDArray) -> pa.Array:
+    """Return an array as a column: (T, D) as lists of D numbers, (T, 1) and (T,) as numbers."""
+    flat = pa.array(np.ascontiguousarray(values).reshape(-1))
+    width = values.shape[1] if values.ndim == 2 else 1
+    return flat if width == 1 else pa.FixedSizeListArray.from_arrays(flat, width)
 
 
 def read_columns(
@@ -104,14 +111,13 @@ def read_columns(
     columns: Collection[str] | None = None,
     *,
     groups: Sequence[int] | None = None,
-    limit: int = ARRAYS_LIMIT,
+    limit: int = _ARRAYS_LIMIT,
 ) -> pa.Table:
-    """Read columns of an open file within bounds.
+    """Read columns of a file from `open_table`, those that are there.
 
     Args:
-        file: from `open_table`.
-        path: of the file, for messages.
-        columns: to read, those that are there; None: all.
+        file, path: the file.
+        columns: to read; None: all.
         groups: row groups to read; None: all.
         limit: bytes that the values may have.
 
@@ -139,11 +145,7 @@ def read_columns(
 
 
 def read_objects(path: Path, columns: Mapping[str, Column], *, most_rows: float = np.inf) -> pa.Table:
-    """Read columns that will become Python objects, and check them.
-
-    Raises:
-        DatasetError: the file is damaged or too large, or a column is missing or holds other values than declared.
-    """
+    """Read columns that will become Python objects, and check them."""
     with open_table(path, most_rows=most_rows) as file:
         table = read_columns(file, path, columns, limit=OBJECTS_LIMIT)
         check_columns(table, columns, path)
@@ -158,7 +160,7 @@ def check_columns(table: pa.Table, columns: Mapping[str, Column], path: Path) ->
     """
     for key, expected, found in faults(table, columns):
         what = "wrong column of a table"
-        raise DatasetError(what, where=f"{path}, {key}", expected=expected, found=found, fix=_SEE_VALIDATE)
+        raise DatasetError(what, where=f"{path}, {key}", expected=expected, found=found, fix=SEE_VALIDATE)
 
 
 def is_numeric(kind: pa.DataType) -> bool:
@@ -183,16 +185,14 @@ def _is_kind(found: pa.DataType, kind: Kind) -> bool:
     return pa.types.is_integer(found) or (kind == NUMBER and pa.types.is_floating(found))
 
 
-def _text_bytes(values: pa.ChunkedArray) -> int:
+def _text_bytes(values: pa.ChunkedArray | pa.Array) -> int:
     """Return the bytes of texts that are stored as dictionaries, each counted as often as it occurs."""
-    return sum(map(_array_text_bytes, values.chunks))
-
-
-def _array_text_bytes(values: pa.Array) -> int:
+    if isinstance(values, pa.ChunkedArray):
+        return sum(map(_text_bytes, values.chunks))
     if pa.types.is_list(values.type) or pa.types.is_large_list(values.type):
-        return _array_text_bytes(values.flatten())
+        return _text_bytes(values.flatten())
     if pa.types.is_struct(values.type):
-        return sum(map(_array_text_bytes, values.flatten()))
+        return sum(map(_text_bytes, values.flatten()))
     if not pa.types.is_dictionary(values.type) or not len(values):
         return 0
     lengths = pc.binary_length(values.dictionary).to_numpy(zero_copy_only=False)  # pyright: ignore[reportAttributeAccessIssue]
@@ -219,11 +219,7 @@ def numbers(values: pa.ChunkedArray | pa.Array) -> NDArray:
 
 
 def read_rows(path: Path, number: int, most_rows: float = np.inf) -> pa.Table:
-    """Read an episode's rows of a file of the data; only row groups that may hold some of them are read.
-
-    Raises:
-        DatasetError: the file is missing, damaged or too large, or does not say which episode a row is of.
-    """
+    """Read an episode's rows of a file of the data; only row groups that may hold some of them are read."""
     with open_table(path, most_rows=most_rows) as file:
         _, _, spans = _footer(path, path.stat().st_mtime_ns)
         groups = [group for group, (low, high) in enumerate(spans) if low <= number <= high]
@@ -234,10 +230,7 @@ def read_rows(path: Path, number: int, most_rows: float = np.inf) -> pa.Table:
 
 @lru_cache(maxsize=8)
 def _footer(path: Path, _changed_ns: int) -> tuple[pq.FileMetaData, list[str], list[tuple[float, float]]]:
-    """Return a file's footer, its columns of texts, and the span of episode numbers in each row group.
-
-    They take long to read where a file has many episodes.
-    """
+    """Return the footer of a file, its columns of texts, and the span of episode numbers in each row group."""
     with pq.ParquetFile(path) as file:
         footer = file.metadata
     leaves = [footer.schema.column(number) for number in range(footer.num_columns)]
@@ -250,15 +243,11 @@ def _footer(path: Path, _changed_ns: int) -> tuple[pq.FileMetaData, list[str], l
 
 
 def read_texts(path: Path, name: str, most_rows: float = np.inf) -> list[str]:
-    """Read the texts of such a table, in the order of their numbers.
-
-    Raises:
-        DatasetError: the table is damaged, or its numbers are not 0, 1, 2, ...
-    """
+    """Read a table of texts, in the order of their numbers."""
     table = read_objects(path, {name: Column(INTEGER), TEXT_INDEX: Column(TEXT)}, most_rows=most_rows)
     places, texts = table.column(name).to_numpy(), table.column(TEXT_INDEX).to_pylist()
     order = np.argsort(places, kind="stable")
     if not np.array_equal(places[order], np.arange(len(places))):
         expected = f"0 to {len(places) - 1}, each once"
-        raise DatasetError("wrong numbers of texts", where=f"{path}, {name}", expected=expected, fix=_SEE_VALIDATE)
+        raise DatasetError("wrong numbers of texts", where=f"{path}, {name}", expected=expected, fix=SEE_VALIDATE)
     return [texts[place] for place in order.tolist()]

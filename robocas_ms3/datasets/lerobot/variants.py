@@ -93,11 +93,7 @@ NEWEST: Version = get_args(Version)[0]
 
 
 def find_variant(version: str) -> Variant:
-    """Return the variant of a version.
-
-    Raises:
-        DatasetError: there is none.
-    """
+    """Return the variant of a version."""
     if version not in VARIANTS:
         raise DatasetError(
             "unknown LeRobot version", where="--lerobot-version", expected=", ".join(VARIANTS), found=version

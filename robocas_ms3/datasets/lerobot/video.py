@@ -1,4 +1,4 @@
-"""Videos with PyAV: encoded one episode at a time, joined without encoding again, read frame by frame."""
+"""Videos with PyAV: encoded per episode, joined without encoding again, read frame by frame."""
 
 from __future__ import annotations
 
@@ -18,19 +18,13 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.documents import DocumentError, check_regular
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.datasets.lerobot.variants import CHUNK_FILES
+from robocas_ms3.datasets.lerobot.variants import CHUNK_FILES, Variant
+from robocas_ms3.datasets.sources.protocol import Kind
 
 
 @dataclass(frozen=True)
 class Coding:
-    """How pictures become a video.
-
-    Attributes:
-        encoder: FFmpeg's name.
-        pixels: FFmpeg's pixel format.
-        suffix: of files.
-        options: of the encoder.
-    """
+    """FFmpeg's encoder and pixel format, suffix of the file, options of the encoder."""
 
     encoder: str
     pixels: str
@@ -63,37 +57,36 @@ CODINGS = {
     # Lossless, 16 bits, a checksum in every slice, every frame by itself.
     "depth": Coding("ffv1", "gray16le", ".mkv", {"level": "3", "slices": "4", "slicecrc": "1", "g": "1"}),
 }
-MAX_PIXELS = 2**26
-"""Pixels of a frame that is decoded: 8192 x 8192."""
+_MAX_PIXELS = 2**26  # of a frame that is decoded: 8192 x 8192
 _GREY = ("gray16le", "gray12le")
 _BAD_VIDEO = (FFmpegError, OSError, DocumentError, IndexError, TypeError)  # no stream of video, or no times
 _CONTAINER = {"fflags": "+bitexact"}  # no dates and random numbers in the file
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 
+def coding_of(kind: Kind, codec: str, variant: Variant) -> Coding:
+    """Return how images of a kind are encoded; ``codec`` is that of RGB."""
+    return CODINGS[codec if kind == "rgb" else "depth12" if variant.native_depth else "depth"]
+
+
 class Encoder:
-    """Writes one video; use it in a ``with`` statement."""
+    """Writes one video; use it in a ``with`` statement.
+
+    Args:
+        path: of the video.
+        coding: how images are encoded.
+        fps: frames per second.
+        size: width and height, pixels.
+    """
 
     def __init__(self, path: Path, coding: Coding, fps: int, size: tuple[int, int]) -> None:
-        """Open the file.
-
-        Args:
-            path: of the video.
-            coding: how.
-            fps: frames a second.
-            size: width and height, pixels.
-
-        Raises:
-            DatasetError: a size the codec can't take, or no such encoder in this FFmpeg.
-        """
         width, height = size
         if coding.pixels == "yuv420p" and (width % 2 or height % 2):
             raise DatasetError(
                 "videos need even sizes", where="size", expected="even width and height", found=f"{width} x {height}"
             )
         os.environ.setdefault("SVT_LOG", "1")  # errors only; it would write a page of settings
-        self.path, self.frames = path, 0
-        self._coding = coding
+        self._frames, self._coding = 0, coding
         self._container = av.open(str(path), "w", options=_CONTAINER)
         try:
             stream: Any = self._container.add_stream(coding.encoder, rate=fps, options=coding.options)
@@ -104,11 +97,9 @@ class Encoder:
         self._stream, self._time_base = stream, Fraction(1, fps)
 
     def __enter__(self) -> Encoder:
-        """Itself."""
         return self
 
     def __exit__(self, kind: object, *_: object) -> None:
-        """Finish the file."""
         try:
             if kind is None:
                 self._container.mux(self._stream.encode(None))
@@ -119,32 +110,22 @@ class Encoder:
         """Append (H, W, 3) uint8 RGB or (H, W) uint16."""
         layout = "rgb24" if picture.ndim == 3 else self._coding.pixels
         frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format=layout)
-        frame.pts, frame.time_base = self.frames, self._time_base
+        frame.pts, frame.time_base = self._frames, self._time_base
         self._container.mux(self._stream.encode(frame))
-        self.frames += 1
-
-
-@dataclass(frozen=True)
-class Place:
-    """Where an episode lies in the joined videos: file, and its first frame there."""
-
-    chunk: int
-    file: int
-    first: int
+        self._frames += 1
 
 
 class Joiner:
-    """Copies videos one behind the other into numbered files; only the one being written is open."""
+    """Copies videos one after the other into numbered files; only the one being written is open.
+
+    Args:
+        path: of a file, from chunk and file number.
+        fps: frames per second.
+        limit_mb: size a file may have, 2^20 bytes.
+        limit_seconds: length it may have.
+    """
 
     def __init__(self, path: Callable[[int, int], Path], fps: int, limit_mb: float, limit_seconds: float) -> None:
-        """Nothing is written yet.
-
-        Args:
-            path: of a file, from chunk and file number.
-            fps: frames a second.
-            limit_mb: size a file may have, 2^20 bytes.
-            limit_seconds: length it may have.
-        """
         self._path, self._fps = path, fps
         self._limit_bytes, self._limit_frames = limit_mb * 2**20, limit_seconds * fps
         self._count = self._bytes = self._frames = 0  # files; of the one being written
@@ -152,26 +133,22 @@ class Joiner:
         self._out: Any = None
         self._stream: Any = None
 
-    def add(self, part: Path, frames: int) -> Place:
-        """Append a video of so many frames.
-
-        Raises:
-            DatasetError: it has others, or is damaged.
-        """
+    def add(self, part: Path, frames: int) -> tuple[int, int, int]:
+        """Append a video of so many frames; return chunk and file number, and its first frame there."""
         size = part.stat().st_size
         try:
             with av.open(str(part)) as video:
                 stream = video.streams.video[0]
                 head = (stream.codec_context.name, stream.width, stream.height, stream.codec_context.extradata)
                 full = self._bytes + size > self._limit_bytes or self._frames + frames > self._limit_frames
-                # Another head: an encoder of another version, after an interruption. One file has one only.
+                # An encoder of another version, after an interruption, writes another head.
                 if self._out is None or full or head != self._head:
                     self._begin(stream, head)
                 first, found = self._frames, 0
                 for packet in video.demux(stream):
                     if packet.dts is None:  # the end
                         continue
-                    packet.pts = packet.dts = self._pts(first + found, packet.time_base)
+                    packet.pts = packet.dts = round(Fraction(first + found, self._fps) / packet.time_base)
                     packet.stream = self._stream
                     assert self._out is not None
                     self._out.mux(packet)
@@ -184,7 +161,7 @@ class Joiner:
             raise DatasetError("frames are missing in this video", where=part, expected=frames, found=found)
         self._frames += frames
         self._bytes += size
-        return Place(*divmod(self._count - 1, CHUNK_FILES), first)
+        return *divmod(self._count - 1, CHUNK_FILES), first
 
     def close(self) -> None:
         """Finish the file that is being written."""
@@ -203,22 +180,15 @@ class Joiner:
         self._head, self._count = head, self._count + 1
         self._bytes = self._frames = 0
 
-    def _pts(self, frame: int, time_base: Fraction) -> int:
-        return round(Fraction(frame, self._fps) / time_base)
-
 
 def read_frames(path: Path, first: int, count: int, fps: int) -> Generator[NDArray, None, None]:
-    """Frames of a video, (H, W, 3) uint8 RGB or (H, W) uint16, from number ``first`` on; it is open until it is closed.
-
-    Raises:
-        DatasetError: the file is missing, damaged, or ends before.
-    """
+    """Yield frames of a video, (H, W, 3) uint8 RGB or (H, W) uint16; the file is open until the generator is closed."""
     given = 0
     try:
         check_regular(path)
         with av.open(str(path)) as video:
             stream: Any = video.streams.video[0]
-            stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
+            stream.codec_context.options = {"max_pixels": str(_MAX_PIXELS)}
             layout = pixels if (pixels := stream.codec_context.pix_fmt) in _GREY else "rgb24"
             video.seek(round(Fraction(first, fps) / stream.time_base), stream=stream, backward=True)
             for frame in video.decode(stream) if count > 0 else ():
@@ -238,14 +208,11 @@ def read_frames(path: Path, first: int, count: int, fps: int) -> Generator[NDArr
 
 
 def packet_times(path: Path, most: int | None = None) -> tuple[list[Fraction], dict[str, Any]]:
-    """Return the times of a video's frames in s, without decoding them, and the video's entry in ``info.json``.
+    """Return the times of the frames of a video in s, without decoding them, and its description in ``info.json``.
 
     Args:
         path: of the video.
-        most: frames that are expected; one more is read at most.
-
-    Raises:
-        DatasetError: the file is missing or damaged.
+        most: expected number of frames; at most one more is read.
     """
     try:
         check_regular(path)
@@ -253,13 +220,12 @@ def packet_times(path: Path, most: int | None = None) -> tuple[list[Fraction], d
             stream: Any = video.streams.video[0]
             packets = (p.pts * p.time_base for p in video.demux(stream) if p.pts is not None)
             times = list(packets if most is None else islice(packets, most + 1))
-            return sorted(times), describe(stream)
+            return sorted(times), _describe(stream)
     except _BAD_VIDEO as error:
         raise DatasetError("can't read this video", where=path, found=getattr(error, "strerror", error)) from error
 
 
-def describe(stream: Any) -> dict[str, Any]:
-    """Return what ``info.json`` says of a video's stream in every version."""
+def _describe(stream: Any) -> dict[str, Any]:
     return {
         "video.height": stream.height,
         "video.width": stream.width,

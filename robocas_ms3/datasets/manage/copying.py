@@ -29,8 +29,7 @@ from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.records import ConversionRecord
 from robocas_ms3.datasets.sources.tolerant import SPECS, arrays_fingerprint, read_arrays
 from robocas_ms3.datasets.writing.info import write_info
-from robocas_ms3.datasets.writing.output import DATASET
-from robocas_ms3.datasets.writing.plan import SETTINGS
+from robocas_ms3.datasets.writing.plan import DATASET, SETTINGS
 
 KEEP_RULE = "every episode keeps the side it had in the dataset it is from"
 _NO_LINKS = {errno.EXDEV, errno.EPERM, errno.EACCES, errno.EMLINK, errno.EOPNOTSUPP, errno.ENOSYS}
@@ -155,10 +154,6 @@ def copy_episodes(
         outs: folder of each new dataset -> its episodes, at least one, all with the same settings.
         split_rule: how the sides were chosen, for ``conversion.json``.
         options: how to copy.
-
-    Raises:
-        DatasetError: an output is an input, or an episode is damaged.
-        OutputExistsError: an output is another dataset, or none.
     """
     numbers: dict[Path, list[int]] = {}
     for member in (member for members in outs.values() for member in members):
@@ -210,11 +205,7 @@ def _record(members: Sequence[CopiedEpisode], split_rule: str) -> dict[str, Any]
 
 @contextmanager
 def dataset_output(out: Path, record: Mapping[str, Any], overwrite: bool) -> Iterator[None]:
-    """Start or continue a dataset made of others: its ``conversion.json`` has to match, whatever the versions.
-
-    Raises:
-        OutputExistsError: ``out`` is another dataset, or none.
-    """
+    """Start or continue a dataset made of others: its ``conversion.json`` has to match, whatever the versions."""
     with OutputFolder(out, DATASET, _settings_of(record), overwrite=overwrite) as output:
         output.start(record)
         yield
@@ -237,11 +228,7 @@ def check_apart(out: Path, inputs: Sequence[Path]) -> None:
 
 
 def _check_episodes(root: Path, numbers: Iterable[int]) -> None:
-    """Check that episodes have all arrays, cameras and images; arrays that an imported episode lacks may be missing.
-
-    Raises:
-        DatasetError: one is damaged.
-    """
+    """Check that episodes have all arrays, cameras and images; arrays that an imported episode lacks may be missing."""
     _, pictures, _ = read_settings(root)
     for folder in (root / schema.episode_folder(number) for number in numbers):
         for wrong in _violations(folder, pictures):
@@ -267,12 +254,7 @@ def damaged_episode(root: Path, wrong: Violation) -> DatasetError:
 
 
 def check_ends(path: Path) -> PictureHeader | None:
-    """Check both ends of an image; if one is not as it should be, the image is read whole.
-
-    Raises:
-        ValueError: it is damaged or not a regular file.
-        OSError: it can't be read.
-    """
+    """Check both ends of an image; if one is not as it should be, the image is read whole."""
     return None if has_both_ends(path) else read_header(path) and None
 
 

@@ -20,16 +20,16 @@ from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.episode_folder import FolderWriter, TextVectors, find_damaged
 from robocas_ms3.datasets.writing.info import add_failures, write_info
 from robocas_ms3.datasets.writing.inputs import ConversionInput, open_trajectory
-from robocas_ms3.datasets.writing.output import DATASET
 from robocas_ms3.datasets.writing.plan import (
+    DATASET,
     dataset_settings,
+    missing_episodes,
     plan_episodes,
     planned_sides,
-    still_missing,
     without_unwritten,
 )
 from robocas_ms3.datasets.writing.settings import Conversion, ConversionSettings, WrittenEpisode
-from robocas_ms3.datasets.writing.workers import WriteJob, write_missing
+from robocas_ms3.datasets.writing.workers import WriteJob, write_episodes
 from robocas_ms3.demos.recordings.entries import versions
 
 _FIX = "The dataset is complete without, and valid; the same command tries again, --leave-out takes it as it is."
@@ -93,7 +93,7 @@ def convert(
         continued = len(missing) < len(plan.tasks)
         job = WriteJob(settings, FolderWriter(out, embed, sheet), missing, continued, _FIX)
         try:
-            written, incomplete = write_missing(job, output, on_episode)
+            written, incomplete = write_episodes(job, output, on_episode)
         finally:
             for folder in (out, out / schema.PREVIEW_FOLDER):
                 sweep(folder)  # left by workers that died; others wrote it again
@@ -107,7 +107,7 @@ def convert(
             raise incomplete
         if incomplete:
             _log.warning("%s", incomplete)
-        if left := still_missing(out, plan.content):
+        if left := missing_episodes(out, plan.content):
             _log.warning("%s: %s are still missing: convert that with --append", out, " and ".join(left))
     kept = len(plan.tasks) - len(missing)
     return Conversion(written, kept, time.perf_counter() - start, previews=sheet is not None)

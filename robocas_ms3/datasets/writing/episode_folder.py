@@ -54,9 +54,6 @@ class FolderWriter:
             number: of the episode in the dataset.
             given: what is converted.
             source: its number there.
-
-        Raises:
-            DatasetError: it can't be shown, or a file can't be written.
         """
         start, timing, pictures = time.perf_counter(), Timing(), given.pictures
         with replacing_folder(self.out / schema.episode_folder(number), sync=True) as folder:

@@ -17,14 +17,14 @@ from robocas_ms3.core.words import count_of
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 from robocas_ms3.datasets.sources.protocol import EpisodeSource, Frame, SourceEpisode
-from robocas_ms3.datasets.sources.tolerant import arrays_fingerprint
+from robocas_ms3.datasets.sources.tolerant import arrays_fingerprint, first_line
 from robocas_ms3.datasets.writing.rendering import RenderedSource
 from robocas_ms3.datasets.writing.settings import ConversionSettings
 
 NEEDED = frozenset(s.name for s in schema.EPISODE_INFO if not s.embedding) - {"base_rel_pos", "base_rel_orn"}
 """Arrays that an episode must have to be converted."""
-_VALIDATE = "robocas validate lists all that is wrong."
 _log = logging.getLogger(__name__)
 
 
@@ -46,7 +46,7 @@ class ConversionInput:
 
     @property
     def stage(self) -> str:
-        """The field of `settings.Timing` that gets the time of images."""
+        """The field of `settings.Timing` for the time of images."""
         return "load" if self.sizes else "render"
 
     def entries(self) -> list[dict[str, Any]]:
@@ -71,7 +71,7 @@ class ConversionInput:
         return chosen
 
     def _entry(self, number: int) -> dict[str, Any] | None:
-        """Return the recording of an episode, as ``conversion.json`` has it; None where it is not wanted."""
+        """Return the recording of an episode, as ``conversion.json`` has it; None if it is not wanted."""
         known = self.source.entry(number)
         if isinstance(self.source, RenderedSource):
             return dict(known) if self.include_failed or known["success"] else None
@@ -80,23 +80,18 @@ class ConversionInput:
         success = scene.get("success", known.get("success"))
         if success is False and not self.include_failed:
             return None
-        mark = (scene.get("source") or {}).get("recording") or known.get("recording")
+        recording = (scene.get("source") or {}).get("recording") or known.get("recording")
         return {
             "trajectory": known.get("trajectory"),
             "trajectory_episode": known.get("trajectory_episode"),
             "seed": scene.get("seed", known.get("seed")),
             "success": success,
             "target": scene.get("target", known.get("target")),
-            "recording": mark or f"arrays {arrays_fingerprint(complete_arrays(episode))}",
+            "recording": recording or f"arrays {arrays_fingerprint(complete_arrays(episode))}",
         }
 
     def frames(self, episode: SourceEpisode) -> Generator[Frame, None, None]:
-        """Yield the images of every step; close the generator unless it is read to the end.
-
-        Raises:
-            DatasetError: a stored image is damaged, or of another size than the first one of its dataset. An encoder
-                would scale it without a word.
-        """
+        """Yield the images of every step; close the generator unless it is read to the end."""
         with closing(episode.images(self.pictures)) as frames:
             for step, frame in enumerate(frames):
                 for camera, size in self.sizes.items():
@@ -107,7 +102,7 @@ class ConversionInput:
                                 where=f"{episode.where}, {camera}/{kind}, step {step}",
                                 expected="{} x {}".format(*size),
                                 found="{} x {}".format(*_size(images[camera])),
-                                fix=_VALIDATE,
+                                fix=SEE_VALIDATE,
                             )
                 yield frame
 
@@ -125,26 +120,8 @@ def open_input(settings: ConversionSettings) -> ConversionInput:
     if settings.is_trajectory:
         rendered = open_trajectory(settings)
         return ConversionInput(rendered, rendered.pictures, settings.include_failed)
-    return _open_dataset(open_source(settings.source), settings)
-
-
-def open_trajectory(settings: ConversionSettings) -> RenderedSource:
-    """Open a trajectory file, which is rendered.
-
-    Raises:
-        DatasetError: it is none, can't be read, or the rate does not suit it.
-    """
-    return RenderedSource(
-        settings.source,
-        rate_hz=settings.rate_hz,
-        pictures=settings.pictures,
-        pack=settings.pack,
-        open_renderer=settings.open_renderer,
-    )
-
-
-def _open_dataset(source: EpisodeSource, settings: ConversionSettings) -> ConversionInput:
-    where, wanted = source.root, settings.pictures
+    source, wanted = open_source(settings.source), settings.pictures
+    where = source.root
     if settings.rate_hz is not None and abs(settings.rate_hz - source.rate_hz) > 1e-9:
         found, expected = f"{settings.rate_hz:g}", f"{source.rate_hz:g} Hz"
         fix = "Convert the trajectory at this rate."
@@ -155,34 +132,37 @@ def _open_dataset(source: EpisodeSource, settings: ConversionSettings) -> Conver
     different = sorted(set(sizes.values()))
     size = different[0] if len(different) == 1 else None
     if wanted.size not in (None, size):
-        raise DatasetError(
-            "a dataset keeps the size of its images",
-            where=where,
-            expected=", ".join(f"{width} x {height}" for width, height in different),
-            found=list(wanted.size or ()),
-            fix="Convert the trajectory with this size.",
-        )
+        what, fix = "a dataset keeps the size of its images", "Convert the trajectory with this size."
+        expected = ", ".join(f"{width} x {height}" for width, height in different)
+        raise DatasetError(what, where=where, expected=expected, found=list(wanted.size or ()), fix=fix)
     pictures = replace(pictures, size=size, depth=wanted.depth and source.has_depth)
     return ConversionInput(source, pictures, settings.include_failed, sizes)
 
 
-def complete_arrays(episode: SourceEpisode) -> dict[str, NDArray]:
-    """Return all arrays of an episode.
+def open_trajectory(settings: ConversionSettings) -> RenderedSource:
+    """Open a trajectory file, which is rendered."""
+    return RenderedSource(
+        settings.source,
+        rate_hz=settings.rate_hz,
+        pictures=settings.pictures,
+        pack=settings.pack,
+        open_renderer=settings.open_renderer,
+    )
 
-    Raises:
-        DatasetError: they can't be read, one is missing, has another length, or holds NaN or infinity.
-    """
+
+def complete_arrays(episode: SourceEpisode) -> dict[str, NDArray]:
+    """Return all arrays of an episode."""
     fix = "robocas validate says what is wrong."
     try:
         arrays = episode.arrays
     except DAMAGED as error:
-        found = str(error).splitlines()[0]
+        found = first_line(error)
         raise DatasetError("these arrays can't be read", where=episode.where, found=found, fix=fix) from error
     there = NEEDED & set(arrays)
     for key in sorted(there):
         if arrays[key].dtype.kind == "f" and not np.isfinite(arrays[key]).all():
             where = f"{episode.where}/{schema.EPISODE_FILE}, {key}"
-            raise DatasetError("this array holds NaN or infinity", where=where, fix=_VALIDATE)
+            raise DatasetError("this array holds NaN or infinity", where=where, fix=SEE_VALIDATE)
     missing, lengths = sorted(NEEDED - set(arrays)), {len(arrays[key]) for key in there if arrays[key].ndim}
     if missing or lengths != {episode.steps}:
         found = f"no {', '.join(missing)}" if missing else f"lengths {sorted(lengths)}"
@@ -191,7 +171,6 @@ def complete_arrays(episode: SourceEpisode) -> dict[str, NDArray]:
 
 
 def _size(image: NDArray) -> tuple[int, int]:
-    """Return width and height."""
     return image.shape[1], image.shape[0]
 
 
@@ -206,10 +185,10 @@ def _distinct(source: EpisodeSource, entries: list[dict[str, Any]]) -> list[dict
 
 
 def _warn_of_other_rates(source: RenderedSource, entries: list[dict[str, Any]]) -> None:
-    """Warn if the open-loop check of the actions was made at another rate than the dataset's."""
+    """Warn if the open-loop check of the actions was made at another rate than that of the dataset."""
     recorded = [source.file.episodes[entry["source"]].get("robocas") for entry in entries]
     checked = [one.get("replay_rate") for one in recorded if isinstance(one, dict)]
-    rates = {float(rate) for rate in checked if isinstance(rate, int | float) and rate}  # else not checked, or unknown
+    rates = {float(rate) for rate in checked if isinstance(rate, int | float) and rate}  # others are not checked
     others = sorted(rate for rate in rates if abs(rate - source.rate_hz) > 1e-9)
     if others:
         _log.warning(

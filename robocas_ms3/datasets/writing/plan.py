@@ -1,6 +1,6 @@
-"""``conversion.json``: a dataset's settings, and which recording becomes which episode.
+"""``conversion.json``: the settings of a dataset, and which recording becomes which episode.
 
-It is written before the first episode, so that a conversion killed at any moment can go on with the same numbers.
+It is written before the first episode, so that a conversion that was killed continues with the same numbers.
 """
 
 from __future__ import annotations
@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.core.errors import DatasetError, OutputExistsError
-from robocas_ms3.core.outputs import OutputFolder
+from robocas_ms3.core.outputs import FolderKind, OutputFolder
 from robocas_ms3.core.strict import parse
+from robocas_ms3.core.words import format_ranges
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.records import ConversionRecord, SettingsRecord
@@ -21,22 +22,32 @@ from robocas_ms3.datasets.sources.split import SPLIT_RULE, split_by_seed
 from robocas_ms3.demos.recordings.entries import one_seed, versions
 
 Entries = Sequence[dict[str, Any]]
-"""What is to be converted, see `players.Player.entries`."""
-
+"""See `inputs.ConversionInput.entries`."""
 SETTINGS = tuple(SettingsRecord.model_fields)
 """Keys of the settings."""
-
 LEFT_OUT = "left_out"
-"""Key of the episodes that could not be written, each with ``why``; a conversion that goes on tries them again."""
+"""Key of the episodes that could not be written, each with ``why``; a continued conversion tries them again."""
+MARKS = (schema.CONVERSION_FILE, schema.DATA_INFO_FILE)
+"""A folder with one of these is a RoboCAS dataset, whole or not."""
+
+
+def with_versions(record: dict[str, Any]) -> dict[str, Any]:
+    """Return a record with the versions of today if it does not name them all, as that of merged datasets."""
+    now, made_with = versions(), record.get("made_with")
+    is_whole = isinstance(made_with, dict) and now.keys() <= made_with.keys()
+    return record if is_whole else {**record, "made_with": now}
+
+
+DATASET = FolderKind("robocas convert", (schema.CONVERSION_FILE,), "rate_hz", marks=MARKS, upgrade=with_versions)
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What a dataset will be.
+class EpisodePlan:
+    """The episodes that a dataset will have.
 
     Attributes:
         content: of ``conversion.json``.
-        tasks: (episode number, number in the source) of all of this source's episodes in it, written or not.
+        tasks: (number in the dataset, number in the source) of each episode of this source, written or not.
     """
 
     content: dict[str, Any]
@@ -56,18 +67,20 @@ def dataset_settings(rate_hz: float, pictures: Pictures, embeddings: bool) -> di
     return settings.model_dump()
 
 
-def plan_episodes(output: OutputFolder, entries: Entries, settings: dict[str, Any], *, append: bool) -> Plan:
-    """Number a source's episodes: from 0, or as recorded, new ones after the episodes of the dataset.
+def header(settings: Mapping[str, Any], split_rule: str = SPLIT_RULE) -> dict[str, Any]:
+    """Return ``conversion.json`` without the episodes."""
+    version = {"format": "robocas", "schema_version": schema.SCHEMA_VERSION, "made_with": versions()}
+    return {**version, **settings, "split": split_rule}
+
+
+def plan_episodes(output: OutputFolder, entries: Entries, settings: dict[str, Any], *, append: bool) -> EpisodePlan:
+    """Number the episodes of a source: as recorded, new ones after those of the dataset.
 
     Args:
         output: folder of the dataset.
         entries: recordings to convert.
         settings: of the dataset.
         append: whether recordings may be new to a dataset that exists.
-
-    Raises:
-        OutputExistsError: some are new to the dataset that is continued.
-        DatasetError: there is no dataset to append to, or its ``conversion.json`` is damaged.
     """
     path, recorded = output.path / schema.CONVERSION_FILE, output.recorded
     if recorded is None:
@@ -82,16 +95,13 @@ def plan_episodes(output: OutputFolder, entries: Entries, settings: dict[str, An
         raise OutputExistsError("a dataset of other recordings", where=path, found=found, fix=fix)
     first = max(map(int, [*content["episodes"], *content.get(LEFT_OUT, {})]), default=-1) + 1
     plan = _extended(content, content["episodes"], new, first)
-    return Plan(plan.content, [*known, *plan.tasks])
+    return EpisodePlan(plan.content, [*known, *plan.tasks])
 
 
 def _divided(
     before: Mapping[str, Any], entries: Entries
 ) -> tuple[dict[str, Any], list[tuple[int, int]], list[dict[str, Any]]]:
-    """Content of ``conversion.json`` as it goes on, where what was left out and comes again is an episode again.
-
-    Also gives (number, number in the source) of the episodes that are planned already, and the entries that are not.
-    """
+    """Return ``conversion.json``, tasks of planned episodes, and new entries; episodes left out are planned again."""
     episodes, left_out = dict(before["episodes"]), dict(before.get(LEFT_OUT, {}))
     planned = {entry["recording"]: number for number, entry in episodes.items() if entry.get("recording")}
     unread = {number: entry for number, entry in episodes.items() if not entry.get("recording")}
@@ -110,21 +120,24 @@ def _divided(
     return {**content, **({LEFT_OUT: left_out} if left_out else {})}, known, new
 
 
+def _extended(head: Mapping[str, Any], episodes: Mapping[str, Any], entries: Entries, first: int) -> EpisodePlan:
+    tasks = [(number, entry["source"]) for number, entry in enumerate(entries, start=first)]
+    added = {str(number): _without_source(entry) for number, entry in enumerate(entries, start=first)}
+    return EpisodePlan(json.loads(json.dumps({**head, "episodes": {**episodes, **added}})), tasks)
+
+
+def _without_source(entry: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in entry.items() if key != "source"}
+
+
 def _place(entry: Mapping[str, Any]) -> str:
-    """What tells recordings apart that may not have been readable."""
+    """Return what distinguishes recordings that may have been unreadable."""
     return json.dumps([entry.get(key) for key in ("trajectory", "trajectory_episode", "seed")])
 
 
-def without_unwritten(out: Path, plan: Plan, reasons: Mapping[str, str]) -> dict[str, Any]:
-    """Content of ``conversion.json`` where episodes of a plan could not be written.
-
-    Args:
-        out: the dataset.
-        plan: it.
-        reasons: why, by name of the episode's folder.
-    """
-    episodes = dict(plan.content["episodes"])
-    left_out = dict(plan.content.get(LEFT_OUT, {}))
+def without_unwritten(out: Path, plan: EpisodePlan, reasons: Mapping[str, str]) -> dict[str, Any]:
+    """Return ``conversion.json`` without the episodes that could not be written; reasons by name of their folder."""
+    episodes, left_out = dict(plan.content["episodes"]), dict(plan.content.get(LEFT_OUT, {}))
     for number, _ in plan.tasks:
         folder = schema.episode_folder(number)
         if not (out / folder).is_dir():
@@ -134,7 +147,7 @@ def without_unwritten(out: Path, plan: Plan, reasons: Mapping[str, str]) -> dict
 
 
 def planned_sides(content: Mapping[str, Any], before: tuple[list[int], list[int]]) -> tuple[list[int], list[int]]:
-    """Training and validation episodes of all that are planned, so that those not there yet change no other's side.
+    """Return the split of all planned episodes, so that missing ones change the side of no other.
 
     Args:
         content: of ``conversion.json``.
@@ -144,42 +157,10 @@ def planned_sides(content: Mapping[str, Any], before: tuple[list[int], list[int]
     return split_by_seed({number: number if seed is None else seed for number, seed in seeds.items()}, before)
 
 
-def still_missing(out: Path, content: Mapping[str, Any]) -> list[str]:
-    """Which planned episodes are not there: ``episodes 4-6 of select.h5``, one text a trajectory."""
+def missing_episodes(out: Path, content: Mapping[str, Any]) -> list[str]:
+    """Return which planned episodes are not there, one text per trajectory: ``episodes 4-6 of select.h5``."""
     missing: dict[str, list[int]] = {}
     for number, entry in content["episodes"].items():
         if not (out / schema.episode_folder(int(number))).is_dir():
             missing.setdefault(str(entry.get("trajectory") or "?"), []).append(int(number))
-    return [f"episodes {_spans(numbers)} of {name}" for name, numbers in missing.items()]
-
-
-def _spans(numbers: list[int]) -> str:
-    """``0, 4-6``."""
-    spans: list[list[int]] = []
-    for number in sorted(numbers):
-        if spans and number == spans[-1][1] + 1:
-            spans[-1][1] = number
-        else:
-            spans.append([number, number])
-    return ", ".join(f"{first}-{last}" if first < last else str(first) for first, last in spans)
-
-
-def header(settings: Mapping[str, Any], split_rule: str = SPLIT_RULE) -> dict[str, Any]:
-    """What ``conversion.json`` says of a dataset as a whole."""
-    return {
-        "format": "robocas",
-        "schema_version": schema.SCHEMA_VERSION,
-        "made_with": versions(),
-        **settings,
-        "split": split_rule,
-    }
-
-
-def _extended(head: Mapping[str, Any], episodes: Mapping[str, Any], entries: Entries, first: int) -> Plan:
-    tasks = [(number, entry["source"]) for number, entry in enumerate(entries, start=first)]
-    added = {str(number): _without_source(entry) for number, entry in enumerate(entries, start=first)}
-    return Plan(json.loads(json.dumps({**head, "episodes": {**episodes, **added}})), tasks)
-
-
-def _without_source(entry: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in entry.items() if key != "source"}
+    return [f"episodes {format_ranges(numbers)} of {name}" for name, numbers in missing.items()]

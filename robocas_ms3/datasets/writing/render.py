@@ -38,9 +38,6 @@ class EnvRenderer:
             env: what the trajectory was recorded in.
             control_mode: of its actions.
             pictures: which ones to render; default: all.
-
-        Raises:
-            DatasetError: there is no render device, or no such environment.
         """
         sensors = dict(env.kwargs.get("sensor_configs") or {})
         self._pictures = (pictures or Pictures()).choose([camera.name for camera in env.cameras()], env.env_id)
@@ -62,11 +59,7 @@ class EnvRenderer:
         self.env.close()
 
     def load(self, recording: Recording) -> None:
-        """Rebuild a recording's scene.
-
-        Raises:
-            DatasetError: the scene is not the recorded one: another pack, configuration or version.
-        """
+        """Rebuild a recording's scene."""
         self.env.reset(seed=recording.seed, options=dict(recording.reset_options))
         for name in set(self._base._sensors) - set(self._pictures.cameras):
             del self._base._sensors[name]  # they are made anew at each reset; what is there is rendered

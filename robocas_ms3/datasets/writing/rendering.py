@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,36 +21,14 @@ from robocas_ms3.demos.recordings.motion import sample_states
 from robocas_ms3.demos.recordings.reading import Recording, TrajectoryFile
 from robocas_ms3.robots.cameras import Parent
 
+if TYPE_CHECKING:
+    from robocas_ms3.datasets.writing.render import EnvRenderer
 
-class Renderer(Protocol):
-    """Renders recorded states: `render.EnvRenderer`, or a ray caster where no render device is wanted."""
-
-    def load(self, recording: Recording) -> None:
-        """Build the scene of a recording."""
-        ...
-
-    def frames(self, recording: Recording, samples: NDArray[np.int64]) -> Iterator[Frame]:
-        """Render some of its states, in order."""
-        ...
-
-    def cameras(self) -> dict[str, CameraModel]:
-        """Return the camera models at the state rendered last."""
-        ...
-
-    def scene(self) -> dict[str, Any]:
-        """Return ``task``, ``config``, ``layout`` and ``objects`` of ``scene.json``."""
-        ...
-
-    def close(self) -> None:
-        """Free the render device."""
-        ...
-
-
-OpenRenderer = Callable[[RecordedEnv, str, Pictures], Renderer]
+OpenRenderer = Callable[[RecordedEnv, str, Pictures], "EnvRenderer"]
 """(environment of the recording, its control mode, images to render) -> renderer."""
 
 
-def open_env(env: RecordedEnv, control_mode: str, pictures: Pictures) -> Renderer:
+def open_env(env: RecordedEnv, control_mode: str, pictures: Pictures) -> EnvRenderer:
     """Open the environment that recorded an episode."""
     from robocas_ms3.datasets.writing.render import EnvRenderer
 
@@ -58,15 +36,13 @@ def open_env(env: RecordedEnv, control_mode: str, pictures: Pictures) -> Rendere
 
 
 class RenderedSource(TrajectorySource):
-    """A trajectory file whose episodes are rendered. The environment is made with the first episode and kept.
-
-    Episodes have the numbers of the file, failed ones included.
+    """A trajectory file whose episodes, failed ones included, are rendered. The environment is made once.
 
     Args:
         path: of the HDF5 file.
         rate_hz: steps per second; None: 5.
         pictures: images to render.
-        pack: name or folder of the object pack, instead of the one that the file names.
+        pack: name or folder of the object pack, instead of the recorded one.
         open_renderer: opens the renderer.
 
     Attributes:
@@ -89,7 +65,7 @@ class RenderedSource(TrajectorySource):
         self.pictures = pictures.choose([camera.name for camera in self.file.env.cameras()], path)
         self.cameras, self.has_depth = self.pictures.cameras, pictures.depth
         self._pack, self._open_renderer = pack, open_renderer
-        self._renderer: Renderer | None = None
+        self._renderer: EnvRenderer | None = None
         self._control_mode = ""
 
     def turn_to(self, path: Path) -> None:
@@ -109,7 +85,7 @@ class RenderedSource(TrajectorySource):
         return [], []
 
     def entry(self, number: int) -> dict[str, Any]:
-        """Return the recording of an episode; one that can't be read, which fails when opened, has no fingerprint."""
+        """Return the recording of an episode, without fingerprint if it can't be read."""
         with self.file.reopened() as file:
             try:
                 return recording_entry(file, number)
@@ -122,11 +98,7 @@ class RenderedSource(TrajectorySource):
         return [entry.instruction, *(goal.goal_description for goal in entry.subgoals)]
 
     def episode(self, number: int) -> RenderedEpisode:
-        """Build the scene of a recording. The episode is valid until the next one is opened.
-
-        Raises:
-            DatasetError: it is damaged, has more than 9999 steps, or its scene can't be built.
-        """
+        """Build the scene of a recording. The episode is valid until the next one is opened."""
         recording = self.recording(number)
         samples = sample_states(recording.control_steps, self.stride)
         if len(samples) > schema.MAX_STEPS:
@@ -149,7 +121,7 @@ class RenderedSource(TrajectorySource):
 class RenderedEpisode(RecordedEpisode):
     """An episode of a `RenderedSource`: its images are rendered once, in order; camera models follow after that."""
 
-    def __init__(self, source: RenderedSource, number: int, recording: Recording, renderer: Renderer) -> None:
+    def __init__(self, source: RenderedSource, number: int, recording: Recording, renderer: EnvRenderer) -> None:
         super().__init__(source, number)
         self.cameras = source.cameras
         self._recording, self._renderer = recording, renderer
@@ -160,9 +132,8 @@ class RenderedEpisode(RecordedEpisode):
 
     def images(self, pictures: Pictures) -> Generator[Frame, None, None]:
         """Render every step; ``pictures`` are those that the source was opened with."""
-        yield from self._renderer.frames(
-            self._recording, sample_states(self._recording.control_steps, self._source.stride)
-        )
+        samples = sample_states(self._recording.control_steps, self._source.stride)
+        yield from self._renderer.frames(self._recording, samples)
 
     @property
     def scene(self) -> dict[str, Any]:
@@ -175,11 +146,11 @@ class RenderedEpisode(RecordedEpisode):
         return self._renderer.cameras()
 
     def intrinsic(self, camera: str) -> NDArray[np.float64]:
-        """(4,) fx, fy, cx, cy in pixels."""
+        """Return fx, fy, cx, cy in pixels (4,)."""
         return self._models[camera].intrinsic
 
     def camera_in_parent(self, camera: str) -> NDArray[np.float64]:
-        """(4, 4) OpenCV camera frame in its parent."""
+        """Return the OpenCV camera frame in its parent (4, 4)."""
         return self._models[camera].camera_in_parent
 
     def camera_parent(self, camera: str) -> Parent:

@@ -1,4 +1,4 @@
-"""What a conversion is asked for, and what it gives: settings, written episodes and the time they took."""
+"""Settings of a conversion, and its result: written episodes and the time that they took."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ class ConversionSettings:
         rate_hz: steps per second; divides the control frequency; None: 5, or the rate of the dataset.
         pictures: cameras, size, depth and image format.
         include_failed: also convert episodes without success.
-        pack: name or folder of the object pack, instead of the one that the trajectory names.
+        pack: name or folder of the object pack, instead of the recorded one.
         overwrite: replace what is in ``out``.
         append: add to the dataset in ``out``. Its episodes keep their numbers and their side of the split, and
-            recordings that it has already are not added again. RoboCAS folders only.
+            recordings that it has are not added again. RoboCAS folders only.
         leave_out: warn of episodes that can't be written instead of raising an error.
         embeddings: embed the texts. RoboCAS folders only.
         previews: write a video of each new episode and a contact sheet; None: if there are at most 20 episodes. RoboCAS
@@ -43,9 +43,8 @@ class ConversionSettings:
         codec: of the RGB videos. LeRobot only.
         lerobot_version: of the LeRobot that will read the dataset, see `lerobot.variants.VARIANTS`. LeRobot only.
         jobs: number of worker processes.
-        limits: time and memory that an episode may take. With limits, one job is a separate process too if it renders.
-            An episode that exceeds them, or kills its process, is retried once, then skipped, which is an error at the
-            end. None: no limits, and one job runs in this process.
+        limits: time and memory per episode; with limits, one job is a separate process too if it renders. An episode
+            that exceeds them, or kills its process, is retried once, then skipped. None: no limits.
         open_renderer: opens what renders a trajectory; importable by workers.
     """
 
@@ -99,7 +98,6 @@ class Timing:
     total: float = 0.0
 
     def __add__(self, other: Timing) -> Timing:
-        """Add each field."""
         more = asdict(other)
         return Timing(**{part: seconds + more[part] for part, seconds in asdict(self).items()})
 
@@ -131,8 +129,8 @@ class WrittenEpisode:
         number: in the dataset.
         steps: T.
         size: bytes.
-        timing: what it took.
-        row: its row of the contact sheet, (H, W, 3) RGB, where one was wanted.
+        timing: time that it took.
+        row: its row of the contact sheet, (H, W, 3) RGB, if one was wanted.
     """
 
     number: int
@@ -150,7 +148,7 @@ class Conversion:
         episodes: the new ones, by number.
         kept: number of episodes of the source that were there already.
         seconds: wall-clock time.
-        joining: seconds for the steps after the last episode, of these.
+        joining: seconds of these for the steps after the last episode.
         previews: whether previews were made.
     """
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import logging
 import os
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -32,29 +32,20 @@ class EpisodeWriter(Protocol):
     """Writes the episodes of one format; can be sent to another process."""
 
     def write(self, number: int, given: ConversionInput, source: int) -> WrittenEpisode:
-        """Write one episode.
-
-        Args:
-            number: of the episode in the dataset.
-            given: what is converted.
-            source: its number there.
-
-        Raises:
-            DatasetError: it can't be shown or written.
-        """
+        """Write episode ``source`` of the input as episode ``number`` of the dataset."""
         ...
 
 
 @dataclass(frozen=True)
 class WriteJob:
-    """The episodes of a conversion that are not there yet.
+    """The episodes of a conversion that are missing.
 
     Attributes:
         settings: of the conversion.
         writer: of the format.
         tasks: the episodes.
         continued: whether there are episodes already.
-        fix: how to go on if episodes can't be written.
+        fix: what to do if episodes can't be written.
     """
 
     settings: ConversionSettings
@@ -64,37 +55,12 @@ class WriteJob:
     fix: str
 
 
-def write_missing(
+def write_episodes(
     job: WriteJob, output: OutputFolder, on_episode: Callable[[WrittenEpisode], None] | None
 ) -> tuple[list[WrittenEpisode], IncompleteError | None]:
     """Write episodes; return them by number, and an error that names those that can't be written.
 
-    Raises:
-        RobocasError: somebody removed the output folder.
-        Exception: an error that all episodes share.
-    """
-    written: list[WrittenEpisode] = []
-    incomplete: IncompleteError | None = None
-    try:
-        with closing(write_episodes(job)) as episodes:
-            for episode in episodes:
-                output.check_exists()
-                written.append(episode)
-                if on_episode:
-                    on_episode(episode)
-    except IncompleteError as error:
-        incomplete = error
-    return sorted(written, key=lambda episode: episode.number), incomplete
-
-
-def write_episodes(job: WriteJob) -> Generator[WrittenEpisode, None, None]:
-    """Write episodes; yield each when it is done, in any order.
-
     An episode that fails does not end the others, unless all share its error: the disk, an extra, or the first three.
-
-    Raises:
-        IncompleteError: episodes failed, or their processes died twice; the others are written.
-        Exception: the error of an episode, if none is written.
     """
     settings = job.settings
     renders, processes = settings.is_trajectory, min(settings.jobs, len(job.tasks))
@@ -105,25 +71,25 @@ def write_episodes(job: WriteJob) -> Generator[WrittenEpisode, None, None]:
     pool: WorkerPool[Task, WrittenEpisode | _Failure] = WorkerPool(
         open_worker, 0 if here else processes, on_crash=_death, limits=settings.limits or NO_LIMITS
     )
+    written: list[WrittenEpisode] = []
     failures: list[_Failure] = []
-    done = 0
     with threads, pool, closing(pool.map(job.tasks, ordered=False)) as results:
         for result in results:
             if isinstance(result, WrittenEpisode):
-                done += 1
-                yield result
+                output.check_exists()
+                written.append(result)
+                if on_episode:
+                    on_episode(result)
                 continue
             failures.append(result)
-            if done or job.continued:
+            if written or job.continued:
                 _log.warning("%s could not be written: %s", result.episode, result.reason)
             elif len(failures) == _ENOUGH:
                 break
-    if not failures:
-        return
-    first = failures[0].sent.with_traceback()
-    if not (done or job.continued):
-        raise first
-    raise _incomplete(failures, job) from first
+    if failures and not (written or job.continued):
+        raise failures[0].sent.with_traceback()
+    written.sort(key=lambda episode: episode.number)
+    return written, _incomplete(failures, job) if failures else None
 
 
 @dataclass(frozen=True)
@@ -152,7 +118,7 @@ def _incomplete(failures: list[_Failure], job: WriteJob) -> IncompleteError:
     more = f"; and {len(listed) - _LISTED} more" if len(listed) > _LISTED else ""
     what = f"{count_of(len(listed), 'episode')} could not be written"
     error = IncompleteError(what, where=job.settings.out, found="; ".join(listed[:_LISTED]) + more, fix=job.fix)
-    error.reasons = reasons
+    error.reasons, error.__cause__ = reasons, failures[0].sent.with_traceback()
     return error
 
 
@@ -185,13 +151,8 @@ class _EpisodeWorker:
 
 
 def _is_shared(error: Exception) -> bool:
-    """Return whether all episodes share an error: the system's, or one of an installation.
-
-    FFmpeg's errors are OSErrors too, but have numbers of their own.
-    """
-    if isinstance(error, OSError) and error.errno in errno.errorcode:
-        return True
-    return isinstance(error, MissingExtraError)
+    """Return whether all episodes share an error: of the system (FFmpeg has other numbers), or of the installation."""
+    return isinstance(error, MissingExtraError) or (isinstance(error, OSError) and error.errno in errno.errorcode)
 
 
 @contextmanager

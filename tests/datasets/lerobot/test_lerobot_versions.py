@@ -6,6 +6,7 @@ from typing import get_args
 
 import numpy as np
 import pytest
+from lerobot_folders import files_of
 from synthetic import RayCaster
 
 pytest.importorskip("av", reason="needs the extra 'lerobot'")
@@ -48,10 +49,6 @@ def version(request):
 def test_the_versions_of_the_command_line_are_those_of_the_table():
     assert get_args(Version) == tuple(VARIANTS)
     assert NEWEST in VARIANTS
-
-
-def files_of(root):
-    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
 
 
 def test_each_version_passes_the_check_and_restores_the_episodes(datasets, version, made, tmp_path):
@@ -211,13 +208,3 @@ def test_an_unknown_version_lists_the_choices(trajectory, tmp_path, capsys):
     command = ["convert", str(trajectory), "--out", str(tmp_path / "out"), "--lerobot-version", "2.1"]
     assert main.run(command) == 1
     assert capsys.readouterr().err == "error: --lerobot-version: not for RoboCAS folders. Leave it out.\n"
-
-
-def test_datasets_of_other_formats_are_refused(spoiled):
-    info = json.loads((spoiled / "meta/info.json").read_text())
-    (spoiled / "meta/info.json").write_text(json.dumps({**info, "codebase_version": "v2.0"}))
-    with pytest.raises(DatasetError, match="of another version .expected v3.0 or v2.1, found v2.0"):
-        LeRobotDataset(spoiled)
-    (spoiled / "meta/info.json").write_text(json.dumps({**info, "chunks_size": 10}))
-    with pytest.raises(DatasetError, match="chunks_size"):
-        LeRobotDataset(spoiled)

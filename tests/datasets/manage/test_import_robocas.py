@@ -9,9 +9,9 @@ import pytest
 from managing import arrays_of, change, die, edit, files_of, make, read
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.cli.import_robocas import ranges
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.words import format_ranges
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.manage.importing import import_robocas
@@ -502,5 +502,5 @@ def test_command(four, tmp_path, capsys):
 
 
 def test_numbers_in_short():
-    assert ranges([0, 1, 2, 5, 7, 8]) == "0-2, 5, 7-8"
-    assert ranges([0, 2, 4, 6, 8, 10, 12, 13], most=3) == "0, 2, 4 and 5 more"
+    assert format_ranges([0, 1, 2, 5, 7, 8]) == "0-2, 5, 7-8"
+    assert format_ranges([0, 2, 4, 6, 8, 10, 12, 13], most=3) == "0, 2, 4 and 5 more"

@@ -9,9 +9,7 @@ from synthetic import RayCaster, render_by, write_trajectory
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.datasets.checks.dataset import validate
-from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.writing import convert as conversion
-from robocas_ms3.datasets.writing.plan import still_missing
 from robocas_ms3.datasets.writing.settings import Conversion, ConversionSettings, Timing, WrittenEpisode
 
 SECONDS = r"\d+\.\d"
@@ -63,11 +61,6 @@ def test_of_lerobot_encoding_is_not_beside_rendering(made, tmp_path, capsys):
     assert capsys.readouterr() == (f"{tmp_path / 'out'}: 2 episodes, 14 steps, valid\n", "")
 
 
-def test_validate_prints_nothing_but_its_lines(made, capsys):
-    assert run(["validate", str(made)]) == 0
-    assert capsys.readouterr() == (f"{made}: 2 episodes, 14 steps, valid\n", "")
-
-
 def tried(path, *rates):
     """A trajectory whose recordings' actions were tried at these rates; "unknown" by versions that knew no trials."""
     write_trajectory(path, seeds=tuple(range(len(rates))))
@@ -91,24 +84,11 @@ def tried(path, *rates):
         (([5], "5"), 10, ""),  # not ours
     ],
 )
-@pytest.mark.parametrize("to", ["robocas", "lerobot"])
-def test_actions_that_were_tried_at_another_rate(tmp_path, caplog, to, rates, rate_hz, said):
+def test_actions_that_were_tried_at_another_rate(tmp_path, caplog, rates, rate_hz, said):
     trajectory = tried(tmp_path / "F.h5", *rates)
-    if to == "robocas":
-        conversion.convert(
-            ConversionSettings(trajectory, tmp_path / "out", rate_hz=rate_hz, embeddings=False, open_renderer=RayCaster)
-        )
-    else:
-        pytest.importorskip("av", reason="needs the extra 'lerobot'")
-        pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
-        from robocas_ms3.datasets.lerobot.convert import convert_lerobot
-
-        pictures = Pictures(depth=False)  # the made-up room is farther than a depth video reaches
-        convert_lerobot(
-            ConversionSettings(
-                trajectory, tmp_path / "out", rate_hz=rate_hz, open_renderer=RayCaster, pictures=pictures
-            )
-        )
+    conversion.convert(
+        ConversionSettings(trajectory, tmp_path / "out", rate_hz=rate_hz, embeddings=False, open_renderer=RayCaster)
+    )
     warnings = [record.getMessage() for record in caplog.records if record.name.startswith("robocas_ms3")]
     assert len(warnings) == bool(said)
     assert not said or warnings[0].startswith(said)
@@ -157,20 +137,6 @@ def test_an_interrupted_conversion_says_how_to_go_on(monkeypatch, tmp_path, caps
     assert capsys.readouterr().err == f"interrupted{said}\n"
 
 
-def test_one_is_no_plural(made_up_pictures, tmp_path, capsys):
-    trajectory, out = write_trajectory(tmp_path / "F.h5", seeds=(1,)), tmp_path / "out"
-    assert run(["convert", str(trajectory), "--out", str(out), "--no-embeddings", "--no-video"]) == 0
-    assert "out: 1 episode, 7 steps, " in capsys.readouterr().out
-    (out / "data_info.json").unlink()
-    assert run(["validate", str(out)]) == 1
-    assert capsys.readouterr().out.splitlines() == [
-        "data_info.json: expected this file, found no file: not finished, convert again",
-        f"{out}: 1 episode, 7 steps, 1 violation",
-    ]
-    assert run(["stats", str(out)]) == 1
-    assert capsys.readouterr().err.startswith(f"error: {out}: this dataset is not finished")
-
-
 @pytest.mark.parametrize(
     ("flags", "said"),
     [
@@ -204,8 +170,3 @@ def test_what_another_trajectory_left_missing_is_said(tmp_path, caplog):
     conversion.convert(ConversionSettings(b, out, append=True, **options))
     assert len(caplog.records) == 1
     assert validate(out).violations == []
-
-
-def test_spans_of_missing_episodes(tmp_path):
-    ledger = {str(n): {"trajectory": "b.h5" if n < 6 else "c.h5"} for n in (0, 3, 4, 5, 7)}
-    assert still_missing(tmp_path, {"episodes": ledger}) == ["episodes 0, 3-5 of b.h5", "episodes 7 of c.h5"]

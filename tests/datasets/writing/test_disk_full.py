@@ -89,9 +89,7 @@ PYTHON = {
     [
         ("write_bytes", 1, 0),  # the first picture
         ("write_bytes", 60, 1),  # one of the second episode; the first has 42
-        ("savez", 1, 0),
         ("savez", 2, 1),
-        ("write_text", 1, 0),  # conversion.json
         ("write_text", 3, 1),  # scene.json of the second episode
         ("write_text", 4, 2),  # data_info.json
     ],
@@ -116,12 +114,10 @@ def test_a_conversion(trajectory, made_up_pictures, tmp_path, monkeypatch, capsy
 @pytest.mark.parametrize(
     ("moment", "last", "parts"),
     [
-        ("video", 1, 0),  # of the first episode
         ("video", 8, 1),  # of the second; the first has 6
         ("frames", 2, 1),
         ("episode", 3, 1),  # episode.json of the second, after the plan and that of the first
         ("joined", 1, 2),  # the table of all frames
-        ("joined", 2, 2),  # the first video
         ("joined", 7, 2),  # the last
         ("joined", 8, 2),  # the table of episodes
         ("overview", 4, 2),  # one of the JSON files about all episodes
@@ -130,15 +126,15 @@ def test_a_conversion(trajectory, made_up_pictures, tmp_path, monkeypatch, capsy
 def test_a_conversion_to_lerobot(made, tmp_path, monkeypatch, capsys, moment, last, parts):
     pytest.importorskip("av", reason="needs the extra 'lerobot'")
     pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
-    from robocas_ms3.datasets.lerobot import stage
+    from robocas_ms3.datasets.lerobot import parts as written
     from robocas_ms3.datasets.lerobot.variants import Layout
 
     out, source = tmp_path / "out", files_of(made)
     command = ["convert", str(made), "--to", "lerobot", "--out", str(out)]
     text = PYTHON["write_text"]
     places = {
-        "video": (stage, "Encoder", to_dev_full(stage.Encoder, 0)),
-        "frames": (stage.pq, "write_table", to_dev_full(stage.pq.write_table, 1)),
+        "video": (written, "Encoder", to_dev_full(written.Encoder, 0)),
+        "frames": (written.pq, "write_table", to_dev_full(written.pq.write_table, 1)),
         "episode": text,
         "joined": (Layout, "path", named_dev_full(Layout.path)),
         "overview": text,
