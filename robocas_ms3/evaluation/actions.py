@@ -1,4 +1,4 @@
-"""What the numbers of an action mean: conventions that policies may speak, as motions of the TCP or joint targets."""
+"""Action conventions of policies: motions of the TCP, or joint targets."""
 
 from __future__ import annotations
 
@@ -14,13 +14,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Motion:
-    """Relative motions of E TCPs, each in its own frame (z approach, y closing), and what the grippers are told.
-
-    Attributes:
-        translation: (E, 3) m.
-        rotation: E rotations.
-        open: (E,) bool, the gripper's command.
-    """
+    """Relative motions of E TCPs, each in its own frame (z approach, y closing): (E, 3) m, E rotations, (E,) bool."""
 
     translation: Array
     rotation: Rotation
@@ -29,12 +23,12 @@ class Motion:
 
 @dataclass(frozen=True)
 class Convention:
-    """How actions are to be read.
+    """A convention of actions.
 
     Attributes:
-        size: numbers of an action.
+        size: numbers per action.
         meaning: for people.
-        read: actions (E, size) to motions; None: they are joint targets, taken as they are.
+        read: converts actions (E, size) to motions; None: they are joint targets.
     """
 
     size: int
@@ -57,8 +51,8 @@ def _axis_angle(actions: Array) -> Motion:
 def _quaternion(actions: Array) -> Motion:
     quaternions = actions[:, [4, 5, 6, 3]]
     lengths = np.linalg.norm(quaternions, axis=1, keepdims=True)
-    still = np.array([0.0, 0.0, 0.0, 1.0])  # of a network that says nothing
-    quaternions = np.where(lengths > 1e-9, quaternions / np.maximum(lengths, 1e-9), still)
+    identity = np.array([0.0, 0.0, 0.0, 1.0])
+    quaternions = np.where(lengths > 1e-9, quaternions / np.maximum(lengths, 1e-9), identity)
     return Motion(actions[:, :3], Rotation.from_quat(quaternions), actions[:, 7] > 0)
 
 
@@ -71,4 +65,4 @@ CONVENTIONS: dict[str, Convention] = {
     "delta_quaternion": Convention(8, "m; quaternion wxyz; gripper, above 0 is open", _quaternion),
     "joint_positions": Convention(8, "seven joint targets, rad; gripper, -1 closed to 1 open", None),
 }
-"""By name. Translation comes first and is the TCP's own, as rotation is; the last number is the gripper's."""
+"""By name. Translation comes first, then rotation, both in the TCP's frame; the last number is the gripper's."""

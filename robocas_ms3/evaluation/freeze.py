@@ -1,4 +1,4 @@
-"""Make a protocol: draw its episodes, keep their scenes, write them down once and for all."""
+"""Make a protocol from a plan: choose its scenes and write them to files."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _WRONG = 300  # stream of the object that a wrong instruction names
 
 
 class Scene(StrictModel):
-    """A configuration, and what of it is changed."""
+    """A configuration with changes."""
 
     config: str = Field(description="name of a shipped configuration, or a YAML file, from the plan's folder")
     name: str = Field(
@@ -62,7 +62,7 @@ class Scene(StrictModel):
 
     @property
     def file(self) -> str:
-        """Name of its configuration's file."""
+        """Name of its configuration in the protocol."""
         return self.name or Path(self.config).stem
 
 
@@ -70,7 +70,7 @@ class Part(Scene):
     """Episodes of one configuration."""
 
     count: int = Field(ge=1, description="how many episodes")
-    first_seed: int = Field(ge=0, description="of which seeds; those without a layout are left out, and more taken")
+    first_seed: int = Field(ge=0, description="of which seeds; those without a layout are skipped, and more taken")
     split: str = "test"
     words: Literal["asked", "wrong", "empty"] = Field(
         default="asked", description="what the policy is told: what is meant, another object's name, or nothing"
@@ -88,11 +88,11 @@ class Plan(StrictModel):
     rules: dict[str, object] = Field(description="of `Protocol`, but for the pack's hash")
     parts: list[Part]
     train: list[Scene] = Field(default=[], description="configurations to train on")
-    lists: dict[str, Any] = Field(default={}, description="what is left to YAML's anchors: lists that changes refer to")
+    lists: dict[str, Any] = Field(default={}, description="for YAML's anchors: lists that changes refer to")
 
 
 def read_plan(path: Path) -> Plan:
-    """Read a plan; configurations that it names by files lie where it does, or where the command runs.
+    """Read a plan. Files that it names are in its folder, or where the command runs.
 
     Raises:
         EvaluationError: it is none.
@@ -102,14 +102,13 @@ def read_plan(path: Path) -> Plan:
     except (OSError, DocumentError) as error:
         raise EvaluationError(NO_PLAN, where=path, found=error) from error
     plan = parse(Plan, data, EvaluationError, where=path, about=NO_PLAN)
-    beside = {name: [_beside(path, scene) for scene in getattr(plan, name)] for name in ("parts", "train")}
-    return plan.model_copy(update=beside)
 
+    def located(scene: Scene) -> Scene:
+        file = path.parent / scene.config
+        own = file.is_file() and scene.config not in shipped_configs()
+        return scene.model_copy(update={"config": str(file)}) if own else scene
 
-def _beside(path: Path, scene: Scene) -> Scene:
-    file = path.parent / scene.config
-    shipped = scene.config in shipped_configs()
-    return scene if shipped or not file.is_file() else scene.model_copy(update={"config": str(file)})
+    return plan.model_copy(update={name: list(map(located, getattr(plan, name))) for name in ("parts", "train")})
 
 
 def freeze(
@@ -119,28 +118,26 @@ def freeze(
 
     Args:
         plan: what it is made from.
-        folder: that it becomes.
-        layouts: cache to take scenes from.
+        folder: of the protocol.
+        layouts: where layouts come from, see `RoboCASEnv`.
         overrides: keys to set in all its configurations, see `load_task_config`.
 
     Yields:
-        How many episodes are drawn, of how many.
+        The number of episodes that are chosen, and of all.
 
     Raises:
-        EvaluationError: the rules are none of a protocol, or two parts are of one name and another configuration.
+        EvaluationError: the rules are invalid, or two parts have the same name and different configurations.
     """
     pack = load_pack(str(plan.rules.get("pack", "builtin")))
-    said = {**plan.rules, "pack_hash": sha256(pack.root / MANIFEST)}
-    rules = parse(Protocol, said, EvaluationError, where="rules", about=NO_RULES)
+    values = {**plan.rules, "pack_hash": sha256(pack.root / MANIFEST)}
+    rules = parse(Protocol, values, EvaluationError, where="rules", about=NO_RULES)
     configs, train = _configs(plan.parts, overrides), _configs(plan.train, overrides)
     total, episodes = sum(part.count for part in plan.parts), []
     with replacing_folder(folder) as tmp:
-        for inside in (CONFIGS, LAYOUTS, *([TRAIN] if plan.train else [])):
-            make_folder(tmp / inside)
-        for name, config in train.items():
-            _write_config(config, tmp / TRAIN / f"{name}.yaml")
-        for name, config in configs.items():
-            _write_config(config, tmp / CONFIGS / f"{name}.yaml")
+        make_folder(tmp / LAYOUTS)
+        for inside, named in ((CONFIGS, configs), (TRAIN, train)):
+            for name, config in named.items():
+                _write_yaml(config.model_dump(mode="json"), make_folder(tmp / inside) / f"{name}.yaml")
         scenes: dict[str, dict[int, Layout]] = {}
         for part in plan.parts:
             for seed, layout, env in _scenes(part, configs[part.file], str(rules.pack), layouts):
@@ -151,44 +148,36 @@ def freeze(
             write_frozen(tmp / LAYOUTS / f"{name}.npy", pack.objects, found)
         with replacing(tmp / EPISODES) as file:
             file.write_text("".join(f"{episode.model_dump_json()}\n" for episode in episodes), encoding="utf-8")
-        dumped = rules.model_dump(mode="json", exclude={"robot"} if rules.robot == DEFAULT else None)
-        said = yaml.safe_dump(dumped, sort_keys=False, allow_unicode=True)  # one that names no robot has the default
-        (tmp / RULES).write_text(said, encoding="utf-8")
+        # A protocol that names no robot has the default.
+        _write_yaml(rules.model_dump(mode="json", exclude={"robot"} if rules.robot == DEFAULT else None), tmp / RULES)
 
 
 def _configs(parts: Sequence[Scene], overrides: Sequence[str]) -> dict[str, TaskConfig]:
-    """Configurations by name."""
+    """Return the configurations by name."""
     found: dict[str, TaskConfig] = {}
     for part in parts:
         config = part.changed(overrides)
         if not re.fullmatch(CONFIG_NAME, part.file) or len(part.file) > LONGEST:
-            expected, fix = f"letters, digits, _ and -, at most {LONGEST}", "Give it a `name`, and a plain `split`."
-            what = "this name can't be that of a configuration"
+            what, fix = "invalid name of a configuration", "Give it a `name`, and a plain `split`."
+            expected = f"letters, digits, _ and -, at most {LONGEST}"
             raise EvaluationError(what, where=part.config, expected=expected, found=repr(part.file)[:80], fix=fix)
         if found.setdefault(part.file, config) != config:
             raise EvaluationError("two configurations of one name", where=part.file, fix="Give one of them a `name`.")
     return found
 
 
-def _write_config(config: TaskConfig, path: Path) -> None:
-    text = yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
-    path.write_text(text, encoding="utf-8")
+def _write_yaml(values: dict[str, Any], path: Path) -> None:
+    path.write_text(yaml.safe_dump(values, sort_keys=False, allow_unicode=True), encoding="utf-8")
 
 
 def _scenes(
     part: Part, config: TaskConfig, pack: str, layouts: str | Path | None
 ) -> Iterator[tuple[int, Layout, RoboCASEnv]]:
     env = gym.make(
-        TASKS[config.task].env_id,
-        config=config,
-        pack=pack,
-        layouts=layouts,
-        obs_mode="none",
-        render_backend="none",
+        TASKS[config.task].env_id, config=config, pack=pack, layouts=layouts, obs_mode="none", render_backend="none"
     )
+    base: Any = env.unwrapped
     try:
-        base = env.unwrapped
-        assert isinstance(base, RoboCASEnv)
         seed, found = part.first_seed, 0
         while found < part.count:
             try:
@@ -204,20 +193,20 @@ def _scenes(
 
 
 def _episode(number: int, part: Part, seed: int, layout: Layout, env: RoboCASEnv) -> Episode:
-    share = float(layout.visible_shares[layout.target])
+    p_vis = float(layout.visible_shares[layout.target])
     return Episode(
         episode=number,
         task=env.SPEC.name,
         config=part.file,
         seed=seed,
         split=part.split,
-        instruction=_said(part, env, seed),
+        instruction=_instruction(part, env, seed),
         target=layout.object_ids[layout.target],
-        p_vis=None if share != share else round(share, 4),  # noqa: PLR0124  (NaN: it was not asked for)
+        p_vis=None if np.isnan(p_vis) else round(p_vis, 4),
     )
 
 
-def _said(part: Part, env: RoboCASEnv, seed: int) -> str:
+def _instruction(part: Part, env: RoboCASEnv, seed: int) -> str:
     if part.words == "empty":
         return ""
     if part.words == "asked":

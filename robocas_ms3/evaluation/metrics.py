@@ -28,14 +28,11 @@ _NEVER = 2**30  # control steps
 
 
 class EpisodeMetrics:
-    """Accumulates the measures of each env.
+    """Accumulates the measures of each env of a RoboCAS environment that has been reset.
 
     `update` is called after every control step, `end_step` and `read` once per policy step. The impulse integrates the
-    forces found after each control step, so it is accurate for lasting contacts and an estimate for knocks. Where
-    nothing has moved or touched the gripper since the last call (`Moment`), only the TCP is read.
-
-    Args:
-        env: a RoboCAS environment, which has been reset.
+    forces found after each control step, so it is accurate for lasting contacts and an estimate for knocks. If nothing
+    has moved or touched the gripper since the last call (`Moment`), only the TCP is read.
     """
 
     def __init__(self, env: RoboCASEnv) -> None:
@@ -57,11 +54,7 @@ class EpisodeMetrics:
             self._retrieval.reset(envs)
 
     def update(self, opened: np.ndarray) -> None:
-        """Add a control step.
-
-        Args:
-            opened: (N,) bool, whether the last command of each gripper was to open.
-        """
+        """Add a control step; ``opened`` (N,): whether the last command of each gripper was to open."""
         env, sums = self._env, self._sums
         tcp = self._tcp_pos()
         sums[:, _PATH] += length(tcp - self._tcp)
@@ -108,21 +101,17 @@ def read_sum(info: dict[str, Any], name: str) -> Any:
 
 
 def _cleared(values: Any, envs: Any) -> Any:
-    """Values that are zero in some envs."""
     changed = values.clone() if isinstance(values, torch.Tensor) else values.copy()
     changed[envs] = 0
     return changed
 
 
 class RetrievalOrder:
-    """Records of each env when its objects were first moved. `update` is called after every control step.
+    """Records when the objects of each env were first moved. `update` is called after every control step.
 
-    An object was moved when it is more than 3 cm from where it stood or has fallen over (`disturbed`), by whatever
-    chain of pushes, before the target was first held. It was **needed** if at the reset it hid or hemmed in the target
-    (an obstacle of `occlusion.clutter`, or it hid a tenth of it) or lay over one that was, and so on upwards.
-
-    Args:
-        env: search's environment.
+    An object was moved if it was more than 3 cm from where it had been or had fallen over (`disturbed`) before the
+    target was first held. It was **needed** if at the reset it hid or hemmed in the target (an obstacle of
+    `occlusion.clutter`, or it hid a tenth of it) or lay over one that was, and so on upwards.
     """
 
     def __init__(self, env: RoboCASSearchEnv) -> None:
@@ -184,7 +173,7 @@ class RetrievalOrder:
 
 
 def needed(first: Tensor, over: Tensor) -> Tensor:
-    """What has to be moved: some objects (N, K), and what lies ``over`` (N, K, K; row over column) these, and so on."""
+    """Return which objects have to be moved: the ``first`` (N, K), those ``over`` them (row over column), and so on."""
     found = first
     for _ in range(first.shape[1]):
         found = found | (over & found[:, None]).any(dim=2)

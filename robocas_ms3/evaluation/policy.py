@@ -1,4 +1,4 @@
-"""What a policy is to the evaluation: what it wants to see, what its actions mean, and how it is asked for them."""
+"""The interface of policies: what they observe, what their actions mean, and how they are asked for actions."""
 
 from __future__ import annotations
 
@@ -28,19 +28,18 @@ Side = Annotated[int, Field(ge=1, le=4096)]
 
 @dataclass(frozen=True)
 class PolicySpec:
-    """What a policy declares of itself; a mismatch with the protocol is refused before the first step.
+    """What a policy declares; a mismatch with the protocol is refused before the first step.
 
     Attributes:
-        convention: what its actions mean, one of ``actions.CONVENTIONS``.
+        convention: meaning of its actions, one of ``actions.CONVENTIONS``.
         reference: motions are relative to where the TCP is, or to where the last action sent it.
-        rate_hz: actions a second; None: whatever the protocol has.
-        cameras: (width, height) in pixels by camera; empty: it sees nothing.
-        depth: whether pictures come with depth.
-        state: whether it is told what only a simulator knows (docs/rl.md).
-        language: how it is told what to do.
-        look_every: it looks at pictures before its first step, and again after so many; those between may be black,
-            as rendering them is most of what an evaluation costs. Chunks it answers with are of that length, or of
-            several times that.
+        rate_hz: actions per second; None: the protocol's.
+        cameras: (width, height) in pixels by camera; empty: no images.
+        depth: whether images come with depth.
+        state: whether it observes privileged state (docs/rl.md).
+        language: form of the instruction.
+        look_every: number of steps between two images that it looks at, from the first step on; those in between may
+            be black, as rendering is most of the cost of an evaluation. Its chunks have a multiple of this length.
     """
 
     __pydantic_config__ = ConfigDict(extra="forbid")  # of specifications in messages and addresses
@@ -76,18 +75,18 @@ class PolicySpec:
 
 @dataclass(frozen=True)
 class EpisodeSpec:
-    """An episode as a policy is told of it.
+    """An episode as a policy gets to know it.
 
     Attributes:
-        env: number of the env that plays it, by which rows of observations are known.
+        env: number of the env that runs it, as in `Observations.envs`.
         episode: its number in the protocol's list.
         task: short name.
         config_file: its configuration.
         layouts_file: its scene's, among others.
         pack: object pack.
         seed: of its scene.
-        instruction: what is asked.
-        robot: name of the one that acts.
+        instruction: for the policy.
+        robot: name of the robot.
     """
 
     env: int
@@ -103,18 +102,18 @@ class EpisodeSpec:
 
 @dataclass(frozen=True)
 class Observations:
-    """What E envs show, a row each; NumPy arrays.
+    """Observations of E envs, a row each; NumPy arrays.
 
     Attributes:
-        envs: (E,) their numbers.
-        instructions: E texts; empty strings for a policy that wants none.
+        envs: (E,) numbers of the envs.
+        instructions: E texts; empty strings with language ``none``.
         embeddings: (E, 384) float32 sentence embeddings, or None.
         images: by camera (E, H, W, 3) uint8.
         depths: by camera (E, H, W, 1) int16, mm.
         qpos: (E, 12) base x, y, yaw, seven arm joints, two fingers; m and rad.
         tcp_in_base: (E, 7) pose of the TCP in the arm's base frame: position m, quaternion wxyz.
         gripper_width: (E, 1) m.
-        state: (E, D) what only a simulator knows, or None.
+        state: (E, D) privileged state, or None.
     """
 
     envs: NDArray[np.int64]
@@ -129,53 +128,49 @@ class Observations:
 
 
 def privileged(extra: Mapping[str, Any]) -> NDArray[np.float32]:
-    """(N, D) ``Observations.state`` of what an environment says besides, its ``obs["extra"]``, arrays (N, ...)."""
+    """Return the privileged state (N, D) of an environment's ``obs["extra"]``, arrays (N, ...)."""
     return np.concatenate([np.asarray(value) for name, value in extra.items() if name != "tcp_pose"], axis=1)
 
 
 class Policy(Protocol):
-    """A policy. It is made once for a run, and plays several episodes at a time."""
+    """A policy, which runs several episodes at a time."""
 
     @property
     def spec(self) -> PolicySpec:
-        """What it declares of itself."""
+        """What it declares."""
         ...
 
     def reset(self, starts: list[EpisodeSpec]) -> None:
-        """Begin episodes in some envs; what was kept of these envs is over."""
+        """Start episodes in some envs, and forget what was kept of these envs."""
         ...
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
-        """Actions (E, A), or chunks (E, H, A) of which all are played before the env is asked for again."""
+        """Return actions (E, A), or chunks (E, H, A) that are executed whole before the next call for the env."""
         ...
 
 
 class ExternalPolicy:
-    """Stand for the policy of an external loop, which calls `EvaluationSession.reset` and `step`.
-
-    Args:
-        spec: what the policy sees, and what its actions mean.
-    """
+    """Stand for the policy of an external loop, which calls `EvaluationSession.reset` and `step`."""
 
     def __init__(self, spec: PolicySpec) -> None:
         self.spec = spec
 
     def reset(self, starts: list[EpisodeSpec]) -> None:
-        """Do nothing: the external loop resets its policy."""
+        """Do nothing."""
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
-        """Raise an error: the external loop chooses the actions."""
+        """Raise an error."""
         raise EvaluationError("this policy has no actions", where="ExternalPolicy", fix="Call reset and step.")
 
 
 def policy_spec_values(spec: PolicySpec) -> dict[str, Any]:
-    """JSON values of what is declared; of looks only if there are fewer than steps, as who reads it may be older."""
-    said = {**vars(spec), "cameras": {name: list(size) for name, size in spec.cameras.items()}}
-    return {key: value for key, value in said.items() if key != "look_every" or value != 1}
+    """Return JSON values of a specification; ``look_every`` only if it is not 1, which older readers do not know."""
+    values = {**vars(spec), "cameras": {name: list(size) for name, size in spec.cameras.items()}}
+    return {key: value for key, value in values.items() if key != "look_every" or value != 1}
 
 
 def describe(policy: Policy) -> dict[str, Any]:
-    """Return what a result says of a policy: its class, what it wants, and what its optional ``describe()`` adds.
+    """Return what a result says of a policy: class, specification, and the entries of its optional ``describe()``.
 
     Raises:
         EvaluationError: the description is not a dict, or has a value that a result can't hold, such as NaN.
@@ -190,7 +185,7 @@ def describe(policy: Policy) -> dict[str, Any]:
 
 
 def policy_code(policy: Policy) -> AbstractContextManager[None]:
-    """Call a policy inside: where its code tries to end the process, that is an error with its name (`no_exit`)."""
+    """Call a policy inside: if its code tries to end the process, that is an error (`no_exit`)."""
     return no_exit(f"policy {_class_of(policy)}")
 
 

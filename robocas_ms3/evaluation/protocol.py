@@ -1,14 +1,14 @@
-"""A protocol: what is evaluated, frozen. A folder with its rules, configurations, episodes and their scenes.
+"""A protocol: episodes and rules of an evaluation, frozen in a folder.
 
 ::
 
     protocol.yaml            the rules, see `Protocol`
-    episodes.jsonl           an episode a line, see `Episode`
+    episodes.jsonl           an episode per line, see `Episode`
     configs/NAME.yaml        the configurations that episodes name, whole
-    layouts/NAME.npy         the scenes of a configuration's episodes (`scenes.table`)
-    train/NAME.yaml          of a suite that holds something out: configurations that don't have it, to train on
+    layouts/NAME.npy         the scenes of a configuration's episodes (`scenes.table.FrozenLayouts`)
+    train/NAME.yaml          of a suite that holds something out: configurations without it, to train on
 
-Its hash is that of all these files, so two results of one hash were measured by the same thing.
+Results of one hash were measured by the same files.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.names import LONGEST, FileName
 from robocas_ms3.core.paths import protocols_dir
 from robocas_ms3.core.strict import StrictModel, nearest, parse, parse_json
-from robocas_ms3.demos.recordings.entries import GREATEST_SEED
+from robocas_ms3.demos.recordings.seeds import GREATEST_SEED
 from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.settings import EvaluationSettings
@@ -38,29 +38,27 @@ from robocas_ms3.scenes.config.load import check_no_base, load_task_config
 from robocas_ms3.scenes.task_specs import TASKS
 
 NO_RULES = "no rules of a protocol"
-DEFAULT_HZ = 20  # where neither protocol nor policy says
+DEFAULT_HZ = 20  # if neither protocol nor policy names a rate
 CONFIG_NAME = r"^[A-Za-z0-9_-]+$"
 RULES, EPISODES, CONFIGS, LAYOUTS, TRAIN = "protocol.yaml", "episodes.jsonl", "configs", "layouts", "train"
 
 
 class Protocol(StrictModel):
-    """Rules that all episodes of a protocol have in common."""
+    """Rules of all episodes of a protocol."""
 
     name: FileName = Field(description="its results are written below a folder of this name")
     description: str = Field(description="what a score by it says")
     rate_hz: Annotated[int, Field(ge=1, le=100)] | None = Field(
-        default=None, description="actions a second; null: what the policy wants, else 20"
+        default=None, description="actions per second; null: what the policy wants, else 20"
     )
     stepping: Literal["timed", "upstream"] = Field(
         default="timed", description="a step is one action of 1 / rate_hz s; or gripper, then motion, as upstream's"
     )
-    max_steps: Annotated[int, Field(ge=1, le=10**7)] | None = Field(
-        default=None, description="actions an episode may have"
-    )
+    max_steps: Annotated[int, Field(ge=1, le=10**7)] | None = Field(default=None, description="actions per episode")
     max_seconds: dict[str, Annotated[float, Field(gt=0, le=10**6)]] = Field(
-        default={}, description="by task, s of the scene an episode may have; max_steps, if given, ends it earlier"
+        default={}, description="by task, simulated s per episode; max_steps, if given, ends it earlier"
     )
-    conventions: list[str] = Field(default=sorted(CONVENTIONS), description="of actions that a policy may speak")
+    conventions: list[str] = Field(default=sorted(CONVENTIONS), description="of actions that a policy may have")
     references: list[Literal["tcp", "target"]] = Field(
         default=["tcp", "target"], description="that its motions may be relative to"
     )
@@ -75,7 +73,7 @@ class Protocol(StrictModel):
     pack_hash: str = Field(description="sha256 of its manifest")
 
     @model_validator(mode="after")
-    def _known(self) -> Protocol:
+    def _check_names(self) -> Protocol:
         named = (("conventions", self.conventions, CONVENTIONS), ("max_seconds", self.max_seconds, TASKS))
         for key, found, known in named:
             unknown = sorted(set(found) - set(known))
@@ -86,7 +84,7 @@ class Protocol(StrictModel):
         return self
 
     def steps(self, task: str, rate: int) -> int | None:
-        """Actions that an episode of a task may have, at so many a second; None: no end to it."""
+        """Return the maximum number of actions per episode of a task at a rate; None: no maximum."""
         seconds = self.max_seconds.get(task) if self.stepping == "timed" else None
         ends = [self.max_steps, None if seconds is None else round(seconds * rate)]
         return min((steps for steps in ends if steps is not None), default=None)
@@ -95,32 +93,24 @@ class Protocol(StrictModel):
         """Check that a policy can be evaluated by this protocol.
 
         Raises:
-            EvaluationError: its actions or its rate are others.
+            EvaluationError: its actions or its rate do not fit.
         """
         for what, found, allowed in (
             ("convention", spec.convention, self.conventions),
             ("reference", spec.reference, self.references),
         ):
             if found not in allowed:
-                raise EvaluationError(
-                    f"the policy's {what} is none of this protocol's",
-                    where=self.name,
-                    expected=" or ".join(allowed),
-                    found=found,
-                )
+                message, expected = f"the policy's {what} is none of this protocol's", " or ".join(allowed)
+                raise EvaluationError(message, where=self.name, expected=expected, found=found)
         if self.rate_hz is not None and spec.rate_hz not in (None, self.rate_hz):
-            raise EvaluationError(
-                "the policy acts at another rate",
-                where=self.name,
-                expected=f"{self.rate_hz} Hz",
-                found=f"{spec.rate_hz:g} Hz",
-            )
+            expected, found = f"{self.rate_hz} Hz", f"{spec.rate_hz:g} Hz"
+            raise EvaluationError("the policy acts at another rate", where=self.name, expected=expected, found=found)
 
     def rate(self, spec: PolicySpec) -> int:
-        """Actions a second.
+        """Return the number of actions per second.
 
         Raises:
-            EvaluationError: physics at 100 Hz can't be stopped at that rate.
+            EvaluationError: physics at 100 Hz has no such rate.
         """
         rate = self.rate_hz or spec.rate_hz or DEFAULT_HZ
         if rate < 1 or rate != int(rate) or 100 % int(rate):
@@ -141,19 +131,13 @@ class Episode(StrictModel):
     instruction: str = Field(description="what the policy is told")
     target: str = Field(description="id of the object that is meant")
     p_vis: Annotated[float, Field(ge=0, le=1)] | None = Field(
-        default=None, description="share of it that is seen from above; search"
+        default=None, description="share of it that is visible from above; search"
     )
 
 
 @dataclass(frozen=True)
 class LoadedProtocol:
-    """A protocol as it was read.
-
-    Attributes:
-        folder: that it came from.
-        rules: of all episodes.
-        episodes: in the order of their numbers.
-    """
+    """A protocol that was read: its folder, rules and episodes in the order of their numbers."""
 
     folder: Path
     rules: Protocol
@@ -164,7 +148,7 @@ class LoadedProtocol:
         """Hex sha256 of its files, by their names.
 
         Raises:
-            EvaluationError: one of them can't be read or is too large.
+            EvaluationError: a file can't be read or is too large.
         """
         digest = hashlib.sha256()
         for path in files_of(self.folder):
@@ -189,9 +173,7 @@ class LoadedProtocol:
                     other = "Name a protocol that has it, or make one: robocas eval freeze."
                     expected, fix = ", ".join(known), nearest(name, known) or other
                     raise EvaluationError(f"the protocol has no such {kind}", expected=expected, found=name, fix=fix)
-        index, count = settings.parse_shard()
-        of_config: Counter[str] = Counter()
-        chosen = []
+        (index, count), of_config, chosen = settings.parse_shard(), Counter[str](), []
         for episode in self.episodes:
             if (settings.tasks and episode.task not in settings.tasks) or settings.split not in ("", episode.split):
                 continue
@@ -230,57 +212,54 @@ class LoadedProtocol:
             raise EvaluationError(what, where=self.rules.name, expected="one", found=found, fix=fix)
 
     def config_file(self, config: str) -> Path:
-        """Of a configuration that episodes name."""
+        """Return the file of a configuration."""
         return self.folder / CONFIGS / f"{config}.yaml"
 
-    def train_files(self) -> list[Path]:
-        """Configurations to train on, where something is held out."""
-        return sorted(self.folder.glob(f"{TRAIN}/*.yaml"))
-
     def layouts_file(self, config: str) -> Path:
-        """Of the scenes of a configuration's episodes."""
+        """Return the file of the scenes of a configuration's episodes."""
         return self.folder / LAYOUTS / f"{config}.npy"
+
+    def train_files(self) -> list[Path]:
+        """Return the configurations to train on; none if nothing is held out."""
+        return sorted(self.folder.glob(f"{TRAIN}/*.yaml"))
 
 
 def files_of(folder: Path) -> list[Path]:
-    """The files that a protocol is made of, sorted."""
-    inside = [
-        path for name in (f"{CONFIGS}/*.yaml", f"{LAYOUTS}/*.npy", f"{TRAIN}/*.yaml") for path in folder.glob(name)
-    ]
-    return sorted([folder / RULES, folder / EPISODES, *inside])
+    """Return the files that a protocol is made of, sorted."""
+    patterns = (f"{CONFIGS}/*.yaml", f"{LAYOUTS}/*.npy", f"{TRAIN}/*.yaml")
+    return sorted([folder / RULES, folder / EPISODES, *(path for name in patterns for path in folder.glob(name))])
 
 
 def shipped_protocols() -> dict[str, Path]:
-    """Name -> folder of the protocols that travel with the package."""
+    """Return the folders of the bundled protocols by name."""
     return {path.parent.name: path.parent for path in sorted(protocols_dir().glob(f"*/{RULES}"))}
 
 
 def load_protocol(name: str | Path) -> LoadedProtocol:
-    """Read a protocol.
-
-    Args:
-        name: of a shipped one, or a folder.
+    """Read a bundled protocol by name, or the protocol in a folder.
 
     Raises:
-        EvaluationError: there is none, or it is not what it should be.
+        EvaluationError: there is none, or a file of it is missing or invalid.
         ConfigError: one of its configurations extends another file, or cannot be read.
     """
     shipped = shipped_protocols()
     folder = shipped.get(str(name), Path(name)).absolute()
     if not (folder / RULES).is_file():
-        likely = nearest(str(name), shipped)
-        expected = f"a folder with {RULES}, or one of {', '.join(sorted(shipped))}"
-        raise EvaluationError("no such protocol", where=name, expected=expected, fix=likely)
-    rules = _rules(folder / RULES)
-    episodes = tuple(_episodes(folder / EPISODES))
-    loaded = LoadedProtocol(folder, rules, episodes)
-    for task in {episode.task for episode in episodes}:
+        expected, fix = f"a folder with {RULES}, or one of {', '.join(sorted(shipped))}", nearest(str(name), shipped)
+        raise EvaluationError("no such protocol", where=name, expected=expected, fix=fix)
+    try:
+        data = load_yaml(folder / RULES)
+    except (OSError, DocumentError) as error:
+        raise EvaluationError(NO_RULES, where=folder / RULES, found=error) from error
+    rules = parse(Protocol, data, EvaluationError, where=folder / RULES, about=NO_RULES)
+    loaded = LoadedProtocol(folder, rules, tuple(_episodes(folder / EPISODES)))
+    for task in {episode.task for episode in loaded.episodes}:
         if task not in TASKS:
             raise EvaluationError("no such task", where=folder / EPISODES, expected=", ".join(TASKS), found=task)
         if rules.steps(task, 1) is None:
             fix = f"Give max_seconds.{task}, or max_steps."
             raise EvaluationError("episodes of this task would never end", where=folder / RULES, found=task, fix=fix)
-    for config in {episode.config for episode in episodes}:
+    for config in {episode.config for episode in loaded.episodes}:
         for path in (loaded.config_file(config), loaded.layouts_file(config)):
             if not path.is_file():
                 raise EvaluationError("a protocol's file is not there", where=path)
@@ -289,23 +268,14 @@ def load_protocol(name: str | Path) -> LoadedProtocol:
     return loaded
 
 
-def _rules(path: Path) -> Protocol:
-    try:
-        data = load_yaml(path)
-    except (OSError, DocumentError) as error:
-        raise EvaluationError(NO_RULES, where=path, found=error) from error
-    return parse(Protocol, data, EvaluationError, where=path, about=NO_RULES)
-
-
 def _episodes(path: Path) -> Iterator[Episode]:
     try:
         lines = read_text(path, JSON_LIMIT).splitlines()
     except (OSError, DocumentError) as error:
         raise EvaluationError("can't read the episodes", where=path, found=error) from error
     for number, line in enumerate(lines):
-        episode = parse_json(Episode, line, EvaluationError, where=f"{path}:{number + 1}", about="no episode")
+        where = f"{path}:{number + 1}"
+        episode = parse_json(Episode, line, EvaluationError, where=where, about="no episode")
         if episode.episode != number:
-            raise EvaluationError(
-                "episodes are not in order", where=f"{path}:{number + 1}", expected=number, found=episode.episode
-            )
+            raise EvaluationError("episodes are not in order", where=where, expected=number, found=episode.episode)
         yield episode

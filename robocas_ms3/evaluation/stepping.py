@@ -1,4 +1,4 @@
-"""The environment in which policies act: from their action conventions to control steps, and measures of each step."""
+"""The environment in which policies act: it executes actions of any convention and measures each step."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ _NEAR, _TURNED, _SPIN = 0.02, np.deg2rad(5), np.deg2rad(3)  # m, rad, rad/s: whe
 
 
 class PolicyStepping(gym.Wrapper):
-    """Executes the actions of a policy, and adds measures to ``info`` (`metrics`). Works on one env and on a batch.
+    """Execute the actions of a policy, and add measures to ``info`` (`metrics`), for one env or a batch.
 
     Args:
         env: a RoboCAS environment made with `env_kwargs`.
-        spec: what the policy's actions mean, and how often it looks at images; those of other steps are black.
+        spec: meaning of the actions, and how often the policy looks at images; those of other steps are black.
         stepping: ``timed``: a policy step is one control step. ``upstream``: a policy step moves the gripper until it
             stands, then the TCP on a straight line, until it is there or 0.4 s are over. Envs of a batch that have
             finished wait.
@@ -76,13 +76,10 @@ class PolicyStepping(gym.Wrapper):
         return {**info, **self._measures(info)}
 
     def step(self, action: Any) -> tuple[Any, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """Execute one policy step.
-
-        Args:
-            action: (A,) or (N, A) of the convention.
+        """Execute one policy step: (A,) or (N, A) of the convention.
 
         Raises:
-            EvaluationError: a number of it is not finite.
+            EvaluationError: a number is not finite.
         """
         actions = np.asarray(action.cpu() if isinstance(action, torch.Tensor) else action, np.float64)
         actions = actions.reshape(self._base.num_envs, self._convention.size)
@@ -109,7 +106,6 @@ class PolicyStepping(gym.Wrapper):
         return self._timed(motion) if self._stepping == "timed" else self._upstream(motion)
 
     def _measures(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
-        """Return the entries that are added to an info, or replaced."""
         return {**self._metrics.read(), **(self._weld.read(info) if self._weld else {})}
 
     def _timed(self, motion: Motion) -> tuple:
@@ -133,7 +129,7 @@ class PolicyStepping(gym.Wrapper):
         return result
 
     def _go(self, position: np.ndarray, rotation: Rotation, opened: np.ndarray) -> tuple:
-        """Send TCPs to poses in the arm's base frame, in one control step, as far as that can go."""
+        """Move TCPs toward poses in the arm's base frame, in one control step."""
         self._open = opened
         at, turn = self._target()
         delta = to_ee_delta_action(turn.inv().apply(position - at), turn.inv() * rotation)
@@ -174,7 +170,7 @@ def control_mode(convention: str) -> str:
 
 
 def env_kwargs(spec: PolicySpec, rate: int, *, renders: bool = False) -> dict[str, Any]:
-    """Return keyword arguments of an environment that a policy acts in: control, observations, no end of its own.
+    """Return keyword arguments of an environment in which a policy acts.
 
     Args:
         spec: of the policy.

@@ -1,8 +1,8 @@
-"""Upstream's weld: an object that closed fingers have lifted is fixed to the hand until the gripper is told to open.
+"""RoboCAS-v0's weld: an object that closed fingers have lifted is fixed to the hand until the gripper opens.
 
-The evaluator that the paper's figures come from does this, and it helps a policy that drops what it has lifted. So it
-is an option (`robocas eval --weld`), off by default, that a result names. Upstream lets go at the end of the step in
-which the gripper was told to open; here that is when it begins to open.
+The evaluator of the paper does this, and it helps policies that drop lifted objects. So it is an option (`robocas eval
+--weld`), off by default, that a result names. RoboCAS-v0 lets go at the end of the step in which the gripper was
+commanded to open; here it is released when it begins to open.
 """
 
 from __future__ import annotations
@@ -22,49 +22,29 @@ _STIFFNESS, _DAMPING = 1e8, 1e5
 
 
 def check_weld(stepping: str, backend: str) -> None:
-    """Check that objects can be welded.
-
-    Args:
-        stepping: of the protocol.
-        backend: where envs run, see `choose_backend`.
+    """Check that objects can be welded with a protocol's steps, on a backend.
 
     Raises:
         EvaluationError: the protocol's steps are not upstream's, or envs run on a GPU.
     """
     if stepping != "upstream":
-        fix = "Leave --weld out, or take paper-v1."
-        raise EvaluationError(
-            "the weld belongs to upstream's steps",
-            where="--weld",
-            expected="stepping upstream",
-            found=stepping,
-            fix=fix,
-        )
+        what, fix = "the weld belongs to upstream's steps", "Leave --weld out, or take paper-v1."
+        raise EvaluationError(what, where="--weld", expected="stepping upstream", found=stepping, fix=fix)
     if backend == "gpu":  # where nothing can be built once a batch runs
-        raise EvaluationError(
-            "nothing can be welded on a GPU", where="--weld", found=backend, fix="Pass --backend processes."
-        )
+        what, fix = "nothing can be welded on a GPU", "Pass --backend processes."
+        raise EvaluationError(what, where="--weld", found=backend, fix=fix)
 
 
 class Weld:
-    """Welds at most one object to the hand of the only env, on a CPU.
-
-    Args:
-        env: a RoboCAS environment.
-
-    Raises:
-        EvaluationError: it runs on a GPU.
-    """
+    """Welds at most one object to the hand of a RoboCAS environment with one env on a CPU."""
 
     def __init__(self, env: Any) -> None:
-        if env.gpu_sim_enabled:
-            check_weld("upstream", "gpu")
         self._env = env
         self._welded: tuple[Any, Any] | None = None  # body and drive
         self._count = 0
 
     def update(self) -> None:
-        """Weld what both fingers touch, if it is raised and nothing is welded.
+        """Weld an object that both fingers touch, if it is raised and nothing is welded.
 
         To be called after a policy step in which the gripper was commanded to close, as RoboCAS-v0 does.
         """
@@ -79,7 +59,7 @@ class Weld:
             self._fix(env.objects[int(found[0])]._bodies[0])
 
     def open(self) -> None:
-        """Let go of what is welded."""
+        """Release the object."""
         if self._welded is None:
             return
         body, drive = self._welded
@@ -88,12 +68,12 @@ class Weld:
         self._welded = None
 
     def reset(self) -> None:
-        """Let go, and count from 0. To be called before a reset, which may remove the objects."""
+        """Release the object, and count from 0; to be called before a reset, which may remove the objects."""
         self.open()
         self._count = 0
 
     def read(self, info: dict[str, Any]) -> dict[str, Any]:
-        """What changes of an info: ``welds`` (1,), how many there were; no ``success`` while anything is welded."""
+        """Return entries of an info: the number of ``welds`` (1,), and no ``success`` while anything is welded."""
         welded = torch.tensor([self._welded is not None])
         return {"welds": torch.tensor([float(self._count)]), "success": info["success"] & ~welded}
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -26,7 +25,7 @@ from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
 from robocas_ms3.evaluation.stepping import PolicyStepping, control_mode
 from robocas_ms3.evaluation.verify import problems
-from robocas_ms3.evaluation.weld import Weld, check_weld
+from robocas_ms3.evaluation.weld import check_weld
 from robocas_ms3.robots.description import MOBILE_PANDA
 
 OPEN, CLOSE = 1.0, 0.0
@@ -190,8 +189,6 @@ def test_it_is_refused_where_it_does_not_belong(tmp_path, capsys):
     assert not out.exists()
     with pytest.raises(EvaluationError, match=r"nothing can be welded on a GPU \(found gpu\)\. Pass --backend"):
         check_weld("upstream", "gpu")
-    with pytest.raises(EvaluationError, match="nothing can be welded on a GPU"):
-        Weld(SimpleNamespace(gpu_sim_enabled=True))
 
 
 def play(folder, protocol, policy="random", **settings) -> dict[int, dict]:
