@@ -18,11 +18,11 @@ from mani_skill.examples.motionplanning.base_motionplanner.utils import compute_
 import robocas_ms3  # noqa: F401  (registers RoboCASPick-v1)
 from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.core.poses import inverse, transform
-from robocas_ms3.planning.drops import Inside, overhangs, sample_drops
 from robocas_ms3.planning.grasp_choice import filter_grasps, grip_margins
 from robocas_ms3.planning.motionplanner import PandaArmMotionPlanningSolver
 from robocas_ms3.planning.protocol import AttachedBody
 from robocas_ms3.planning.scene import SPACING, PlanningScene
+from robocas_ms3.planning.skills.placing import Inside, overhangs, sample_drops
 from robocas_ms3.scenes.grasping import gripper_is_clear
 
 

@@ -25,13 +25,9 @@ LIFT = 0.10  # m that a held target is raised before it is carried, as after a g
 
 
 def complete(arm: Arm, policy: Callable[[Arm], None]) -> None:
-    """Do the task from a state in which another policy was; returns when it has succeeded.
+    """Do the task (``policy``) from a state in which another policy was; returns when it has succeeded.
 
-    A target that is held is carried on, or, on every other attempt, since it may be held in a way that leads nowhere,
-    let go of as anything else is.
-
-    Args:
-        policy: the scripted one of the task.
+    A held target is carried on; on every other attempt it is let go, since it may be held in a way that leads nowhere.
     """
     slot = int(arm.env.target_slot[0])
     arm.executor.move_gripper(arm.executor.gripper, arm.at, seconds=BRAKE_SECONDS)

@@ -37,11 +37,7 @@ class Child:
     pipe: Connection
 
     def send(self, message: Any) -> None:
-        """Send a message.
-
-        Raises:
-            ChildGone: the child has ended.
-        """
+        """Send a message; raises ``ChildGone`` if the child has ended."""
         try:
             self.pipe.send(message)
         except OSError as error:

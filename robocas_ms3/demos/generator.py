@@ -43,12 +43,12 @@ from robocas_ms3.tasks.base import RoboCASEnv
 class EpisodeGenerator:
     """Makes episodes of one task in one process: holds the environment, the planner and the policy.
 
-    A process that has others beside it does best with one thread of torch (``torch.set_num_threads``): on a busy
-    machine the threads of its small operations wait for each other, 25 times longer than they work.
+    Next to other processes it needs one thread of torch (``torch.set_num_threads``): threads of small operations wait
+    for each other 25 times longer than they work.
 
     Args:
         settings: the same for all episodes.
-        fork: undo what fails by forking where that is safe; the episodes are the same without.
+        fork: undo failed attempts by forking where that is safe; the episodes are the same without.
     """
 
     def __init__(self, settings: EpisodeSettings, *, fork: bool = True) -> None:
@@ -93,13 +93,8 @@ class EpisodeGenerator:
     def generate(self, seed: int, folder: Path, name: str, takeover: Takeover | None = None) -> EpisodeResult:
         """Make the episode of a seed, as ``folder/name.h5`` and ``.json``; no files where every attempt failed.
 
-        The same seed and versions give the same episode, whatever was generated before.
-
-        Args:
-            seed: of the scene.
-            folder: where the files go.
-            name: of the files.
-            takeover: where another policy was in this scene; the episode begins there.
+        The same seed and versions give the same episode, whatever was generated before. With a takeover, the episode
+        begins where another policy was in this scene.
         """
         recorder = EpisodeRecorder(self.env, folder, name)
         executor = Executor(recorder, seed)

@@ -27,9 +27,9 @@ class Failure:
     Attributes:
         seed: of the episode.
         attempt: counted from 0; -1 marks the seed as given up.
-        stage: where the policy could not go on.
+        stage: of the policy that failed.
         reason: why, in words that can be counted.
-        seconds: wall-clock time the attempt took; 0 where a kill has come before it was noted.
+        seconds: wall-clock time of the attempt; 0 if a kill came before it was noted.
     """
 
     seed: Annotated[int, Field(ge=0, le=GREATEST_SEED)]
@@ -111,12 +111,12 @@ class Ledger(ledger.Ledger[Failure]):
 
 
 def failed_attempts(seed: int, said: Iterable[str], noted: Iterable[Failure]) -> list[Failure]:
-    """What failed before a seed's episode was recorded.
+    """Return the failed attempts of a recorded seed.
 
     Args:
-        seed: it.
-        said: ``stage: reason`` of each attempt, as the record has them.
-        noted: lines of the seed, as far as the file has them.
+        seed: of the episode.
+        said: ``stage: reason`` of each attempt in the record.
+        noted: lines of the seed in the file, as far as they are complete.
     """
     there = {failure.attempt: failure for failure in noted}
     failures = []

@@ -22,7 +22,7 @@ SETTLE_SECONDS = 1.0  # after the last action, held still: what was let go comes
 
 @dataclass(frozen=True)
 class Noise:
-    """What a robot does otherwise than it was told, at every action: normal, each component by itself.
+    """Noise of a robot, at every action: normal, each component by itself.
 
     Attributes:
         position: standard deviation of the translation, m.
@@ -41,13 +41,12 @@ class Noise:
 
 @dataclass(frozen=True)
 class Playback:
-    """What came of an episode's actions.
+    """Result of playing an episode's actions.
 
     Attributes:
         success: whether the task succeeded, at some step or within ``SETTLE_SECONDS`` after the last one.
-        tcp_in_base: (T, 3) m, where the TCP was, in the arm's base frame.
-        clipped: actions beyond what one step may do: a component of the translation, or the norm of the rotation,
-            outside [-1, 1].
+        tcp_in_base: (T, 3) m, of the TCP in the arm's base frame.
+        clipped: actions with a component of the translation, or the norm of the rotation, outside [-1, 1].
     """
 
     success: bool
@@ -56,11 +55,7 @@ class Playback:
 
 
 class OpenLoop:
-    """An environment that takes dataset actions.
-
-    Args:
-        env: what the recording was made in.
-        rate_hz: of the actions; a whole number that divides the rate of physics.
+    """An environment that takes dataset actions at a rate, a whole number that divides the rate of physics.
 
     Attributes:
         success: whether the task has succeeded at some step since the reset.
@@ -94,12 +89,7 @@ class OpenLoop:
         return env
 
     def reset(self, seed: int, options: dict[str, Any] | None = None) -> None:
-        """Build an episode's scene.
-
-        Args:
-            seed: of the episode.
-            options: further options of its reset.
-        """
+        """Build the scene of a seed, with further options of its reset."""
         self._env.reset(seed=seed, options=dict(options or {}))
         self.success, self.clipped, self._gripper = False, 0, 1.0
 
@@ -113,12 +103,7 @@ class OpenLoop:
         return self.env.agent.tcp_in_arm_base.p[0].numpy().copy()
 
     def begin_at(self, state: dict[str, Any], gripper: float) -> None:
-        """Go on from another state of the scene that was reset.
-
-        Args:
-            state: as ``set_state_dict`` takes it, without targets of controllers.
-            gripper: what it was told last, -1 closed or 1 open.
-        """
+        """Continue from another state (as ``set_state_dict`` takes it), and the gripper's last command, -1 or 1."""
         self.env.set_state_dict(state)
         self._gripper = gripper
 

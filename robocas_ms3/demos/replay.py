@@ -13,6 +13,8 @@ import gymnasium as gym
 import numpy as np
 import torch
 from mani_skill.envs.utils.observations import ALL_VISUAL_TEXTURES, parse_obs_mode_to_struct
+from mani_skill.trajectory.utils import dict_to_list_of_dicts
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import DatasetError, RobocasError
@@ -20,11 +22,16 @@ from robocas_ms3.core.files import make_folder
 from robocas_ms3.core.outputs import check_replaceable
 from robocas_ms3.core.poses import from_wxyz, inverse
 from robocas_ms3.core.strict import check_number
-from robocas_ms3.demos.recorded import Recorded
-from robocas_ms3.demos.recordings.entries import read_json
+from robocas_ms3.demos.recordings.entries import read_json, read_reset, was_taken_over
 from robocas_ms3.demos.recordings.environment import RecordedEnv, read_env
 from robocas_ms3.demos.recordings.merging import merge
-from robocas_ms3.demos.recordings.stored import open_trajectory
+from robocas_ms3.demos.recordings.stored import (
+    BODIES,
+    named_arrays,
+    open_episode,
+    open_trajectory,
+    read_steps,
+)
 from robocas_ms3.demos.recordings.writing import EpisodeRecorder
 from robocas_ms3.demos.settings import ReplaySettings
 from robocas_ms3.robots.ee_controller import RoboCASEEPoseController
@@ -34,6 +41,63 @@ from robocas_ms3.tasks.base import RoboCASEnv
 
 _JOINT_DELTA_SCALE = 0.1  # rad at |action| = 1 of pd_joint_delta_pos
 CONVERTIBLE = ("pd_joint_pos", "pd_joint_delta_pos", "pd_ee_delta_pose", "pd_ee_pose")
+_JOINT_TARGETS = 8  # numbers of an action that can be converted
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A recorded episode of S steps.
+
+    Attributes:
+        where: name of the episode for messages.
+        seed, options: of ``env.reset``.
+        control_mode: of the actions.
+        actions: (S, A).
+        states: S + 1, each as ``set_state_dict`` takes it.
+        taken_over: whether it begins at the first state instead of that of the reset.
+    """
+
+    where: str
+    seed: int
+    options: dict[str, Any]
+    control_mode: str
+    actions: NDArray[np.float32]
+    states: list[dict[str, Any]]
+    taken_over: bool
+
+    @classmethod
+    def read(cls, trajectory: Path, episode: dict[str, Any]) -> Recorded:
+        """Read the episode of an entry of the JSON."""
+        where = f"{trajectory}, traj_{episode['episode_id']}"
+        seed, options = read_reset(episode, where)
+        mode = episode.get("control_mode")
+        if not isinstance(mode, str):
+            found = str(mode)[:40]
+            raise DatasetError("no such control mode", where=f"{where}, control_mode", expected="text", found=found)
+        with open_trajectory(trajectory) as file:
+            group = open_episode(file, episode["episode_id"])
+            actions, states = read_steps(group, extras=True)
+        return cls(where, seed, options, mode, actions, dict_to_list_of_dicts(states), was_taken_over(episode))
+
+    def check_fits(self, env: RoboCASEnv) -> None:
+        """See that an environment, reset for this episode, is such a one as it was recorded in."""
+        converted = env.control_mode != self.control_mode
+        width = _JOINT_TARGETS if converted else cast(Any, env.single_action_space).shape[0]
+        if self.actions.shape[1] != width:
+            found = self.actions.shape[1]
+            raise DatasetError("actions of another robot", where=self.where, expected=f"{width} numbers", found=found)
+        theirs = {name: np.size(row) for name, row in named_arrays(self.states[0])}
+        ours = {name: np.size(row.cpu().numpy()) for name, row in named_arrays(env.get_state_dict())}
+        for name in sorted({*theirs, *ours}):
+            body = name.startswith(BODIES)
+            # targets of controllers and the like are kept for some modes, and weren't always
+            if theirs.get(name) != ours.get(name) and (body or (name in theirs and not converted)):
+                raise DatasetError(
+                    "states of another scene",
+                    where=f"{self.where}, {name}",
+                    expected=f"{ours[name]} numbers" if name in ours else "nothing of this name",
+                    found=f"{theirs[name]} numbers" if name in theirs else "nothing",
+                )
 
 
 @dataclass(frozen=True)

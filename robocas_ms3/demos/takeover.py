@@ -12,15 +12,15 @@ from robocas_ms3.core.errors import EpisodeLost
 
 @dataclass(frozen=True)
 class Takeover:
-    """What a policy left behind.
+    """State in which a policy left a scene.
 
     Attributes:
         seed: of the scene.
         policy: its name.
         policy_steps: for which it acted.
         state: as ``set_state_dict`` takes it, each array (1, D) float32 or bool; without targets of controllers.
-        gripper: what the gripper was told last, -1 closed or 1 open.
-        refused: why there is nothing to take over, in a few words that can be counted; empty: there is.
+        gripper: last command of the gripper, -1 closed or 1 open.
+        refused: why nothing can be taken over, in a few words that can be counted; empty: it can.
     """
 
     seed: int
@@ -35,10 +35,6 @@ class Takeover:
         return {"policy": self.policy, "policy_steps": self.policy_steps}
 
     def check(self) -> None:
-        """See that there is something to take over.
-
-        Raises:
-            EpisodeLost: there is not.
-        """
+        """Raise ``EpisodeLost`` if nothing can be taken over."""
         if self.refused:
             raise EpisodeLost("takeover", self.refused)

@@ -25,12 +25,9 @@ States = dict[str, dict[str, NDArray[np.float32]]]
 
 
 class Trials:
-    """Worlds that follow a recording.
+    """Environments that follow a recording: the first one plays the actions as they are, the others with noise.
 
-    Args:
-        worlds: of the same configuration; the first one plays the actions as they are, the others with noise.
-        noise: of the others.
-        stride: control steps of the recording an action.
+    ``stride``: control steps of the recording per action.
     """
 
     def __init__(self, worlds: Sequence[OpenLoop], noise: Noise, stride: int) -> None:
@@ -55,7 +52,7 @@ class Trials:
             states: ManiSkill's, after the reset and after each control step; see ``EpisodeRecorder.states``.
             gripper: (S,) its commands.
             finished: the recording has ended: the last action may be a shorter one, and the task must succeed.
-            noisy: play it with noise too; without, those worlds stay behind.
+            noisy: play it with noise too; without, those environments stay behind.
 
         Raises:
             EpisodeLost: ``clipped``, an action goes beyond the range of ``pd_ee_delta_pose``; ``parted``, the target is

@@ -20,14 +20,7 @@ UPRIGHT = 1 - 1e-9  # cosine between the upper arm and the vertical beyond which
 
 
 class PandaGeometry:
-    """The Panda's lengths, read from its chain.
-
-    Args:
-        chain: the arm.
-
-    Raises:
-        RobocasError: its joints don't stand to each other as the Panda's do.
-    """
+    """The Panda's lengths, read from its chain; a chain of another geometry raises ``RobocasError``."""
 
     def __init__(self, chain: ArmChain) -> None:
         one, two, three, four, five, six, seven, tcp = chain.links
@@ -52,11 +45,7 @@ class PandaGeometry:
         self.lower, self.upper = chain.lower, chain.upper
 
     def solve(self, tcp_in_base: Array, joint7: Array) -> Array:
-        """Give all configurations that reach poses with given turns of joint 7.
-
-        Args:
-            tcp_in_base: (M, 4, 4).
-            joint7: (M,) rad.
+        """Return all configurations that reach poses (M, 4, 4) with given turns of joint 7 (M,), rad.
 
         Returns:
             (M, 4, 7) rad, or another number of branches; NaN where a branch doesn't exist or breaks a joint limit.

@@ -21,13 +21,8 @@ LIMIT_MARGIN = 0.02  # rad kept from every joint limit
 class ArmChain:
     """Seven joints that turn about z of their own links, and the TCP fixed to the last.
 
-    ``robots.kinematics.SerialChain`` describes revolute joints too. It runs on tensors of a GPU, as controllers need,
-    and gives only the pose of its tip. This class runs on NumPy's arrays alone. It gives the frames of all links, which
-    collision checks need, without BLAS, so that plans repeat exactly.
-
-    Args:
-        arm_urdf: the arm alone, rooted at its base.
-        robot: description of the robot that carries the arm.
+    ``robots.kinematics.SerialChain`` serves controllers on a GPU, and gives only the pose of its tip. This class gives
+    the frames of all links, for collision checks, in NumPy without BLAS, so that plans repeat exactly.
 
     Attributes:
         robot: description of the robot that carries the arm.
@@ -38,7 +33,7 @@ class ArmChain:
         upper: (7,) upper joint limits with a margin, rad.
 
     Raises:
-        RobotDescriptionError: the file is missing or malformed, or it does not describe that arm.
+        RobotDescriptionError: the URDF of the arm is missing or malformed, or it does not describe that arm.
     """
 
     def __init__(self, arm_urdf: Path | str, robot: RobotDescription) -> None:

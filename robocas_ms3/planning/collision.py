@@ -7,8 +7,6 @@ obstacles. Only the pairs whose boxes overlap are given to FCL (python-fcl).
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -29,40 +27,6 @@ SPARSE = 12  # every so manieth configuration of a path is checked before all ot
 CHUNK = 128  # configurations of a path checked at once
 
 
-@dataclass(frozen=True)
-class _PartPoses:
-    """Poses of all parts in the base frame at several configurations.
-
-    Attributes:
-        rotations: (P, M, 3, 3).
-        positions: (P, M, 3), m.
-    """
-
-    rotations: Array
-    positions: Array
-
-
-@dataclass(frozen=True)
-class _Candidates:
-    """Pairs whose boxes overlap, sorted by configuration.
-
-    Attributes:
-        links: (n, 2) index of the configuration and of the pair of parts.
-        obstacles: (m, 3) index of the configuration, of the part and of the obstacle's piece.
-    """
-
-    links: NDArray[np.int_]
-    obstacles: NDArray[np.int_]
-
-    def rows(self, count: int) -> Iterator[tuple[list[int], list[list[int]]]]:
-        """Yield for each configuration its pairs of parts, and its parts with obstacle pieces."""
-        link_ends = np.searchsorted(self.links[:, 0], np.arange(count + 1)).tolist()
-        obstacle_ends = np.searchsorted(self.obstacles[:, 0], np.arange(count + 1)).tolist()
-        links, obstacles = self.links[:, 1].tolist(), self.obstacles[:, 1:].tolist()
-        for (a, b), (c, d) in zip(pairwise(link_ends), pairwise(obstacle_ends), strict=True):
-            yield links[a:b], obstacles[c:d]
-
-
 class FclWorld:
     """The arm, the obstacles and the held object.
 
@@ -72,7 +36,6 @@ class FclWorld:
         urdf: the arm alone, rooted at its base.
         srdf: pairs of its links that need no check.
         robot: description of the robot that carries the arm.
-        voxel: edge length of the voxels of point clouds, equal to the spacing of their points, m.
 
     Attributes:
         chain: kinematic chain of the arm.
@@ -80,14 +43,13 @@ class FclWorld:
         finger_width: distance between the pads in checks that name none, m.
 
     Raises:
-        RobotDescriptionError: the URDF, the SRDF or a collision mesh is missing or unusable, or a geometry is not
-            supported.
+        RobotDescriptionError: a file is missing or unusable, or a geometry is not supported.
     """
 
-    def __init__(self, urdf: Path | str, srdf: Path | str, robot: RobotDescription, *, voxel: float = 0.005) -> None:
+    def __init__(self, urdf: Path | str, srdf: Path | str, robot: RobotDescription) -> None:
         self.chain = ArmChain(urdf, robot)
         self.open_width = self.finger_width = robot.open_width
-        self._shapes = CollisionShapes(voxel)
+        self._shapes = CollisionShapes()
         self._request, self._result = fcl.CollisionRequest(), fcl.CollisionResult()
         self._held = False
         self._pieces: list[tuple[Pieces, int, Array]] = []
@@ -199,25 +161,28 @@ class FclWorld:
         if not len(qpos):
             return
         rotations, positions = self.chain.frames(qpos)
-        candidates = self._broad_phase(rotations, positions, width, obstacles)
-        if not len(candidates.links) and not len(candidates.obstacles):
+        links, others = self._broad_phase(rotations, positions, width, obstacles)
+        if not len(links) and not len(others):
             yield from (iter(()) for _ in qpos)
             return
-        poses = self._part_poses(rotations, positions, width)
-        for row, (links, others) in enumerate(candidates.rows(len(qpos))):
-            yield self._narrow_phase(links, others, poses, row)
+        rotations, positions = self._part_poses(rotations, positions, width)
+        link_ends, other_ends = (np.searchsorted(found[:, 0], np.arange(len(qpos) + 1)) for found in (links, others))
+        for row in range(len(qpos)):
+            own = links[link_ends[row] : link_ends[row + 1], 1].tolist()
+            pieces = others[other_ends[row] : other_ends[row + 1], 1:].tolist()
+            yield self._narrow_phase(own, pieces, rotations[:, row], positions[:, row])
 
     def _narrow_phase(
-        self, links: list[int], others: list[list[int]], poses: _PartPoses, row: int
+        self, links: list[int], others: list[list[int]], rotations: Array, positions: Array
     ) -> Iterator[tuple[str, str]]:
-        """Yield the names of the pairs that FCL finds in collision."""
+        """Yield the names of the pairs that FCL finds in collision, for parts at (P, 3, 3) and (P, 3)."""
         names, placed = self._names, set()
 
         def part(index: int) -> Any:
             found = self._parts[index]
             if index not in placed and self._frames[index] != BASE:  # placing takes as long as a check
                 placed.add(index)
-                found.setTransform(fcl.Transform(poses.rotations[index, row], poses.positions[index, row]))
+                found.setTransform(fcl.Transform(rotations[index], positions[index]))
             return found
 
         for pair in links:
@@ -242,17 +207,21 @@ class FclWorld:
             found.setTransform(_fcl_pose(pose))
         return self._obstacles[index]
 
-    def _part_poses(self, rotations: Array, positions: Array, width: float) -> _PartPoses:
-        """Return the poses of the parts for frames at rotations (8, M, 3, 3) and positions (8, M, 3)."""
+    def _part_poses(self, rotations: Array, positions: Array, width: float) -> tuple[Array, Array]:
+        """Return rotations (P, M, 3, 3) and positions (P, M, 3) of the parts for those of frames (8, M, ...)."""
         turned = rotations[self._frames]  # parts of the base get the last frame's pose, which nothing reads
         offsets = self._poses[:, :3, 3] + self._slides * (width / 2)
-        return _PartPoses(
-            np.einsum("pmij,pjk->pmik", turned, self._poses[:, :3, :3]),
-            np.einsum("pmij,pj->pmi", turned, offsets) + positions[self._frames],
-        )
+        placed = np.einsum("pmij,pj->pmi", turned, offsets) + positions[self._frames]
+        return np.einsum("pmij,pjk->pmik", turned, self._poses[:, :3, :3]), placed
 
-    def _broad_phase(self, rotations: Array, positions: Array, width: float, obstacles: bool) -> _Candidates:
-        """Return the pairs whose boxes overlap, for frames at rotations (8, M, 3, 3) and positions (8, M, 3)."""
+    def _broad_phase(
+        self, rotations: Array, positions: Array, width: float, obstacles: bool
+    ) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+        """Return the pairs whose boxes overlap, for frames at rotations (8, M, 3, 3) and positions (8, M, 3).
+
+        Returns:
+            (n, 2) configuration and pair of parts; (m, 3) configuration, part and obstacle's piece.
+        """
         bounds = self._closed_bounds + (self._open_bounds - self._closed_bounds) * (width / self.open_width)
         moving = self._moving if self._held else self._moving[:-1]
         frames, count = self._frames[moving], rotations.shape[1]
@@ -266,7 +235,7 @@ class FclWorld:
         a, b = (self._pairs if self._held else self._pairs[: self._own_pairs]).T
         links = np.argwhere(np.all((low[a] <= high[b]) & (low[b] <= high[a]), axis=2).T)
         if not obstacles or not len(self._low):
-            return _Candidates(links, np.zeros((0, 3), dtype=int))
+            return links, np.zeros((0, 3), dtype=int)
         low, high = low[moving], high[moving]
         near = np.all((self._low <= high.max(axis=(0, 1))) & (self._high >= low.min(axis=(0, 1))), axis=1)
         pieces = np.flatnonzero(near)
@@ -276,7 +245,7 @@ class FclWorld:
             overlap &= high[:, :, axis].T[:, :, None] >= self._low[pieces, axis]
         found = np.argwhere(overlap)
         found[:, 1], found[:, 2] = moving[found[:, 1]], pieces[found[:, 2]]
-        return _Candidates(links, found)
+        return links, found
 
 
 def _fcl_pose(pose: Array) -> Any:

@@ -54,10 +54,6 @@ def read_collision_parts(urdf: Path | str, chain: ArmChain) -> list[CollisionPar
 
     A joint that is neither an arm joint nor a finger joint is taken at its zero position.
 
-    Args:
-        urdf: URDF of the arm, rooted at its base.
-        chain: kinematic chain of the same arm.
-
     Raises:
         RobotDescriptionError: the URDF is malformed, a mesh is missing or unreadable, a geometry has another type than
             mesh, box, cylinder or sphere, or a finger joint is not prismatic.
@@ -90,16 +86,7 @@ def read_collision_parts(urdf: Path | str, chain: ArmChain) -> list[CollisionPar
 
 
 def read_link_pairs(urdf: Path | str, srdf: Path | str, parts: list[CollisionPart]) -> list[tuple[int, int]]:
-    """Return the pairs of part indices (i < j) to check: of links neither adjacent nor disabled in the SRDF.
-
-    Args:
-        urdf: URDF of the arm; links that a joint connects are adjacent.
-        srdf: SRDF with ``disable_collisions`` elements.
-        parts: parts of the arm.
-
-    Raises:
-        RobotDescriptionError: a file is missing or malformed.
-    """
+    """Return the pairs of part indices (i < j) to check: of links neither adjacent nor disabled in the SRDF."""
     ignored = {frozenset((joint.parent, joint.child)) for joint in DescriptionFile(urdf).joints()}
     file = DescriptionFile(srdf)
     for pair in file.root.iterfind("disable_collisions"):

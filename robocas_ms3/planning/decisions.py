@@ -19,12 +19,12 @@ TRIES = 3  # candidates of one decision that are gone on from before the decisio
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is tried before a decision is made, and before it is given up.
+    """How many candidates are tried for a decision.
 
     Attributes:
-        ahead: how many candidates that can be done are compared before the best is gone on from.
-        tries: how many are gone on from.
-        enough: a score at which no other candidate is looked at.
+        ahead: feasible candidates that are compared before the episode continues from the best.
+        tries: candidates that the episode continues from, before the decision is given up.
+        enough: a score at which no other candidate is played.
     """
 
     ahead: int = 1
@@ -39,21 +39,21 @@ class Decisions(Protocol):
     """Plays candidates and goes on from one of them."""
 
     def choose(self, candidates: Iterable[T], play: Callable[[T], float], effort: Effort = ONE_BY_ONE) -> T:
-        """Play candidates from this moment on and go on from the one with the greatest score.
+        """Play candidates from this moment on and continue from the one with the greatest score.
 
-        When what comes after it fails, the policy is back here, and goes on from the next best one, as if the first
-        had never been tried.
+        If a later step fails, the policy is back here and continues from the next best one, as if the first had never
+        been tried.
 
         Args:
-            candidates: ways to go on, those tried first that promise most.
-            play: makes a candidate's motions and gives its score; raises ``PlanningFailed`` where it can't be done.
-            effort: how many are compared, and gone on from.
+            candidates: the most promising first.
+            play: makes a candidate's motions and returns its score; raises ``PlanningFailed`` where it can't be done.
+            effort: how many are compared, and continued from.
 
         Returns:
             The candidate that was played, its motions done.
 
         Raises:
-            PlanningFailed: of the candidate that came last, where none can be done; nothing has moved then.
+            PlanningFailed: of the last candidate, where none can be done; nothing has moved then.
         """
         ...
 

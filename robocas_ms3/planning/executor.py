@@ -41,12 +41,11 @@ class Executor:
         actions: every action since the reset, (8,) each, or (11,) where the base is driven.
         segments: the sub-goals so far.
         info: of the last step or reset.
-        gripper: the gripper's command as it stands.
-        base: (3,) where the base's joints are told to be: x m, y m, yaw rad.
+        gripper: last command of the gripper.
+        base: (3,) last command of the base joints: x m, y m, yaw rad.
         seconds: where the time went.
-        facts: what a policy counts since the reset, for the record, e.g. ``pushes``.
-        rehearse: tries what was done so far as a dataset will hold it; raises ``EpisodeLost`` where it comes out
-            otherwise.
+        facts: counters of the policy for the record, e.g. ``pushes``.
+        rehearse: replays the actions so far open loop; raises ``EpisodeLost`` where the outcome differs.
     """
 
     env: gym.Env
@@ -80,14 +79,10 @@ class Executor:
         self.facts = {}
 
     def follow(self, trajectory: Trajectory, *, until: str | None = None) -> bool:
-        """Send a trajectory's rows to the arm, the gripper's command held.
+        """Send a trajectory's rows to the arm, holding the gripper's command.
 
-        Args:
-            trajectory: at this executor's ``dt``.
-            until: stop as soon as this flag of ``info`` is set.
-
-        Returns:
-            Whether the flag is set at the end; True without one.
+        With ``until`` it stops as soon as that flag of ``info`` is set, and returns whether it is; else it returns
+        True.
         """
         for qpos in trajectory.qpos:
             if until and self.flag(until):
@@ -96,13 +91,7 @@ class Executor:
         return until is None or self.flag(until)
 
     def move_gripper(self, command: float, hold: Array, *, seconds: float) -> None:
-        """Command the gripper, with the arm held where it is meant to be.
-
-        Args:
-            command: ``OPEN`` or ``CLOSED``.
-            hold: (7,) arm target meanwhile.
-            seconds: how long.
-        """
+        """Command the gripper (``OPEN`` or ``CLOSED``) for some seconds, with the arm held at (7,) rad."""
         self.gripper = command
         for _ in range(max(1, round(seconds / self.dt))):
             self._step(self._action(hold))
@@ -113,12 +102,7 @@ class Executor:
         return self.base_env.control_mode.endswith("_base")
 
     def drive(self, waypoints: Array, hold: Array) -> None:
-        """Send base joint targets, the arm held.
-
-        Args:
-            waypoints: (T, 3) x m, y m, yaw rad, one a control step.
-            hold: (7,) arm target meanwhile.
-        """
+        """Send base joint targets (T, 3), x m, y m, yaw rad, one per control step, with the arm held at (7,) rad."""
         for base in waypoints:
             self.base = base
             self._step(self._action(hold))

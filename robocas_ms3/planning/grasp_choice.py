@@ -66,16 +66,15 @@ def filter_grasps(
 
 
 def grip_margins(tcp: Array, widths: Array, surface: Array) -> Array:
-    """How much of an object is between the pads even where a grasp comes out a little otherwise than planned.
+    """Return how much (N,) of an object is between the pads even where a grasp misses a little, 0 to 1.
+
+    1: at least ``PAD_POINTS`` lie between the pads of each of several shifted grasps, and ``ROOM_BESIDE`` is left
+    beside the object while the gripper is open.
 
     Args:
         tcp: (N, 4, 4) grasps, in the frame of the points.
         widths: (N,) of the object there, m.
         surface: (P, 3) of the object, m, 5 mm apart.
-
-    Returns:
-        (N,) in 0..1: 1 where at least ``PAD_POINTS`` lie between the pads of each of several shifted grasps, and
-        ``ROOM_BESIDE`` beside the object while the gripper is open.
     """
     margin = np.clip((MAX_WIDTH - np.asarray(widths)) / 2 / ROOM_BESIDE, 0, 1)
     widest, deepest = np.abs(GRIP_SHIFTS).max(axis=0)

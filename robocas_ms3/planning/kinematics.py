@@ -29,11 +29,8 @@ DAMPING = 1e-8  # added to the diagonal of J J^T, so that it can be inverted at 
 class Reachability:
     """Inverse kinematics of one arm; collisions do not count.
 
-    Args:
-        chain: the arm.
-
     Raises:
-        RobocasError: the closed form that its robot names is not there, or for other arms.
+        RobocasError: the robot's description names no closed form, or one for another arm.
     """
 
     def __init__(self, chain: ArmChain) -> None:
@@ -101,8 +98,7 @@ def newton_step(chain: ArmChain, qpos: Array, goals: Array) -> tuple[Array, Arra
     """Move each configuration by one damped Newton step towards its own TCP pose, within the joint limits.
 
     The step has the smallest norm over the joints. It is computed without BLAS and LAPACK, whose last bits depend on
-    the processor and on the number of threads. This holds for the configurations of lines alone: the margin of obstacle
-    hulls (``shapes.inflated``) and ``SerialChain`` do use LAPACK.
+    the processor and on the number of threads.
 
     Args:
         chain: the arm.
@@ -123,15 +119,7 @@ def newton_step(chain: ArmChain, qpos: Array, goals: Array) -> tuple[Array, Arra
 
 
 def solve_positive(matrices: Array, values: Array) -> Array:
-    """Solve linear systems of symmetric positive definite matrices by Gauss-Jordan elimination without pivoting.
-
-    Args:
-        matrices: (M, N, N).
-        values: (M, N) right-hand sides.
-
-    Returns:
-        (M, N) solutions.
-    """
+    """Solve positive definite systems (M, N, N) for (M, N) by Gauss-Jordan elimination without pivoting."""
     rows = np.concatenate([matrices, values[:, :, None]], axis=2)
     for pivot in range(rows.shape[1]):
         rows[:, pivot] /= rows[:, pivot, pivot, None]
@@ -142,13 +130,7 @@ def solve_positive(matrices: Array, values: Array) -> Array:
 
 
 def follow_line(chain: ArmChain, start: Array, tcp_in_base: Array, *, stage: str) -> Array:
-    """Follow a straight line of the TCP from a configuration to a pose: linear position, shortest rotation.
-
-    Args:
-        chain: the arm.
-        start: (7,) configuration, rad.
-        tcp_in_base: (4, 4) goal pose of the TCP.
-        stage: stage of the policy, for errors.
+    """Follow a straight line of the TCP from a configuration (7,) to a pose (4, 4): linear position, shortest rotation.
 
     Returns:
         (n, 7) configurations whose TCP poses are at most 1 cm and 3 deg apart; the first is ``start``.

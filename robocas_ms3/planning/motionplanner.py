@@ -142,19 +142,9 @@ class PandaArmMotionPlanningSolver:
         return result if dry_run else self.follow_path(result, refine_steps)
 
     def move_to_pose_with_screw(self, pose: sapien.Pose | Pose, dry_run: bool = False, refine_steps: int = 0) -> Any:
-        """Move the TCP to a pose on a straight line with the shortest rotation, without collisions.
+        """Move the TCP to a pose on a straight, collision-free line with the shortest rotation.
 
-        Args:
-            pose: goal of the TCP.
-            dry_run: return the planned trajectory and do not step the environment.
-            refine_steps: how many times to send the last joint target again.
-
-        Returns:
-            The last step, or the trajectory of a dry run.
-
-        Raises:
-            PlanningFailed: the line leaves the arm's reach or touches an obstacle.
-            RobocasError: ``refine_steps`` is negative, or a number of the pose is NaN or infinite.
+        Arguments and errors as of ``move_to_pose_with_RRTConnect``.
         """
         _require_count(refine_steps, "refine_steps", 0)
         start, goal = self._prepare(pose)
@@ -163,10 +153,6 @@ class PandaArmMotionPlanningSolver:
 
     def follow_path(self, result: Trajectory, refine_steps: int = 0) -> Step:
         """Send the joint targets of a planned trajectory, one per control step, and hold the gripper command.
-
-        Args:
-            result: a trajectory with at least one row, as a dry run returns it.
-            refine_steps: how many times to send the last joint target again.
 
         Raises:
             RobocasError: the trajectory has no row, or ``refine_steps`` is negative.
@@ -179,11 +165,7 @@ class PandaArmMotionPlanningSolver:
         return self._run(qpos, qvel)
 
     def open_gripper(self, t: int = 6, gripper_state: float = OPEN) -> Step:
-        """Open the gripper for some control steps while the arm holds its position.
-
-        Args:
-            t: number of control steps, at least 1.
-            gripper_state: gripper command, also for the motions that follow.
+        """Open the gripper for ``t`` control steps while the arm holds its position; later motions hold the command.
 
         Raises:
             RobocasError: ``t`` is less than 1.
@@ -195,11 +177,7 @@ class PandaArmMotionPlanningSolver:
         return self._move_gripper(t, gripper_state)
 
     def add_box_collision(self, extents: Array, pose: sapien.Pose | Pose) -> None:
-        """Add a box to the obstacles.
-
-        Args:
-            extents: (3,) edge lengths, m.
-            pose: of the box's centre.
+        """Add a box with edge lengths (3,) m and its centre at a pose to the obstacles.
 
         Raises:
             RobocasError: an edge length is not positive, or a number is NaN or infinite.
@@ -217,10 +195,7 @@ class PandaArmMotionPlanningSolver:
         self.add_obstacles([Obstacle("box", Shape(hulls=(corners,)), _matrix(pose, "add_box_collision"))])
 
     def add_collision_pts(self, pts: Array) -> None:
-        """Add surface points to the obstacles.
-
-        Args:
-            pts: (P, 3) m, about 5 mm apart. No points add no obstacle.
+        """Add surface points (P, 3) m, about 5 mm apart, to the obstacles; no points add no obstacle.
 
         Raises:
             RobocasError: the array has another shape, or a coordinate is NaN or infinite.
@@ -240,11 +215,7 @@ class PandaArmMotionPlanningSolver:
         self.add_obstacles([Obstacle("points", Shape(points=points.reshape(-1, 3)), np.eye(4))])
 
     def add_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
-        """Add rigid bodies to the obstacles, such as those of ``PlanningScene.obstacles_in_world``.
-
-        Args:
-            obstacles: bodies whose ``pose_in_base`` is their pose in the world frame.
-        """
+        """Add bodies whose ``pose_in_base`` is in the world frame, as ``PlanningScene.obstacles_in_world`` returns."""
         self._obstacles += obstacles
 
     def clear_collisions(self) -> None:

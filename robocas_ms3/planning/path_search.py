@@ -84,11 +84,7 @@ class PathSearch:
     def connect(
         self, start: Array, goals: list[Array], rng: np.random.Generator, *, max_checks: int
     ) -> list[Array] | None:
-        """Find a path from ``start`` to one of ``goals`` (all free).
-
-        Returns:
-            Waypoints, the first is ``start``, the last one of ``goals``; none when the budget is spent.
-        """
+        """Return waypoints from ``start`` to one of ``goals`` (all free), or None when the budget is spent."""
         self._left = max_checks
         trees = (_Tree([start]), _Tree(goals))
         grow, other = 0, 1

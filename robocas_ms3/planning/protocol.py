@@ -57,9 +57,6 @@ class Shape:
     Attributes:
         hulls: vertices (V, 3) of its convex pieces, m.
         points: (P, 3) samples at 5 mm of surfaces that no hulls describe, m.
-
-    Raises:
-        RobocasError: there are neither hulls nor points.
     """
 
     hulls: tuple[Array, ...] = ()
@@ -112,11 +109,9 @@ class Planner(Protocol):
         ...
 
     def set_scene(self, obstacles: Sequence[Obstacle] | Array) -> None:
-        """Replace the obstacles.
+        """Replace the obstacles by rigid bodies, which costs little, or by a point cloud (P, 3) of surfaces at 5 mm.
 
-        Args:
-            obstacles: rigid bodies, which cost next to nothing; or a point cloud (P, 3) of all surfaces at 5 mm, of
-                which a tree is built. Points inside the robot's own base are cut out.
+        Points inside the robot's own base are cut out.
         """
         ...
 
@@ -129,11 +124,9 @@ class Planner(Protocol):
         ...
 
     def collisions(self, qpos: Array, finger_width: float | None = None) -> list[str]:
-        """Name what touches at a configuration: links, obstacles ('cloud': of points), 'attached'. Empty: free.
+        """Return what touches at a configuration (7,): links, obstacles ('cloud': of points), 'attached'; empty: free.
 
-        Args:
-            qpos: (7,).
-            finger_width: m; default: of the open gripper.
+        ``finger_width`` is in m; default: of the open gripper.
         """
         ...
 
@@ -142,15 +135,9 @@ class Planner(Protocol):
         ...
 
     def ik(self, tcp_in_base: Array, near: Array, *, avoid_collisions: bool = True) -> list[Array]:
-        """Solve inverse kinematics.
+        """Return distinct configurations (7,) that reach a pose (4x4), nearest to ``near`` (7,) first, or none.
 
-        Args:
-            tcp_in_base: 4x4.
-            near: (7,) preferred configuration.
-            avoid_collisions: keep only configurations free of collisions.
-
-        Returns:
-            Distinct solutions (7,), nearest to ``near`` first; empty when there is none.
+        With ``avoid_collisions`` only those free of collisions.
         """
         ...
 
@@ -165,7 +152,7 @@ class Planner(Protocol):
     def plan_straight(
         self, start: Array, tcp_in_base: Array, *, stage: str, check_collisions: bool = True, speed: float = 1.0
     ) -> Trajectory:
-        """Move the TCP on a straight line (and shortest rotation) from where ``start`` has it to a pose.
+        """Move the TCP on a straight line (and shortest rotation) from where ``start`` (7,) has it to a pose (4x4).
 
         Args:
             start: (7,).
@@ -177,13 +164,8 @@ class Planner(Protocol):
         ...
 
     def join(self, start: Array, first: Trajectory, second: Trajectory) -> Trajectory:
-        """Run one motion on into the next without a stop where nothing of the scene is in the way of that.
+        """Join two motions, the first from ``start`` (7,), without a stop where the scene allows it.
 
-        The corner between them is cut within the last and the first second of theirs.
-
-        Args:
-            start: (7,) where the first begins.
-            first: ends where the second begins.
-            second: the next one.
+        The corner between them is cut within the last second of the first and the first second of the second.
         """
         ...

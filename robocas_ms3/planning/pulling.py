@@ -31,7 +31,7 @@ def turned_about_bar(tcp: Array, angle: float) -> Array:
 
 
 def track(chain: ArmChain, starts: Array, goals: Array, *, max_slip: float = MAX_SLIP) -> Array:
-    """Follow poses of a bar with the TCP, free to turn about the bar by up to ``max_slip``.
+    """Follow poses of a bar with the TCP, free to turn about the bar by up to ``max_slip`` (rad).
 
     Args:
         chain: the arm.

@@ -56,11 +56,10 @@ def candidates(
     fixed: Array,
     turn_deg: float = 0.0,
 ) -> Iterator[Push]:
-    """Pushes of an object that begin clear of everything else and end on the surface; the paper's direction first.
+    """Yield pushes of an object that begin clear of all else and end on the surface; the paper's direction first.
 
-    The object itself may be pushed against other objects, but neither over the edge nor against furniture or basket.
-
-    The tool touches at the target's height, or at the nearest height above it at which there is room for it.
+    The object may be pushed against other objects, but neither over the edge nor against furniture or basket. The tool
+    touches at the target's height, or at the nearest height above it at which there is room for it.
 
     Args:
         rng: source of all randomness.

@@ -114,12 +114,7 @@ class PlanningScene:
         without_link: tuple[str, str] | None = None,
         room: float = 0.0,
     ) -> list[Obstacle]:
-        """Furniture, basket and the objects that are there, as bodies for a planner.
-
-        Args:
-            without, without_link: as below.
-            room: to keep to furniture and basket, m.
-        """
+        """Return furniture, basket and present objects as bodies, with ``room`` (m) to furniture and basket."""
         bodies = self.obstacles_in_world(without=without, without_link=without_link)
         objects = {asset.asset.id for asset in self.env.object_assets[0]}
         bodies = [body if body.name in objects else replace(body, room=room) for body in bodies]
@@ -143,13 +138,13 @@ class PlanningScene:
         radius: float = RADIUS,
         around: Array | None = None,
     ) -> Array:
-        """Samples (P, 3) of the collision surfaces of furniture, basket and the objects that are there.
+        """Return samples (P, 3) of the collision surfaces of furniture, basket and present objects.
 
         Args:
             without: slot or slots of objects to leave out.
             without_link: a piece of furniture and its moving part to leave out.
-            radius: m, beyond it they are left out.
-            around: (3,) of what; default: the arm's base as it stands.
+            radius: m around ``around``, beyond which samples are left out.
+            around: (3,); default: the arm's base.
         """
         to_base = inverse(self.arm_base_in_world)
         center = np.zeros(3) if around is None else around

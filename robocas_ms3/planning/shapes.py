@@ -18,6 +18,7 @@ from scipy.spatial import ConvexHull
 from robocas_ms3.planning.protocol import Array, Shape
 
 MARGIN = 0.0025  # m that obstacles are larger than they are: about what voxels of 5 mm add on average
+VOXEL = 0.005  # m, edge of the voxels of point clouds, equal to the spacing of their points
 KEPT = 16  # trees of the last clouds and hulls of the last held objects
 DEPTH = 16  # levels of an octree
 OCCUPIED, INNER = 2, 3  # bits per child in octomap's stream; 0: unknown
@@ -41,14 +42,9 @@ class Pieces:
 
 
 class CollisionShapes:
-    """Build FCL geometries and cache them.
+    """Builds FCL geometries and caches them."""
 
-    Args:
-        voxel: edge length of the voxels of point clouds, equal to the spacing of their points, m.
-    """
-
-    def __init__(self, voxel: float) -> None:
-        self._voxel = voxel
+    def __init__(self) -> None:
         self._shapes: WeakKeyDictionary[Shape, dict[float, Pieces]] = WeakKeyDictionary()
         self._recent: OrderedDict[bytes, Pieces] = OrderedDict()
 
@@ -76,12 +72,12 @@ class CollisionShapes:
         return Pieces(geometries, np.concatenate([vertices for vertices, _ in hulls]), first)
 
     def _tree(self, points: Array) -> Pieces:
-        stream = encode_octree(points, self._voxel)
+        stream = encode_octree(points, VOXEL)
         if not stream:
             return Pieces([], np.zeros((0, 3)), np.zeros(0, dtype=int))
-        ends = np.array([points.min(axis=0) - self._voxel, points.max(axis=0) + self._voxel])
+        ends = np.array([points.min(axis=0) - VOXEL, points.max(axis=0) + VOXEL])
         corners = np.array(list(itertools.product(*ends.T)))
-        return Pieces([fcl.OcTree(self._voxel, stream)], corners, np.zeros(1, dtype=int))
+        return Pieces([fcl.OcTree(VOXEL, stream)], corners, np.zeros(1, dtype=int))
 
     def _hull(self, vertices: Array) -> Pieces:
         corners, faces, _ = convex_hull(vertices)

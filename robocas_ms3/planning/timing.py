@@ -107,7 +107,7 @@ def blended(first: Array, second: Array, rows: int) -> Array:
     Args:
         first: (T, n) configurations, evenly in time, that come to rest where the next motion begins.
         second: (U, n) of that next motion, the same time apart.
-        rows: how many of either overlap.
+        rows: how many of either overlap, at least 1.
 
     Returns:
         (T + U - rows, n): both motions' own configurations before and after.
@@ -125,15 +125,9 @@ def thinned(points: Array, spacing: float) -> Array:
 
 
 def timed(path: JointPath, *, velocity: float, acceleration: float, dt: float) -> Trajectory | None:
-    """Time a path as fast as the limits allow, from rest to rest; none when TOPP-RA fails.
+    """Time a path as fast as the limits of every joint allow, from rest to rest; None if TOPP-RA fails.
 
     The motion is stretched to a whole number of steps, so that row i lies exactly at ``(i + 1) * dt``.
-
-    Args:
-        path: where to go.
-        velocity: limit of every joint, rad/s.
-        acceleration: limit of every joint, rad/s^2.
-        dt: seconds between rows.
     """
     bounds = _bounds(path.dof, velocity, acceleration)
     solver = toppra.algorithm.TOPPRA(bounds, path, gridpoints=path.grid(), parametrizer="ParametrizeConstAccel")

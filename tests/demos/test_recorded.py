@@ -11,8 +11,7 @@ from fuzzing import VALUES, flipped
 from synthetic import STEPS, write_trajectory
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.demos.recorded import Recorded
-from robocas_ms3.demos.replay import replay
+from robocas_ms3.demos.replay import Recorded, replay
 from robocas_ms3.demos.settings import ReplaySettings
 
 SEED = "episode_seed"

@@ -17,7 +17,7 @@ from robocas_ms3.planning.kinematics import Reachability
 from robocas_ms3.planning.protocol import AttachedBody, Obstacle, Shape
 from robocas_ms3.planning.pulling import reached, track, turned_about_bar
 from robocas_ms3.planning.skills.driving import Surroundings, _routes, body_is_free, free_route
-from robocas_ms3.planning.skills.part import Part
+from robocas_ms3.planning.skills.handles import Part
 from robocas_ms3.robots.description import MOBILE_PANDA
 
 SLIDE = Joint(name="slide", kind="prismatic", axis=(-1.0, 0.0, 0.0), limits=(0.0, 0.6), friction=0, damping=0)

@@ -124,7 +124,7 @@ def test_free_places_are_on_the_surface_and_clear_of_everything():
 
 def test_views_look_at_the_point_from_above():
     point = np.array([0.5, 0.1, 0.2])
-    views = sample_views(np.random.default_rng(1), point, (0.4, 0.5), count=200)
+    views = sample_views(np.random.default_rng(1), point, (0.4, 0.5), 200)
     line = point - views[:, :3, 3]
     distance = np.linalg.norm(line, axis=1)
     assert np.all((distance >= 0.4) & (distance <= 0.5))

@@ -21,8 +21,7 @@ from robocas_ms3.demos.trials import Trials
 from robocas_ms3.planning.executor import Executor
 from robocas_ms3.planning.skills.driving import base_at, drive
 from robocas_ms3.planning.skills.grasping import plan_grasp
-from robocas_ms3.planning.skills.handles import DEEPER, open_part, plan_pull, pull_share
-from robocas_ms3.planning.skills.part import Part
+from robocas_ms3.planning.skills.handles import DEEPER, Part, open_part, plan_pull, pull_share
 from robocas_ms3.planning.skills.stance import drive_to_handle
 from robocas_ms3.scenes.config import load_task_config, shipped_configs
 from robocas_ms3.scenes.language.templates import subgoal

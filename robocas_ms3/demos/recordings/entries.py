@@ -102,17 +102,17 @@ class TrajectoryRecord(_Record):
 
 @dataclass(frozen=True)
 class Entry:
-    """What the JSON says of a recorded episode of S control steps.
+    """A recorded episode of S control steps in the JSON.
 
     Attributes:
         episode_id: number in the trajectory file.
-        seed: the environment's seed, which builds its scene.
+        seed: of the environment.
         reset_options: further options of ``env.reset``.
         control_mode: of the actions.
         control_steps: S.
         instruction: of the task.
         subgoals: ranges over the actions 0..S-1.
-        taken_over: whether it begins where another policy was, to which the seed alone does not lead.
+        taken_over: whether it begins where another policy was, instead of at the reset.
     """
 
     episode_id: int

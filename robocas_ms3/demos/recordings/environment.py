@@ -74,13 +74,12 @@ class _Info(BaseModel):
 
 @dataclass(frozen=True)
 class RecordedEnv:
-    """An environment as a file tells of it.
+    """The environment that a file names.
 
     Attributes:
         env_id: gymnasium's, of a registered task.
-        control_mode: of the actions; None: not said.
-        kwargs: for ``gym.make``, what makes the scene: ``_SCENE``. Where layouts were kept is not followed: they
-            follow from the seed.
+        control_mode: of the actions, if the file names it.
+        kwargs: for ``gym.make``, those of the scene (``_SCENE``); layouts follow from the seed.
     """
 
     env_id: str
@@ -115,11 +114,7 @@ class RecordedEnv:
             return STANDARD_CAMERAS
 
     def make(self, **kwargs: Any) -> Any:
-        """Make it.
-
-        Args:
-            kwargs: further ones of ``gym.make``, which win over its own.
-        """
+        """Make it with further arguments of ``gym.make``; raises ``DatasetError`` if what it names is not installed."""
         import gymnasium as gym
 
         known = sorted(spec.env_id for spec in TASKS.values())
@@ -139,12 +134,7 @@ class RecordedEnv:
 
 
 def read_env(info: Any, where: object, *, pack: str | Path | None = None) -> RecordedEnv:
-    """Read ``env_info`` of a file.
-
-    Args:
-        info: ``{"env_id": ..., "env_kwargs": {...}}``.
-        pack: name or folder, instead of what the file names.
-    """
+    """Read ``env_info`` of a file, ``{"env_id": ..., "env_kwargs": {...}}``; ``pack`` replaces the named one."""
     if pack is not None and isinstance(info, Mapping) and isinstance(info.get("env_kwargs"), Mapping):
         info = {**info, "env_kwargs": {**info["env_kwargs"], "pack": "builtin"}}
     try:

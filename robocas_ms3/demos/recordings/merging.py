@@ -17,11 +17,7 @@ _MARGIN = 4096  # bytes an episode may need in a file of many beyond those of it
 def merge(shards: list[Path], out: Path) -> None:
     """Merge trajectory files into one, episodes numbered in the order given; unknown keys of the JSON are kept.
 
-    It is on the disk before it gets its name: a power cut leaves none that is half there.
-
-    Args:
-        shards: HDF5 files, each with its JSON beside it.
-        out: HDF5 file to write; its JSON is written beside it.
+    The file is synced to disk before it gets its name, so a power cut leaves no half file.
     """
     merged: dict[str, Any] = {}
     episodes: list[dict[str, Any]] = []
@@ -41,12 +37,7 @@ def merge(shards: list[Path], out: Path) -> None:
 
 
 def damage_of(path: Path, seeds: Sequence[int]) -> str:
-    """What is wrong with a merged file, of whose arrays only the heads are looked at; empty: nothing.
-
-    Args:
-        path: HDF5 file, with its JSON beside it.
-        seeds: of the episodes it has to hold, in their order.
-    """
+    """Return what is wrong with a merged file that must hold these seeds in order, by its metadata; empty: nothing."""
     try:
         with open_trajectory(path) as file:
             said = read_json(path)["episodes"]

@@ -52,20 +52,16 @@ def gripper_open(
     *,
     initial_width: float,
 ) -> NDArray[np.bool_]:
-    """Gripper command in force at each sampled state: that of the action which led there.
+    """Return the gripper command (T,) bool in force at each sampled state: that of the action which led there.
 
-    So ``gripper_status[t + 1]`` is what was commanded between t and t + 1, as the released loader reads it. Commanded
-    wider than half of what it opens to, it counts as open.
+    So ``gripper_status[t + 1]`` is what was commanded between t and t + 1, as the released loader reads it. More than
+    half open counts as open.
 
     Args:
-        robot: whose gripper.
+        robot: with that gripper.
         commands: (S,) gripper actions in [-1, 1].
         samples: (T,) from ``sample_states``.
         initial_width: of the gripper at reset, m, which is its target until the first action.
-
-
-    Returns:
-        (T,) bool.
     """
     low, high = robot.finger_targets
     finger_targets = low + (np.clip(commands, -1, 1) + 1) / 2 * (high - low)
@@ -107,7 +103,7 @@ def stored_actions(positions: NDArray, turns: NDArray, gripper_status: NDArray[n
 
 @dataclass(frozen=True)
 class Motion:
-    """What the robot did, at the T states that a dataset keeps of an episode.
+    """Motion of the robot at the T states of an episode that a dataset keeps.
 
     Attributes:
         qpos: (T, 12) base x, y, yaw, 7 arm joints, 2 fingers, m and rad.
@@ -133,10 +129,10 @@ class Motion:
         gripper: NDArray[np.floating],
         samples: NDArray[np.int64],
     ) -> Motion:
-        """The one way from recorded states to what datasets hold of them, to the last bit.
+        """Compute the motion in datasets from recorded states, for all of them to the same bit.
 
         Args:
-            robot: whose they are.
+            robot: of the states.
             robot_states: (S + 1, 37) after the reset and after each control step.
             gripper: (S,) commands in [-1, 1].
             samples: (T,) indices of states, from `sample_states`, or some of them in a row.

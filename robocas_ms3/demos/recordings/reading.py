@@ -17,8 +17,7 @@ from robocas_ms3.demos.recordings.motion import Motion, gripper_commands
 from robocas_ms3.demos.recordings.stored import (
     open_episode,
     open_trajectory,
-    read_actions,
-    read_bodies,
+    read_steps,
     readable,
 )
 from robocas_ms3.robots.description import RobotDescription
@@ -52,20 +51,15 @@ class Recording(Entry):
 
 
 class TrajectoryFile:
-    """An open trajectory; use it in a ``with`` statement.
-
-    Args:
-        path: the HDF5 file.
-        pack: name or folder of the objects' pack, instead of what the file names.
-
+    """An open trajectory file; use it in a ``with`` statement. ``pack`` (name or folder) replaces the named one.
 
     Attributes:
         path: the HDF5 file.
         env_info: ``env_id``, ``env_kwargs``, ... of the JSON.
-        env: what it was recorded in.
-        robot: whose motion it is.
+        env: the environment it was recorded in.
+        robot: that was recorded.
         control_freq: Hz.
-        versions: what it was made with.
+        versions: of the packages that it was made with.
         episodes: the JSON's entries.
     """
 
@@ -130,32 +124,21 @@ class TrajectoryFile:
         return {**self.__dict__, "_file": None}
 
     def entry(self, index: int) -> Entry:
-        """What the JSON says of an episode.
-
-        Args:
-            index: position in ``episodes``.
-        """
+        """Return the JSON's entry of an episode, by its position in ``episodes``."""
         return read_entry(self.episodes[index], self._where(index))
 
     def recording(self, index: int, *, bodies: bool = True) -> Recording:
-        """Read an episode.
-
-        Args:
-            index: position in ``episodes``.
-            bodies: whether to read the states of all, not only of the robot.
-        """
+        """Read an episode by its position in ``episodes``, with the states of all bodies or of the robot only."""
         where, uid = self._where(index), self.robot.description.uid
         group = open_episode(self._file, self.episodes[index]["episode_id"])
-        states, actions = read_bodies(group, only=None if bodies else uid), read_actions(group)
+        actions, found = read_steps(group, body=None if bodies else uid)
+        states = {
+            kind: {name: rows.astype(np.float32, copy=False) for name, rows in of.items()} for kind, of in found.items()
+        }
         entry = self.entry(index)
-        lengths = {len(array) for arrays in states.values() for array in arrays.values()}
-        if lengths != {len(actions) + 1} or entry.control_steps != len(actions):
-            raise DatasetError(
-                "actions, states and JSON differ in length",
-                where=where,
-                expected=f"{entry.control_steps} actions, one state more",
-                found=f"{len(actions)} actions, {sorted(lengths)} states",
-            )
+        if entry.control_steps != len(actions):
+            expected = f"{entry.control_steps} actions, as the JSON says"
+            raise DatasetError("this episode is damaged", where=where, expected=expected, found=len(actions))
         robot = states.get("articulations", {}).get(uid)
         width = _STATE_DIM
         if robot is None or robot.shape[1] != width:

@@ -33,11 +33,7 @@ _DEEP = 4  # groups in groups that states may have
 
 
 def write_whole(path: Path, fill: Callable[[h5py.File], None]) -> None:
-    """Make a file in memory and write it at once.
-
-    Raises:
-        OSError: it can't be written.
-    """
+    """Make a file in memory and write it at once; raises OSError if it can't be written."""
     with h5py.File(path.name, "w", driver="core", backing_store=False) as file:
         fill(file)
         file.flush()
@@ -47,11 +43,7 @@ def write_whole(path: Path, fill: Callable[[h5py.File], None]) -> None:
 
 @contextmanager
 def reserved(path: Path, size: int) -> Iterator[h5py.File]:
-    """Open a new file of which so many bytes have their place on the disk; what is not needed is given back.
-
-    Raises:
-        OSError: there is no room for them.
-    """
+    """Open a new file with ``size`` bytes reserved on the disk; raises OSError if there is no room."""
     write_whole(path, lambda file: None)
     with path.open("r+b") as file:
         try:
@@ -124,67 +116,62 @@ def read_actions(episode: h5py.Group) -> NDArray[np.float32]:
         actions = np.asarray(_read(_found(episode["actions"], 0)), np.float32)
     if actions.ndim != 2 or len(actions) == 0:
         raise DatasetError("this episode has no actions", where=where)
-    check_finite(actions, f"{where}, actions")
+    _check_finite(actions, f"{where}, actions")
     return actions
 
 
-def check_finite(rows: NDArray[Any], where: object) -> None:
-    """See that numbers are numbers: a policy can't learn from what is none, and a simulation keeps it.
+def read_steps(
+    episode: h5py.Group, *, body: str | None = None, extras: bool = False
+) -> tuple[NDArray[np.float32], dict[str, Any]]:
+    """Read actions (S, A) and states (S + 1, ...) of an episode by kind and name, and check that they are finite.
 
-    Args:
-        rows: (S, ...), a step each.
+    States of all bodies are read, or those of one body, or with ``extras`` all others too, as of controllers.
     """
+    where, actions = _where(episode), read_actions(episode)
+    with readable(where):
+        found: Any = episode["env_states"]
+        if not extras:
+            kinds = {kind: found[kind] for kind in BODIES if kind in found}
+            found = {
+                kind: {name: _found(of[name], 0) for name in of if body in (None, name)} for kind, of in kinds.items()
+            }
+        states = _read(_found(found, _DEEP) if extras else found)
+    for name, rows in named_arrays(states):
+        place, kind = f"{where}, {name}", name.split("/")[0]
+        if rows.dtype.kind not in "fbiu" or rows.shape[:1] != (len(actions) + 1,):
+            expected = f"{len(actions) + 1} rows of numbers, one more than actions"
+            found = f"{rows.dtype} of shape {rows.shape}"
+            raise DatasetError("this episode is damaged", where=place, expected=expected, found=found)
+        _check_finite(rows, place)
+        if kind in BODIES:
+            _check_orientations(rows, name, place)
+    return actions, states
+
+
+def named_arrays(node: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the arrays in nested dicts, each with the path that leads to it."""
+    if not isinstance(node, dict):
+        yield name, node
+        return
+    for key, inner in node.items():
+        yield from named_arrays(inner, f"{name}/{key}" if name else key)
+
+
+def _check_finite(rows: NDArray[Any], where: str) -> None:
     finite = np.isfinite(rows)
     if not finite.all():
-        step = int(np.argwhere(~finite)[0, 0])
-        place = f"{where}, row {step}"
+        place = f"{where}, row {int(np.argwhere(~finite)[0, 0])}"
         raise DatasetError("NaN or infinity", where=place, expected="finite numbers", fix="Record it again.")
 
 
-def read_states(episode: h5py.Group) -> dict[str, Any]:
-    """All of the states: by kind and name, the steps first; what is kept beside bodies may be nested deeper."""
-    with readable(_where(episode)):
-        return _read(_found(episode["env_states"], _DEEP))
-
-
-def read_bodies(episode: h5py.Group, *, only: str | None = None) -> dict[str, dict[str, NDArray[np.float32]]]:
-    """States of bodies: by kind and name, (S + 1, D) each.
-
-    Args:
-        only: name of the one to read; default: all.
-    """
-    with readable(_where(episode)):
-        states: Any = episode["env_states"]
-        kinds = {kind: states[kind] for kind in BODIES if kind in states}
-        if only is not None:
-            kinds = {kind: {only: of[only]} if only in of else {} for kind, of in kinds.items()}
-        bodies = _read({kind: {name: _found(of[name], 0) for name in of} for kind, of in kinds.items()})
-    check_bodies(bodies, _where(episode))
-    return {
-        kind: {name: rows.astype(np.float32, copy=False) for name, rows in of.items()} for kind, of in bodies.items()
-    }
-
-
-def check_bodies(states: dict[str, Any], where: object) -> None:
-    """See that the states of bodies are finite numbers, with orientations.
-
-    Args:
-        states: of `read_states`.
-    """
-    for kind in BODIES:
-        if not isinstance(bodies := states.get(kind, {}), dict):
-            raise DatasetError("this episode is damaged", where=f"{where}, {kind}", expected="a group of bodies")
-        for name, rows in bodies.items():
-            place = f"{where}, {kind}/{name}"
-            if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.shape[1] < 7 or rows.dtype.kind not in "fiu":
-                raise DatasetError("this episode is damaged", where=place, expected="rows of numbers")
-            check_finite(rows, place)
-            length = np.linalg.norm(rows[:, 3:7].astype(np.float64), axis=1)
-            wrong = np.flatnonzero(abs(length - 1) > _UNIT)
-            if len(wrong):
-                row, found = wrong[0], f"{length[wrong[0]]:g}"
-                expected = "a quaternion of length 1"
-                raise DatasetError("no orientation", where=f"{place}, row {row}", expected=expected, found=found)
+def _check_orientations(rows: NDArray[Any], name: str, where: str) -> None:
+    if name.count("/") != 1 or rows.ndim != 2 or rows.shape[1] < 7:
+        raise DatasetError("this episode is damaged", where=where, expected="rows with a pose", found=rows.shape)
+    length = np.linalg.norm(rows[:, 3:7].astype(np.float64), axis=1)
+    wrong = np.flatnonzero(abs(length - 1) > _UNIT)
+    if len(wrong):
+        place, found = f"{where}, row {wrong[0]}", f"{length[wrong[0]]:g}"
+        raise DatasetError("no orientation", where=place, expected="a quaternion of length 1", found=found)
 
 
 def _found(node: Any, deep: int) -> Any:

@@ -75,18 +75,10 @@ def read_subgoals(entries: Any, where: object) -> list[SubGoal]:
 
 
 def sample_subgoals(subgoals: Sequence[SubGoal], samples: NDArray[np.int64]) -> list[SubGoal]:
-    """Carry sub-goals over to the sampled steps.
+    """Return the sub-goals of sampled steps (`motion.sample_states`), in order, without gaps.
 
-    A step belongs to the sub-goal of the action that leaves its state, the last step to that of the last action; a
-    sub-goal shorter than a stride may hold no step, and is left out.
-
-    Args:
-        subgoals: ranges over the actions 0..S-1, in order, without gaps.
-        samples: from `motion.sample_states`.
-
-
-    Returns:
-        Ranges over the sampled steps, in order, without gaps.
+    A step belongs to the sub-goal of the action that leaves its state, the last step to that of the last action. A sub-
+    goal shorter than a stride may hold no step, and is left out.
     """
     actions = int(samples[-1])
     expected_first = 0

@@ -29,12 +29,8 @@ _PICTURES = ("rgb", "depth", "seg")
 class EpisodeRecorder(gym.Wrapper):
     """Keeps a single episode of one env, and writes it in ManiSkill's format when it is finished.
 
-    Until then there is no file: it costs next to nothing a step, and survives a fork of the process.
-
-    Args:
-        env: the environment to record.
-        folder: where ``<name>.h5`` and ``<name>.json`` go.
-        name: of the files.
+    Until then there is no file: a step costs little, and the recorder survives a fork of the process. The files are
+    ``<name>.h5`` and ``<name>.json`` in ``folder``.
     """
 
     def __init__(self, env: gym.Env, folder: Path, name: str) -> None:
@@ -80,11 +76,7 @@ class EpisodeRecorder(gym.Wrapper):
         return self._base_env.bodies.split(np.stack(self._steps.states))
 
     def finish(self, episode: dict[str, Any]) -> None:
-        """Write the episode; the environment stays open.
-
-        Args:
-            episode: what ManiSkill's format has no place for: instruction, target, sub-goals.
-        """
+        """Write the episode, with ``robocas`` metadata (instruction, target, sub-goals); the environment stays open."""
         steps, env = self._steps, self._base_env
         terminated, truncated, success, fail = np.array(steps.flags, bool).reshape(-1, 4).T
 

@@ -34,13 +34,7 @@ PUSHED = 8.0  # what is pushed comes to lie elsewhere each time, and so may all 
 
 @dataclass(frozen=True)
 class Move:
-    """A way to get an object out of the way.
-
-    Attributes:
-        skill: what is done with it.
-        slot: of the object.
-        turn_deg: of a push, off the paper's direction.
-    """
+    """A way to get an object out of the way; ``turn_deg`` turns a push off the paper's direction."""
 
     skill: Literal["push", "lift"]
     slot: int
@@ -49,12 +43,7 @@ class Move:
 
 @dataclass(frozen=True)
 class Heap:
-    """The objects around a target, as they lie now.
-
-    Attributes:
-        arm: the attempt's tools.
-        target: slot of the target.
-    """
+    """The objects around a target, as they lie now."""
 
     arm: Arm
     target: int
@@ -92,10 +81,7 @@ class Heap:
         return self.uncovered and self.visible
 
     def moves(self) -> Iterator[Move]:
-        """Ways to make room, those first that promise most: of the highest obstacles, then of what blocks grasps.
-
-        A push takes less time than a lift.
-        """
+        """Yield moves of the highest obstacles, then of those that block grasps; pushes first, as they are faster."""
         if self.moves_made >= MOVES:
             raise EpisodeLost("horizon", "too_many_obstacles")
         with self.arm.planning():

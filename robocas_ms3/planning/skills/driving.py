@@ -34,7 +34,7 @@ DETOURS = (0.15, 0.30)  # m straight back first
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What is in the way of a drive, in the world.
+    """Obstacles of a drive, in the world.
 
     Attributes:
         obstacles: for the arm.
@@ -92,13 +92,13 @@ def places_before(arm: Arm, center: Array) -> Array:
 def best_route(
     arm: Arm, goals: Array, around: Surroundings, judge: Callable[[Array], float], *, enough: float
 ) -> list[Array]:
-    """Base poses that lead to the best of the first few goals where the body is free; the first one that is enough.
+    """Return base poses that lead to the best of the first few goals (N, 3) where the body is free.
 
     Args:
-        goals: (N, 3), the most promising first.
+        goals: the most promising first.
         around: what is in the way.
-        judge: what a base pose (3,) is good for, the more the better; 0: nothing.
-        enough: look no further.
+        judge: value of a base pose (3,), more is better; 0: useless.
+        enough: value at which no other goal is judged.
     """
     best: tuple[float, list[Array]] = (0.0, [])
     tried = 0
@@ -119,13 +119,9 @@ def best_route(
 
 
 def free_route(arm: Arm, start: Array, goal: Array, around: Surroundings, *, leaving: bool) -> list[Array] | None:
-    """Base poses to drive to one after the other: straight, or by way of a place behind the narrower end.
+    """Return base poses to drive to one after the other: straight, or by way of a place behind the narrower end.
 
-    Args:
-        start: (3,).
-        goal: (3,).
-        around: what is in the way.
-        leaving: whether ``start`` is the narrower end, so that the robot backs out first; else it moves up last.
+    With ``leaving``, ``start`` is the narrower end, so that the robot backs out first; else it moves up last.
     """
     for route in _routes(start, goal, leaving, arm.robot.base_limits):
         poses = [start, *route]

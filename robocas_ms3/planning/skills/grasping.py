@@ -112,12 +112,7 @@ def plan_grasp(arm: Arm, slot: int, lift_height: float, approach: Approach = "to
 
 
 def candidates(arm: Arm, slot: int, approach: Approach = "top", other_than: int = 0) -> Iterator[Array]:
-    """Grasps worth planning for, best first: TCP poses 4x4.
-
-    Args:
-        approach: from where the gripper may come.
-        other_than: how many kinds of them to leave out, the best first.
-    """
+    """Yield grasps worth planning for, best first, as TCP poses 4x4; without the best few kinds (``other_than``)."""
     notes = arm.env.object_assets[0][slot].annotations
     base, object_in_base = arm.scene.arm_base_in_world, arm.scene.object_in_base(slot)
     kept = filter_grasps(notes, base @ object_in_base, base, approach)

@@ -20,12 +20,7 @@ VIEWS_SAMPLED, VIEWS_PLANNED = 96, 6
 
 
 def look_at(arm: Arm, point_in_base: Array, distance: tuple[float, float]) -> None:
-    """Move the gripper's camera to where it looks at a point from above.
-
-    Args:
-        point_in_base: (3,) m.
-        distance: least and greatest, m.
-    """
+    """Move the gripper's camera to where it looks at a point (3,) from above, at a least and greatest distance (m)."""
     arm.rise_clear()
     with arm.planning():
         motion = plan_look(arm, point_in_base, distance)
@@ -36,7 +31,7 @@ def plan_look(arm: Arm, point_in_base: Array, distance: tuple[float, float]) -> 
     """Plan to one of the nearest views of a point; arguments as in `look_at`."""
     tcp_in_camera = inverse(inverse(arm.scene.tcp_in_base) @ camera_in_base(arm))
     for least, greatest in (distance, (NEAR[0], FAR[1])):  # where a high table leaves no such view, any other
-        views = sample_views(arm.rng, point_in_base, (least, greatest), count=VIEWS_SAMPLED)
+        views = sample_views(arm.rng, point_in_base, (least, greatest), VIEWS_SAMPLED)
         solved, qpos = arm.reachability.reachable(views @ tcp_in_camera, arm.at)
         if solved.any():
             break
@@ -100,27 +95,12 @@ def _camera_config(arm: Arm) -> CameraConfig:
     return arm.env.agent.camera_config(_hand_camera(arm))
 
 
-def sample_views(
-    rng: np.random.Generator,
-    point: Array,
-    distance: tuple[float, float],
-    *,
-    elevation_deg: tuple[float, float] = ELEVATION_DEG,
-    count: int,
-) -> Array:
-    """Camera poses that look at a point from above, turned freely about the line of sight.
+def sample_views(rng: np.random.Generator, point: Array, distance: tuple[float, float], count: int) -> Array:
+    """Sample camera poses (count, 4, 4) that look at a point (3,) from above: x forward, y left, z up.
 
-    Args:
-        rng: source of all randomness.
-        point: (3,) in an upright frame, m.
-        distance: least and greatest, m.
-        elevation_deg: least and greatest angle of the camera above the point.
-        count: how many.
-
-    Returns:
-        (count, 4, 4) in the same frame: x forward, y left, z up.
+    They are turned freely about the line of sight. ``distance`` is the least and the greatest, m.
     """
-    elevation = np.deg2rad(rng.uniform(*elevation_deg, count))
+    elevation = np.deg2rad(rng.uniform(*ELEVATION_DEG, count))
     azimuth, roll = rng.uniform(-np.pi, np.pi, (2, count))
     # forward = x: turned down by the elevation, about the vertical by the azimuth
     turn = Rotation.from_euler("ZYX", np.column_stack([azimuth, elevation, roll]))

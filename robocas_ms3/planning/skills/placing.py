@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.core.poses import from_wxyz, inverse, transform
 from robocas_ms3.planning.chain import turn_between
-from robocas_ms3.planning.drops import Inside, overhangs, sample_drops
 from robocas_ms3.planning.protocol import Array, AttachedBody, Trajectory
 from robocas_ms3.planning.skills.arm import CARRYING_ROOM, Arm, first_plan, moved_back, raised
 from robocas_ms3.planning.skills.retreating import plan_step_back
@@ -18,6 +20,24 @@ DROP_MARGIN = 0.045  # m, as far as a robot may be off by then
 LEAN_WEIGHT = 0.7  # rad of a joint that a rad of the gripper's is worth
 ELBOW, STRETCHED, STRETCH_WEIGHT = 3, -0.7, 5.0  # joint; rad from which on the arm is nearly straight
 RETREAT_HEIGHT = 0.05  # m, upstream's
+CLEARANCE = (0.03, 0.07)  # m, least and greatest height of the object's lowest point above the rim
+MAX_TILT_DEG = 70.0  # RoboCAS-v0: 30 to 70
+SPREAD = 0.25  # of the inside's half size: how far from the middle the centre of mass may be
+
+
+@dataclass(frozen=True)
+class Inside:
+    """The inside of a container, a box.
+
+    Attributes:
+        container_in_base: 4x4 of the container's frame in the arm's base frame.
+        low: (3,) least corner in the container's frame, m.
+        high: (3,) greatest corner.
+    """
+
+    container_in_base: Array
+    low: Array
+    high: Array
 
 
 def carry_to_basket(arm: Arm, slot: int) -> None:
@@ -45,9 +65,9 @@ def release_into_basket(arm: Arm, slot: int) -> None:
 
 
 def plan_carry(arm: Arm, slot: int) -> Trajectory:
-    """Plan from where the arm is to a pose above the basket from which it can also step back.
+    """Plan to a pose above the basket from which the arm can also step back.
 
-    Where there is such a way, it keeps off basket and furniture by what a robot may miss them: both may be pushed away.
+    Where possible it keeps off basket and furniture by the error of a robot: both may be pushed away.
     """
     drops = drop_poses(arm, slot, arm.scene.arm_base_in_world)
     solved, qpos = arm.reachability.reachable(drops, arm.at)
@@ -117,11 +137,7 @@ def attach_held(arm: Arm, slot: int) -> None:
 
 
 def drop_poses(arm: Arm, slot: int, arm_base_in_world: Array) -> Array:
-    """Poses (N, 4, 4) of the TCP that bring the object it holds above the basket.
-
-    Args:
-        arm_base_in_world: 4x4, in whose frame the poses are: where the arm's base is, or might be.
-    """
+    """Return TCP poses (N, 4, 4) that bring the held object above the basket, in the frame of an arm's base (4x4)."""
     object_in_tcp, vertices = held_object(arm, slot)
     center_of_mass = np.array([arm.env.object_assets[0][slot].asset.center_of_mass])
     return sample_drops(
@@ -153,3 +169,54 @@ def _why_not(arm: Arm) -> str:
         if not bool(reached[0]):
             return f"not_{measure}"
     return "unstable"
+
+
+def sample_drops(rng: np.random.Generator, count: int, inside: Inside, vertices: Array, center_of_mass: Array) -> Array:
+    """Sample TCP poses (count, 4, 4) at which a held object hangs above a container, its lowest point clear of the rim.
+
+    The approach axis is tilted from straight down, away from the arm, so that far containers are within reach; half of
+    the samples are steep, for near ones.
+
+    Args:
+        rng: source of all randomness.
+        count: how many poses.
+        inside: of the container.
+        vertices: (V, 3) the object's hull in the TCP frame, m.
+        center_of_mass: (3,) the object's, in the TCP frame, m.
+    """
+    middle, half = (inside.low + inside.high) / 2, (inside.high - inside.low) / 2
+    local = np.column_stack(
+        [middle[:2] + rng.uniform(-SPREAD, SPREAD, (count, 2)) * half[:2], np.full(count, inside.high[2])]
+    )
+    above = local @ inside.container_in_base[:3, :3].T + inside.container_in_base[:3, 3]
+    tilt = np.deg2rad(MAX_TILT_DEG) * rng.uniform(0, 1, count) ** 2
+    outward = np.arctan2(above[:, 1], above[:, 0]) + rng.uniform(-0.6, 0.6, count)
+    roll = rng.uniform(-np.pi, np.pi, count)
+    # straight down (z of the TCP = -z of the base) with a free turn, then tilted about the axis across ``outward``
+    down = Rotation.from_euler("x", np.pi) * Rotation.from_euler("z", roll[:, None])
+    across = np.column_stack([-np.sin(outward), np.cos(outward), np.zeros(count)])
+    rotation = Rotation.from_rotvec(-across * tilt[:, None]) * down
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = rotation.as_matrix()
+    lowest = (poses[:, 2, :3] @ vertices.T).min(axis=1)
+    center = np.einsum("nij,j->ni", poses[:, :3, :3], center_of_mass)
+    poses[:, :2, 3] = above[:, :2] - center[:, :2]
+    poses[:, 2, 3] = above[:, 2] + rng.uniform(*CLEARANCE, count) - lowest
+    return poses
+
+
+def overhangs(tcp_in_base: Array, inside: Inside, vertices: Array, margin: float = 0.0) -> Array:
+    """Return how far (n,) a held object sticks out sideways of the opening below it, m; 0 where it falls straight in.
+
+    Args:
+        tcp_in_base: (n, 4, 4) poses of the TCP.
+        inside: of the container.
+        vertices: (V, 3) the object's hull in the TCP frame, m.
+        margin: by which the opening is narrower at each side, m.
+    """
+    rotation, origin = inside.container_in_base[:3, :3], inside.container_in_base[:3, 3]
+    points = np.einsum("nij,vj->nvi", tcp_in_base[:, :3, :3], vertices) + tcp_in_base[:, None, :3, 3]
+    local = (points - origin) @ rotation
+    return np.maximum(
+        np.maximum(inside.low + margin - local, local - inside.high + margin)[..., :2].max(axis=(1, 2)), 0
+    )

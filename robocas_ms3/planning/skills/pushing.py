@@ -36,12 +36,7 @@ class PushPlan:
 
 
 def push_away(arm: Arm, slot: int, target: int, *, turn_deg: float = 0.0) -> None:
-    """Push an object away from the target until it has gone far enough or resists, then rise.
-
-    Args:
-        target: slot of the target.
-        turn_deg: by which the paper's direction is turned.
-    """
+    """Push an object away from the target until it has moved far enough or resists, then rise."""
     arm.rise_clear()
     with arm.planning():
         plan = plan_push(arm, slot, target, turn_deg)
@@ -94,10 +89,10 @@ def _fixed_bodies(arm: Arm) -> list[Obstacle]:
 
 
 def plan_push(arm: Arm, slot: int, target: int, turn_deg: float = 0.0) -> PushPlan:
-    """Plan the first push that has a way in; one that would move other objects too only where there is no other.
+    """Plan the first push that has a way in; one that would move other objects only where there is no other.
 
-    The way to the object is clear of everything, the way along of furniture, basket and target in either case, and the
-    way up after it of furniture and basket.
+    The way to the object is clear of everything, the way along of furniture, basket and target, and the way up of
+    furniture and basket.
     """
     planner = arm.planner
     width, planner.finger_width = planner.finger_width, 0.0
@@ -157,10 +152,7 @@ def _plan_along(arm: Arm, begun: list[tuple[Push, Array, Trajectory]], movable: 
 def reachable_pushes(
     arm: Arm, slot: int, target: int, others: Array, turn_deg: float = 0.0
 ) -> Iterator[tuple[Push, Array]]:
-    """Pushes that the arm can reach, the paper's direction first, then those near where the arm is.
-
-    Each comes with a configuration (7,) above its start.
-    """
+    """Yield pushes within reach and a configuration (7,) above each start: the paper's direction first."""
     points, own = (
         transform(arm.scene.object_in_base(s), arm.env.object_assets[0][s].surface_points(SPACING))
         for s in (slot, target)

@@ -98,8 +98,8 @@ def _grasps_from_above(arm: Arm, slot: int) -> Array:
 def plan_place(arm: Arm, slot: int) -> Trajectory:
     """Plan to above a free place and down to it.
 
-    In a heap an object leans; let go of as it leant, it would fall over, off its place. So it is turned as little as
-    makes it stand, and put down as it is held only where that can't be done.
+    In a heap an object leans, and would fall over if put down so. It is turned as little as makes it stand, and put
+    down as it is held only where that can't be done.
     """
     scene, asset, held = arm.scene, arm.env.object_assets[0][slot], arm.scene.object_in_base(slot)
     vertices = transform(held, np.concatenate(asset.hulls))
@@ -139,12 +139,7 @@ def _plan_to_one_of(arm: Arm, places: Array) -> Trajectory:
 
 
 def turn_to_stand(vertices: Array, center_of_mass: Array) -> Array:
-    """The least turn (4x4) of a body after which it stands on level ground and stays as it stands.
-
-    Args:
-        vertices: (V, 3), in a frame whose z points up, m.
-        center_of_mass: (3,) in that frame.
-    """
+    """Return the least turn (4x4) after which a body with vertices (V, 3), z up, stands on level ground and stays."""
     corners, faces, normals = convex_hull(vertices)
     a, b, c = corners[faces.T]
     # it stays on a face that its centre of mass lies above
@@ -160,7 +155,7 @@ def turn_to_stand(vertices: Array, center_of_mass: Array) -> Array:
 
 
 def free_places(vertices: Array, others: Array, frame: Array, half: Array, margin: float = EDGE_MARGINS[-1]) -> Array:
-    """Motions that bring a held object above a free place of a surface, turned about the vertical.
+    """Return motions (n, 4, 4) that bring a held object above a free place of a surface, turned about the vertical.
 
     Args:
         vertices: (V, 3) of the object where it is held, in the arm's base frame, m.
@@ -168,9 +163,6 @@ def free_places(vertices: Array, others: Array, frame: Array, half: Array, margi
         frame: 4x4 of the surface's middle.
         half: (2,) its half size, m.
         margin: kept from its edge, m.
-
-    Returns:
-        (n, 4, 4) motions in that frame.
     """
     middle = (vertices.max(axis=0) + vertices.min(axis=0)) / 2
     outline = (vertices - middle)[:, :2]

@@ -14,13 +14,9 @@ POINTS_DOWN = -0.7  # upright component of an approach that is rather from above
 def plan_step_back(
     arm: Arm, start: Array, goals: list[Array], *, try_free: bool = False, only_free: bool = False
 ) -> Trajectory:
-    """Plan a straight line to the first of several TCP poses that one leads to, through whatever is touched.
+    """Plan a straight line to the first of several TCP poses (best first), through whatever is touched.
 
-    Args:
-        start: (7,) rad.
-        goals: 4x4 in the arm's base frame, the best first.
-        try_free: first look for a line that touches nothing of the planner's scene.
-        only_free: take no other.
+    With ``try_free`` a line that touches nothing comes first; with ``only_free`` no other is taken.
     """
     if try_free or only_free:
         try:
@@ -32,11 +28,10 @@ def plan_step_back(
 
 
 def back_out(arm: Arm) -> None:
-    """After a failed attempt that stays in the record: open the gripper and get out of whatever is there.
+    """Open the gripper and leave, after a failed attempt that stays in the record.
 
-    On what lies open to above the arm rises, through what it touches. Where it reached in level, as into a shelf or
-    for a handle, something may be above: it steps straight back, on a way that is free of all but the target, which
-    it may still stand against.
+    Above an open surface the arm rises, through what it touches. Where it reached in level, as into a shelf or for a
+    handle, it steps straight back on a way that is free of all but the target.
     """
     arm.hold_nothing()
     arm.open_gripper()

@@ -13,7 +13,7 @@ from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.core.poses import inverse, transform
 from robocas_ms3.planning.protocol import Array, Obstacle
 from robocas_ms3.planning.scene import seen_from
-from robocas_ms3.planning.skills.arm import Arm, moved_back
+from robocas_ms3.planning.skills.arm import Arm, first_plan, moved_back
 from robocas_ms3.planning.skills.driving import (
     THINNED,
     Surroundings,
@@ -27,8 +27,7 @@ from robocas_ms3.planning.skills.driving import (
     surroundings,
 )
 from robocas_ms3.planning.skills.grasping import grasp
-from robocas_ms3.planning.skills.handles import open_part, pull_share
-from robocas_ms3.planning.skills.part import Part
+from robocas_ms3.planning.skills.handles import Part, open_part, pull_share
 from robocas_ms3.planning.skills.placing import attach_held, drop_poses
 from robocas_ms3.scenes.grasping import HALF_TURN, NEIGHBOURHOOD, PREGRASP_DISTANCE, directions_ok, gripper_is_clear
 
@@ -71,11 +70,7 @@ def _from_some_place(arm: Arm, go: Callable[[bool], None], act: Callable[[], Non
 
 
 def drive_to_object(arm: Arm, slot: int, *, elsewhere: bool = False) -> None:
-    """Fold the arm and drive to where an object is within comfortable reach, unless it is already.
-
-    Args:
-        elsewhere: drive even so, since no grasp could be planned from here.
-    """
+    """Fold the arm and drive within comfortable reach of an object; if already there, only with ``elsewhere``."""
     if not arm.executor.drives:
         return
     with arm.planning():
@@ -88,27 +83,24 @@ def drive_to_object(arm: Arm, slot: int, *, elsewhere: bool = False) -> None:
         goals = places_before(arm, center)
         seen = np.array([len(_from_here(arm, arm_base_in_world(arm, goal), grasps)) for goal in goals])
         goals = goals[seen >= max(1, 0.3 * seen.max(initial=0))]
-        try:
-            route = best_route(
-                arm, goals, around, lambda goal: reach_share(arm, goal, grasps, others), enough=2 * COMFORTABLE
-            )
-        except PlanningFailed:  # the elbow is in the way: what else is there for it?
-            route = best_route(
-                arm,
-                goals,
-                around,
-                lambda goal: reach_share(arm, goal, grasps, others, thorough=True),
-                enough=COMFORTABLE,
-            )
+
+        def route_to(judged: tuple[bool, float]) -> list[Array]:
+            thorough, enough = judged
+
+            def share(goal: Array) -> float:
+                return reach_share(arm, goal, grasps, others, thorough=thorough)
+
+            return best_route(arm, goals, around, share, enough=enough)
+
+        # where the elbow is in the way of the nearest configurations, others are judged too
+        route = first_plan(
+            ((False, 2 * COMFORTABLE), (True, COMFORTABLE)), route_to, PlanningFailed("drive", "nowhere")
+        )
     drive(arm, *route)
 
 
 def drive_to_handle(arm: Arm, *, elsewhere: bool = False) -> None:
-    """Fold the arm and drive to where it can pull what the task wants opened far enough, unless it stands there.
-
-    Args:
-        elsewhere: drive even so, since no pull could be planned from here.
-    """
+    """Fold the arm and drive to where it can pull the handle far enough; if it can already, only with ``elsewhere``."""
     if not arm.executor.drives:
         return
     part = Part.of(arm)
@@ -133,7 +125,7 @@ def drive_to_handle(arm: Arm, *, elsewhere: bool = False) -> None:
 
 
 def drive_to_basket(arm: Arm, slot: int) -> None:
-    """Drive back to where the episode began, an object in the gripper.
+    """Drive back to the start of the episode, an object in the gripper.
 
     Where there is no free way, or the basket is out of reach from there, stay if it is in reach, else drive to where it
     is.
@@ -187,13 +179,13 @@ def clear_grasps(arm: Arm, slot: int) -> Array:
 
 
 def reach_share(arm: Arm, base: Array, grasps: Array, others: list[Obstacle], *, thorough: bool = False) -> float:
-    """Share of grasps that the arm reaches from a base pose without touching anything, pre-grasps included.
+    """Return the share of grasps (with pre-grasps) that the arm reaches from a base pose (3,) without collisions.
 
     Args:
         base: (3,).
         grasps: (G, 4, 4) from ``clear_grasps``; those that come from the far side count as out of reach.
         others: everything but the object, in the world.
-        thorough: judge more grasps, and by every configuration, not by the nearest alone; dearer by far.
+        thorough: judge more grasps, by all configurations instead of the nearest; far slower.
     """
     frame = arm_base_in_world(arm, base)
     poses = _poses_of_some(arm, frame, grasps, GRASPS_THOROUGH if thorough else GRASPS)

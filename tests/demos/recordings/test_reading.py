@@ -83,7 +83,7 @@ def test_json_of_another_file(own):
 
 def test_lengths_that_differ(own):
     edit_json(own, lambda data: data["episodes"][0].update(elapsed_steps=21))
-    fails(own, "expected 21 actions, one state more, found 22 actions, .23. states")
+    fails(own, "expected 21 actions, as the JSON says, found 22")
 
 
 def test_incomplete_entries(own):
