@@ -77,16 +77,7 @@ def test_from_below_or_not_at_all():
     assert Retrieval.of(kept_of({LID: 20}), NAMES, held_at=50, cleared=True).left == 0
 
 
-def test_the_target_lies_over_nothing_that_waits_for_it(monkeypatch):
-    """It may lie on what hems it in; that may be moved before it all the same."""
-    over = OVER.clone()
-    over[0, TARGET, LID] = 0.4
-    monkeypatch.setattr(Heap, "covering", lambda self, envs: over)
-    found = Retrieval.of(kept_of({CUP: 10, LID: 60}), NAMES, held_at=50, cleared=True)
-    assert (found.needed, found.left, found.score) == (["lid", "cup"], 0, 1.0)
-
-
-@pytest.mark.parametrize("start", range(20, 140, 7))
+@pytest.mark.parametrize("start", (20, 69, 132))
 def test_a_second_is_a_second_wherever_it_begins(start):
     assert kept_of({LID: start, CUP: start + 20})[LID][2] == 1
     assert kept_of({LID: start, CUP: start + 21})[LID][2] == 0

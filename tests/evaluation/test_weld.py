@@ -39,8 +39,8 @@ class ClaimsSuccess(gym.Wrapper):
         return (*others, {**info, "success": torch.tensor([True])})
 
 
-def made(weld: bool = True, wrap: Any = lambda env: env, **kwargs: Any) -> PolicyStepping:
-    env = gym.make(
+def make(**kwargs: Any) -> gym.Env:
+    return gym.make(
         "RoboCASPick-v1",
         obs_mode="none",
         reward_mode="none",
@@ -50,7 +50,16 @@ def made(weld: bool = True, wrap: Any = lambda env: env, **kwargs: Any) -> Polic
         max_episode_steps=10_000,
         **kwargs,
     )
-    stepped = PolicyStepping(wrap(env), PolicySpec("robocas", "tcp"), "upstream", weld=weld)
+
+
+@pytest.fixture(scope="module")
+def pick():
+    env = make()
+    yield env
+
+
+def welding(env: gym.Env, weld: bool = True) -> PolicyStepping:
+    stepped = PolicyStepping(env, PolicySpec("robocas", "tcp"), "upstream", weld=weld)
     stepped.reset(seed=3)
     return stepped
 
@@ -91,8 +100,8 @@ def in_hand(env: PolicyStepping) -> sapien.Pose:
     return base.agent.robot.links_map[MOBILE_PANDA.hand_link]._bodies[0].entity_pose.inv() * target(env).entity_pose
 
 
-def test_what_is_welded_keeps_its_pose_in_the_hand_whatever_arm_and_fingers_do():
-    env, rng = made(), np.random.default_rng(0)
+def test_what_is_welded_keeps_its_pose_in_the_hand_whatever_arm_and_fingers_do(pick):
+    env, rng = welding(pick), np.random.default_rng(0)
     assert float(grasp(env)["welds"]) == 1
     before = in_hand(env)
     shifts, turns = [], []
@@ -108,12 +117,11 @@ def test_what_is_welded_keeps_its_pose_in_the_hand_whatever_arm_and_fingers_do()
     assert max(turns) < np.deg2rad(0.5)
     assert read_sum(info, "path_length") > 1  # the arm did move
     assert float(info["welds"]) == 1
-    env.close()
 
 
 @pytest.mark.parametrize("weld", [True, False])
-def test_it_hangs_until_the_gripper_is_told_to_open_and_then_falls(weld):
-    env = made(weld)
+def test_it_hangs_until_the_gripper_is_told_to_open_and_then_falls(pick, weld):
+    env = welding(pick, weld)
     grasp(env)
     height = target(env).entity_pose.p[2]
     open_fingers(env)
@@ -122,48 +130,43 @@ def test_it_hangs_until_the_gripper_is_told_to_open_and_then_falls(weld):
     env.step(stay(OPEN))
     env.step(stay(OPEN))
     assert height - target(env).entity_pose.p[2] > 0.3
-    env.close()
 
 
-def test_it_is_welded_once_a_grasp():
-    env = made()
+def test_it_is_welded_once_a_grasp(pick):
+    env = welding(pick)
     counts = [grasp(env)["welds"], env.step(stay(CLOSE))[-1]["welds"], env.step(stay(OPEN))[-1]["welds"]]
     counts += [grasp(env)["welds"]]
     assert [float(count) for count in counts] == [1, 1, 1, 2]
-    env.close()
 
 
 @pytest.mark.parametrize(("above", "welds"), [(0.025, 0), (0.035, 1)])
-def test_what_was_hardly_raised_is_not_welded(above, welds):
-    env = made()
+def test_what_was_hardly_raised_is_not_welded(pick, above, welds):
+    env = welding(pick)
     info = grasp(env, above)
     assert bool(info["target_grasped"])
     assert float(info["welds"]) == welds
-    env.close()
 
 
-def test_what_one_finger_touches_is_not_welded():
-    env = made()
+def test_what_one_finger_touches_is_not_welded(pick, monkeypatch):
+    env = welding(pick)
     base: Any = env.unwrapped
     forces = torch.zeros(1, 3, len(base.objects), 3)
     forces[0, 0] = forces[0, 2] = 5.0  # N, on the left finger and the hand
-    base.gripper_forces = lambda: forces
+    monkeypatch.setattr(base, "gripper_forces", lambda: forces)
     assert float(grasp(env)["welds"]) == 0
-    env.close()
 
 
-def test_there_is_no_success_while_anything_is_welded():
-    env = made(wrap=ClaimsSuccess)
+def test_there_is_no_success_while_anything_is_welded(pick):
+    env = welding(ClaimsSuccess(pick))
     assert not bool(grasp(env)["success"])
     open_fingers(env)  # in the basket, at rest and touched by nothing it would still hang
     assert not bool(env.step(stay(CLOSE))[-1]["success"])
     assert bool(env.step(stay(OPEN))[-1]["success"])
-    env.close()
 
 
 @pytest.mark.parametrize("reconfiguration_freq", [0, 1])
 def test_no_weld_outlives_a_reset(reconfiguration_freq):
-    env = made(reconfiguration_freq=reconfiguration_freq)
+    env = welding(make(reconfiguration_freq=reconfiguration_freq))
     base: Any = env.unwrapped
     grasp(env)
     _, info = env.reset(seed=4)

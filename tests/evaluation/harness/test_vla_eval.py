@@ -104,7 +104,9 @@ def test_an_episode_that_the_run_cuts_short_is_no_result(benchmark):
     assert asyncio.run(play(benchmark, task, max_steps=5))["metrics"]["success"]
 
 
-def test_more_episodes_than_the_protocol_has(benchmark):
+def test_more_episodes_than_the_protocol_has_and_mode_live_are_refused(benchmark):
+    with pytest.raises(NotImplementedError, match="mode sync"):
+        benchmark.get_hold_action(None)
     task = {**benchmark.get_tasks()[0], "episode_idx": 2}
     with pytest.raises(EvaluationError, match="expected episodes_per_task: 2 at most, found 3"):
         asyncio.run(play(benchmark, task))
@@ -133,8 +135,3 @@ def test_an_action_that_is_none_fails_its_episode_alone(benchmark, actions, monk
 def test_parameters_that_are_none(params, words):
     with pytest.raises(EvaluationError, match=words):
         RoboCAS(**params)
-
-
-def test_mode_live_is_refused(benchmark):
-    with pytest.raises(NotImplementedError, match="mode sync"):
-        benchmark.get_hold_action(None)

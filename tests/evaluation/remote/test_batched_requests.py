@@ -66,17 +66,6 @@ def test_a_remote_run_is_equal_to_a_local_run_bit_for_bit():
     assert [step.tobytes() for step in actions] == [step.tobytes() for step in expected_actions]
 
 
-def test_more_envs_than_a_batch_may_have_are_asked_in_several():
-    policy = Told()
-    with serving(policy, max_batch=2) as url:
-        remote = RemotePolicy(url)
-        remote.reset([a_start(env) for env in range(5)])
-        seen = some_observations(0, 1, 2, 3, 4)
-        np.testing.assert_array_equal(remote.act(seen), Told().act(seen))
-        remote.close()
-    assert [one.envs.tolist() for one in policy.seen] == [[0, 1], [2, 3], [4]]
-
-
 def test_a_batch_of_the_announced_size_fits_in_a_message():
     for camera in ((8, 8), (224, 224), (640, 480), (4096, 4096)):
         spec = PolicySpec(cameras=dict.fromkeys(("base_camera", "gripper_camera", "static_camera"), camera), depth=True)
@@ -87,49 +76,50 @@ def test_a_batch_of_the_announced_size_fits_in_a_message():
 
 
 class FailingIn(Told):
-    """Fail in some envs, by `PolicyFailed` or by another exception."""
+    """Fail in one env by `PolicyFailed`, and in another one by an exception."""
 
-    def __init__(self, env: int, error: Exception) -> None:
-        super().__init__()
-        self.env, self.error = env, error
+    failing, raising = 1, 4
 
     def act(self, observations):
         actions = super().act(observations)
-        if self.env in observations.envs:
-            raise PolicyFailed({self.env: "no\nplan"}, actions) if isinstance(self.error, PolicyFailed) else self.error
+        if self.raising in observations.envs:
+            raise RuntimeError("out of memory")
+        if self.failing in observations.envs:
+            raise PolicyFailed({self.failing: "no\nplan"}, actions)
         return actions
 
 
-def test_an_env_that_fails_ends_its_episode_alone():
-    policy = FailingIn(1, PolicyFailed({}))
+def test_batches_are_split_and_failures_end_their_episodes_alone():
+    policy = FailingIn()
+    with serving(policy, max_batch=2) as url:
+        remote = RemotePolicy(url)
+        remote.reset([a_start(env) for env in range(6)])
+        seen = some_observations(0, 1, 2, 3, 4, 5)
+        with pytest.raises(PolicyFailed) as failed:
+            remote.act(seen)
+        assert [one.envs.tolist() for one in policy.seen] == [[0, 1], [2, 3], [4, 5]]
+        exception = "the server failed: RuntimeError: out of memory"
+        assert failed.value.reasons == {1: "the server failed: no plan", 4: exception, 5: exception}
+        np.testing.assert_array_equal(failed.value.actions[[0, 2, 3]], Told().act(seen)[[0, 2, 3]])
+        remote.close()
+
+
+def test_an_env_that_failed_starts_another_episode():
+    policy = FailingIn()
     seen = some_observations(0, 1, 2)
     with serving(policy) as url:
         remote = RemotePolicy(url)
         remote.reset([a_start(env) for env in range(3)])
-        with pytest.raises(PolicyFailed) as failed:
+        with pytest.raises(PolicyFailed):
             remote.act(seen)
-        assert failed.value.reasons == {1: "the server failed: no plan"}
-        np.testing.assert_array_equal(failed.value.actions[[0, 2]], Told().act(seen)[[0, 2]])
         assert remote.act(some_observations(0, 2)).shape == (2, 3, 7)
         with pytest.raises(PolicyFailed, match="connection is lost"):
             remote.act(some_observations(1))
-        policy.env = -1
+        policy.failing = -1
         remote.reset([a_start(1, episode=9)])
         assert remote.act(seen).shape == (3, 3, 7)
         remote.close()
     assert policy.starts[3:] == [a_start(1, episode=9)]
-
-
-def test_an_exception_ends_the_episodes_of_its_batch_alone():
-    with serving(FailingIn(1, RuntimeError("out of memory"))) as url:
-        remote = RemotePolicy(url)
-        remote.reset([a_start(env) for env in range(3)])
-        remote.act(some_observations(0))
-        with pytest.raises(PolicyFailed) as failed:
-            remote.act(some_observations(1, 2))
-        assert failed.value.reasons == dict.fromkeys((1, 2), "the server failed: RuntimeError: out of memory")
-        assert remote.act(some_observations(0)).shape == (1, 3, 7)
-        remote.close()
 
 
 GOOD = {"actions": np.zeros((1, 7))}
@@ -180,31 +170,32 @@ def test_an_announcement_out_of_range_is_an_error(metadata):
         RemotePolicy(f"{url}?{IN_A_HURRY}")
 
 
-def message(env=0, **more):
-    return observation_message(some_observations(env), 0, a_start(env), reset=True) | more
+def message(env=0, start=None, **more):
+    made = observation_message(some_observations(env), 0, a_start(env), reset=True)
+    return made | {"start": made["start"] | (start or {})} | more
 
 
 @pytest.mark.parametrize(
-    "batch",
+    "request_",
     [
-        7,
-        [],
-        {},
-        [7],
-        [message(), message()],
-        [message(env) for env in range(5)],
-        [message(), message(1, env_id="1")],
-        [message(), message(1, **{"observation/qpos": np.zeros(3, np.float32)})],
-        [message(), message(1, reset=False)],
-        [{"batch": [message()]}],
+        *({"batch": batch} for batch in (7, [], {}, [7])),
+        {"batch": [message(), message()]},
+        {"batch": [message(env) for env in range(5)]},
+        {"batch": [message(), message(1, env_id="1")]},
+        {"batch": [message(), message(1, **{"observation/qpos": np.zeros(3, np.float32)})]},
+        {"batch": [message(), message(1, reset=False)]},
+        {"batch": [{"batch": [message()]}]},
+        *(message(start=start) for start in ({"seed": -1}, {"seed": 2**62}, {"episode": -1}, {"env": 0})),
+        message(start={"instruction": "x" * 100_000}),
+        message(prompt="x" * 100_000),
     ],
-    ids=range(10),
+    ids=range(16),
 )
-def test_a_bad_batch_is_one_line_to_its_client(batch):
+def test_an_invalid_request_is_one_line_to_its_client(request_):
     policy = Told()
     with serving(policy, max_batch=4) as url, connect(url, proxy=None, compression=None) as client:
         client.recv()
-        client.send(pack({"batch": batch}))
+        client.send(pack(request_))
         answer = client.recv(20)
         with pytest.raises(ConnectionClosed):
             client.recv(20)
@@ -220,21 +211,3 @@ def test_embeddings_of_a_batch_have_one_length():
         client.send(pack({"batch": embedded}))
         assert "differ in shape" in client.recv(20)
     assert policy.seen == []
-
-
-def test_a_batch_needs_one_connection():
-    asked = []
-
-    def talk(socket):
-        socket.send(pack({"robocas_max_batch": 64}))
-        for _ in socket:
-            asked.append(socket)
-            socket.send(pack({"batch": [GOOD] * 16}))
-
-    with talking(talk) as url:
-        remote = RemotePolicy(url)
-        remote.reset([a_start(env) for env in range(16)])
-        for _ in range(3):
-            assert remote.act(some_observations(*range(16))).shape == (16, 1, 7)
-        remote.close()
-    assert len(asked) == 3 and len(set(asked)) == 1

@@ -44,21 +44,6 @@ def started(url):
     return remote
 
 
-def test_answers_in_any_order_belong_to_their_envs():
-    arrived = threading.Barrier(ENVS)  # nobody is answered before all have asked
-
-    def answer(env):
-        arrived.wait(20)
-        time.sleep(0.05 * (ENVS - env))
-        return env
-
-    with answering(answer) as url:
-        remote = started(url)
-        for order in ([0, 1, 2, 3, 4], [3, 0, 4, 2, 1]):
-            assert remote.act(some_observations(*order))[:, 0, 0].tolist() == order
-        remote.close()
-
-
 def test_one_request_at_a_time_comes_in_the_order_of_the_envs():
     asked, present = [], threading.Semaphore(1)
 
@@ -78,9 +63,10 @@ def test_one_request_at_a_time_comes_in_the_order_of_the_envs():
 
 
 def test_a_server_that_computes_one_answer_after_another_has_the_time_limit_for_each():
-    turn = threading.Lock()
+    turn, arrived = threading.Lock(), threading.Barrier(ENVS)  # nobody is answered before all have asked
 
     def answer(env):
+        arrived.wait(20)
         with turn:
             time.sleep(0.5)
         return env
@@ -88,8 +74,9 @@ def test_a_server_that_computes_one_answer_after_another_has_the_time_limit_for_
     with answering(answer) as url:
         remote = started(f"{url}?timeout_s=1.5")
         start = time.monotonic()
-        assert remote.act(some_observations(*range(ENVS)))[:, 0, 0].tolist() == [*range(ENVS)]
-        assert time.monotonic() - start > 1.5
+        for order in ([0, 1, 2, 3, 4], [3, 0, 4, 2, 1]):  # answers in any order belong to their envs
+            assert remote.act(some_observations(*order))[:, 0, 0].tolist() == order
+        assert time.monotonic() - start > 3
         remote.close()
 
 

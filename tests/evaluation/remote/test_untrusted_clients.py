@@ -1,7 +1,6 @@
 """Clients of a policy server choose no path of its machine, and learn no more than one line of what went wrong."""
 
 import logging
-import socket
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,11 +17,8 @@ from websockets.sync.client import connect
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.policies.scripted import ScriptedPolicy
 from robocas_ms3.evaluation.remote.answers import ServedFiles
-from robocas_ms3.evaluation.remote.client import RemotePolicy
 from robocas_ms3.evaluation.remote.messages import name_of, observation_message
 from robocas_ms3.evaluation.remote.wire import pack
-
-GARBAGE = 1008
 
 
 class Failing(Told):
@@ -63,17 +59,17 @@ def asked(url, changes=None, **more):
 
 
 @pytest.mark.parametrize("name", ["config_file", "layouts_file", "pack"])
-@pytest.mark.parametrize("path", ["{folder}/secret.yaml", "smoke/configs/../../{folder}/secret.yaml", "new", "a\0b"])
-def test_no_text_of_a_client_becomes_a_path(tmp_path, monkeypatch, name, path):
+def test_no_text_of_a_client_becomes_a_path(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "secret.yaml").write_text("hunter2: [")
     (tmp_path / "new").mkdir()  # a folder where the server runs is not installed as a pack
     policy = Reading()
     with serving(policy) as url:
-        answer, _ = asked(url, {name: path.format(folder=tmp_path)})
-    assert getattr(policy.starts[0], name) == ""
-    assert isinstance(answer, str) and len(answer.splitlines()) == 1
-    assert "hunter2" not in answer
+        for path in (f"{tmp_path}/secret.yaml", f"smoke/configs/../../{tmp_path}/secret.yaml", "new", "a\0b"):
+            answer, _ = asked(url, {name: path})
+            assert getattr(policy.starts[-1], name) == ""
+            assert isinstance(answer, str) and len(answer.splitlines()) == 1
+            assert "hunter2" not in answer
     assert {entry.name for entry in tmp_path.iterdir()} == {"secret.yaml", "new"}
 
 
@@ -113,41 +109,7 @@ def test_a_failing_policy_is_one_line_to_its_client_and_others_are_served(error)
         assert isinstance(asked(url)[0], str)
 
 
-@pytest.mark.parametrize(
-    ("changes", "more"),
-    [
-        ({"seed": -1}, {}),
-        ({"seed": 2**62}, {}),
-        ({"episode": -1}, {}),
-        ({"instruction": "x" * 100_000}, {}),
-        ({}, {"prompt": "x" * 100_000}),
-        ({"env": 0}, {}),
-    ],
-)
-def test_numbers_and_texts_are_bounded(changes, more):
-    policy = Told()
-    with serving(policy) as url:
-        answer, code = asked(url, changes, **more)
-    assert (policy.starts, code) == ([], GARBAGE)
-    assert isinstance(answer, str) and answer.isprintable()
-
-
 def test_messages_are_no_larger_than_a_policys_pictures_need():
     with serving(Told()) as url:
         answer, code = asked(url, **{"observation/more": np.zeros(16 * 2**20, np.uint8)})
     assert (answer, code) == (None, 1009)
-
-
-@pytest.mark.parametrize("host", ["::1", "[::1]"])
-def test_an_ipv6_address_is_in_brackets(host):
-    try:
-        with socket.create_server(("::1", 0), family=socket.AF_INET6):
-            pass
-    except OSError:
-        pytest.skip("no IPv6 here")
-    with serving(Told(), host=host) as url:
-        assert url.startswith("ws://[::1]:")
-        remote = RemotePolicy(url)
-        remote.reset([a_start()])
-        assert remote.act(some_observations(0)).shape == (1, 3, 7)
-        remote.close()
