@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from made_up_assets import furniture_asset
 
 from asset_tools.pipeline import Job, content_hash, made_of, write_pack
 from robocas_ms3.assets.hulls import write_hulls
-from robocas_ms3.assets.manifest import FurnitureAsset, FurnitureQuality
 from robocas_ms3.assets.pack import HULLS, VISUALS, load_pack, sha256
 from robocas_ms3.core.errors import AssetError, OutputExistsError
 
@@ -31,17 +31,7 @@ def make(id_, folder, log, fail="", seconds=0.0, hull=CUBE):
     for name in VISUALS.values():
         (folder / name).write_text(f"{id_} {name}")
     write_hulls(folder / HULLS, [hull])
-    return FurnitureAsset(
-        id=id_,
-        name=id_,
-        category="test",
-        source="test",
-        licence="MIT",
-        attribution="none",
-        extents=(1, 1, 1),
-        files={path.name: sha256(path) for path in folder.iterdir()},
-        quality=FurnitureQuality(hull_count=1, hull_vertices=8),
-    )
+    return furniture_asset(id_, files={path.name: sha256(path) for path in folder.iterdir()})
 
 
 def jobs(log, **contents):
@@ -153,11 +143,12 @@ def test_what_is_no_pack_is_not_replaced(tmp_path):
     assert made_in(tmp_path / "log") == []
 
 
+SUPPORT = Path(__file__).resolve().parents[1] / "support"
 SCRIPT = """
 import sys
 from functools import partial
 from pathlib import Path
-sys.path.insert(0, {tests!r})
+sys.path[:0] = {tests!r}
 from test_pipeline import make
 from asset_tools.pipeline import Job, write_pack
 if __name__ == "__main__":
@@ -179,7 +170,7 @@ def workers_of(script):
 
 def test_a_killed_run_goes_on_where_it_stopped(tmp_path):
     script = tmp_path / "run.py"
-    script.write_text(SCRIPT.format(tests=os.path.dirname(__file__), root=str(tmp_path)))
+    script.write_text(SCRIPT.format(tests=[os.path.dirname(__file__), str(SUPPORT)], root=str(tmp_path)))
     quick = {**os.environ, "ROBOCAS_TEST_RUN": str(script)}
     run = subprocess.Popen([sys.executable, script], start_new_session=True, env=quick)
     while len(list((tmp_path / "kept").glob("asset_*/asset.json"))) < 3:

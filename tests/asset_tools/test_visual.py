@@ -97,42 +97,16 @@ def test_sides_have_flat_normals_though_vertices_meet(light_box):
     assert agreement.min() > 0.99  # one smooth normal at a box's corner would give 0.58
 
 
-def dense_bottle(sections: int, rows: int) -> trimesh.Trimesh:
-    """A body, a shoulder and a neck, closed: its wall is straight upwards, and finely divided all the same."""
-    angle = np.linspace(0, 2 * np.pi, sections, endpoint=False)
-    ring = np.column_stack([np.cos(angle), np.sin(angle)])
-    heights = np.linspace(0, 2 * SIDE, rows + 1)
-    radii = np.interp(heights / SIDE, [0, 1.2, 1.5, 2], [0.3, 0.3, 0.1, 0.1]) * SIDE
-    wall = np.column_stack([(radii[:, None, None] * ring).reshape(-1, 2), np.repeat(heights, sections)])
-    row, column = (grid.reshape(-1) for grid in np.meshgrid(np.arange(rows), np.arange(sections), indexing="ij"))
-    a, b = row * sections + column, row * sections + (column + 1) % sections
-    low, high, k = len(wall), len(wall) + 1, np.arange(sections)
-    top, after = k + rows * sections, (k + 1) % sections
-    faces = [
-        np.column_stack([a, b, b + sections]),
-        np.column_stack([a, b + sections, a + sections]),
-        np.column_stack([after, k, np.full(sections, low)]),
-        np.column_stack([top, after + rows * sections, np.full(sections, high)]),
-    ]
-    vertices = np.vstack([wall, [[0, 0, 0], [0, 0, 2 * SIDE]]])
-    return trimesh.Trimesh(vertices, np.concatenate(faces), process=False)
-
-
 @pytest.mark.parametrize(
-    ("make", "triangles"),
-    [
-        (lambda: textured_box(130), 1000),
-        (lambda: trimesh.creation.icosphere(subdivisions=7, radius=SIDE), 1000),
-        (lambda: dense_bottle(400, 300), 1000),
-        (lambda: dense_bottle(400, 300), 12_000),
-    ],
-    ids=["box", "ball", "bottle", "fine bottle"],
+    "make",
+    [lambda: textured_box(130), lambda: trimesh.creation.icosphere(subdivisions=7, radius=SIDE)],
+    ids=["box", "ball"],
 )
-def test_dense_meshes_do_not_fold_over(make, triangles):
+def test_dense_meshes_do_not_fold_over(make):
     dense = make()
     assert len(dense.faces) > 200_000
-    light = simplified(dense, triangles)
-    assert len(light.faces) <= triangles
+    light = simplified(dense, 1000)
+    assert len(light.faces) <= 1000
     assert light.volume == pytest.approx(dense.volume, rel=0.01)
     assert light.area == pytest.approx(dense.area, rel=0.01)
     np.testing.assert_allclose(light.bounds, dense.bounds, atol=0.01 * SIDE)
@@ -160,15 +134,6 @@ def test_thin_shell_keeps_inside_and_outside_apart():
     wrong = np.abs(colors - wanted).max(axis=1) > 20
     assert 0.4 < facing_out.mean() < 0.6
     assert wrong.mean() < 0.005
-
-
-@pytest.mark.parametrize("cells", [4, 20])
-def test_inward_mesh_is_turned_outward(cells):
-    box = textured_box(cells)
-    box.invert()
-    light = to_display(box, triangles=200, texture_size=64)
-    assert light.volume == pytest.approx(SIDE**3, rel=1e-2)
-    assert (np.einsum("fcd,fd->fc", light.vertex_normals[light.faces], light.face_normals) > 0.5).all()
 
 
 def test_glb_is_the_same_every_time_and_readable(fine_box, light_box, tmp_path):

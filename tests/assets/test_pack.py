@@ -3,35 +3,19 @@ import os
 
 import numpy as np
 import pytest
+from made_up_assets import furniture_asset, object_asset
 from pydantic import ValidationError
 
 from robocas_ms3.assets.annotations import Annotations, footprints
 from robocas_ms3.assets.hulls import write_hulls
 from robocas_ms3.assets.manifest import (
-    FurnitureAsset,
-    FurnitureQuality,
     Joint,
     Link,
-    ObjectAsset,
-    ObjectQuality,
     PackManifest,
 )
 from robocas_ms3.assets.pack import load_pack, pack_folders, sha256
 from robocas_ms3.core.errors import AssetError
 
-QUALITY = ObjectQuality(
-    compact=True,
-    hull_count=1,
-    hull_vertices=8,
-    volume_iou=1.0,
-    surface_p95=0.0,
-    rest_share=1.0,
-    rest_time=0.1,
-    penetration=0.0,
-    jitter=0.0,
-    grasps_tried=1,
-    grasps_held=1.0,
-)
 BOX = np.array([[x, y, z] for x in (-0.05, 0.05) for y in (-0.03, 0.03) for z in (-0.02, 0.02)])
 
 
@@ -64,22 +48,8 @@ def box_pack(tmp_path):
     for name in ("visual_fast.glb", "visual_full.glb"):
         (folder / name).write_bytes(b"glTF")
     names = ("hulls.obj", "annotations.npz", "visual_fast.glb", "visual_full.glb")
-    asset = ObjectAsset(
-        id="box",
-        name="box",
-        category="box",
-        source="test",
-        licence="MIT",
-        attribution="none",
-        extents=(0.1, 0.06, 0.04),
-        mass=0.1,
-        center_of_mass=(0, 0, 0),
-        inertia=(1e-5, 1e-5, 1e-5),
-        grasp_count=1,
-        no_grasps_because="one is enough here",
-        quality=QUALITY,
-        files={name: sha256(folder / name) for name in names},
-    )
+    files = {name: sha256(folder / name) for name in names}
+    asset = object_asset("box", extents=(0.1, 0.06, 0.04), inertia=(1e-5, 1e-5, 1e-5), files=files)
     (root / "manifest.json").write_text(PackManifest(name="boxes", assets=[asset]).model_dump_json())
     return root
 
@@ -207,17 +177,6 @@ def test_joints_that_make_no_sense(changes, message):
         Joint(**JOINT | changes)
 
 
-CABINET = {
-    "id": "cabinet",
-    "name": "cabinet",
-    "category": "cabinet",
-    "source": "test",
-    "licence": "MIT",
-    "attribution": "none",
-    "extents": (1, 1, 1),
-    "files": {},
-    "quality": FurnitureQuality(hull_count=1, hull_vertices=8),
-}
 SURFACE = {"link": "", "min_xy": (0, 0), "max_xy": (1, 1), "z": 0}
 
 
@@ -248,9 +207,9 @@ def link(name="door", joint="hinge", parent=""):
     ],
 )
 def test_furniture_that_makes_no_sense(changes, message):
-    FurnitureAsset.model_validate(CABINET | {"surfaces": {"top": SURFACE}, "links": (link(),)})
+    furniture_asset(surfaces={"top": SURFACE}, links=(link(),))
     with pytest.raises(ValidationError, match=message):
-        FurnitureAsset.model_validate(CABINET | changes)
+        furniture_asset(**changes)
 
 
 def test_a_footprint_has_each_corner_once():

@@ -2,13 +2,14 @@ import numpy as np
 import pytest
 import sapien
 import torch
+from made_up_assets import furniture_asset
 from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.envs.utils.system.backend import parse_sim_and_render_backend
 from mani_skill.utils.structs import Actor, Articulation
 from sapien.physx import PhysxCollisionShapeBox, PhysxCollisionShapeConvexMesh, PhysxMaterial
 
 from robocas_ms3.assets.hulls import write_hulls
-from robocas_ms3.assets.manifest import FurnitureAsset, FurnitureQuality, Joint, Link
+from robocas_ms3.assets.manifest import Joint, Link
 from robocas_ms3.assets.pack import LoadedFurniture, Part
 from robocas_ms3.assets.physics import shapes_of
 from robocas_ms3.assets.spawn import spawn, spawn_articulation
@@ -28,18 +29,7 @@ def cabinet(tmp_path):
     (tmp_path / "links" / "drawer").mkdir(parents=True)
     write_hulls(tmp_path / "links" / "drawer" / "hulls.obj", [box((0, 0, 0.03), (0.2, 0.2, 0.1))])
     link = Link(name="drawer", joint=DRAWER, mass=1.5, center_of_mass=(0.1, 0.1, 0.065), inertia=(0.006, 0.006, 0.01))
-    asset = FurnitureAsset(
-        id="cabinet",
-        name="cabinet",
-        category="cabinet",
-        source="test",
-        licence="MIT",
-        attribution="none",
-        extents=(0.2, 0.2, 0.1),
-        files={},
-        links=(link,),
-        quality=FurnitureQuality(hull_count=2, hull_vertices=8),
-    )
+    asset = furniture_asset("cabinet", extents=(0.2, 0.2, 0.1), links=(link,))
     return LoadedFurniture(tmp_path, asset=asset, links={"drawer": Part(tmp_path / "links" / "drawer")})
 
 

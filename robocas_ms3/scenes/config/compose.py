@@ -55,9 +55,10 @@ def parse_override(text: str, error: type[RobocasError], example: str) -> dict[s
     if value is None and word.strip() not in _NULL:
         fix = f"Write {key}=null to remove the key or to set it to null."
         raise error("invalid override: the value is empty", where="--set", expected="a value", found=text, fix=fix)
-    for name in reversed(names):
-        value = {name: value}
-    return value
+    nested = {names[-1]: value}
+    for name in reversed(names[:-1]):
+        nested = {name: nested}
+    return nested
 
 
 class Composition:

@@ -4,6 +4,7 @@ from typing import cast
 import numpy as np
 import pytest
 import trimesh
+from made_up_assets import QUALITY, object_asset
 
 from asset_tools.grasps import sample_grasps
 from asset_tools.quality import measure
@@ -11,23 +12,7 @@ from asset_tools.quality.drops import DropReport
 from asset_tools.quality.measure import differences, judge, measure_object, rows
 from asset_tools.resting import resting_poses
 from robocas_ms3.assets.annotations import Annotations, footprints
-from robocas_ms3.assets.manifest import ObjectAsset, ObjectQuality
 from robocas_ms3.assets.pack import LoadedObject
-
-GOOD = ObjectQuality(
-    compact=True,
-    hull_count=4,
-    hull_vertices=48,
-    volume_iou=0.95,
-    surface_p95=0.001,
-    rest_share=1,
-    rest_time=0.5,
-    penetration=0.0005,
-    jitter=1e-6,
-    grasps_tried=20,
-    grasps_held=0.9,
-)
-
 
 REPORT = DropReport(
     ends=np.tile(np.eye(4), (3, 1, 1)),
@@ -40,27 +25,8 @@ REPORT = DropReport(
 )
 
 
-def asset(quality=GOOD, grasp_count=60, no_grasps_because=""):
-    return ObjectAsset(
-        id="a",
-        name="thing",
-        category="box",
-        source="builtin",
-        licence="MIT",
-        attribution="-",
-        extents=(0.1, 0.1, 0.1),
-        files={},
-        mass=0.1,
-        center_of_mass=(0, 0, 0),
-        inertia=(1e-4, 1e-4, 1e-4),
-        grasp_count=grasp_count,
-        no_grasps_because=no_grasps_because,
-        quality=quality,
-    )
-
-
 def but(**change):
-    return asset(GOOD.model_copy(update=change))
+    return object_asset(quality=QUALITY.model_copy(update=change))
 
 
 def annotate(mesh, solid, count=60):
@@ -87,7 +53,7 @@ def test_a_block_passes_all(block):
     assert (quality.compact, quality.hull_count, quality.hull_vertices) == (True, 1, 8)
     assert quality.volume_iou == 1 and quality.surface_p95 == 0
     assert quality.rest_share == 1 and quality.grasps_tried == 20 and quality.grasps_held >= 0.95
-    assert judge({"block": asset(quality)}) == []
+    assert judge({"block": object_asset(quality=quality)}) == []
     assert measure_object(mesh, solid, notes) == quality
 
 
@@ -95,8 +61,11 @@ def test_an_object_without_grasps(block):
     mesh, solid = trimesh.creation.box((0.12, 0.12, 0.12)), block(0.12, 0.12, 0.12)
     quality = measure_object(mesh, solid, annotate(mesh, solid))
     assert (quality.grasps_tried, quality.grasps_held) == (0, 0)
-    assert judge({"cube": asset(quality, grasp_count=0, no_grasps_because="too thick"), "fine": asset()}) == []
-    found = judge({"cube": asset(quality, grasp_count=0)})
+    assert (
+        judge({"cube": object_asset(quality=quality, grasp_count=0, no_grasps_because="wide"), "b": object_asset()})
+        == []
+    )
+    found = judge({"cube": object_asset(quality=quality, grasp_count=0)})
     assert [(broken.asset, broken.what) for broken in found] == [
         ("cube", "number of grasps"),
         ("", "number of objects that can be grasped"),
@@ -117,15 +86,15 @@ def test_an_object_without_grasps(block):
     ],
 )
 def test_each_limit_of_an_object(change, what):
-    pack = {"a": asset(), "b": asset(), "bad": but(**change)}
+    pack = {"a": object_asset(), "b": object_asset(), "bad": but(**change)}
     assert [(broken.asset, broken.what) for broken in judge(pack)] == [("bad", what)]
 
 
 def test_medians_of_the_pack():
     weak = dict(volume_iou=0.85, hull_count=9, grasps_held=0.75)
-    one = {"a": asset(), "b": asset(), "c": but(**weak)}
+    one = {"a": object_asset(), "b": object_asset(), "c": but(**weak)}
     assert judge(one) == []
-    most = {"a": asset(), "b": but(**weak), "c": but(**weak)}
+    most = {"a": object_asset(), "b": but(**weak), "c": but(**weak)}
     found = judge(most)
     assert [(broken.asset, broken.what, broken.expected, broken.found) for broken in found] == [
         ("", "median volume IoU", ">= 0.90", "0.85"),
@@ -136,18 +105,18 @@ def test_medians_of_the_pack():
 
 
 def test_too_few_grasps_need_a_reason():
-    found = judge({"a": asset(), "few": asset(grasp_count=49)})
+    found = judge({"a": object_asset(), "few": object_asset(grasp_count=49)})
     assert [(broken.asset, broken.what, broken.found) for broken in found] == [("few", "number of grasps", "49")]
-    assert judge({"a": asset(), "few": asset(grasp_count=49, no_grasps_because="wide")}) == []
+    assert judge({"a": object_asset(), "few": object_asset(grasp_count=49, no_grasps_because="wide")}) == []
 
 
 def test_what_the_manifest_says_is_compared():
     def loaded(grasps):
         notes = SimpleNamespace(grasp_widths=np.zeros(grasps))
-        return cast(LoadedObject, SimpleNamespace(asset=asset(), annotations=notes))
+        return cast(LoadedObject, SimpleNamespace(asset=object_asset(), annotations=notes))
 
-    assert differences(loaded(60), GOOD) == []
-    found = differences(loaded(59), GOOD.model_copy(update=dict(rest_share=0.95, grasps_held=0.85)))
+    assert differences(loaded(60), QUALITY) == []
+    found = differences(loaded(59), QUALITY.model_copy(update=dict(rest_share=0.95, grasps_held=0.85)))
     assert [(broken.what, broken.expected, broken.found) for broken in found] == [
         ("measured rest_share", "1, as the manifest says", "0.95"),
         ("measured grasps_held", "0.9, as the manifest says", "0.85"),
