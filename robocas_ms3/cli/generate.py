@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 from robocas_ms3.cli.interrupts import resumable
@@ -22,10 +23,10 @@ def main(settings: GenerateSettings) -> int:
 
     players, weights = None, ""
     if settings.episode.after_policy:
-        from robocas_ms3.evaluation.acting import Players, check_acting
+        from robocas_ms3.evaluation.acting import Player, check_acting
 
         weights = check_acting(settings.episode)
-        players = Players(settings.episode)
+        players = partial(Player, settings.episode)
     with bar("episodes recorded") as shown:
 
         def on_result(result: EpisodeResult) -> None:

@@ -9,7 +9,6 @@ import json
 import logging
 import tempfile
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -50,17 +49,6 @@ def check_acting(settings: EpisodeSettings) -> str:
         if policy.spec.cameras:
             require_renderer()
         return str(getattr(policy, "describe", dict)().get("weights", ""))
-
-
-@dataclass(frozen=True)
-class Players:
-    """Makes a `Player` in a worker process; settings: of the demonstrations."""
-
-    settings: EpisodeSettings
-
-    def __call__(self) -> Player:
-        """Make it."""
-        return Player(self.settings)
 
 
 class Player:

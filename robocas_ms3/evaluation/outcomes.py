@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,10 +60,10 @@ class Retrieval:
             held_at: policy step after which the target was first held; None: never.
             cleared: whether the obstacles had been cleared before.
         """
-        slots = [slot for slot in np.argsort(record[:, 0], kind="stable").tolist() if record[slot, 0]]
+        slots: list[int] = [slot for slot in np.argsort(record[:, 0], kind="stable").tolist() if record[slot, 0]]
         moved = [Move(objects[slot], int(record[slot, 0]), *(bool(x) for x in record[slot, 1:])) for slot in slots]
         left = 0 if cleared or held_at is None else int(((record[:, 0] == 0) & (record[:, 1] == 1)).sum())
-        needed = [objects[slot] for slot in np.flatnonzero(record[:, 1]).tolist()]
+        needed = [name for name, is_needed in zip(objects, record[:, 1], strict=False) if is_needed]
         return cls(moved, needed, left, score_of(moved, left, held_at))
 
 
@@ -143,36 +143,3 @@ def failure_stage(flags: dict[str, int | None], error: str = "", order: Sequence
     reached = [number for number, stage in enumerate(stages) if flags[stage] is not None]
     following = reached[-1] + 1 if reached else 0
     return stages[following] if following < len(stages) else "placed"
-
-
-class RetrievalSummary(NamedTuple):
-    """Summary of the episodes in which the target was held.
-
-    Attributes:
-        held: number of episodes.
-        score: mean score.
-        moved: mean number of objects moved before the target.
-        needed: share of these that were needed.
-        left: mean number of objects left in the way.
-    """
-
-    held: int
-    score: float
-    moved: float
-    needed: float
-    left: float
-
-
-def summarize_retrieval(orders: Iterable[Retrieval | None]) -> RetrievalSummary | None:
-    """Return the summary of several episodes; None if the target was held in none."""
-    scored = [(order, order.score) for order in orders if order is not None and order.score is not None]
-    if not scored:
-        return None
-    moved, count = [move for order, _ in scored for move in order.moved], len(scored)
-    return RetrievalSummary(
-        held=count,
-        score=sum(score for _, score in scored) / count,
-        moved=len(moved) / count,
-        needed=sum(move.needed for move in moved) / max(len(moved), 1),
-        left=sum(order.left for order, _ in scored) / count,
-    )

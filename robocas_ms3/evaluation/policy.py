@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic import ConfigDict, Field
 
 from robocas_ms3.core.errors import EvaluationError
@@ -147,6 +147,22 @@ class Policy(Protocol):
     def act(self, observations: Observations) -> NDArray[np.floating]:
         """Return actions (E, A), or chunks (E, H, A) that are executed whole before the next call for the env."""
         ...
+
+
+def as_chunks(actions: ArrayLike, count: int, size: int | None, *, where: str = "") -> NDArray[np.float32]:
+    """Return actions (E, A) or (E, H, A) of ``count`` envs as chunks (E, H, A).
+
+    Raises:
+        EvaluationError: they are no numbers, or have another shape; ``size`` None: of any A.
+    """
+    found = np.asarray(actions)
+    chunks = found[:, None] if found.ndim == 2 else found
+    fits = chunks.ndim == 3 and len(chunks) == count and chunks.shape[1] > 0 and size in (None, chunks.shape[2])
+    if found.dtype.kind not in "iuf" or not fits:
+        expected = f"({count}, {size or 'size'}) or ({count}, chunk, {size or 'size'}) numbers"
+        what = f"{found.shape} {found.dtype}"
+        raise EvaluationError("actions don't fit", where=where, expected=expected, found=what)
+    return chunks.astype(np.float32)
 
 
 class ExternalPolicy:

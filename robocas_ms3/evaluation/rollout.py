@@ -15,7 +15,15 @@ from robocas_ms3.core.words import printable
 from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.metrics import MEASURES, read_sum
 from robocas_ms3.evaluation.outcomes import Outcome, Retrieval, failure_stage
-from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, Policy, PolicySpec, policy_code, privileged
+from robocas_ms3.evaluation.policy import (
+    EpisodeSpec,
+    Observations,
+    Policy,
+    PolicySpec,
+    as_chunks,
+    policy_code,
+    privileged,
+)
 from robocas_ms3.evaluation.protocol import Episode
 from robocas_ms3.scenes.language.embed import TextEmbedder
 from robocas_ms3.scenes.task_specs import TASKS
@@ -250,14 +258,13 @@ def _request_actions(batch: EpisodeBatch, policy: Policy, chunks: dict[int, list
     started = time.perf_counter()
     try:
         with policy_code(policy):
-            result: Any = policy.act(observations)
-            actions = np.asarray(result, np.float32)
+            actions: Any = np.asarray(policy.act(observations))
     except PolicyFailed as failed:
         for env in envs if failed.actions is None else failed.reasons:
             running[env].error = failed.reasons.get(env, str(failed))
         if failed.actions is None:
             return
-        actions = np.asarray(failed.actions, np.float32)
+        actions = failed.actions
     seconds = (time.perf_counter() - started) / len(envs)
     new = as_chunks(actions, len(envs), batch.action_size, where=type(policy).__name__)
     period = policy.spec.look_every
@@ -273,19 +280,6 @@ def _request_actions(batch: EpisodeBatch, policy: Policy, chunks: dict[int, list
             running[env].error = running[env].error or NOT_FINITE
         chunks[env] = list(chunk)
         running[env].inference_seconds += seconds
-
-
-def as_chunks(actions: NDArray[np.float32], count: int, size: int, *, where: str) -> NDArray[np.float32]:
-    """Return actions (E, A) or (E, H, A) as chunks (E, H, A).
-
-    Raises:
-        EvaluationError: they have another shape.
-    """
-    chunks = actions[:, None] if actions.ndim == 2 else actions
-    if chunks.ndim != 3 or chunks.shape[0] != count or chunks.shape[1] < 1 or chunks.shape[2] != size:
-        expected = f"({count}, {size}) or ({count}, chunk, {size})"
-        raise EvaluationError("actions don't fit", where=where, expected=expected, found=actions.shape)
-    return chunks
 
 
 def _is_flag(value: Any) -> bool:

@@ -20,9 +20,9 @@ from robocas_ms3.core.workers import Limits
 from robocas_ms3.datasets.writing.render import require_renderer
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.outcomes import Outcome
-from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, Policy, describe
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, Policy, as_chunks, describe
 from robocas_ms3.evaluation.protocol import Episode, load_protocol
-from robocas_ms3.evaluation.rollout import NOT_FINITE, EndConditions, EpisodeBatch, Rollout, as_chunks, rollout
+from robocas_ms3.evaluation.rollout import NOT_FINITE, EndConditions, EpisodeBatch, Rollout, rollout
 from robocas_ms3.evaluation.settings import EvaluationSettings
 from robocas_ms3.evaluation.stepping import UPSTREAM_HZ, PolicyStepping, env_kwargs
 from robocas_ms3.evaluation.weld import check_weld
@@ -191,7 +191,7 @@ class EvaluationSession:
         batch = self._batch
         if batch is None or not batch.running:
             raise EvaluationError("no episode is running", fix="Call reset first.")
-        chunks = as_chunks(np.asarray(actions, np.float32), batch.num_envs, batch.action_size, where="step")
+        chunks = as_chunks(actions, batch.num_envs, batch.action_size, where="step")
         seconds = (time.perf_counter() - self._observed) / len(batch.running)
         for env, running in batch.running.items():
             running.inference_seconds += seconds
@@ -303,12 +303,8 @@ class EvaluationSession:
         rules, name = self.protocol.rules, self.settings.policy
         pack = sha256(load_pack(rules.pack).root / MANIFEST)
         if pack != rules.pack_hash:
-            raise EvaluationError(
-                "the installed object pack is not the protocol's",
-                where=rules.name,
-                expected=rules.pack_hash,
-                found=pack,
-            )
+            what = "the installed object pack is not the protocol's"
+            raise EvaluationError(what, where=rules.name, expected=rules.pack_hash, found=pack)
         values = {
             "protocol": rules.name,
             "protocol_hash": self.protocol.hash,

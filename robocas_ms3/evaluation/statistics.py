@@ -75,15 +75,6 @@ class Comparison:
         return (self.only_a - self.only_b) / self.n
 
 
-@dataclass(frozen=True)
-class Bin:
-    """Success rate of the episodes whose value is in [low, high); ``share`` is None where there are none."""
-
-    low: float
-    high: float
-    share: Share | None
-
-
 def share(k: int, n: int, level: float = 0.95) -> Share:
     """Return a rate with its exact interval, which holds the true rate in at least ``level`` of all evaluations.
 
@@ -158,8 +149,8 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return adjusted.tolist()
 
 
-def success_by(values: ArrayLike, successes: ArrayLike, edges: Sequence[float]) -> list[Bin]:
-    """Return success rates over bins of a number that each episode has, such as p_vis.
+def success_by(values: ArrayLike, successes: ArrayLike, edges: Sequence[float]) -> list[Share | None]:
+    """Return success rates over bins of a number that each episode has, such as p_vis; None: an empty bin.
 
     Args:
         values: (n,) the numbers, within the outermost edges.
@@ -169,10 +160,7 @@ def success_by(values: ArrayLike, successes: ArrayLike, edges: Sequence[float]) 
     done, ends = np.asarray(successes, dtype=bool), np.asarray(edges, dtype=float)
     place = np.minimum(np.searchsorted(ends, np.asarray(values), side="right") - 1, len(ends) - 2)
     groups = [done[place == number] for number in range(len(ends) - 1)]
-    return [
-        Bin(low, high, share(int(group.sum()), group.size) if group.size else None)
-        for low, high, group in zip(edges[:-1], edges[1:], groups, strict=True)
-    ]
+    return [share(int(group.sum()), group.size) if group.size else None for group in groups]
 
 
 def mcnemar_power(n: int, difference: float, discordant: float, *, alpha: float = 0.05) -> float:

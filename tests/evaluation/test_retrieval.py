@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from robocas_ms3.evaluation.metrics import RetrievalOrder, needed
-from robocas_ms3.evaluation.outcomes import Retrieval, summarize_retrieval
+from robocas_ms3.evaluation.outcomes import Retrieval
 
 TARGET, LID, CUP, PEAR = range(4)
 NAMES = ("target", "lid", "cup", "pear")
@@ -93,18 +93,6 @@ def test_a_target_that_was_never_held_has_no_order():
     assert (found.score, found.left, len(found.moved)) == (None, 0, 1)
     nothing = np.zeros((4, 3), np.int16)
     assert Retrieval.of(nothing, NAMES, held_at=5, cleared=True).score == 1.0
-
-
-def test_several_episodes_are_summed_up_where_the_target_was_held():
-    episodes = [
-        Retrieval.of(kept_of({CUP: 10, LID: 60, PEAR: 81}), NAMES, held_at=90, cleared=True),
-        Retrieval.of(kept_of({LID: 20}), NAMES, held_at=50, cleared=False),
-        Retrieval.of(kept_of({CUP: 10}), NAMES, held_at=None, cleared=False),
-        None,
-    ]
-    found = summarize_retrieval(episodes)
-    assert found == (2, pytest.approx(0.33335), 2.0, 0.75, 0.5)
-    assert summarize_retrieval(episodes[2:]) is None
 
 
 def test_envs_begin_anew_on_their_own():

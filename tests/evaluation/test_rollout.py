@@ -79,7 +79,7 @@ def test_chunks_begin_with_images(chunk, looks, fits):
 def test_actions_of_another_shape_are_refused():
     policy = Obedient()
     policy.act = lambda observations: np.zeros((2, 6))
-    with pytest.raises(EvaluationError, match=r"expected \(1, 7\) or \(1, chunk, 7\), found \(2, 6\)"):
+    with pytest.raises(EvaluationError, match=r"expected \(1, 7\) or \(1, chunk, 7\) numbers, found \(2, 6\)"):
         play(CountingEnv(1, None), policy, starts([4]), 7)
 
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import ExitStack
-from typing import Any
+from copy import deepcopy
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
-from gymnasium.vector.utils import batch_space
+from gymnasium.vector.utils import batch_space, create_empty_array
 from numpy.typing import ArrayLike, NDArray
 
 from robocas_ms3.core.errors import EvaluationError
@@ -23,16 +24,15 @@ from robocas_ms3.robots.table import find_robot
 
 
 class ProtocolVectorEnv(gym.vector.VectorEnv):
-    """Runs the frozen episodes of one task, N at a time.
+    """Run the frozen episodes of one task, N at a time.
 
     A seed is the index of an episode in the task's list, modulo the length of the list. There is no automatic reset:
     an env whose episode has ended returns its last observation until the next reset.
 
     Observations: ``pixels`` by camera (N, H, W, 3) uint8; ``agent_pos`` (N, 18), ``joint_velocity`` (N, 7),
     ``arm_base`` (N, 7) and ``gripper_open`` (N, 1) float32, the state columns of our LeRobot datasets; with depth
-    ``images.CAMERA_depth`` (N, 1, H, W) float32 in mm, 0 where nothing was measured. Reward: 1 at the step where an
-    episode ends with success, else 0. ``info["is_success"]`` (N,): whether it has; at steps where an episode ends the
-    same array is in ``info["final_info"]``.
+    ``images.CAMERA_depth`` (N, 1, H, W) float32 in mm, 0: nothing measured. Reward: 1 at the step where an episode ends
+    with success, else 0. ``info["is_success"]`` (N,) is also in ``info["final_info"]`` at steps where an episode ends.
 
     Args:
         spec: cameras, action convention and rate.
@@ -79,8 +79,7 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         self._grippers: list[float | None] = [None] * count  # last command, -1 closed to 1 open
         self._success, self._truncated = np.zeros(count, bool), np.zeros(count, bool)
         self._ended = np.ones(count, bool)
-        self._obs: dict[str, NDArray[Any]] = {}
-        self._pixels: dict[str, NDArray[np.uint8]] = {}
+        self._obs: dict[str, Any] = {}
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: Mapping[str, Any] | None = None
@@ -111,13 +110,9 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
             self._proprioception.reset(env, obs, robot)
         for flags in (self._ended, self._success, self._truncated):
             flags[:] = False
-        self._obs = {name: np.zeros((self.num_envs, *shape), np.float32) for name, shape in _shapes(self._spec)}
-        self._pixels = {
-            name: np.zeros((self.num_envs, height, width, 3), np.uint8)
-            for name, (width, height) in self._spec.cameras.items()
-        }
+        self._obs = cast(dict[str, Any], create_empty_array(self.single_observation_space, self.num_envs))
         self._read(list(range(self.num_envs)))
-        return self._shown(), self._info()
+        return deepcopy(self._obs), self._info()  # the caller may keep them
 
     def step(
         self, actions: ArrayLike
@@ -147,11 +142,11 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         reward = (self._success & ~before).astype(np.float64)
         just_ended = np.isin(np.arange(self.num_envs), running) & self._ended
         terminated, truncated = self._ended & ~self._truncated, self._truncated.copy()
-        return self._shown(), reward, terminated, truncated, self._info(just_ended)
+        return deepcopy(self._obs), reward, terminated, truncated, self._info(just_ended)
 
     def render(self) -> tuple[NDArray[np.uint8], ...]:
         """Return the first camera's image (H, W, 3) of each env."""
-        return tuple(next(iter(self._pixels.values())).copy())
+        return tuple(next(iter(self._obs["pixels"].values())).copy())
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """Return ``task``, ``task_description`` or ``_max_episode_steps`` of each env."""
@@ -179,7 +174,7 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         return np.where(opened, 1.0, -1.0).tolist()
 
     def _record(self, envs: list[int]) -> None:
-        """Take over the outcomes of episodes that have just ended in some of these envs."""
+        """Record the outcomes of episodes that have just ended in some of these envs."""
         for env in envs:
             outcome = self._session.outcomes.get(env)
             if outcome is None:
@@ -191,21 +186,15 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
                 self._recorded.add(outcome.episode)
 
     def _read(self, envs: list[int]) -> None:
-        """Read the observations of envs."""
         obs = self._session.observation
         for env in envs:
             for name, values in self._proprioception.read(env, obs, self._grippers[env]).items():
                 self._obs[name][env] = values
-        for camera, pixels in self._pixels.items():
+        for camera, pixels in self._obs["pixels"].items():
             images = obs["sensor_data"][camera]
             pixels[envs] = images["rgb"][envs]
             if self._spec.depth:
                 self._obs[depth_key(camera)][envs] = images["depth"][envs].transpose(0, 3, 1, 2)
-
-    def _shown(self) -> dict[str, Any]:
-        """Copies, because the caller may keep them."""
-        pixels = {name: value.copy() for name, value in self._pixels.items()}
-        return {"pixels": pixels, **{name: value.copy() for name, value in self._obs.items()}}
 
     def _info(self, just_ended: NDArray[np.bool_] | None = None) -> dict[str, Any]:
         info: dict[str, Any] = {"is_success": self._success.copy(), "_is_success": np.ones(self.num_envs, bool)}
@@ -215,16 +204,11 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         return info
 
 
-def _shapes(spec: PolicySpec) -> list[tuple[str, tuple[int, ...]]]:
-    """Names and shapes of the float32 entries of one env's observation."""
-    depths = [(depth_key(name), (1, h, w)) for name, (w, h) in spec.cameras.items()] if spec.depth else []
-    return [*((name, (width,)) for name, width in WIDTHS.items()), *depths]
-
-
 def _space(spec: PolicySpec) -> gym.spaces.Dict:
-    numbers: dict[str, gym.Space[Any]] = {
-        name: gym.spaces.Box(-np.inf, np.inf, shape, np.float32) for name, shape in _shapes(spec)
-    }
+    """Return the space of one env's observation."""
+    depths = [(depth_key(name), (1, h, w)) for name, (w, h) in spec.cameras.items()] if spec.depth else []
+    shapes = [*((name, (width,)) for name, width in WIDTHS.items()), *depths]
+    numbers: dict[str, gym.Space[Any]] = {name: gym.spaces.Box(-np.inf, np.inf, shape) for name, shape in shapes}
     pixels: dict[str, gym.Space[Any]] = {
         name: gym.spaces.Box(0, 255, (h, w, 3), np.uint8) for name, (w, h) in spec.cameras.items()
     }

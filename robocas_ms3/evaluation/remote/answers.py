@@ -9,12 +9,11 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import EvaluationError, PolicyFailed, RobocasError, WireError
 from robocas_ms3.core.paths import builtin_packs_dir, data_dir, protocols_dir
-from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, Policy, policy_code
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, Policy, as_chunks, policy_code
 from robocas_ms3.evaluation.remote.messages import (
     ACTIONS,
     BATCH,
@@ -158,7 +157,7 @@ class Answers:
         with policy_code(self._policy):
             if starts:
                 self._policy.reset(starts)
-            return _chunks(self._policy.act(observations), len(observations.envs))
+            return as_chunks(self._policy.act(observations), len(observations.envs), None)
 
     def _act_or_explain(self, observations: Observations, starts: list[EpisodeSpec]) -> tuple[Any, dict[int, str]]:
         """Return the policy's (E, H, A) actions, and by env why it has none; an error without an env is that of all."""
@@ -169,7 +168,7 @@ class Answers:
             _log.warning("%s", failed)
             reasons, text = {env: one_line(reason, 300) for env, reason in failed.reasons.items()}, error_line(failed)
             if failed.actions is not None:
-                return _chunks(failed.actions, len(observations.envs)), reasons
+                return as_chunks(failed.actions, len(observations.envs), None), reasons
         except RobocasError as error:
             _log.warning("the policy failed: %s", error)
             text = error_line(error)
@@ -207,16 +206,3 @@ def read_episode_spec(message: Mapping[str, Any], env: int) -> EpisodeSpec:
             found = one_line(repr(value), 80)
             raise WireError("invalid start of an episode", where=f"{START}.{name}", expected=expected, found=found)
     return replace(blank, **said)
-
-
-def _chunks(acted: Any, count: int) -> NDArray[Any]:
-    """Return (E, H, A) actions of a policy's (E, A) or (E, H, A).
-
-    Raises:
-        EvaluationError: they are something else.
-    """
-    actions = np.asarray(acted)
-    if actions.dtype.kind not in "iuf" or actions.ndim not in (2, 3) or len(actions) != count:
-        expected = f"({count}, size) or ({count}, chunk, size) numbers"
-        raise EvaluationError("actions don't fit", expected=expected, found=f"{actions.shape} {actions.dtype}")
-    return actions[:, None] if actions.ndim == 2 else actions

@@ -54,7 +54,7 @@ class ServerMetadata(BaseModel):
         answers_pings: whether the server answers websocket pings during inference.
     """
 
-    model_config = ConfigDict(strict=True, frozen=True, populate_by_name=True)
+    model_config = ConfigDict(strict=True, frozen=True)
 
     spec: Any = Field(default=None, alias="robocas_wants")
     policy: Annotated[Any, BeforeValidator(_as_json)] = Field(default=None, alias="robocas_policy")
@@ -130,7 +130,7 @@ def read_observations(messages: Sequence[Mapping[str, Any]], envs: Sequence[int]
     """
 
     def stack(name: str, dtype: str, *shape: int | None) -> NDArray[Any]:
-        arrays = [message.get(PREFIX + name) for message in messages]
+        arrays: list[Any] = [message.get(PREFIX + name) for message in messages]
         for found in arrays:
             if not (
                 isinstance(found, np.ndarray)

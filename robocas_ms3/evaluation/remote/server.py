@@ -61,7 +61,12 @@ class PolicyServer:
         max_batch = batch_limit(spec, max_batch)
         self._max_bytes = message_bytes(spec, max_batch)
         about = {**describe(policy), "robocas_ms3": __version__}
-        metadata = ServerMetadata(spec=policy_spec_values(spec), policy=about, max_batch=max_batch, answers_pings=True)
+        metadata = ServerMetadata(
+            robocas_wants=policy_spec_values(spec),
+            robocas_policy=about,
+            robocas_max_batch=max_batch,
+            robocas_answers_pings=True,
+        )
         self._metadata = pack(metadata.model_dump(by_alias=True))
         self._answers = Answers(policy, files or ServedFiles.of(), self._max_bytes, max_batch)
         self._calls: SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None] = SimpleQueue()

@@ -28,7 +28,7 @@ def pack(value: Any) -> bytes:
         WireError: it holds something else.
     """
     try:
-        return msgpack.packb(value, default=_encode)
+        return msgpack.Packer(default=_encode).pack(value)
     except (TypeError, ValueError, OverflowError) as error:
         raise WireError("can't be sent", found=error) from error
 

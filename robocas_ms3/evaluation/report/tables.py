@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from robocas_ms3.core.words import count_of, in_markdown
-from robocas_ms3.evaluation.outcomes import STAGES, Outcome, summarize_retrieval
+from robocas_ms3.evaluation.outcomes import STAGES, Outcome
 from robocas_ms3.evaluation.results import Result
 from robocas_ms3.evaluation.statistics import Share, success_by
 from robocas_ms3.scenes.task_specs import STAGES as DEFAULT_STAGES
@@ -184,7 +184,8 @@ def _failures(result: Result) -> Table:
 
 def _occlusion(hidden: list[Outcome]) -> Table:
     bins = success_by([one.p_vis or 0.0 for one in hidden], [one.success for one in hidden], P_VIS_EDGES)
-    rows = [(f"{b.low:g} to {b.high:g}", str(b.share.n if b.share else 0), b.share) for b in bins]
+    edges = zip(P_VIS_EDGES[:-1], P_VIS_EDGES[1:], bins, strict=True)
+    rows = [(f"{low:g} to {high:g}", str(share.n if share else 0), share) for low, high, share in edges]
     configs = ", ".join(sorted({outcome.config for outcome in hidden}))
     note = f"By p_vis, the share of the target that is visible from above at the start; episodes of {configs}."
     return Table("Success by occlusion", note, ("p_vis", "n#", "success%"), rows)
@@ -193,12 +194,14 @@ def _occlusion(hidden: list[Outcome]) -> Table:
 def _retrieval(result: Result) -> Iterator[Table]:
     rows = []
     for config, outcomes in result.by("config").items():
-        found = summarize_retrieval(outcome.retrieval for outcome in outcomes)
-        if found is not None:
-            needed = f"{100 * found.needed:.0f} %"
-            rows.append(
-                (config, str(found.held), f"{found.score:.2f}", f"{found.moved:.1f}", needed, f"{found.left:.1f}")
-            )
+        orders = [one.retrieval for one in outcomes if one.retrieval is not None]
+        held = [(order, order.score) for order in orders if order.score is not None]
+        if held:
+            moved = [move for order, _ in held for move in order.moved]
+            score, left = mean([score for _, score in held]), mean([order.left for order, _ in held])
+            needed = sum(move.needed for move in moved) / max(len(moved), 1)
+            counts = (f"{len(moved) / len(held):.1f}", f"{100 * needed:.0f} %", f"{left:.1f}")
+            rows.append((config, str(len(held)), f"{score:.2f}", *counts))
     note = (
         "Objects that were moved before the target was first held. Needed: they hid or hemmed it in, or lay over one "
         "that did. The score is the share, of what was moved or left in the way, that was needed and moved from the "

@@ -60,6 +60,9 @@ def test_splits_are_side_by_side(tmp_path):
 def test_objects_moved_before_the_target_are_summed_up(tmp_path):
     move = {"object": "lid", "step": 3, "needed": True, "in_order": True}
     order = {"moved": [move, {**move, "needed": False, "in_order": False}], "needed": ["lid"], "left": 0, "score": 0.5}
-    said = markdown(write(tmp_path / "a", [outcome(0, retrieval=order), outcome(1)]))
-    assert row(said.partition("Retrieval order")[2], "table") == ["table", "1", "0.50", "2.0", "50 %", "0.0"]
+    other = {**order, "moved": [move], "left": 1, "score": 1.0}
+    never_held = {**other, "score": None}
+    orders = [outcome(number, retrieval=one) for number, one in enumerate((order, other, never_held))]
+    said = markdown(write(tmp_path / "a", [*orders, outcome(3)]))
+    assert row(said.partition("Retrieval order")[2], "table") == ["table", "2", "0.75", "1.5", "67 %", "0.5"]
     assert "Retrieval order" not in markdown(write(tmp_path / "b", [outcome(1)]))
