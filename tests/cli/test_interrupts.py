@@ -23,8 +23,10 @@ except KeyboardInterrupt:
 """
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-@pytest.mark.parametrize(("seconds", "said"), [(0.5, "interrupted\n"), (100, "")])
+@pytest.mark.parametrize(
+    ("number", "code", "seconds", "said"),
+    [(signal.SIGINT, 130, 0.5, "interrupted\n"), (signal.SIGINT, 130, 100, ""), (signal.SIGTERM, 143, 100, "")],
+)
 def test_it_ends_once_and_soon(seconds, said, number, code):
     env = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[2])}
     words = [sys.executable, "-c", PROGRAM, str(seconds)]

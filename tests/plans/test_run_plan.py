@@ -90,7 +90,7 @@ def test_shards_in_any_order_make_the_same(undisturbed, tmp_path):
     assert_same(undisturbed, out)
 
 
-@pytest.mark.parametrize("text", ["3/2", "2/2", "1", "-1/2", "1/0", "a/b", "1/2/3"])
+@pytest.mark.parametrize("text", ["2/2", "1", "-1/2", "1/2/3"])
 def test_an_invalid_shard_is_refused(text):
     with pytest.raises(PlanError):
         parse_shard(text)
@@ -140,41 +140,29 @@ def test_a_process_that_dies_once_costs_nothing(undisturbed, tmp_path):
 
 def test_a_seed_that_kills_twice_is_left_out_and_another_takes_its_place(tmp_path):
     out = tmp_path / "out"
-    plan_faults(out, {11: ["crash", "crash", "crash"], 12: ["fail"]})
+    plan_faults(out, {11: ["crash", "crash", "crash"], 12: ["fail"], 13: ["damaged", "damaged"]})
     report = run_here(out)
-    assert report["parts"]["a"]["seeds"] == [10, 13, 14, 15, 16]
-    found = read_status(out)
-    assert found.parts[0].failed == {"record: SIGSEGV": 1, "grasp: slipped": 1}
+    assert report["parts"]["a"]["seeds"] == [10, 14, 15, 16, 17]
+    found, damaged = read_status(out), "record: DatasetError: this recording is damaged"
+    assert found.parts[0].failed == {"record: SIGSEGV": 1, "grasp: slipped": 1, damaged: 1}
     assert (found.parts[0].done, found.parts[0].wanted) == (5, 5)
     assert found.finished
-    assert deaths_of(out) == [(11, "record: SIGSEGV")] * 2
+    assert deaths_of(out) == [(11, "record: SIGSEGV")] * 2 + [(13, damaged)] * 2
 
 
 def test_an_error_of_all_seeds_ends_the_run_which_continues_later(undisturbed, tmp_path):
     out = tmp_path / "out"
-    plan_faults(out, {13: ["refuse"]})
+    plan_faults(out, {12: ["limit"], 13: ["refuse"]})
+    with pytest.raises(RobocasError, match="can't start another process"):
+        run_here(out)
     with pytest.raises(MissingExtraError):
         run_here(out)
     run_here(out)
+    assert deaths_of(out) == []  # of no seed
     assert_same(undisturbed, out)
     before = (out / "report.json").stat().st_mtime_ns
     run_here(out)  # nothing is left to do
     assert (out / "report.json").stat().st_mtime_ns == before
-
-
-def test_a_system_without_another_process_is_no_seed_s_fault(undisturbed, tmp_path):
-    out = tmp_path / "out"
-    plan_faults(out, {12: ["limit"]})
-    with pytest.raises(RobocasError, match="can't start another process"):
-        run_here(out)
-    run_here(out)
-    assert deaths_of(out) == []
-    assert_same(undisturbed, out)
-
-
-def test_a_damaged_recording_is_a_seed_s_own(tmp_path):
-    plan_faults(tmp_path / "out", {11: ["damaged", "damaged"]})
-    assert run_here(tmp_path / "out")["parts"]["a"]["seeds"] == [10, 12, 13, 14, 15]
 
 
 def test_a_machine_that_cannot_open_a_part_does_no_seed(tmp_path):
@@ -310,11 +298,10 @@ def of_group(process, group):
         return False
 
 
-@pytest.mark.parametrize("seeds", [0, 2])
-def test_ctrl_c_ends_all_processes_and_blames_no_seed(undisturbed, tmp_path, seeds):
+def test_ctrl_c_ends_all_processes_and_blames_no_seed(undisturbed, tmp_path):
     out = tmp_path / "out"
     with in_a_process(out) as process:
-        wait_until(lambda: (out / "plan.json").is_file() and seeds_done(out) >= seeds, process)
+        wait_until(lambda: seeds_done(out) >= 2, process)
         time.sleep(0.3)  # processes that record or render are starting
         os.killpg(process.pid, signal.SIGINT)
         _, said = process.communicate(timeout=30)
@@ -341,7 +328,7 @@ def test_a_process_that_cannot_begin_ends_the_run_and_blames_no_seed(tmp_path):
 
 def test_killed_at_any_moment_it_continues_and_ends_the_same(undisturbed, tmp_path):
     out = tmp_path / "out"
-    for seeds in (0, 1, 4):
+    for seeds in (0, 4):
         with in_a_process(out) as process:
             wait_until(lambda seeds=seeds: (out / "plan.json").is_file() and seeds_done(out) >= seeds, process)
             os.killpg(process.pid, signal.SIGKILL)
