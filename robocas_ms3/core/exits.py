@@ -35,7 +35,6 @@ class _CommandInterrupt:
         self._handled = threading.Event()
 
     def install(self, handler: Handler) -> None:
-        """Handle SIGINT by a command's handler."""
         read, write = os.pipe()
         os.set_blocking(write, False)
         signal.set_wakeup_fd(write, warn_on_full_buffer=False)
@@ -45,7 +44,6 @@ class _CommandInterrupt:
         self.arm()
 
     def handle(self, number: int, frame: FrameType | None) -> None:
-        """Call the command's handler."""
         self._handled.set()
         self._handler(number, frame)
 
@@ -54,10 +52,9 @@ class _CommandInterrupt:
         return self.installed and signal.getsignal(signal.SIGINT) == self.handle
 
     def arm(self) -> None:
-        """Let the system restore its default when the first SIGINT comes.
+        """Let the system restore its default when the first SIGINT comes, if the C library has ``sysv_signal``.
 
-        So the second one ends the process even while native code keeps the thread of `_watch` from running. Only where
-        the C library has ``sysv_signal``.
+        So the second one ends the process even while native code keeps the thread of `_watch` from running.
         """
         libc = ctypes.CDLL(None)
         action = ctypes.create_string_buffer(1024)  # a `struct sigaction`, which begins with the handler

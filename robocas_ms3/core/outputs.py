@@ -25,8 +25,6 @@ from robocas_ms3.core.files import empty_folder, is_fixed, json_text, make_folde
 from robocas_ms3.core.locks import LOCK, locked_folder
 
 _LEFTOVERS = (".*.tmp*", ".*.old")  # of `files.replacing` and `files.replacing_folder` in a process that was killed
-# Files that do not count as content
-_HIDDEN = (LOCK, *_LEFTOVERS)
 _SHOWN_CHANGES = 8
 _SHOWN_VALUE = 60  # characters
 
@@ -37,11 +35,10 @@ class FolderKind:
 
     Attributes:
         command: which writes them, such as ``robocas generate``.
-        records: paths inside of the JSON file with the settings. `OutputFolder.start` writes the first; the folder
-            of a finished run may have another.
-        key: a key that this command's record has, and the record of no other command.
-        marks: other paths inside by which such a folder is known. Without a record it can't be continued, but it may
-            be overwritten.
+        records: paths of the JSON file with the settings. `OutputFolder.start` writes the first; the folder of a
+            finished run may have another.
+        key: a key that the record of this command has, and of no other.
+        marks: other paths by which such a folder is known. Without a record it can only be overwritten.
         upgrade: returns a record as its settings are compared, such as one of an older version with defaults.
     """
 
@@ -171,31 +168,25 @@ class OutputFolder:
         return next((path for path in paths if path.is_file()), paths[0])
 
     def _load_matching(self) -> dict[str, Any] | None:
-        """Return the record; None if there is nothing to continue."""
+        """Return the record, or None if there is nothing to continue."""
         if is_empty(self.path):
             return None
-        record = self._load()
+        record = None
+        with suppress(OSError, ValueError):
+            record = load_json(self._record_path())
+        if not isinstance(record, dict) or self._kind.key not in record:
+            record = None
         if record is None:
             if not any((self.path / mark).exists() for mark in self._kind.marks):
-                what, expected = f"this is not an output of `{self._kind.command}`", " or ".join(self._known_by())
+                known_by = [f"{self._kind.records[0]} with {self._kind.key!r}", *self._kind.marks]
+                what, expected = f"this is not an output of `{self._kind.command}`", " or ".join(known_by)
                 raise OutputExistsError(what, where=self.path, expected=expected, fix="Choose another.")
             if not self._overwrite and self._has_results():
                 what, fix = "there are no recorded settings to continue with", "Pass --overwrite to start again."
                 raise OutputExistsError(what, where=self._record_path(), fix=fix)
         return None if self._overwrite or not self._has_results() else record
 
-    def _load(self) -> dict[str, Any] | None:
-        try:
-            record = load_json(self._record_path())
-        except (OSError, ValueError):
-            return None
-        return record if isinstance(record, dict) and self._kind.key in record else None
-
-    def _known_by(self) -> list[str]:
-        return [f"{self._kind.records[0]} with {self._kind.key!r}", *self._kind.marks]
-
     def _has_results(self) -> bool:
-        """Return whether a file besides the record has content."""
         records = {self.path / record for record in self._kind.records}
         return any(path not in records and path.lstat().st_size for path in _content(self.path))
 
@@ -203,7 +194,7 @@ class OutputFolder:
 def _content(folder: Path) -> Iterator[Path]:
     """Yield the files in a folder and below it that are not hidden."""
     for entry in folder.iterdir() if folder.is_dir() else ():
-        if any(fnmatchcase(entry.name, pattern) for pattern in _HIDDEN):
+        if _is_hidden(entry):
             continue
         if entry.is_dir() and not entry.is_symlink():
             yield from _content(entry)
@@ -211,11 +202,15 @@ def _content(folder: Path) -> Iterator[Path]:
             yield entry
 
 
+def _is_hidden(path: Path) -> bool:
+    return any(fnmatchcase(path.name, pattern) for pattern in (LOCK, *_LEFTOVERS))
+
+
 def is_empty(path: Path) -> bool:
     """Return whether nothing exists there but an empty folder, or one with a lock and leftovers of a killed run."""
     if not path.is_dir():
         return not path.exists()
-    return all(any(fnmatchcase(entry.name, pattern) for pattern in _HIDDEN) for entry in path.iterdir())
+    return all(map(_is_hidden, path.iterdir()))
 
 
 def check_replaceable(path: Path | str, *, overwrite: bool | None = None, marks: Sequence[str] = ()) -> None:
@@ -262,7 +257,7 @@ def _delete(path: Path) -> None:
 
 
 def _finish_deletion(path: Path) -> None:
-    """Delete what an overwriting run that was killed has only renamed."""
+    """Delete a folder that an overwriting run renamed before it was killed."""
     for old in path.parent.glob(f".{glob.escape(path.name)}.*.old"):
         if not (old / "old").exists():  # else `files.replacing_folder` may put it back
             shutil.rmtree(old, ignore_errors=True)

@@ -34,54 +34,48 @@ def main(descriptor: int, parent: int) -> None:
     escape_tracebacks()
     tqdm.set_lock(threading.RLock())  # its own is a semaphore of the system, which a killed process leaves behind
     with suppress(EOFError, OSError):
-        _Server(Connection(descriptor)).serve()
+        _serve(Connection(descriptor))
     end_process(0)
 
 
-class _Server:
-    """Answers each message of the pool with a result or a `RemoteError`."""
+def _serve(connection: Connection) -> None:
+    """Make the worker, then run tasks; answer each message with a result or a `RemoteError`."""
+    make_worker: Any = None
+    worker: Any = None
 
-    def __init__(self, connection: Connection) -> None:
-        self._connection = connection
-        self._make_worker: Any = None
-        self._worker: Any = None
+    def start(pickled: bytes) -> None:
+        nonlocal make_worker, worker
+        make_worker = pickle.loads(pickled)
+        worker = make_worker()
 
-    def serve(self) -> None:
-        """Make the worker, then run tasks.
-
-        Raises:
-            OSError: the pool is gone; or EOFError.
-        """
-        self._connection.send(None)
-        self._answer(self._start)
-        while True:
-            self._answer(self._run)
-
-    def _start(self, make_worker: bytes) -> None:
-        self._make_worker = pickle.loads(make_worker)
-        self._worker = self._make_worker()
-
-    def _run(self, task: Any) -> Any:
-        if self._worker is None:
-            self._worker = self._make_worker()
+    def run(task: Any) -> Any:
+        nonlocal worker
+        if worker is None:
+            worker = make_worker()
         try:
-            return self._worker.run(task)
+            return worker.run(task)
         except BaseException:
-            worker, self._worker = self._worker, None
-            worker.close()
+            failed, worker = worker, None
+            failed.close()
             raise
 
-    def _answer(self, function: Callable[[Any], Any]) -> None:
-        message = self._connection.recv_bytes()
-        try:
-            answer = function(pickle.loads(message))
-        except KeyboardInterrupt as error:  # of the code: the process ignores Ctrl-C
-            answer = RemoteError.of(exit_error(error, "a worker"), "a worker")
-        except BaseException as error:  # noqa: BLE001  (it is raised again in the pool's process)
-            answer = RemoteError.of(error, "a worker")
-        try:
-            self._connection.send(answer)
-        except OSError:
-            raise
-        except Exception as error:  # the result can't be pickled
-            self._connection.send(RemoteError.of(error, "a worker"))
+    connection.send(None)
+    _answer(connection, start)
+    while True:
+        _answer(connection, run)
+
+
+def _answer(connection: Connection, function: Callable[[Any], Any]) -> None:
+    message = connection.recv_bytes()
+    try:
+        answer = function(pickle.loads(message))
+    except KeyboardInterrupt as error:  # of the code: the process ignores Ctrl-C
+        answer = RemoteError.of(exit_error(error, "a worker"), "a worker")
+    except BaseException as error:  # noqa: BLE001  (it is raised again in the pool's process)
+        answer = RemoteError.of(error, "a worker")
+    try:
+        connection.send(answer)
+    except OSError:
+        raise
+    except Exception as error:  # the result can't be pickled
+        connection.send(RemoteError.of(error, "a worker"))

@@ -22,7 +22,6 @@ import threading
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import CancelledError
 from contextlib import suppress
-from dataclasses import dataclass
 from itertools import islice
 from multiprocessing import Pipe
 from queue import Empty, SimpleQueue
@@ -40,19 +39,11 @@ _TASKS_PER_WORKER = 2  # running and queued, so that no worker waits for its nex
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
 class FunctionWorker(Generic[Task, Result]):
-    """A worker that calls a function.
+    """A worker that calls a function."""
 
-    Attributes:
-        function: task -> result.
-    """
-
-    function: Callable[[Task], Result]
-
-    def run(self, task: Task) -> Result:
-        """Call the function."""
-        return self.function(task)
+    def __init__(self, function: Callable[[Task], Result]) -> None:
+        self.run = function
 
     def close(self) -> None:
         """Do nothing."""
@@ -192,7 +183,7 @@ class WorkerPool(Generic[Task, Result]):
             except WorkerCrashed as crash:
                 reason = str(crash.found)
                 if retries_left:
-                    _log.warning("%s: its worker process died (%s); it is tried again", _name(task), reason)
+                    _log.warning("%.80s: its worker process died (%s); it is tried again", task, reason)
         return self._on_crash(task, reason)
 
     def stop(self) -> None:
@@ -226,7 +217,7 @@ class WorkerPool(Generic[Task, Result]):
 
 
 class _Job(Generic[Task, Result]):
-    """A task, what became of it, and the queue that it goes to then."""
+    """A task, its result, and the queue that it goes to then."""
 
     def __init__(self, task: Task, finished: SimpleQueue[_Job[Task, Result]]) -> None:
         self.task, self.finished = task, finished
@@ -236,16 +227,12 @@ class _Job(Generic[Task, Result]):
 
 
 def use_one_torch_thread() -> None:
-    """Let torch use one thread from now on: several threads of small operations wait for each other."""
+    """Let torch use one thread: several threads of small operations wait for each other."""
     import torch
 
     torch.set_num_threads(1)
 
 
-def _name(task: Any) -> str:
-    return f"{task}"[:80]
-
-
 def _raise_crash(task: Any, reason: str) -> Any:
     what, fix = "its worker process died", "Is memory short? Use fewer --jobs."
-    raise WorkerCrashed(what, where=_name(task), found=reason, fix=fix)
+    raise WorkerCrashed(what, where=f"{task}"[:80], found=reason, fix=fix)

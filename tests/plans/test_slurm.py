@@ -10,16 +10,12 @@ import pytest
 pytest.importorskip("submitit", reason='plans on Slurm need submitit: pip install -e ".[slurm]"')
 
 from plan_stages import PLAN, assert_same, deaths_of, plan_faults, run_here
-from slurm_runs import LOCAL, NO_SLURM, SLURM, job_at, processes_of, run, slurm_answers, start, wait_for
+from slurm_runs import LOCAL, job_at, processes_of, run, start, wait_for
 
 from robocas_ms3.core.errors import MissingExtraError, PlanError
 from robocas_ms3.plans.executors import open_executor
 
 SUPPORT = Path(__file__).resolve().parents[1] / "support"
-CLUSTERS = [
-    pytest.param(LOCAL, id="local"),
-    pytest.param(SLURM, id="slurm", marks=[pytest.mark.slow, pytest.mark.skipif(not slurm_answers(), reason=NO_SLURM)]),
-]
 
 
 @pytest.fixture(autouse=True)
@@ -27,63 +23,51 @@ def jobs_know_the_made_up_episodes(monkeypatch):
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(SUPPORT), os.environ.get("PYTHONPATH", "")]))
 
 
-@pytest.mark.parametrize("options", CLUSTERS)
 @pytest.mark.parametrize("units_per_job", [1, 2])
-def test_jobs_make_what_this_machine_makes(undisturbed, tmp_path, options, units_per_job):
+def test_jobs_make_what_this_machine_makes(undisturbed, tmp_path, units_per_job):
     out = tmp_path / "out"
-    run(out, options | {"units_per_job": str(units_per_job)})
+    run(out, LOCAL | {"units_per_job": str(units_per_job)})
     assert_same(undisturbed, out)
     wait_for(lambda: not processes_of(out))
 
 
-@pytest.mark.parametrize("options", CLUSTERS)
-def test_a_job_that_is_killed_costs_nothing(undisturbed, tmp_path, options):
+SIGNALS = {"killed": signal.SIGKILL, "time is up": signal.SIGUSR2, "told to end": signal.SIGTERM}
+
+
+@pytest.mark.parametrize("number", SIGNALS.values(), ids=SIGNALS)
+def test_a_job_that_ends_costs_nothing_and_blames_no_seed(undisturbed, tmp_path, number):
     out = tmp_path / "out"
-    plan_faults(out, {11: ["hang"], 4: ["hang"]})
-    runner = start(out, options, stderr=subprocess.PIPE)
-    for seed in (11, 4):
-        job_at(out, seed).kill()
+    plan_faults(out, {11: ["hang"]})
+    runner = start(out, LOCAL, stderr=subprocess.PIPE)
+    job = job_at(out, 11)
+    for process in [*reversed(job.children(recursive=True)), job]:  # Slurm goes through them in no order
+        process.send_signal(number)
     assert runner.wait(240) == 0, runner.stderr.read()
     assert_same(undisturbed, out)
     assert deaths_of(out) == []
 
 
-@pytest.mark.parametrize("number", [signal.SIGUSR2, signal.SIGTERM], ids=["time is up", "told to end"])
-def test_a_signal_to_all_processes_of_a_job_is_blamed_on_no_seed(undisturbed, tmp_path, number):
-    out = tmp_path / "out"
-    plan_faults(out, {11: ["hang"]})
-    runner = start(out, LOCAL)
-    job = job_at(out, 11)
-    for process in [*reversed(job.children(recursive=True)), job]:  # Slurm goes through them in no order
-        process.send_signal(number)
-    assert runner.wait(240) == 0
-    assert_same(undisturbed, out)
-    assert deaths_of(out) == []
-
-
-@pytest.mark.parametrize("options", CLUSTERS)
-def test_ctrl_c_ends_jobs_and_the_plan_continues_later(undisturbed, tmp_path, options):
+def test_ctrl_c_ends_jobs_and_the_plan_continues_later(undisturbed, tmp_path):
     out = tmp_path / "out"
     plan_faults(out, {10: ["hang"]})
-    runner = start(out, options, stderr=subprocess.DEVNULL)
+    runner = start(out, LOCAL, stderr=subprocess.DEVNULL)
     job_at(out, 10)
     runner.send_signal(signal.SIGINT)
     assert runner.wait(30) != 0
     wait_for(lambda: not processes_of(out), 30)
     assert not (out / "report.json").exists()
-    run(out, options)
+    run(out, LOCAL)
     assert_same(undisturbed, out)
 
 
-@pytest.mark.parametrize("options", CLUSTERS)
-def test_jobs_of_a_killed_run_do_no_harm(undisturbed, tmp_path, options):
+def test_jobs_of_a_killed_run_do_no_harm(undisturbed, tmp_path):
     out = tmp_path / "out"
-    runner = start(out, options, stderr=subprocess.DEVNULL)
+    runner = start(out, LOCAL, stderr=subprocess.DEVNULL)
     wait_for(lambda: list(out.glob("units/a/*/.*")))
     runner.kill()
     runner.wait()
     run_here(out)  # while they are at work, on this machine
-    assert_same(undisturbed, out) if not processes_of(out) else wait_for(lambda: not processes_of(out))
+    wait_for(lambda: not processes_of(out))
     run_here(out)
     assert_same(undisturbed, out)
 

@@ -20,7 +20,6 @@ CONF = Path("/etc/slurm/slurm.conf")
 STARTS = Path(__file__).resolve().parents[2] / "scripts" / "slurm_here.sh"
 OURS = CONF.is_file() and "Written by scripts/slurm_here.sh" in CONF.read_text() and os.getuid() == 0
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(not slurm_answers(), reason=NO_SLURM)]
-ours = pytest.mark.skipif(not OURS, reason="this Slurm is not that of scripts/slurm_here.sh: its daemons live on")
 
 
 @pytest.fixture(autouse=True)
@@ -76,79 +75,87 @@ def start_daemons():
     subprocess.run(["bash", STARTS], check=True, capture_output=True, timeout=120)
 
 
+def test_jobs_make_what_this_machine_makes(undisturbed, tmp_path):
+    run(tmp_path / "out", SLURM | {"units_per_job": "2"})
+    assert_same(undisturbed, tmp_path / "out")
+
+
 def test_what_sbatch_refuses_is_said(tmp_path):
     with pytest.raises(PlanError, match="partition"):
         run(tmp_path / "out", {"partition": "none_of_this_name"})
 
 
-def test_a_job_whose_processes_are_killed_costs_nothing(running, undisturbed):
+def kill_processes(running):
     process, _ = running.job()
     for one in [*process.children(recursive=True), *process.parents()[:2], process]:
         if one.name() not in ("slurmstepd", "init", "systemd"):
             one.kill()
-    running.ends_well(undisturbed)
 
 
-def test_a_job_that_is_cancelled_by_hand_costs_nothing(running, undisturbed):
-    say("scancel", running.job()[1])
-    running.ends_well(undisturbed)
-
-
-def test_a_requeued_job_goes_on(running, undisturbed):
-    say("scontrol", "requeue", running.job()[1])
-    running.ends_well(undisturbed)
-
-
-def test_a_job_that_makes_room_for_another_goes_on(running, undisturbed):
-    partitions = say("scontrol", "show", "partition", "--oneliner")
-    if "PartitionName=first" not in partitions:
+def make_room(running):
+    if "PartitionName=first" not in say("scontrol", "show", "partition", "--oneliner"):
         pytest.skip("this Slurm has no partition that preempts: preemption is NOT tested")
     before = running.job()[0]
     say("sbatch", "--partition=first", "--exclusive", "--output=/dev/null", "--wrap", "sleep 1")
     before.wait(60)
-    running.ends_well(undisturbed)
 
 
-@ours
-def test_while_slurmd_is_down_a_job_goes_on(running, undisturbed):
+def kill_slurmd(running):
     kill_all("slurmd")
     process, _ = running.job()
     process.kill()  # nobody says so to the controller before slurmd is back
     start_daemons()
-    running.ends_well(undisturbed)
 
 
-@ours
-def test_a_node_that_is_lost_costs_nothing(running, undisturbed):
+def lose_the_node(running):
     kill_all("slurmd")
     kill_all("slurmstepd", with_children=True)
     start_daemons()
-    running.ends_well(undisturbed)
 
 
-@ours
-def test_without_a_controller_for_a_while_nothing_is_lost(running, undisturbed):
+def kill_the_controller(running):
     kill_all("slurmctld")
     running.job()[0].kill()
     with pytest.raises(subprocess.TimeoutExpired):
         running.process.wait(8)  # it asks and gets no answer
     start_daemons()
-    running.ends_well(undisturbed)
 
 
-def test_a_run_that_is_killed_leaves_jobs_that_the_next_ends(running, undisturbed):
+def kill_the_command(running):
     running.process.kill()
     running.process.wait()
     left, _ = running.job()
     running.process = start(running.out, running.options, stderr=subprocess.PIPE)
-    left.wait(60)
-    running.ends_well(undisturbed)
+    left.wait(60)  # the next command cancels it
 
 
-def test_ctrl_c_cancels_all_jobs(running, undisturbed):
+def interrupt_the_command(running):
     running.process.send_signal(signal.SIGINT)
     assert running.process.wait(10) != 0
     wait_for(lambda: not processes_at(running.out), 30)
     wait_for(lambda: "robocas-out" not in say("squeue", "--noheader", "--format=%j"), 30)
     running.process = start(running.out, running.options, stderr=subprocess.PIPE)
+
+
+FAULTS = {
+    "processes killed": kill_processes,
+    "scancel": lambda running: say("scancel", running.job()[1]),
+    "requeue": lambda running: say("scontrol", "requeue", running.job()[1]),
+    "preempted": make_room,
+    "command killed": kill_the_command,
+    "Ctrl-C": interrupt_the_command,
+}
+OF_DAEMONS = {"slurmd": kill_slurmd, "node": lose_the_node, "slurmctld": kill_the_controller}
+
+
+@pytest.mark.parametrize("fault", FAULTS.values(), ids=FAULTS)
+def test_a_fault_costs_nothing(running, undisturbed, fault):
+    fault(running)
+    running.ends_well(undisturbed)
+
+
+@pytest.mark.skipif(not OURS, reason="this Slurm is not that of scripts/slurm_here.sh: its daemons live on")
+@pytest.mark.parametrize("fault", OF_DAEMONS.values(), ids=OF_DAEMONS)
+def test_a_fault_of_daemons_costs_nothing(running, undisturbed, fault):
+    fault(running)
     running.ends_well(undisturbed)
