@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from robocas_ms3.datasets.writing.settings import Conversion
 
 from robocas_ms3.cli.interrupts import resumable
-from robocas_ms3.cli.options import Maybe
+from robocas_ms3.cli.options import Maybe, Several
 from robocas_ms3.datasets.lerobot.variants import NEWEST, Version
 
 
@@ -45,7 +45,7 @@ class Convert:
     lerobot)."""
     all_videos: bool = False
     """Write videos and contact sheet of more than 20 episodes too."""
-    cameras: tuple[str, ...] = ()
+    cameras: Several[str] = ()
     """Cameras to render, or to take from the dataset. Default: all that there are."""
     size: Maybe[tuple[int, int]] = None
     """Width and height of the images. Default: those of the cameras, 640 480."""
