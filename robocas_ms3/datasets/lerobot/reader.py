@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -23,21 +22,15 @@ from robocas_ms3.datasets.lerobot.depth import to_depth
 from robocas_ms3.datasets.lerobot.language import EVENTS, PERSISTENT, boxes_of, goals_of, read_rows_of
 from robocas_ms3.datasets.lerobot.metadata import Metadata
 from robocas_ms3.datasets.lerobot.records import (
-    SUBGOAL_TYPES,
-    SUBGOALS,
     CameraRecord,
     CamerasRecord,
     frame_columns,
     unknown_numbers,
 )
 from robocas_ms3.datasets.lerobot.tables import (
-    OBJECTS_LIMIT,
     check_columns,
     is_numeric,
     numbers,
-    open_table,
-    read_columns,
-    read_objects,
     read_rows,
 )
 from robocas_ms3.datasets.lerobot.video import read_frames
@@ -97,42 +90,6 @@ class LeRobotDataset(Metadata, EpisodeSource):
         """Return the entry of an episode in ``conversion.json``."""
         entries = self.settings.get("episodes", [])
         return entries[number] if number < len(entries) else {}
-
-    @cached_property
-    def goals(self) -> dict[int, list[SubGoal]]:
-        """Number -> sub-goals over the steps, in one pass over the tables; empty for datasets made elsewhere."""
-        goals: dict[int, list[SubGoal]] = {}
-        for path in sorted((self.root / "data").glob("*/*.parquet")) if self.is_ours else ():
-            for number, types, texts in self._subgoals(path):
-                before = goals.setdefault(number, [])
-                first = before[-1].last + 1 if before else 0
-                for run in subgoal_runs(types, texts):
-                    before.append(replace(run, first=first + run.first, last=first + run.last))
-        return goals
-
-    def _subgoals(self, path: Path) -> Iterator[tuple[int, list[str], list[str]]]:
-        """Yield, of each episode of a file, its number and the types and texts of the sub-goals of its steps."""
-        if not self.has_language:
-            columns = read_objects(path, SUBGOALS, most_rows=self.info["total_frames"])
-            numbers, types, places = (columns.column(key) for key in SUBGOALS)
-            texts = self.subtask_texts(places.to_numpy(), path)
-            for number, steps in groupby(
-                zip(numbers.to_pylist(), types.to_pylist(), texts, strict=True), lambda s: s[0]
-            ):
-                _, kinds, said = zip(*steps, strict=True)
-                yield number, list(kinds), list(said)
-            return
-        with open_table(path, most_rows=self.info["total_frames"]) as file:
-            for group in range(file.num_row_groups):  # the rows of an episode are in each of its frames
-                keys = (*SUBGOAL_TYPES, PERSISTENT)
-                table = read_columns(file, path, keys, groups=[group], limit=OBJECTS_LIMIT)
-                check_columns(table, SUBGOAL_TYPES, path)
-                numbers = table.column("episode_index").to_numpy()
-                starts = np.flatnonzero(np.diff(numbers, prepend=-1))
-                for first, end in zip(starts, [*starts[1:], len(numbers)], strict=True):
-                    rows = read_rows_of(table.slice(first, 1), PERSISTENT, path)[0]
-                    types = table.column(schema.SUBGOAL_TYPE.key).slice(first, end - first).to_pylist()
-                    yield int(numbers[first]), types, goals_of(rows, len(types), self.info["fps"])
 
     def episode(self, number: int) -> LeRobotEpisode:
         """Open an episode."""
@@ -200,24 +157,31 @@ class LeRobotEpisode(SourceEpisode):
         """Arrays of ``episode_info.npz`` without embeddings."""
         if not self.dataset.is_ours:
             raise DatasetError("not of our columns", where=self.where, expected=", ".join(schema.OUR_KEYS))
-        check_columns(self.table, frame_columns(self.dataset.info["features"]), Path(self.where))
+        types, texts = self._subgoals()
         for feature in schema.FEATURES:
             values = self.columns[feature.key]
             if values.shape[1] != feature.width or not (np.abs(values) <= np.finfo(np.float32).max).all():
                 where, expected = f"{self.where}, {feature.key}", f"{feature.width} finite numbers per step"
                 raise DatasetError("wrong numbers", where=where, expected=expected, fix=SEE_VALIDATE)
-        texts = self._subgoal_texts()
-        types = self.table.column(schema.SUBGOAL_TYPE.key).to_pylist()
         try:
             return robocas_arrays(self.columns, self.instruction, texts, types)
         except ValueError as error:  # a quaternion of length 0, a text that is not ASCII
             raise DatasetError("wrong values", where=self.where, found=first_line(error), fix=SEE_VALIDATE) from error
 
-    def _subgoal_texts(self) -> list[str]:
+    @property
+    def goals(self) -> list[SubGoal]:
+        """Sub-goals over the steps; empty for datasets made elsewhere."""
+        return subgoal_runs(*self._subgoals()) if self.dataset.is_ours else []
+
+    def _subgoals(self) -> tuple[list[str], list[str]]:
+        """Return type and text of the sub-goal of each step."""
+        check_columns(self.table, frame_columns(self.dataset.info["features"]), Path(self.where))
+        types = self.table.column(schema.SUBGOAL_TYPE.key).to_pylist()
         if self.dataset.has_language:
-            first = read_rows_of(self.table.slice(0, 1), PERSISTENT, self.where)
-            return goals_of(first[0], self.steps, self.dataset.info["fps"])
-        return self.dataset.subtask_texts(self.columns[schema.SUBTASK_INDEX.key][:, 0], self.where)
+            rows = read_rows_of(self.table.slice(0, 1), PERSISTENT, self.where)[0]
+            return types, goals_of(rows, self.steps, self.dataset.info["fps"])
+        places = self.columns[schema.SUBTASK_INDEX.key][:, 0]
+        return types, self.dataset.subtask_texts(places, self.where)
 
     @cached_property
     def target_boxes(self) -> Sequence[dict[str, Box]]:
@@ -229,11 +193,6 @@ class LeRobotEpisode(SourceEpisode):
         if not self.dataset.has_language:
             return []
         return [boxes_of(rows) for rows in read_rows_of(self.table, EVENTS, self.where)]
-
-    @property
-    def goals(self) -> list[SubGoal]:
-        """Sub-goals over the steps; none where the dataset is not one of ours."""
-        return self.dataset.goals.get(self.number, [])
 
     def _described(self, key: str, otherwise: str) -> dict[str, Any]:
         where = f"{self.where}, {schema.SCENES_FILE}, {key}"

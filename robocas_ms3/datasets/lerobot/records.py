@@ -166,12 +166,6 @@ class CamerasRecord(_Record):
 
 
 SCENES: Mapping[str, Column] = {"episode_index": Column(INTEGER), "scene": Column(TEXT), "cameras": Column(TEXT)}
-SUBGOAL_TYPES: Mapping[str, Column] = {"episode_index": Column(INTEGER), schema.SUBGOAL_TYPE.key: Column(TEXT)}
-SUBGOALS: Mapping[str, Column] = {
-    "episode_index": Column(INTEGER),
-    schema.SUBGOAL_TYPE.key: Column(TEXT),
-    schema.SUBTASK_INDEX.key: Column(INTEGER),
-}
 
 
 def episode_columns(names: Iterable[str], features: Mapping[str, Any]) -> dict[str, Column]:

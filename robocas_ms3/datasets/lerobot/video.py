@@ -86,7 +86,7 @@ class Encoder:
                 "videos need even sizes", where="size", expected="even width and height", found=f"{width} x {height}"
             )
         os.environ.setdefault("SVT_LOG", "1")  # errors only; it would write a page of settings
-        self._frames, self._coding = 0, coding
+        self.frames, self._coding = 0, coding
         self._container = av.open(str(path), "w", options=_CONTAINER)
         try:
             stream: Any = self._container.add_stream(coding.encoder, rate=fps, options=coding.options)
@@ -110,9 +110,9 @@ class Encoder:
         """Append (H, W, 3) uint8 RGB or (H, W) uint16."""
         layout = "rgb24" if picture.ndim == 3 else self._coding.pixels
         frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format=layout)
-        frame.pts, frame.time_base = self._frames, self._time_base
+        frame.pts, frame.time_base = self.frames, self._time_base
         self._container.mux(self._stream.encode(frame))
-        self._frames += 1
+        self.frames += 1
 
 
 class Joiner:

@@ -4,12 +4,11 @@ import errno
 import json
 import os
 import shutil
-import subprocess
 
 import numpy as np
 import pytest
 from managing import change, edit, files_of, make, read
-from synthetic import RayCaster, write_trajectory
+from synthetic import RayCaster
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.checks.dataset import validate
@@ -63,21 +62,6 @@ def test_camera_files_with_pickles(dataset):
     assert any("base_camera/intrinsic.npy: expected a numpy array" in violation for violation in violations(dataset))
 
 
-def test_pictures_through_the_reader(dataset):
-    episode = Dataset(dataset).episode(0)
-    rgb = dataset / "episode_0000000" / "base_camera" / "rgb"
-    (rgb / "0001.png").unlink()
-    (rgb / "0002.png").write_bytes((rgb / "0003.png").read_bytes()[:100])
-    (rgb / "0004.png").write_bytes(b"")
-    with pytest.raises(DatasetError) as error:
-        episode.rgb("base_camera", 1)
-    assert error.value.where == rgb / "0001.png"
-    for step in (2, 4):
-        with pytest.raises(DatasetError) as error:
-            episode.rgb("base_camera", step)
-    assert episode.rgb("base_camera", 0).shape == (48, 64, 3)
-
-
 def test_an_episode_twice(dataset):
     shutil.copytree(dataset / "episode_0000001", dataset / "episode_0000002")
     found = violations(dataset)
@@ -107,24 +91,6 @@ def test_appending_to_a_damaged_dataset_says_which_episode(trajectory, tmp_path)
     with pytest.raises(DatasetError, match=r"episode_0000000.*this episode can't be read.*robocas validate"):
         convert(ConversionSettings(trajectory, root, append=True, embeddings=False, open_renderer=RayCaster))
     assert json.loads((root / "conversion.json").read_text())["episodes"].keys() >= {"0", "1"}
-
-
-def grow(folder, megabytes=16):
-    subprocess.run(["mount", "-o", f"remount,size={megabytes}m", str(folder)], check=True)
-
-
-def test_a_full_disk_ends_a_conversion_which_goes_on_later(small_disk, tmp_path):
-    trajectory = write_trajectory(tmp_path / "F.h5", seeds=range(5))
-    out = small_disk / "out"
-    with pytest.raises(OSError, match="No space left on device"):
-        convert(ConversionSettings(trajectory, out, embeddings=False, open_renderer=RayCaster))
-    left = sorted(path.name for path in out.iterdir())
-    assert left == ["conversion.json", *(f"episode_{n:07d}" for n in range(len(left) - 1))]
-    assert 1 < len(left) < 6
-    grow(small_disk)
-    convert(ConversionSettings(trajectory, out, embeddings=False, open_renderer=RayCaster))
-    convert(ConversionSettings(trajectory, tmp_path / "whole", embeddings=False, open_renderer=RayCaster))
-    assert files_of(out) == files_of(tmp_path / "whole")
 
 
 @pytest.mark.parametrize("moment", (0, 60, 119))

@@ -1,7 +1,6 @@
 """Each way of spoiling ``scene.json`` and ``conversion.json`` is one violation, by key, what is expected and found."""
 
 import json
-import re
 
 import pytest
 
@@ -92,19 +91,11 @@ def test_values_of_another_kind(key):
     ("new", "key", "expected", "found"),
     [
         ({"schema_version": 1}, "schema_version", "2", "1"),
-        ({"task": ["pick"]}, "task", "text", '["pick"]'),
         ({"env_info": {"env_kwargs": {}}}, "env_info.env_id", "this key", "no such key"),
-        ({"env_info": {"env_id": "x", "env_kwargs": "x"}}, "env_info.env_kwargs", "an object", '"x"'),
         ({"seed": "7"}, "seed", "an integer, or a list of one", '"7"'),
-        ({"seed": [1, 2]}, "seed", "an integer, or a list of one", "[1, 2]"),
-        ({"seed": 7.0}, "seed", "an integer, or a list of one", "7.0"),
-        ({"reset_options": []}, "reset_options", "an object", "[]"),
-        ({"config": "pick_table"}, "config", "an object", '"pick_table"'),
-        ({"layout": {"object_ids": "ab"}}, "layout.object_ids", "a list", '"ab"'),
         ({"layout": {"object_ids": ["a", 3]}}, "layout.object_ids.1", "text", "3"),
         ({"layout": {"poses": [POSE[:6]]}}, "layout.poses.0", "7 values", "6"),
         ({"layout": {"poses": [["x"] * 7] * 9}}, "layout.poses.0.0", "a number", '"x"'),
-        ({"layout": {"robot_pose": [*POSE[:6], None]}}, "layout.robot_pose.6", "a number", "null"),
         ({"layout": {"object_ids": ["a"], "poses": []}}, "", "", ""),
         (
             {"layout": {"object_ids": ["a"], "poses": [POSE, POSE]}},
@@ -118,29 +109,16 @@ def test_values_of_another_kind(key):
             "1, as many as object_ids",
             "2",
         ),
-        ({"layout": {"present": [1]}}, "layout.present.0", "true or false", "1"),
-        ({"objects": {"0": "a"}}, "objects", "a list", '{"0": "a"}'),
         ({"objects": [{"slot": 0, "id": "a"}]}, "objects.0.name", "this key", "no such key"),
         ({"objects": [{"slot": -1, "id": "a", "name": "a"}]}, "objects.0.slot", "greater than or equal to 0", "-1"),
         ({"target": {"slot": "0", "asset_id": "a", "name": "a"}}, "target.slot", "an integer", '"0"'),
-        ({"success": 1}, "success", "true or false", "1"),
-        ({"control_mode": 3}, "control_mode", "text", "3"),
-        ({"control_freq": "20"}, "control_freq", "a number", '"20"'),
-        ({"rate_hz": 0}, "rate_hz", "greater than 0", "0"),
         ({"rate_hz": float("inf")}, "rate_hz", "a finite number", "Infinity"),
         ({"source": {"episode_id": "1"}}, "source.episode_id", "an integer", '"1"'),
-        ({"recorded": {"attempts": "two"}}, "recorded.attempts", "an integer", '"two"'),
-        ({"recorded": {"facts": [1]}}, "recorded.facts", "an object", "[1]"),
         ({"recorded": {"recoveries": [RECOVERY | {"range": [3]}]}}, "recorded.recoveries.0.range", "2 values", "1"),
-        ({"versions": ["1"]}, "versions", "an object", '["1"]'),
     ],
 )  # fmt: skip
 def test_one_violation_a_fault(new, key, expected, found):
     assert [said(v) for v in check_values({**WHOLE, **new})] == ([(key, expected, found)] if key else [])
-
-
-def test_two_faults_are_two_violations():
-    assert [v.key for v in check_values({**WHOLE, "seed": "x", "objects": 5})] == ["seed", "objects"]
 
 
 def test_scenes_that_are_no_objects():
@@ -154,13 +132,11 @@ def test_scenes_that_are_no_objects():
         (FILE, {"seed": "five"}, f'{FILE}, seed: expected an integer, or a list of one, found "five"'),
         (FILE, {"seed": [99]}, f"{FILE}, seed: expected 5 (conversion.json), found 99"),
         (FILE, {"rate_hz": 10}, f"{FILE}, rate_hz: expected 5.0 (conversion.json), found 10"),
-        (FILE, {"rate_hz": "5"}, f'{FILE}, rate_hz: expected a number, found "5"'),
         (FILE, {"recorded": {"facts": {"x": float("nan")}}}, f"{FILE}: expected JSON, found"),
         ("conversion.json", {"rate_hz": None}, "conversion.json, rate_hz: expected a number, found null"),
         ("conversion.json", {"image_size": [64]}, "conversion.json, image_size: expected 2 values, found 1"),
         ("conversion.json", {"cameras": "base_camera"}, "conversion.json, cameras: expected a list"),
         ("conversion.json", {"cameras": []}, "conversion.json, cameras: expected 1 values, found 0"),
-        ("conversion.json", {"depth": "yes"}, 'conversion.json, depth: expected true or false, found "yes"'),
         ("conversion.json", {"episodes": []}, "conversion.json, episodes: expected an object, found []"),
         ("conversion.json", {"episodes": {"0": {}, "1": 3}}, "conversion.json, episodes.1: expected an object"),
     ],
@@ -176,19 +152,10 @@ def test_a_seed_in_a_list_is_that_seed(dataset):
     assert validate(dataset).violations == []
 
 
-def test_another_rate_in_conversion_json_is_said_of_each_episode(dataset):
-    change(dataset, "conversion.json", rate_hz=10.0)
-    found = [str(violation) for violation in validate(dataset).violations]
-    assert len(found) == 2
-    assert all(re.search(r"rate_hz: expected 10.0 \(conversion.json\), found 5.0", text) for text in found)
-
-
 @pytest.mark.parametrize(
     ("name", "text", "said"),
     [
         (FILE, "[1]", f"{FILE}: expected an object, found list"),
-        (FILE, "{", f"{FILE}: expected JSON"),
-        (FILE, "null", f"{FILE}: expected an object, found NoneType"),
         ("conversion.json", "[]", "conversion.json: expected an object, found list"),
         ("conversion.json", '{"schema_version": 2', "conversion.json: expected settings of a dataset"),
     ],

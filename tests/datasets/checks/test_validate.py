@@ -93,16 +93,11 @@ def test_unknown_keys(dataset):
     [
         ("ee_pos", np.zeros((7, 3)), "expected float32, found float64"),
         ("gripper_status", np.ones(7, np.int64), "expected bool, found int64"),
-        ("robot_joints", np.zeros((7, 6), np.float32), "expected shape (7, 7), found shape (7, 6)"),
         ("gripper_width", np.full(7, np.nan, np.float32), "expected finite numbers, found 7 others"),
         ("step_lang_goals", np.array([b"x"] * 7), "expected str, found |S1"),
-        ("language_embedding", np.ones(512, np.float32), "expected shape (384,), found shape (512,)"),
         ("episode_length", np.array([7, 7]), "expected shape (), found shape (2,)"),
-        ("episode_length", np.array(np.nan), "expected int64, found float64"),
         ("episode_length", np.array(10**9), "expected 1 to 10000 steps, found 1000000000"),
-        ("episode_length", np.array(0), "expected 1 to 10000 steps, found 0"),
         ("rel_pos", np.array(0, np.float32), "expected shape (7, 3), found shape ()"),
-        ("step_goal_type", np.array(3), "expected str, found int64"),
         ("step_goal_type", np.array(["grasp"] * 6), "expected shape (7,), found shape (6,)"),
         ("episode_length", np.array(6), "expected 7, as the arrays have, found 6"),
     ],
@@ -118,12 +113,6 @@ def test_an_episode_without_steps(dataset):
     violations = found(dataset)
     assert f"{NPZ}, episode_length: expected 1 to 10000 steps, found 0" in violations
     assert any("rgb/0000.png: expected 0 pictures" in violation for violation in violations)
-
-
-def test_a_damaged_archive(dataset):
-    data = (dataset / NPZ).read_bytes()
-    (dataset / NPZ).write_bytes(data[: len(data) // 2])
-    assert any(v.startswith(f"{NPZ}: expected a numpy archive") for v in found(dataset))
 
 
 def damage_member(path):
@@ -158,12 +147,6 @@ def test_a_picture_without_pixels(dataset):
     assert any(place in violation for violation in found(dataset))
 
 
-def test_intrinsics_that_are_no_numbers(dataset):
-    path = dataset / "episode_0000001" / "base_camera" / "intrinsic.npy"
-    change_array(path, lambda intrinsic: intrinsic * [np.nan, 1, 1, 1])
-    assert_only(dataset, "base_camera/intrinsic.npy: expected fx, fy, cx, cy > 0, found [nan")
-
-
 def test_quaternions_that_are_no_rotations(dataset):
     orn = arrays_of(dataset)["ee_orn"]
     orn[3] *= 1.1
@@ -175,14 +158,6 @@ def test_wxyz_is_recognised(dataset):
     arrays = arrays_of(dataset)
     change(dataset, **{key: np.roll(arrays[key], 1, axis=1) for key in ("ee_orn", "rel_orn")})
     assert f"{NPZ}, ee_orn, rel_orn: expected quaternions xyzw, found quaternions wxyz" in found(dataset)
-
-
-def test_relative_motion_stored_a_step_late(dataset):
-    arrays = arrays_of(dataset)
-    change(dataset, **{key: np.roll(arrays[key], 1, axis=0) for key in ("rel_pos", "rel_orn")})
-    violations = found(dataset)
-    assert any(v.startswith(f"{NPZ}, rel_pos: expected the motion between rows of ee_pos, ee_orn") for v in violations)
-    assert any(v.startswith(f"{NPZ}, rel_orn: expected the motion between rows of ee_pos, ee_orn") for v in violations)
 
 
 def test_one_wrong_row_of_the_base(dataset):
@@ -206,13 +181,6 @@ def test_values(dataset):
         f"{NPZ}, rel_agv_pose: expected differences of agv_pose, found off by 0.1",
         f"{NPZ}, language_embedding: expected unit length, found off by 1",
     )
-
-
-def test_unknown_sub_goal_types(dataset):
-    kinds = arrays_of(dataset)["step_goal_type"]
-    kinds[:3] = "dance"
-    change(dataset, step_goal_type=kinds)
-    assert any(v.startswith(f"{NPZ}, step_goal_type: expected one of") and v.endswith("dance") for v in found(dataset))
 
 
 def test_embeddings_in_one_episode_only(dataset):
@@ -267,17 +235,14 @@ def turned(pose):
 
 
 @pytest.mark.parametrize(
-    ("camera", "parent"), [("base_camera", "arm_base"), ("gripper_camera", "ee"), ("static_camera", "world")]
-)
-@pytest.mark.parametrize(
-    "edit",
+    ("camera", "parent", "edit"),
     [
-        turned,
-        np.linalg.inv,
-        lambda pose: pose @ np.diag([1.0, -1, -1, 1]),  # OpenGL's camera frame
-        lambda pose: pose @ np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]]).T,  # SAPIEN's
+        ("base_camera", "arm_base", turned),
+        ("gripper_camera", "ee", np.linalg.inv),
+        ("static_camera", "world", lambda pose: pose @ np.diag([1.0, -1, -1, 1])),  # OpenGL's camera frame
+        ("base_camera", "arm_base", lambda pose: pose @ np.eye(4)[[1, 2, 0, 3]]),  # other axes
     ],
-    ids=["turned by 5 deg", "inverted", "OpenGL frame", "SAPIEN frame"],
+    ids=["turned by 5 deg", "inverted", "OpenGL frame", "permuted axes"],
 )
 def test_wrong_camera_poses_show_in_the_depth(dataset, camera, parent, edit):
     both_poses(dataset, camera, parent, edit)
@@ -288,12 +253,10 @@ def test_wrong_camera_poses_show_in_the_depth(dataset, camera, parent, edit):
     ("camera", "edit"),
     [
         ("base_camera", lambda depth: depth // 10),
-        ("base_camera", lambda depth: (depth * 1.05).astype(np.uint16)),
-        ("gripper_camera", lambda depth: (depth * 0.9).astype(np.uint16)),
         ("base_camera", lambda depth: np.ascontiguousarray(depth[:, ::-1])),
         ("static_camera", lambda depth: depth * 0),
     ],
-    ids=["centimetres", "5 % too far", "10 % too near", "mirrored", "nothing"],
+    ids=["centimetres", "mirrored", "nothing"],
 )
 def test_wrong_depth(dataset, camera, edit):
     change_depth(dataset, edit, camera)
@@ -318,7 +281,6 @@ def assert_depth(violations, camera):
     [
         (lambda info: info.pop("val_eps"), "data_info.json, val_eps: expected this key"),
         (lambda info: info["train_eps"].extend(info["val_eps"]), "expected no episode in both"),
-        (lambda info: info["train_eps"].append(7), "expected the episodes on disk, found [7]"),
         (lambda info: info.update(train_eps="all"), "train_eps: expected a list"),
         (lambda info: info["ep_length"].update({"1": 8}), "ep_length.1: expected 7, found 8"),
         (lambda info: info["ep_length"].pop("0"), "ep_length: expected the episodes on disk, found 1 others"),
@@ -326,10 +288,7 @@ def assert_depth(violations, camera):
         (lambda info: info["step_goals"]["0"][0].update(goal_range=[0, 1]), "step_goals.0: expected a range from 2"),
         (lambda info: info["step_goals"]["0"].pop(), "step_goals.0: expected ranges up to step 6, found up to 2"),
         (lambda info: info["step_goals"]["0"][0].update(goal_type="dance"), "step_goals.0: expected the sub-goal"),
-        (lambda info: info["step_goals"]["0"][0].pop("goal_range"), "step_goals.0.0.goal_range: expected this key"),
         (lambda info: info["action_space"].pop("relative_rotation"), "action_space.relative_rotation: expected"),
-        (lambda info: info["step_goals"]["0"][0].update(goal_range=[0, math.inf]), "is not a finite number"),
-        (lambda info: info["step_goals"]["0"][0].update(goal_description=["x"]), "goal_description: expected text"),
         (lambda info: info["action_space"]["relative_position"][0].__setitem__(0, 9.0), "expected percentiles of the"),
         (
             lambda info: info["action_space"]["relative_position"][0].__setitem__(0, math.nan),
@@ -365,19 +324,6 @@ def test_the_ledger_lists_an_episode_that_is_not_there(dataset):
     assert_only(dataset, "conversion.json, episodes.2: expected the episodes on disk, found no folder")
 
 
-@pytest.mark.parametrize(
-    ("new", "text"),
-    [
-        ({"seed": 99}, "seed: expected 5 (conversion.json), found 99"),
-        ({"source": {"recording": "x"}}, "recording: expected"),
-    ],
-)
-def test_a_scene_that_is_not_the_ledgers(dataset, new, text):
-    path = dataset / "episode_0000001" / "scene.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), **new}))
-    assert_only(dataset, text)
-
-
 def test_one_camera_has_none_to_agree_with(dataset):
     path = dataset / "conversion.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "cameras": ["static_camera"]}))
@@ -385,10 +331,3 @@ def test_one_camera_has_none_to_agree_with(dataset):
         for folder in dataset.glob(f"*/{name}"):
             shutil.rmtree(folder)
     assert found(dataset) == []
-
-
-def test_pictures_of_another_size_than_the_first_episodes(dataset):
-    for kind in ("rgb", "depth"):
-        for path in (dataset / "episode_0000001" / "base_camera" / kind).iterdir():
-            cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[:40])
-    assert any("expected 64 x 48, 3 x 8 bit, found 64 x 40, 3 x 8 bit" in violation for violation in found(dataset))

@@ -221,14 +221,6 @@ def test_values_that_are_taken_as_they_are(upstream, tmp_path):
     assert (violation.key, violation.found) == ("gripper_width", "0.500 to 0.500")
 
 
-def test_a_last_row_that_is_no_identity(upstream):
-    motion = arrays_of(upstream / "episode_0000000")["base_rel_pos"]
-    motion[-1] = 1
-    change(upstream / "episode_0000000", base_rel_pos=motion)
-    text = "the last row was not the identity"
-    assert (0, "episode_info.npz, base_rel_pos, base_rel_orn", text, "mended") in problems(upstream)
-
-
 @pytest.mark.parametrize("degrees", [90, -90, 180])
 def test_a_turned_eef_frame_is_turned_back(upstream, made, tmp_path, degrees):
     """Upstream's TCP is ManiSkill's turned by -90 deg about z; the gripper camera's place tells."""
@@ -308,12 +300,6 @@ def test_arrays_that_can_not_be_made_are_told(upstream, tmp_path):
     assert {v.split(", ")[1].split(":")[0] for v in violations} == set(missing)
 
 
-def test_velocities_are_estimated_where_they_are_missing(upstream):
-    joints = np.arange(7, dtype=np.float32)[:, None] * np.full(7, 0.1, np.float32)
-    change(upstream / "episode_0000001", robot_joints=joints, arm_joint_vel=None)
-    np.testing.assert_allclose(Dataset(upstream).episode(1).arrays["arm_joint_vel"], 0.5, atol=1e-5)  # 0.1 rad at 5 Hz
-
-
 def test_pictures_that_are_missing_or_damaged(four, tmp_path):
     root = shutil.copytree(four, tmp_path / "four")
     rgb = root / "episode_0000001" / "base_camera" / "rgb"
@@ -346,15 +332,6 @@ def test_pictures_of_another_kind(four, tmp_path):
     text = f"pictures of {cameras}, 64 x 40 png, with depth; most are of {cameras}, 64 x 48 png, with depth"
     assert (1, "episode_0000001", text, "left out") in found
     assert imported(root, tmp_path / "out").numbers == [2, 3]
-
-
-def test_pictures_too_small_to_show_anything(four, tmp_path):
-    root = shutil.copytree(four, tmp_path / "four")
-    for path in (root / "episode_0000001").glob("*/*/*.png"):
-        cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[:9, :9])
-    found = (1, "episode_0000001", "pictures this small show nothing: [9, 9]", "left out")
-    assert found in problems(root)
-    assert sorted(survey(root).taken) == [0, 2, 3]
 
 
 def test_cameras(four, tmp_path):

@@ -9,7 +9,7 @@ from managing import files_of
 from synthetic import RayCaster, render_by, write_trajectory
 
 from robocas_ms3.cli.main import run as run_command
-from robocas_ms3.core.errors import AssetError, DatasetError, IncompleteError
+from robocas_ms3.core.errors import AssetError, IncompleteError
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing import convert as conversion
@@ -27,16 +27,8 @@ class Breaking(RayCaster):
     def frames(self, recording, samples):
         for step, frame in enumerate(super().frames(recording, samples)):
             if recording.seed == self.seed and step == 3:
-                self.fail(frame)
+                raise AssetError("no such object", where="cube")
             yield frame
-
-    def fail(self, frame):
-        raise AssetError("no such object", where="cube")
-
-
-class Unencodable(Breaking):
-    def fail(self, frame):
-        frame.rgb["base_camera"] = np.zeros((0, 0, 3), np.uint8)
 
 
 class OfOddSeeds(RayCaster):
@@ -87,17 +79,6 @@ def test_a_broken_recording(many, tmp_path, how):
     assert files_of(out) == files_of(whole)
 
 
-@pytest.mark.parametrize(("source", "jobs"), [(Breaking, 1), (Unencodable, 2)])
-def test_an_episode_that_cannot_be_shown_or_stored(many, tmp_path, source, jobs):
-    trajectory, whole = many
-    with pytest.raises(IncompleteError, match="found episode_0000003: .*(no such object|can't encode this picture)"):
-        run(trajectory, tmp_path / "out", open_renderer=source, jobs=jobs)
-    assert validate(tmp_path / "out").violations == []
-    assert len(Dataset(tmp_path / "out").numbers) == len(SEEDS) - 1
-    run(trajectory, tmp_path / "out")
-    assert files_of(tmp_path / "out") == files_of(whole)
-
-
 def test_the_only_one_of_its_side(many, tmp_path):
     """It comes back to its side, whatever was resumed between."""
     trajectory, whole = many
@@ -131,16 +112,6 @@ def test_others_are_appended_meanwhile(many, tmp_path):
     ledger = json.loads((tmp_path / "out" / "conversion.json").read_text())
     assert list(ledger["episodes"]) == [str(number) for number in range(16)]
     assert "left_out" not in ledger
-
-
-def test_what_is_wrong_with_the_first_three_is_wrong_with_all(many, tmp_path):
-    class Hopeless(RayCaster):
-        def load(self, recording):
-            raise DatasetError(f"seed {recording.seed}: no renderer")
-
-    with pytest.raises(DatasetError, match="^seed 10: no renderer$"):
-        run(many[0], tmp_path / "out", open_renderer=Hopeless)
-    assert not (tmp_path / "out").exists()
 
 
 def test_texts_that_cannot_be_read(many, tmp_path, monkeypatch):

@@ -1,7 +1,6 @@
 """What ``robocas convert`` and ``robocas validate`` print."""
 
 import json
-import re
 import shutil
 
 import pytest
@@ -12,28 +11,22 @@ from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.writing import convert as conversion
 from robocas_ms3.datasets.writing.settings import Conversion, ConversionSettings, Timing, WrittenEpisode
 
-SECONDS = r"\d+\.\d"
-
 
 @pytest.fixture
 def made_up_pictures(monkeypatch):
     monkeypatch.setattr(conversion, "convert", render_by(RayCaster, conversion.convert))
 
 
-def test_the_parts_of_the_time_come_last(trajectory, made_up_pictures, tmp_path, capsys):
+def test_a_conversion_and_its_repetition(trajectory, made_up_pictures, tmp_path, capsys):
     command = ["convert", str(trajectory), "--out", str(tmp_path / "out"), "--no-embeddings", "--no-video"]
     assert run(command) == 0
     printed = capsys.readouterr()
     first, last = printed.out.splitlines()
     assert first.startswith(f"{tmp_path / 'out'}: 2 episodes, 14 steps, ")
-    beside = rf"\(beside rendering(, which waited {SECONDS})?\)"
-    parts = rf"load {SECONDS}, render {SECONDS}, encode {SECONDS} {beside}, write {SECONDS} s an episode"
-    assert re.fullmatch(parts, last), last
-    assert re.fullmatch(
-        r"episodes written: 0 of 2\nepisodes written: 2 of 2, .+\n", printed.err
-    )  # no bar, no blank line
+    assert last.startswith("load ")
+    assert "episodes written: 2 of 2" in printed.err
     assert run(command) == 0
-    assert re.fullmatch(r".*: 0 episodes, 2 kept\n", capsys.readouterr().out)
+    assert capsys.readouterr().out.endswith(": 0 episodes, 2 kept\n")
 
 
 def test_seconds_are_those_of_an_episode(monkeypatch, tmp_path, capsys):
@@ -47,18 +40,6 @@ def test_seconds_are_those_of_an_episode(monkeypatch, tmp_path, capsys):
         "load 1.0, render 5.0, encode 3.0 (beside rendering, which waited 0.4), write 0.6 s an episode, 2 at a time"
     )
     assert capsys.readouterr().out.splitlines()[1] == expected
-
-
-def test_of_lerobot_encoding_is_not_beside_rendering(made, tmp_path, capsys):
-    pytest.importorskip("av", reason="needs the extra 'lerobot'")
-    pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
-    assert run(["convert", str(made), "--to", "lerobot", "--out", str(tmp_path / "out")]) == 0
-    printed = capsys.readouterr()
-    parts = rf"load {SECONDS}, render 0\.0, encode {SECONDS}, write {SECONDS} s an episode"
-    assert re.fullmatch(parts, printed.out.splitlines()[-1])
-    assert re.fullmatch(r"episodes written: 0 of 2\nepisodes written: 2 of 2, .+\n", printed.err)
-    assert run(["validate", str(tmp_path / "out")]) == 0
-    assert capsys.readouterr() == (f"{tmp_path / 'out'}: 2 episodes, 14 steps, valid\n", "")
 
 
 def tried(path, *rates):

@@ -1,9 +1,7 @@
 """Recorded states seen through ManiSkill's own cameras."""
 
-import importlib
 import json
 import shutil
-from pathlib import Path
 
 import gymnasium as gym
 import h5py
@@ -215,51 +213,3 @@ def test_a_real_dataset_is_valid(recorded, tmp_path, capsys):
         # The mobile base stands at (0.7, 0.15), turned by 90 deg; the arm's base above it.
         np.testing.assert_allclose(arrays["agv_pose"], [[0.7, 0.15, np.pi / 2]] * 4, atol=1e-3)
         np.testing.assert_allclose(arrays["base_pos"][:, :2], [[0.7, 0.15]] * 4, atol=1e-3)
-
-
-def test_the_benchmark_runs(recorded, monkeypatch, capsys):
-    """Every case, and jobs; of pictures this small everything but rendering is what takes time."""
-    pytest.importorskip("av", reason="needs the extra 'lerobot'")
-    pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
-    monkeypatch.syspath_prepend(Path(__file__).resolve().parents[3] / "benchmarks")
-    benchmark, used = importlib.import_module("convert"), []
-    converts = benchmark.convert_one
-
-    def convert_one(*args):  # whether more processes do it is tested elsewhere: each takes 10 s to begin
-        used.append(args[5] if len(args) > 5 else 1)
-        converts(*args[:5])
-
-    monkeypatch.setattr(benchmark, "convert_one", convert_one)
-    benchmark.main(benchmark.Benchmark(recorded[0], episodes=2, turns=1, size=(32, 24), jobs=2, jobs_episodes=2))
-    report = json.loads(capsys.readouterr().out)
-    assert report["steps"] == 2 * 4
-    for name in benchmark.CASES:
-        case = report[name]
-        assert case["cpu ms a step"] == pytest.approx(1000 * case["cpu s"][0] / 8, abs=1.3)  # rounded to 10 ms
-        bare = report["bare, depth" if "depth" in name else "bare"]
-        assert case["over bare"] > 1
-        assert 0 < bare["cpu ms a step"] < case["cpu ms a step"]
-    assert set(report["jobs"]["wall s"]) == {"1", "2"}
-    assert report["jobs"]["times as fast"] > 0
-    assert used[-2:] == [1, 2]
-
-
-def test_torch_has_one_thread_while_it_converts(recorded, tmp_path, monkeypatch):
-    """And as many as before afterwards."""
-    import torch
-
-    seen, frames = [], EnvRenderer.frames
-
-    def counted(self, *args):
-        seen.append(torch.get_num_threads())
-        return frames(self, *args)
-
-    monkeypatch.setattr(EnvRenderer, "frames", counted)
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
-        convert(ConversionSettings(recorded[0], tmp_path / "out", embeddings=False, pictures=Pictures(size=SIZE)))
-        assert torch.get_num_threads() == 2
-    finally:
-        torch.set_num_threads(before)
-    assert seen == [1]
