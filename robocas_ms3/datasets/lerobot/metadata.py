@@ -45,9 +45,9 @@ class Metadata:
     def info(self) -> dict[str, Any]:
         """``meta/info.json``."""
         path = self.root / schema.INFO_FILE
-        found = read_json(path)
-        if not found:
+        if not path.is_file():
             raise DatasetError("no LeRobot dataset here", where=path, found="no file")
+        found = read_json(path)
         version = found.get("codebase_version")
         if not isinstance(version, str) or version not in LAYOUTS:
             what = "a LeRobot dataset of another version"
