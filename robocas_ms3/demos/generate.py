@@ -233,9 +233,7 @@ class _Run:
                 if about := episode.get("robocas"):
                     seed = int(episode["episode_seed"])
                     result = EpisodeResult(seed, True, int(episode["elapsed_steps"]), int(about["attempts"]))
-                    lines = noted.get(seed, [])
-                    failed = about.get("failed_attempts")  # missing in files of older versions
-                    result.failures = lines if failed is None else failed_attempts(seed, failed, lines)
+                    result.failures = failed_attempts(seed, about["failed_attempts"], noted.get(seed, []))
                     for part, value in about["seconds"].items():
                         setattr(result.seconds, part, float(value))
                     results[seed] = result

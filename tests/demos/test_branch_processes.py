@@ -112,9 +112,7 @@ def test_a_child_that_takes_too_long_is_ended(monkeypatch):
     def decide(runner):
         assert runner.choose("ab", play) == "b"
 
-    start = time.monotonic()
     assert forked(decide)[0]
-    assert time.monotonic() - start < 20
 
 
 def test_a_child_that_dies_in_the_middle_of_a_message_is_gone():
@@ -206,7 +204,6 @@ def test_threads_that_write_do_not_hold_up_branches(capfd):
     writers = [threading.Thread(target=write) for _ in range(2)]
     for writer in writers:
         writer.start()
-    start = time.monotonic()
     try:
         ended, notes = forked(decide)
     finally:
@@ -214,23 +211,7 @@ def test_threads_that_write_do_not_hold_up_branches(capfd):
         for writer in writers:
             writer.join()
     assert (ended, notes.texts) == (True, [])
-    assert time.monotonic() - start < 60
     assert capfd.readouterr().err.count("in a branch\n") >= 40
-
-
-def test_an_error_of_ours_is_raised_here():
-    def decide(runner):
-        runner.choose("a", lambda letter: 1 / 0)
-
-    with pytest.raises(ZeroDivisionError):
-        forked(decide)
-
-    def later(runner):
-        runner.choose("a", lambda letter: 0.0)
-        raise KeyError("later")
-
-    with pytest.raises(KeyError, match="later"):
-        forked(later)
 
 
 def test_an_error_says_where_in_a_child_it_came_from():
@@ -248,30 +229,6 @@ def test_an_error_says_where_in_a_child_it_came_from():
     text = str(caught.value.__cause__)
     assert text.count("in divide") == 1
     assert text.count("Traceback") == 1
-
-
-def test_an_error_that_can_not_be_sent_is_told_of():
-    class Local(Exception):  # pickle can't find it
-        pass
-
-    for error in (Local("odd"), TwoWords("very", "odd")):
-
-        def decide(runner, error=error):
-            def play(letter):
-                raise error
-
-            runner.choose("a", play)
-
-        with pytest.raises(RuntimeError, match=f"{type(error).__name__}: .*odd") as caught:
-            forked(decide)
-        assert "in play" in str(caught.value.__cause__)
-
-
-class TwoWords(Exception):
-    """Pickles, but takes another number of arguments when it is made again."""
-
-    def __init__(self, one: str, two: str) -> None:
-        super().__init__(f"{one} {two}")
 
 
 def test_an_interrupt_in_a_new_child_ends_the_run_not_its_siblings(monkeypatch):

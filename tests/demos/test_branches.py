@@ -6,6 +6,7 @@ import pytest
 from branch_notes import Notes
 
 from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.demos.backtracking import DeadEnd, turns
 from robocas_ms3.demos.branches import ForkedBranches
 from robocas_ms3.demos.resimulation import Resimulation
 from robocas_ms3.planning.decisions import ONE_BY_ONE, Effort, StraightDecisions
@@ -23,11 +24,11 @@ class World:
         self.done += letter
 
 
-def search(decide, good, *, most=100, **how):
+def search(decide, good, **how):
     """Run an attempt that `decide`s; the outcome and the failures."""
     found = []
     for make in RUNNERS:
-        notes, world = Notes(max_attempts=most), World()
+        notes, world = Notes(), World()
         runner = make(notes)
 
         def attempt(world=world, runner=runner, notes=notes):
@@ -60,10 +61,6 @@ def test_no_way_ends_well():
     assert len(failures) == 9
 
 
-def test_attempts_are_counted():
-    assert search(two_letters, {"cc"}, most=4) == (False, "", ["end: aa", "end: ab", "end: ac", "end: ba"])
-
-
 def test_a_decision_gives_up_after_some_tries():
     ended, outcome, failures = search(two_letters, {"ba"}, effort=Effort(tries=2))
     assert (ended, outcome, failures) == (True, "ba", ["end: aa", "end: ab"])
@@ -75,10 +72,6 @@ def test_the_best_of_those_compared_is_gone_on_from_first():
         two_letters, {"cb", "bc"}, score=lambda letters: score[letters[-1]], effort=Effort(ahead=3)
     )
     assert (ended, outcome, failures) == (True, "bc", ["end: bb"])
-
-
-def test_equal_scores_keep_the_order_of_the_candidates():
-    assert search(two_letters, {"aa"}, effort=Effort(ahead=3)) == (True, "aa", [])
 
 
 def test_others_are_compared_when_the_first_few_lead_nowhere():
@@ -143,3 +136,23 @@ def test_without_undoing_the_first_that_can_be_played_stays():
     with pytest.raises(PlanningFailed, match="late: c"):
         straight.choose("cb", play)
     assert world.done == "bc"
+
+
+def test_candidates_are_taken_as_they_are_needed():
+    def candidates():
+        yield "a"
+        raise AssertionError("nobody asked for another")
+
+    order = turns(candidates(), Effort(tries=1), Notes())
+    assert order.send(None) == ("a", False)
+    assert order.send(0.0) == ("a", True)
+    with pytest.raises(DeadEnd):
+        order.send(None)
+
+
+def test_attempts_are_counted():
+    order = turns("abc", Effort(), notes := Notes(max_attempts=1))
+    assert (next(order), order.send(0.0)) == (("a", False), ("a", True))
+    notes.failed(PlanningFailed("end", "a"))
+    with pytest.raises(DeadEnd):
+        order.send(None)

@@ -136,18 +136,6 @@ def test_what_was_cut_off_is_made_again(tmp_path, made, suffix, left):
     assert Ledger(out / FAILURES_FILE).read() == [*lines_of(1), *lines_of(2)]
 
 
-def test_files_that_do_not_tell_of_failures_leave_them_to_the_ledger(tmp_path):
-    """Those of an earlier version."""
-    out = tmp_path / "out"
-    begun(out, (0, 1), lines_of(1))
-    path = out / "episodes" / f"{shard_name(1)}.json"
-    content = json.loads(path.read_text())
-    del content["episodes"][0]["robocas"]["failed_attempts"]
-    path.write_text(json.dumps(content))
-    generate(out, episodes=2)
-    assert Ledger(out / FAILURES_FILE).read() == lines_of(1)
-
-
 def test_killed_when_all_was_merged_already(tmp_path, made):
     out = tmp_path / "out"
     generate(out, episodes=2)

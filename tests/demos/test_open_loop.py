@@ -7,7 +7,7 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.actions import episode_actions
 from robocas_ms3.datasets.sources.arrays import episode_arrays
 from robocas_ms3.demos.generator import EpisodeGenerator
-from robocas_ms3.demos.open_loop import Noise, OpenLoop
+from robocas_ms3.demos.open_loop import OpenLoop
 from robocas_ms3.demos.recordings.motion import sample_states
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
 from robocas_ms3.demos.recordings.subgoals import sample_subgoals
@@ -80,23 +80,11 @@ def test_a_trial_plays_what_a_dataset_will_hold_to_the_last_bit(recorded):
     assert np.deg2rad(0.12) < difference[:, 3:6].std() < np.deg2rad(0.28)  # 0.2 deg
 
 
-def test_the_noise_of_an_action_does_not_depend_on_how_many_are_drawn():
-    few, many = (Noise().draw(np.random.default_rng(3), count) for count in (2, 9))
-    np.testing.assert_array_equal(few, many[:2])
-    np.testing.assert_array_equal(Noise(0, 0).draw(np.random.default_rng(3), 4), np.zeros((4, 7)))
-
-
-def test_with_an_open_gripper_they_do_not(recorded):
+@pytest.mark.parametrize(("part", "value"), [(np.s_[:, 6], 1), (np.s_[:2, 0], 0.05)], ids=["open gripper", "beside"])
+def test_spoilt_actions_do_not_succeed(recorded, part, value):
     world, recording, _ = recorded
     actions = own_actions(recording)[0].copy()
-    actions[:, 6] = 1
-    assert not play(world, actions).success
-
-
-def test_beside_the_object_they_do_not(recorded):
-    world, recording, _ = recorded
-    actions = own_actions(recording)[0].copy()
-    actions[:2, 0] += 0.05
+    actions[part] = value if value == 1 else actions[part] + value
     assert not play(world, actions).success
 
 

@@ -15,8 +15,8 @@ from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.planning.chain import ArmChain
 from robocas_ms3.planning.kinematics import Reachability
 from robocas_ms3.planning.protocol import AttachedBody, Obstacle, Shape
-from robocas_ms3.planning.pulling import reached, track, turned_about_bar
-from robocas_ms3.planning.skills.driving import Surroundings, _routes, body_is_free, free_route
+from robocas_ms3.planning.pulling import reached, track
+from robocas_ms3.planning.skills.driving import Surroundings, body_is_free, free_route
 from robocas_ms3.planning.skills.handles import Part
 from robocas_ms3.robots.description import MOBILE_PANDA
 
@@ -43,14 +43,6 @@ def level_hold(x: float, y: float, z: float) -> np.ndarray:
 def angle_about_bar(found: np.ndarray, goal: np.ndarray) -> float:
     turn = goal[:3, :3].T @ found[:3, :3]
     return float(np.arctan2(turn[2, 1], turn[1, 1]))
-
-
-def test_turn_about_the_bar_keeps_the_pose_of_the_bar():
-    hold = level_hold(0.7, 0.1, 0.3)
-    turned = turned_about_bar(hold, np.pi / 2)
-    assert turned[:3, 3] == pytest.approx([0.7, 0.1, 0.3])
-    assert turned[:3, 0] == pytest.approx(hold[:3, 0])
-    assert turned[:3, 1] == pytest.approx(hold[:3, 2])  # a quarter turn takes closing to approach
 
 
 @pytest.mark.parametrize(("joint", "end"), [(SLIDE, 0.25), (HINGE, 0.9)])
@@ -92,18 +84,6 @@ def test_the_body_is_free_where_no_point_is_inside_it():
     assert body_is_free(MOBILE_PANDA, frame, beside)
     for hit in ([1.27, 2.0, 0.2], [1.0, 1.78, 0.2], [1.14, 2.0, 0.4], [1.08, 2.0, 0.6]):
         assert not body_is_free(MOBILE_PANDA, frame, np.array([hit]))
-
-
-def test_a_detour_backs_out_of_the_narrow_end_against_its_heading():
-    narrow, wide = np.array([0.4, 0.0, np.pi / 2]), np.array([0.0, 0.5, 0.0])
-    straight, *detours = _routes(narrow, wide, leaving=True, limits=MOBILE_PANDA.base_limits)
-    assert len(straight) == 1
-    via, goal = detours[0]
-    assert via == pytest.approx([0.4, -0.15, np.pi / 2])
-    assert goal == pytest.approx(wide)
-    arriving = list(_routes(wide, narrow, leaving=False, limits=MOBILE_PANDA.base_limits))[1]
-    assert arriving[0] == pytest.approx([0.4, -0.15, np.pi / 2])
-    assert arriving[1] == pytest.approx(narrow)
 
 
 def test_drive_keeps_the_held_object_free_of_collisions(planner):

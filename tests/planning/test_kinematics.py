@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.planning.chain import ArmChain
-from robocas_ms3.planning.kinematics import Reachability, follow_line, newton_step, rotation_vector, solve_positive
+from robocas_ms3.planning.kinematics import Reachability, follow_line, newton_step, rotation_vector
 from robocas_ms3.robots.description import MOBILE_PANDA
 
 
@@ -26,14 +26,6 @@ def test_rotation_vectors_invert_rotation_matrices(angle):
     vectors = rotation_vector(matrices)
     np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), angle, atol=1e-7)
     np.testing.assert_allclose(Rotation.from_rotvec(vectors).as_matrix(), matrices, atol=1e-7)
-
-
-def test_solve_positive_solves_positive_definite_systems():
-    rng = np.random.default_rng(0)
-    roots, expected = rng.normal(size=(50, 6, 7)), rng.normal(size=(50, 6))
-    matrices = roots @ roots.transpose(0, 2, 1) + 1e-8 * np.eye(6)
-    values = np.einsum("mij,mj->mi", matrices, expected)
-    np.testing.assert_allclose(solve_positive(matrices, values), expected, rtol=1e-6)
 
 
 def test_pose_error_of_a_half_turn_is_pi(chain):

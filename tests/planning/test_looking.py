@@ -1,17 +1,13 @@
 """Where policies take the gripper's camera to be is where it is rendered from."""
 
-from types import SimpleNamespace
-
 import gymnasium as gym
 import numpy as np
 import pytest
 
 import robocas_ms3.tasks  # noqa: F401
-from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.planning.scene import PlanningScene
-from robocas_ms3.planning.skills import looking
 from robocas_ms3.planning.skills.arm import Arm
-from robocas_ms3.planning.skills.looking import FAR, _shift, camera_in_base, plan_look
+from robocas_ms3.planning.skills.looking import _shift, camera_in_base
 from robocas_ms3.scenes.config import load_task_config
 
 pytestmark = pytest.mark.slow
@@ -37,22 +33,3 @@ def test_the_cameras_shift_is_known():
     made.close()
     assert pose == pytest.approx(rendered, abs=1e-4)
     assert np.linalg.norm(shift[:3, 3]) > 0.02
-
-
-def test_views_that_are_all_in_collision_are_an_error(monkeypatch):
-    monkeypatch.setattr(looking, "camera_in_base", lambda arm: np.eye(4))
-    planner = SimpleNamespace(
-        set_scene=lambda obstacles: None, free=lambda qpos, width: np.zeros(len(qpos), dtype=bool), finger_width=0.08
-    )
-    arm = SimpleNamespace(
-        at=np.zeros(7),
-        rng=np.random.default_rng(0),
-        planner=planner,
-        reachability=SimpleNamespace(
-            reachable=lambda poses, near: (np.ones(len(poses), bool), np.ones((len(poses), 7)))
-        ),
-        scene=SimpleNamespace(tcp_in_base=np.eye(4), obstacles=list),
-    )
-    with pytest.raises(PlanningFailed) as caught:
-        plan_look(arm, np.zeros(3), FAR)
-    assert (caught.value.stage, caught.value.reason) == ("look", "goal_in_collision")

@@ -48,14 +48,6 @@ def test_jacobian_is_the_derivative_and_agrees_with_pytorch_kinematics(reachabil
     np.testing.assert_allclose(pose, their_pose.numpy(), atol=1e-6)
 
 
-def test_an_arm_may_end_behind_its_tcp(reachability):
-    chain, qpos = reachability.chain, np.random.default_rng(0).uniform(-1, 1, (3, 7))
-    tcp, behind = chain.tcp(qpos), chain.ending_behind(0.02).tcp(qpos)
-    np.testing.assert_allclose(behind[:, :3, 3], tcp[:, :3, 3] - 0.02 * tcp[:, :3, 2], atol=1e-12)
-    np.testing.assert_array_equal(behind[:, :3, :3], tcp[:, :3, :3])
-    np.testing.assert_array_equal(chain.tcp(qpos), tcp)  # the arm itself is as before
-
-
 def anywhere(chain: ArmChain, count: int, seed: int) -> np.ndarray:
     """Configurations (count, 7) all over the joint space, the elbow bent by more than 27 deg."""
     qpos = np.random.default_rng(seed).uniform(chain.lower, chain.upper, (count, 7))

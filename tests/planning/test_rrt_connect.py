@@ -101,15 +101,6 @@ def test_short_motions_end_exactly_at_their_goals(make_planner, dt):
     assert pose_error(planner.tcp(tiny.qpos[-1]), here @ shifted(0.002))[0] < 1e-5
 
 
-def test_trajectories_do_not_depend_on_the_control_step(make_planner):
-    durations = []
-    for dt in (0.01, 0.05, 0.2):
-        planner = make_planner(dt=dt)
-        planner.seed(1)
-        durations.append(planner.plan_to_pose(REST, top_down(0.5, 0.2, 0.3), stage="x").duration)
-    assert max(durations) - min(durations) <= 0.2  # each is stretched to whole steps
-
-
 def test_the_nearest_reachable_goal_is_taken(planner):
     near, far = REST + 0.2, REST + np.array([-1.0, 0.3, 0, 0, 0, 0.3, 0])
     trajectory = planner.plan_to_qpos(REST, [far, near], stage="x")
@@ -144,12 +135,6 @@ def test_joined_motions_do_not_stop_and_end_as_the_second(planner):
     low = np.array([planner.tcp(qpos)[:3, 3] for qpos in joined.qpos])
     low = low[low[:, 2] < 0.25]
     assert len(low) > 3 and np.abs(low[:, :2] - (0.5, 0.2)).max() < 0.004
-
-
-def test_where_the_corner_is_blocked_motions_are_joined_with_a_stop(planner):
-    reach, down = reach_and_down(planner)
-    planner.set_scene(cloud([Box((0.5, 0.2, 0.25), (0.2, 0.2, 0.2))]))
-    assert planner.join(REST, reach, down).qpos.tolist() == [*reach.qpos.tolist(), *down.qpos.tolist()]
 
 
 def test_motions_are_joined_only_where_all_of_the_first_is_free(planner):

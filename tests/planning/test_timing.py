@@ -84,13 +84,6 @@ def test_spline_through_a_smooth_motion_stays_on_it():
     np.testing.assert_array_equal(trajectory.qpos[-1], [np.sin(1.0), np.cos(1.0)])
 
 
-@pytest.mark.parametrize("count", [2, 3, 4])
-def test_few_configurations_are_enough(count):
-    trajectory = timed(through(np.linspace([0.0, 0.0], [0.02, 0.01], count)), dt=0.05, **LIMITS)
-    assert trajectory is not None
-    np.testing.assert_array_equal(trajectory.qpos[-1], [0.02, 0.01])
-
-
 def test_blended_motions_cut_the_corner_between_them():
     first = np.array([[1.0, 0], [2, 0], [3, 0]])  # along x, then along y
     second = np.array([[3.0, 1], [3, 2], [3, 3]])

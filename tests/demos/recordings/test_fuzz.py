@@ -10,6 +10,7 @@ from synthetic import write_trajectory
 
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
+from robocas_ms3.demos.replay import Recorded
 
 
 @pytest.fixture(scope="module")
@@ -19,12 +20,13 @@ def whole(tmp_path_factory):
 
 
 def read_all(path):
-    """Everything that a conversion reads."""
+    """Everything that a conversion and a replay read."""
     with TrajectoryFile(path) as file:
         for index in range(len(file.episodes)):
             recording = file.recording(index)
             motion = recording.motion(np.arange(0, recording.control_steps + 1, 4))
             assert np.isfinite(motion.actions).all()
+            assert np.isfinite(Recorded.read(path, file.episodes[index]).actions).all()
 
 
 def test_bytes_of_the_hdf5(whole, tmp_path):

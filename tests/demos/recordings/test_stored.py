@@ -120,15 +120,3 @@ def test_nan_is_not_replayed(whole, name):
         file[f"traj_0/{name}"][4, 2] = np.nan
     for read in (by_file, by_replay, *([by_policy] if name == "actions" else [])):
         refused(read, whole, "NaN or infinity", name.rpartition("/")[2], "row 4")
-
-
-def test_what_is_whole_is_read_by_all(whole):
-    recording, recorded = by_file(whole), by_replay(whole)
-    np.testing.assert_array_equal(recording.actions, recorded.actions)
-    np.testing.assert_array_equal(by_policy(whole), recorded.actions)
-    assert len(recorded.states) == STEPS + 1
-    for name, rows in recording.states["actors"].items():
-        np.testing.assert_array_equal(recorded.states[5]["actors"][name], rows[5])
-    by_merge(whole)
-    with h5py.File(whole) as old, h5py.File(whole.with_name("merged.h5")) as new:
-        np.testing.assert_array_equal(old[CUBE], new[CUBE])

@@ -29,12 +29,6 @@ def fill(file):
     file.create_group("a", track_order=True).create_dataset("b", data=DATA)
 
 
-def test_what_is_written_whole_is_read(tmp_path):
-    write_whole(tmp_path / "x.h5", fill)
-    with h5py.File(tmp_path / "x.h5") as file:
-        np.testing.assert_array_equal(file["a/b"], DATA)
-
-
 @pytest.mark.parametrize("size", [1, 10_000_000])
 def test_what_was_reserved_and_not_needed_is_given_back(tmp_path, size):
     with reserved(tmp_path / "x.h5", size) as file:
