@@ -26,30 +26,21 @@ class RemoteError:
     traceback: str
 
     @classmethod
-    def of(
-        cls,
-        error: BaseException,
-        where: str,
-        *,
-        sendable: type[BaseException] = BaseException,
-        otherwise: type[Exception] = RuntimeError,
-    ) -> RemoteError:
-        """Return an error in this form.
+    def of(cls, error: BaseException, where: str) -> RemoteError:
+        """Return an error in this form; one that can't be pickled becomes a `RuntimeError`.
 
         Args:
             error: the error.
             where: name of this process; an error from another process keeps the name of that one.
-            sendable: type of the errors that are sent as they are, if they can be pickled.
-            otherwise: type of the error that replaces all others.
         """
         if isinstance(error, SystemExit):  # would end the receiving process without a message
             error = exit_error(error, where).with_traceback(error.__traceback__)
         cause = error.__cause__
         place = cause.args if isinstance(cause, RemoteTraceback) else (where, "".join(format_exception(error)))
         with suppress(Exception):  # any error of pickling it
-            if isinstance(error, sendable) and type(pickle.loads(pickle.dumps(error))) is type(error):
+            if type(pickle.loads(pickle.dumps(error))) is type(error):
                 return cls(error, *place)
-        return cls(otherwise(f"{type(error).__name__}: {error}"), *place)
+        return cls(RuntimeError(f"{type(error).__name__}: {error}"), *place)
 
     def with_traceback(self) -> BaseException:
         """Return the error with a `RemoteTraceback` as its cause."""

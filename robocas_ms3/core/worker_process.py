@@ -79,6 +79,7 @@ class WorkerProcess(Generic[Task, Result]):
         self._make_worker, self._limits, self._stop = make_worker, limits, stop
         self._process: subprocess.Popen[bytes] | None = None
         self._connection: Any = None  # a Connection
+        self._checked = 0.0  # time of the last check of the memory limit
 
     def run(self, task: Task) -> Result:
         """Run a task.
@@ -133,11 +134,15 @@ class WorkerProcess(Generic[Task, Result]):
     def _receive(self, seconds: float) -> Any:
         assert self._process is not None
         deadline = time.monotonic() + seconds
-        while not (ready := wait([self._connection, self._stop], _POLL_SECONDS)):
-            if time.monotonic() > deadline:
+        ready: list[Any] = []
+        while not ready:
+            ready = wait([self._connection, self._stop], _POLL_SECONDS)
+            if not ready and time.monotonic() > deadline:
                 raise self._crash("too slow")
-            if exceeds_memory(self._process.pid, self._limits.memory_gb):
-                raise self._crash("too much memory")
+            if time.monotonic() - self._checked > _POLL_SECONDS:  # also where tasks are shorter than that
+                self._checked = time.monotonic()
+                if _exceeds_memory(self._process.pid, self._limits.memory_gb):
+                    raise self._crash("too much memory")
         if self._stop in ready:
             self._end()
             raise CancelledError
@@ -171,20 +176,13 @@ class WorkerProcess(Generic[Task, Result]):
             self._connection = None
 
 
-def exceeds_memory(pid: int, memory_gb: float, *, forks: bool = True) -> bool:
-    """Return whether a process, or one that it forked, uses more than ``memory_gb`` GiB.
-
-    Args:
-        pid: process id.
-        memory_gb: limit of each process.
-        forks: whether to look for processes that it forked, which takes milliseconds.
-    """
+def _exceeds_memory(pid: int, memory_gb: float) -> bool:
+    """Return whether a process, or one that it forked, uses more than ``memory_gb`` GiB."""
     if memory_gb == math.inf:
         return False
     try:
         process = psutil.Process(pid)
-        processes = [process, *(process.children(recursive=True) if forks else ())]
-        return any(one.memory_info().rss > memory_gb * 2**30 for one in processes)
+        return any(one.memory_info().rss > memory_gb * 2**30 for one in [process, *process.children(recursive=True)])
     except psutil.Error:
         return False  # it has just ended
 

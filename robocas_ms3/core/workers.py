@@ -103,6 +103,20 @@ class WorkerPool(Generic[Task, Result]):
         (result,) = self.map([task])
         return result
 
+    def submit(self, task: Task) -> Callable[[], Result]:
+        """Start a task in a worker process; return a function that waits for its result, and raises as `map` does."""
+        job = _Job(task, SimpleQueue())
+        self._submit(job)
+
+        def wait() -> Result:
+            while not job.done:
+                self._next(job.finished)
+            if job.error is not None:
+                raise job.error
+            return job.result  # pyright: ignore[reportReturnType]  (of a job that is done)
+
+        return wait
+
     def _map_here(self, tasks: Iterable[Task]) -> Generator[Result, None, None]:
         for task in tasks:
             if self._worker is None:

@@ -28,8 +28,7 @@ from robocas_ms3.evaluation.stepping import UPSTREAM_HZ, PolicyStepping, env_kwa
 from robocas_ms3.evaluation.weld import check_weld
 from robocas_ms3.scenes.table import FrozenLayouts
 from robocas_ms3.scenes.task_specs import TASKS
-from robocas_ms3.tasks.vector import make_vec
-from robocas_ms3.tasks.vector.backend import choose_backend
+from robocas_ms3.tasks.vector import choose_backend, make_vec
 
 MAX_STARTS = 2
 """How often an episode is started whose process dies."""

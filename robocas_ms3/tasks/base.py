@@ -287,6 +287,10 @@ class RoboCASEnv(BaseEnv):
         """(N, 7) pose of the TCP in the world, native (`arrays`)."""
         return native(link_poses(self.scene, [self.agent.tcp]))[:, 0]
 
+    def target_center(self, objects: Any) -> Any:
+        """(N, 3) m, the target's centre of mass in the world, from states (N, K, 13); native (`arrays`)."""
+        return self.success_check.target_center(objects)
+
     def target_asset(self, env: int = 0) -> LoadedObject:
         """The target's asset in one env."""
         return self.object_assets[env][int(self.target_slot[env])]

@@ -148,7 +148,7 @@ class InBasket(Goal):
         """See `Goal`: grasp, lift, carry, place, release, rest."""
         env = self.env
         slot = native(env.target_slot)
-        target, center = terms.of_target(now.objects, slot), env.success_check.target_center(now.objects)
+        target, center = terms.of_target(now.objects, slot), env.target_center(now.objects)
         basket, turned = now.basket[:, :3], now.basket[:, 3:]
         inside = terms.rotate_inverse(turned, center - basket)  # the target in the basket's frame
         low, high = map(native, self._inside)

@@ -17,7 +17,7 @@ def privileged_observations(env: Any) -> dict[str, torch.Tensor]:
     """Return the poses of objects and basket, and the target's position relative to TCP and goal, (N, D) each."""
     state, tcp = env.bodies.read(), env.tcp_in_world()
     objects, basket = env.bodies.objects(state), env.bodies.basket(state)
-    center = env.success_check.target_center(native(objects))
+    center = env.target_center(native(objects))
     observations = {
         "object_poses": torch.where(env.present[..., None], objects[..., :7], 0.0).flatten(1),
         "target": env.is_target.float(),

@@ -1,23 +1,27 @@
-"""Several environments at once, as a vector environment: in processes on a CPU, batched on a GPU."""
+"""Several environments at once, as a vector environment: in worker processes on a CPU, batched on a GPU."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import gymnasium as gym
+import torch
 from gymnasium.vector import VectorEnv
+from mani_skill.envs.utils.system.backend import CPU_SIM_BACKENDS
 from mani_skill.utils.registration import REGISTERED_ENVS
+from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
 from robocas_ms3.core.errors import VectorEnvError
 from robocas_ms3.core.workers import NO_LIMITS, Limits
 from robocas_ms3.scenes.task_specs import TASKS
-from robocas_ms3.tasks.vector.backend import Backend, choose_backend
-from robocas_ms3.tasks.vector.environment import NumpyVectorEnv, RoboCASVectorEnv
-from robocas_ms3.tasks.vector.processes import ProcessEnv
+from robocas_ms3.tasks.vector.process_env import ProcessEnv
 
-__all__ = ["NumpyVectorEnv", "ProcessEnv", "RoboCASVectorEnv", "make_vec"]
+Backend = Literal["auto", "processes", "gpu"]
+_VECTOR_OPTIONS = ("auto_reset", "ignore_terminations", "record_metrics")
+
+__all__ = ["Backend", "NumpyVectorEnv", "ProcessEnv", "RoboCASVectorEnv", "choose_backend", "make_vec"]
 
 
 def make_vec(
@@ -27,19 +31,11 @@ def make_vec(
     backend: Backend = "auto",
     workers: int | None = None,
     arrays: Literal["torch", "numpy"] = "torch",
-    auto_reset: bool = True,
-    ignore_terminations: bool = False,
-    record_metrics: bool = True,
     wrappers: Sequence[Callable[[gym.Env], gym.Env]] = (),
     limits: Limits = NO_LIMITS,
     **kwargs: Any,
 ) -> VectorEnv:
-    """Several environments as one vector environment, with ManiSkill's conventions.
-
-    Observations, rewards and infos are tensors (N, ...) or dictionaries of them. An env that ends is reset in the same
-    step; its last observation and info are rows of ``info["final_obs"]`` and ``info["final_info"]``, where
-    ``info["_final_info"]`` (N,) says so. ``final_info["episode"]`` has ``return``, ``episode_len``, ``reward``,
-    ``success_once``, ``success_at_end``. ``reset(seed=..., options={"env_idx": ...})`` resets some envs.
+    """Make several environments as one vector environment, with the conventions of `RoboCASVectorEnv`.
 
     In processes, what an env does follows from its seeds and actions alone, not from ``num_envs`` or ``workers``, and
     is what ``gym.make`` gives; with ``reconfiguration_freq=0`` env i keeps the objects of seed 2022 + i. Close it, or
@@ -49,26 +45,25 @@ def make_vec(
         env_id: gymnasium's, such as ``RoboCASPick-v1``; ``module:Id-v1`` imports the module first.
         num_envs: N.
         backend: ``processes`` on the CPU, ``gpu`` in one batch, or ``auto``: the GPU where there is one.
-        workers: how many processes; default and at most one an env, by default no more than cores.
-        arrays: what comes back: tensors, or NumPy arrays.
-        auto_reset: whether envs that end are reset.
-        ignore_terminations: whether an env goes on after success, until its time is up.
-        record_metrics: whether infos have ``episode``.
+        workers: number of processes; default: an env each, at most one per core.
+        arrays: ``torch`` for tensors, or ``numpy``.
         wrappers: put around each env, the first one first; on a GPU around the batch.
-        limits: of what a process may take for a step or a reset of its envs; it dies where it takes more.
-        kwargs: for ``gym.make``, such as ``obs_mode``, ``control_mode``, ``config``, ``max_episode_steps``.
+        limits: of what a process may take for a step or a reset of its envs; it is killed where it takes more.
+        kwargs: ``auto_reset``, ``ignore_terminations`` and ``record_metrics`` of `RoboCASVectorEnv`; all others are for
+            ``gym.make``, such as ``obs_mode``, ``control_mode``, ``config``, ``max_episode_steps``.
 
     Raises:
         VectorEnvError: there is no such environment or backend, or no GPU for it.
-        WorkerDied: a process died.
+        WorkerStartError: a process died while it made its environments.
         Exception: whatever making an environment raises.
     """
-    _check_count("num_envs", num_envs)
-    if workers is not None:
-        _check_count("workers", workers)
+    for name, value in (("num_envs", num_envs), ("workers", 1 if workers is None else workers)):
+        if not isinstance(value, int) or value < 1:
+            raise VectorEnvError("invalid number", where=name, expected="an integer from 1 on", found=repr(value))
     if arrays not in ("torch", "numpy"):
         raise VectorEnvError("no such arrays", where="make_vec", expected='"torch" or "numpy"', found=repr(arrays))
     _check_id(env_id)
+    options = {name: kwargs.pop(name) for name in _VECTOR_OPTIONS if name in kwargs}
     if choose_backend(backend, kwargs.get("sim_backend", "auto")) == "gpu":
         env = gym.make(env_id, num_envs=num_envs, **{"sim_backend": "physx_cuda", **kwargs})
         for wrap in wrappers:
@@ -76,29 +71,105 @@ def make_vec(
     else:
         workers = min(num_envs, workers or len(os.sched_getaffinity(0)))
         env = ProcessEnv(env_id, num_envs, workers, kwargs, wrappers, limits)
-    vector = RoboCASVectorEnv(
-        env, auto_reset=auto_reset, ignore_terminations=ignore_terminations, record_metrics=record_metrics
-    )
+    vector = RoboCASVectorEnv(env, **options)
     return vector if arrays == "torch" else NumpyVectorEnv(vector)
 
 
-def _check_count(name: str, value: Any) -> None:
-    if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-        raise VectorEnvError("is no number of them", where=name, expected="a whole number from 1 on", found=repr(value))
+def choose_backend(backend: str, sim_backend: str = "auto") -> Literal["processes", "gpu"]:
+    """Return what several environments are made with.
+
+    Args:
+        backend: what was asked for; ``auto``: a GPU if there is one and ``sim_backend`` does not say otherwise.
+        sim_backend: ManiSkill's argument, ``auto`` or where physics runs.
+
+    Raises:
+        VectorEnvError: there is no such backend, it contradicts ``sim_backend``, or it needs a GPU and there is none.
+    """
+    if backend not in get_args(Backend):
+        expected = f"one of {list(get_args(Backend))}"
+        raise VectorEnvError("no such backend", where="make_vec", expected=expected, found=repr(backend))
+    on_cpu = sim_backend in CPU_SIM_BACKENDS
+    if (backend == "gpu" and on_cpu) or (backend == "processes" and sim_backend != "auto" and not on_cpu):
+        found = f"backend={backend!r} and sim_backend={sim_backend!r}"
+        fix = "Leave one of them out: with processes physics runs on the CPU, otherwise on the GPU."
+        raise VectorEnvError("backend and sim_backend contradict each other", where="make_vec", found=found, fix=fix)
+    if backend == "processes" or on_cpu:
+        return "processes"
+    if torch.cuda.is_available():
+        return "gpu"
+    if backend == "auto" and sim_backend == "auto":
+        return "processes"
+    fix = 'Pass backend="processes", which runs on the CPU.'
+    raise VectorEnvError("needs a GPU", where="make_vec", found="no CUDA device", fix=fix)
+
+
+class RoboCASVectorEnv(ManiSkillVectorEnv):
+    """ManiSkill's vector environment, over one batched environment: on a GPU, or a `ProcessEnv`.
+
+    The last observations and infos of episodes are named as gymnasium's ``AutoresetMode.SAME_STEP`` names them:
+    ``final_obs`` and ``final_info``, with the flags ``_final_obs`` and ``_final_info`` (N,). ``info["episode"]`` and
+    ``info["final_info"]["episode"]`` have ``return``, ``episode_len``, ``reward`` per step, ``success_once`` and
+    ``success_at_end``. ``reset(seed=..., options={"env_idx": ...})`` resets some envs.
+
+    Args:
+        env: the batched environment.
+        auto_reset: whether an env is reset in the step in which it ends.
+        ignore_terminations: whether an env goes on after success, until its time is up.
+        record_metrics: whether infos have ``episode``.
+    """
+
+    def __init__(
+        self, env: gym.Env, auto_reset: bool = True, ignore_terminations: bool = False, record_metrics: bool = True
+    ) -> None:
+        super().__init__(
+            env, auto_reset=auto_reset, ignore_terminations=ignore_terminations, record_metrics=record_metrics
+        )
+
+    def step(self, actions: Any) -> tuple[Any, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Step every env; see ``ManiSkillVectorEnv``."""
+        obs, reward, terminated, truncated, info = super().step(actions)
+        if "final_observation" in info:  # ManiSkill's name
+            info["final_obs"] = info.pop("final_observation")
+            info["_final_obs"] = info.pop("_final_observation")
+        at_end = info.get("final_info", info)
+        if self.record_metrics and "success" in at_end:  # ManiSkill has it with ``ignore_terminations`` only
+            at_end["episode"]["success_at_end"] = at_end["success"].clone()
+        return obs, reward, terminated, truncated, info  # pyright: ignore[reportReturnType]
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> Any:
+        """Return the result of a method, or an attribute: in processes a tuple of each env's, on a GPU the batch's."""
+        if isinstance(self._env, ProcessEnv):
+            return self._env.call(name, *args, **kwargs)
+        found = self._env.get_wrapper_attr(name)  # ManiSkill's own does not look behind the outermost wrapper
+        return found(*args, **kwargs) if callable(found) else found
+
+
+class NumpyVectorEnv(gym.vector.VectorWrapper):
+    """A vector environment whose tensors are NumPy arrays."""
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Reset; see the environment."""
+        return _as_numpy(self.env.reset(seed=seed, options=options))
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Step every env; see the environment."""
+        return _as_numpy(self.env.step(actions))
+
+
+def _as_numpy(nested: Any) -> Any:
+    if isinstance(nested, torch.Tensor):
+        return nested.cpu().numpy()
+    if isinstance(nested, dict):
+        return {name: _as_numpy(value) for name, value in nested.items()}
+    return type(nested)(map(_as_numpy, nested)) if type(nested) in (tuple, list) else nested
 
 
 def _check_id(env_id: str) -> None:
+    ours = sorted(task.env_id for task in TASKS.values())
+    expected = f"one such as {', '.join(ours)}"
     try:
-        known = gym.spec(env_id).id in {*_ours(), *REGISTERED_ENVS}
+        known = gym.spec(env_id).id in {*ours, *REGISTERED_ENVS}
     except (gym.error.Error, ModuleNotFoundError) as error:
-        raise VectorEnvError("no such environment", where=env_id, expected=_one(), found=error) from error
+        raise VectorEnvError("no such environment", where=env_id, expected=expected, found=error) from error
     if not known:
-        raise VectorEnvError("no environment of ManiSkill's kind", where=env_id, expected=_one())
-
-
-def _one() -> str:
-    return f"one such as {', '.join(sorted(_ours()))}"
-
-
-def _ours() -> set[str]:
-    return {task.env_id for task in TASKS.values()}
+        raise VectorEnvError("no environment of ManiSkill's kind", where=env_id, expected=expected)

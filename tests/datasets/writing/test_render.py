@@ -110,7 +110,7 @@ def test_boxes_hold_the_target(recorded, recording):
     frames.load(recording)
     frame = shown(frames, recording, 0)
     base, cameras = frames.env.unwrapped, frames.cameras()
-    centre = base.success_check.target_center(base.object_states)[0]
+    centre = base.target_center(base.object_states)[0]
     seen = 0
     for camera, (left, top, right, bottom) in frame.boxes.items():
         assert 0 <= left <= right < SIZE[0]

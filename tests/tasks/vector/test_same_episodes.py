@@ -10,7 +10,7 @@ from vector_envs import HORIZON, STATE_ONLY, doing, make
 
 import robocas_ms3
 from robocas_ms3.core.errors import VectorEnvError
-from robocas_ms3.tasks.vector.environment import RoboCASVectorEnv
+from robocas_ms3.tasks.vector import RoboCASVectorEnv
 
 slow = pytest.mark.slow
 

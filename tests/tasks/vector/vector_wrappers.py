@@ -57,13 +57,6 @@ class Wins(gym.Wrapper):
         return obs, won.float(), won.clone(), truncated, info
 
 
-class Narrow(gym.ObservationWrapper):
-    """Shows the first number alone, and does not say so."""
-
-    def observation(self, observation):
-        return observation[:, :1]
-
-
 class LacksLayouts(gym.Wrapper):
     """There is no layout for seed 5, nor every other time without a seed if the last one was ``draws_none_after``."""
 

@@ -1,13 +1,71 @@
-"""ManiSkill's conventions: how episodes end and are counted, on a batch that only counts its steps."""
+"""`make_vec` without simulation: backend, arguments, and conventions on a batch that counts its steps."""
 
 import gymnasium as gym
 import numpy as np
+import pytest
 import torch
 from vector_envs import STATE_ONLY, with_gpu
 
 import robocas_ms3
+from robocas_ms3.core.errors import VectorEnvError
 from robocas_ms3.tasks import vector
-from robocas_ms3.tasks.vector.environment import RoboCASVectorEnv
+from robocas_ms3.tasks.vector import RoboCASVectorEnv, choose_backend
+
+
+@pytest.mark.parametrize(
+    ("backend", "sim_backend", "gpu", "chosen"),
+    [
+        ("auto", "auto", True, "gpu"),
+        ("auto", "auto", False, "processes"),
+        ("auto", "cpu", True, "processes"),
+        ("auto", "physx_cuda", True, "gpu"),
+        ("processes", "auto", True, "processes"),
+        ("gpu", "cuda:1", True, "gpu"),
+    ],
+)
+def test_the_backend_follows_from_what_is_asked_and_what_is_there(monkeypatch, backend, sim_backend, gpu, chosen):
+    with_gpu(monkeypatch, gpu)
+    assert choose_backend(backend, sim_backend) == chosen
+
+
+@pytest.mark.parametrize(
+    ("backend", "sim_backend", "gpu"),
+    [
+        ("gpu", "auto", False),
+        ("auto", "physx_cuda", False),
+        ("gpu", "physx_cpu", True),
+        ("processes", "physx_cuda", True),
+        ("threads", "auto", True),
+    ],
+)
+def test_invalid_backend(monkeypatch, backend, sim_backend, gpu):
+    with_gpu(monkeypatch, gpu)
+    with pytest.raises(VectorEnvError):
+        choose_backend(backend, sim_backend)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {"env_id": "RoboCASPik-v1"},
+        {"env_id": "nowhere_at_all:RoboCASPick-v1"},
+        {"env_id": "CartPole-v1"},
+        {"num_envs": 0},
+        {"num_envs": 2.0},
+        {"workers": 0},
+        {"arrays": "jax"},
+    ],
+)
+def test_invalid_arguments(arguments):
+    with pytest.raises(VectorEnvError):
+        robocas_ms3.make_vec(**{"env_id": "RoboCASPick-v1", "num_envs": 2, **arguments}, **STATE_ONLY)
+
+
+@pytest.mark.parametrize("arguments", [{}, {"sim_backend": "physx_cpu"}])
+def test_several_envs_in_one_process_on_a_cpu_point_to_make_vec(monkeypatch, arguments):
+    with_gpu(monkeypatch, bool(arguments))
+    with pytest.raises(VectorEnvError, match=r"num_envs=4.*robocas_ms3\.make_vec"):
+        gym.make("RoboCASPick-v1", num_envs=4, **STATE_ONLY, **arguments)
 
 
 class FakeBatch(gym.Env):

@@ -1,0 +1,273 @@
+"""Environments in worker processes, which look like one of ManiSkill's batched environments on a GPU."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import tempfile
+import weakref
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from copy import copy
+from functools import partial
+from typing import Any
+
+import cloudpickle
+import gymnasium as gym
+import numpy as np
+import torch
+from gymnasium.vector.utils import batch_space
+from mani_skill.utils.registration import REGISTERED_ENVS
+
+from robocas_ms3.core.errors import VectorEnvError, WorkerCrashed, WorkerDied
+from robocas_ms3.core.workers import NO_LIMITS, Limits, WorkerPool
+from robocas_ms3.tasks.seeds import following_seeds
+from robocas_ms3.tasks.vector.worker import EnvDescription, EnvSettings, EnvWorker, Rows, join_rows, split_rows
+
+
+class ProcessEnv(gym.Env):
+    """Several environments, each of one env on the CPU, in worker processes; batched as ``BaseEnv`` is on a GPU.
+
+    What an env does follows from its seeds and actions alone, whatever the others do and whichever process it is in.
+    Without a seed, env i's stream of seeds begins with 2022 + i, as ManiSkill's. gymnasium's ``AsyncVectorEnv`` takes a
+    process for each env: benchmarks/vector.py compares them.
+
+    Args:
+        env_id: gymnasium's, of a ManiSkill environment.
+        num_envs: how many.
+        workers: processes, each with as many envs as the others, or one more.
+        kwargs: for ``gym.make``; pickled, with what the main program defines.
+        wrappers: put around each env, the first one first; pickled the same way.
+        limits: of what a process may take for a step or a reset of its envs; it is killed where it takes more.
+
+    Raises:
+        VectorEnvError: they can't be sent to processes.
+        WorkerStartError: a process died while it made its environments.
+        Exception: whatever making an environment raises.
+
+    Attributes:
+        pids: ids of the worker processes.
+        elapsed_steps: (N,) int32 control steps since each env's reset; don't write to it.
+    """
+
+    def __init__(
+        self,
+        env_id: str,
+        num_envs: int,
+        workers: int,
+        kwargs: dict[str, Any],
+        wrappers: Sequence[Callable[[gym.Env], gym.Env]] = (),
+        limits: Limits = NO_LIMITS,
+    ) -> None:
+        self.num_envs, self.device = num_envs, torch.device("cpu")
+        self.reconfiguration_freq = 0  # of the batch; what a reset builds anew is each env's own affair
+        self.spec = copy(gym.spec(env_id))
+        if kwargs.get("max_episode_steps") is not None:  # which ManiSkill's helpers read here
+            self.spec.max_episode_steps = kwargs["max_episode_steps"]
+        self._seed_range: tuple[int, int] | None = kwargs.get("seeds")
+        self._must_reset: set[int] = set()  # envs that an interrupted or failed call left in an unknown state
+        self._idle, self._owner = False, os.getpid()
+        self._parts: list[tuple[int, Rows]] = []  # what the envs returned last, with the number of envs of each part
+        self.elapsed_steps = torch.zeros(num_envs, dtype=torch.int32)
+        registered = REGISTERED_ENVS.get(self.spec.id)  # ours are there once they are loaded
+        module = registered.cls.__module__ if registered else "robocas_ms3"
+        if module == "__main__":
+            fix = f'Put it into a module, and pass "the_module:{self.spec.id}".'
+            raise VectorEnvError("registered in the program itself, which processes don't know", where=env_id, fix=fix)
+        running = tempfile.NamedTemporaryFile(prefix="robocas-envs-")  # noqa: SIM115  (closed in `_stop`)
+        running.write(bytes(num_envs))
+        running.flush()
+        self._running = np.memmap(running.name, np.bool_, "r")
+        settings = EnvSettings(env_id, module, kwargs, tuple(wrappers), running.name)
+        try:
+            pickled = cloudpickle.dumps(settings)
+        except Exception as error:
+            raise VectorEnvError("arguments can't be sent to processes", where=env_id, found=error) from error
+        cuts = [num_envs * worker // workers for worker in range(workers + 1)]
+        self._shares = [range(*cut) for cut in zip(cuts, cuts[1:], strict=False)]
+        # a pool for each process, which keeps its envs
+        self._pools: list[WorkerPool[Any, Any]] = [
+            WorkerPool(partial(EnvWorker, pickled, share), 1, limits=limits, retries=0) for share in self._shares
+        ]
+        # also when this is collected, or when Python ends
+        self._stop = weakref.finalize(self, _stop, self._pools, running)
+        try:
+            made: list[EnvDescription] = self._ask([("describe",)] * workers)
+        except BaseException:
+            self.close()
+            raise
+        self.pids = [one.pid for one in made]
+        self.render_mode, self.metadata = made[0].render_mode, made[0].metadata
+        self.single_observation_space, self.single_action_space = made[0].observation_space, made[0].action_space
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Reset all envs, or those of ``options["env_idx"]``; the others stay as they are.
+
+        Args:
+            seed: of each env that is reset; a single one is the first one's, and the others take those after it, within
+                the range ``seeds`` if it is of the range. None: the next of each env's own stream.
+            options: of ``BaseEnv``.
+
+        Raises:
+            VectorEnvError: seeds or envs don't fit.
+            LayoutError: there is no layout for a seed that was asked for, or for many that were drawn.
+        """
+        options = dict(options or {})
+        envs = self._numbers(options.pop("env_idx")) if "env_idx" in options else list(range(self.num_envs))
+        seeds = self._seeds(seed, len(envs))
+        # Of a single seed only the first env's was asked for. Without a seed each env looks for a possible one itself.
+        replaceable = [seed is not None and np.ndim(seed) == 0 and i > 0 for i in range(len(envs))]
+        asked = dict(zip(envs, zip(seeds, replaceable, strict=True), strict=True))
+        if not self._parts and len(envs) < self.num_envs:
+            raise VectorEnvError("no observation of the other environments yet", fix="Reset all of them first.")
+        self._must_reset |= set(envs)
+        shares = [[env for env in share if env in asked] for share in self._shares]
+        answers = self._ask([("reset", {env: asked[env] for env in share}, options) for share in shares])
+        self._must_reset -= set(envs)
+        parts = [(len(share), rows) for share, rows in zip(shares, answers, strict=True) if share]
+        if len(envs) < self.num_envs:
+            parts = [(self.num_envs, self._with_others(join_rows(parts), sum(shares, [])))] if envs else self._parts
+        found = self._batch(parts)
+        return found.get("obs", {}), found["info"]
+
+    def step(self, action: Any) -> tuple[Any, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        """Step every env; see ``BaseEnv``.
+
+        Args:
+            action: (N, A) array or tensor, for one env (A,) too.
+
+        Raises:
+            VectorEnvError: it is of another shape, or envs have to be reset first.
+        """
+        if self._must_reset:
+            envs = name_envs(sorted(self._must_reset))
+            raise VectorEnvError("an earlier call was interrupted or failed", where=envs, fix="Reset them first.")
+        action = action.cpu().numpy() if isinstance(action, torch.Tensor) else np.asarray(action)
+        expected = self.action_space.shape
+        if action.shape not in (expected, expected[1:] if self.num_envs == 1 else expected):  # pyright: ignore[reportOptionalSubscript]
+            raise VectorEnvError("actions don't fit", expected=expected, found=action.shape)
+        action = action.astype(self.action_space.dtype).reshape(expected)
+        self._must_reset = set(range(self.num_envs))
+        answers = self._ask([("step", action[share.start : share.stop]) for share in self._shares])
+        self._must_reset = set()
+        found = self._batch([(len(share), rows) for share, rows in zip(self._shares, answers, strict=True)])
+        return found.get("obs", {}), found["reward"], found["terminated"], found["truncated"], found["info"]
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Return what a method of each env returns, or the attribute of that name; it is pickled."""
+        answers = self._ask([("call", name, args, kwargs)] * len(self._pools))
+        return tuple(pickle.loads(result) for results in answers for result in results)
+
+    def get_language_instruction(self) -> list[str]:
+        """Return the instruction of each env."""
+        return [text for texts in self.call("get_language_instruction") for text in texts]
+
+    def render(self) -> Any:
+        """Return images (N, H, W, 3) of all envs, as ``render_mode`` says."""
+        images = self.call("render")
+        return None if any(image is None for image in images) else torch.cat([*map(torch.as_tensor, images)])
+
+    def close(self) -> None:
+        """Close all environments and end their processes; those that are at work are killed."""
+        if self._owner != os.getpid() or not self._stop.alive:  # a fork has no say
+            return
+        try:
+            if self._idle:
+                with suppress(Exception):
+                    self._ask([("close",)] * len(self._pools))
+        finally:
+            self._must_reset.clear()
+            self._stop()
+            for pool in self._pools:
+                pool.close()
+
+    def _ask(self, commands: Sequence[tuple[Any, ...]]) -> list[Any]:
+        """Send each worker its command, and return their answers.
+
+        Raises:
+            VectorEnvError: it is closed.
+            WorkerDied: a process died; all of them are ended.
+            Exception: whatever the first env that failed raised.
+        """
+        if not self._stop.alive:
+            raise VectorEnvError("these environments are closed", fix="Make them again.")
+        self._idle = False
+        waits = [pool.submit(command) for pool, command in zip(self._pools, commands, strict=True)]
+        answers = []
+        for share, wait in zip(self._shares, waits, strict=True):
+            try:
+                answers.append(wait())
+            except WorkerCrashed as crash:
+                envs = [env for env in share if self._running[env]] or list(share)
+                died = WorkerDied("its process died", where=name_envs(envs), found=crash.found, fix="Make them again.")
+                died.envs = tuple(envs)
+                self.close()
+                raise died from crash
+        self._idle = True
+        for _, failed in answers:
+            if failed is not None:
+                failed.reraise()
+        return [found for found, _ in answers]
+
+    def _with_others(self, rows: Rows, envs: list[int]) -> Rows:
+        """Return rows of all envs: new ones of some, and the last ones of the others."""
+        last, found = join_rows(self._parts), {}
+        for path, new in rows.items():
+            old = last.get(path)
+            if isinstance(old, np.ndarray) and isinstance(new, np.ndarray):
+                old[envs] = new
+                found[path] = old
+            else:
+                entries = dict(zip(envs, split_rows(new), strict=True))
+                found[path] = [entries.get(env) for env in range(self.num_envs)]
+        return found
+
+    def _batch(self, parts: list[tuple[int, Rows]]) -> dict[str, Any]:
+        """Return rows of all envs as nested dictionaries of tensors (N, ...), or of lists."""
+        self._parts = parts
+        nested: dict[str, Any] = {}
+        for (*path, name), value in join_rows(parts).items():
+            inner = nested
+            for part in path:
+                inner = inner.setdefault(part, {})
+            inner[name] = torch.from_numpy(value) if isinstance(value, np.ndarray) else [*map(_as_tensor, value)]
+        if "reconfigure" in nested["info"]:
+            nested["info"]["reconfigure"] = any(nested["info"]["reconfigure"])
+        self.elapsed_steps = nested["info"]["elapsed_steps"].clone()
+        return nested
+
+    def _numbers(self, chosen: Any) -> list[int]:
+        chosen = np.asarray(chosen.cpu() if isinstance(chosen, torch.Tensor) else chosen)
+        envs = np.flatnonzero(chosen) if chosen.dtype == bool and chosen.shape == (self.num_envs,) else chosen
+        numbers = envs.tolist()
+        if envs.ndim != 1 or len(set(numbers)) < len(numbers) or not set(numbers) <= set(range(self.num_envs)):
+            expected = f"different numbers from 0 to {self.num_envs - 1}"
+            raise VectorEnvError("no such environments", where="env_idx", expected=expected, found=numbers)
+        return numbers
+
+    def _seeds(self, seed: Any, count: int) -> list[int | None]:
+        if seed is None:
+            return [None] * count
+        if np.ndim(seed) == 0:
+            return [*following_seeds(int(seed), count, self._seed_range)]
+        seeds = [None if one is None else int(one) for one in seed]
+        if len(seeds) != count:
+            raise VectorEnvError("seeds don't fit", expected=f"{count}, or a single one", found=len(seeds))
+        return seeds
+
+
+def name_envs(envs: Sequence[int]) -> str:
+    """Return words for some environments, such as "envs 0, 2"."""
+    return f"env{'s' * (len(envs) > 1)} {', '.join(map(str, envs))}"
+
+
+def _stop(pools: list[WorkerPool[Any, Any]], running: Any) -> None:
+    for pool in pools:
+        pool.stop()
+    running.close()
+
+
+def _as_tensor(row: Any) -> Any:
+    return torch.from_numpy(row) if isinstance(row, np.ndarray) else row
