@@ -62,19 +62,6 @@ def test_a_slow_server_is_not_dropped_and_answers_health_checks(fast_pings):
         remote.close()
 
 
-def test_openpis_client_waits_for_a_slow_server(fast_pings, monkeypatch):
-    openpi = pytest.importorskip("openpi_client.websocket_client_policy")
-    pinging = openpi.websockets.sync.client.connect
-
-    def impatient(*args, **options):
-        return pinging(*args, **options, ping_interval=0.2, ping_timeout=1)
-
-    monkeypatch.setattr(openpi.websockets.sync.client, "connect", impatient)
-    with serving(Slow(4.0)) as url:
-        client = openpi.WebsocketClientPolicy(host=url)
-        assert client.infer(observation_message(some_observations(0), 0, None, reset=True))["actions"].shape == (3, 7)
-
-
 @contextmanager
 def tunnel(port, cut):
     """Forward connections to a port, until the event is set: then nothing passes, and nothing is closed."""
