@@ -101,14 +101,13 @@ class FurnitureReport:
 
 
 def measure_furniture(furniture: FurnitureSource | LoadedFurniture) -> FurnitureQuality:
-    """Shares of joints that work and surfaces that hold. The same furniture gives the same figures.
+    """Return the shares of joints that work and surfaces that hold. The same furniture gives the same figures.
 
     Raises:
         AssetError: the physics engine refuses a hull.
     """
-    model = model_of(furniture)
-    report = _examine(model)
-    hulls = [piece for pieces in model.pieces.values() for piece in pieces]
+    report = examine_furniture(furniture)
+    hulls = [piece for pieces in model_of(furniture).pieces.values() for piece in pieces]
     return FurnitureQuality(
         hull_count=len(hulls),
         hull_vertices=max(len(convex_faces(hull)[0]) for hull in hulls),
@@ -118,22 +117,15 @@ def measure_furniture(furniture: FurnitureSource | LoadedFurniture) -> Furniture
 
 
 def examine_furniture(furniture: FurnitureSource | LoadedFurniture) -> FurnitureReport:
-    """The same in detail: which joint sticks, which surface lets things slip.
+    """Measure each joint and surface.
 
     Raises:
         AssetError: the physics engine refuses a hull.
     """
-    return _examine(model_of(furniture))
-
-
-def _examine(model: Model) -> FurnitureReport:
+    model = model_of(furniture)
     with engine_settings():
-        return _examine_in_engine(model)
-
-
-def _examine_in_engine(model: Model) -> FurnitureReport:
-    joints = {link.joint.name: _try_joint(model, link) for link in model.links}
-    return FurnitureReport(joints, {name: _try_surface(model, surface) for name, surface in model.surfaces.items()})
+        joints = {link.joint.name: _try_joint(model, link) for link in model.links}
+        return FurnitureReport(joints, {name: _try_surface(model, surface) for name, surface in model.surfaces.items()})
 
 
 def _share(flags: Iterable[bool]) -> float | None:

@@ -20,6 +20,7 @@ from robocas_ms3.assets.manifest import SCHEMA_VERSION, FurnitureAsset, ObjectAs
 from robocas_ms3.core.documents import JSON_LIMIT, DocumentError, check_regular, read_bytes
 from robocas_ms3.core.errors import AssetError
 from robocas_ms3.core.paths import builtin_packs_dir, data_dir
+from robocas_ms3.core.poses import transform
 from robocas_ms3.core.strict import mistakes, refusal, validate_json
 
 VisualLevel = Literal["fast", "full"]
@@ -91,17 +92,11 @@ class LoadedFurniture(Part):
     asset: FurnitureAsset = field(kw_only=True)
     links: dict[str, Part] = field(default_factory=dict, kw_only=True)
 
-    def all_surface_points(self, positions: Mapping[str, float] | None = None, spacing: float = 0.005) -> Array:
-        """Return points (P, 3), about ``spacing`` m apart, on body and links, in the furniture's frame.
-
-        Args:
-            positions: of the joints by name, m or rad; those not named are at 0.
-            spacing: m.
-        """
-        pieces = [self.surface_points(spacing)]
-        for name, pose in link_poses(self.asset.links, positions or {}).items():
-            pieces.append(self.links[name].surface_points(spacing) @ pose[:3, :3].T + pose[:3, 3])
-        return np.concatenate(pieces)
+    def all_surface_points(self, positions: Mapping[str, float]) -> Array:
+        """Return points (P, 3), m, on body and links in the furniture's frame; joints not in ``positions`` are at 0."""
+        poses = link_poses(self.asset.links, positions)
+        links = [transform(pose, self.links[name].surface_points()) for name, pose in poses.items()]
+        return np.concatenate([self.surface_points(), *links])
 
     def finish(self, part: str, name: str) -> Path:
         """Return the textured mesh (GLB) of a part in one of its finishes.

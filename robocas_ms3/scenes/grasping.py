@@ -59,22 +59,19 @@ def directions_ok(
     return tests | {"from_the_robots_side": from_side, "closing_is_level": closing_is_level}
 
 
-def gripper_is_clear(
-    tcp_in_world: Array, points_in_world: Array, sweep: float = PREGRASP_DISTANCE, side_clearance: float = 0.0
-) -> NDArray[np.bool_]:
+def gripper_is_clear(tcp_in_world: Array, points_in_world: Array, side_clearance: float = 0.0) -> NDArray[np.bool_]:
     """Return for each grasp (G, 4, 4) whether no point (P, 3) is in the open gripper, from pre-grasp to grasp.
 
     Args:
         tcp_in_world: (G, 4, 4).
         points_in_world: (P, 3) m.
-        sweep: distance from which the gripper comes in along its approach, m.
         side_clearance: how far from its sides (along x and y of the TCP) points have to stay, m.
     """
     clear = np.ones(len(tcp_in_world), dtype=bool)
     if len(points_in_world) == 0 or len(tcp_in_world) == 0:
         return clear
     low, high = GRIPPER_BOXES[:, 0].copy(), GRIPPER_BOXES[:, 1].copy()
-    low -= (side_clearance, side_clearance, sweep)
+    low -= (side_clearance, side_clearance, PREGRASP_DISTANCE)
     high += (side_clearance, side_clearance, 0.0)
     first, last = _bounds_around(tcp_in_world, low.min(axis=0), high.max(axis=0))
     near = np.all((points_in_world >= first.min(0)) & (points_in_world <= last.max(0)), axis=1)

@@ -20,6 +20,7 @@ from robocas_ms3.scenes.placement import Array
 
 PixelBox = tuple[slice, slice]  # rows, columns
 
+HEIGHT = 0.5  # m, of the selection camera above the support, upstream's
 _FAR = 1e30  # embree's distance of a miss is greater
 _scenes: WeakKeyDictionary[trimesh.Trimesh, EmbreeScene] = WeakKeyDictionary()
 
@@ -63,14 +64,12 @@ class PinholeCamera:
         return slice(r0, r1), slice(c0, c1)
 
 
-def top_down_camera(
-    center_xy: Array, support_z: float, *, height: float = 0.5, size: int = 512, fov: float = np.pi / 2
-) -> PinholeCamera:
-    """Return a camera that looks straight down on (x, y) from ``height`` above the support; defaults: upstream's."""
+def top_down_camera(center_xy: Array, support_z: float, *, size: int = 512) -> PinholeCamera:
+    """Return upstream's selection camera: it looks straight down on (x, y) from `HEIGHT` above the support."""
     pose = np.eye(4)
     pose[:3, :3] = np.column_stack([(0, 0, -1.0), (0, 1.0, 0), (1.0, 0, 0)])
-    pose[:3, 3] = *center_xy, support_z + height
-    return PinholeCamera(pose, size, size, fov)
+    pose[:3, 3] = *center_xy, support_z + HEIGHT
+    return PinholeCamera(pose, size, size)
 
 
 @lru_cache(maxsize=512)

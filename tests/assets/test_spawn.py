@@ -57,7 +57,7 @@ def test_a_drawer_slides_along_its_axis_and_no_farther_than_its_limit(scene, cab
 
 
 def test_surface_points_follow_the_joint(cabinet):
-    closed, pulled = cabinet.all_surface_points(), cabinet.all_surface_points({"slide": 0.3})
+    closed, pulled = cabinet.all_surface_points({}), cabinet.all_surface_points({"slide": 0.3})
     assert closed[:, 0].max() == pytest.approx(0.2) and pulled[:, 0].max() == pytest.approx(0.5)
     assert len(closed) == len(pulled)
     np.testing.assert_allclose(pulled[:, 2].max(), 0.1)

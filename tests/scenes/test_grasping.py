@@ -93,12 +93,6 @@ def test_many_grasps_among_many_points_are_judged_as_each_alone():
     assert gripper_is_clear(grasps, points).tolist() == expected
 
 
-def test_without_a_sweep_only_the_grasp_itself_counts():
-    above = grasp()[:3, 3] + [0, 0.042, 0.2]  # 0.2 m above the pad
-    assert not gripper_is_clear(grasp()[None], above[None], sweep=0.1)[0]
-    assert gripper_is_clear(grasp()[None], above[None], sweep=0.0)[0]
-
-
 @pytest.mark.parametrize(
     ("point", "clear"),
     [

@@ -11,7 +11,7 @@ from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.scenes.visibility import PinholeCamera, Scenery, object_mesh, top_down_camera
 
 PLATE = trimesh.creation.box((0.1, 0.1, 0.002))
-HIGH = top_down_camera(np.zeros(2), 0.0, height=10.0, size=256, fov=0.03)  # nearly parallel rays
+HIGH = PinholeCamera(top_down_camera(np.zeros(2), 9.5).pose, 256, 256, 0.03)  # nearly parallel rays
 
 
 def at(*position: float) -> np.ndarray:
