@@ -43,7 +43,7 @@ def test_the_cameras_of_the_page(tmp_path):
     assert (base.name, base.width, base.height, base.position) == ("base_camera", 320, 240, (0, -0.3, 1.2))
     assert (hand, static) == MOBILE_PANDA.cameras[1:]
     assert (side.parent, side.fov, side.look_at) == ("world", pytest.approx(np.pi / 3), (1.2, 0.7, 0.6))
-    assert (wrist.name, wrist.parent, wrist.rpy) == ("wrist_camera", "ee", pytest.approx((np.pi, -np.pi / 2, 0)))
+    assert (wrist.name, wrist.parent, wrist.rpy) == ("wrist_camera", "ee", pytest.approx((0, -np.pi / 2, 0)))
 
 
 @pytest.mark.parametrize(
