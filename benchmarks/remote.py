@@ -107,7 +107,7 @@ def synthetic(envs: int, spec: PolicySpec) -> Observations:
     shapes = {name: (envs, height, width, 3) for name, (width, height) in spec.cameras.items()}
     images = {name: rng.integers(0, 256, shape, np.uint8) for name, shape in shapes.items()}
     robot = {name: rng.normal(size=(envs, size)).astype(np.float32) for name, size in SIZES.items()}
-    return Observations(np.arange(envs), ["take the apple"] * envs, None, images, {}, **robot, state=None)
+    return Observations(np.arange(envs), ["take the apple"] * envs, None, images, {}, robot, None)
 
 
 def plain_options(spec: PolicySpec) -> list[str]:

@@ -20,18 +20,14 @@ Metres and radians; quaternions are xyzw.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
-
-import numpy as np
+from typing import Literal
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.robots.cameras import CAMERA_NAME, PARENT_FRAMES, STANDARD_CAMERAS, Parent, standard_parent
+from robocas_ms3.robots.quantities import QUANTITIES, ArraySpec
 from robocas_ms3.scenes.language.embed import DIMENSIONS
 from robocas_ms3.scenes.language.templates import GOAL_TYPES
-
-DataType = Literal["float32", "int64", "bool", "str"]
 
 SCHEMA_VERSION = 2
 """Raised when older datasets have to be converted again. 1: no ``scene.json``; 0: upstream's, see docs/dataset.md."""
@@ -50,63 +46,8 @@ MAX_STEPS = 10_000  # four digits in image names
 MAX_DEPTH_MM = 65_535
 
 
-@dataclass(frozen=True)
-class ArraySpec:
-    """One array of ``episode_info.npz``.
-
-    Attributes:
-        name: its key.
-        dtype: its type; ``str`` is numpy's fixed-width unicode.
-        shape: lengths; ``"T"`` is the number of steps.
-        unit: of its numbers.
-        meaning: for people.
-        quaternion: rows are unit quaternions xyzw.
-        embedding: rows are sentence embeddings; absent from datasets converted without.
-    """
-
-    name: str
-    dtype: DataType
-    shape: tuple[int | Literal["T"], ...]
-    unit: str
-    meaning: str
-    quaternion: bool = False
-    embedding: bool = False
-
-    def shape_for(self, steps: int) -> tuple[int, ...]:
-        """Shape in an episode of ``steps`` steps."""
-        return tuple(steps if length == "T" else length for length in self.shape)
-
-    def has_dtype(self, array: np.ndarray) -> bool:
-        """Whether an array is of the declared type."""
-        return array.dtype.kind == "U" if self.dtype == "str" else array.dtype == np.dtype(self.dtype)
-
-    def cast(self, values: Any) -> np.ndarray:
-        """Values as an array of the declared type."""
-        return np.asarray(values, dtype=np.str_ if self.dtype == "str" else self.dtype)
-
-
-_EE = "EEF (TCP) in the arm base frame (panda_link0)"
-_BASE = "arm base in the world"
-
 EPISODE_INFO: tuple[ArraySpec, ...] = (
-    ArraySpec("rel_pos", "float32", ("T", 3), "m", "EEF from step t to t+1, in the EEF frame at t; last row 0"),
-    ArraySpec("rel_orn", "float32", ("T", 4), "xyzw", "the same turn; last row the identity", quaternion=True),
-    ArraySpec("ee_pos", "float32", ("T", 3), "m", _EE),
-    ArraySpec("ee_orn", "float32", ("T", 4), "xyzw", _EE, quaternion=True),
-    ArraySpec("robot_joints", "float32", ("T", 7), "rad", "arm joints"),
-    ArraySpec("arm_joint_vel", "float32", ("T", 7), "rad/s", "velocities of the arm joints"),
-    ArraySpec("base_pos", "float32", ("T", 3), "m", _BASE),
-    ArraySpec("base_orn", "float32", ("T", 4), "xyzw", _BASE, quaternion=True),
-    ArraySpec("base_rel_pos", "float32", ("T", 3), "m", "as rel_pos, of the arm base"),
-    ArraySpec("base_rel_orn", "float32", ("T", 4), "xyzw", "as rel_orn, of the arm base", quaternion=True),
-    ArraySpec("gripper_width", "float32", ("T",), "m", "distance between the finger pads: sum of both finger joints"),
-    ArraySpec(
-        "gripper_status", "bool", ("T",), "", "command in force at this step: True = open (commanded width > 0.04 m)"
-    ),
-    ArraySpec("agv_pose", "float32", ("T", 3), "m, m, rad", "mobile base in the world: x, y, yaw, which never jumps"),
-    ArraySpec(
-        "rel_agv_pose", "float32", ("T", 3), "m, m, rad", "agv_pose[t+1] - agv_pose[t] (world frame); last row 0"
-    ),
+    *(quantity for quantity in QUANTITIES if quantity.recorded),
     ArraySpec("episode_length", "int64", (), "steps", "T"),
     ArraySpec("language_goal", "str", (), "", "the instruction"),
     ArraySpec(
@@ -118,6 +59,7 @@ EPISODE_INFO: tuple[ArraySpec, ...] = (
         "step_goal_embs", "float32", ("T", DIMENSIONS), "", "step_lang_goals, by all-MiniLM-L6-v2", embedding=True
     ),
 )
+"""Arrays of ``episode_info.npz``: the recorded quantities of the robot, and texts."""
 
 RELATIVE_PAIRS = (("ee_pos", "ee_orn", "rel_pos", "rel_orn"), ("base_pos", "base_orn", "base_rel_pos", "base_rel_orn"))
 """Keys of absolute position and orientation, and of the same as relative motion."""

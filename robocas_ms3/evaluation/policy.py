@@ -18,8 +18,11 @@ from robocas_ms3.core.exits import no_exit
 from robocas_ms3.core.files import json_text
 from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.robots.cameras import CAMERA_NAME
+from robocas_ms3.robots.quantities import QUANTITIES
 from robocas_ms3.robots.table import DEFAULT
 
+ROBOT = {quantity.policy: quantity for quantity in QUANTITIES if quantity.policy}
+"""Quantities of the robot that policies observe, by their names there."""
 Language = Literal["none", "text", "embedding"]
 Reference = Literal["tcp", "target"]
 Side = Annotated[int, Field(ge=1, le=4096)]
@@ -110,9 +113,7 @@ class Observations:
         embeddings: (E, 384) float32 sentence embeddings, or None.
         images: by camera (E, H, W, 3) uint8.
         depths: by camera (E, H, W, 1) int16, mm.
-        qpos: (E, 12) base x, y, yaw, seven arm joints, two fingers; m and rad.
-        tcp_in_base: (E, 7) pose of the TCP in the arm's base frame: position m, quaternion wxyz.
-        gripper_width: (E, 1) m.
+        robot: (E, D) by name, the quantities of `ROBOT`; they are attributes too, such as ``qpos``.
         state: (E, D) privileged state, or None.
     """
 
@@ -121,10 +122,14 @@ class Observations:
     embeddings: NDArray[np.float32] | None
     images: dict[str, NDArray[np.uint8]]
     depths: dict[str, NDArray[Any]]
-    qpos: NDArray[np.float32]
-    tcp_in_base: NDArray[np.float32]
-    gripper_width: NDArray[np.float32]
+    robot: dict[str, NDArray[np.float32]]
     state: NDArray[np.float32] | None
+
+    def __getattr__(self, name: str) -> NDArray[np.float32]:
+        """Return a quantity of the robot."""
+        if name not in ROBOT:
+            raise AttributeError(name)
+        return self.robot[name]
 
 
 def privileged(extra: Mapping[str, Any]) -> NDArray[np.float32]:

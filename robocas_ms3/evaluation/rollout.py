@@ -16,6 +16,7 @@ from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.metrics import MEASURES, read_sum
 from robocas_ms3.evaluation.outcomes import Outcome, Retrieval, failure_stage
 from robocas_ms3.evaluation.policy import (
+    ROBOT,
     EpisodeSpec,
     Observations,
     Policy,
@@ -161,9 +162,7 @@ class EpisodeBatch:
             embeddings=self._embed(texts) if self._embed else None,
             images={name: cameras[name]["rgb"][index] for name in spec.cameras},
             depths={name: cameras[name]["depth"][index] for name in spec.cameras} if spec.depth else {},
-            qpos=agent["qpos"][index],
-            tcp_in_base=agent["tcp_in_arm_base"][index],
-            gripper_width=agent["gripper_width"][index],
+            robot={name: agent[quantity.name][index] for name, quantity in ROBOT.items()},
             state=privileged(obs["extra"])[index] if spec.state else None,
         )
 

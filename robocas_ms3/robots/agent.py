@@ -20,6 +20,7 @@ from robocas_ms3.robots.control_modes import control_modes
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.robots.drives import EvenDrives
 from robocas_ms3.robots.ee_controller import relative_pose
+from robocas_ms3.robots.quantities import QUANTITIES
 from robocas_ms3.robots.table import RobotSpec
 
 
@@ -187,13 +188,8 @@ class MobileManipulator(BaseAgent):
         self.robot.set_joint_drive_velocity_targets(torch.zeros(1, len(joints), device=self.device), joints)
 
     def get_proprioception(self) -> dict[str, Any]:
-        """Joint state, TCP pose in the arm's base frame (N, 7), gripper width (N, 1), controller state."""
-        obs: dict[str, Any] = dict(
-            qpos=self.robot.get_qpos(),
-            qvel=self.robot.get_qvel(),
-            tcp_in_arm_base=self.tcp_in_arm_base.raw_pose,
-            gripper_width=self.gripper_width[:, None],
-        )
+        """Return the observed quantities, (N, D) each, and the controller's state."""
+        obs: dict[str, Any] = {one.name: one.observed(self) for one in QUANTITIES if one.observed}
         state = self.controller.get_state()
         if state:
             obs["controller"] = state

@@ -70,9 +70,7 @@ def observe(frames, texts=None):
         embeddings=None,
         images={"base_camera": images, "gripper_camera": images + 100},
         depths={},
-        qpos=zeros,
-        tcp_in_base=zeros[:, :7],
-        gripper_width=zeros[:, :1],
+        robot={"qpos": zeros, "tcp_in_base": zeros[:, :7], "gripper_width": zeros[:, :1]},
         state=None,
     )
 

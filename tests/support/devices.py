@@ -42,9 +42,7 @@ def check(dataset, tmp_path, name, precision, device):
         embeddings=np.ones((2, 384), np.float32),
         images={camera: np.zeros((2, height, width, 3), np.uint8) for camera, (width, height) in sizes.items()},
         depths={},
-        qpos=nothing,
-        tcp_in_base=here,
-        gripper_width=nothing[:, :1],
+        robot={"qpos": nothing, "tcp_in_base": here, "gripper_width": nothing[:, :1]},
         state=None,
     )
     acted = policy.act(seen)

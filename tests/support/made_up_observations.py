@@ -12,14 +12,17 @@ def start(env=0, seed=0):
 def observe(envs=(0,), **values):
     """Observations of some envs; zeros where no value is given, and a TCP that is not turned."""
     count = len(envs)
-    zeros = {
+    robot = {
+        "qpos": np.zeros((count, 12), np.float32),
+        "tcp_in_base": np.tile(np.float32([0.5, 0, 0.3, 1, 0, 0, 0]), (count, 1)),
+        "gripper_width": np.zeros((count, 1), np.float32),
+    }
+    others = {
         "instructions": ["take it"] * count,
         "embeddings": None,
         "images": {},
         "depths": {},
-        "qpos": np.zeros((count, 12), np.float32),
-        "tcp_in_base": np.tile(np.float32([0.5, 0, 0.3, 1, 0, 0, 0]), (count, 1)),
-        "gripper_width": np.zeros((count, 1), np.float32),
         "state": None,
     }
-    return Observations(envs=np.array(envs), **zeros | values)
+    robot |= {name: values.pop(name) for name in robot if name in values}
+    return Observations(envs=np.array(envs), robot=robot, **others | values)

@@ -10,7 +10,7 @@ import pytest
 
 import robocas_ms3  # noqa: F401
 from robocas_ms3.core.errors import PlanningFailed
-from robocas_ms3.datasets.sources.arrays import episode_arrays, planar_base
+from robocas_ms3.datasets.sources.arrays import episode_arrays
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.recordings.motion import sample_states
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
@@ -105,7 +105,7 @@ def test_a_drive_is_in_the_datasets_base_motion(driven):
         recording = file.recording(0)
     samples = sample_states(recording.control_steps, 4)
     motion = recording.motion(samples)
-    x, y, yaw = planar_base(motion.root_in_world, motion.qpos).T
+    x, y, yaw = motion.agv_pose.T
     base = np.tile(np.eye(4), (len(x), 1, 1))  # what rendering reads from the arm's base link
     base[:, 0, 0] = base[:, 1, 1] = np.cos(yaw)
     base[:, 1, 0] = np.sin(yaw)

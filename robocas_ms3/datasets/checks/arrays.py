@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from robocas_ms3.core.poses import from_xyzw
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.violation import Violation
-from robocas_ms3.datasets.sources.tolerant import SPECS, EpisodeArrays, planar_motion
-from robocas_ms3.demos.recordings.motion import relative_motion
+from robocas_ms3.datasets.sources.tolerant import SPECS, EpisodeArrays
+from robocas_ms3.demos.recordings.motion import planar_motion, relative_motion
 from robocas_ms3.scenes.language.templates import GOAL_TYPES
 
 Check = Callable[[EpisodeArrays], Iterator[Violation]]
@@ -138,10 +138,11 @@ def check_base_motion(stored: EpisodeArrays) -> Iterator[Violation]:
 
 
 def check_values(stored: EpisodeArrays) -> Iterator[Violation]:
-    """Check that the gripper can be that wide, sub-goals are of known types, and there is an instruction."""
-    width = stored.arrays.get("gripper_width")
-    if width is not None and (width.min() < -0.005 or width.max() > 0.085):
-        yield Violation(stored.file, "gripper_width", "0 to 0.08 m", f"{width.min():.3f} to {width.max():.3f}")
+    """Check that numbers are within their limits, sub-goals are of known types, and there is an instruction."""
+    for spec, array in _known(stored):
+        if spec.limits and not spec.limits[0] <= array.min() <= array.max() <= spec.limits[1]:
+            expected = f"{spec.limits[0]:g} to {spec.limits[1]:g} {spec.unit}"
+            yield Violation(stored.file, spec.name, expected, f"{array.min():.3f} to {array.max():.3f}")
     types = stored.arrays.get("step_goal_type", np.zeros(0, np.str_))
     for goal_type in sorted(set(types.tolist()) - set(GOAL_TYPES)):
         yield Violation(stored.file, "step_goal_type", f"one of {', '.join(GOAL_TYPES)}", goal_type)

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from robocas_ms3.core.poses import from_xyzw
 from robocas_ms3.datasets.schema import EPISODE_INFO
 from robocas_ms3.demos.recordings.motion import relative_motion
+from robocas_ms3.robots.quantities import features
 
 
 def frame_columns(arrays: dict[str, NDArray]) -> dict[str, NDArray]:
@@ -19,18 +20,13 @@ def frame_columns(arrays: dict[str, NDArray]) -> dict[str, NDArray]:
     status = arrays["gripper_status"].astype(np.float32)[:, None]
     command, joints = _next(status), _next(arrays["robot_joints"])
     parts = {
-        "observation.state": (
-            arrays["ee_pos"], arrays["ee_orn"], arrays["robot_joints"], arrays["gripper_width"][:, None],
-            arrays["agv_pose"],
-        ),
-        "observation.joint_velocity": (arrays["arm_joint_vel"],),
-        "observation.arm_base": (arrays["base_pos"], arrays["base_orn"]),
-        "observation.gripper_open": (status,),
+        **{key: [arrays[one.name] for one in quantities] for key, quantities in features().items()},
         "action": (arrays["rel_pos"], turn, command),
         "action.joint": (joints, command),
         "action.base": (arrays["rel_agv_pose"],),
-    }  # fmt: skip
-    return {key: np.concatenate(part, axis=1).astype(np.float32) for key, part in parts.items()}
+    }
+    columns = {key: [part.reshape(len(status), -1) for part in of_feature] for key, of_feature in parts.items()}
+    return {key: np.concatenate(column, axis=1).astype(np.float32) for key, column in columns.items()}
 
 
 def robocas_arrays(
@@ -40,24 +36,20 @@ def robocas_arrays(
 
     Relative rotations are computed from the absolute ones.
     """
-    state, base = columns["observation.state"], columns["observation.arm_base"]
     values: dict[str, Any] = {
-        "ee_pos": state[:, :3],
-        "ee_orn": state[:, 3:7],
-        "robot_joints": state[:, 7:14],
-        "gripper_width": state[:, 14],
-        "agv_pose": state[:, 15:18],
-        "arm_joint_vel": columns["observation.joint_velocity"],
-        "base_pos": base[:, :3],
-        "base_orn": base[:, 3:],
-        "gripper_status": columns["observation.gripper_open"].reshape(-1) > 0.5,
         "rel_pos": columns["action"][:, :3],
         "rel_agv_pose": columns["action.base"],
-        "episode_length": len(state),
+        "episode_length": len(columns["action"]),
         "language_goal": instruction,
         "step_lang_goals": subgoals,
         "step_goal_type": types,
     }
+    for key, quantities in features().items():
+        column, first = columns[key].reshape(len(columns["action"]), -1), 0
+        for quantity in quantities:
+            part = column[:, first : first + quantity.width].reshape(quantity.shape_for(len(column)))
+            values[quantity.name] = part > 0.5 if quantity.dtype == "bool" else part
+            first += quantity.width
     for pos, orn, rel in (("ee_pos", "ee_orn", "rel"), ("base_pos", "base_orn", "base_rel")):
         poses = from_xyzw(values[pos].astype(np.float64), values[orn].astype(np.float64))
         motion = relative_motion(poses)

@@ -44,6 +44,8 @@ from typing import Any
 from robocas_ms3.core.documents import check_regular
 from robocas_ms3.core.errors import DatasetError, MissingExtraError
 from robocas_ms3.datasets.lerobot.variants import Variant
+from robocas_ms3.robots.quantities import Quantity
+from robocas_ms3.robots.quantities import features as quantities_of_features
 from robocas_ms3.robots.table import DEFAULT
 
 ROBOT_TYPE = "mobile_panda"  # of the default robot; another one's is its name
@@ -107,17 +109,15 @@ class Feature:
 
 
 _JOINTS = tuple(f"joint_{number}" for number in range(1, 8))
-_XYZ, _XYZW = ("x", "y", "z"), ("qx", "qy", "qz", "qw")
+
+
+def _observation(key: str, quantities: Sequence[Quantity]) -> Feature:
+    names = tuple(name for quantity in quantities for name in quantity.names)
+    return Feature(key, names, ", ".join(f"{one.name} ({one.width}, {one.unit or 'bool'})" for one in quantities))
+
 
 FEATURES: tuple[Feature, ...] = (
-    Feature(
-        "observation.state",
-        (*_XYZ, *_XYZW, *_JOINTS, "gripper_width", "agv_x", "agv_y", "agv_yaw"),
-        "ee_pos (3, m), ee_orn (4, xyzw), robot_joints (7, rad), gripper_width (m), agv_pose (m, m, rad)",
-    ),
-    Feature("observation.joint_velocity", _JOINTS, "arm_joint_vel, rad/s"),
-    Feature("observation.arm_base", (*_XYZ, *_XYZW), "base_pos (3, m), base_orn (4, xyzw)"),
-    Feature("observation.gripper_open", ("gripper_open",), "gripper_status: command in force at this step, 1 = open"),
+    *(_observation(key, quantities) for key, quantities in quantities_of_features().items()),
     Feature(
         "action",
         ("dx", "dy", "dz", "roll", "pitch", "yaw", "gripper_open"),
@@ -210,7 +210,7 @@ def single_features(variant: Variant) -> tuple[Feature, ...]:
 
 def modality_json(cameras: Sequence[str]) -> dict[str, Any]:
     """Return ``meta/modality.json``, by which GR00T reads a dataset of format v2.1."""
-    state = {"ee_pos": 3, "ee_orn": 4, "robot_joints": 7, "gripper_width": 1, "agv_pose": 3}
+    state = {quantity.name: quantity.width for quantity in quantities_of_features()["observation.state"]}
     action = {"rel_pos": 3, "rel_orn": 3, "gripper_open": 1}
     slices = {"state": {}, "action": {}}
     for name, widths in (("state", state), ("action", action)):

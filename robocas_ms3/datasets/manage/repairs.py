@@ -14,8 +14,9 @@ from robocas_ms3.core.words import count_of
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks import arrays as laws
 from robocas_ms3.datasets.checks.violation import Violation
-from robocas_ms3.datasets.sources.arrays import continuous_xyzw
-from robocas_ms3.datasets.sources.tolerant import SPECS, EpisodeArrays, motion_arrays, planar_motion
+from robocas_ms3.datasets.sources.tolerant import SPECS, EpisodeArrays, motion_arrays
+from robocas_ms3.demos.recordings.motion import planar_motion
+from robocas_ms3.robots.quantities import continuous_xyzw
 
 EMBEDDINGS = tuple(spec.name for spec in schema.EPISODE_INFO if spec.embedding)
 _ESSENTIAL = ("ee_pos", "ee_orn", "gripper_status", "language_goal", "step_lang_goals", "step_goal_type")

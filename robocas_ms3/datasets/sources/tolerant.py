@@ -16,8 +16,7 @@ from robocas_ms3.core.documents import DAMAGED, open_arrays
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import from_xyzw
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.sources.arrays import wrap_angle
-from robocas_ms3.demos.recordings.motion import stored_motion
+from robocas_ms3.demos.recordings.motion import planar_motion, stored_motion
 
 SPECS = {spec.name: spec for spec in schema.EPISODE_INFO}
 PICKLED = "pickled objects, which are never loaded"
@@ -207,14 +206,6 @@ def motion_arrays(arrays: Mapping[str, NDArray], keys: tuple[str, str, str, str]
     poses = _poses(arrays, keys[0], keys[1])
     assert poses is not None
     return dict(zip(keys[2:], stored_motion(poses), strict=True))
-
-
-def planar_motion(agv_pose: NDArray) -> NDArray[np.float64]:
-    """(T, 3) differences of x, y, yaw; the last row is 0."""
-    pose = agv_pose.astype(np.float64)
-    motion = np.diff(pose, axis=0, append=pose[-1:])
-    motion[:, 2] = wrap_angle(motion[:, 2])
-    return motion
 
 
 def arrays_fingerprint(arrays: Mapping[str, NDArray]) -> str:

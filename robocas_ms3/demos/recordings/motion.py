@@ -8,6 +8,7 @@ step alone is shorter.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,6 +102,32 @@ def stored_actions(positions: NDArray, turns: NDArray, gripper_status: NDArray[n
     return actions.astype(np.float32)
 
 
+def planar_base(root: Array, qpos: Array) -> Array:
+    """Return the mobile base in the world, (T, 3) x, y in m, yaw in rad: first in [-pi, pi), then without jumps.
+
+    Args:
+        root: (T, 4, 4) of the robot in the world.
+        qpos: (T, 12).
+    """
+    x, y, yaw = qpos[:, RobotDescription.base_slice].T
+    position = root[:, :3, 3] + np.einsum("tij,tj->ti", root[:, :3, :3], np.stack([x, y, 0 * x], axis=1))
+    root_yaw = np.arctan2(root[:, 1, 0], root[:, 0, 0])
+    return np.column_stack([position[:, :2], np.asarray(np.unwrap(_wrap(root_yaw + yaw)), dtype=np.float64)])
+
+
+def planar_motion(agv_pose: NDArray) -> Array:
+    """Return the differences (T, 3) of x, y, yaw; the last row is 0."""
+    pose = agv_pose.astype(np.float64)
+    motion = np.diff(pose, axis=0, append=pose[-1:])
+    motion[:, 2] = _wrap(motion[:, 2])
+    return motion
+
+
+def _wrap(angle: Array) -> Array:
+    """Return angles in [-pi, pi)."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
 @dataclass(frozen=True)
 class Motion:
     """Motion of the robot at the T states of an episode that a dataset keeps.
@@ -149,10 +176,30 @@ class Motion:
         """Of a robot, and of what the attributes of these names say."""
         return cls(qpos, qvel, root_in_world, *link_poses(robot, root_in_world, qpos), opened)
 
-    @property
+    @cached_property
     def tcp_in_base(self) -> Array:
         """(T, 4, 4)."""
         return inverse(self.arm_base_in_world) @ self.tcp_in_world
+
+    @cached_property
+    def tcp_motion(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """`stored_motion` of the TCP in the arm's base."""
+        return stored_motion(self.tcp_in_base)
+
+    @cached_property
+    def base_motion(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """`stored_motion` of the arm's base in the world."""
+        return stored_motion(self.arm_base_in_world)
+
+    @cached_property
+    def agv_pose(self) -> Array:
+        """(T, 3) mobile base in the world, see `planar_base`."""
+        return planar_base(self.root_in_world, self.qpos)
+
+    @property
+    def agv_motion(self) -> Array:
+        """(T, 3), see `planar_motion`."""
+        return planar_motion(self.agv_pose)
 
     @property
     def gripper_width(self) -> Array:
@@ -162,7 +209,7 @@ class Motion:
     @property
     def actions(self) -> NDArray[np.float32]:
         """(T, 7), see `stored_actions`."""
-        return stored_actions(*stored_motion(self.tcp_in_base), self.gripper_open)
+        return stored_actions(*self.tcp_motion, self.gripper_open)
 
 
 def gripper_commands(actions: NDArray[np.floating], control_mode: str) -> NDArray[np.floating]:

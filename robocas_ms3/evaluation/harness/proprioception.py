@@ -14,13 +14,11 @@ from robocas_ms3.datasets.lerobot.arrays import frame_columns
 from robocas_ms3.datasets.sources.arrays import episode_arrays
 from robocas_ms3.demos.recordings.motion import Motion, gripper_open
 from robocas_ms3.robots.forward import chain
+from robocas_ms3.robots.quantities import features
 from robocas_ms3.robots.table import RobotSpec
 
-KEYS = {
-    "agent_pos": "observation.state",
-    "joint_velocity": "observation.joint_velocity",
-    "arm_base": "observation.arm_base",
-    "gripper_open": "observation.gripper_open",
+KEYS = {"agent_pos": "observation.state"} | {
+    key.removeprefix("observation."): key for key in features() if key != "observation.state"
 }
 """Key of an environment's observation -> column of our LeRobot datasets."""
 WIDTHS = {name: next(one.width for one in schema.FEATURES if one.key == column) for name, column in KEYS.items()}

@@ -21,13 +21,12 @@ from robocas_ms3.core.errors import EvaluationError, WireError
 from robocas_ms3.core.paths import protocols_dir
 from robocas_ms3.core.strict import refusal
 from robocas_ms3.evaluation.actions import CONVENTIONS
-from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
+from robocas_ms3.evaluation.policy import ROBOT, EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.evaluation.remote.wire import MAX_BYTES, one_line
 from robocas_ms3.robots.table import DEFAULT
 
 ENV, RESET, START, PROMPT, ACTIONS, BATCH, ERROR = "env_id", "reset", "start", "prompt", "actions", "batch", "error"
 PREFIX = "observation/"
-ROBOT = {"qpos": 12, "tcp_in_base": 7, "gripper_width": 1}
 DEFAULT_BATCH, LARGEST_BATCH = 64, 256  # envs
 FILE_NAME_PARTS = 3  # of a file's name in messages: folder of the protocol, folder in it, file
 MAX_TEXT = 10_000  # characters
@@ -100,7 +99,7 @@ def observation_message(
         start: the episode that starts, if the server is to know it.
         reset: whether an episode starts.
     """
-    arrays: dict[str, Any] = {name: getattr(observations, name)[row] for name in ROBOT}
+    arrays: dict[str, Any] = {name: values[row] for name, values in observations.robot.items()}
     arrays |= {name: images[row] for name, images in observations.images.items()}
     arrays |= {f"{name}_depth": depths[row] for name, depths in observations.depths.items()}
     for name, values in (("embedding", observations.embeddings), ("simulator_state", observations.state)):
@@ -154,7 +153,7 @@ def read_observations(messages: Sequence[Mapping[str, Any]], envs: Sequence[int]
         embeddings=stack("embedding", "float32", None) if spec.language == "embedding" else None,
         images={name: stack(name, "uint8", *size, 3) for name, size in sizes.items()},
         depths={name: stack(f"{name}_depth", "int16", *size, 1) for name, size in sizes.items()} if spec.depth else {},
-        **{name: stack(name, "float32", size) for name, size in ROBOT.items()},
+        robot={name: stack(name, "float32", quantity.width) for name, quantity in ROBOT.items()},
         state=stack("simulator_state", "float32", None) if spec.state else None,
     )
 

@@ -70,9 +70,11 @@ def shown(widths):
         embeddings=np.tile(np.eye(384, dtype=np.float32)[:1], (count, 1)),
         images={"base_camera": pictures},
         depths={},
-        qpos=np.tile(np.arange(12, dtype=np.float32), (count, 1)),
-        tcp_in_base=tcp,
-        gripper_width=np.array(list(widths.values()), np.float32)[:, None],
+        robot={
+            "qpos": np.tile(np.arange(12, dtype=np.float32), (count, 1)),
+            "tcp_in_base": tcp,
+            "gripper_width": np.array(list(widths.values()), np.float32)[:, None],
+        },
         state=None,
     )
 

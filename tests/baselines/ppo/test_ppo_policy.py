@@ -28,9 +28,7 @@ def observations(count, state=4):
         embeddings=None,
         images={},
         depths={},
-        qpos=zeros(12),
-        tcp_in_base=zeros(7),
-        gripper_width=zeros(1),
+        robot={"qpos": zeros(12), "tcp_in_base": zeros(7), "gripper_width": zeros(1)},
         state=zeros(state),
     )
 

@@ -64,9 +64,7 @@ def played(policy, folder, place):
             embeddings=arrays["language_embedding"][None],
             images={name: episode.rgb(name, step)[None] for name in policy.spec.cameras},
             depths={},
-            qpos=nothing,
-            tcp_in_base=nothing[:, :7],
-            gripper_width=nothing[:, :1],
+            robot={"qpos": nothing, "tcp_in_base": nothing[:, :7], "gripper_width": nothing[:, :1]},
             state=None,
         )
         given.append(policy.act(shown)[0])

@@ -25,9 +25,7 @@ def observations(envs, shots, words):
         embeddings=words,
         images={name: shots[:, view] for view, name in enumerate(CAMERAS)},
         depths={},
-        qpos=nothing,
-        tcp_in_base=nothing[:, :7],
-        gripper_width=nothing[:, :1],
+        robot={"qpos": nothing, "tcp_in_base": nothing[:, :7], "gripper_width": nothing[:, :1]},
         state=None,
     )
 

@@ -102,9 +102,11 @@ def observed(episode, arrays, poses, step):
         embeddings=arrays["language_embedding"][None],
         images={name: episode.rgb(name, step)[None] for name in ("base_camera", "gripper_camera")},
         depths={},
-        qpos=np.zeros((1, 12), np.float32),
-        tcp_in_base=poses[step : step + 1].astype(np.float32),
-        gripper_width=arrays["gripper_width"].reshape(-1, 1)[step : step + 1],
+        robot={
+            "qpos": np.zeros((1, 12), np.float32),
+            "tcp_in_base": poses[step : step + 1].astype(np.float32),
+            "gripper_width": arrays["gripper_width"].reshape(-1, 1)[step : step + 1],
+        },
         state=None,
     )
 

@@ -177,7 +177,7 @@ def test_values(dataset):
     )
     assert_only(
         dataset,
-        f"{NPZ}, gripper_width: expected 0 to 0.08 m, found 0.4",
+        f"{NPZ}, gripper_width: expected -0.005 to 0.085 m, found 0.4",
         f"{NPZ}, rel_agv_pose: expected differences of agv_pose, found off by 0.1",
         f"{NPZ}, language_embedding: expected unit length, found off by 1",
     )

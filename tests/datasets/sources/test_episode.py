@@ -1,3 +1,5 @@
+from itertools import accumulate
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,10 +9,18 @@ from scipy.spatial.transform import Rotation
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import from_xyzw, inverse, wxyz_to_xyzw, xyzw_to_wxyz
 from robocas_ms3.datasets.schema import EPISODE_INFO
-from robocas_ms3.datasets.sources.arrays import compose, continuous_xyzw, episode_arrays, planar_base, with_embeddings
-from robocas_ms3.demos.recordings.motion import Motion, gripper_open, relative_motion, sample_states, sample_stride
+from robocas_ms3.datasets.sources.arrays import episode_arrays, with_embeddings
+from robocas_ms3.demos.recordings.motion import (
+    Motion,
+    gripper_open,
+    planar_base,
+    relative_motion,
+    sample_states,
+    sample_stride,
+)
 from robocas_ms3.demos.recordings.subgoals import SubGoal, sample_subgoals
 from robocas_ms3.robots.description import MOBILE_PANDA
+from robocas_ms3.robots.quantities import continuous_xyzw
 
 
 @st.composite
@@ -19,6 +29,11 @@ def pose_sequences(draw):
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     count = draw(st.integers(2, 30))
     return from_xyzw(rng.uniform(-2, 2, (count, 3)), Rotation.random(count, random_state=rng).as_quat())
+
+
+def compose(first, relative):
+    """Poses (T, 4, 4) of the first one and the relative motion (T, 4, 4)."""
+    return np.stack(list(accumulate(relative[:-1], np.matmul, initial=first)))
 
 
 @settings(max_examples=50, deadline=None)

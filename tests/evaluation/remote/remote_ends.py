@@ -32,9 +32,11 @@ def some_observations(*envs: int, seed: int = 0, cameras: bool = False) -> Obser
         embeddings=None,
         images={"base_camera": rng.integers(0, 256, (*shape, 3), np.uint8)} if cameras else {},
         depths={"base_camera": rng.integers(0, 999, (*shape, 1), np.int16)} if cameras else {},
-        qpos=rng.normal(size=(count, 12)).astype(np.float32),
-        tcp_in_base=rng.normal(size=(count, 7)).astype(np.float32),
-        gripper_width=rng.normal(size=(count, 1)).astype(np.float32),
+        robot={
+            "qpos": rng.normal(size=(count, 12)).astype(np.float32),
+            "tcp_in_base": rng.normal(size=(count, 7)).astype(np.float32),
+            "gripper_width": rng.normal(size=(count, 1)).astype(np.float32),
+        },
         state=rng.normal(size=(count, 9)).astype(np.float32) if cameras else None,
     )
 

@@ -1,0 +1,277 @@
+"""The quantities that are observed of a robot and recorded of it, one entry each.
+
+Environments, policies, remote messages, both dataset formats, checks and documentation read `QUANTITIES`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from robocas_ms3.robots.description import RobotDescription
+
+DataType = Literal["float32", "int64", "bool", "str"]
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ArraySpec:
+    """An array of an episode.
+
+    Attributes:
+        name: its key.
+        dtype: its type; ``str`` is numpy's fixed-width unicode.
+        shape: lengths; ``"T"`` is the number of steps.
+        unit: of its numbers.
+        meaning: for people.
+        quaternion: rows are unit quaternions xyzw.
+        embedding: rows are sentence embeddings; absent from datasets converted without.
+        limits: least and greatest value; None: any.
+    """
+
+    name: str
+    dtype: DataType
+    shape: tuple[int | Literal["T"], ...]
+    unit: str
+    meaning: str
+    quaternion: bool = False
+    embedding: bool = False
+    limits: tuple[float, float] | None = None
+
+    def shape_for(self, steps: int) -> tuple[int, ...]:
+        """Shape in an episode of ``steps`` steps."""
+        return tuple(steps if length == "T" else length for length in self.shape)
+
+    def has_dtype(self, array: np.ndarray) -> bool:
+        """Whether an array is of the declared type."""
+        return array.dtype.kind == "U" if self.dtype == "str" else array.dtype == np.dtype(self.dtype)
+
+    def cast(self, values: Any) -> np.ndarray:
+        """Values as an array of the declared type."""
+        return np.asarray(values, dtype=np.str_ if self.dtype == "str" else self.dtype)
+
+
+@dataclass(frozen=True)
+class Quantity(ArraySpec):
+    """A quantity of each step.
+
+    Attributes:
+        observed: computes it (N, ...) of an agent (`agent.MobileManipulator`), for ``obs["agent"]`` of environments;
+            None: it is not observed.
+        policy: its name in the observations and remote messages of policies; empty: they do not get it.
+        recorded: computes it (T, ...) of a motion (`demos.recordings.motion.Motion`), for ``episode_info.npz``; None:
+            it is not recorded.
+        feature: LeRobot feature that holds it, next to the others of that feature; empty: none does.
+        components: names of its numbers there; default: its own, numbered where it has several.
+    """
+
+    observed: Callable[[Any], Any] | None = None
+    policy: str = ""
+    recorded: Callable[[Any], Any] | None = None
+    feature: str = ""
+    components: tuple[str, ...] = ()
+
+    @property
+    def width(self) -> int:
+        """Numbers per step."""
+        return int(np.prod(self.shape_for(1)))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the numbers."""
+        numbered = (self.name,) if self.width == 1 else tuple(f"{self.name}_{i}" for i in range(1, self.width + 1))
+        return self.components or numbered
+
+
+def continuous_xyzw(poses: Array) -> Array:
+    """Return the orientations of poses (T, 4, 4) as (T, 4) xyzw: w >= 0 in the first row, no sign flips after it."""
+    quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True)
+    flips = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0
+    quaternions[1:] *= np.where(np.cumsum(flips) % 2, -1.0, 1.0)[:, None]
+    return quaternions
+
+
+_JOINTS = tuple(f"joint_{number}" for number in range(1, 8))
+_XYZ, _XYZW = ("x", "y", "z"), ("qx", "qy", "qz", "qw")
+_STATE, _ARM_BASE = "observation.state", "observation.arm_base"
+_EE = "EEF (TCP) in the arm base frame (panda_link0)"
+_BASE = "arm base in the world"
+
+QUANTITIES: tuple[Quantity, ...] = (
+    Quantity(
+        "qpos",
+        "float32",
+        ("T", 12),
+        "m, rad",
+        "base x, y, yaw; 7 arm joints; 2 fingers",
+        observed=lambda agent: agent.robot.get_qpos(),
+        policy="qpos",
+    ),
+    Quantity(
+        "qvel",
+        "float32",
+        ("T", 12),
+        "m/s, rad/s",
+        "velocities of qpos",
+        observed=lambda agent: agent.robot.get_qvel(),
+    ),
+    Quantity(
+        "tcp_in_arm_base",
+        "float32",
+        ("T", 7),
+        "m",
+        "TCP in the arm base frame: position, quaternion wxyz",
+        observed=lambda agent: agent.tcp_in_arm_base.raw_pose,
+        policy="tcp_in_base",
+    ),
+    Quantity(
+        "rel_pos",
+        "float32",
+        ("T", 3),
+        "m",
+        "EEF from step t to t+1, in the EEF frame at t; last row 0",
+        recorded=lambda motion: motion.tcp_motion[0],
+    ),
+    Quantity(
+        "rel_orn",
+        "float32",
+        ("T", 4),
+        "xyzw",
+        "the same turn; last row the identity",
+        quaternion=True,
+        recorded=lambda motion: motion.tcp_motion[1],
+    ),
+    Quantity(
+        "ee_pos",
+        "float32",
+        ("T", 3),
+        "m",
+        _EE,
+        recorded=lambda motion: motion.tcp_in_base[:, :3, 3],
+        feature=_STATE,
+        components=_XYZ,
+    ),
+    Quantity(
+        "ee_orn",
+        "float32",
+        ("T", 4),
+        "xyzw",
+        _EE,
+        quaternion=True,
+        recorded=lambda motion: continuous_xyzw(motion.tcp_in_base),
+        feature=_STATE,
+        components=_XYZW,
+    ),
+    Quantity(
+        "robot_joints",
+        "float32",
+        ("T", 7),
+        "rad",
+        "arm joints",
+        recorded=lambda motion: motion.qpos[:, RobotDescription.arm_slice],
+        feature=_STATE,
+        components=_JOINTS,
+    ),
+    Quantity(
+        "arm_joint_vel",
+        "float32",
+        ("T", 7),
+        "rad/s",
+        "velocities of the arm joints",
+        recorded=lambda motion: motion.qvel[:, RobotDescription.arm_slice],
+        feature="observation.joint_velocity",
+        components=_JOINTS,
+    ),
+    Quantity(
+        "base_pos",
+        "float32",
+        ("T", 3),
+        "m",
+        _BASE,
+        recorded=lambda motion: motion.arm_base_in_world[:, :3, 3],
+        feature=_ARM_BASE,
+        components=_XYZ,
+    ),
+    Quantity(
+        "base_orn",
+        "float32",
+        ("T", 4),
+        "xyzw",
+        _BASE,
+        quaternion=True,
+        recorded=lambda motion: continuous_xyzw(motion.arm_base_in_world),
+        feature=_ARM_BASE,
+        components=_XYZW,
+    ),
+    Quantity(
+        "base_rel_pos",
+        "float32",
+        ("T", 3),
+        "m",
+        "as rel_pos, of the arm base",
+        recorded=lambda motion: motion.base_motion[0],
+    ),
+    Quantity(
+        "base_rel_orn",
+        "float32",
+        ("T", 4),
+        "xyzw",
+        "as rel_orn, of the arm base",
+        quaternion=True,
+        recorded=lambda motion: motion.base_motion[1],
+    ),
+    Quantity(
+        "gripper_width",
+        "float32",
+        ("T",),
+        "m",
+        "distance between the finger pads: sum of both finger joints",
+        limits=(-0.005, 0.085),
+        observed=lambda agent: agent.gripper_width[:, None],
+        policy="gripper_width",
+        recorded=lambda motion: motion.gripper_width,
+        feature=_STATE,
+    ),
+    Quantity(
+        "gripper_status",
+        "bool",
+        ("T",),
+        "",
+        "command in force at this step: True = open (commanded width > 0.04 m)",
+        recorded=lambda motion: motion.gripper_open,
+        feature="observation.gripper_open",
+        components=("gripper_open",),
+    ),
+    Quantity(
+        "agv_pose",
+        "float32",
+        ("T", 3),
+        "m, m, rad",
+        "mobile base in the world: x, y, yaw, which never jumps",
+        recorded=lambda motion: motion.agv_pose,
+        feature=_STATE,
+        components=("agv_x", "agv_y", "agv_yaw"),
+    ),
+    Quantity(
+        "rel_agv_pose",
+        "float32",
+        ("T", 3),
+        "m, m, rad",
+        "agv_pose[t+1] - agv_pose[t] (world frame); last row 0",
+        recorded=lambda motion: motion.agv_motion,
+    ),
+)
+
+
+def features() -> dict[str, list[Quantity]]:
+    """Return the quantities that each LeRobot feature of observations holds, in their order."""
+    found: dict[str, list[Quantity]] = {}
+    for quantity in QUANTITIES:
+        if quantity.feature:
+            found.setdefault(quantity.feature, []).append(quantity)
+    return found
