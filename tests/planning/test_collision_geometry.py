@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import trimesh
 from planning_scenes import REST, Checker, corners
-from robocas_ms3.assets.gripper import GRIPPER_BOXES
 
+from robocas_ms3.assets.annotations import GRIPPER_BOXES
 from robocas_ms3.core.errors import RobotDescriptionError
 from robocas_ms3.planning.collision import FclWorld
 from robocas_ms3.planning.protocol import Obstacle, Shape
