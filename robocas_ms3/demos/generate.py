@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from contextlib import closing
 from dataclasses import asdict, dataclass, fields
 from itertools import count
@@ -183,7 +183,7 @@ def check_episode_settings(settings: EpisodeSettings) -> None:
 
 def _results(
     settings: GenerateSettings, run: _Run, players: Callable[[], Worker[int, Takeover]] | None
-) -> Iterator[EpisodeResult]:
+) -> Generator[EpisodeResult, None, None]:
     """Yield the results of all seeds in order: those of earlier runs, and new ones."""
     missing = (seed for seed in count(settings.seed) if seed not in run.earlier)
     with closing(generate_seeds(settings, missing, run.shards, players)) as new:
