@@ -4,11 +4,11 @@ import json
 
 import numpy as np
 import pytest
+from made_up_observations import observe, start
 from made_up_runs import stop_at, train
 from rt1_sizes import SIZES
 
 from robocas_ms3.baselines.policy import RunPolicy
-from robocas_ms3.evaluation.policy import EpisodeSpec, Observations
 
 VIEW = {"rendered": [64, 48], "size": [64, 48]}
 CHANGES = {
@@ -30,21 +30,10 @@ def check(dataset, tmp_path, name, precision, device):
         [step, split] for step, split in (("2", "train"), ("3", "val"), ("4", "train"), ("6", "train"), ("6", "val"))
     ]
     policy = RunPolicy(out, device)
-    policy.reset(
-        [EpisodeSpec(0, 0, "pick", "", "", "builtin", 0, ""), EpisodeSpec(1, 0, "pick", "", "", "builtin", 0, "")]
-    )
-    sizes = {camera: size for camera, size in policy.spec.cameras.items()}
-    nothing = np.zeros((2, 12), np.float32)
-    here = np.tile(np.array([0.5, 0, 0.3, 1, 0, 0, 0], np.float32), (2, 1))
-    seen = Observations(
-        envs=np.arange(2),
-        instructions=["", ""],
-        embeddings=np.ones((2, 384), np.float32),
-        images={camera: np.zeros((2, height, width, 3), np.uint8) for camera, (width, height) in sizes.items()},
-        depths={},
-        robot={"qpos": nothing, "tcp_in_base": here, "gripper_width": nothing[:, :1]},
-        state=None,
-    )
+    policy.reset([start(0), start(1)])
+    sizes = policy.spec.cameras.items()
+    images = {camera: np.zeros((2, height, width, 3), np.uint8) for camera, (width, height) in sizes}
+    seen = observe((0, 1), embeddings=np.ones((2, 384), np.float32), images=images)
     acted = policy.act(seen)
     assert acted.shape == (2, 7) and np.isfinite(acted).all()
     assert np.array_equal(acted[0], acted[1])

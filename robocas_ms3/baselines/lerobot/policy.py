@@ -1,4 +1,4 @@
-"""A LeRobot policy as one of ours. Runs in LeRobot's environment; knows it by its methods alone."""
+"""A LeRobot policy as one of ours; runs in LeRobot's environment, and uses nothing but the policy's methods."""
 
 from __future__ import annotations
 
@@ -11,40 +11,71 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from robocas_ms3.baselines.lerobot.observations import DIMENSIONS, EMBEDDING, STATE, STATE_NAMES, scaled, state_of
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.robots.cameras import CAMERA_NAME
 from robocas_ms3.robots.description import RobotDescription
 
+STATE, EMBEDDING, ACTION = "observation.state", "observation.environment_state", "action"
+"""Keys of LeRobot. Its policies take what is no robot's as the environment's state; ours holds the instruction."""
+STATE_NAMES = (
+    *("x", "y", "z"),
+    *("xx", "xy", "xz", "yx", "yy", "yz"),
+    *(f"joint_{number}" for number in range(1, 8)),
+    "gripper_width",
+)
+"""TCP in the arm's base, m; its x and y axes there; rad; m."""
+DIMENSIONS = 384  # of an embedding
 _IMAGES = "observation.images."
-Process = Callable[[Any], Any]
+Processor = Callable[[Any], Any]
+
+
+def state_of(position: NDArray, xyzw: NDArray, joints: NDArray, width: NDArray) -> NDArray[np.float32]:
+    """Return the state (N, 17) of `STATE_NAMES`.
+
+    Axes stand for the orientation, as the sign of the quaternion of a gripper that points down is random. The pose of
+    the base is left out: the policy socket does not send it.
+
+    Args:
+        position: (N, 3) m, of the TCP in the arm's base.
+        xyzw: (N, 4) its orientation there.
+        joints: (N, 7) rad.
+        width: (N, 1) m.
+    """
+    turns = Rotation.from_quat(np.asarray(xyzw, np.float64)).as_matrix()
+    return np.concatenate([position, turns[:, :, 0], turns[:, :, 1], joints, width], axis=1).astype(np.float32)
+
+
+def scale_embeddings(embeddings: NDArray) -> NDArray[np.float32]:
+    """Scale embeddings (N, 384) so that a number of them is about 1: LeRobot does not normalise them."""
+    return (np.asarray(embeddings) * np.sqrt(DIMENSIONS)).astype(np.float32)
 
 
 class LeRobotPolicy:
-    """Asks a LeRobot policy for one action at a time and env, as LeRobot's own rollouts do.
+    """Asks a LeRobot policy for one action per step and env, as LeRobot's own rollouts do.
 
-    A LeRobot policy keeps what it saw and has yet to play in itself, of one batch of envs that begin together. Ours
-    begin when they like, so each env has a copy of the policy that shares its weights and has queues of its own.
+    A LeRobot policy holds its history and the rest of its chunk itself, for one batch of envs that start together.
+    Our envs start at any time, so each has a copy of the policy that shares the weights and has its own queues.
 
     Args:
         model: with ``reset`` and ``select_action``.
         before: LeRobot's preprocessor: one observation to a normalised batch of one.
         after: its postprocessor: an action (1, 7) back in m, rad and the gripper's opening.
-        inputs: shape by key, as the checkpoint's configuration has them; pictures are (3, H, W).
-        rate_hz: actions a second, the dataset's frames.
-        about: what a result says of it besides.
+        inputs: shape by key, as in the checkpoint's configuration; images are (3, H, W).
+        rate_hz: actions per second, the dataset's frames.
+        about: what results record about the policy.
 
     Raises:
-        EvaluationError: the policy wants what the socket does not show.
+        EvaluationError: the policy needs an input that the socket does not send.
     """
 
     def __init__(
         self,
         model: Any,
-        before: Process,
-        after: Process,
+        before: Processor,
+        after: Processor,
         inputs: Mapping[str, tuple[int, ...]],
         rate_hz: float,
         about: Mapping[str, Any] | None = None,
@@ -69,49 +100,49 @@ class LeRobotPolicy:
         self._draws: dict[int, np.random.Generator] = {}
 
     def describe(self) -> dict[str, Any]:
-        """What a result says of it besides."""
+        """Return what results record about the policy."""
         return self._about
 
     def reset(self, starts: list[EpisodeSpec]) -> None:
-        """Begin episodes: queues are emptied, noise begins with the episode's seed."""
+        """Start episodes: queues are emptied, noise starts with the episode's seed."""
         for start in starts:
-            self._models[start.env] = _copied(self._model)
+            self._models[start.env] = _copy_with_queues(self._model)
             self._draws[start.env] = np.random.default_rng([start.seed, start.episode])
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
-        """(E, 7), each env by itself, so that an outcome does not depend on what is played beside it."""
+        """Return actions (E, 7), of each env by itself, so that they do not depend on the other envs."""
         actions = [self._act(env, observations, row) for row, env in enumerate(observations.envs.tolist())]
         return np.stack(actions)
 
     def _act(self, env: int, observations: Observations, row: int) -> NDArray[np.float32]:
         torch.manual_seed(int(self._draws[env].integers(2**63)))  # diffusion draws noise
         with torch.inference_mode():
-            action = self._after(self._models[env].select_action(self._before(self._observed(observations, row))))
+            action = self._after(self._models[env].select_action(self._before(self._item(observations, row))))
         return action.reshape(-1).to("cpu", torch.float32).numpy()
 
-    def _observed(self, observations: Observations, row: int) -> dict[str, Any]:
-        """An observation as items of LeRobot's datasets have it: no axis of batches, pictures (3, H, W) from 0 to 1."""
+    def _item(self, observations: Observations, row: int) -> dict[str, Any]:
+        """Return an observation like an item of LeRobot's datasets: no batch axis, images (3, H, W) from 0 to 1."""
         one = slice(row, row + 1)
         tcp = observations.tcp_in_base[one]
         joints = observations.qpos[one, RobotDescription.arm_slice]
         state = state_of(tcp[:, :3], tcp[:, [4, 5, 6, 3]], joints, observations.gripper_width[one])
-        seen: dict[str, Any] = {"task": observations.instructions[row], STATE: torch.from_numpy(state[0])}
+        item: dict[str, Any] = {"task": observations.instructions[row], STATE: torch.from_numpy(state[0])}
         if EMBEDDING in self._inputs:
             assert observations.embeddings is not None
-            seen[EMBEDDING] = torch.from_numpy(scaled(observations.embeddings[row]))
-        for camera, pictures in observations.images.items():
-            picture = torch.from_numpy(np.ascontiguousarray(pictures[row]))
-            seen[_IMAGES + camera] = picture.permute(2, 0, 1).float() / 255
-        return {key: seen[key] for key in seen if key in self._inputs or key == "task"}
+            item[EMBEDDING] = torch.from_numpy(scale_embeddings(observations.embeddings[row]))
+        for camera, images in observations.images.items():
+            image = torch.from_numpy(np.ascontiguousarray(images[row]))
+            item[_IMAGES + camera] = image.permute(2, 0, 1).float() / 255
+        return {key: item[key] for key in item if key in self._inputs or key == "task"}
 
 
-def _copied(model: Any) -> Any:
-    """The same weights, with queues of its own."""
-    one = copy.copy(model)
+def _copy_with_queues(model: Any) -> Any:
+    """Return a policy with the same weights and its own queues."""
+    copied = copy.copy(model)
     for name, value in vars(model).items():
         if hasattr(value, "reset"):  # such as ACT's ensembler, which is no module and is reset in place
-            setattr(one, name, copy.copy(value))
+            setattr(copied, name, copy.copy(value))
         elif isinstance(value, deque | dict) and name.endswith(("queue", "queues")):
-            setattr(one, name, copy.deepcopy(value))
-    one.reset()
-    return one
+            setattr(copied, name, copy.deepcopy(value))
+    copied.reset()
+    return copied

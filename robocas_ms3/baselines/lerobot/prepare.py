@@ -1,10 +1,10 @@
-"""Makes of our LeRobot export the one that policies train on: what the socket shows, and the instruction as numbers.
+"""Make of a LeRobot export what LeRobot's policies train on: what the socket sends, and the instruction as numbers.
 
     python -m robocas_ms3.baselines.lerobot.prepare DATASET OUT [--no-language]
 
-Pictures and episodes stay as they are (videos are hard links). The state is that of `observations`;
+Images and episodes stay as they are (videos are hard links). The state is that of `policy.STATE_NAMES`;
 ``observation.environment_state`` is the sentence embedding of a frame's instruction, as LeRobot's ACT and diffusion
-policy read no text. Of the actions only ``action`` is left, of the rest LeRobot's own indices.
+policy read no text. Of the actions only ``action`` is left.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import os
 import shutil
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -23,13 +24,13 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from robocas_ms3.baselines.dataset_checks import check_base_stands
-from robocas_ms3.baselines.lerobot.observations import (
+from robocas_ms3.baselines.lerobot.policy import (
     ACTION,
     DIMENSIONS,
     EMBEDDING,
     STATE,
     STATE_NAMES,
-    scaled,
+    scale_embeddings,
     state_of,
 )
 from robocas_ms3.core.errors import DatasetError, RobocasError
@@ -51,7 +52,7 @@ _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 
 
 def prepare(source: Path, out: Path, embed: Embed | None) -> None:
-    """Write it; the folder is there when all is written.
+    """Write the dataset; the folder appears when all is written.
 
     Args:
         source: of ``robocas convert --to lerobot``.
@@ -59,29 +60,33 @@ def prepare(source: Path, out: Path, embed: Embed | None) -> None:
         embed: texts to (N, 384) of unit length; None: no instruction, which policies then do not know.
 
     Raises:
-        DatasetError: it is no such dataset, has numbers that are none, or its base drives.
+        DatasetError: it is no such dataset, holds NaN, or its base drives.
         OutputExistsError: there is something at ``out``.
     """
     check_replaceable(out)
     info = _info(source)
+    depths = [key for key, feature in info["features"].items() if is_depth(feature)]  # policies would take it for RGB
     with replacing_folder(out) as part:
-        ignored = shutil.ignore_patterns(*_NOT_COPIED, *_depth_keys(info["features"]))
+        ignored = shutil.ignore_patterns(*_NOT_COPIED, *depths)
         shutil.copytree(source, part, ignore=ignored, copy_function=_link, dirs_exist_ok=True)
-        vectors = None if embed is None else scaled(embed(LeRobotDataset(source).tasks))
-        kept: dict[str, list[NDArray]] = {}
+        vectors = None if embed is None else scale_embeddings(embed(LeRobotDataset(source).tasks))
+        parts: dict[str, list[NDArray]] = {}
         for path in sorted((source / "data").rglob("*.parquet")):
             columns, indices = _columns(path, info["features"], vectors)
-            table = pa.table({**{key: _rows(values) for key, values in columns.items()}, **indices})
-            _write(table, part / path.relative_to(source))
             for key, values in columns.items():
-                kept.setdefault(key, []).append(values)
+                parts.setdefault(key, []).append(values)
+            lists = {
+                key: pa.FixedSizeListArray.from_arrays(pa.array(values.reshape(-1)), values.shape[1])
+                for key, values in columns.items()
+            }
+            _write(pa.table({**lists, **indices}), part / path.relative_to(source))
         for path in sorted((source / "meta" / "episodes").rglob("*.parquet")):
             _table(path, episode_columns((), info["features"]))  # bounded and checked, with texts as dictionaries
             table = pq.read_table(path)  # LeRobot reads no statistics of episodes, and these are of other columns
-            left_out = ("stats/", *(f"videos/{key}/" for key in _depth_keys(info["features"])))
+            left_out = ("stats/", *(f"videos/{key}/" for key in depths))
             names = [name for name in table.column_names if not name.startswith(left_out)]
             _write(table.select(names), part / path.relative_to(source))
-        _write_meta(source, part, info, {key: np.concatenate(values) for key, values in kept.items()})
+        _write_meta(source, part, info, {key: np.concatenate(values) for key, values in parts.items()})
 
 
 def _info(source: Path) -> dict[str, Any]:
@@ -98,34 +103,32 @@ def _info(source: Path) -> dict[str, Any]:
     if widths != {key: [width] for key, width in _WIDTHS.items()}:
         raise DatasetError("another LeRobot dataset's columns", where=source, expected=_WIDTHS, found=widths)
     if not any(key.startswith("observation.images.") for key in info["features"]):
-        raise DatasetError("no pictures", where=source, expected="a camera at least")
+        raise DatasetError("no images", where=source, expected="at least one camera")
     return info
 
 
 def _columns(
     path: Path, features: Mapping[str, Any], vectors: NDArray | None
 ) -> tuple[dict[str, NDArray], dict[str, pa.ChunkedArray]]:
-    """The numbers (N, D) of a file by key, and the columns that stay as they are."""
+    """Return the numbers (N, D) of a file by key, and the columns that stay as they are."""
     table = _table(path, frame_columns(features))
-    said = {key: _numbers(table, key) for key in (STATE, ACTION, "action.base")}
-    for key, values in said.items():
+    read = {key: _numbers(table, key) for key in (STATE, ACTION, "action.base")}
+    for key, values in read.items():
         if not np.isfinite(values).all():
             row = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
-            raise DatasetError("a number that is none", where=f"{path}: {key}, row {row}", found=values[row].tolist())
+            raise DatasetError("NaN or infinite value", where=f"{path}: {key}, row {row}", found=values[row].tolist())
     ends = np.flatnonzero(np.diff(table["episode_index"].to_numpy())) + 1
-    for motion in np.split(said["action.base"], ends):
+    for motion in np.split(read["action.base"], ends):
         check_base_stands(motion, path)
-    state = said[STATE]
-    found = {STATE: state_of(state[:, :3], state[:, 3:7], state[:, 7:14], state[:, 14:15]), ACTION: said[ACTION]}
+    state = read[STATE]
+    columns = {STATE: state_of(state[:, :3], state[:, 3:7], state[:, 7:14], state[:, 14:15]), ACTION: read[ACTION]}
     if vectors is not None:
         places = table["task_index"].to_numpy()
         if len(places) and places.max() >= len(vectors):
-            expected = f"0 to {len(vectors) - 1}"
-            raise DatasetError(
-                "no such instruction", where=f"{path}, task_index", expected=expected, found=places.max()
-            )
-        found[EMBEDDING] = vectors[places]
-    return found, {key: table[key] for key in INDICES}
+            expected, where = f"0 to {len(vectors) - 1}", f"{path}, task_index"
+            raise DatasetError("no such instruction", where=where, expected=expected, found=places.max())
+        columns[EMBEDDING] = vectors[places]
+    return columns, {key: table[key] for key in INDICES}
 
 
 def _table(path: Path, columns: Mapping[str, Column]) -> pa.Table:
@@ -142,10 +145,6 @@ def _numbers(table: pa.Table, key: str) -> NDArray[np.float32]:
     return values
 
 
-def _rows(values: NDArray[np.float32]) -> pa.FixedSizeListArray:
-    return pa.FixedSizeListArray.from_arrays(pa.array(values.reshape(-1)), values.shape[1])
-
-
 def _write_meta(source: Path, part: Path, info: dict[str, Any], columns: dict[str, NDArray]) -> None:
     names = {STATE: list(STATE_NAMES), EMBEDDING: [f"e{number}" for number in range(DIMENSIONS)]}
     names[ACTION] = info["features"][ACTION]["names"]
@@ -153,14 +152,12 @@ def _write_meta(source: Path, part: Path, info: dict[str, Any], columns: dict[st
         key: {"dtype": "float32", "shape": [values.shape[1]], "names": names[key]} for key, values in columns.items()
     }
     features |= {
-        key: said
-        for key, said in info["features"].items()
-        if (key.startswith("observation.images.") and not is_depth(said)) or key in INDICES
+        key: feature
+        for key, feature in info["features"].items()
+        if (key.startswith("observation.images.") and not is_depth(feature)) or key in INDICES
     }
-    stats = read_json(source / STATS_FILE)
-    stats = {key: said for key, said in stats.items() if key in features} | {
-        key: _stats(values.astype(np.float64)) for key, values in columns.items()
-    }
+    stats = {key: values for key, values in read_json(source / STATS_FILE).items() if key in features}
+    stats |= {key: _stats(values.astype(np.float64)) for key, values in columns.items()}
     write_json(part / INFO_FILE, {**info, "features": features})
     write_json(part / STATS_FILE, stats)
 
@@ -176,22 +173,15 @@ def _write(table: pa.Table, path: Path) -> None:
     pq.write_table(table, path)
 
 
-def _depth_keys(features: Mapping[str, Any]) -> list[str]:
-    """Return the features of depth, which ACT and diffusion policy would take for RGB."""
-    return [key for key, feature in features.items() if is_depth(feature)]
-
-
 def _link(source: str, target: str) -> None:
-    try:
+    with suppress(OSError):  # another disk, or one without links
         if source.endswith(".mp4"):
             return os.link(source, target)
-    except OSError:  # another disk, or one without links
-        pass
     shutil.copyfile(source, target)
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Run the command; gives the exit code."""
+    """Run the command and return the exit code."""
     parser = argparse.ArgumentParser(description="Make a LeRobot export fit for LeRobot's policies on our socket.")
     parser.add_argument("dataset", type=Path)
     parser.add_argument("out", type=Path)

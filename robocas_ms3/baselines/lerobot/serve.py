@@ -1,9 +1,9 @@
-"""Serves a LeRobot checkpoint to ``robocas eval``; runs in LeRobot's environment, see scripts/serve_lerobot.sh.
+"""Serve a LeRobot checkpoint to ``robocas eval``; runs in LeRobot's environment, see scripts/serve_lerobot.sh.
 
     python -m robocas_ms3.baselines.lerobot.serve RUN [--port 8000] [--play N] [--device cpu]
 
-Of this package it imports what talks over the socket and nothing that simulates; besides LeRobot it needs msgpack,
-websockets, pydantic, scipy, PyYAML and platformdirs.
+It imports the socket and nothing that simulates; besides LeRobot it needs msgpack, websockets, pydantic, scipy, PyYAML
+and platformdirs.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ INFO = "dataset/meta/info.json"
 
 
 def open_checkpoint(checkpoint: Path, rate_hz: float, device: str, play: int | None) -> LeRobotPolicy:
-    """Load what ``lerobot-train`` wrote.
+    """Load a checkpoint of ``lerobot-train``.
 
     Args:
         checkpoint: folder ``pretrained_model``.
-        rate_hz: frames a second of the dataset.
+        rate_hz: frames per second of the dataset.
         device: of torch.
-        play: of a chunk, actions that are played before it is asked again; None: as it was trained.
+        play: actions of a chunk before the next one; None: as trained.
 
     Raises:
-        EvaluationError: there is none, or it plays no such number of actions.
+        EvaluationError: there is none, or it can't play so many actions.
     """
     if not (checkpoint / "config.json").is_file():
         fix = "Train first: bash scripts/train_lerobot.sh act DATASET RUN"
@@ -58,24 +58,23 @@ def open_checkpoint(checkpoint: Path, rate_hz: float, device: str, play: int | N
             raise EvaluationError("can't play so many", where="--play", found=f"{play}: {error}") from error
     model = get_policy_class(config.type).from_pretrained(checkpoint, config=config)
     model.eval()
-    # In the checkpoint the device is that of the training.
-    overrides = {"device_processor": {"device": device}}
+    overrides = {"device_processor": {"device": device}}  # the checkpoint has that of the training
     before, after = make_pre_post_processors(config, checkpoint, preprocessor_overrides=overrides)
     inputs = {key: tuple(feature.shape) for key, feature in config.input_features.items()}
     about = {
         "lerobot": version("lerobot"),
         "type": config.type,
-        "weights": checksum(checkpoint / "model.safetensors"),  # so that a result is not gone on with by another run's
+        "weights": checksum(checkpoint / "model.safetensors"),  # a result can't be continued with other weights
         "n_action_steps": config.n_action_steps,
     }
     return LeRobotPolicy(model, before, after, inputs, rate_hz, about)
 
 
 def rate_of(info: Path) -> float:
-    """Frames a second of a dataset.
+    """Return the frames per second of a dataset.
 
     Raises:
-        EvaluationError: it does not say.
+        EvaluationError: its ``info.json`` has none.
     """
     try:
         rate_hz = load_json(info)["fps"]
@@ -88,7 +87,7 @@ def rate_of(info: Path) -> float:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Run the command; gives the exit code."""
+    """Run the command and return the exit code."""
     parser = argparse.ArgumentParser(description="Serve a LeRobot checkpoint over the policy socket.")
     parser.add_argument("run", type=Path, help="folder of train_lerobot.sh, or a checkpoint's pretrained_model")
     parser.add_argument("--host", default="127.0.0.1", help="there is no password: keep to loopback, and tunnel")
@@ -99,8 +98,7 @@ def main(words: Sequence[str] | None = None) -> int:
     cfg = parser.parse_args(words)
     escape_log_lines()
     try:
-        alone = (cfg.run / "config.json").is_file()
-        checkpoint = cfg.run if alone else cfg.run / CHECKPOINT
+        checkpoint = cfg.run if (cfg.run / "config.json").is_file() else cfg.run / CHECKPOINT
         rate_hz = cfg.rate if cfg.rate is not None else rate_of(cfg.run / INFO)
         policy = open_checkpoint(checkpoint, rate_hz, cfg.device, cfg.play)
         PolicyServer(policy, cfg.host, cfg.port).run(lambda url: print(printable(f"{checkpoint} at {url}"), flush=True))

@@ -1,4 +1,4 @@
-"""`rt1`: RT-1 as the paper trains it (Brohan et al. 2022), with the sizes of its training configuration."""
+"""`rt1`: RT-1 as the RoboCAS paper trains it (Brohan et al. 2022)."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""How the `rt1` baseline sees, thinks and is trained; the defaults are those of the paper's RT-1.
+"""Configuration of `rt1`; the defaults are those of the RoboCAS paper's RT-1.
 
 They are of RoboCAS-v0's training configuration, as is the batch of 24, where the paper says 64; what that leaves open,
-as TokenLearner's bottleneck, is of RT-1 itself (Brohan et al. 2022, and its code).
+such as TokenLearner's bottleneck, is of RT-1 itself (Brohan et al. 2022, and its code).
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from robocas_ms3.baselines.baseline import BaselineConfig, Fraction, TrainSettin
 
 _IMAGENET_STD = (0.229, 0.224, 0.225)
 _KERAS_STD = (0.47853944, 0.4732864, 0.47434163)
-"""What EfficientNet's published weights were trained with, and transformers divides by: the roots of the others."""
+"""Of EfficientNet's published weights, by which transformers divides: the roots of the others."""
 
 
 class RT1Train(TrainSettings):
-    """How it is trained; 140 000 steps are the paper's 20 epochs of some 2.8 k episodes of 60 steps.
+    """Settings of the training; 140 000 steps are the paper's 20 epochs of about 2.8 k episodes of 60 steps.
 
-    A class of its own, so that who changes one of these numbers leaves the others as they are here.
+    A class of its own, so that changing one of these numbers leaves the others as they are here.
     """
 
     steps: int = Field(default=140_000, ge=1)
@@ -29,7 +29,7 @@ class RT1Train(TrainSettings):
     learning_rate: float = Field(default=1e-4, gt=0)
     min_learning_rate: float = Field(default=1e-5, ge=0)
     weight_decay: float = Field(default=0.01, ge=0)
-    betas: tuple[Fraction, Fraction] = (0.9, 0.999)  # AdamW's own, as nothing else is said
+    betas: tuple[Fraction, Fraction] = (0.9, 0.999)  # of AdamW, as nothing else is said
     warmup_steps: int = Field(default=0, ge=0)
     schedule: Literal["cosine", "constant", "restarts"] = "restarts"
     restart_epochs: float = Field(default=20, gt=0)
@@ -45,26 +45,25 @@ class RT1Config(BaselineConfig):
     """Configuration of `rt1`.
 
     Attributes:
-        cameras: one encoder each; their tokens stand side by side in this order.
-        picture: width and height in pixels that pictures are scaled to, whole.
-        crop_height: rows of a picture that are looked at: any in training, the middle ones later.
-        rate_hz: steps a second that the data has to have, and the policy acts at.
-        frames: steps that are looked back on, the present one included.
-        image_width, image_depth: EfficientNet's coefficients; 1.2 and 1.4 make B3.
+        cameras: one encoder each; their tokens are concatenated in this order.
+        picture: width and height in pixels that images are scaled to.
+        crop_height: rows of an image that are used: any in training, the middle ones when acting.
+        rate_hz: steps per second of the data and of the policy.
+        frames: number of steps in the history, the present one included.
+        image_width, image_depth: coefficients of EfficientNet; 1.2 and 1.4 make B3.
         drop_connect: probability that the last of EfficientNet's blocks is skipped in training; others in proportion.
-        norm_momentum: share of each batch in the running means that EfficientNet's norms act with.
-        image_mean: subtracted from pictures in 0..1, by colour.
-        image_std: divides them; None: ImageNet's, or with ``image_weights`` what these weights were trained with.
-        image_weights: file of EfficientNet's weights, as ``model.safetensors`` of google/efficientnet-b3; None: it
-            learns to see from the demonstrations alone. Only the beginning of a training reads it.
-        token_width: numbers of an image token.
-        image_tokens: of a picture, after TokenLearner.
+        norm_momentum: momentum of EfficientNet's batch norms.
+        image_mean: subtracted from images in 0..1, by colour.
+        image_std: divides them; None: ImageNet's, or with ``image_weights`` that of these weights.
+        image_weights: file of EfficientNet's weights, such as ``model.safetensors`` of google/efficientnet-b3; None:
+            random weights. Only the start of a training reads it.
+        token_width: size of an image token.
+        image_tokens: per image, after TokenLearner.
         token_bottleneck: width of TokenLearner's hidden layer.
-        width: of the transformer, which in RT-1 is its feed-forward layer's too.
-        layers, heads, key_width: of the transformer.
-        dropout: of the transformer.
-        bins: of each number of an action.
-        terminate_steps: the last so many actions of an episode are to be told as its end.
+        width: of the transformer, and in RT-1 of its feed-forward layer.
+        layers, heads, key_width, dropout: of the transformer.
+        bins: per number of an action.
+        terminate_steps: number of last actions of an episode that are labelled as its end.
         train: see `TrainSettings`.
     """
 
@@ -94,7 +93,6 @@ class RT1Config(BaselineConfig):
 
     @model_validator(mode="after")
     def _check(self) -> RT1Config:
-        """See that pictures can be cropped and divided, and that cameras are there, each once."""
         if not self.cameras or len(set(self.cameras)) < len(self.cameras):
             raise ValueError("cameras have to be named, each once")
         if min(self.picture) < 32:
@@ -107,7 +105,7 @@ class RT1Config(BaselineConfig):
 
     @property
     def std(self) -> tuple[float, float, float]:
-        """What pictures in 0..1 are divided by, after the mean is subtracted."""
+        """What images in 0..1 are divided by, after the mean is subtracted."""
         if self.image_std is not None:
             return self.image_std
         return _IMAGENET_STD if self.image_weights is None else _KERAS_STD

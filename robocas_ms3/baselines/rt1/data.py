@@ -1,4 +1,4 @@
-"""Training samples of `rt1`: six frames of pictures, and the action beside each."""
+"""Samples of `rt1`: a history of images, and the action of each step."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from robocas_ms3.datasets.training.sample_arrays import read_episode
 from robocas_ms3.datasets.training.torch_dataset import RoboCASDataset
 
 
-class RT1Samples(torch.utils.data.Dataset):
+class RT1Samples:
     """Samples of a dataset's split.
 
     A batch of B samples of F frames and C cameras holds
@@ -30,20 +30,20 @@ class RT1Samples(torch.utils.data.Dataset):
     ``terminate``  (B, F)                bool, whether the action is among the last ``terminate_steps`` of its episode
     =============  ====================  ===========================================================================
 
-    The last action is the one that leads to an episode's last step, T - 2: after it there is nothing to do.
+    The last action is the one that leads to an episode's last step, T - 2.
 
     Args:
-        config: what is looked at.
+        config: see `RT1Config`.
         folder: of the dataset.
         split: of it.
-        on_read: see `Baseline.data`; what is read here are numbers and texts.
+        on_read: see `Baseline.data`; only numbers and texts are read here.
 
     Raises:
-        DatasetError: it lacks embeddings or a camera, is of another rate, has no such split, is damaged, holds what is
-            no number, or its base drives.
+        DatasetError: it lacks embeddings or a camera, is of another rate, has no such split, is damaged, holds NaN, or
+            its base drives.
     """
 
-    def __init__(self, config: RT1Config, folder: Path, split: Split, on_read: OnRead = lambda done, of: None) -> None:
+    def __init__(self, config: RT1Config, folder: Path, split: Split, on_read: OnRead) -> None:
         source = open_source(folder)
         needs = DatasetNeeds("rt1", config.cameras, config.rate_hz, True, '--set cameras="[base_camera]"')
         check_dataset(source, source.split(split), needs)
@@ -60,36 +60,30 @@ class RT1Samples(torch.utils.data.Dataset):
         self._lengths, self._terminate = source.lengths, config.terminate_steps
         self.episodes = len(self._data.episodes)
         scale = ActionScale.of(source.action_space(), folder)
-        for done, number in enumerate(self._data.episodes, start=1):  # before hours of training come upon it
+        for done, number in enumerate(self._data.episodes, start=1):  # damage is found before hours of training
             read_episode(source, number, (), embedding=True, subgoals=False)
             on_read(done, self.episodes)
         first = source.episode(self._data.episodes[0])
         self.facts: dict[str, Any] = {
             "rate_hz": self._data.rate_hz,
-            "cameras": {name: list(first.rgb(name, 0).shape[1::-1]) for name in config.cameras},
+            "cameras": {name: list(first.rgb(name, 0).shape[1::-1]) for name in config.cameras},  # as stored
             "action_low": scale.low.tolist(),
             "action_high": scale.high.tolist(),
         }
-        """Rate; width and height of the pictures as they are stored, by camera; ranges of the motion, m and rad."""
 
     def __len__(self) -> int:
         return len(self._data)
 
     def __getitems__(self, indices: list[int]) -> Batch:
-        """A batch.
-
-        Raises:
-            DatasetError: a picture is missing or damaged.
-        """
         samples = [self._data[index] for index in indices]
         steps = torch.tensor([sample["step"] for sample in samples])[:, None]
         last = torch.tensor([self._lengths[sample["episode"]] - 2 for sample in samples])[:, None]
         mask = torch.stack([sample["action_mask"] for sample in samples])
-        acted = steps + torch.arange(1 - mask.shape[1], 1)
+        at = steps + torch.arange(1 - mask.shape[1], 1)
         return {
             "rgb": torch.stack([sample["rgb"] for sample in samples]),
             "language": torch.stack([sample["language_embedding"] for sample in samples]),
             "action": torch.stack([sample["action"] for sample in samples]),
             "mask": mask,
-            "terminate": mask & (acted > last - self._terminate),
+            "terminate": mask & (at > last - self._terminate),
         }

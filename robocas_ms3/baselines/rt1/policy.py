@@ -16,13 +16,13 @@ from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 
 
 class RT1Policy:
-    """Looks at the last six frames, the first one repeated at the start, and does what is likeliest.
+    """Takes the likeliest action for the last six frames, the first one repeated at the start.
 
-    Frames are encoded once and kept as tokens, those of the language of their time. Once it says that an episode ends,
-    it does the action beside that, then holds still with the gripper as it was told last.
+    Frames are encoded once and kept as tokens, with the language of their time. After an action that ends the episode
+    the policy does nothing, with the last gripper command.
 
-    Pictures are asked for as the dataset stores them, and scaled as its samples are: rendering at 320 x 256 would show
-    another field of view than pictures of 640 x 480 scaled to that.
+    Images are requested as the dataset stores them, and scaled as its samples are: images rendered at 320 x 256 would
+    show another field of view than images of 640 x 480 scaled to that.
 
     Args:
         config: of the network.
@@ -33,7 +33,7 @@ class RT1Policy:
     def __init__(self, config: RT1Config, facts: dict[str, Any], model: RT1Model) -> None:
         self._config, self._model = config, model.eval()
         self._frames: dict[int, deque[torch.Tensor]] = {}  # by env, tokens (images, width), the oldest first
-        self._held: dict[int, NDArray[np.float32]] = {}  # by env that has ended, the action that holds still
+        self._final: dict[int, NDArray[np.float32]] = {}  # by env that has ended, the action that does nothing
         self.spec = PolicySpec(
             convention="robocas",
             reference="tcp",
@@ -43,49 +43,49 @@ class RT1Policy:
         )
 
     def describe(self) -> dict[str, Any]:
-        """What a result says of it: what its image encoders began with."""
+        """Return what results record about the policy: the initial weights of its image encoders."""
         path = self._config.image_weights
-        begun = path.name if path is not None and bool(self._model.from_imagenet) else "from scratch"
-        return {"image_weights": begun}
+        name = path.name if path is not None and bool(self._model.from_imagenet) else "from scratch"
+        return {"image_weights": name}
 
     def reset(self, starts: list[EpisodeSpec]) -> None:
-        """Forget what these envs showed."""
+        """Forget the frames of these envs."""
         for start in starts:
             self._frames.pop(start.env, None)
-            self._held.pop(start.env, None)
+            self._final.pop(start.env, None)
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
-        """(E, 7) motions and gripper commands, each env by itself: in a batch they would depend on the others' bits."""
+        """Return actions (E, 7), of each env by itself: in a batch their last bits depend on the other rows."""
         return np.stack([self._act(observations, row) for row in range(len(observations.envs))])
 
     def _act(self, observations: Observations, row: int) -> NDArray[np.floating]:
         env, count = int(observations.envs[row]), self._config.frames
-        if env in self._held:
-            return self._held[env]
-        token = self._look(observations, row)
+        if env in self._final:
+            return self._final[env]
+        token = self._encode(observations, row)
         frames = self._frames.setdefault(env, deque([token] * count, maxlen=count))
         frames.append(token)
         with torch.inference_mode():
-            acted, over = self._model.act(torch.stack(tuple(frames))[None])
-        action = acted[0].cpu().numpy()
-        if over[0]:
-            self._held[env] = np.append(np.zeros(6, np.float32), action[6:])
+            actions, is_last = self._model.act(torch.stack(tuple(frames))[None])
+        action = actions[0].cpu().numpy()
+        if is_last[0]:
+            self._final[env] = np.append(np.zeros(6, np.float32), action[6:])
         return action
 
-    def _look(self, observations: Observations, row: int) -> torch.Tensor:
-        """(images, token_width) of what an env shows."""
+    def _encode(self, observations: Observations, row: int) -> torch.Tensor:
+        """Return the image tokens (images, token_width) of an env."""
         assert observations.embeddings is not None
-        views = [scaled(observations.images[name][row], self._config.picture) for name in self._config.cameras]
+        views = [scale_image(observations.images[name][row], self._config.picture) for name in self._config.cameras]
         device = self._model.mean.device
-        seen = torch.from_numpy(np.stack(views).transpose(0, 3, 1, 2)[None].copy()).to(device)
+        images = torch.from_numpy(np.stack(views).transpose(0, 3, 1, 2)[None].copy()).to(device)
         with torch.inference_mode():
-            return self._model.encode(seen, torch.from_numpy(observations.embeddings[row : row + 1]).to(device))[0]
+            return self._model.encode(images, torch.from_numpy(observations.embeddings[row : row + 1]).to(device))[0]
 
 
-def scaled(picture: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
-    """A picture (H, W, 3) scaled to a width and height as samples of a dataset are: down by areas."""
-    if picture.shape[1::-1] == tuple(size):
-        return picture
-    smaller = size[0] <= picture.shape[1] and size[1] <= picture.shape[0]
-    found: Any = cv2.resize(picture, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
+def scale_image(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
+    """Scale an image (H, W, 3) to a width and height, as samples of a dataset are: down by areas."""
+    if image.shape[1::-1] == tuple(size):
+        return image
+    smaller = size[0] <= image.shape[1] and size[1] <= image.shape[0]
+    found: Any = cv2.resize(image, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
     return found

@@ -1,4 +1,4 @@
-"""How the `small` baseline sees, thinks and is trained."""
+"""Configuration of `small`."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from robocas_ms3.core.strict import StrictModel
 
 
 class View(StrictModel):
-    """What is taken of a camera's pictures.
+    """The part of a camera's images that the network sees.
 
     Attributes:
-        rendered: width and height of the pictures that are asked for, in pixels.
-        part: left, top, right, bottom of the part that is looked at, in shares of the picture.
-        size: width and height that this part is scaled to, in pixels; multiples of 16.
+        rendered: width and height of the whole images, in pixels.
+        part: left, top, right, bottom of the part, as fractions of the image.
+        size: width and height that the part is scaled to, in pixels; multiples of 16.
     """
 
     rendered: tuple[int, int] = (512, 384)
@@ -27,13 +27,13 @@ class View(StrictModel):
     def _check(self) -> View:
         left, top, right, bottom = self.part
         if not (0 <= left < right <= 1 and 0 <= top < bottom <= 1):
-            raise ValueError(f"part {list(self.part)} is none: left < right and top < bottom, in 0..1")
+            raise ValueError(f"invalid part {list(self.part)}: expected left < right and top < bottom, in 0..1")
         if min(self.rendered) < 16 or min(self.size) < 16 or any(number % 16 for number in self.size):
             raise ValueError("size has to be multiples of 16, and rendered at least 16 pixels")
         return self
 
     def box(self) -> tuple[int, int, int, int]:
-        """Left, top, right, bottom of the part in pixels."""
+        """Return left, top, right, bottom of the part in pixels."""
         width, height = self.rendered
         left, top, right, bottom = self.part
         return round(left * width), round(top * height), round(right * width), round(bottom * height)
@@ -41,7 +41,7 @@ class View(StrictModel):
 
 if TYPE_CHECKING:
     Views = dict[str, View]
-else:  # null above a default's leaves that camera out
+else:  # null leaves a camera of the defaults out
     Views = Annotated[dict[str, View | None], AfterValidator(lambda views: {k: v for k, v in views.items() if v})]
 
 
@@ -49,27 +49,26 @@ class SmallConfig(BaselineConfig):
     """Configuration of `small`.
 
     Attributes:
-        views: by camera; null leaves one out. The base camera sees the room from behind the arm: what can be reached
-            lies in the lower middle of its picture, objects of upstream's scenes in a thirtieth of it.
-        language: whether it is told what to do.
-        rate_hz: steps a second that the data has to have, and the policy acts at.
-        chunk: steps it predicts.
+        views: by camera; null leaves one out. The base camera is behind the arm: what can be reached is in the lower
+            middle of its images, objects of RoboCAS-v0's scenes in a thirtieth of them.
+        language: whether the instruction is an input.
+        rate_hz: steps per second of the data and of the policy.
+        chunk: number of predicted steps.
         channels: of the first feature maps.
-        width: of the transformer.
-        heads, layers: of the transformer.
-        dropout: of the transformer.
-        keys_weight: weight of the loss of where the gripper will close or open next, beside that of the chunk.
-        gripper_weight: weight of the loss of the gripper's commands.
-        near: m at which a pose counts half as much as one that is reached, see `chunk_losses`; 0: all alike.
-        point_weight: weight of the loss of where that is in the pictures, of each camera (`pointing`).
-        name_weight: weight of the loss of where objects are that other instructions would name, of each camera.
-        lift: whether what is pointed at is located by the cameras' calibration (`lifting`).
-        lift_weight: weight of the loss of that, of each camera.
-        shift: pixels that pictures are shifted by at most, at random, in training.
-        brightness: share that brightness and contrast change by at most, at random, in training.
-        play: steps of a chunk that it follows before it predicts the next one.
-        fade: how fast older predictions lose weight when it acts, see `ChunkPolicy`.
-        reopen: m; an empty fist that moves less between two looks opens, see `ChunkPolicy`. 0: never.
+        width, heads, layers, dropout: of the transformer.
+        keys_weight: weight of the loss of the next key pose.
+        gripper_weight: weight of the loss of the gripper commands.
+        near: distance in m at which a pose has half the weight of one that is reached, see `chunk_losses`; 0: no
+            weights.
+        point_weight: weight, per camera, of the loss of where the next key pose is in the image (`locating`).
+        name_weight: weight, per camera, of the loss of where objects of other instructions are.
+        lift: whether points are located in space by the calibration of the cameras (`locating.Lift`).
+        lift_weight: weight of the loss of that, per camera.
+        shift: largest random shift of the images in training, in pixels.
+        brightness: largest random change of brightness and contrast in training, as a fraction.
+        play: steps of a chunk before the next one is predicted.
+        fade: decay of the weight of older predictions, see `ChunkPolicy`.
+        reopen: distance in m of the reopen heuristic, see `ChunkPolicy`; 0: switched off.
         train: see `TrainSettings`.
     """
 
@@ -102,7 +101,7 @@ class SmallConfig(BaselineConfig):
     @model_validator(mode="after")
     def _check(self) -> SmallConfig:
         if not self.views:
-            raise ValueError("views of a camera at least")
+            raise ValueError("views have to be of at least one camera")
         if self.width % self.heads:
             raise ValueError(f"width {self.width} has to be a multiple of heads {self.heads}")
         return self

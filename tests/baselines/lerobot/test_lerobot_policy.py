@@ -5,12 +5,12 @@ from collections import deque
 import numpy as np
 import pytest
 import torch
+from made_up_observations import observe, start
 
-from robocas_ms3.baselines.lerobot.observations import EMBEDDING, STATE, scaled, state_of
-from robocas_ms3.baselines.lerobot.policy import LeRobotPolicy
+from robocas_ms3.baselines.lerobot.policy import EMBEDDING, STATE, LeRobotPolicy, scale_embeddings, state_of
 from robocas_ms3.baselines.lerobot.serve import main, open_checkpoint, rate_of
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, describe
+from robocas_ms3.evaluation.policy import describe
 
 INPUTS = {STATE: (17,), "observation.images.base_camera": (3, 2, 4), EMBEDDING: (384,)}
 HALF = float(np.sqrt(0.5))
@@ -54,28 +54,18 @@ def made(model=None, inputs=None):
     return LeRobotPolicy(model or Chunks(), before, lambda action: 2 * action, inputs or INPUTS, 5.0)
 
 
-def a_start(env, seed=0):
-    return EpisodeSpec(env, 0, "pick", "a.yaml", "a.npy", "builtin", seed, "take it")
-
-
 def shown(widths):
     """Widths of grippers by env."""
     count = len(widths)
-    tcp = np.tile(np.array([0.1, 0.2, 0.3, HALF, 0, 0, HALF], np.float32), (count, 1))  # 90 deg about z
-    pictures = np.zeros((count, 2, 4, 3), np.uint8)
-    pictures[:, 0, 1] = 255, 0, 51
-    return Observations(
-        envs=np.array(list(widths)),
-        instructions=["take it"] * count,
+    images = np.zeros((count, 2, 4, 3), np.uint8)
+    images[:, 0, 1] = 255, 0, 51
+    return observe(
+        list(widths),
         embeddings=np.tile(np.eye(384, dtype=np.float32)[:1], (count, 1)),
-        images={"base_camera": pictures},
-        depths={},
-        robot={
-            "qpos": np.tile(np.arange(12, dtype=np.float32), (count, 1)),
-            "tcp_in_base": tcp,
-            "gripper_width": np.array(list(widths.values()), np.float32)[:, None],
-        },
-        state=None,
+        images={"base_camera": images},
+        qpos=np.tile(np.arange(12, dtype=np.float32), (count, 1)),
+        tcp_in_base=np.tile(np.float32([0.1, 0.2, 0.3, HALF, 0, 0, HALF]), (count, 1)),  # 90 deg about z
+        gripper_width=np.float32(list(widths.values()))[:, None],
     )
 
 
@@ -97,7 +87,7 @@ def test_a_policy_of_another_dataset_is_refused(key, shape):
 def test_an_observation_is_an_item_of_the_dataset():
     model = Chunks()
     policy = made(model)
-    policy.reset([a_start(0)])
+    policy.reset([start(0)])
     policy.act(shown({0: 0.07}))
     seen = model.seen[0]  # the list is shared by copies
     expected = [0.1, 0.2, 0.3, 0, 1, 0, -1, 0, 0, 3, 4, 5, 6, 7, 8, 9, 0.07]  # x axis is y's, y axis is -x's
@@ -111,16 +101,16 @@ def test_an_observation_is_an_item_of_the_dataset():
 
 def made_without_embedding(model):
     policy = made(model, {STATE: (17,)})
-    policy.reset([a_start(0)])
+    policy.reset([start(0)])
     policy.act(shown({0: 0.07}))
     return model.seen[-1]
 
 
 def test_envs_play_chunks_of_their_own():
     policy = made()
-    policy.reset([a_start(0), a_start(5)])
+    policy.reset([start(0), start(5)])
     assert policy.act(shown({0: 1, 5: 50}))[:, :2].tolist() == [[2, 4], [100, 4]]
-    policy.reset([a_start(5)])  # begins anew while env 0 goes on with its chunk
+    policy.reset([start(5)])  # begins anew while env 0 goes on with its chunk
     assert policy.act(shown({0: 2, 5: 60}))[:, :2].tolist() == [[2, 2], [120, 4]]
     assert policy.act(shown({5: 61}))[:, :2].tolist() == [[120, 2]]
     actions = policy.act(shown({0: 3, 5: 62}))
@@ -132,7 +122,7 @@ def test_envs_play_chunks_of_their_own():
 def test_weights_are_shared():
     model = Chunks()
     policy = made(model)
-    policy.reset([a_start(0)])
+    policy.reset([start(0)])
     assert policy._models[0].weight is model.weight
 
 
@@ -141,8 +131,8 @@ def test_noise_is_the_episode_s_own():
         return policy.act(shown({**dict.fromkeys(others, 1.0), env: 1.0}))[-1, 2]
 
     alone, beside = made(), made()
-    alone.reset([a_start(0, seed=7)])
-    beside.reset([a_start(1, seed=8), a_start(2, seed=7)])
+    alone.reset([start(0, seed=7)])
+    beside.reset([start(1, seed=8), start(2, seed=7)])
     first = noise(alone, 0)
     assert noise(beside, 2, others=[1]) == first
     assert noise(beside, 1) != first
@@ -151,7 +141,7 @@ def test_noise_is_the_episode_s_own():
 def test_a_quaternion_s_sign_does_not_matter():
     parts = np.zeros((1, 3)), np.array([[0.1, 0.2, 0.3, 0.4]]), np.zeros((1, 7)), np.zeros((1, 1))
     np.testing.assert_array_equal(state_of(*parts), state_of(parts[0], -parts[1], *parts[2:]))
-    assert np.sqrt(np.mean(scaled(np.full((1, 384), 384**-0.5)) ** 2)) == pytest.approx(1)
+    assert np.sqrt(np.mean(scale_embeddings(np.full((1, 384), 384**-0.5)) ** 2)) == pytest.approx(1)
 
 
 def test_what_is_no_run_is_one_line(tmp_path, capsys):

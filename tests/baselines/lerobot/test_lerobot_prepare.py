@@ -14,7 +14,7 @@ pa = pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
 pq = pytest.importorskip("pyarrow.parquet", reason="needs the extra 'lerobot'")
 
 from robocas_ms3.baselines.lerobot import prepare as module
-from robocas_ms3.baselines.lerobot.observations import EMBEDDING, STATE, STATE_NAMES
+from robocas_ms3.baselines.lerobot.policy import EMBEDDING, STATE, STATE_NAMES
 from robocas_ms3.baselines.lerobot.prepare import main, prepare
 from robocas_ms3.core.errors import DatasetError, OutputExistsError
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
@@ -118,7 +118,7 @@ def test_nothing_is_replaced(source, out):
 
 
 @pytest.mark.parametrize(
-    "key, value, message", [("action", np.nan, "a number that is none"), ("action.base", 0.02, "the base drives")]
+    "key, value, message", [("action", np.nan, "NaN or infinite value"), ("action.base", 0.02, "the base drives")]
 )
 def test_numbers_that_nothing_can_be_learnt_from(source, tmp_path, key, value, message):
     spoiled = tmp_path / "spoiled"

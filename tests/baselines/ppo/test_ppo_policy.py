@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from made_up_observations import observe
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.baselines.ppo import BASELINE
@@ -11,26 +12,14 @@ from robocas_ms3.baselines.ppo.config import PpoConfig
 from robocas_ms3.baselines.ppo.environments import expand_action
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.actions import CONVENTIONS
-from robocas_ms3.evaluation.policy import Observations
 from robocas_ms3.evaluation.stepping import control_mode
 from robocas_ms3.robots.ee_deltas import to_ee_delta_action
 
 FACTS = {"observed": 12 + 7 + 1 + 4, "acted": 5, "rate_hz": 5}
 
 
-def observations(count, state=4):
-    def zeros(size):
-        return np.zeros((count, size), np.float32)
-
-    return Observations(
-        envs=np.arange(count),
-        instructions=[""] * count,
-        embeddings=None,
-        images={},
-        depths={},
-        robot={"qpos": zeros(12), "tcp_in_base": zeros(7), "gripper_width": zeros(1)},
-        state=zeros(state),
-    )
+def see(count, state=4):
+    return observe(range(count), state=np.zeros((count, state), np.float32))
 
 
 def policy_that_says(numbers):
@@ -49,7 +38,7 @@ def test_five_numbers_are_seven():
 
 
 def test_motions_are_metres_and_radians():
-    found = policy_that_says([0.5, -1.0, 2.0, 0.4, 0.1]).act(observations(2))
+    found = policy_that_says([0.5, -1.0, 2.0, 0.4, 0.1]).act(see(2))
     assert found.shape == (2, 7)
     np.testing.assert_allclose(found[1], [0.025, -0.05, 0.05, 0, 0, 0.1, 1], atol=1e-6)
 
@@ -57,7 +46,7 @@ def test_motions_are_metres_and_radians():
 def test_the_evaluation_does_what_the_training_did():
     policy = policy_that_says([0.5, -1.0, 0.3, 0.4, -0.2])
     assert control_mode(policy.spec.convention) == "pd_ee_delta_pose"
-    motion = CONVENTIONS[policy.spec.convention].read(policy.act(observations(1)))
+    motion = CONVENTIONS[policy.spec.convention].read(policy.act(see(1)))
     assert isinstance(motion.rotation, Rotation)
     assert motion.open.tolist() == [False]
     again = to_ee_delta_action(motion.translation, motion.rotation)
@@ -73,7 +62,7 @@ def test_it_says_what_it_wants():
 
 def test_other_scenes_are_refused():
     with pytest.raises(EvaluationError, match="24 numbers.*30"):
-        policy_that_says([0.0] * 5).act(observations(1, state=10))
+        policy_that_says([0.0] * 5).act(see(1, state=10))
 
 
 def test_what_was_observed_is_what_observations_are_measured_by():

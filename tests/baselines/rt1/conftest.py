@@ -1,4 +1,4 @@
-"""Small networks that tests of rt1 share."""
+"""A small network and a batch that tests of rt1 share."""
 
 import pytest
 import torch
@@ -10,7 +10,7 @@ from robocas_ms3.baselines.rt1.config import RT1Config
 
 @pytest.fixture
 def facts():
-    """As a dataset of 64 x 48 pictures gives them."""
+    """Of a dataset of 64 x 48 images."""
     cameras = {"base_camera": [64, 48], "gripper_camera": [64, 48]}
     return {"rate_hz": 5.0, "cameras": cameras, "action_low": [-0.1] * 6, "action_high": [0.1] * 6}
 
@@ -22,7 +22,7 @@ def config():
 
 @pytest.fixture
 def model(config, facts, batch):
-    """With weights that tell pictures and words apart, in place of those at the start, which hardly do."""
+    """With weights that depend on images and language, which initial ones hardly do."""
     torch.manual_seed(0)
     made = BASELINE.model(config, facts)
     with torch.no_grad():

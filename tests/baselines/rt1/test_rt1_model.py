@@ -1,16 +1,22 @@
-"""What the network looks at, and what its loss counts."""
+"""What the network attends to, its loss, its tokens, and its size with the paper's configuration."""
 
 import math
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
-from robocas_ms3.baselines.rt1.transformer import looked_at
+from robocas_ms3.baselines.rt1 import BASELINE
+from robocas_ms3.baselines.rt1.config import RT1Config
+from robocas_ms3.baselines.rt1.model import ActionBins, attention_mask, likeliest_tokens
+from robocas_ms3.core.errors import TrainingError
+from robocas_ms3.core.strict import parse
 
 
-def test_who_looks_at_whom():
-    """Two frames of two image tokens and two that are said: a token sees image tokens before it, and itself if one."""
-    assert looked_at(2, 2, 2).int().tolist() == [
+def test_the_attention_mask():
+    """Two frames of two image tokens and two predicted ones; tokens attend to image tokens before them."""
+    assert attention_mask(2, 2, 2).int().tolist() == [
         [1, 0, 0, 0, 0, 0, 0, 0],
         [1, 1, 0, 0, 0, 0, 0, 0],
         [1, 1, 0, 0, 0, 0, 0, 0],
@@ -34,24 +40,18 @@ def test_a_frame_sees_no_later_one(model, batch, frame, view):
     assert (changed > 1e-2).all()  # each frame from then on
 
 
-def test_frames_of_one_picture_differ_by_their_place(model, batch):
-    batch["rgb"][:] = batch["rgb"][:, :1].clone()
-    logits = model.logits(batch)
-    assert not torch.allclose(logits[:, 0], logits[:, 1], atol=1e-2)
-
-
-def test_language_is_heard_and_samples_stay_apart(model, batch):
+def test_logits_depend_on_language_cameras_and_time_but_not_on_other_samples(model, batch):
     before = model.logits(batch)
+    swapped = {**batch, "rgb": batch["rgb"].flip(2)}
+    assert not torch.allclose(model.logits(swapped), before, atol=1e-2)
+    still = {**batch, "rgb": batch["rgb"][:, :1].expand_as(batch["rgb"])}
+    assert not torch.allclose(model.logits(still)[:, 0], model.logits(still)[:, 1], atol=1e-2)
+    torch.manual_seed(7)  # acting draws no random numbers
+    assert torch.equal(model.logits(batch), before)
     batch["language"][1] = -batch["language"][1]
     after = model.logits(batch)
     assert torch.allclose(after[0], before[0], atol=1e-5)
     assert not torch.allclose(after[1], before[1], atol=1e-2)
-
-
-def test_cameras_are_not_interchangeable(model, batch):
-    before = model.logits(batch)
-    batch["rgb"] = batch["rgb"].flip(2)
-    assert not torch.allclose(model.logits(batch), before, atol=1e-2)
 
 
 def test_loss_by_hand(model, batch, monkeypatch):
@@ -87,7 +87,139 @@ def test_padding_counts_nowhere(model, batch):
     assert not torch.equal(model(batch)["loss"], found["loss"])
 
 
-def test_all_weights_learn(model, batch):
+def test_every_weight_is_learned(model, batch):
     model.train()(batch)["loss"].backward()
     still = [name for name, weight in model.named_parameters() if weight.grad is None or not weight.grad.any()]
     assert still == []
+
+
+LOW, HIGH = [-0.02, -0.1, 0.0, -0.5, -1.0, 0.3], [0.06, 0.1, 0.4, 0.0, 1.0, 0.7]
+
+
+@given(
+    st.lists(st.floats(0, 1), min_size=7, max_size=7),
+    st.lists(st.tuples(st.floats(-2, 2), st.floats(1e-3, 2)), min_size=6, max_size=6),
+    st.integers(2, 256),
+)
+def test_decoding_inverts_encoding_to_half_a_bin(shares, ranges, count):
+    low, span = torch.tensor([*[low for low, _ in ranges], 0.0]), torch.tensor([*[span for _, span in ranges], 1.0])
+    bins = ActionBins(low[:6].tolist(), (low + span)[:6].tolist(), count)
+    action = low + torch.tensor(shares) * span
+    tokens = bins.encode(action)
+    assert tokens.dtype == torch.int64
+    assert ((tokens >= 0) & (tokens < count)).all()
+    assert ((bins.decode(tokens) - action).abs() <= 0.5 * span / count + 1e-6).all()  # 1e-6: float32 near 2
+    assert torch.equal(bins.encode(bins.decode(tokens)), tokens)
+
+
+def test_bins_by_hand():
+    bins = ActionBins(LOW, HIGH, 4)
+    # bins of 0.02 from -0.02, 0.05 from -0.1; beyond 0.4, before -0.5; bins of 0.5 from -1, 0.1 from 0.3, 0.25 from 0
+    action = torch.tensor([0.025, 0.0, 0.5, -0.7, 0.99, 0.65, 1.0])
+    assert bins.encode(action).tolist() == [2, 2, 3, 0, 3, 3, 3]
+    wanted = [0.03, 0.025, 0.35, -0.4375, 0.75, 0.65, 0.875]
+    assert torch.allclose(bins.decode(torch.tensor([2, 2, 3, 0, 3, 3, 3])), torch.tensor(wanted))
+
+
+def test_the_gripper_and_an_axis_that_never_moves():
+    bins = ActionBins(LOW, HIGH, 256)
+    tokens = bins.encode(torch.tensor([[0.0] * 7, [0.0] * 6 + [1.0]]))
+    assert tokens[:, 6].tolist() == [0, 255]
+    assert bins.decode(tokens)[:, 6].tolist() == [0.5 / 256, 255.5 / 256]
+    fixed = ActionBins([0.1] * 6, [0.1] * 6, 256)
+    tokens = fixed.encode(torch.tensor([0.1, 0.0, 0.2, 0.1, 0.1, 0.1, 1.0]))
+    assert torch.allclose(fixed.decode(tokens)[:6], torch.full((6,), 0.1))
+
+
+def test_the_end_is_predicted_by_its_own_two_logits():
+    logits = torch.zeros(8, 5)
+    logits[:, 4] = 3.0
+    logits[7, :2] = torch.tensor([1.0, 2.0])
+    assert likeliest_tokens(logits).tolist() == [4] * 7 + [1]
+    logits[7, 0] = 2.5
+    assert likeliest_tokens(logits).tolist() == [4] * 7 + [0]
+
+
+# EfficientNet-B0's table, channels by 1.2 (to eights), repeats by 1.4 (up): expansion, kernel, in, out, repeats
+B3 = [
+    (1, 3, 40, 24, 2),
+    (6, 3, 24, 32, 3),
+    (6, 5, 32, 48, 3),
+    (6, 3, 48, 96, 5),
+    (6, 5, 96, 136, 5),
+    (6, 5, 136, 232, 6),
+    (6, 3, 232, 384, 2),
+]
+CHANNELS = sum(out * repeats for *_, out, repeats in B3)  # that FiLM scales and shifts in the blocks
+
+
+def norm(channels):
+    return 2 * channels
+
+
+def block(expand, kernel, entering, leaving):
+    """An MBConv block: expansion, depthwise convolution, squeeze and excite by a quarter of what enters, projection."""
+    inner, squeezed = expand * entering, entering // 4
+    expansion = entering * inner + norm(inner) if expand > 1 else 0
+    depthwise = kernel * kernel * inner + norm(inner)
+    excite = inner * squeezed + squeezed + squeezed * inner + inner
+    return expansion + depthwise + excite + inner * leaving + norm(leaving)
+
+
+def efficientnet():
+    count = 3 * 40 * 9 + norm(40) + 384 * 1536 + norm(1536)  # stem and top
+    for expand, kernel, entering, leaving, repeats in B3:
+        count += block(expand, kernel, entering, leaving) + (repeats - 1) * block(expand, kernel, leaving, leaving)
+    return count
+
+
+def parameters(module):
+    return sum(parameter.numel() for parameter in module.parameters())
+
+
+@pytest.fixture(scope="module")
+def paper():
+    """On the meta device, where nothing is computed."""
+    facts = {"action_low": [-0.1] * 6, "action_high": [0.1] * 6}
+    with torch.device("meta"):
+        return BASELINE.model(RT1Config(), facts).eval()
+
+
+def test_image_encoder_is_efficientnet_b3_with_film_and_token_learner(paper):
+    first, second = paper.encoders
+    assert efficientnet() == 10_696_232  # 12 233 232 of B3 without its classifier, 1537 * 1000
+    assert CHANNELS == 3608
+    assert parameters(first.net) == 10_696_232
+    assert len(first.films) == 26
+    assert parameters(first.films) == 2 * (384 + 1) * 3608
+    assert parameters(first.film) == 2 * (384 + 1) * 512
+    assert parameters(first.project) == 1536 * 512
+    # norm, 512 to 64, 64 to 8
+    assert parameters(first.learner) == 1024 + 512 * 64 + 64 + 64 * 8 + 8 == 34_376
+    assert parameters(first) == parameters(second) == 10_696_232 + 2_778_160 + 394_240 + 786_432 + 34_376
+    assert not {id(p) for p in first.parameters()} & {id(p) for p in second.parameters()}
+
+
+def test_transformer(paper):
+    attention = 3 * (512 + 1) * 8 * 128 + (8 * 128 + 1) * 512
+    layer = attention + (512 + 1) * 512 + 2 * norm(512)
+    places = 6 * (2 * 8 + 8) * 512
+    assert parameters(paper.transformer) == 8 * layer + (512 + 1) * 512 + places + (512 + 1) * 256 == 19_391_232
+    assert parameters(paper) == 2 * 14_689_440 + 19_391_232
+    with torch.device("meta"):
+        features = paper.encoders[0].features(torch.zeros(2, 3, 236, 320), torch.zeros(2, 384))
+        tokens = paper.encode(torch.zeros(2, 2, 3, 256, 320, dtype=torch.uint8), torch.zeros(2, 384))
+    assert features.shape == (2, 512, 8, 10)  # 236 x 320 halved five times: 118, 59, 30, 15, 8 rows
+    assert tokens.shape == (2, 2 * 8, 512)
+
+
+def test_defaults_are_the_training_configuration_of_the_paper():
+    config = RT1Config()
+    train = config.train
+    assert (config.picture, config.crop_height, config.frames, config.bins) == ((320, 256), 236, 6, 256)
+    assert (config.token_width, config.image_tokens, config.width) == (512, 8, 512)
+    assert (config.layers, config.heads, config.key_width, config.dropout) == (8, 8, 128, 0.1)
+    assert (train.batch_size, train.learning_rate, train.min_learning_rate, train.clip_norm) == (24, 1e-4, 1e-5, 4)
+    assert (train.schedule, train.restart_epochs, train.restart_factor) == ("restarts", 20, 2)
+    changed = parse(RT1Config, {"train": {"steps": 300}}, TrainingError, where="rt1").train
+    assert changed == RT1Config().train.model_copy(update={"steps": 300})

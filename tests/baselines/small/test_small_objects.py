@@ -1,11 +1,11 @@
-"""Where objects are seen as long as nothing has touched them."""
+"""Where objects are in the images, until the gripper command changes."""
 
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from robocas_ms3.baselines.small.standing import seen_from, standing
+from robocas_ms3.baselines.small.objects import in_camera_parent, locate_objects
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import from_parts
 from robocas_ms3.robots.cameras import standard_parent
@@ -22,7 +22,9 @@ LAYOUT = {
     "poses": [[2, 2, 0.5, 1, 0, 0, 0], [9, 9, 9, 1, 0, 0, 0], [1, 1, 1, 1, 0, 0, 0]],
     "present": [True, False, True],
 }
-LOOKS = {camera: lambda points: points[..., :2].astype(np.float32) for camera in ("base_camera", "gripper_camera")}
+PROJECTIONS = {
+    camera: lambda points: points[..., :2].astype(np.float32) for camera in ("base_camera", "gripper_camera")
+}
 
 
 def episode(layout=LAYOUT, target="lemon"):
@@ -35,8 +37,8 @@ def tcp(heights):
     return from_parts([[1, 0, height] for height in heights], np.diag([1.0, -1, -1]))
 
 
-def test_where_they_are_by_hand():
-    found = standing(episode(), ARRAYS, tcp([1, 0.9, 0.8, 0.7, 0.6]), LOOKS)
+def test_places_by_hand():
+    found = locate_objects(episode(), ARRAYS, tcp([1, 0.9, 0.8, 0.7, 0.6]), PROJECTIONS)
     assert (found.steps, found.target, found.kinds) == (STEPS, "lemon", ["apple", "lemon"])
     in_base = [[1, 0], [0, 1]]  # a metre ahead of the arm; a metre to its left, and half a metre up
     assert found.places["base_camera"] == pytest.approx(np.tile(np.float32(in_base), (STEPS, 1, 1)), abs=1e-6)
@@ -45,30 +47,26 @@ def test_where_they_are_by_hand():
     assert found.places["gripper_camera"] == pytest.approx(np.tile(np.float32(in_tcp), (STEPS, 1, 1)), abs=1e-6)
 
 
-def test_what_may_have_been_moved_is_not_known_any_more():
+def test_once_the_command_changes_objects_may_have_moved():
     closed = {**ARRAYS, "gripper_status": np.array([True, True, True, False, True])}
-    held = standing(episode(), closed, tcp([1] * STEPS), LOOKS).places["gripper_camera"]
+    held = locate_objects(episode(), closed, tcp([1] * STEPS), PROJECTIONS).places["gripper_camera"]
     assert np.isnan(held).all((1, 2)).tolist() == [False, False, False, True, True]
 
 
 def test_a_camera_in_the_world():
     points = np.zeros((STEPS, 1, 3))
-    assert seen_from("world", points, tcp([1] * STEPS), ARRAYS)[0, 0].tolist() == pytest.approx(BASE)
+    assert in_camera_parent("world", points, tcp([1] * STEPS), ARRAYS)[0, 0].tolist() == pytest.approx(BASE)
 
 
-@pytest.mark.parametrize("layout", [{}, {"object_ids": ["apple"], "present": [True]}])
-def test_nothing_is_known_where_no_scene_tells(layout):
-    found = standing(episode(layout), ARRAYS, tcp([1] * STEPS), LOOKS)
-    assert (found.kinds, found.places["base_camera"].shape) == ([], (STEPS, 0, 2))
-
-
-def test_nothing_is_known_after_another_policy():
+def test_without_a_layout_or_after_another_policy_nothing_is_known():
     after = episode()
     after.scene["recorded"] = {"takeover": {"policy": "small", "policy_steps": 5}}
-    assert standing(after, ARRAYS, tcp([1] * STEPS), LOOKS).kinds == []
+    for unknown in (episode({}), episode({"object_ids": ["apple"], "present": [True]}), after):
+        found = locate_objects(unknown, ARRAYS, tcp([1] * STEPS), PROJECTIONS)
+        assert (found.kinds, found.places["base_camera"].shape) == ([], (STEPS, 0, 2))
 
 
 @pytest.mark.parametrize("layout", [{"poses": [[1, 2]]}, {**LAYOUT, "present": [True]}, {"poses": LAYOUT["poses"]}])
-def test_damage(layout):
+def test_a_damaged_scene_is_an_error(layout):
     with pytest.raises(DatasetError, match="scene.json: this description of a scene is damaged"):
-        standing(episode(layout), ARRAYS, tcp([1] * STEPS), LOOKS)
+        locate_objects(episode(layout), ARRAYS, tcp([1] * STEPS), PROJECTIONS)

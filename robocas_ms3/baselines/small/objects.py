@@ -1,6 +1,6 @@
-"""Where the objects of a scene are seen as long as they stand where the layout put them.
+"""Where the objects of an episode are in its images, until the gripper command changes.
 
-That is until the gripper is told something else: the scripted policy comes to what it grasps on a way that is free.
+Until then they are where the layout put them: the scripted policy reaches its target on a free path.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from robocas_ms3.datasets.schema import SCENE_FILE
 from robocas_ms3.datasets.sources.protocol import SourceEpisode
 from robocas_ms3.robots.cameras import Parent
 
-_ALIKE = {"mount": 1e-3, "intrinsic": 1e-2}
+_TOLERANCES = {"mount": 1e-3, "intrinsic": 1e-2}  # m or 1; pixels
 
 
 @dataclass(frozen=True)
-class Standing:
+class SceneObjects:
     """Objects of an episode.
 
     Attributes:
-        steps: of it.
-        target: kind (asset) of the one that is meant; empty: not known.
-        kinds: of each of N objects.
-        places: (T, N, 2) in pixels of the view of each camera; NaN: behind it, or not known any more.
-        points: (N, 3) where they stand in the arm's base, m.
+        steps: of the episode.
+        target: asset of the target; empty: not known.
+        kinds: asset of each of N objects.
+        places: by camera (T, N, 2) in pixels of its view; NaN: behind it, or not known any more.
+        points: (N, 3) where they are in the arm's base, m.
     """
 
     steps: int
@@ -41,32 +41,30 @@ class Standing:
     points: NDArray[np.floating] = field(default_factory=lambda: np.zeros((0, 3)))
 
 
-def standing(
+def locate_objects(
     episode: SourceEpisode,
     arrays: Mapping[str, NDArray[Any]],
     tcp_in_base: Array,
-    looks: Mapping[str, Callable[[Array], NDArray[np.float32]]],
-) -> Standing:
-    """Where an episode's objects are seen.
-
-    Nothing is known of them where the scene does not tell, or another policy acted before.
+    projections: Mapping[str, Callable[[Array], NDArray[np.float32]]],
+) -> SceneObjects:
+    """Return the objects of an episode; none if the scene is not known, or another policy acted before.
 
     Args:
         episode: with its scene.
         arrays: its ``base_pos``, ``base_orn`` and ``gripper_status``.
         tcp_in_base: (T, 4, 4).
-        looks: by camera, (T, N, 3) in its parent to (T, N, 2) in pixels.
+        projections: by camera, from points (T, N, 3) in its parent to pixels (T, N, 2).
 
     Raises:
-        DatasetError: what is said of the scene is damaged.
+        DatasetError: the description of the scene is damaged.
     """
     steps = len(tcp_in_base)
     try:
         layout, target = episode.layout, episode.scene.get("target") or {}
         meant, known = str(target.get("asset_id") or ""), layout.get("poses")
-        if not known or "takeover" in (episode.scene.get("recorded") or {}):  # who acted before has moved them
+        if not known or "takeover" in (episode.scene.get("recorded") or {}):  # the other policy may have moved them
             nothing = np.full((steps, 0, 2), np.nan, np.float32)
-            return Standing(steps, meant, places=dict.fromkeys(looks, nothing))
+            return SceneObjects(steps, meant, places=dict.fromkeys(projections, nothing))
         there = np.array(layout.get("present") or [True] * len(known), bool)
         points = np.array(known, np.float64).reshape(-1, 7)[there, :3]
         kinds = [name for name, present in zip(layout["object_ids"], there, strict=True) if present]
@@ -74,21 +72,21 @@ def standing(
         where = f"{episode.where}/{SCENE_FILE}"
         raise DatasetError("this description of a scene is damaged", where=where, found=error) from error
     in_base = transform(inverse(_base(arrays)), points[None])
-    opened = arrays["gripper_status"].reshape(-1)
-    still = np.logical_and.accumulate(opened == opened[0])
+    commands = arrays["gripper_status"].reshape(-1)
+    unmoved = np.logical_and.accumulate(commands == commands[0])
     places = {
-        camera: look(seen_from(episode.camera_parent(camera), in_base, tcp_in_base, arrays))
-        for camera, look in looks.items()
+        camera: project(in_camera_parent(episode.camera_parent(camera), in_base, tcp_in_base, arrays))
+        for camera, project in projections.items()
     }
     for seen in places.values():
-        seen[~still] = np.nan
-    return Standing(steps, meant, kinds, places, in_base[0])
+        seen[~unmoved] = np.nan
+    return SceneObjects(steps, meant, kinds, places, in_base[0])
 
 
 def calibration(
     episode: SourceEpisode, camera: str, arrays: Mapping[str, NDArray[Any]], stored: tuple[int, int], view: View
 ) -> dict[str, Any]:
-    """How a camera looks, see `lifting.Lift`; of one that is fixed in the world where the arm's base stands first."""
+    """Return the ``camera`` of `locating.Lift`; a camera in the world is seen from the first pose of the arm's base."""
     mount, parent = episode.camera_in_parent(camera), episode.camera_parent(camera)
     if parent == "world":
         mount = inverse(_base(arrays))[0] @ mount
@@ -98,18 +96,18 @@ def calibration(
     return {"on_hand": parent == "ee", "mount": mount.tolist(), "intrinsic": [*focal.tolist(), *middle.tolist()]}
 
 
-def looks_alike(one: dict[str, Any], other: dict[str, Any], keys: Sequence[str] = tuple(_ALIKE)) -> bool:
-    """Whether calibrations are the same, to a mm, a mrad and a hundredth of a pixel."""
-    return all(np.allclose(one[key], other[key], rtol=0, atol=_ALIKE[key]) for key in keys)
+def same_calibration(one: dict[str, Any], other: dict[str, Any], keys: Sequence[str] = tuple(_TOLERANCES)) -> bool:
+    """Return whether calibrations are equal to a mm, a mrad and a hundredth of a pixel."""
+    return all(np.allclose(one[key], other[key], rtol=0, atol=_TOLERANCES[key]) for key in keys)
 
 
-def seen_from(parent: Parent, points: Array, tcp_in_base: Array, arrays: Mapping[str, NDArray[Any]]) -> Array:
-    """(T, N, 3) points in the arm's base, in the frame that a camera is fixed to; ``tcp_in_base`` is (T, 4, 4)."""
+def in_camera_parent(parent: Parent, points: Array, tcp_in_base: Array, arrays: Mapping[str, NDArray[Any]]) -> Array:
+    """Return points (T, N, 3) in the arm's base in the frame of a camera's parent; ``tcp_in_base`` (T, 4, 4)."""
     if parent == "ee":
         return transform(inverse(tcp_in_base), points)
     return transform(_base(arrays), points) if parent == "world" else points
 
 
 def _base(arrays: Mapping[str, NDArray[Any]]) -> Array:
-    """(T, 4, 4) the arm's base in the world."""
+    """Return the poses (T, 4, 4) of the arm's base in the world."""
     return from_xyzw(arrays["base_pos"].astype(np.float64), arrays["base_orn"].astype(np.float64))
