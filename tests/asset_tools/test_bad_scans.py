@@ -225,16 +225,6 @@ def test_paths_of_textures(tmp_path, named, texture, repair):
     check_bottle(scan)
 
 
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "cp1252"])
-def test_names_with_accents(tmp_path, encoding):
-    path = write_obj(
-        tmp_path / "Öl", name="Flasche für Öl", mtl="matériau", texture="étiquette n° 1.png", encoding=encoding
-    )
-    scan = prepare(path)
-    assert scan.repairs == ()
-    check_bottle(scan)
-
-
 def test_several_materials(tmp_path):
     """Each quarter has a texture of its own."""
     vertices, uv, faces = bottle()

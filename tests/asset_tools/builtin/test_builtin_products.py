@@ -30,17 +30,8 @@ def test_whole_numbers_lists_and_defaults(tmp_path):
     [
         ("mass: 1", "mas: 1", "box: unknown key 'mas' .*Did you mean mass.*1 more after this one"),
         ("mass: 1", "mass: heavy", "box: wrong value for 'mass' .expected a number, found 'heavy'"),
-        ("mass: 1", "mass: 2026-01-01", "box: wrong value for 'mass' .expected a number, found .*2026-01-01"),
-        ("mass: 1", "mass: -1", "box: wrong value for 'mass' .expected greater than 0, found -1"),
-        (
-            "size: [0.1, 0.1, 0.1]",
-            "size: [0.1, 0.1]",
-            "box: wrong value for 'size.2' .expected at least 3 items in this list",
-        ),
-        ("mass: 1", "mass: 1\n  weight: 2", "box: unknown key 'weight' .expected one of .'category'"),
         ("kind: carton, radius", "kind: crate, radius", "box: wrong value for 'shape.kind' .*'carton'.* found 'crate'"),
         ("radius: 0.002", "corner: 0.002", "box: unknown key 'shape.corner' .*'kind', 'radius'"),
-        ("radius: 0.002", "radius: [1]", r"box: wrong value for 'shape.radius' .expected a number, found .1."),
         ("[1, 2, 3]", "[1, 2, 256]", "box: .*'paint.label.base.2' .expected less than or equal to 255, found 256"),
         ("motif: sun", "motif: moon", "box: paint.label.motif: no such motif; known are tomato, sun.*'moon'"),
         ("mass: 1", "mass: 1\n  model: padlock", "box: a product has a shape and a paint, or a model"),
@@ -48,7 +39,6 @@ def test_whole_numbers_lists_and_defaults(tmp_path):
         ("  shape: {kind: carton, radius: 0.002}\n", "", "box: a product has a shape and a paint, or a model"),
         ("box:", "Box:", "Box: wrong value for 'id' .expected a string like"),
         (CARTON, "- box", "products can't be read .expected a mapping of products by id"),
-        (CARTON, "box: carton", "products can't be read .expected a mapping of products by id"),
         (CARTON, "box: [", "products can't be read .found while parsing"),
     ],
 )

@@ -8,7 +8,7 @@ from PIL import ImageFont
 from scipy.ndimage import binary_dilation
 
 from asset_tools.builtin.catalogue import products
-from asset_tools.builtin.textures import OVERSAMPLING, Canvas
+from asset_tools.builtin.textures import OVERSAMPLING
 
 WHITE, BLACK = (255, 255, 255), (0, 0, 0)
 HOUSEHOLD = [p for p in products().values() if not p.model and p.category not in ("ball", "toy")]
@@ -18,26 +18,6 @@ LABELS = {p.id: p.paint.label for p in products().values() if hasattr(p.paint, "
 @cache
 def built(name):
     return products()[name].build()
-
-
-def canvas(size=(0.1, 0.05)):
-    return Canvas(size, 2000, WHITE, np.random.default_rng(0))
-
-
-def dark_box(image):
-    rows, columns = np.nonzero(np.asarray(image.convert("L")) < 128)
-    return columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
-
-
-@pytest.mark.parametrize("words", ["SUGAR", "TOMATO\nSOUP", "Qg", "a long line of small print"])
-@pytest.mark.parametrize("turn", [0, 90])
-def test_text_fills_its_box_and_stays_inside(words, turn):
-    page = canvas()
-    page.text(words, (0.1, 0.2, 0.9, 0.8), BLACK, bold=0.05, turn=turn)
-    left, top, right, bottom = dark_box(page.image)
-    assert left >= 0.1 * page.width - 2 and right <= 0.9 * page.width + 2
-    assert top >= 0.2 * page.height - 2 and bottom <= 0.8 * page.height + 2
-    assert (right - left) / (0.8 * page.width) > 0.85 or (bottom - top) / (0.6 * page.height) > 0.85
 
 
 @pytest.mark.parametrize("name", ["apple", "orange", "banana"])

@@ -6,9 +6,7 @@ import trimesh
 from scipy.spatial import KDTree
 from shapely import MultiPoint, Point
 
-from asset_tools.builtin import blends
 from asset_tools.builtin.catalogue import products
-from asset_tools.builtin.toys import STICKERS, scrambled
 from asset_tools.decompose import GPU_LIMIT, flat_faces
 from asset_tools.glb import write_glb
 from asset_tools.grasps import sample_grasps
@@ -101,36 +99,3 @@ def test_holes_are_open():
     assert scissors.euler_number == -2  # two rings, nothing else
     for point in rings:  # nor does any collision piece close them
         assert not any(trimesh.convex.convex_hull(p).contains([point])[0] for p in built("scissors")[0].pieces)
-
-
-def test_cube_is_solvable_and_scrambled():
-    faces = scrambled()
-    flat = [colour for face in faces.values() for colour in face]
-    assert all(flat.count(colour) == 9 for colour in STICKERS.values())
-    assert all(len(set(face)) >= 3 for face in faces.values())
-    solved = scrambled(())
-    assert all(face == [STICKERS[name]] * 9 for name, face in solved.items())
-    # A quarter turn about +x takes up (+z) from the front (-y): its right column shows what was at the bottom (-z).
-    turned = scrambled(((0, 1, 3),))
-    assert turned["right"] == solved["right"]
-    columns = {name: {turned[name][i] for i in (2, 5, 8)} for name in ("front", "top")}
-    assert columns == {"front": {STICKERS["bottom"]}, "top": {STICKERS["front"]}}
-
-
-def test_volumes_by_hand():
-    """A ball, a capsule, a cylinder and a plate, against their formulas."""
-    low, high = (-22.0, -22.0, -22.0), (22.0, 22.0, 22.0)
-
-    def volume(field):
-        return blends.mesh_of(field, low, high, step=0.5, triangles=4000).volume
-
-    assert volume(blends.ellipsoid((1, 2, 3), (10, 10, 10))) == pytest.approx(4 / 3 * np.pi * 1000, rel=0.01)
-    assert volume(blends.chain((-8, 0, 0, 5), (8, 0, 0, 5))) == pytest.approx(np.pi * 25 * (16 + 20 / 3), rel=0.01)
-    assert volume(blends.cylinder("y", (0, 0, 0), 20, 8)) == pytest.approx(np.pi * 64 * 20, rel=0.015)
-    assert volume(blends.turned("x", (0, 0, 0), [(-10, 8), (10, 8)])) == pytest.approx(np.pi * 64 * 20, rel=0.015)
-    triangle = [(-12, -9), (12, -9), (12, 9)]
-    assert volume(blends.plate("z", 2, 6, triangle)) == pytest.approx(24 * 18 / 2 * 6, rel=0.015)
-    two = blends.both_sides(blends.box((0, 8, 0), (6, 8, 10)))
-    assert volume(two) == pytest.approx(2 * 480, rel=0.02)
-    holed = blends.cut(blends.box((0, 0, 0), (30, 30, 10)), blends.cylinder("z", (0, 0, 0), 20, 6))
-    assert volume(holed) == pytest.approx(9000 - np.pi * 36 * 10, rel=0.015)

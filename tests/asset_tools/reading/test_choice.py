@@ -138,16 +138,6 @@ def test_two_scans_with_one_id_fail_alone(tmp_path):
         jobs["mug"].make(tmp_path / "out")
 
 
-def test_versions_in_several_folders(tmp_path):
-    write_obj(tmp_path / "meshes", "mug", mug())
-    mug().export(tmp_path / "mug.stl")
-    (tmp_path / "collision").mkdir()
-    mug().export(tmp_path / "collision" / "a.stl")
-    model = read_model(tmp_path)
-    assert "used meshes/mug.obj" in notes_of(model)
-    assert "ignored mug.stl" in notes_of(model) and "ignored collision/a.stl" in notes_of(model)
-
-
 @pytest.mark.parametrize(
     ("names", "sizes", "middles"),
     [
@@ -167,9 +157,3 @@ def test_parts_that_look_like_versions(tmp_path, names, sizes, middles):
     model = read_model(tmp_path)
     assert len(model.mesh.faces) == 24
     np.testing.assert_allclose(model.mesh.area, sum(part.area for part in parts), rtol=1e-5)
-
-
-def test_only_a_folder_of_collision_meshes(tmp_path):
-    (tmp_path / "collision").mkdir()
-    mug().export(tmp_path / "collision" / "a.stl")
-    assert len(read_model(tmp_path).mesh.faces) == 12

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from models import BLUE, GREEN, RED, box, image_file, obj_text, shown_colors, write_obj
+from models import GREEN, RED, box, image_file, shown_colors, write_obj
 
 from asset_tools.reading.model import read_model
 from asset_tools.reading.obj import parse_obj
@@ -79,23 +79,6 @@ def test_a_missing_texture_or_material_file_that_faces_need_is_an_error(tmp_path
     assert str(caught.value.where).endswith("skin.mtl")
 
 
-def test_each_material_keeps_its_colour(tmp_path):
-    """Two textures, a plain colour and an unknown material in one file."""
-    image_file(tmp_path / "red.png", RED), image_file(tmp_path / "blue.png", BLUE)
-    (tmp_path / "m.mtl").write_text("newmtl r\nmap_Kd red.png\nnewmtl b\nmap_Kd blue.png\nnewmtl g\nKd 0 0.5 1\n")
-    lines = obj_text(box(), head="mtllib m.mtl", use="").splitlines()
-    faces = [i for i, line in enumerate(lines) if line.startswith("f ")]
-    for row, name in reversed(list(zip(faces[::3], "rbgx", strict=True))):
-        lines.insert(row, f"usemtl {name}")
-    (tmp_path / "m.obj").write_text("\n".join(lines))
-    colors = shown_colors(read_model(tmp_path / "m.obj").mesh)
-    expected = {RED: 3, BLUE: 3, (0, 128, 255): 3, (255, 255, 255): 3}
-    found = {
-        tuple(color): int(count) for color, count in zip(*np.unique(colors, axis=0, return_counts=True), strict=True)
-    }
-    assert found == expected
-
-
 def test_vertex_colours_of_an_obj(tmp_path):
     mesh = box()
     text = "".join(f"v {x} {y} {z} 0 0.5 1\n" for x, y, z in mesh.vertices)
@@ -131,16 +114,6 @@ def test_too_many_materials(tmp_path):
     (tmp_path / "mug.obj").write_text(text)
     with pytest.raises(AssetError):
         read_model(tmp_path / "mug.obj")
-
-
-def test_a_concave_polygon():
-    """The outline of an L, which a fan of triangles from its first corner would leave."""
-    outline = [(3, 0), (3, 1), (1, 1), (1, 3), (0, 3), (0, 0)]
-    text = "".join(f"v {x} {y} 0\n" for x, y in outline) + "f 1 2 3 4 5 6\n"
-    mesh = parse_obj(text, "L.obj")
-    sides = mesh.vertices[mesh.faces]
-    areas = np.cross(sides[:, 1] - sides[:, 0], sides[:, 2] - sides[:, 0])[:, 2] / 2
-    assert len(mesh.faces) == 4 and (areas > 0).all() and areas.sum() == pytest.approx(5)
 
 
 def test_the_only_material_file_is_taken_if_it_has_all_materials(tmp_path):
