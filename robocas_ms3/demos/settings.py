@@ -108,7 +108,7 @@ class GenerateSettings:
 
         episode, name = self.episode, self.episode.config
         config = load_task_config(name, overrides=self.set)
-        if self.set or name not in shipped_configs():
+        if self.set or not isinstance(name, str) or name not in shipped_configs():
             episode = replace(episode, config=config.model_dump(mode="json"))
         if self.noise is not None:
             episode = replace(episode, noise_mm=self.noise[0], noise_deg=self.noise[1])

@@ -60,12 +60,6 @@ def test_they_call_what_there_is(tmp_path, words):
     assert sum(counts) == 100
 
 
-def test_few_episodes_are_shared_among_the_parts_that_get_one(tmp_path):
-    _, calls = called(tmp_path, "reproduce_small.sh", "search", str(tmp_path / "out"), EPISODES="7")
-    recorded = [(call[1], int(call[call.index("-n") + 1])) for call in calls if call[0] == "generate"]
-    assert recorded == [("pick", 4), ("search", 3)]  # of 65, 13 and 22 percent
-
-
 def test_takeovers_are_from_a_run_that_came_to_its_end(tmp_path):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "weights.safetensors").touch()  # there from the first checkpoint on
@@ -82,12 +76,6 @@ def reproduced(tmp_path, episodes):
     for number in range(episodes):
         (data / f"episode_{number:07d}").mkdir()
     return tmp_path / "out"
-
-
-def test_processes_are_one_a_core_whatever_torch_is_told(tmp_path):
-    _, calls = called(tmp_path, "reproduce_small.sh", "pick", str(tmp_path / "out"), JOBS="", OMP_NUM_THREADS="1")
-    jobs = {call[call.index("--jobs") + 1] for call in calls if "--jobs" in call}
-    assert jobs == {str(len(os.sched_getaffinity(0)))}
 
 
 def test_what_breaks_off_is_gone_on_with_by_the_same_call(tmp_path):
@@ -127,12 +115,6 @@ def test_a_study_trains_on_what_is_there_and_on_parts_of_it(tmp_path, what):
     if not whole:
         shares = [float(share) for share in calls[0][calls[0].index("--parts") + 1 :][:2]]
         assert shares == [0.25, 0.75]
-
-
-def test_a_study_leaves_out_what_it_is_about(tmp_path):
-    _, calls = called(tmp_path, "study_small.sh", str(reproduced(tmp_path, 10)), "no-language", "no-gripper-camera")
-    settings = [call[call.index("--set") + 1] for call in calls if call[0] == "train"]
-    assert settings == ["language=false", "views.gripper_camera=null"]
 
 
 @pytest.mark.parametrize("what", ["10", "11", "0", "5x", "no-words"])

@@ -2,22 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, get_args
-
-GoalType = Literal[
-    "find the object",
-    "operate the target",
-    "move and grasp",
-    "transfer object",
-    "grasp object",
-    "release object",
-    "lift object",
-    "grasp and lift the object",
-]
-
-GOAL_TYPES: tuple[GoalType, ...] = get_args(GoalType)
-
-SUBGOALS: dict[GoalType, str] = {
+SUBGOALS = {
     # upstream's, word for word
     "find the object": "find the {object} on the {support}",
     "operate the target": "open the {support}",
@@ -29,9 +14,10 @@ SUBGOALS: dict[GoalType, str] = {
     "lift object": "lift the {object}",
     "grasp and lift the object": "grasp and lift the {object}",
 }
+GOAL_TYPES = tuple(SUBGOALS)
 
 
-def subgoal(goal_type: GoalType, object: str, support: str) -> dict[str, str]:
+def subgoal(goal_type: str, object: str, support: str) -> dict[str, str]:
     """Return type and text of a sub-goal as episodes record them: ``goal_type`` and ``goal_description``.
 
     Args:
