@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, Protocol
@@ -12,11 +12,11 @@ from typing import Annotated, Any, Literal, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import ConfigDict, Field
+from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.exits import no_exit
 from robocas_ms3.core.files import json_text
-from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.robots.cameras import CAMERA_NAME
 from robocas_ms3.robots.quantities import QUANTITIES
 from robocas_ms3.robots.table import DEFAULT
@@ -29,12 +29,71 @@ Side = Annotated[int, Field(ge=1, le=4096)]
 """Of an image, pixels."""
 
 
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Relative motions of E TCPs, each in its own frame (z approach, y closing): (E, 3) m, E rotations, (E,) bool."""
+
+    translation: Array
+    rotation: Rotation
+    open: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Convention:
+    """A convention of actions.
+
+    Attributes:
+        size: numbers per action.
+        meaning: for people.
+        read: converts actions (E, size) to motions; None: they are joint targets.
+    """
+
+    size: int
+    meaning: str
+    read: Callable[[Array], Motion] | None
+
+
+def _robocas(actions: Array) -> Motion:
+    return Motion(actions[:, :3], Rotation.from_euler("xyz", actions[:, 3:6]), actions[:, 6] > 0.5)
+
+
+def _euler(actions: Array) -> Motion:
+    return Motion(actions[:, :3], Rotation.from_euler("xyz", actions[:, 3:6]), actions[:, 6] > 0)
+
+
+def _axis_angle(actions: Array) -> Motion:
+    return Motion(actions[:, :3], Rotation.from_rotvec(actions[:, 3:6]), actions[:, 6] > 0)
+
+
+def _quaternion(actions: Array) -> Motion:
+    quaternions = actions[:, [4, 5, 6, 3]]
+    lengths = np.linalg.norm(quaternions, axis=1, keepdims=True)
+    identity = np.array([0.0, 0.0, 0.0, 1.0])
+    quaternions = np.where(lengths > 1e-9, quaternions / np.maximum(lengths, 1e-9), identity)
+    return Motion(actions[:, :3], Rotation.from_quat(quaternions), actions[:, 7] > 0)
+
+
+CONVENTIONS: dict[str, Convention] = {
+    "robocas": Convention(
+        7, "m; Euler angles about fixed axes x, y, z, rad; gripper opening, above 0.5 is open: the paper's", _robocas
+    ),
+    "delta_euler": Convention(7, "m; Euler angles about fixed axes x, y, z, rad; gripper, above 0 is open", _euler),
+    "delta_axis_angle": Convention(7, "m; rotation vector, rad; gripper, above 0 is open", _axis_angle),
+    "delta_quaternion": Convention(8, "m; quaternion wxyz; gripper, above 0 is open", _quaternion),
+    "joint_positions": Convention(8, "seven joint targets, rad; gripper, -1 closed to 1 open", None),
+}
+"""By name. Translation comes first, then rotation, both in the TCP's frame; the last number is the gripper's."""
+
+
 @dataclass(frozen=True)
 class PolicySpec:
     """What a policy declares; a mismatch with the protocol is refused before the first step.
 
     Attributes:
-        convention: meaning of its actions, one of ``actions.CONVENTIONS``.
+        convention: meaning of its actions, one of `CONVENTIONS`.
         reference: motions are relative to where the TCP is, or to where the last action sent it.
         rate_hz: actions per second; None: the protocol's.
         cameras: (width, height) in pixels by camera; empty: no images.

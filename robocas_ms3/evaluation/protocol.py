@@ -29,8 +29,7 @@ from robocas_ms3.core.names import LONGEST, FileName
 from robocas_ms3.core.paths import protocols_dir
 from robocas_ms3.core.strict import StrictModel, nearest, parse, parse_json
 from robocas_ms3.demos.recordings.entries import GREATEST_SEED
-from robocas_ms3.evaluation.actions import CONVENTIONS
-from robocas_ms3.evaluation.policy import PolicySpec
+from robocas_ms3.evaluation.policy import CONVENTIONS, PolicySpec
 from robocas_ms3.evaluation.settings import EvaluationSettings
 from robocas_ms3.robots.table import DEFAULT as DEFAULT_ROBOT
 from robocas_ms3.robots.table import find_robot

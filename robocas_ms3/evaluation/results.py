@@ -76,11 +76,7 @@ class RunRecord(BaseModel):
 
     @classmethod
     def of(cls, values: dict[str, Any], where: object) -> RunRecord:
-        """Return the record of these values, which can be written and read back.
-
-        Args:
-            values: of the record.
-            where: for error messages.
+        """Return the record of these values, which can be written and read back; ``where`` is for errors.
 
         Raises:
             EvaluationError: a value is missing or wrong, or could not be read back, such as NaN.

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import EvaluationError, PolicyFailed
 from robocas_ms3.core.words import printable
-from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.metrics import MEASURES, read_sum
 from robocas_ms3.evaluation.outcomes import Outcome, Retrieval, failure_stage
 from robocas_ms3.evaluation.policy import (
+    CONVENTIONS,
     ROBOT,
     EpisodeSpec,
     Observations,
@@ -30,7 +30,7 @@ from robocas_ms3.scenes.language.embed import TextEmbedder
 from robocas_ms3.scenes.task_specs import TASKS
 
 NOT_FINITE = "the policy's action is not finite"
-_WELDS = "welds"  # of `weld`, where there is one
+_WELDS = "welds"  # of `stepping.Weld`, where there is one
 
 
 @dataclass

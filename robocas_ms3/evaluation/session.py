@@ -24,8 +24,7 @@ from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, Policy, as_
 from robocas_ms3.evaluation.protocol import Episode, load_protocol
 from robocas_ms3.evaluation.rollout import NOT_FINITE, EndConditions, EpisodeBatch, Rollout, rollout
 from robocas_ms3.evaluation.settings import EvaluationSettings
-from robocas_ms3.evaluation.stepping import UPSTREAM_HZ, PolicyStepping, env_kwargs
-from robocas_ms3.evaluation.weld import check_weld
+from robocas_ms3.evaluation.stepping import UPSTREAM_HZ, PolicyStepping, check_weld, env_kwargs
 from robocas_ms3.scenes.table import FrozenLayouts
 from robocas_ms3.scenes.task_specs import TASKS
 from robocas_ms3.tasks.vector import choose_backend, make_vec

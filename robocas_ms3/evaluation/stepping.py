@@ -6,16 +6,16 @@ from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
+import sapien
 import torch
 from mani_skill.utils.structs import Pose
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.evaluation.actions import CONVENTIONS, Motion
 from robocas_ms3.evaluation.metrics import EpisodeMetrics
-from robocas_ms3.evaluation.policy import PolicySpec
-from robocas_ms3.evaluation.weld import Weld
+from robocas_ms3.evaluation.policy import CONVENTIONS, Motion, PolicySpec
 from robocas_ms3.robots.ee_deltas import to_ee_delta_action
+from robocas_ms3.tasks import terms
 
 Stepping = Literal["timed", "upstream"]
 UPSTREAM_HZ = 5
@@ -24,6 +24,10 @@ _GRIPPER_STEPS, _MOTION_STEPS = 5, 2
 _STANDS = 0.0005  # m that the gripper's width changes in a control step; velocities shiver where fingers press
 _UNUSED = 8  # pixels per side of cameras that the policy does not use, which are rendered all the same
 _NEAR, _TURNED, _SPIN = 0.02, np.deg2rad(5), np.deg2rad(3)  # m, rad, rad/s: where upstream's motion ends early
+RAISED = 0.03  # m above where it stood (evaluation_v0.md)
+# Of the drive that keeps the rotation: 1/s^2 and 1/s, so that it is as stiff for a strawberry as for a bottle. Limits
+# of no width lock the translation; those of angles SAPIEN 3.0.3 does not keep.
+_STIFFNESS, _DAMPING = 1e8, 1e5
 
 
 class PolicyStepping(gym.Wrapper):
@@ -35,7 +39,7 @@ class PolicyStepping(gym.Wrapper):
         stepping: ``timed``: a policy step is one control step. ``upstream``: a policy step moves the gripper until it
             stands, then the TCP on a straight line, until it is there or 0.4 s are over. Envs of a batch that have
             finished wait.
-        weld: whether lifted objects are welded to the hand (`weld`); only with one env on a CPU.
+        weld: whether lifted objects are welded to the hand (`Weld`); only with one env on a CPU.
     """
 
     def __init__(self, env: gym.Env, spec: PolicySpec, stepping: Stepping, *, weld: bool = False) -> None:
@@ -162,6 +166,79 @@ class PolicyStepping(gym.Wrapper):
         spin = torch.linalg.vector_norm(self._base.agent.tcp.angular_velocity, dim=-1).cpu().numpy()
         near = np.linalg.norm(position - at, axis=1) < _NEAR
         return near & ((turn.inv() * rotation).magnitude() < _TURNED) & (spin < _SPIN)
+
+
+class Weld:
+    """RoboCAS-v0's weld: fixes at most one lifted object to the hand, in an environment with one env on a CPU.
+
+    The evaluator of the paper does this, and it helps policies that drop lifted objects. RoboCAS-v0 lets go at the end
+    of the step in which the gripper was commanded to open; here the object is released when it begins to open.
+    """
+
+    def __init__(self, env: Any) -> None:
+        self._env = env
+        self._welded: tuple[Any, Any] | None = None  # body and drive
+        self._count = 0
+
+    def update(self) -> None:
+        """Weld an object that both fingers touch, if it is raised and nothing is welded.
+
+        To be called after a policy step in which the gripper was commanded to close, as RoboCAS-v0 does.
+        """
+        if self._welded is not None:
+            return
+        env = self._env
+        forces = env.gripper_forces()
+        touched = terms.touched(forces[:, :1]) & terms.touched(forces[:, 1:2])  # by the left finger, by the right
+        raised = env.object_poses[..., 2] - env.start_poses[..., 2] >= RAISED
+        found = (touched & raised & env.present)[0].nonzero()
+        if len(found):
+            self._fix(env.objects[int(found[0])]._bodies[0])
+
+    def open(self) -> None:
+        """Release the object."""
+        if self._welded is None:
+            return
+        body, drive = self._welded
+        body.entity.remove_component(drive)
+        body.wake_up()
+        self._welded = None
+
+    def reset(self) -> None:
+        """Release the object, and count from 0; to be called before a reset, which may remove the objects."""
+        self.open()
+        self._count = 0
+
+    def read(self, info: dict[str, Any]) -> dict[str, Any]:
+        """Return entries of an info: the number of ``welds`` (1,), and no ``success`` while anything is welded."""
+        welded = torch.tensor([self._welded is not None])
+        return {"welds": torch.tensor([float(self._count)]), "success": info["success"] & ~welded}
+
+    def _fix(self, body: Any) -> None:
+        hand = self._env.agent.hand_link._bodies[0]
+        drive = sapien.physx.PhysxDriveComponent(body)
+        drive.parent = hand
+        drive.pose_in_parent, drive.pose_in_child = hand.entity_pose.inv() * body.entity_pose, sapien.Pose()
+        for lock in (drive.set_limit_x, drive.set_limit_y, drive.set_limit_z):
+            lock(0.0, 0.0)
+        drive.set_drive_property_slerp(_STIFFNESS, _DAMPING, mode="acceleration")
+        body.entity.add_component(drive)
+        self._welded = body, drive
+        self._count += 1
+
+
+def check_weld(stepping: str, backend: str) -> None:
+    """Check that objects can be welded with a protocol's steps, on a backend.
+
+    Raises:
+        EvaluationError: the protocol's steps are not upstream's, or envs run on a GPU.
+    """
+    if stepping != "upstream":
+        what, fix = "the weld belongs to upstream's steps", "Leave --weld out, or take paper-v1."
+        raise EvaluationError(what, where="--weld", expected="stepping upstream", found=stepping, fix=fix)
+    if backend == "gpu":  # where nothing can be built once a batch runs
+        what, fix = "nothing can be welded on a GPU", "Pass --backend processes."
+        raise EvaluationError(what, where="--weld", found=backend, fix=fix)
 
 
 def control_mode(convention: str) -> str:

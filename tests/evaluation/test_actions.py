@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from robocas_ms3.evaluation.actions import CONVENTIONS
+from robocas_ms3.evaluation.policy import CONVENTIONS
 
 QUARTER = np.pi / 2
 SAID = {  # 1, 2, 3 cm, then a quarter turn about z; gripper open, then shut

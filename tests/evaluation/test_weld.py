@@ -23,9 +23,8 @@ from robocas_ms3.evaluation.report import videos
 from robocas_ms3.evaluation.report.videos import film
 from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
-from robocas_ms3.evaluation.stepping import PolicyStepping, control_mode
+from robocas_ms3.evaluation.stepping import PolicyStepping, check_weld, control_mode
 from robocas_ms3.evaluation.verify import problems
-from robocas_ms3.evaluation.weld import check_weld
 from robocas_ms3.robots.description import MOBILE_PANDA
 
 OPEN, CLOSE = 1.0, 0.0

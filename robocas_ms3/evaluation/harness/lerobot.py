@@ -11,9 +11,8 @@ from lerobot.configs import FeatureType, PolicyFeature  # pyright: ignore[report
 from lerobot.envs import EnvConfig  # pyright: ignore[reportMissingImports]
 
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.harness.proprioception import KEYS, WIDTHS, depth_key
-from robocas_ms3.evaluation.policy import PolicySpec, Reference
+from robocas_ms3.evaluation.policy import CONVENTIONS, PolicySpec, Reference
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.robots.cameras import STANDARD_NAMES
 
@@ -73,7 +72,7 @@ class RoboCASEnvConfig(EnvConfig):
 
     @property
     def spec(self) -> PolicySpec:
-        """What the policy sees, and what its actions mean.
+        """Specification of the policy.
 
         Raises:
             EvaluationError: no camera is named, or a value is unknown.
@@ -84,15 +83,11 @@ class RoboCASEnvConfig(EnvConfig):
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        """Nothing: `create_envs` does not call ``gym.make``."""
+        """Return nothing: `create_envs` does not call ``gym.make``."""
         return {}
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, Any]]:
-        """Make the vector environments, ``{task: {0: environment}}``.
-
-        Args:
-            n_envs: episodes at a time.
-            use_async_envs: ignored, because envs on a CPU run in processes anyway.
+        """Make the vector environments, ``{task: {0: environment}}``; ``use_async_envs`` is ignored.
 
         Raises:
             EvaluationError: no task is named, or the settings don't fit the protocol.

@@ -33,19 +33,12 @@ def depth_key(camera: str) -> str:
 
 @dataclass
 class _Robot:
-    """Robot of one episode.
-
-    Attributes:
-        spec: its row in the registry.
-        root: (4, 4) pose of its root link in the world, which is constant.
-        width: width of the gripper at the start, m.
-        last: values that `Proprioception.read` returned last.
-    """
+    """Robot of one episode."""
 
     spec: RobotSpec
-    root: NDArray[np.float64]
-    width: float
-    last: dict[str, NDArray[np.float32]] | None = None
+    root: NDArray[np.float64]  # (4, 4) pose of its root link in the world, which is constant
+    width: float  # of the gripper at the start, m
+    last: dict[str, NDArray[np.float32]] | None = None  # last values of `Proprioception.read`
 
 
 class Proprioception:
@@ -55,13 +48,7 @@ class Proprioception:
         self._robots: dict[int, _Robot] = {}
 
     def reset(self, env: int, obs: dict[str, Any], spec: RobotSpec) -> None:
-        """Start an episode.
-
-        Args:
-            env: row of the observation.
-            obs: first observation of the episode.
-            spec: its robot.
-        """
+        """Start an episode of a robot with its first observation, whose row is ``env``."""
         robot = spec.description
         qpos, tcp_in_base, tcp_in_world = _row(obs, env)
         base_in_root = chain(spec.files().urdf, robot.root_link, robot.arm_base_link, qpos[:, robot.base_slice])
@@ -69,13 +56,7 @@ class Proprioception:
         self._robots[env] = _Robot(spec, root, float(qpos[0, robot.finger_slice].sum()))
 
     def read(self, env: int, obs: dict[str, Any], gripper: float | None) -> dict[str, NDArray[np.float32]]:
-        """Return the values (D,) of each of `KEYS`.
-
-        Args:
-            env: row of the observation.
-            obs: observation of the environment.
-            gripper: last gripper command, -1 closed to 1 open; None: there was none yet.
-        """
+        """Return the values (D,) of each of `KEYS`; ``gripper``: last command, -1 closed to 1 open, None: none yet."""
         robot, qpos = self._robots[env], _row(obs, env)[0]
         qvel = obs["agent"]["qvel"][env][None].astype(np.float64)
         commands = np.array([] if gripper is None else [gripper])

@@ -15,9 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation import results
-from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.harness.proprioception import WIDTHS, Proprioception, depth_key
-from robocas_ms3.evaluation.policy import ExternalPolicy, PolicySpec
+from robocas_ms3.evaluation.policy import CONVENTIONS, ExternalPolicy, PolicySpec
 from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
 from robocas_ms3.robots.table import find_robot
@@ -84,12 +83,11 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start an episode in each env.
+        """Start an episode in each env; ``options`` are ignored.
 
         Args:
             seed: of the first env, whose successors the other envs get, or one per env; None: the episodes after
                 those of the last reset.
-            options: ignored.
 
         Raises:
             ValueError: there are more or fewer seeds than envs, or one is None.
@@ -117,10 +115,7 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
     def step(
         self, actions: ArrayLike
     ) -> tuple[dict[str, Any], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        """Step the envs whose episodes run.
-
-        Args:
-            actions: (N, A).
+        """Step the envs whose episodes run, by actions (N, A).
 
         Raises:
             ValueError: the actions have another shape.

@@ -1,7 +1,7 @@
-"""A benchmark of vla-eval: its runs name ``robocas_ms3.evaluation.harness.vla_eval:RoboCAS``; docs/vla_eval.md.
+"""A benchmark of vla-eval 0.8, which names it ``robocas_ms3.evaluation.harness.vla_eval:RoboCAS``; docs/vla_eval.md.
 
-Written to vla-eval 0.8's interface without deriving from it, so that this package needs no vla-eval: who uses this
-class is vla-eval. One of its tasks is a configuration of the protocol, its episodes in the protocol's order.
+It does not derive from vla-eval's class, so that this package does not need vla-eval. A task of vla-eval is a
+configuration of the protocol, its episodes in the protocol's order.
 """
 
 from __future__ import annotations
@@ -25,28 +25,27 @@ from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
 from robocas_ms3.robots.description import RobotDescription
 
-# How vla-eval calls what the numbers of an action mean, where it has a word for it.
+# vla-eval's names of rotations
 _ROTATIONS = {
     "robocas": (3, "euler_xyz"),
     "delta_euler": (3, "euler_xyz"),
     "delta_axis_angle": (3, "axis_angle"),
     "delta_quaternion": (4, "quaternion_wxyz"),
 }
-_STATE = 18  # numbers of `state_of`
 
 
 class RoboCAS:
-    """The episodes of a protocol, as vla-eval's runners play them, in mode ``sync``.
+    """The episodes of a protocol, for vla-eval's runners in mode ``sync``.
 
     Args:
-        protocol: name of a shipped one, or a folder.
-        cameras: (width, height) in pixels by camera, in the order in which a model server is sent the pictures.
-        convention: what actions mean, one of ``evaluation.actions.CONVENTIONS``.
+        protocol: name of a bundled protocol, or its folder.
+        cameras: (width, height) in pixels by camera, in the order in which a model server gets the images.
+        convention: meaning of the actions, one of ``evaluation.policy.CONVENTIONS``.
         reference: what motions are relative to: ``tcp`` or ``target``.
-        rate_hz: actions a second; None: the protocol's.
+        rate_hz: actions per second; None: the protocol's.
 
     Raises:
-        EvaluationError: no such protocol, or these are none of it.
+        EvaluationError: there is no such protocol, or the other arguments do not fit it.
         DatasetError: there are cameras, and no render device.
     """
 
@@ -68,32 +67,32 @@ class RoboCAS:
         self._episode: Episode | None = None
         self._seen: Observations | None = None
         self._recorder: Any = None
-        self._begun = 0.0
+        self._started = 0.0  # clock time, s
 
     @classmethod
     def configure_render(cls, mode: str) -> dict[str, str]:
-        """Nothing to set: SAPIEN renders on the GPU, and where there is none on the processor."""
+        """Return no variables: SAPIEN finds its render device."""
         return {}
 
     def get_tasks(self) -> list[dict[str, Any]]:
-        """A task a configuration; ``tasks:`` of a run may name these or, as suites, the short names of tasks."""
+        """Return a task per configuration; its suite is the short name of our task."""
         return [
             {"name": config, "suite": episodes[0].task, "episodes": len(episodes)}
             for config, episodes in self._of_config.items()
         ]
 
     def get_metadata(self) -> dict[str, Any]:
-        """``max_steps`` is that of the longest task; those of others end by the protocol's rules."""
+        """Return ``max_steps`` of the longest task; others end by the protocol's rules."""
         tasks = {episode.task for episode in self._session.protocol.episodes}
         return {"max_steps": max(self._session.max_steps(task) for task in tasks)}
 
     def get_metric_keys(self) -> dict[str, str]:
-        """What is averaged over episodes; the others stay with each of them."""
+        """Return the entries of results that are averaged over episodes."""
         names = ("success", "success_at_end", "success_v0", *STAGES.values(), "seconds", *MEASURES)
         return dict.fromkeys(names, "mean")
 
     def get_action_spec(self) -> dict[str, Any]:
-        """What actions mean, in vla-eval's words."""
+        """Return the meaning of actions."""
         from vla_eval.specs import DimSpec  # pyright: ignore[reportMissingImports]
 
         convention = self._spec.convention
@@ -108,57 +107,45 @@ class RoboCAS:
         }
 
     def get_observation_spec(self) -> dict[str, Any]:
-        """What is seen, in vla-eval's words."""
+        """Return the meaning of observations."""
         from vla_eval.specs import IMAGE_RGB, LANGUAGE, DimSpec  # pyright: ignore[reportMissingImports]
 
         images = dict.fromkeys(["image", *self._spec.cameras] if self._spec.cameras else [], IMAGE_RGB)
-        return {**images, "state": DimSpec("state", _STATE, "robocas"), "language": LANGUAGE}
+        return {**images, "state": DimSpec("state", 18, "robocas"), "language": LANGUAGE}
 
     def get_hold_action(self, last_action: dict[str, Any] | None) -> dict[str, Any]:
-        """What only mode ``live`` asks for, in which the clock's time would choose the steps, not the protocol.
-
-        Raises:
-            NotImplementedError: it is asked for; vla-eval says so before the first episode.
-        """
-        raise NotImplementedError("RoboCAS' protocols are played in mode sync")
+        """Refuse mode ``live``, in which clock time chooses the steps."""
+        raise NotImplementedError("RoboCAS' protocols need mode sync")
 
     async def start_episode(self, task: Mapping[str, Any], recorder: Any = None) -> None:
-        """Begin an episode of a task.
-
-        Args:
-            task: of `get_tasks`, with ``episode_idx``.
-            recorder: takes pictures of the first camera.
+        """Start the episode ``episode_idx`` of a task of `get_tasks`.
 
         Raises:
-            EvaluationError: the protocol has no more of it.
+            EvaluationError: the protocol has fewer episodes.
         """
         episodes, number = self._of_config[task["name"]], task["episode_idx"]
         if number >= len(episodes):
-            raise EvaluationError(
-                "the protocol has no more episodes of this task",
-                where=task["name"],
-                expected=f"episodes_per_task: {len(episodes)} at most",
-                found=number + 1,
-            )
+            what, expected = "the protocol has no more episodes of this task", f"{len(episodes)} at most"
+            raise EvaluationError(what, where=task["name"], expected=f"episodes_per_task: {expected}", found=number + 1)
         episode = episodes[number]
-        self._episode, self._recorder, self._begun = episode, recorder, time.monotonic()
+        self._episode, self._recorder, self._started = episode, recorder, time.monotonic()
         self._seen = self._session.reset([episode.episode])
         self._record()
 
     async def apply_action(self, action: Mapping[str, Any]) -> None:
-        """Play an action, or all of a chunk.
+        """Execute an action, or all of a chunk.
 
         Raises:
-            WireError: it is none of the convention.
+            WireError: it does not fit the convention.
         """
         actions = actions_of({"actions": action.get("actions", action.get("action"))}, self._spec.convention)
         self._seen = self._session.step(actions[None])
         self._record()
 
     async def get_observation(self) -> dict[str, Any]:
-        """``images`` (H, W, 3) uint8 by camera, ``state`` (18,) and ``task_description``."""
+        """Return ``images`` (H, W, 3) uint8 by camera, ``state`` (18,) and ``task_description``."""
         seen = self._seen
-        assert seen is not None  # of an episode that is over vla-eval asks for no observation
+        assert seen is not None  # vla-eval asks for no observation of an episode that has ended
         return {
             "images": {name: images[0] for name, images in seen.images.items()},
             "state": state_of(seen),
@@ -166,26 +153,23 @@ class RoboCAS:
         }
 
     async def is_done(self) -> bool:
-        """Whether the protocol's rules ended the episode."""
+        """Return whether the protocol's rules ended the episode."""
         return self._seen is None
 
     async def get_time(self) -> float:
-        """Clock time since the episode began, s."""
-        return time.monotonic() - self._begun
+        """Return the clock time since the start of the episode, s."""
+        return time.monotonic() - self._started
 
     async def get_result(self) -> dict[str, Any]:
-        """All that ``robocas eval`` says of an episode, whether flags ever held, and what it was measured with.
+        """Return the outcome of the episode, whether flags ever held, and what it was measured with.
 
         Raises:
             EvaluationError: vla-eval ended it before the protocol does.
         """
         outcome, episode = self._session.outcomes.get(0), self._episode
         if outcome is None or episode is None:
-            raise EvaluationError(
-                "the run ended an episode before the protocol does",
-                where="max_steps",
-                fix="Leave max_steps out of the run's configuration.",
-            )
+            what, fix = "the run ended an episode before the protocol does", "Leave max_steps out of the configuration."
+            raise EvaluationError(what, where="max_steps", fix=fix)
         return {
             **{name: step is not None for name, step in outcome.flags.items()},
             **outcome.measures,
@@ -195,11 +179,11 @@ class RoboCAS:
         }
 
     def cleanup(self) -> None:
-        """End the env's process."""
+        """Close the environment."""
         self._session.close()
 
     def render(self) -> NDArray[np.uint8] | None:
-        """(H, W, 3) the first camera's picture; None: there is none."""
+        """Return the first camera's image (H, W, 3); None without cameras."""
         images = self._seen.images if self._seen is not None else {}
         return next(iter(images.values()))[0] if images else None
 
@@ -209,7 +193,7 @@ class RoboCAS:
 
 
 def state_of(seen: Observations) -> NDArray[np.float32]:
-    """(18,) as ``observation.state`` of our LeRobot datasets has it.
+    """Return the state (18,) as in ``observation.state`` of our LeRobot datasets.
 
     TCP in the arm's base frame, position m and quaternion xyzw; seven joints, rad; width of the gripper, m; the base's
     x, y, m, and yaw, rad.

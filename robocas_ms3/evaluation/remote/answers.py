@@ -49,11 +49,7 @@ class ServedFiles:
 
     @classmethod
     def of(cls, protocols: Iterable[Path] = (), packs: Iterable[str] = ()) -> ServedFiles:
-        """Collect the files of shipped protocols and installed packs, and of others.
-
-        Args:
-            protocols: folders of others.
-            packs: that these name.
+        """Collect the files of shipped protocols and installed packs, and of other protocols and their packs.
 
         Raises:
             EvaluationError: two protocols have the same name.
@@ -100,10 +96,10 @@ class Answers:
         self._used: set[int] = set()  # envs of the policy
 
     def answer(self, data: str | bytes, envs: dict[int, int]) -> dict[str, Any]:
-        """Return the answer to a request.
+        """Return the answer to a packed message.
 
         Args:
-            data: packed message.
+            data: the message.
             envs: the policy's env by the client's, of this connection; new ones are added.
 
         Raises:
@@ -184,11 +180,7 @@ def error_line(error: BaseException) -> str:
 
 
 def read_episode_spec(message: Mapping[str, Any], env: int) -> EpisodeSpec:
-    """Return the episode that starts; of a client that tells nothing else, the instruction.
-
-    Args:
-        message: of the client.
-        env: of the policy.
+    """Return the episode that starts in an env of the policy; some clients tell only its instruction.
 
     Raises:
         WireError: a value is unknown, or of another type or size.

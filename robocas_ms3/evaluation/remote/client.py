@@ -173,16 +173,7 @@ class RemotePolicy:
             self._connections[_SHARED].envs.discard(env)
 
     async def _ask(self, envs: list[int], messages: list[dict[str, Any]], starting: set[int]) -> dict[int, Any]:
-        """Send messages and wait for the answers.
-
-        Args:
-            envs: of the messages.
-            messages: one per env.
-            starting: envs whose episodes start.
-
-        Returns:
-            By row: a map with the actions, or the error.
-        """
+        """Send a message per env, of which some are ``starting`` episodes; return by row the answer or the error."""
         answers: dict[int, Any] = {}
         size = min(self._metadata.max_batch or 1, LARGEST_BATCH)
         slots = asyncio.Semaphore(1 if self._metadata.max_batch else self._address.max_in_flight or len(envs))
@@ -229,14 +220,10 @@ class RemotePolicy:
         return dict(zip(rows, answers, strict=True))
 
     async def _answer(self, socket: ClientConnection, message: dict[str, Any]) -> Any:
-        """Send a message and return the answer.
+        """Send a message and return the answer; raise if there is none in time, or it is an error or invalid.
 
         A server that computes one answer after another may take ``timeout_s`` for each of them, so the time counts from
         the last answer to any request.
-
-        Raises:
-            ConnectionLost: the connection is closed.
-            EvaluationError: there is no answer in time, or it is an error text or invalid.
         """
 
         async def exchange() -> str | bytes:
@@ -264,11 +251,6 @@ class RemotePolicy:
         return metadata
 
     async def _connect(self, key: int) -> None:
-        """Open a connection.
-
-        Raises:
-            EvaluationError: no server answers in time, or it serves another policy.
-        """
         socket, metadata = await self._open()
         if self._spec_of(metadata) != self._spec_of(self._metadata) or metadata.max_batch != self._metadata.max_batch:
             await close_connection(socket)
@@ -287,11 +269,7 @@ class RemotePolicy:
             await close_connection(connection.socket)
 
     def _spec_of(self, metadata: ServerMetadata) -> PolicySpec:
-        """Return what the policy declares, as its server announces it or the address says.
-
-        Raises:
-            EvaluationError: it is invalid, or both say it.
-        """
+        """Return the policy's specification, from its server or the address; raise if both have one."""
         url, given = self._address.url, self._address.spec
         if metadata.spec is None:
             return given or PolicySpec()

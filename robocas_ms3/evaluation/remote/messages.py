@@ -20,8 +20,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PositiveInt,
 from robocas_ms3.core.errors import EvaluationError, WireError
 from robocas_ms3.core.paths import protocols_dir
 from robocas_ms3.core.strict import refusal
-from robocas_ms3.evaluation.actions import CONVENTIONS
-from robocas_ms3.evaluation.policy import ROBOT, EpisodeSpec, Observations, PolicySpec
+from robocas_ms3.evaluation.policy import CONVENTIONS, ROBOT, EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.evaluation.remote.wire import MAX_BYTES, one_line
 from robocas_ms3.robots.table import DEFAULT
 
@@ -91,14 +90,7 @@ def read_policy_spec(message: Any, where: object) -> PolicySpec:
 def observation_message(
     observations: Observations, row: int, start: EpisodeSpec | None, *, reset: bool
 ) -> dict[str, Any]:
-    """Return the message with the observation of one env.
-
-    Args:
-        observations: of several envs.
-        row: of the env.
-        start: the episode that starts, if the server is to know it.
-        reset: whether an episode starts.
-    """
+    """Return the message with a row of observations; ``start``: the episode that starts, if the server may know it."""
     arrays: dict[str, Any] = {name: values[row] for name, values in observations.robot.items()}
     arrays |= {name: images[row] for name, images in observations.images.items()}
     arrays |= {f"{name}_depth": depths[row] for name, depths in observations.depths.items()}
@@ -117,12 +109,7 @@ def observation_message(
 
 
 def read_observations(messages: Sequence[Mapping[str, Any]], envs: Sequence[int], spec: PolicySpec) -> Observations:
-    """Return the observations of several messages as a policy gets them.
-
-    Args:
-        messages: of one env each.
-        envs: the policy's number of each.
-        spec: of the policy.
+    """Return the observations of messages of one env each, whose numbers are ``envs``, as a policy gets them.
 
     Raises:
         WireError: an entry is missing, or has another shape or type.

@@ -11,7 +11,7 @@ from robocas_ms3.baselines.ppo.agent import Agent
 from robocas_ms3.baselines.ppo.config import PpoConfig
 from robocas_ms3.baselines.ppo.environments import expand_action
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.evaluation.actions import CONVENTIONS
+from robocas_ms3.evaluation.policy import CONVENTIONS
 from robocas_ms3.evaluation.stepping import control_mode
 from robocas_ms3.robots.ee_deltas import to_ee_delta_action
 
