@@ -111,17 +111,11 @@ def test_the_command_runs_from_the_wheel(installed, tmp_path):
     assert builtin["error"] == ""
 
 
-def test_mesh_tools_work_without_the_formulas(installed, tmp_path):
+def test_mesh_tools_work_without_the_formulas_of_the_builtin_pack(installed, tmp_path):
     file, *names = run(installed, "-c", IMPORT_ALL, cwd=tmp_path).split()
     assert Path(file).is_relative_to(installed.parent.parent)
     assert "asset_tools.partnet.importer" in names
     assert not [name for name in names if name.startswith("asset_tools.builtin")]
-
-
-def test_the_builtin_pack_is_not_built_from_a_wheel(installed, tmp_path):
     done = call(installed, str(installed.with_name("robocas")), "assets", "build", cwd=tmp_path)
     assert done.returncode == 1
-    assert done.stderr == (
-        "error: the formulas of the builtin pack are not installed (expected asset_tools/builtin of the repository, "
-        "found an installed wheel). Clone the repository to change them; the pack itself is installed and complete.\n"
-    )
+    assert done.stderr.startswith("error: the formulas of the builtin pack are not installed")

@@ -6,10 +6,8 @@ The commands that write a folder step by step use `OutputFolder`. Commands that 
 
 from __future__ import annotations
 
-import glob
 import json
 import os
-import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
@@ -21,7 +19,7 @@ from typing import Any
 
 from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import OutputExistsError, RobocasError
-from robocas_ms3.core.files import empty_folder, is_fixed, json_text, make_folder, remove, write_json
+from robocas_ms3.core.files import empty_folder, json_text, make_folder, remove, write_json
 from robocas_ms3.core.locks import LOCK, locked_folder
 
 _LEFTOVERS = (".*.tmp*", ".*.old")  # of `files.replacing` and `files.replacing_folder` in a process that was killed
@@ -103,9 +101,10 @@ class OutputFolder:
                     self.check_exists()
                 except RobocasError as removed:
                     raise removed from error
-            with suppress(OSError, RobocasError):
+            with suppress(OSError):  # a mount point or a link stays
                 if not self._has_results():
-                    _delete(self.path)
+                    empty_folder(self.path)
+                    self.path.rmdir()
 
     def read(self) -> None:
         """Check the folder without locking it, as is enough for further processes of one run.
@@ -143,14 +142,19 @@ class OutputFolder:
         Raises:
             RobocasError: the folder can't be made or replaced, or the record is no JSON.
         """
-        if not self._started:
-            _finish_deletion(self.path)
-            if self._overwrite:
-                _delete(self.path)
+        if self._overwrite and not self._started and self.path.is_dir():
+            self._hide_content()
         self._started = True
         make_folder(self.path)
         sweep(self.path)
         write_json(self._record_path(), record, sync=True)
+
+    def _hide_content(self) -> None:
+        """Move the content into a temporary folder, which `sweep` deletes; the record is the last that is moved."""
+        old, record = Path(tempfile.mkdtemp(prefix=".", suffix=".old", dir=make_folder(self.path))), self._record_path()
+        for entry in sorted(self.path.iterdir(), key=record.is_relative_to):
+            if entry.name not in (LOCK, old.name):
+                os.replace(entry, old / entry.name)
 
     def check_exists(self) -> None:
         """Check that nobody removed the folder: writers make missing folders, and would begin another one.
@@ -233,34 +237,6 @@ def check_replaceable(path: Path | str, *, overwrite: bool | None = None, marks:
     if marks and not any((path / mark).exists() for mark in marks):
         what = "refusing to replace what this command has not written"
         raise OutputExistsError(what, where=path, expected=" or ".join(marks), fix="Choose another.")
-
-
-def _delete(path: Path) -> None:
-    """Delete a file or folder; a folder disappears at once under this name."""
-    if not path.is_dir():
-        path.unlink(missing_ok=True)
-        return
-    if is_fixed(path):
-        empty_folder(path, but=path / LOCK)
-        return
-    target = path.resolve()  # a symbolic link stays, and leads to an empty folder
-    old = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".old", dir=make_folder(target.parent)))
-    try:
-        os.replace(target, old)
-    except OSError as error:
-        old.rmdir()
-        what = "can't replace this folder"
-        raise RobocasError(what, where=path, found=error.strerror, fix="Choose another.") from error
-    if path.is_symlink():
-        target.mkdir()
-    shutil.rmtree(old, ignore_errors=True)
-
-
-def _finish_deletion(path: Path) -> None:
-    """Delete a folder that an overwriting run renamed before it was killed."""
-    for old in path.parent.glob(f".{glob.escape(path.name)}.*.old"):
-        if not (old / "old").exists():  # else `files.replacing_folder` may put it back
-            shutil.rmtree(old, ignore_errors=True)
 
 
 def sweep(folder: Path) -> None:

@@ -106,18 +106,6 @@ def test_overwritten_folder_stays_until_the_start(tmp_path):
     assert names(tmp_path / "out") == ["episode_0", "run.json"]
 
 
-def test_overwritten_folder_disappears_at_once(tmp_path, monkeypatch):
-    out = tmp_path / "out"
-    write_run(out)
-    with monkeypatch.context() as patch:
-        patch.setattr("shutil.rmtree", lambda *_, **__: None)  # as if killed there
-        write_run(out, episodes=0, overwrite=True)
-    assert names(out) == ["run.json"]
-    assert len(names(tmp_path)) == 2
-    write_run(out)
-    assert names(tmp_path) == ["out"]
-
-
 def test_link_to_an_overwritten_folder_stays(tmp_path):
     write_run(tmp_path / "disk" / "data")
     (tmp_path / "out").symlink_to(tmp_path / "disk" / "data")

@@ -2,11 +2,8 @@
 
 import json
 import shutil
-from pathlib import Path
 
-import made_up_results
 import pytest
-import yaml
 from fuzzing import VALUES, changed
 from synthetic import write_trajectory
 
@@ -21,12 +18,6 @@ from robocas_ms3.datasets.writing.plan import DATASET, dataset_settings, plan_ep
 from robocas_ms3.demos.generate import OUTPUT
 from robocas_ms3.demos.ledger import Ledger, count_by_stage
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
-from robocas_ms3.evaluation import results
-from robocas_ms3.evaluation.policy import PolicySpec
-from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
-from robocas_ms3.evaluation.report.comparison import comparison
-from robocas_ms3.evaluation.report.page import page
-from robocas_ms3.evaluation.report.tables import markdown
 from robocas_ms3.plans.folder import PLAN, check_plan_record, plan_record, read_plan
 from robocas_ms3.plans.load import load_plan, shipped_plans
 from robocas_ms3.plans.status import read_status
@@ -52,50 +43,6 @@ def refused(read, path, whole, *, line=False, most=MOST):
             raise AssertionError(f"{place}: {str(value)[:40]}") from error
     path.write_text(before)
     return places
-
-
-ORDER = {
-    "moved": [{"object": "mug", "step": 3, "needed": True, "in_order": True}],
-    "needed": ["mug"],
-    "left": 0,
-    "score": 1.0,
-}
-
-
-@pytest.mark.parametrize("name", [results.RUN, results.OUTCOMES])
-def test_results_of_an_evaluation(tmp_path, name):
-    root = tmp_path / "result"
-    played = [made_up_results.outcome(i, came_to=7 - i, retrieval=ORDER, p_vis=0.5) for i in range(2)]
-    run = made_up_results.write(root, played).run
-
-    def read():
-        found = results.read(root)
-        assert markdown(found)
-        assert page(found)
-        assert comparison([found, found])
-        OutputFolder(root, results.OUTPUT, run.entries()).read()
-
-    read()
-    lines, text = name == results.OUTCOMES, (root / name).read_text()
-    whole = json.loads(text.splitlines()[0] if lines else text)
-    assert refused(read, root / name, whole, line=lines, most=25)
-
-
-@pytest.mark.parametrize("name", ["protocol.yaml", "episodes.jsonl"])
-def test_protocols(tmp_path, name):
-    root = shutil.copytree(Path(shipped_protocols()["ms3-v1"]), tmp_path / "protocol")
-    episodes = (root / "episodes.jsonl").read_text().splitlines(keepends=True)[:2]
-    (root / "episodes.jsonl").write_text("".join(episodes))
-
-    def read():
-        rules = load_protocol(root).rules
-        for task in ("pick", "search"):
-            rules.steps(task, rules.rate(PolicySpec("robocas", reference="tcp")))
-
-    read()
-    line = name == "episodes.jsonl"
-    whole = json.loads(episodes[0]) if line else yaml.safe_load((root / name).read_text())
-    assert refused(read, root / name, whole, line=line)
 
 
 def test_files_of_a_plan(tmp_path):
