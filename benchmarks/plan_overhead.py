@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import tyro
 
-from robocas_ms3.plans.executors.local import LocalExecutor
+from robocas_ms3.plans.executors import LocalExecutor
 from robocas_ms3.plans.plan import PartConfig, Plan
 from robocas_ms3.plans.run import run_shard
 from robocas_ms3.plans.units import SeedFiles, Unit

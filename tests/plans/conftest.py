@@ -1,3 +1,5 @@
+import shutil
+
 import pytest
 from plan_stages import run_here
 
@@ -8,3 +10,18 @@ def undisturbed(tmp_path_factory):
     out = tmp_path_factory.mktemp("plan") / "out"
     run_here(out)
     return out
+
+
+@pytest.fixture(scope="session")
+def done(tmp_path_factory):
+    out = tmp_path_factory.mktemp("done") / "out"
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(ZeroDivisionError):
+        patch.setattr("robocas_ms3.plans.run.join", lambda *_, **__: 1 / 0)
+        run_here(out)
+    return out
+
+
+@pytest.fixture
+def out(done, tmp_path):
+    """A folder of the plan, all of whose units are done and nothing is joined."""
+    return shutil.copytree(done, tmp_path / "out")

@@ -12,21 +12,6 @@ from robocas_ms3.plans.run import Callbacks
 from robocas_ms3.plans.units import Unit
 
 
-@pytest.fixture(scope="module")
-def done(tmp_path_factory):
-    """The folder of a plan, all of whose units are done; nobody may change it."""
-    out = tmp_path_factory.mktemp("done") / "out"
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(ZeroDivisionError):
-        patch.setattr("robocas_ms3.plans.run.join", lambda *_, **__: 1 / 0)
-        run_here(out)
-    return out
-
-
-@pytest.fixture
-def out(done, tmp_path):
-    return shutil.copytree(done, tmp_path / "out")
-
-
 @pytest.mark.parametrize(
     "name",
     ["demos/a/trajectory.h5", "datasets/robocas/conversion.json", "datasets/robocas/data_info.json", "report.json"],

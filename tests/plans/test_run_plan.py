@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import sys
 import time
@@ -29,9 +30,9 @@ from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.demos.recordings.entries import versions
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
-from robocas_ms3.plans.executors.local import LocalExecutor
+from robocas_ms3.plans.executors import LocalExecutor
 from robocas_ms3.plans.progress import parse_shard
-from robocas_ms3.plans.run import Callbacks, join_plan, run_shard
+from robocas_ms3.plans.run import join_plan, run_shard
 from robocas_ms3.plans.status import read_status
 from robocas_ms3.plans.units import Outcome, Unit
 from robocas_ms3.plans.worker import UnitWorker
@@ -65,16 +66,13 @@ def test_a_plan_makes_demonstrations_and_one_dataset_of_all_parts(undisturbed):
     assert not list((undisturbed / "units").rglob("*.h5"))  # nothing is kept twice
 
 
-def test_the_lerobot_dataset_has_the_version_of_the_plan(tmp_path):
-    plan = PLAN.model_copy(update={"formats": ["robocas", "lerobot"], "lerobot_version": "2.1"})
-    run_here(tmp_path / "out", plan)
-    info = json.loads((tmp_path / "out" / "datasets" / "lerobot" / "meta" / "info.json").read_text())
+def test_two_jobs_make_the_same_and_a_lerobot_dataset_of_the_version_of_the_plan(undisturbed, tmp_path):
+    out, lerobot = tmp_path / "out", tmp_path / "out" / "datasets" / "lerobot"
+    run_here(out, PLAN.model_copy(update={"formats": ["robocas", "lerobot"], "lerobot_version": "2.1"}), jobs=2)
+    info = json.loads((lerobot / "meta" / "info.json").read_text())
     assert (info["codebase_version"], info["total_episodes"]) == ("v2.1", 7)
-
-
-def test_more_jobs_make_the_same(undisturbed, tmp_path):
-    run_here(tmp_path / "out", jobs=2)
-    assert_same(undisturbed, tmp_path / "out")
+    shutil.rmtree(lerobot)
+    assert_same(undisturbed, out)
 
 
 def test_shards_in_any_order_make_the_same(undisturbed, tmp_path):
@@ -114,9 +112,7 @@ def test_the_first_folder_of_a_seed_is_kept(tmp_path):
     assert [path.name for path in files.folder.parent.iterdir()] == [files.folder.name]
 
 
-def test_a_seed_whose_outcome_is_damaged_is_done_again(undisturbed, tmp_path):
-    out = tmp_path / "out"
-    shard(out, "0/2")
+def test_a_seed_whose_outcome_is_damaged_is_done_again(undisturbed, out):
     unit = Unit(0, 0)
     (unit.folder(PLAN, out) / "seeds.jsonl").unlink()
     os.truncate(unit.files(PLAN, out, 11).folder / "outcome.json", 20)
@@ -189,26 +185,23 @@ def test_hardly_any_success_is_an_error(tmp_path):
     assert error.value.found == "25 of 25, most of them: grasp: slipped"
 
 
-def test_episodes_whose_files_were_cut_off_are_made_again(undisturbed, tmp_path):
-    out, stages = tmp_path / "out", []
-    for text in ("0/2", "1/2"):
-        shard(out, text)
+def test_episodes_whose_files_were_cut_off_are_made_again(undisturbed, out):
     folders = [Unit(0, 0).files(PLAN, out, seed).folder for seed in (10, 11, 12)]
     picture = sorted(folders[1].rglob("*.png"))[0]
     for path, length in ((folders[0] / "recording.h5", 1000), (picture, 50), (folders[2] / "recording.json", 0)):
         os.truncate(path, length)
     with pytest.raises(PlanError, match="work units are missing"):
         join_plan(out)
-    run_here(out, callbacks=Callbacks(stage=stages.append))
+    run_here(out)
     assert_same(undisturbed, out)
 
 
-def test_a_disk_that_damages_files_again_and_again_ends_the_run(tmp_path, monkeypatch):
+def test_a_disk_that_damages_files_again_and_again_ends_the_run(out, monkeypatch):
     monkeypatch.setattr("robocas_ms3.plans.run.damaged_episodes", lambda *_: {Unit(1, 0): [4]})
     with pytest.raises(PlanError, match="files don't keep the sizes") as error:
-        run_here(tmp_path / "out")
-    assert error.value.where == Unit(1, 0).folder(PLAN, tmp_path / "out")
-    assert not (tmp_path / "out" / "datasets").exists()
+        run_here(out)
+    assert error.value.where == Unit(1, 0).folder(PLAN, out)
+    assert not (out / "datasets").exists()
 
 
 def test_a_folder_of_something_else_is_refused(tmp_path):
@@ -221,9 +214,7 @@ def test_a_folder_of_something_else_is_refused(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["thesis"]
 
 
-def test_another_plan_is_refused_unless_it_is_to_overwrite(tmp_path):
-    out = tmp_path / "out"
-    shard(out, "0/2")
+def test_another_plan_is_refused_unless_it_is_to_overwrite(out):
     other = PLAN.model_copy(update={"block": 4})
     for start in (run_here, lambda out, plan: shard(out, "1/2", plan)):
         with pytest.raises(RobocasError, match="block: 3 -> 4"):
@@ -233,9 +224,7 @@ def test_another_plan_is_refused_unless_it_is_to_overwrite(tmp_path):
     assert Unit(0, 1).outcomes(other, out) is not None
 
 
-def test_limits_and_the_description_may_change(undisturbed, tmp_path):
-    out = tmp_path / "out"
-    shard(out, "0/2")
+def test_limits_and_the_description_may_change(undisturbed, out):
     limits = PLAN.limits.model_copy(update={"memory_gb": 3.0})
     run_here(out, PLAN.model_copy(update={"limits": limits, "description": "another"}))
     assert_same(undisturbed, out)

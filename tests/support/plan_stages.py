@@ -11,7 +11,7 @@ import time
 from synthetic import RayCaster, write_trajectory
 
 from robocas_ms3.core.errors import DatasetError, MissingExtraError, RobocasError
-from robocas_ms3.plans.executors.local import LocalExecutor
+from robocas_ms3.plans.executors import LocalExecutor
 from robocas_ms3.plans.plan import PartConfig, Plan
 from robocas_ms3.plans.render import Renderer
 from robocas_ms3.plans.run import run_plan

@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 from pydantic import ValidationError
@@ -18,7 +19,7 @@ from robocas_ms3.plans.units import Unit
 from robocas_ms3.plans.worker import UnitWorker
 
 EXECUTORS = {
-    "local": "robocas_ms3.plans.executors.local:LocalExecutor",
+    "local": "robocas_ms3.plans.executors:LocalExecutor",
     "slurm": "robocas_ms3.plans.executors.slurm:SlurmExecutor",
     "ray": "robocas_ms3.plans.executors.ray:RayExecutor",
 }
@@ -95,6 +96,34 @@ class ThreadExecutor(Executor):
     @abstractmethod
     def run(self, units: Sequence[Unit]) -> None:
         """Do some units, as a job."""
+
+
+class LocalExecutor(ThreadExecutor):
+    """Work units on this machine: a thread per job, each with two processes. It has no options."""
+
+    def __enter__(self) -> LocalExecutor:
+        self._workers = [self.open_worker(self.plan, self.out) for _ in range(self.jobs)]
+        self._idle: SimpleQueue[UnitWorker] = SimpleQueue()
+        for worker in self._workers:
+            self._idle.put(worker)
+        super().__enter__()
+        return self
+
+    def run(self, units: Sequence[Unit]) -> None:
+        """Do some units by an idle worker."""
+        worker = self._idle.get()
+        try:
+            for unit in units:
+                worker.do(unit)
+        finally:
+            self._idle.put(worker)
+
+    def __exit__(self, *error: object) -> None:
+        for worker in self._workers:
+            worker.stop()
+        self.threads.shutdown(cancel_futures=True)
+        for worker in self._workers:
+            worker.close()
 
 
 def open_executor(name: str, plan: Plan, out: Path, jobs: int, options: Mapping[str, str]) -> Executor:
