@@ -21,7 +21,7 @@ import re
 from pathlib import PurePosixPath
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from robocas_ms3.core.errors import AssetError
 from robocas_ms3.core.names import LONGEST
@@ -51,12 +51,6 @@ def _inside(path: str) -> str:
     if parts.is_absolute() or ".." in parts.parts or str(parts) != path:
         raise ValueError(f"{path!r} is no plain path inside the asset's folder")
     return path
-
-
-def _whole(version: object) -> object:
-    if type(version) is not int:  # a literal 2 lets 2.0 pass
-        raise ValueError("a whole number")
-    return version
 
 
 Vec3 = tuple[float, float, float]
@@ -254,8 +248,7 @@ Asset = Annotated[ObjectAsset | FurnitureAsset, Field(discriminator="kind")]
 class PackManifest(StrictModel):
     """The content of ``manifest.json``."""
 
-    # the default is for writing; `load_pack` insists that the file says it
-    schema_version: Annotated[Literal[2], BeforeValidator(_whole)] = SCHEMA_VERSION
+    schema_version: Literal[2] = SCHEMA_VERSION
     name: str = Field(pattern=r"^[a-z0-9_\-]+$")
     description: str = ""
     assets: list[Asset]

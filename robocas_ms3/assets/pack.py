@@ -8,10 +8,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from robocas_ms3.assets.annotations import Annotations
 from robocas_ms3.assets.hulls import Array, Hull, read_hulls, sample_surface
@@ -21,7 +21,7 @@ from robocas_ms3.core.documents import JSON_LIMIT, DocumentError, check_regular,
 from robocas_ms3.core.errors import AssetError
 from robocas_ms3.core.paths import builtin_packs_dir, data_dir
 from robocas_ms3.core.poses import transform
-from robocas_ms3.core.strict import mistakes, refusal, validate_json
+from robocas_ms3.core.strict import refusal, validate_json
 
 VisualLevel = Literal["fast", "full"]
 
@@ -220,15 +220,24 @@ def _files(folder: str, prefix: str = "") -> Iterator[str]:
                 yield prefix + entry.name
 
 
+class _Header(BaseModel):
+    schema_version: Any = None
+
+
 def _read(folder: Path, path: Path) -> Pack:
+    fix = "Make the pack again: run the import or build that made it."
     try:
-        manifest = validate_json(PackManifest, read_bytes(path, JSON_LIMIT))
+        data = read_bytes(path, JSON_LIMIT)
+        version = _Header.model_validate_json(data).schema_version
+        if type(version) is not int or version != SCHEMA_VERSION:
+            what, expected = "this pack has another format", f"pack format {SCHEMA_VERSION}"
+            found = "none" if version is None else repr(version)[:40]
+            raise AssetError(what, where=path, expected=expected, found=found, fix=fix)
+        manifest = validate_json(PackManifest, data)
     except (OSError, DocumentError) as error:
         raise AssetError("can't read the manifest of the asset pack", where=path, found=error) from error
     except ValidationError as error:
-        raise _damaged(path, error) from error
-    if "schema_version" not in manifest.model_fields_set:
-        raise _other_format(path, "none")
+        raise refusal(error, PackManifest, AssetError, where=path, about="the manifest is damaged", fix=fix) from error
     objects: dict[str, LoadedObject] = {}
     furniture: dict[str, LoadedFurniture] = {}
     for asset in manifest.assets:
@@ -253,17 +262,3 @@ def _required_files(asset: ObjectAsset | FurnitureAsset) -> list[str]:
     parts = [f"{LINKS}/{link.name}/{name}" for link in asset.links for name in body]
     finishes = [f"{FINISHES}/{part}_{name}.glb" for part, names in asset.finishes.items() for name in names]
     return [*body, *parts, *finishes]
-
-
-def _damaged(path: Path, error: ValidationError) -> AssetError:
-    for mistake in mistakes(error, PackManifest):
-        if mistake.key == "schema_version":
-            return _other_format(path, repr(mistake.value)[:40])
-    fix = "Make the pack again."
-    return refusal(error, PackManifest, AssetError, where=path, about="the manifest is damaged", fix=fix)
-
-
-def _other_format(path: Path, found: str) -> AssetError:
-    fix = "Make the pack again: run the import or build that made it."
-    expected = f"pack format {SCHEMA_VERSION}"
-    return AssetError("this pack has another format", where=path, expected=expected, found=found, fix=fix)

@@ -42,7 +42,8 @@ def draw_lights(config: TaskConfig, seed: int) -> Lights:
         return Lights(lights.ambient, lights.directional, direction)
     rng = np.random.default_rng([seed, _LIGHTS])
     ambient, directional = rng.uniform(*by.ambient), rng.uniform(*by.directional)
-    turn = Rotation.from_rotvec(_in_ball(rng) * np.deg2rad(by.direction_deg))
+    vector = rng.normal(size=3)
+    turn = Rotation.from_rotvec(vector / np.linalg.norm(vector) * rng.uniform() * np.deg2rad(by.direction_deg))
     return Lights(float(ambient), float(directional), turn.apply(direction))
 
 
@@ -59,8 +60,3 @@ def draw_camera_shift(by: CameraRandomisation, camera: int, seed: int) -> Array:
 def _either_way(drawn: Array, least: float, most: float) -> Array:
     """Scale numbers of at most a magnitude to magnitudes between ``least`` and that."""
     return drawn if least == 0 else np.copysign(least + np.abs(drawn) * (1 - least / most), drawn)
-
-
-def _in_ball(rng: np.random.Generator) -> Array:
-    vector = rng.normal(size=3)
-    return vector / np.linalg.norm(vector) * rng.uniform()
