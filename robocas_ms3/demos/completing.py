@@ -13,10 +13,9 @@ import numpy as np
 from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.planning.executor import OPEN
 from robocas_ms3.planning.protocol import Array, Trajectory
-from robocas_ms3.planning.skills.arm import Arm, moved_back, raised
+from robocas_ms3.planning.skills.arm import BACK_OUT, Arm, moved_back, plan_back_out, raised
 from robocas_ms3.planning.skills.placing import carry_to_basket, release_into_basket
 from robocas_ms3.planning.skills.removing import hang_clear
-from robocas_ms3.planning.skills.retreating import BACK_OUT, plan_back_out
 from robocas_ms3.planning.skills.stance import drive_to_basket
 from robocas_ms3.scenes.language.templates import subgoal
 

@@ -32,8 +32,7 @@ from robocas_ms3.planning.executor import Executor
 from robocas_ms3.planning.kinematics import Reachability
 from robocas_ms3.planning.protocol import Planner
 from robocas_ms3.planning.rrt_connect import make_planner
-from robocas_ms3.planning.skills.arm import Arm
-from robocas_ms3.planning.skills.retreating import back_out
+from robocas_ms3.planning.skills.arm import Arm, back_out
 from robocas_ms3.robots.table import DEFAULT, find_robot
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.task_specs import TASKS
@@ -218,9 +217,9 @@ class _Attempts:
     def _describe(self, recoveries: list[dict[str, Any]]) -> dict[str, Any]:
         """What the record says of the episode, besides ManiSkill's own."""
         executor, settings, tried = self.executor, self.generator.settings, self.generator.trials is not None
-        env = executor.base_env
+        env, taken = executor.base_env, self.takeover
         target = env.target_asset().asset
-        if self.takeover is not None:
+        if taken is not None:
             executor.segments[0].first = 0  # what freed the way to it is part of it
         bounds = [part.first for part in executor.segments] + [len(executor.actions)]
         said, layout = env.instructions.of(0), env.layout()
@@ -243,5 +242,5 @@ class _Attempts:
             "failed_attempts": [f"{failure.stage}: {failure.reason}" for failure in self.result.failures],
             "noisy_trials": None if not tried else settings.noisy_trials if self._noisy else 0,
             "recoveries": recoveries,
-            **({"takeover": self.takeover.as_json()} if self.takeover else {}),
+            **({"takeover": {"policy": taken.policy, "policy_steps": taken.policy_steps}} if taken else {}),
         }

@@ -30,10 +30,6 @@ class Takeover:
     gripper: float
     refused: str = ""
 
-    def as_json(self) -> dict[str, Any]:
-        """What the record says of it."""
-        return {"policy": self.policy, "policy_steps": self.policy_steps}
-
     def check(self) -> None:
         """Raise ``EpisodeLost`` if nothing can be taken over."""
         if self.refused:

@@ -30,29 +30,25 @@ def turned_about_bar(tcp: Array, angle: float) -> Array:
     return tcp @ turn
 
 
-def track(chain: ArmChain, starts: Array, goals: Array, *, max_slip: float = MAX_SLIP) -> Array:
-    """Follow poses of a bar with the TCP, free to turn about the bar by up to ``max_slip`` (rad).
+@_BLAS.wrap(limits=1, user_api="blas")
+def track(chain: ArmChain, starts: Array, goals: Array) -> Array:
+    """Follow poses of a bar with the TCP, free to turn about the bar by up to ``MAX_SLIP``.
 
     Args:
         chain: the arm.
         starts: (N, 7) configurations at (or near) the first pose.
         goals: (T, 4, 4) TCP poses in the arm's base frame that hold the bar squarely, a centimetre or so apart; or
             (T, N, 4, 4), each start's own.
-        max_slip: rad.
 
     Returns:
         (T, N, 7) rad; NaN from where a start leads no further: out of reach, a joint limit, or a jump.
     """
-    with _BLAS.limit(limits=1, user_api="blas"):
-        return _track(chain, np.array(starts, dtype=np.float64), goals, max_slip)
-
-
-def _track(chain: ArmChain, qpos: Array, goals: Array, max_slip: float) -> Array:
+    qpos = np.array(starts, dtype=np.float64)
     path = np.full((len(goals), len(qpos), 7), np.nan)
     alive = np.arange(len(qpos))
     for step, goal in enumerate(goals):
         wanted = np.broadcast_to(goal, (len(qpos), 4, 4))[alive]
-        found, solved = _solve(chain, qpos[alive], wanted, max_slip)
+        found, solved = _solve(chain, qpos[alive], wanted)
         if step:
             solved &= np.abs(found - qpos[alive]).max(axis=1) <= MAX_JUMP
         alive, found = alive[solved], found[solved]
@@ -66,7 +62,7 @@ def reached(path: Array) -> NDArray[np.int_]:
     return np.isfinite(path[:, :, 0]).sum(axis=0)
 
 
-def _solve(chain: ArmChain, starts: Array, goals: Array, max_slip: float) -> tuple[Array, NDArray[np.bool_]]:
+def _solve(chain: ArmChain, starts: Array, goals: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Damped least squares from (M, 7) to (M, 4, 4); gives (M, 7) and (M,) whether it got there."""
     qpos, lower, upper = starts.copy(), chain.lower, chain.upper
     middle, half = (lower + upper) / 2, (upper - lower) / 2
@@ -76,8 +72,8 @@ def _solve(chain: ArmChain, starts: Array, goals: Array, max_slip: float) -> tup
         pose, jacobian = chain.jacobian(qpos)
         error = twist(pose, goals)
         lag = (error[:, 3:] * bar).sum(axis=1)
-        free = np.abs(lag) <= max_slip
-        error[:, 3:] -= bar * np.clip(lag, -max_slip, max_slip)[:, None]
+        free = np.abs(lag) <= MAX_SLIP
+        error[:, 3:] -= bar * np.clip(lag, -MAX_SLIP, MAX_SLIP)[:, None]
         along = (bar[:, :, None] * jacobian[:, 3:]).sum(axis=1)  # what the joints add about the bar
         jacobian[:, 3:] -= np.where(free, 1.0, 0.0)[:, None, None] * bar[:, :, None] * along[:, None]
         solved = (np.linalg.norm(error[:, :3], axis=1) <= POSITION_TOLERANCE) & (

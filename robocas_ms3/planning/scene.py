@@ -134,7 +134,6 @@ class PlanningScene:
         self,
         *,
         without: int | Collection[int] = (),
-        without_link: tuple[str, str] | None = None,
         radius: float = RADIUS,
         around: Array | None = None,
     ) -> Array:
@@ -142,7 +141,6 @@ class PlanningScene:
 
         Args:
             without: slot or slots of objects to leave out.
-            without_link: a piece of furniture and its moving part to leave out.
             radius: m around ``around``, beyond which samples are left out.
             around: (3,); default: the arm's base.
         """
@@ -150,7 +148,7 @@ class PlanningScene:
         center = np.zeros(3) if around is None else around
         left_out = {without} if isinstance(without, int) else without
         pieces: list[Array] = [np.zeros((0, 3))]
-        for _, part, spacing, pose in self._bodies(left_out, without_link):
+        for _, part, spacing, pose in self._bodies(left_out, None):
             in_base, points = to_base @ pose, part.surface_points(spacing)
             middle = (center - in_base[:3, 3]) @ in_base[:3, :3]
             if np.linalg.norm(middle) + _size(part) > radius:  # not all of it is there

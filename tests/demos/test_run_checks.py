@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import asdict, replace
+from pathlib import Path
 
 import h5py
 import pytest
@@ -47,6 +48,15 @@ def test_a_wrong_argument_of_generate_leaves_nothing(tmp_path, capsys, words, me
     assert message in captured.err
     assert captured.out == ""
     assert list(tmp_path.iterdir()) == []
+
+
+def test_settings_are_resolved_once_and_for_all():
+    settings = GenerateSettings(EpisodeSettings("pick"), set=("objects.count=6",), noise=(1.0, 2.0)).resolve()
+    assert settings == settings.resolve()
+    assert isinstance(settings.episode.config, dict)
+    assert settings.episode.config["objects"]["count"] == 6
+    assert (settings.episode.noise_mm, settings.episode.noise_deg) == (1.0, 2.0)
+    assert settings.out == Path("demos/pick_table_scattered-builtin")
 
 
 def killed_run(out, **record):

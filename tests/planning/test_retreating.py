@@ -12,8 +12,7 @@ from planning_scenes import REST, top_down
 
 from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.planning.protocol import Trajectory
-from robocas_ms3.planning.skills.arm import Arm
-from robocas_ms3.planning.skills.retreating import back_out
+from robocas_ms3.planning.skills.arm import Arm, back_out
 
 TARGET = 3
 LEVEL = np.eye(4)  # points ahead, closes level

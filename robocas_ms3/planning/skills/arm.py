@@ -23,6 +23,9 @@ OPEN_SECONDS, CLOSE_SECONDS = 0.50, 0.50  # a dataset at 5 Hz may give either co
 # m kept to furniture and basket where there is a way that does, as a robot may be off: on straight ways, while carrying
 ROOM, CARRYING_ROOM = 0.012, 0.024
 RISE, RISES = 0.04, 4  # m a step, steps
+BACK_OUT_RISE = 0.10  # m
+BACK_OUT = (0.25, 0.15, 0.10, 0.06)  # m against the approach; the first one to which the way is free
+POINTS_DOWN = -0.7  # upright component of an approach that is rather from above than level
 
 
 @dataclass
@@ -177,3 +180,35 @@ def moved_back(tcp_in_base: Array, distance: float) -> Array:
     result = tcp_in_base.copy()
     result[..., :3, 3] -= distance * tcp_in_base[..., :3, 2]
     return result
+
+
+def plan_step_back(arm: Arm, start: Array, goals: list[Array]) -> Trajectory:
+    """Plan a straight line to the first of several TCP poses (best first), through whatever is touched."""
+    return arm.first_line(start, goals, stage="retreat", check_collisions=False)
+
+
+def plan_back_out(arm: Arm, goals: list[Array]) -> Trajectory:
+    """Plan a straight line to the first of several TCP poses (best first), free of all but the target."""
+    try:
+        return arm.first_line(arm.at, goals, stage="retreat")
+    except PlanningFailed:
+        arm.planner.set_scene(arm.scene.obstacles(without=int(arm.env.target_slot[0])))
+        return arm.first_line(arm.at, goals, stage="retreat")
+
+
+def back_out(arm: Arm) -> None:
+    """Open the gripper and leave, after a failed attempt that stays in the record.
+
+    Above an open surface the arm rises, through what it touches. Where it reached in level, as into a shelf or for a
+    handle, it steps straight back on a way that is free of all but the target.
+    """
+    arm.hold_nothing()
+    arm.open_gripper()
+    with arm.planning():
+        tcp = arm.planner.tcp(arm.at)
+        arm.planner.set_scene(arm.scene.obstacles())
+        if arm.env.task_config.target.approach == "top" and tcp[2, 2] < POINTS_DOWN:
+            motion = arm.plan_rise(arm.scene.tcp_in_base, BACK_OUT_RISE, stage="recover")
+        else:
+            motion = plan_back_out(arm, [moved_back(tcp, distance) for distance in BACK_OUT])
+    arm.follow(motion)

@@ -42,18 +42,15 @@ class GraspPlan:
     retreat: tuple[Trajectory, ...]
 
 
-def grasp(
-    arm: Arm, slot: int, *, lift_height: float = 0.10, approach: Approach | None = None, other_than: int = 0
-) -> None:
+def grasp(arm: Arm, slot: int, *, lift_height: float = 0.10, other_than: int = 0) -> None:
     """Plan a grasp of an object, run it, and lift (from the front: lift and withdraw) the object.
 
     Args:
         lift_height: when grasping from above, m (upstream: 0.10 when picking, 0.15 when searching).
-        approach: from where the gripper comes; default: as the configuration says.
         other_than: how many kinds of grasps to leave out, the best first.
     """
     with arm.planning():
-        plan = plan_grasp(arm, slot, lift_height, approach or arm.env.task_config.target.approach, other_than)
+        plan = plan_grasp(arm, slot, lift_height, arm.env.task_config.target.approach, other_than)
     arm.follow(plan.way_in)
     arm.close_gripper()
     if not arm.holds(slot):

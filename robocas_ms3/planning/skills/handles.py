@@ -19,8 +19,7 @@ from robocas_ms3.core.poses import inverse, transform
 from robocas_ms3.planning.protocol import Array, Obstacle, Shape, Trajectory
 from robocas_ms3.planning.pulling import reached, track, turned_about_bar
 from robocas_ms3.planning.scene import SPACING, shape_of
-from robocas_ms3.planning.skills.arm import Arm, first_plan, moved_back
-from robocas_ms3.planning.skills.retreating import plan_step_back
+from robocas_ms3.planning.skills.arm import Arm, first_plan, moved_back, plan_step_back
 from robocas_ms3.planning.timing import through, timed
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.scenes.grasping import HALF_TURN
@@ -166,7 +165,13 @@ def pull(arm: Arm, part: Part) -> None:
     with arm.planning():
         arm.hold_nothing()
         arm.planner.set_scene(arm.scene.obstacles())
-        back = _plan_retreat(arm, arm.at, try_free=True)
+        goals = [moved_back(arm.planner.tcp(arm.at), distance) for distance in RETREATS]
+        lines = (True, False)  # if possible without touching anything
+        back = first_plan(
+            lines,
+            lambda free: arm.first_line(arm.at, goals, stage="retreat", check_collisions=free),
+            PlanningFailed("retreat", "no_goal"),
+        )
     arm.follow(back)
 
 
@@ -289,10 +294,9 @@ def _free_length(arm: Arm, part: Part, path: Array, frames: Array, others: list[
     return length
 
 
-def _plan_retreat(arm: Arm, start: Array, *, try_free: bool = False) -> Trajectory:
+def _plan_retreat(arm: Arm, start: Array) -> Trajectory:
     tcp = arm.planner.tcp(start)
-    goals = [moved_back(tcp, distance) for distance in RETREATS]
-    return plan_step_back(arm, start, goals, try_free=try_free)
+    return plan_step_back(arm, start, [moved_back(tcp, distance) for distance in RETREATS])
 
 
 def _retreatable(arm: Arm, path: Array, least: int) -> int:

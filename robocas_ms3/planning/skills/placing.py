@@ -12,8 +12,7 @@ from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.core.poses import from_wxyz, inverse, transform
 from robocas_ms3.planning.chain import turn_between
 from robocas_ms3.planning.protocol import Array, AttachedBody, Trajectory
-from robocas_ms3.planning.skills.arm import CARRYING_ROOM, Arm, first_plan, moved_back, raised
-from robocas_ms3.planning.skills.retreating import plan_step_back
+from robocas_ms3.planning.skills.arm import CARRYING_ROOM, Arm, first_plan, moved_back, plan_step_back, raised
 
 DROPS_SAMPLED, DROPS_CHECKED, DROPS_PLANNED = 192, 64, 10
 DROP_MARGIN = 0.045  # m, as far as a robot may be off by then

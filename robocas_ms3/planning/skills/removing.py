@@ -14,11 +14,10 @@ from robocas_ms3.core.poses import transform
 from robocas_ms3.planning.protocol import Array, Trajectory
 from robocas_ms3.planning.scene import SPACING
 from robocas_ms3.planning.shapes import convex_hull
-from robocas_ms3.planning.skills.arm import Arm, first_plan, moved_back, raised
+from robocas_ms3.planning.skills.arm import Arm, first_plan, moved_back, plan_step_back, raised
 from robocas_ms3.planning.skills.grasping import grasp
 from robocas_ms3.planning.skills.placing import attach_held
 from robocas_ms3.planning.skills.pushing import surface_in_base
-from robocas_ms3.planning.skills.retreating import plan_step_back
 from robocas_ms3.scenes.grasping import MAX_WIDTH, directions_ok, gripper_is_clear
 
 GRID = 0.04  # m between places tried
@@ -31,6 +30,7 @@ RETREAT = 0.08  # m
 ARM_REACH = 0.8  # m from its base
 LIFTS = (0.08, 0.2)  # m, least and greatest
 GRASPS_LOOKED_AT = 150
+RIM_SPACING = 0.015  # m
 PLACES_SOLVED, PLACES_PLANNED = 96, 12
 
 
@@ -192,13 +192,13 @@ def free_places(vertices: Array, others: Array, frame: Array, half: Array, margi
     return np.array(motions).reshape(-1, 4, 4)
 
 
-def _rim(outline: Array, spacing: float = 0.015) -> Array:
+def _rim(outline: Array) -> Array:
     """Points (n, 2) along the convex hull of an outline (V, 2), and its middle."""
     corners = outline[ConvexHull(outline).vertices]
     points = [np.zeros((1, 2))]
     for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         points.append(
-            a + np.linspace(0, 1, 1 + int(np.linalg.norm(b - a) / spacing), endpoint=False)[:, None] * (b - a)
+            a + np.linspace(0, 1, 1 + int(np.linalg.norm(b - a) / RIM_SPACING), endpoint=False)[:, None] * (b - a)
         )
     return np.concatenate(points)
 
