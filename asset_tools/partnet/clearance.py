@@ -52,20 +52,6 @@ def trimmed(pieces: Sequence[Array], others: Sequence[Array], joint: Joint) -> l
     return found
 
 
-def overlaps(pieces: Sequence[Array], others: Sequence[Array], joint: Joint, share: float) -> Array:
-    """Depths in m by which pieces (rows) of a moving part reach into others (columns); 0 where they don't touch.
-
-    Args:
-        pieces: as in `trimmed`.
-        others: as in `trimmed`.
-        joint: of the part.
-        share: of its range at which it stands.
-    """
-    rest = [_passed(other, joint, (share, share)) for other in others]
-    depths = [[overlap(convex(piece), other)[0] for other in rest] for piece in pieces]
-    return np.array(depths).reshape(len(pieces), len(rest))
-
-
 def _passed(other: Array, joint: Joint, span: tuple[float, float]) -> ConvexBody:
     """Where something that stays is while a joint moves, as its link sees it."""
     far = max(joint.limits, key=abs)

@@ -154,7 +154,7 @@ def same(one, other):
     return one.object_ids == other.object_ids and np.array_equal(one.object_poses, other.object_poses)
 
 
-def test_a_damaged_layout_of_a_bank_is_made_again(cache):
+def test_a_damaged_layout_of_a_cache_is_made_again(cache):
     whole_layout = cache.get(0, 0)
     path = cache.path(0, 0)
     whole = path.read_bytes()
@@ -171,7 +171,7 @@ def test_a_damaged_layout_of_a_bank_is_made_again(cache):
                 raise AssertionError(f"{name} {value}")
 
 
-def test_banks_with_damaged_notes_are_listed(cache, capsys):
+def test_caches_with_damaged_notes_are_listed(cache, capsys):
     cache.get(0, 0)
     path = cache.folder / ABOUT
     whole = json.loads(path.read_text())
