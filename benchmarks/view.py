@@ -29,7 +29,7 @@ from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.datasets.writing.settings import ConversionSettings
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT / "tests" / "viewer"), str(ROOT / "tests" / "datasets")]
+sys.path.insert(0, str(ROOT / "tests" / "support"))
 THUMBNAILS = "[...document.querySelectorAll('.row img')]"
 CAMERAS = "[...document.querySelectorAll('#cameras img')]"
 LOADED = "every(img => img.complete && img.naturalWidth)"
@@ -53,7 +53,7 @@ def main(cfg: Benchmark) -> None:
         source = cfg.dataset or _made_up(Path(folder))
         dataset = Path(folder) / "dataset"
         _multiply(shutil.copytree(source, Path(folder) / "source"), dataset, cfg.episodes)
-        runs = [_measure(dataset, cfg.episodes, Path(folder) / f"profile_{run}") for run in range(cfg.runs)]
+        runs = [_measure(dataset, cfg.episodes) for _ in range(cfg.runs)]
     medians = {name: round(statistics.median(run[name] for run in runs), 3) for name in runs[0]}
     print(json.dumps({"episodes": cfg.episodes, "median": medians, "runs": runs}, indent=2))
 
@@ -99,10 +99,10 @@ def _multiply(source: Path, out: Path, count: int) -> None:
     (out / schema.DATA_INFO_FILE).write_text(json.dumps({**info, **tables, **split}))
 
 
-def _measure(dataset: Path, count: int, profile: Path) -> dict[str, float]:
-    from browser import Browser, require_chromium  # pyright: ignore[reportMissingImports]
+def _measure(dataset: Path, count: int) -> dict[str, float]:
+    from browser import open_page  # pyright: ignore[reportMissingImports]
 
-    with Browser(require_chromium(), profile) as browser:
+    with open_page() as page:
         begun = time.perf_counter()
         command = [sys.executable, str(ROOT / "robocas_cli.py"), "view", str(dataset), "--no-open"]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
@@ -112,31 +112,33 @@ def _measure(dataset: Path, count: int, profile: Path) -> dict[str, float]:
                 address = re.search(r"http\S+", server.stdout.readline())
                 assert address, "robocas view told no address"
                 found["server"] = time.perf_counter() - begun
-                found.update(_page(browser, address[0], count))
+                found.update(_page(page, address[0], count))
             finally:
                 server.terminate()
     return {name: round(value, 3) for name, value in found.items()}
 
 
-def _page(browser: Any, url: str, count: int) -> dict[str, float]:
-    browser.send("Page.navigate", url=url)
-    browser.wait("document.querySelectorAll('#rows .row').length")
-    table = browser.run("performance.now() / 1000")
-    assert browser.text("#count").startswith(f"{count} episodes")
-    browser.wait(f"{CAMERAS}.length && {CAMERAS}.{LOADED}")
-    pictures = browser.run("performance.now() / 1000")
-    browser.wait(f"{THUMBNAILS}.slice(0, 12).{LOADED}")
-    thumbnails = browser.run("performance.now() / 1000")
-    paints = browser.run("performance.getEntriesByType('paint').map(entry => [entry.name, entry.startTime / 1000])")
-    loads = browser.run(
+def _page(page: Any, url: str, count: int) -> dict[str, float]:
+    from browser import wait  # pyright: ignore[reportMissingImports]
+
+    page.goto(url, wait_until="commit")
+    wait(page, "document.querySelectorAll('#rows .row').length")
+    table = page.evaluate("performance.now() / 1000")
+    assert page.text_content("#count").startswith(f"{count} episodes")
+    wait(page, f"{CAMERAS}.length && {CAMERAS}.{LOADED}")
+    pictures = page.evaluate("performance.now() / 1000")
+    wait(page, f"{THUMBNAILS}.slice(0, 12).{LOADED}")
+    thumbnails = page.evaluate("performance.now() / 1000")
+    paints = page.evaluate("performance.getEntriesByType('paint').map(entry => [entry.name, entry.startTime / 1000])")
+    loads = page.evaluate(
         "performance.getEntriesByType('resource').filter(entry => entry.name.includes('thumbnails'))"
         ".map(entry => entry.duration / 1000)"
     )
     begun = time.perf_counter()
-    browser.click(".row[data-episode='5']")
-    browser.wait("document.querySelector('#summary').textContent.startsWith('Episode 5 ')")
+    page.click(".row[data-episode='5']")
+    wait(page, "document.querySelector('#summary').textContent.startsWith('Episode 5 ')")
     opened = time.perf_counter() - begun
-    browser.wait(f"{CAMERAS}.every(img => img.src.includes('/pictures/5/')) && {CAMERAS}.{LOADED}")
+    wait(page, f"{CAMERAS}.every(img => img.src.includes('/pictures/5/')) && {CAMERAS}.{LOADED}")
     return {
         **{name.replace("-", "_"): seconds for name, seconds in paints},
         "table": table,

@@ -1,7 +1,7 @@
 """The page of a result in a real browser: nothing overflows, nothing fails, and the list can be narrowed."""
 
 import pytest
-from browser import Browser, require_chromium
+from browser import open_page
 from made_up_results import outcome, write
 
 from robocas_ms3.evaluation.report import PAGE, write_report
@@ -14,9 +14,9 @@ SHOWN = (
 
 
 @pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    with Browser(require_chromium(), tmp_path_factory.mktemp("profile")) as running:
-        yield running
+def page():
+    with open_page() as page:
+        yield page
 
 
 @pytest.fixture(scope="module")
@@ -32,23 +32,23 @@ def url(tmp_path_factory):
 
 
 @pytest.mark.parametrize(("width", "dark"), [(420, True), (1440, False)])
-def test_nothing_fails_or_overflows(browser, url, width, dark):
-    browser.resize(width, 900)
-    browser.dark(dark)
-    browser.goto(url)
-    assert browser.errors == []
-    assert browser.run("document.documentElement.scrollWidth <= innerWidth")
-    paper, ink = browser.run("(s => [s.backgroundColor, s.color])(getComputedStyle(document.body))")
+def test_nothing_fails_or_overflows(page, url, width, dark):
+    page.set_viewport_size({"width": width, "height": 900})
+    page.emulate_media(color_scheme="dark" if dark else "light")
+    page.goto(url)
+    assert page.errors == []
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    paper, ink = page.evaluate("(s => [s.backgroundColor, s.color])(getComputedStyle(document.body))")
     assert (paper == "rgb(20, 23, 27)") == dark
     assert paper != ink
 
 
-def test_failed_episodes_are_narrowed_down(browser, url):
-    browser.goto(url)
-    assert len(browser.run(SHOWN).split(",")) == 35
-    browser.choose("select[data-column='1']", "table")
-    browser.choose("select[data-column='4']", "target grasped")  # came to three stages
-    assert browser.run(SHOWN) == ""
-    browser.choose("select[data-column='4']", "target touched")
-    assert browser.run(SHOWN) == "2,10,18,26,34"
-    assert browser.text("#count") == "5"
+def test_failed_episodes_are_narrowed_down(page, url):
+    page.goto(url)
+    assert len(page.evaluate(SHOWN).split(",")) == 35
+    page.select_option("select[data-column='1']", "table")
+    page.select_option("select[data-column='4']", "target grasped")  # came to three stages
+    assert page.evaluate(SHOWN) == ""
+    page.select_option("select[data-column='4']", "target touched")
+    assert page.evaluate(SHOWN) == "2,10,18,26,34"
+    assert page.text_content("#count") == "5"
