@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
@@ -15,44 +13,19 @@ from robocas_ms3.scenes.visibility import PinholeCamera, Scenery, object_mesh, t
 
 pytestmark = pytest.mark.slow
 
-SIZE = 256
-
-
-@dataclass
-class Rendered:
-    """Eight objects in a scene of SAPIEN's, and its camera."""
-
-    assets: list[LoadedObject]
-    actors: list[Any]
-    scene: Any
-    eye: Any
-
-    def segmentation(self, camera: PinholeCamera, poses: np.ndarray, shown: list[int]) -> np.ndarray:
-        """(SIZE, SIZE) index of the object that each pixel shows, -1: none; those not shown are out of sight."""
-        import sapien
-
-        for i, actor in enumerate(self.actors):
-            actor.set_pose(sapien.Pose(poses[i]) if i in shown else sapien.Pose([0, 0, -50]))
-        self.eye.entity.set_pose(sapien.Pose(camera.pose))
-        self.scene.update_render()
-        self.eye.take_picture()
-        numbers = self.eye.get_picture("PositionSegmentation")[..., 3]
-        ids = np.full(numbers.shape, -1)
-        for i, actor in enumerate(self.actors):
-            ids[numbers == actor.per_scene_id] = i
-        return ids
+SIZE, COUNT = 256, 8
+Segmentation = Callable[[PinholeCamera, np.ndarray, list[int]], np.ndarray]
 
 
 @pytest.fixture(scope="module")
-def rendered(needs_renderer) -> Iterator[Rendered]:
+def rendered(needs_renderer) -> Iterator[tuple[list[LoadedObject], Segmentation]]:
+    """Eight objects, and the index of the object that each pixel shows, -1: none, of those that are shown."""
     import sapien
     from mani_skill.render import PREBUILT_SHADER_CONFIGS, set_shader_pack
 
-    set_shader_pack(
-        PREBUILT_SHADER_CONFIGS["minimal"]
-    )  # of the whole process; the one that data sets are rendered with
+    set_shader_pack(PREBUILT_SHADER_CONFIGS["minimal"])  # of the whole process; datasets are rendered with it
     pack = load_pack("builtin")
-    assets = [pack.objects[i] for i in np.random.default_rng(0).choice(sorted(pack.objects), 8, replace=False)]
+    assets = [pack.objects[i] for i in np.random.default_rng(0).choice(sorted(pack.objects), COUNT, replace=False)]
     scene = sapien.Scene()
     scene.set_ambient_light([1, 1, 1])
     actors = []
@@ -61,16 +34,22 @@ def rendered(needs_renderer) -> Iterator[Rendered]:
         builder.add_visual_from_file(str(asset.visual("fast")))
         builder.initial_pose = sapien.Pose()
         actors.append(builder.build_kinematic())
-    yield Rendered(assets, actors, scene, scene.add_camera("eye", SIZE, SIZE, np.pi / 2, 0.01, 5))
+    eye = scene.add_camera("eye", SIZE, SIZE, np.pi / 2, 0.01, 5)
+
+    def segmentation(camera: PinholeCamera, poses: np.ndarray, shown: list[int]) -> np.ndarray:
+        for i, actor in enumerate(actors):
+            actor.set_pose(sapien.Pose(poses[i]) if i in shown else sapien.Pose([0, 0, -50]))
+        eye.entity.set_pose(sapien.Pose(camera.pose))
+        scene.update_render()
+        eye.take_picture()
+        numbers = eye.get_picture("PositionSegmentation")[..., 3]
+        ids = np.full(numbers.shape, -1)
+        for i, actor in enumerate(actors):
+            ids[numbers == actor.per_scene_id] = i
+        return ids
+
+    yield assets, segmentation
     set_shader_pack(PREBUILT_SHADER_CONFIGS["default"])
-
-
-def heap(seed: int) -> np.ndarray:
-    rng = np.random.default_rng(seed)
-    poses = np.tile(np.eye(4), (8, 1, 1))
-    poses[:, :3, :3] = Rotation.random(8, random_state=rng).as_matrix()
-    poses[:, :3, 3] = rng.uniform([-0.08, -0.08, 0.0], [0.08, 0.08, 0.15], (8, 3))
-    return poses
 
 
 def slanted_camera() -> PinholeCamera:
@@ -86,11 +65,15 @@ def slanted_camera() -> PinholeCamera:
 )
 @pytest.mark.parametrize("seed", [0, 1])
 def test_shares_agree_with_the_segmentation(rendered, seed, camera):
-    poses = heap(seed)
-    together = rendered.segmentation(camera, poses, list(range(8)))
-    visible = np.array([(together == i).sum() for i in range(8)])
-    full = np.array([(rendered.segmentation(camera, poses, [i]) == i).sum() for i in range(8)])
-    scenery = Scenery([object_mesh(asset) for asset in rendered.assets], poses)
+    assets, segmentation = rendered
+    rng = np.random.default_rng(seed)
+    poses = np.tile(np.eye(4), (COUNT, 1, 1))
+    poses[:, :3, :3] = Rotation.random(COUNT, random_state=rng).as_matrix()
+    poses[:, :3, 3] = rng.uniform([-0.08, -0.08, 0.0], [0.08, 0.08, 0.15], (COUNT, 3))
+    together = segmentation(camera, poses, list(range(COUNT)))
+    visible = np.array([(together == i).sum() for i in range(COUNT)])
+    full = np.array([(segmentation(camera, poses, [i]) == i).sum() for i in range(COUNT)])
+    scenery = Scenery([object_mesh(asset) for asset in assets], poses)
     large = full >= 200
     shares = scenery.visible_shares(camera)
     assert large.sum() >= 6
