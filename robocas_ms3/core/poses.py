@@ -1,7 +1,7 @@
 """Rigid transforms in NumPy: 4x4 matrices, and the seven numbers that files and simulators have instead.
 
 ``T_a_b`` maps points of frame b into frame a. Quaternions are wxyz, but for RoboCAS folders and SciPy, which have xyzw.
-Batches of quaternions that must be as ManiSkill computes them: `robots.rotations`; on tensors of envs: `tasks.terms`.
+Batches of envs: `core.rotations`.
 """
 
 from __future__ import annotations

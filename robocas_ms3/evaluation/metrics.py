@@ -37,9 +37,9 @@ class EpisodeMetrics:
 
     def __init__(self, env: RoboCASEnv) -> None:
         self._env = env
-        self._sums = native(torch.zeros(env.num_envs, len(SUMS), device=env.device))
+        self._sums: Any = native(torch.zeros(env.num_envs, len(SUMS), device=env.device))
         self._near = native(torch.zeros(env.num_envs, dtype=torch.bool, device=env.device))
-        self._in_v0 = native(torch.zeros(env.num_envs, dtype=torch.bool, device=env.device))
+        self._in_v0: Any = native(torch.zeros(env.num_envs, dtype=torch.bool, device=env.device))
         self._tcp = self._tcp_pos()
         self._moment: Moment | None = None
         self._retrieval = RetrievalOrder(env) if isinstance(env, RoboCASSearchEnv) else None

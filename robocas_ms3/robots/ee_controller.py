@@ -14,6 +14,7 @@ import torch
 from mani_skill.agents.controllers import PDEEPosController, PDEEPoseController, PDEEPoseControllerConfig
 from mani_skill.utils.structs import Link, Pose
 
+from robocas_ms3.core import rotations
 from robocas_ms3.core.arrays import (
     as_double,
     as_float,
@@ -27,7 +28,6 @@ from robocas_ms3.core.arrays import (
     native,
 )
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.robots import rotations
 from robocas_ms3.robots.drives import ARM_SET_FROM_OUTSIDE, EvenDrives
 from robocas_ms3.robots.ee_deltas import ee_delta_target
 from robocas_ms3.robots.kinematics import SerialChain
@@ -47,7 +47,7 @@ def _relative_pose(frame: Link, link: Link) -> Any:
     if frame.scene.gpu_sim_enabled:
         base, pose = frame.pose, link.pose  # ManiSkill's own product waits for the GPU
         inverse = torch.cat([base.q[:, :1], -base.q[:, 1:]], dim=1)
-        return torch.cat([rotations.turn(inverse, pose.p - base.p), rotations.multiply(inverse, pose.q)], dim=1)
+        return join([rotations.turn(inverse, pose.p - base.p), rotations.multiply(inverse, pose.q)])
     pose = frame._bodies[0].entity_pose.inv() * link._bodies[0].entity_pose
     position, quaternion = pose.p, pose.q
     if quaternion[0] < 0:  # as ManiSkill's products

@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from robocas_ms3.core import rotations
 from robocas_ms3.core.arrays import Array
-from robocas_ms3.robots import rotations
 
 POSITION_SCALE, ROTATION_SCALE = 0.1, 0.5  # m and rad at |action| = 1
 

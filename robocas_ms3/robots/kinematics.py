@@ -16,8 +16,8 @@ from torch import Tensor
 
 from robocas_ms3.core.arrays import Array, choose, clamp, join, known_all_false, matmul
 from robocas_ms3.core.errors import RobocasError
+from robocas_ms3.core.rotations import left_matrix, positive
 from robocas_ms3.robots.forward import read_joints
-from robocas_ms3.robots.rotations import left_matrix, positive
 
 IK_ITERATIONS = 8
 IK_DAMPING, IK_LEAST_DAMPING = 0.1, 1e-6  # times the squared error, and added to it
@@ -134,7 +134,7 @@ class SerialChain:
         while joined < count:
             skipped = 2 * rows * joined
             later = frames[skipped:]
-            later[:] = matmul(frames[:-skipped], later)
+            later[:] = matmul(frames[:-skipped], later)  # pyright: ignore[reportArgumentType]
             joined *= 2
         return frames.reshape(count, 2, rows, 4, 4)
 

@@ -14,9 +14,10 @@ from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
 from mani_skill.utils.structs import Actor
 from mani_skill.utils.structs.types import SimConfig
+from numpy.typing import NDArray
 
 from robocas_ms3.assets.pack import VISUALS, LoadedObject, VisualLevel, load_pack
-from robocas_ms3.core.arrays import as_tensor, native
+from robocas_ms3.core.arrays import Array, as_tensor, native
 from robocas_ms3.core.errors import ConfigError
 from robocas_ms3.core.extensions import load
 from robocas_ms3.robots.agent import MobileManipulator
@@ -25,7 +26,7 @@ from robocas_ms3.robots.table import DEFAULT, find_robot
 from robocas_ms3.scenes import build
 from robocas_ms3.scenes.cache import layout_source
 from robocas_ms3.scenes.config import TaskConfig, load_config_of
-from robocas_ms3.scenes.layout import Array, Layout, LayoutSource
+from robocas_ms3.scenes.layout import Layout, LayoutSource
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.task_specs import TaskSpec
 from robocas_ms3.tasks import engine
@@ -129,7 +130,7 @@ class RoboCASEnv(BaseEnv):
         pose = sapien_utils.look_at(eye.tolist(), target.tolist())
         return CameraConfig("render_camera", pose, 640, 480, np.pi / 3, 0.01, 20)
 
-    def overview(self) -> tuple[Array, Array]:
+    def overview(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return a viewpoint of the task and the point to look at, (3,) each, world, m."""
         return over_the_shoulder(self.model)
 
@@ -283,11 +284,11 @@ class RoboCASEnv(BaseEnv):
         assert pose is not None, "there is no basket in this scene"
         return pose
 
-    def tcp_in_world(self) -> Any:
+    def tcp_in_world(self) -> Array:
         """(N, 7) pose of the TCP in the world, native (`arrays`)."""
         return native(link_poses(self.scene, [self.agent.tcp]))[:, 0]
 
-    def target_center(self, objects: Any) -> Any:
+    def target_center(self, objects: Array) -> Array:
         """(N, 3) m, the target's centre of mass in the world, from states (N, K, 13); native (`arrays`)."""
         return self.success_check.target_center(objects)
 

@@ -11,7 +11,7 @@ from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.utils.structs import Actor, Articulation, Link
 from numpy.typing import NDArray
 
-from robocas_ms3.core.arrays import as_tensor
+from robocas_ms3.core.arrays import Array, as_tensor
 from robocas_ms3.core.errors import RobocasError
 
 BODY = 13
@@ -197,7 +197,7 @@ class Contacts:
             self._rows: dict[Any, int] = {body: i for i, body in enumerate(self._bodies)}
             self._columns: dict[Any, int] = {body: i for i, body in enumerate(self._objects)}
 
-    def forces(self, still: object = None) -> Any:
+    def forces(self, still: object = None) -> Array:
         """Force that each object exerts on each body, summed over their contact points, in the last physics step.
 
         Args:

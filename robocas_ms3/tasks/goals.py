@@ -11,7 +11,8 @@ from typing import Any, ClassVar, NamedTuple
 
 import torch
 
-from robocas_ms3.core.arrays import known_all_true, native
+from robocas_ms3.core import rotations
+from robocas_ms3.core.arrays import Array, known_all_true, native
 from robocas_ms3.tasks import rewards, terms
 
 _RIM = 0.05  # m around the basket's inside that still count as over it for a target that falls
@@ -33,13 +34,13 @@ class Moment(NamedTuple):
         forces: (N, 3, K, 3) N, of objects on left finger, right finger and hand, world frame.
     """
 
-    objects: Any
-    basket: Any
-    held: Any
-    touched: Any
-    at_goal: Any
-    disturbed: Any
-    forces: Any
+    objects: Array
+    basket: Array | None
+    held: Array
+    touched: Array
+    at_goal: Array
+    disturbed: Array
+    forces: Array
 
 
 class Goal(ABC):
@@ -60,26 +61,26 @@ class Goal(ABC):
         self.env = env
 
     @abstractmethod
-    def holds(self, centers: Any, basket: Any) -> Any:
+    def holds(self, centers: Array, basket: Array | None) -> Array:
         """Return which objects are at the goal, (N,) or (N, K), from their centres of mass (N, 3) or (N, K, 3)."""
 
-    def measures(self, basket: Any) -> dict[str, Any]:
+    def measures(self, basket: Array | None) -> dict[str, Array]:
         """Return what else has to hold at the moment of success: (N,) bool each."""
         return {}
 
-    def lost(self, basket: Any, measures: dict[str, Any]) -> Any:
+    def lost(self, basket: Array | None, measures: dict[str, Array]) -> Array | None:
         """Return in which envs (N,) the goal itself can't be reached any more; None: in none."""
         return None
 
-    def catches(self, positions: Any, basket: Any) -> Any:
+    def catches(self, positions: Array, basket: Array | None) -> Array | None:
         """Return which targets at (N, 3) m may be lower than where they stood, (N,) bool; None: none may."""
         return None
 
-    def point(self, basket: Any) -> Any:
+    def point(self, basket: Array | None) -> Array | None:
         """Return where the target's centre of mass is to be brought, (N, 3) m in the world; None: not at one point."""
         return None
 
-    def progress(self, now: Moment, brought: Any, table: rewards.RewardTable) -> tuple[Any, dict[str, Any]]:
+    def progress(self, now: Moment, brought: Array, table: rewards.RewardTable) -> tuple[Array, dict[str, Array]]:
         """Return how far an episode is, for dense rewards.
 
         Args:
@@ -95,7 +96,7 @@ class Goal(ABC):
         """
         raise NotImplementedError(f"{type(self).__name__} has no dense rewards")
 
-    def penalties(self, now: Moment) -> dict[str, Any]:
+    def penalties(self, now: Moment) -> dict[str, Array]:
         """Return penalties of dense rewards by name, (N,) in [0, 1] each."""
         return {}
 
@@ -119,40 +120,41 @@ class InBasket(Goal):
         self._inside, self._above = (low, high), (low - aside, high + aside)
         self._drop = torch.cat([(low + high)[:2] / 2, high[2:] + _DROP_HEIGHT])  # in the basket's frame
 
-    def holds(self, centers: Any, basket: Any) -> Any:
+    def holds(self, centers: Array, basket: Array | None) -> Array:
         """See `Goal`."""
-        return terms.inside_box(centers, basket[:, :3], basket[:, 3:], *map(native, self._inside))
+        return terms.inside_box(centers, *_split(basket), *map(native, self._inside))
 
-    def point(self, basket: Any) -> Any:
+    def point(self, basket: Array | None) -> Array:
         """See `Goal`: over the middle of the basket's rim."""
-        return basket[:, :3] + terms.rotate(basket[:, 3:], native(self._drop))
+        position, quaternion = _split(basket)
+        return position + rotations.rotate(quaternion, native(self._drop))
 
-    def measures(self, basket: Any) -> dict[str, Any]:
+    def measures(self, basket: Array | None) -> dict[str, Array]:
         """``basket_stands``."""
         start = native(self.env.basket_at_start)
-        return {"basket_stands": terms.stands(basket[:, :3], basket[:, 3:], start[:, :3], start[:, 3:])}
+        return {"basket_stands": terms.stands(*_split(basket), *_split(start))}
 
-    def lost(self, basket: Any, measures: dict[str, Any]) -> Any:
+    def lost(self, basket: Array | None, measures: dict[str, Array]) -> Array | None:
         """See `Goal`."""
         if known_all_true(measures["basket_stands"]):  # as nearly always
             return None
         start = native(self.env.basket_at_start)
-        over = terms.fell_over(basket[:, :3], basket[:, 3:], start[:, :3], start[:, 3:])
+        over = terms.fell_over(*_split(basket), *_split(start))
         return over & ~measures["basket_stands"]
 
-    def catches(self, positions: Any, basket: Any) -> Any:
+    def catches(self, positions: Array, basket: Array | None) -> Array | None:
         """See `Goal`: those above the basket."""
-        return terms.inside_box(positions, basket[:, :3], basket[:, 3:], *map(native, self._above))
+        return terms.inside_box(positions, *_split(basket), *map(native, self._above))
 
-    def progress(self, now: Moment, brought: Any, table: rewards.RewardTable) -> tuple[Any, dict[str, Any]]:
+    def progress(self, now: Moment, brought: Array, table: rewards.RewardTable) -> tuple[Array, dict[str, Array]]:
         """See `Goal`: grasp, lift, carry, place, release, rest."""
         env = self.env
         slot = native(env.target_slot)
         target, center = terms.of_target(now.objects, slot), env.target_center(now.objects)
-        basket, turned = now.basket[:, :3], now.basket[:, 3:]
-        inside = terms.rotate_inverse(turned, center - basket)  # the target in the basket's frame
+        basket, turned = _split(now.basket)
+        inside = rotations.rotate_inverse(turned, center - basket)  # the target in the basket's frame
         low, high = map(native, self._inside)
-        over = ((inside[:, :2] >= low[:2]) & (inside[:, :2] <= high[:2])).all(-1) & (inside[:, 2] >= low[2])
+        over = ((inside[:, :2] >= low[:2]) & (inside[:, :2] <= high[:2])).all(-1) & (inside[:, 2] >= low[2])  # pyright: ignore[reportOperatorIssue]
         delivered = brought & now.at_goal
         stage = rewards.furthest(
             0 * slot + table.index("grasp"),
@@ -175,6 +177,12 @@ class InBasket(Goal):
             "at_rest": rewards.calm(target[:, 7:10], target[:, 10:]),
         }
 
-    def penalties(self, now: Moment) -> dict[str, Any]:
+    def penalties(self, now: Moment) -> dict[str, Array]:
         """``basket_shift``."""
-        return {"basket_shift": rewards.shift(now.basket[:, :3], native(self.env.basket_at_start)[:, :3])}
+        return {"basket_shift": rewards.shift(_split(now.basket)[0], native(self.env.basket_at_start)[:, :3])}
+
+
+def _split(basket: Array | None) -> tuple[Array, Array]:
+    """Return position and quaternion of poses (N, 7)."""
+    assert basket is not None, "the scene has no basket"
+    return basket[:, :3], basket[:, 3:]

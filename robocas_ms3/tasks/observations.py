@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
-from robocas_ms3.core.arrays import as_tensor, join, native
-from robocas_ms3.scenes.layout import Array
+from robocas_ms3.core import rotations
+from robocas_ms3.core.arrays import Array, as_tensor, join, native
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.tasks import terms
 
@@ -30,15 +31,15 @@ def privileged_observations(env: Any) -> dict[str, torch.Tensor]:
     else:
         seen = in_tcp_frame(tcp, join([to_target, point - center]).reshape(-1, 2, 3))
         observations |= {"tcp_to_target": seen[:, 0], env.goal.TOWARDS: seen[:, 1]}
-    return observations | {"target_extents": terms.of_target(env.success_check.extents, env.target_slot)}
+    return observations | {"target_extents": as_tensor(terms.of_target(env.success_check.extents, env.target_slot))}
 
 
-def in_tcp_frame(tcp: Any, vectors: Any) -> torch.Tensor:
+def in_tcp_frame(tcp: Array, vectors: Array) -> torch.Tensor:
     """Return vectors (N, V, 3) of the world along the axes of poses (N, 7); both native (`arrays`)."""
-    return as_tensor(vectors @ terms.rotation(tcp[:, 3:]))
+    return as_tensor(vectors @ rotations.rotation(tcp[:, 3:]))
 
 
-def over_the_shoulder(model: SceneModel) -> tuple[Array, Array]:
+def over_the_shoulder(model: SceneModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return a viewpoint over the robot's shoulder, and a point on the support, (3,) each, world, m."""
     region, robot = model.region, model.robot_pose[:3, 3]
     middle = np.array([*np.add(region.min_xy, region.max_xy) / 2, region.z, 1.0])

@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 import torch
 from mani_skill.utils.structs import Articulation
+from numpy.typing import NDArray
 
-from robocas_ms3.core.arrays import as_tensor, known_all_false, native
-from robocas_ms3.scenes.layout import Array
+from robocas_ms3.core import rotations
+from robocas_ms3.core.arrays import Array, as_tensor, known_all_false, native
 from robocas_ms3.scenes.task_specs import OPEN_PICK
-from robocas_ms3.tasks import rewards, terms
+from robocas_ms3.tasks import rewards
 from robocas_ms3.tasks.base import STAGES, RoboCASEnv
 from robocas_ms3.tasks.bodies import link_poses
 from robocas_ms3.tasks.observations import in_tcp_frame
@@ -27,7 +28,7 @@ class RoboCASOpenPickEnv(RoboCASEnv):
     STAGES = ("furniture_opened", *STAGES)
     REWARDS = rewards.OPEN_PICK
 
-    def overview(self) -> tuple[Array, Array]:
+    def overview(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return a viewpoint above the basket's side, where an opening door does not hide the gripper."""
         model, opening = self.model, self.task_config.opening
         assert opening is not None  # checked by the configuration
@@ -59,11 +60,11 @@ class RoboCASOpenPickEnv(RoboCASEnv):
         furniture, joint = self._opening
         return furniture.get_qpos()[:, joint]
 
-    def handle_in_world(self) -> Any:
+    def handle_in_world(self) -> Array:
         """Return where the handle is, (N, 3) m, native (`arrays`)."""
         link, position = self._handle
         pose = native(link_poses(self.scene, [link]))[:, 0]
-        return pose[:, :3] + terms.rotate(pose[:, 3:], native(position))
+        return pose[:, :3] + rotations.rotate(pose[:, 3:], native(position))
 
     def furniture_opened(self) -> torch.Tensor:
         """Return whether the furniture is open now, (N,) bool."""
@@ -86,7 +87,7 @@ class RoboCASOpenPickEnv(RoboCASEnv):
             stage = rewards.furthest(stage, [(shut, self.REWARDS.index("open"))])
         return self.dense_reward.weigh(stage, found, action, info)
 
-    def _opened_share(self) -> Any:
+    def _opened_share(self) -> Array:
         return rewards.rise(native(self.opening_position()), 0.0, self.model.opened_position)
 
     def privileged_observations(self) -> dict[str, torch.Tensor]:

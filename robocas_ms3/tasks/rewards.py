@@ -100,7 +100,7 @@ def closeness(points: Array, goals: Array, *, half: float = 0.1) -> Array:
     return half / (half + length(goals - points))
 
 
-def rise(value: Array, start: Array, by: float) -> Array:
+def rise(value: Array, start: Array | float, by: float) -> Array:
     """(N,) in [0, 1]: how much of the way from its start a value (N,) has risen, of a way of ``by``."""
     return clamp((value - start) / by, 0.0, 1.0)
 
@@ -176,12 +176,12 @@ class DenseReward:
         self.last_level = level.clone()
         return (level - before).nan_to_num()
 
-    def of_goal(self) -> tuple[Any, dict[str, Any]]:
+    def of_goal(self) -> tuple[Array, dict[str, Array]]:
         """Return stages (N,) and terms by name, (N,) in [0, 1] each, of the goal; native (`arrays`)."""
         brought = native(self._env.success_check.stages["target_lifted"])
         return self._env.goal.progress(self._env.success_check.moment, brought, self._table)
 
-    def weigh(self, stage: Any, found: dict[str, Any], action: Any, info: dict[str, Any]) -> torch.Tensor:
+    def weigh(self, stage: Array, found: dict[str, Array], action: Any, info: dict[str, Any]) -> torch.Tensor:
         """Return the reward (N,) in [0, total of the table], and add ``reward_terms`` to the info.
 
         Args:
@@ -197,7 +197,7 @@ class DenseReward:
         info["reward_terms"] = {name: as_tensor(term) for name, term in counted.items()}
         return as_tensor(reward * ~native(info["fail"]))
 
-    def _penalties(self, action: Any) -> dict[str, Any]:
+    def _penalties(self, action: Any) -> dict[str, Array]:
         """The table's penalties by name, (N,) in [0, 1] each, native."""
         moment = self._env.success_check.moment
         found = {
@@ -207,7 +207,7 @@ class DenseReward:
         }
         return {name: found[name] for name in self._table.penalties}
 
-    def _action_rate(self, action: Any) -> Any:
+    def _action_rate(self, action: Any) -> Array:
         before = self.last_action
         if action is None or before is None or before.shape[-1] != action.shape[-1]:
             return native(torch.zeros(self._env.num_envs, device=self._env.device))

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from robocas_ms3.core.arrays import as_tensor, known_all_false, native
+from robocas_ms3.core.arrays import Array, as_tensor, known_all_false, native
 from robocas_ms3.scenes.targets import selection_camera
 from robocas_ms3.scenes.task_specs import SEARCH
 from robocas_ms3.tasks import occlusion, rewards, terms
@@ -113,7 +113,7 @@ class RoboCASSearchEnv(RoboCASEnv):
         """Control steps from one measurement of the clutter to the next."""
         return max(1, self.control_freq // MEASUREMENTS_PER_SECOND)
 
-    def _due(self) -> Any:
+    def _due(self) -> Array:
         """(N,) bool, native: whose clutter is measured in this step."""
         stages = self.success_check.stages
         settled = native(stages["target_grasped"]) | native(stages["obstacles_cleared"])

@@ -11,7 +11,8 @@ import torch
 from mani_skill.utils.structs import Articulation
 
 from robocas_ms3.assets.manifest import BODY
-from robocas_ms3.core.arrays import as_tensor, count_up, known_all_false, native
+from robocas_ms3.core import rotations
+from robocas_ms3.core.arrays import Array, as_tensor, count_up, known_all_false, native
 from robocas_ms3.tasks import terms
 from robocas_ms3.tasks.bodies import link_poses
 from robocas_ms3.tasks.goals import Moment
@@ -65,7 +66,7 @@ class SuccessCheck:
             self.reached[:, envs] = reached.reshape(-1, len(self.reached)).T
         self._last = None
 
-    def reach(self, stage: str, now: Any) -> torch.Tensor:
+    def reach(self, stage: str, now: Array) -> torch.Tensor:
         """Note which envs are at a stage now, (N,) bool, native (`arrays`); return which have reached it, (N,) bool."""
         row = native(self.stages[stage])
         row |= now
@@ -85,12 +86,12 @@ class SuccessCheck:
         self._last = self._dependencies(forces), found
         return dict(found)
 
-    def _dependencies(self, forces: Any) -> object:
+    def _dependencies(self, forces: Array) -> object:
         """Return what the next result depends on, on a CPU while nothing touches the gripper; None: unknown."""
         others = self._env.bodies.others
-        return None if others is None or forces.any() else (others, native(self.reached).tobytes())
+        return None if others is None or forces.any() else (others, self.reached.numpy().tobytes())
 
-    def _check(self, forces: Any, objects: Any, basket: Any) -> dict[str, torch.Tensor]:
+    def _check(self, forces: Array, objects: Array, basket: Array | None) -> dict[str, torch.Tensor]:
         """Check from forces (N, 3, K, 3), states (N, K, 13) and the basket's pose (N, 7) or None, all native."""
         env = self._env
         slot, goal = native(env.target_slot), env.goal
@@ -119,24 +120,24 @@ class SuccessCheck:
         flags = {"success": as_tensor(success), "fail": as_tensor(fail)}
         return {**stages, **flags, "disturbed": as_tensor(disturbed.sum(1))}
 
-    def centers(self, objects: Any) -> Any:
+    def centers(self, objects: Array) -> Array:
         """Return the centres of mass (N, K, 3) of the objects in the world, from their states (N, K, 13)."""
-        return objects[..., :3] + terms.rotate(objects[..., 3:7], native(self._centers_of_mass))
+        return objects[..., :3] + rotations.rotate(objects[..., 3:7], native(self._centers_of_mass))
 
-    def target_center(self, objects: Any) -> Any:
+    def target_center(self, objects: Array) -> Array:
         """Return the target's centre of mass (N, 3) in the world, from the objects' states (N, K, 13)."""
         slot = native(self._env.target_slot)
         target, center = terms.of_target(objects, slot), terms.of_target(native(self._centers_of_mass), slot)
-        return target[:, :3] + terms.rotate(target[:, 3:7], center)
+        return target[:, :3] + rotations.rotate(target[:, 3:7], center)
 
-    def grasped(self, forces: Any) -> Any:
+    def grasped(self, forces: Array) -> Array:
         """Return which objects (N, K) both fingers hold, from forces (N, 3, K, 3) N on the gripper; native."""
         pressed = terms.pressed(forces[:, 0], forces[:, 1])
         if known_all_false(pressed):  # as most of the time: no need to ask in which direction
             return pressed
         finger = native(link_poses(self._env.scene, [self._env.agent.finger1_link]))[:, 0]
         # the left finger opens along its own +y
-        opening = terms.rotate(finger[:, 3:], native(self._sideways))
+        opening = rotations.rotate(finger[:, 3:], native(self._sideways))
         return terms.finger_grasps(forces[:, 0], forces[:, 1], opening)
 
     def measures(self) -> dict[str, torch.Tensor]:
@@ -145,12 +146,12 @@ class SuccessCheck:
         found = self._measures(touched, *self._objects_and_basket(self._env.bodies.read()))
         return {name: as_tensor(measure) for name, measure in found.items()}
 
-    def _objects_and_basket(self, state: torch.Tensor) -> tuple[Any, Any]:
+    def _objects_and_basket(self, state: torch.Tensor) -> tuple[Array, Array | None]:
         """States of the objects (N, K, 13) and pose of the basket (N, 7) or None, native, from that of all bodies."""
         basket = self._env.bodies.basket(state)
         return native(self._env.bodies.objects(state)), None if basket is None else native(basket)
 
-    def _measures(self, touched: Any, objects: Any, basket: Any) -> dict[str, Any]:
+    def _measures(self, touched: Array, objects: Array, basket: Array | None) -> dict[str, Array]:
         """`measures`, native, from which objects the gripper touches (N, K), their states and the basket's pose."""
         goal, slot = self._env.goal, native(self._env.target_slot)
         target = terms.of_target(objects, slot)
@@ -161,7 +162,7 @@ class SuccessCheck:
             **goal.measures(basket),
         }
 
-    def fallen(self) -> Any:
+    def fallen(self) -> Array:
         """Return which other objects (N, K) lay 5 cm below the surface in `moment`, outside of the goal; native.
 
         The target is carried to the goal, and if it falls, that is ``fail``.
@@ -172,7 +173,7 @@ class SuccessCheck:
             return low
         return low & ~env.goal.holds(self.centers(objects), self.moment.basket)
 
-    def _has_failed(self, measures: dict[str, Any], objects: Any, basket: Any) -> Any:
+    def _has_failed(self, measures: dict[str, Array], objects: Array, basket: Array | None) -> Array:
         """(N,) bool of ``fail``, native, from the measures, states (N, K, 13) and the basket's pose."""
         goal, slot = self._env.goal, native(self._env.target_slot)
         height = terms.of_target(objects[..., 2], slot)
@@ -183,7 +184,7 @@ class SuccessCheck:
         fell = terms.fell_off(height, self.surface, low & False if caught is None else caught, ~measures["untouched"])
         return fell if lost is None else fell | lost
 
-    def _disturbed(self, poses: Any) -> Any:
+    def _disturbed(self, poses: Array) -> Array:
         """(N, K) bool: which objects other than the target no longer stand as they stood, from poses (N, K, 7)."""
         env, undo = self._env, None
         support = env.fixtures.furniture[env.task_config.surface.furniture]

@@ -6,59 +6,9 @@ They take tensors or NumPy's arrays, see `arrays`: all arguments of one kind, wh
 from __future__ import annotations
 
 import math
-from functools import cache
-
-import numpy as np
-import torch
-from torch import Tensor
 
 from robocas_ms3.core.arrays import Array, count_up, length
-
-# The entries of a rotation matrix, row by row, in the products of a quaternion's numbers, ww, wx, wy, ..., zz.
-_PRODUCTS = np.array(
-    [
-        # ww wx wy wz  xw xx xy xz  yw yx yy yz  zw zx zy zz
-        [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, -1, 0, 0, 0, 0, -1],
-        [0, 0, 0, -2, 0, 0, 2, 0, 0, 0, 0, 0, 0, 0, 0, 0],
-        [0, 0, 2, 0, 0, 0, 0, 2, 0, 0, 0, 0, 0, 0, 0, 0],
-        [0, 0, 0, 2, 0, 0, 2, 0, 0, 0, 0, 0, 0, 0, 0, 0],
-        [1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, -1],
-        [0, -2, 0, 0, 0, 0, 0, 0, 0, 0, 0, 2, 0, 0, 0, 0],
-        [0, 0, -2, 0, 0, 0, 0, 2, 0, 0, 0, 0, 0, 0, 0, 0],
-        [0, 2, 0, 0, 0, 0, 0, 0, 0, 0, 0, 2, 0, 0, 0, 0],
-        [1, 0, 0, 0, 0, -1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1],
-    ],
-    np.float32,
-).T
-
-
-@cache
-def _products_on(device: torch.device) -> Tensor:
-    return torch.from_numpy(_PRODUCTS).to(device)
-
-
-def rotation(quaternion: Array) -> Array:
-    """(..., 3, 3) matrices of unit quaternions (..., 4) wxyz."""
-    # few operations, as each takes longer than its arithmetic
-    products = quaternion[..., :, None] * quaternion[..., None, :]
-    table = _products_on(quaternion.device) if isinstance(quaternion, Tensor) else _PRODUCTS
-    shape = quaternion.shape[:-1]
-    return (products.reshape(*shape, 16) @ table).reshape(*shape, 3, 3)
-
-
-def rotate_inverse(quaternion: Array, vector: Array) -> Array:
-    """Rotate vectors (..., 3) by the inverse of unit quaternions (..., 4) wxyz."""
-    return (vector[..., None, :] @ rotation(quaternion))[..., 0, :]
-
-
-def rotate(quaternion: Array, vector: Array) -> Array:
-    """Rotate vectors (..., 3) by unit quaternions (..., 4) wxyz."""
-    return (rotation(quaternion) @ vector[..., None])[..., 0]
-
-
-def upward(quaternion: Array) -> Array:
-    """(..., 3) the vertical axes of bodies with unit quaternions (..., 4) wxyz."""
-    return rotation(quaternion)[..., 2]
+from robocas_ms3.core.rotations import rotate_inverse, rotation, upward
 
 
 def inside_box(points: Array, box_position: Array, box_quaternion: Array, low: Array, high: Array) -> Array:
@@ -77,7 +27,7 @@ def inside_box(points: Array, box_position: Array, box_quaternion: Array, low: A
     if points.ndim == 3:
         box_position, box_quaternion = box_position[:, None], box_quaternion[:, None]
     local = rotate_inverse(box_quaternion, points - box_position)
-    return ((local >= low) & (local <= high)).all(-1)
+    return ((local >= low) & (local <= high)).all(-1)  # pyright: ignore[reportReturnType]
 
 
 MIN_GRASP_FORCE = 0.5  # N, on each finger
@@ -123,7 +73,7 @@ def touched(forces: Array, *, min_force: float = 1e-3) -> Array:
     Returns:
         (N, K) bool.
     """
-    return (length(forces) >= min_force).any(1)
+    return (length(forces) >= min_force).any(1)  # pyright: ignore[reportReturnType]
 
 
 def lifted(height: Array, rest_height: Array, grasped: Array, *, by: float = 0.03) -> Array:
@@ -212,7 +162,7 @@ def another_of_its_kind(marked: Array, kinds: Array, target: Array) -> Array:
     """
     slots = count_up(kinds.shape[1], kinds)
     alike = (kinds == of_target(kinds, target)[:, None]) & (slots != target[:, None])
-    return (marked & alike).any(1)
+    return (marked & alike).any(1)  # pyright: ignore[reportReturnType]
 
 
 def way_back(body: Array, part: Array, part_before: Array) -> tuple[Array, Array]:

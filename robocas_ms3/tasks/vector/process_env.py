@@ -176,7 +176,7 @@ class ProcessEnv(gym.Env):
         try:
             if self._idle:
                 with suppress(Exception):
-                    self._ask([("close",)] * len(self._pools))
+                    self.call("close")
         finally:
             self._must_reset.clear()
             self._stop()

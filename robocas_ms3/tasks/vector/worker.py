@@ -84,15 +84,15 @@ class EnvWorker:
         name, *arguments = command
         return getattr(self, name)(*arguments)
 
-    def close(self) -> tuple[list[Any], RemoteError | None]:
+    def close(self) -> None:
         """Close the environments."""
-        return self._each(self._envs, lambda env: self._envs[env].close())
+        self._each(self._envs, lambda env: self._envs[env].close())
 
     def describe(self) -> tuple[EnvDescription, None]:
         """Return what the environments have in common."""
         env = next(iter(self._envs.values()))
-        spaces = (env.get_wrapper_attr(f"single_{kind}_space") for kind in ("observation", "action"))
-        return EnvDescription(*spaces, env.render_mode, dict(env.metadata), os.getpid()), None
+        observations, actions = (env.get_wrapper_attr(f"single_{kind}_space") for kind in ("observation", "action"))
+        return EnvDescription(observations, actions, env.render_mode, dict(env.metadata), os.getpid()), None
 
     def step(self, actions: np.ndarray) -> tuple[Rows, RemoteError | None]:
         """Step all environments with actions (E, A)."""
@@ -144,7 +144,7 @@ class EnvWorker:
     def _step(self, env: int, action: np.ndarray) -> Rows:
         obs, reward, terminated, truncated, info = self._envs[env].step(action)
         ends = {"terminated": np.array([bool(terminated)]), "truncated": np.array([bool(truncated)])}
-        return as_rows({"obs": obs, "reward": np.float32([float(reward)]), **ends, "info": info})
+        return as_rows({"obs": obs, "reward": np.array([float(reward)], np.float32), **ends, "info": info})
 
     def _reset(self, env: int, seed: int | None, replaceable: bool, options: dict) -> Rows:
         try:

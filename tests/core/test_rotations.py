@@ -12,7 +12,7 @@ from mani_skill.utils.geometry.rotation_conversions import (
     quaternion_multiply,
 )
 
-from robocas_ms3.robots import rotations
+from robocas_ms3.core import rotations
 
 same = partial(np.testing.assert_allclose, rtol=0, atol=2.5e-7)  # two units in the last place of 1
 
