@@ -12,7 +12,7 @@ from mani_skill.utils.structs import Articulation, Pose
 import robocas_ms3.tasks  # noqa: F401
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.robots.description import MOBILE_PANDA
-from robocas_ms3.tasks.bodies import Bodies, link_poses
+from robocas_ms3.tasks.bodies import Bodies
 
 pytestmark = pytest.mark.slow
 
@@ -98,13 +98,6 @@ def test_a_state_dict_is_maniskills(env):
             assert torch.equal(ours[kind][name], state)
     ours["actors"]["basket"][:] = 0  # belongs to whoever asked for it
     assert torch.equal(base.bodies.read(), maniskills(base))
-
-
-def test_links_are_where_their_poses_say(env):
-    robot = env.unwrapped.agent.robot
-    robot.set_qpos(robot.get_qpos() + 0.1)
-    links = robot.links[3:6]
-    assert torch.equal(link_poses(robot.scene, links)[0], torch.cat([link.pose.raw_pose for link in links]))
 
 
 def test_another_layout_of_packed_states_is_an_error(env, monkeypatch):

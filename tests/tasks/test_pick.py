@@ -49,6 +49,9 @@ def test_success_needs_all_of_its_conditions(env):
     put_target_into_basket(env)
     base.success_check.stages["target_lifted"][:] = True
     assert settle(env, 40)["success"]
+    base.objects[int(base.target_slot[0])].set_linear_velocity(torch.tensor([[0.0, 0.0, 0.5]]))
+    assert not bool(base.target_measures()["at_rest"][0])
+    assert settle(env, 40)["success"]
     # a basket that was pushed too far
     basket = base.fixtures.basket
     home = basket.pose.raw_pose.clone()
@@ -60,16 +63,6 @@ def test_success_needs_all_of_its_conditions(env):
     assert not flags["success"]
     assert not bool(base.target_measures()["basket_stands"][0])
     basket.set_pose(Pose.create(home))
-
-
-def test_a_moving_target_is_no_success(env):
-    env.reset(seed=0)
-    base = env.unwrapped
-    put_target_into_basket(env)
-    base.success_check.stages["target_lifted"][:] = True
-    settle(env, 40)
-    base.objects[int(base.target_slot[0])].set_linear_velocity(torch.tensor([[0.0, 0.0, 0.5]]))
-    assert not bool(base.target_measures()["at_rest"][0])
 
 
 def test_stages_are_sticky_until_the_next_reset(env):
@@ -100,21 +93,6 @@ def test_the_instruction_names_the_target(env):
     assert env.unwrapped.get_language_instruction() == [f"grasp the {name} on the table and move it to the basket"]
 
 
-def test_same_named_objects_mean_the_nearest():
-    config = {"ids": ["banana", "mug"], "count": 4}
-    env = gym.make("RoboCASPick-v1", config=changed(objects=config), **STATE_ONLY)
-    for seed in range(4):
-        env.reset(seed=seed)
-        base = env.unwrapped
-        names = [asset.asset.name for asset in base.object_assets[0]]
-        target = int(base.target_slot[0])
-        distance = (base.object_poses[0, :, :2] - torch.tensor(base.task_config.robot.position[:2])).norm(dim=1)
-        same = [i for i, name in enumerate(names) if name == names[target]]
-        assert len(same) == 2
-        assert target == min(same, key=lambda i: distance[i])
-    env.close()
-
-
 def test_the_arm_begins_where_the_configuration_says():
     for start, joints in (
         ("rest", [0, -1.02, 0, -2.51, 0, 1.35, 0.78]),
@@ -127,13 +105,6 @@ def test_the_arm_begins_where_the_configuration_says():
         settle(env, 5)  # it is told to stay there, too
         np.testing.assert_allclose(robot.get_qpos()[0, 3:10], joints, atol=2e-3)
         env.close()
-
-
-def test_five_hertz_by_sim_config():
-    env = gym.make("RoboCASPick-v1", sim_config={"control_freq": 5}, **STATE_ONLY)
-    assert env.unwrapped.control_freq == 5
-    assert env.unwrapped.sim_freq == 100
-    env.close()
 
 
 @pytest.mark.parametrize(

@@ -73,13 +73,8 @@ def test_same_seed_same_scene_other_seed_other_scene(env):
     assert torch.equal(states[0], states[2])
     assert words[0] == words[2]
     assert words[0] != words[1]
-
-
-def test_an_unseeded_reset_gives_another_scene(env):
-    env.reset(seed=5)
-    first = env.unwrapped.object_poses
     env.reset()
-    assert not torch.equal(first, env.unwrapped.object_poses)
+    assert not torch.equal(env.unwrapped.get_state(), states[1])
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2, 3])
@@ -115,17 +110,6 @@ def test_layouts_are_settled_and_as_their_kind_says(env, seed):
         assert abs(local[:, 2].min() - base.model.region.z) < 0.002
 
 
-def test_visual_modes_hold_nothing_only_a_simulator_knows(monkeypatch):
-    from mani_skill.envs.utils.observations import parse_obs_mode_to_struct
-
-    from robocas_ms3.tasks.pick import RoboCASPickEnv
-
-    env = RoboCASPickEnv.__new__(RoboCASPickEnv)
-    env.obs_mode_struct, env._obs_mode = parse_obs_mode_to_struct("rgb+depth"), "rgb+depth"
-    monkeypatch.setattr(RoboCASPickEnv, "tcp_in_world", lambda env: np.zeros((1, 7), np.float32))
-    assert list(env._get_obs_extra({})) == ["tcp_pose"]
-
-
 @lru_cache
 def complaints(env_id: str, mode: str) -> tuple[str, list[str]]:
     """What gymnasium's checker says of an environment: its error, and its warnings but for the environment's name."""
@@ -151,15 +135,6 @@ def test_gymnasiums_checker_finds_nothing_that_it_does_not_find_in_pick_cube(nam
     theirs = complaints("PickCube-v1", mode)
     assert error == theirs[0]
     assert set(warned) <= set(theirs[1])
-
-
-def test_cameras_take_a_size(needs_renderer):
-    env = gym.make("RoboCASPick-v1", obs_mode="rgb", sensor_configs=dict(width=40, height=24))
-    observation, _ = env.reset(seed=0)
-    assert {name: tuple(seen["rgb"].shape) for name, seen in observation["sensor_data"].items()} == {
-        name: (1, 24, 40, 3) for name in ("base_camera", "gripper_camera", "static_camera")
-    }
-    env.close()
 
 
 def test_a_renderer_on_the_cpu_is_not_warned_of(caplog):

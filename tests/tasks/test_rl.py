@@ -6,7 +6,6 @@ import pytest
 
 import robocas_ms3
 from robocas_ms3.core.errors import ConfigError
-from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.tasks import TASKS
 
 HORIZONS = {
@@ -38,12 +37,6 @@ def test_all_of_them():
         "max_episode_steps": 100,
         "render_backend": "none",
     }
-
-
-def test_a_configuration_may_be_a_mapping():
-    still = load_task_config("open_pick_cabinet_door").model_dump(mode="json") | {"base_motion": False}
-    assert robocas_ms3.rl_kwargs("open_pick", still)["max_episode_steps"] == 200
-    assert robocas_ms3.rl_kwargs("open_pick", still | {"base_motion": True})["max_episode_steps"] == 350
 
 
 @pytest.mark.parametrize(

@@ -15,9 +15,6 @@ from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.errors import AssetError
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.settings import EpisodeSettings
-from robocas_ms3.planning.executor import Executor
-from robocas_ms3.planning.skills.arm import Arm
-from robocas_ms3.planning.skills.grasping import plan_grasp
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.config.load import shipped_configs
 from robocas_ms3.scenes.model import SceneModel
@@ -127,25 +124,6 @@ class TestOnAShelf:
         generator = EpisodeGenerator(EpisodeSettings("select", "select_shelf_orderly", "builtin", max_attempts=6))
         yield generator
         generator.close()
-
-    def test_the_way_out_goes_up_a_little_then_straight_back(self, generator):
-        executor = Executor(generator.env, 1)
-        executor.reset()
-        generator.planner.seed(1)
-        arm = Arm(generator.planner, generator.reachability, executor, np.random.default_rng(1))
-        slot = int(arm.env.target_slot[0])
-        plan = plan_grasp(arm, slot, 0.1, "front")
-        lift, withdraw = plan.retreat
-        grasp = arm.planner.tcp(plan.way_in.qpos[-1])
-        lifted, out = arm.planner.tcp(lift.qpos[-1]), arm.planner.tcp(withdraw.qpos[-1])
-        np.testing.assert_allclose((lifted - grasp)[:2], 0, atol=1e-3)  # turned nowhere, moved up
-        assert 0.03 < lifted[2, 3] - grasp[2, 3] < 0.21
-        way = np.array([arm.planner.tcp(qpos)[:3, 3] - lifted[:3, 3] for qpos in withdraw.qpos])
-        back = -grasp[:2, 2] / np.linalg.norm(grasp[:2, 2])
-        assert 0.11 < way[-1, :2] @ back < 0.26
-        across = way - np.outer(way[:, :2] @ back, [*back, 0.0])
-        assert np.abs(across).max() < 2e-3  # level and straight, all the way
-        np.testing.assert_allclose(out[:3, :3], grasp[:3, :3], atol=1e-3)
 
     def test_an_episode_leaves_the_neighbours_standing(self, generator, tmp_path):
         result = generator.generate(1, tmp_path, "episode")

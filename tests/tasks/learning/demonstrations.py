@@ -55,11 +55,6 @@ class Demonstration:
         self.stages = np.array([[*map(all, terms), False].index(False) for terms in full])
         self.released = int(np.flatnonzero(self.actions[:, 7] < 0)[-1])
 
-    def _stage(self, terms: dict) -> int:
-        """The first stage whose terms don't all count in full."""
-        stages = self.env.unwrapped.REWARDS.stages.values()
-        return [*(all(terms[name] == 1 for name in own) for own in stages), False].index(False)
-
     def first(self, flag: str) -> int:
         """The step after which a flag was set for the first time."""
         return next(i for i, info in enumerate(self.infos) if info[flag][0])

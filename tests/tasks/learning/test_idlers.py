@@ -14,10 +14,8 @@ from scipy.stats import spearmanr
 DEMONSTRATED = [
     ("pick", "pick_table_scattered", 0),
     ("pick", "pick_side_table_scattered", 0),  # the basket stands on the floor
-    ("select", "select_table_orderly", 0),
     ("select", "select_shelf_orderly", 0),  # and lower than the shelf
     ("search", "search_table_small_heap", 3),
-    ("search", "search_table_stacked", 70200),
     ("open_pick", "open_pick_drawer", 0),
 ]
 HELD = 40  # steps that an idler is watched for
