@@ -39,6 +39,7 @@ def main(cfg: ServePolicy) -> int:
     """Run the command; gives the exit code."""
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.core.errors import EvaluationError
+    from robocas_ms3.core.strict import check_number
     from robocas_ms3.evaluation.policies import open_policy
     from robocas_ms3.evaluation.protocol import load_protocol
     from robocas_ms3.evaluation.remote.address import strip_brackets
@@ -46,11 +47,8 @@ def main(cfg: ServePolicy) -> int:
     from robocas_ms3.evaluation.remote.messages import LARGEST_BATCH
     from robocas_ms3.evaluation.remote.server import PolicyServer
 
-    if not 0 <= cfg.port < 2**16:
-        raise EvaluationError("no such port", where="--port", expected="0 to 65535", found=cfg.port)
-    if not 1 <= cfg.max_batch <= LARGEST_BATCH:
-        expected = f"1 to {LARGEST_BATCH}"
-        raise EvaluationError("invalid batch size", where="--max-batch", expected=expected, found=cfg.max_batch)
+    check_number("port", cfg.port, 0, 2**16 - 1)
+    check_number("max_batch", cfg.max_batch, 1, LARGEST_BATCH)
     if not cfg.host:
         raise EvaluationError("no address to listen on", where="--host", expected="such as 127.0.0.1 or ::1")
     packs = [load_protocol(folder).rules.pack for folder in cfg.protocol]

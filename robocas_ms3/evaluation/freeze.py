@@ -114,16 +114,13 @@ def read_plan(path: Path) -> Plan:
 def freeze(
     plan: Plan, folder: Path, layouts: str | Path | None = "auto", overrides: Sequence[str] = ()
 ) -> Iterator[tuple[int, int]]:
-    """Write a protocol into a folder, which appears whole.
+    """Write a protocol into a folder, which appears whole; yield the number of episodes that are chosen, and of all.
 
     Args:
         plan: what it is made from.
         folder: of the protocol.
         layouts: where layouts come from, see `RoboCASEnv`.
         overrides: keys to set in all its configurations, see `load_task_config`.
-
-    Yields:
-        The number of episodes that are chosen, and of all.
 
     Raises:
         EvaluationError: the rules are invalid, or two parts have the same name and different configurations.

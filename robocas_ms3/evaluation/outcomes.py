@@ -52,13 +52,10 @@ class Retrieval:
     def of(
         cls, record: NDArray[np.integer], objects: Sequence[str], held_at: int | None, *, cleared: bool
     ) -> Retrieval:
-        """Make it from a record of an episode.
+        """Make it from a record (K, 3) of `metrics.RetrievalOrder.read`, and the ids of the objects by slot.
 
-        Args:
-            record: (K, 3) of `metrics.RetrievalOrder.read`.
-            objects: ids by slot.
-            held_at: policy step after which the target was first held; None: never.
-            cleared: whether the obstacles had been cleared before.
+        ``held_at``: policy step after which the target was first held; ``cleared``: whether the obstacles had been
+        cleared before.
         """
         slots: list[int] = [slot for slot in np.argsort(record[:, 0], kind="stable").tolist() if record[slot, 0]]
         moved = [Move(objects[slot], int(record[slot, 0]), *(bool(x) for x in record[slot, 1:])) for slot in slots]
@@ -127,13 +124,9 @@ class Outcome:
 def failure_stage(flags: dict[str, int | None], error: str = "", order: Sequence[str] = DEFAULT_STAGES) -> str:
     """Return the first stage that an episode did not reach after the furthest one that it reached.
 
-    Stages that were skipped do not count: a target can be pulled out of a heap that was never cleared. ``placed``: it
-    reached all of them, but did not succeed; ``error``: it was ended by an error; empty: success.
-
-    Args:
-        flags: by stage, the step at which it was reached; stages that are missing do not exist in the environment.
-        error: that ended the episode.
-        order: of the stages (`TaskSpec.stages`).
+    Stages that were skipped do not count: a target can be pulled out of a heap that was never cleared. Stages that are
+    missing in ``flags`` do not exist in the environment. ``placed``: it reached all of them, but did not succeed;
+    ``error``: it was ended by an error; empty: success.
     """
     if error:
         return "error"

@@ -148,16 +148,9 @@ class Result:
 def open_result(
     folder: Path, run: RunRecord, *, overwrite: bool = False, retry_errors: bool = False
 ) -> Iterator[dict[int, Outcome]]:
-    """Lock the folder of a result, and start it or continue it.
+    """Lock the folder of a result, start or continue it, and yield the outcomes that exist, by number of the episode.
 
-    Args:
-        folder: of the result.
-        run: what it is measured with.
-        overwrite: start again.
-        retry_errors: drop episodes that an error ended, so that they run again.
-
-    Yields:
-        The outcomes that exist, by number of the episode.
+    With ``retry_errors`` episodes that an error ended are dropped, so that they run again.
 
     Raises:
         OutputExistsError: it was measured with something else, or the folder is not of an evaluation.

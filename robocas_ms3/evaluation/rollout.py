@@ -101,12 +101,9 @@ class EndConditions:
 class EpisodeBatch:
     """Run one episode in each of several envs; the caller chooses the action of every step.
 
-    The result of an episode depends on its seed and its actions only.
-
     Args:
-        env: vector environment (`make_vec`, NumPy arrays, no automatic resets) whose envs take actions of the policy's
-            convention (`stepping.PolicyStepping`).
-        spec: what the policy sees, and what its actions mean.
+        env: vector environment (`make_vec`, NumPy arrays, no automatic resets) of `stepping.PolicyStepping` envs.
+        spec: of the policy.
         ends: when an episode ends.
         control_dt: simulated time of a control step, s.
         refill: whether an env can be reset while others run. In a GPU's batch all envs are reset together.

@@ -47,11 +47,8 @@ class EvaluationSession:
         wrap_env: called with each vector environment that is opened; returns the one to use.
 
     Attributes:
-        protocol: that was read.
         episodes: the episodes of the protocol that the settings choose.
         rate: control steps per second; with RoboCAS-v0's steps, see `PolicyStepping`.
-        record: what a result says about the evaluation.
-        folder: of the result.
         outcomes: by env, the outcome of each episode that has ended since the last `reset`.
 
     Raises:
@@ -89,10 +86,7 @@ class EvaluationSession:
     def run(self, on_start: Callable[[int], None] = lambda count: None) -> Iterator[Outcome]:
         """Start or continue a result: run the episodes that it lacks, write and yield each outcome as its episode ends.
 
-        The session is closed at the end.
-
-        Args:
-            on_start: called with the number of episodes to run.
+        ``on_start`` is called with the number of episodes to run. The session is closed at the end.
 
         Raises:
             OutputExistsError: the result was measured with something else.
@@ -132,9 +126,7 @@ class EvaluationSession:
     def play(self, episodes: Sequence[Episode], max_steps: int | None = None) -> Iterator[Outcome]:
         """Run episodes with the policy, configuration by configuration, and yield each outcome as its episode ends.
 
-        Args:
-            episodes: of the protocol.
-            max_steps: maximum number of policy steps per episode; None: the protocol's.
+        ``max_steps`` replaces the protocol's maximum number of policy steps per episode.
 
         Raises:
             WorkerDied: a process died in which no episode ran.
@@ -147,10 +139,7 @@ class EvaluationSession:
             raise
 
     def reset(self, numbers: Sequence[int]) -> Observations:
-        """Start an episode in each env. Running episodes are dropped, without an outcome.
-
-        Args:
-            numbers: of the episodes in the protocol's list, one per env, all of one configuration.
+        """Start an episode in each env, by number, all of one configuration; running episodes are dropped.
 
         Raises:
             EvaluationError: there is no such episode, or the configurations differ.
@@ -173,14 +162,10 @@ class EvaluationSession:
         return self._observe(batch)
 
     def step(self, actions: ArrayLike) -> Observations | None:
-        """Step the running episodes of `reset`.
+        """Step the running episodes of `reset` by actions (N, A), or by all steps of chunks (N, H, A).
 
-        Args:
-            actions: (N, A), or chunks (N, H, A), of which every step is executed. Rows of envs whose episode has ended
-                have no effect. An episode whose actions are not finite ends with an error.
-
-        Returns:
-            The observations of the envs with a running episode; None if all episodes have ended.
+        Rows of envs whose episode has ended have no effect. An episode whose actions are not finite ends with an error.
+        Returns the observations of the envs with a running episode; None if all episodes have ended.
 
         Raises:
             EvaluationError: no episode runs, or the actions have another shape.
@@ -216,13 +201,7 @@ class EvaluationSession:
         return self._batch.obs
 
     def open(self, episode: Episode, num_envs: int, max_steps: int | None = None) -> EpisodeBatch:
-        """Return envs for the episodes of a configuration; they are opened where needed.
-
-        Args:
-            episode: any episode of that configuration.
-            num_envs: number of envs.
-            max_steps: maximum number of policy steps per episode; None: the protocol's.
-        """
+        """Return envs for the episodes of the configuration of an episode; they are opened if needed."""
         steps = self.max_steps(episode.task) if max_steps is None else max_steps
         wanted, rules = (episode.config, num_envs, steps), self.protocol.rules
         if self._batch is not None and self._open_for == wanted:

@@ -98,9 +98,7 @@ class Answers:
     def answer(self, data: str | bytes, envs: dict[int, int]) -> dict[str, Any]:
         """Return the answer to a packed message.
 
-        Args:
-            data: the message.
-            envs: the policy's env by the client's, of this connection; new ones are added.
+        ``envs`` has the policy's env by the client's, of this connection; new ones are added.
 
         Raises:
             WireError: the request is invalid.

@@ -35,9 +35,6 @@ def enable_tcp_keepalive(connection: Any) -> None:
     The other machine's kernel answers, so a busy process keeps its connections. The kernel sends no probes while sent
     data are unacknowledged: pings and ``timeout_s`` detect a network that is lost then. ``TCP_USER_TIMEOUT`` is not
     set, as it also closes a connection to a server that reads no data for that time during inference.
-
-    Args:
-        connection: a connection of `websockets.asyncio`.
     """
     tcp = connection.transport.get_extra_info("socket")
     tcp.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
@@ -47,12 +44,9 @@ def enable_tcp_keepalive(connection: Any) -> None:
 
 
 async def open_connection(url: str, connect_s: float, *, pings: bool) -> tuple[ClientConnection, ServerMetadata]:
-    """Connect to a policy server and read its metadata; retry while there is no server.
+    """Connect to a policy server and read its metadata; retry for ``connect_s`` while there is no server.
 
-    Args:
-        url: of the server.
-        connect_s: time limit, s.
-        pings: whether the server answers websocket pings during inference.
+    ``pings``: whether the server answers websocket pings during inference.
 
     Raises:
         EvaluationError: no server answers in time, or its metadata are an error text or invalid.

@@ -73,10 +73,7 @@ class PolicyServer:
         self._connections = 0
 
     def run(self, listening: Callable[[str], object] = lambda url: None) -> None:
-        """Serve until `stop`.
-
-        Args:
-            listening: is called with the server's address as soon as it can be reached.
+        """Serve until `stop`; ``listening`` is called with the server's address as soon as it can be reached.
 
         Raises:
             EvaluationError: it can't listen there.

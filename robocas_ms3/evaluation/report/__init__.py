@@ -24,15 +24,9 @@ _NESTED = {"flags": "int64", "flag_seconds": "float64", "measures": "float64"}  
 
 
 def write_report(result: Result, folder: Path, protocol: LoadedProtocol | None = None) -> list[Path]:
-    """Write the tables, the page and the columns of a result, the columns only if pyarrow is installed.
+    """Write the tables, the page and, if pyarrow is installed, the columns of a result, and return the files.
 
-    Args:
-        result: of an evaluation.
-        folder: of the files; the page links the videos in its ``videos``.
-        protocol: that the result was measured by, if it is at hand; the page then names missing episodes.
-
-    Returns:
-        The files.
+    The page links the videos in the folder's ``videos``, and names episodes that are missing of the protocol, if given.
     """
     make_folder(folder)
     written = []

@@ -28,13 +28,7 @@ def video_name(episode: int) -> str:
 
 
 def page(result: Result, folder: Path | None = None, protocol: LoadedProtocol | None = None) -> str:
-    """Return the page.
-
-    Args:
-        result: to be shown.
-        folder: of the page, which may have ``videos``.
-        protocol: that the result was measured by, if it is at hand.
-    """
+    """Return the page of a result, for a folder that may have ``videos``; see `write_report`."""
     here = files("robocas_ms3.evaluation.report")
     style, script = ((here / name).read_text(encoding="utf-8") for name in ("style.css", "script.js"))
     title, parts = escape(title_of(result)), [_lead(result, protocol)]

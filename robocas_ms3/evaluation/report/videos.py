@@ -42,10 +42,9 @@ def _in_turn(lists: list[list[int]]) -> list[int]:
 def film(
     result: Result, protocol: LoadedProtocol, policy: Policy, episodes: Sequence[int]
 ) -> Iterator[tuple[Path, bool]]:
-    """Run episodes again, in processes, and write a video of each into the result's ``videos``.
+    """Run episodes again, in processes, and write videos into the result's ``videos``.
 
-    Yields:
-        The video, and whether the outcome is the same as before.
+    Yields each video, and whether the outcome is the same as before.
 
     Raises:
         EvaluationError: the result is of another protocol.
