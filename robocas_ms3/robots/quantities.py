@@ -234,7 +234,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         limits=(-0.005, 0.085),
         observed=lambda agent: agent.gripper_width[:, None],
         policy="gripper_width",
-        recorded=lambda motion: motion.gripper_width,
+        recorded=lambda motion: motion.qpos[:, RobotDescription.finger_slice].sum(axis=1),
         feature=_STATE,
     ),
     Quantity(

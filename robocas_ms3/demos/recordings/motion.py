@@ -202,11 +202,6 @@ class Motion:
         return planar_motion(self.agv_pose)
 
     @property
-    def gripper_width(self) -> Array:
-        """(T,) m."""
-        return self.qpos[:, RobotDescription.finger_slice].sum(axis=1)
-
-    @property
     def actions(self) -> NDArray[np.float32]:
         """(T, 7), see `stored_actions`."""
         return stored_actions(*self.tcp_motion, self.gripper_open)
