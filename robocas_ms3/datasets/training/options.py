@@ -30,51 +30,6 @@ STATE_KEYS = tuple(
 
 
 @dataclass(frozen=True)
-class Window:
-    """The shape of a sample.
-
-    Attributes:
-        observation: H, steps looked back on, the present one included.
-        action: A, actions from the present step on.
-        padding: what stands beyond an episode's ends. ``hold``: the robot stands still there (first picture, no
-            motion, the gripper command nearest in time); ``zero``: zeros; ``drop``: nothing, such samples are left out.
-    """
-
-    observation: int = 6
-    action: int = 1
-    padding: Padding = "hold"
-
-    def __post_init__(self) -> None:
-        """Check it.
-
-        Raises:
-            DatasetError: a horizon below 1, or no such padding.
-        """
-        for name, horizon in (("observation_horizon", self.observation), ("action_horizon", self.action)):
-            if isinstance(horizon, bool) or not isinstance(horizon, int) or horizon < 1:
-                raise DatasetError(
-                    "a horizon is a number of steps", where=name, expected="an integer >= 1", found=horizon
-                )
-        if self.padding not in get_args(Padding):
-            expected = f"one of {', '.join(get_args(Padding))}"
-            raise DatasetError("no such padding", where="padding", expected=expected, found=self.padding)
-
-    def samples(self, length: int) -> range:
-        """Steps of an episode of T steps which have a sample."""
-        if self.padding == "drop":
-            return range(self.observation - 1, max(self.observation - 1, length - self.action))
-        return range(max(0, length - 1))
-
-    def observed(self, step: int) -> Steps:
-        """(H,) steps observed; below 0 before the episode."""
-        return np.arange(step - self.observation + 1, step + 1)
-
-    def acted(self, step: int) -> Steps:
-        """(H + A - 1,) steps whose actions are given; below 0 or beyond T - 2 outside the episode."""
-        return np.arange(step - self.observation + 1, step + self.action)
-
-
-@dataclass(frozen=True)
 class SampleOptions:
     """What the samples of a dataset hold.
 
@@ -82,7 +37,8 @@ class SampleOptions:
         split: ``train`` or ``val`` by ``data_info.json``, or ``all``.
         observation_horizon: steps looked back on, the present one included; upstream's RT-1: 6, RoboFlamingo: 11.
         action_horizon: actions from the present step on; upstream: 1.
-        padding: beyond an episode's ends: ``hold``, ``zero`` or ``drop``, see `Window`.
+        padding: beyond an episode's ends. ``hold``: the robot stands still (first image, no motion, the gripper command
+            nearest in time); ``zero``: zeros; ``drop``: such samples are left out.
         cameras: names, in the order of their stack; empty: no images.
         size: width and height to scale images to; None: as they are.
         depth: whether to give depth too.
@@ -118,21 +74,30 @@ class SampleOptions:
         """Check the options.
 
         Raises:
-            DatasetError: an unknown split or array, no size, or see `Window`.
+            DatasetError: an unknown choice, a horizon below 1, or no size.
         """
-        _ = self.window
-        _check_choice("split", self.split, get_args(Side))
-        for key in self.state:
-            _check_choice("state", key, STATE_KEYS)
+        choices = [("split", self.split, get_args(Side)), ("padding", self.padding, get_args(Padding))]
+        for where, found, known in (*choices, *(("state", key, STATE_KEYS) for key in self.state)):
+            if found not in known:
+                raise DatasetError("no such choice", where=where, expected=f"one of {', '.join(known)}", found=found)
+        for where in ("observation_horizon", "action_horizon"):
+            found = getattr(self, where)
+            if type(found) is not int or found < 1:
+                raise DatasetError("invalid number of steps", where=where, expected="an integer >= 1", found=found)
         if self.size is not None and (len(self.size) != 2 or min(self.size) < 1):
             raise DatasetError("no such size", where="size", expected="width and height >= 1", found=self.size)
 
-    @property
-    def window(self) -> Window:
-        """Steps of a sample."""
-        return Window(self.observation_horizon, self.action_horizon, self.padding)
+    def samples(self, length: int) -> range:
+        """Return the steps of an episode of T steps that have a sample."""
+        if self.padding == "drop":
+            first = self.observation_horizon - 1
+            return range(first, max(first, length - self.action_horizon))
+        return range(max(0, length - 1))
 
+    def observed(self, step: int) -> Steps:
+        """Return the steps (H,) that a sample observes; below 0 before the episode."""
+        return np.arange(step - self.observation_horizon + 1, step + 1)
 
-def _check_choice(where: str, found: object, known: Sequence[str]) -> None:
-    if found not in known:
-        raise DatasetError("no such choice", where=where, expected=f"one of {', '.join(known)}", found=found)
+    def acted(self, step: int) -> Steps:
+        """Return the steps (H + A - 1,) of its actions; below 0 or beyond T - 2 outside of the episode."""
+        return np.arange(step - self.observation_horizon + 1, step + self.action_horizon)

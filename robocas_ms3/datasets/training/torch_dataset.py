@@ -21,7 +21,6 @@ from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.datasets.training.options import SampleOptions
 from robocas_ms3.datasets.training.sample_arrays import check_holds, read_episode, type_index
 from robocas_ms3.datasets.training.sample_pictures import PictureStack
-from robocas_ms3.datasets.training.sampling import SampleIndex, balancing_weights
 
 
 class RoboCASDataset(torch.utils.data.Dataset):
@@ -64,7 +63,7 @@ class RoboCASDataset(torch.utils.data.Dataset):
         transform: Callable[[dict[str, Any]], Any] | None = None,
     ) -> None:
         self.options = options = options or SampleOptions()
-        self.window, self.transform = options.window, transform
+        self.transform = transform
         cameras = tuple(options.cameras)
         self.source = open_source(path, rate_hz=options.rate_hz, include_failed=options.include_failed)
         self.rate_hz = self.source.rate_hz
@@ -81,11 +80,11 @@ class RoboCASDataset(torch.utils.data.Dataset):
                 found=f"{len(self.source.lengths)} in all",
                 fix='Add seeds, or pass split="all".',
             )
-        samples = {number: self.window.samples(self.source.lengths[number]) for number in self.episodes}
-        self._index = SampleIndex(samples)
-        if not len(self._index):
+        self._steps = {number: options.samples(self.source.lengths[number]) for number in self.episodes}
+        self._offsets = np.cumsum([0, *map(len, self._steps.values())])
+        if not len(self):
             longest = max(self.source.lengths[number] for number in self.episodes)
-            needed = self.window.observation + self.window.action if self.window.padding == "drop" else 2
+            needed = options.observation_horizon + options.action_horizon if options.padding == "drop" else 2
             raise DatasetError(
                 "no episode is long enough",
                 where=path,
@@ -93,7 +92,8 @@ class RoboCASDataset(torch.utils.data.Dataset):
                 found=longest,
                 fix="Pad them.",
             )
-        self._stages = np.concatenate([self._stages_of(number, steps) for number, steps in samples.items()])
+        self.stages = np.concatenate([self._stages_of(number, within) for number, within in self._steps.items()])
+        """(N,) int8 sub-goal type of each sample's step, index in ``GOAL_TYPES``; -1 = unknown."""
         self.scale: ActionScale | None = None
         """How actions are normalised; None: they are not."""
         if options.normalize:
@@ -108,36 +108,43 @@ class RoboCASDataset(torch.utils.data.Dataset):
         return stages[steps.start : steps.stop]
 
     def __len__(self) -> int:
-        return len(self._index)
+        return int(self._offsets[-1])
 
     def locate(self, index: int) -> tuple[int, int]:
-        """Episode number and step of a sample.
+        """Return episode number and step of a sample.
 
         Raises:
             IndexError: there is no such sample.
         """
-        return self._index.locate(index)
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"sample {index} of {len(self)}")
+        index %= len(self)
+        place = int(np.searchsorted(self._offsets, index, side="right")) - 1
+        number = self.episodes[place]
+        return number, self._steps[number][index - int(self._offsets[place])]
+
+    def indices(self, episode: int) -> range:
+        """Return the samples of an episode.
+
+        Raises:
+            DatasetError: the episode is not in this split.
+        """
+        if episode not in self._steps:
+            raise DatasetError("no such episode in this split", where=f"episode {episode}")
+        place = self.episodes.index(episode)
+        return range(int(self._offsets[place]), int(self._offsets[place + 1]))
 
     def index(self, episode: int, step: int) -> int:
-        """The sample of an episode's step.
+        """Return the sample of an episode's step.
 
         Raises:
             DatasetError: the episode is not in this split, or that step has no sample.
         """
-        return self._index.index(episode, step)
-
-    def indices(self, episode: int) -> range:
-        """Samples of an episode.
-
-        Raises:
-            DatasetError: it is not in this split.
-        """
-        return self._index.indices(episode)
-
-    @property
-    def stages(self) -> NDArray[np.int8]:
-        """(N,) sub-goal type of each sample's step, index in ``GOAL_TYPES``; -1 = unknown."""
-        return self._stages
+        found, steps = self.indices(episode), self._steps[episode]
+        if step not in steps:
+            expected = f"{steps[0]} to {steps[-1]}" if steps else "none"
+            raise DatasetError("no sample of this step", where=f"episode {episode}", expected=expected, found=step)
+        return found[step - steps.start]
 
     def weights(self) -> torch.Tensor:
         """(N,) float64 weights for ``WeightedRandomSampler`` with which each sub-goal type is drawn equally often.
@@ -145,9 +152,10 @@ class RoboCASDataset(torch.utils.data.Dataset):
         Raises:
             DatasetError: no sub-goals are known.
         """
-        if (self._stages < 0).all():
+        if (self.stages < 0).all():
             raise DatasetError("no sub-goals are known here", where=self.source.root, expected="step_goals")
-        return torch.from_numpy(balancing_weights(self._stages))
+        _, stages, counts = np.unique(self.stages, return_inverse=True, return_counts=True)
+        return torch.from_numpy(1.0 / (len(counts) * counts[stages]))
 
     def __getitem__(self, index: int) -> Any:
         """One sample.
@@ -158,7 +166,7 @@ class RoboCASDataset(torch.utils.data.Dataset):
         """
         number, step = self.locate(int(index))
         episode = self._episode(number)
-        observed, acted = self.window.observed(step), self.window.acted(step)
+        observed, acted = self.options.observed(step), self.options.acted(step)
         last = len(episode["action"]) - 2  # that an action leaves
         sample: dict[str, Any] = {"episode": number, "step": step}
         sample["observation_mask"] = torch.from_numpy(observed >= 0)
@@ -173,7 +181,7 @@ class RoboCASDataset(torch.utils.data.Dataset):
         if self.options.subgoals:
             sample["subgoal"] = episode["texts"][step]
         if self.options.cameras:
-            zero = self.window.padding == "zero"
+            zero = self.options.padding == "zero"
             sample["rgb"] = self._pictures.read(episode["pictures"], observed, "rgb", zero=zero)
             if self.options.depth:
                 sample["depth"] = self._pictures.read(episode["pictures"], observed, "depth", zero=zero)
@@ -183,18 +191,18 @@ class RoboCASDataset(torch.utils.data.Dataset):
         rows = np.clip(acted, 0, last)
         actions = episode["action"][rows]
         outside = acted != rows
-        if self.window.padding == "hold":
+        if self.options.padding == "hold":
             actions[outside, :6] = 0
             actions[acted < 0, 6] = episode["first_command"]  # that of the last one goes on after the end
         if self.scale is not None:
             actions = self.scale.encode(actions)
-        if self.window.padding == "zero":
+        if self.options.padding == "zero":
             actions[outside] = 0
         return torch.from_numpy(actions)
 
     def _rows(self, array: NDArray, observed: NDArray[np.int64], nothing: int) -> torch.Tensor:
         rows = array[np.maximum(observed, 0)]
-        if self.window.padding == "zero":
+        if self.options.padding == "zero":
             rows[observed < 0] = nothing
         return torch.from_numpy(rows)
 

@@ -22,8 +22,7 @@ from torch.utils.data import DataLoader, WeightedRandomSampler
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import RoboCASDataset
 from robocas_ms3.datasets.actions import ActionScale, episode_actions
-from robocas_ms3.datasets.training.options import SampleOptions, Window
-from robocas_ms3.datasets.training.sampling import SampleIndex, balancing_weights
+from robocas_ms3.datasets.training.options import SampleOptions
 from robocas_ms3.demos.recordings.motion import Motion
 from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.table import PANDA
@@ -182,25 +181,24 @@ def test_words_and_subgoals(made):
     assert data[data.index(1, 5)]["subgoal_type"].tolist() == [3, 3, 3]  # transfer object
 
 
-@given(st.dictionaries(st.integers(0, 99), st.tuples(st.integers(0, 3), st.integers(0, 6)), min_size=1))
-def test_index_and_back(episodes):
-    samples = {number: range(first, first + count) for number, (first, count) in episodes.items()}
-    index = SampleIndex(samples)
-    listed = [(number, step) for number, steps in samples.items() for step in steps]
-    assert [index.locate(i) for i in range(len(index))] == listed
-    assert [index.index(*place) for place in listed] == list(range(len(listed)))
-    assert [index.locate(i - len(listed)) for i in range(len(index))] == listed
+def test_index_and_back(made):
+    data = RoboCASDataset(made, SampleOptions(split="all", cameras=(), observation_horizon=2, padding="drop"))
+    places = [data.locate(i) for i in range(len(data))]
+    assert places == [(number, step) for number in (0, 1) for step in range(1, 6)]
+    assert [data.index(*place) for place in places] == list(range(len(data)))
+    assert data.locate(-1) == places[-1] and data.indices(1) == range(5, 10)
     with pytest.raises(IndexError):
-        index.locate(len(listed))
+        data.locate(len(data))
+    for place in ((1, 0), (1, 6), (2, 1)):
+        with pytest.raises(DatasetError):
+            data.index(*place)
 
 
 @given(st.integers(1, 9), st.integers(1, 9), st.integers(1, 30))
 def test_dropped_samples_are_those_with_padding(horizon, chunk, length):
-    whole = Window(horizon, chunk, "drop")
+    whole, padded = (SampleOptions("all", horizon, chunk, padding) for padding in ("drop", "hold"))
     complete = [
-        step
-        for step in Window(horizon, chunk).samples(length)
-        if whole.observed(step)[0] >= 0 and whole.acted(step)[-1] <= length - 2
+        step for step in padded.samples(length) if whole.observed(step)[0] >= 0 and whole.acted(step)[-1] <= length - 2
     ]
     assert list(whole.samples(length)) == complete
 
@@ -209,7 +207,7 @@ def test_weights_draw_all_stages_alike(made):
     data = RoboCASDataset(made, SampleOptions(split="all", cameras=(), observation_horizon=1, subgoals=True))
     weights = data.weights()
     assert data.stages.tolist() == [2, 2, 2, 3, 3, 3] * 2
-    assert balancing_weights(np.array([0, 0, 0, 5])).tolist() == pytest.approx([1 / 6, 1 / 6, 1 / 6, 1 / 2])
+    assert weights.tolist() == pytest.approx([1 / 12] * 12)
     generator = torch.Generator().manual_seed(0)
     sampler = WeightedRandomSampler(weights.tolist(), 400, generator=generator)
     drawn = torch.cat([batch["subgoal_type"][:, 0] for batch in DataLoader(data, batch_size=100, sampler=sampler)])
@@ -368,9 +366,9 @@ def test_forward_kinematics_by_hand():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (dict(observation_horizon=0), "observation_horizon: a horizon is a number of steps.*found 0"),
+        (dict(observation_horizon=0), "observation_horizon: invalid number of steps.*found 0"),
         (dict(action_horizon=2.0), "action_horizon"),
-        (dict(padding="mirror"), "no such padding"),
+        (dict(padding="mirror"), "padding: no such choice"),
         (dict(cameras=("head_camera",)), "no such camera.*base_camera.*head_camera"),
         (dict(cameras=("base_camera", "base_camera")), "no such camera.*each once"),
         (dict(split="test"), "split: no such choice"),
