@@ -24,7 +24,7 @@ from robocas_ms3.assets.physics import (
 from robocas_ms3.core.errors import AssetError
 from robocas_ms3.core.poses import inverse
 
-# The fingers of robots/mobile_panda.py and robots/urdf.py: drives in N/m and N s/m, N, m, kg, kg m2
+# The fingers of robots/agent.py and robots/urdf.py: drives in N/m and N s/m, N, m, kg, kg m2
 STIFFNESS, DAMPING, FORCE_LIMIT = 1e3, 1e2, 100.0
 OPEN, CLOSED = 0.04, -0.01  # m, drive targets of a finger; beyond closed, so that thin things are pressed too
 FINGER_MASS, FINGER_INERTIA = 0.1, (6e-5, 6e-5, 6e-6)

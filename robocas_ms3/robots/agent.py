@@ -15,13 +15,13 @@ from mani_skill.utils import common, sapien_utils
 from mani_skill.utils.structs import Actor, Link, Pose
 
 from robocas_ms3.robots.cameras import CameraSpec
-from robocas_ms3.robots.combined import RobotController, State
-from robocas_ms3.robots.control_modes import control_modes
+from robocas_ms3.robots.control_modes import Drive, Drives, control_modes
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.robots.drives import EvenDrives
 from robocas_ms3.robots.ee_controller import relative_pose
+from robocas_ms3.robots.joint_controllers import RobotController
 from robocas_ms3.robots.quantities import QUANTITIES
-from robocas_ms3.robots.table import RobotSpec
+from robocas_ms3.robots.table import PANDA, STOCK_FINGERS, RobotSpec
 
 
 class _GeneratedUrdf:
@@ -49,9 +49,9 @@ class MobileManipulator(BaseAgent):
 
     # Arm: twice as stiff as ManiSkill's Panda, damped so that no direction overshoots. Damping / stiffness is the lag.
     # Stiffer gains would track no better (targets are smooth) and press harder on what is touched.
-    arm_stiffness, arm_damping, arm_force_limit = 2e3, 1.5e2, 100.0
-    gripper_stiffness, gripper_damping, gripper_force_limit = 1e3, 1e2, 100.0
-    base_stiffness, base_damping, base_force_limit = 4e5, 2e4, 4e3
+    arm_drive: ClassVar[Drive] = dict(stiffness=2e3, damping=1.5e2, force_limit=100.0)
+    gripper_drive: ClassVar[Drive] = dict(stiffness=1e3, damping=1e2, force_limit=100.0)
+    base_drive: ClassVar[Drive] = dict(stiffness=4e5, damping=2e4, force_limit=4e3)
     base_max_speed = 0.5  # m/s and rad/s
 
     cameras: tuple[CameraSpec, ...]
@@ -72,14 +72,8 @@ class MobileManipulator(BaseAgent):
 
     @property
     def _controller_configs(self) -> dict[str, dict[str, Any]]:
-        arm = dict(stiffness=self.arm_stiffness, damping=self.arm_damping, force_limit=self.arm_force_limit)
-        gripper = dict(
-            stiffness=self.gripper_stiffness, damping=self.gripper_damping, force_limit=self.gripper_force_limit
-        )
-        base = dict(stiffness=self.base_stiffness, damping=self.base_damping, force_limit=self.base_force_limit)
-        on_gpu = self.scene.gpu_sim_enabled
-        speed = self.base_max_speed
-        return deepcopy_dict(control_modes(self.spec, arm, gripper, base, base_max_speed=speed, on_gpu=on_gpu))
+        drives = Drives(self.arm_drive, self.gripper_drive, self.base_drive, self.base_max_speed)
+        return deepcopy_dict(control_modes(self.spec, drives, on_gpu=self.scene.gpu_sim_enabled))
 
     @property
     def _sensor_configs(self) -> list[CameraConfig]:
@@ -87,6 +81,7 @@ class MobileManipulator(BaseAgent):
 
     def camera_config(self, camera: CameraSpec) -> CameraConfig:
         """Return a camera in ManiSkill's form, with the cheapest shader; ``sensor_configs`` of ``gym.make`` wins."""
+        links = {"world": None, "base": self.description.base_link, "hand": self.description.hand_link}
         if camera.look_at is None:
             pose = sapien.Pose(camera.position)
             pose.set_rpy(camera.rpy)
@@ -100,9 +95,7 @@ class MobileManipulator(BaseAgent):
             fov=camera.fov,
             near=camera.near,
             far=camera.far,
-            entity_uid={"world": None, "base": self.description.base_link, "hand": self.description.hand_link}[
-                camera.mount
-            ],
+            entity_uid=links[camera.mount],
             shader_pack="minimal",
         )
 
@@ -155,32 +148,16 @@ class MobileManipulator(BaseAgent):
                 for link in self.robot.links:  # as ManiSkill does for those that it makes
                     link.disable_gravity = True
         super().set_control_mode(mode)
-        self._within_a_step = [part for part in self._parts.controllers.values() if isinstance(part, EvenDrives)]
+        self._within_a_step = [part for part in self.controller.controllers.values() if isinstance(part, EvenDrives)]
         if hasattr(self, "tcp"):  # not while the robot is being made
             self._still()
             if self.scene.gpu_sim_enabled and self.scene._gpu_sim_initialized:
                 cast("Any", self.scene.px).gpu_apply_articulation_target_velocity()
 
     @property
-    def _parts(self) -> RobotController:
-        return cast("RobotController", self.controller)
-
-    def reset_only(self, env_idx: torch.Tensor | None) -> None:
-        """Say which envs the next reset of the controllers is of; None: all."""
-        self._parts.reset_only = env_idx
-
-    def controller_targets(self) -> dict[str, dict[str, torch.Tensor]]:
-        """What the next actions start from, beside where the joints are; see `combined.RobotController.targets`."""
-        return self._parts.targets()
-
-    def set_controller_targets(self, state: State | None = None, env_idx: torch.Tensor | None = None) -> None:
-        """Let the next actions start from targets, and where there are none from where the joints are.
-
-        Args:
-            state: of `controller_targets`, a row for each env that is set.
-            env_idx: of these envs; default: all.
-        """
-        self._parts.set_targets(state, env_idx)
+    def controller(self) -> RobotController:
+        """The controller of the control mode."""
+        return cast("RobotController", super().controller)
 
     def _still(self) -> None:
         """Take back the velocities that the drives were told, of the envs being reset."""
@@ -240,3 +217,11 @@ class MobileManipulator(BaseAgent):
         """(N,) bool: no joint but the fingers moves faster than ``threshold`` (m/s, rad/s)."""
         qvel = self.robot.get_qvel()[:, : self.description.finger_slice.start]
         return qvel.abs().max(dim=1).values <= threshold
+
+
+class RoboCASMobilePanda(MobileManipulator, spec=PANDA):
+    """A Franka Panda with lengthened finger tips on a mobile base."""
+
+
+class RoboCASMobilePandaStockFingers(MobileManipulator, spec=STOCK_FINGERS):
+    """The same robot with ManiSkill's own fingers, for comparison."""

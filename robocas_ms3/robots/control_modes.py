@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 from mani_skill.agents.controllers import PDJointPosControllerConfig
@@ -22,20 +23,27 @@ Drive = dict[str, Any]
 """Stiffness, damping and force limit of joints, in ManiSkill's units."""
 
 
-def control_modes(
-    spec: RobotSpec, arm: Drive, gripper: Drive, base: Drive, *, base_max_speed: float, on_gpu: bool
-) -> dict[str, dict[str, Any]]:
-    """Configurations of the controllers of each control mode, by name.
+@dataclass(frozen=True)
+class Drives:
+    """The drives of arm, gripper and base, and the greatest speed of the base, m/s and rad/s."""
+
+    arm: Drive
+    gripper: Drive
+    base: Drive
+    base_max_speed: float
+
+
+def control_modes(spec: RobotSpec, drives: Drives, *, on_gpu: bool) -> dict[str, dict[str, Any]]:
+    """Return the configurations of the controllers of each control mode, by name.
 
     Args:
         spec: the robot.
-        arm, gripper, base: how their joints are driven.
-        base_max_speed: m/s and rad/s.
+        drives: of its joints.
         on_gpu: whether the physics is on a GPU. On a CPU the arm of ``pd_joint_delta_pos`` has ManiSkill's own
             controller, whose exact class ManiSkill's replay tool asks for.
     """
     joint_deltas = JointDeltaControllerConfig if on_gpu else PDJointPosControllerConfig
-    robot = spec.description
+    robot, arm, base = spec.description, drives.arm, drives.base
     arm_joints, base_joints, fingers = list(robot.arm_joints), list(robot.base_joints), list(robot.finger_joints)
     end_effector: dict[str, Any] = dict(
         joint_names=arm_joints,
@@ -62,9 +70,9 @@ def control_modes(
     )
     low, high = robot.finger_targets
     mimic: dict[str, Any] = {fingers[1]: {"joint": fingers[0]}}
-    hand = FingersControllerConfig(fingers, lower=low, upper=high, mimic=mimic, **gripper)
+    hand = FingersControllerConfig(fingers, lower=low, upper=high, mimic=mimic, **drives.gripper)
     held = HeldJointsControllerConfig(base_joints, **base)
-    moving: dict[str, Any] = {**base, "max_speed": base_max_speed}
+    moving: dict[str, Any] = {**base, "max_speed": drives.base_max_speed}
     moved = SmoothJointPosControllerConfig(base_joints, None, None, **moving)
     least, most = [-scale for scale in BASE_SCALE], list(BASE_SCALE)
     moved_by = SmoothJointPosControllerConfig(base_joints, least, most, use_delta=True, normalize_action=True, **moving)

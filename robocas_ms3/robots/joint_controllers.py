@@ -1,17 +1,21 @@
-"""Controllers of joints: the arm's, moved evenly; fingers that do the same; a base that is held."""
+"""Controllers of joints: the arm's, moved evenly; fingers that do the same; a base that is held; all of a robot."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
+import torch
 from gymnasium import spaces
 from mani_skill.agents.controllers import (
     PDJointPosControllerConfig,
     PDJointPosMimicController,
     PDJointPosMimicControllerConfig,
 )
+from mani_skill.agents.controllers.base_controller import CombinedController
+from mani_skill.utils.structs import Pose
 
 from robocas_ms3.core.arrays import as_tensor, choose, clamp, join, native
 from robocas_ms3.robots.drives import (
@@ -122,3 +126,63 @@ class HeldJointsControllerConfig(PDJointPosControllerConfig):
     damping: Any = None
     normalize_action: bool = False
     controller_cls = HeldJointsController
+
+
+State = Mapping[str, Mapping[str, Any]]
+"""By controller: ``target_qpos`` (N, joints), rad or m; ``target_pose`` (N, 7) of the TCP in the arm's base frame."""
+
+
+class RobotController(CombinedController):
+    """ManiSkill's, whose reset leaves the other envs alone.
+
+    ManiSkill resets controllers after it has forgotten which envs are reset: all would start from where they are.
+    """
+
+    reset_only: torch.Tensor | None = None
+    """Indices of the envs of the next reset; None: all."""
+
+    def reset(self) -> None:
+        """Start from where the joints are, in the envs that are being reset."""
+        every = self.scene._reset_mask
+        if self.reset_only is not None:
+            self.scene._reset_mask = torch.zeros_like(every)
+            self.scene._reset_mask[self.reset_only] = True
+        try:
+            super().reset()
+        finally:
+            self.scene._reset_mask, self.reset_only = every, None
+
+    def targets(self) -> dict[str, dict[str, torch.Tensor]]:
+        """Return a copy of what the next actions start from besides the joints, as `State`."""
+        found: dict[str, dict[str, torch.Tensor]] = {}
+        for name, controller in self.controllers.items():
+            part, kept = cast("Any", controller), found.setdefault(name, {})
+            if part._target_qpos is not None:
+                kept["target_qpos"] = part._target_qpos.clone()
+            if getattr(part, "_target_pose", None) is not None:
+                kept["target_pose"] = part._target_pose.raw_pose.clone()
+        return found
+
+    def set_targets(self, state: State | None = None, env_idx: torch.Tensor | None = None) -> None:
+        """Let the next actions start from targets, and without these from where the joints are.
+
+        Args:
+            state: of `targets`, a row for each env that is set.
+            env_idx: of these envs; default: all.
+        """
+        envs = slice(None) if env_idx is None else env_idx
+        for name, controller in self.controllers.items():
+            part, given = cast("Any", controller), (state or {}).get(name, {})
+            if part._target_qpos is not None:
+                target = given.get("target_qpos", part.qpos[envs])
+                part._target_qpos = _put(part._target_qpos, envs, target)
+            if getattr(part, "_target_pose", None) is not None:
+                target = given["target_pose"] if "target_pose" in given else part.ee_pose_at_base.raw_pose[envs]
+                part._target_pose = Pose(raw_pose=_put(part._target_pose.raw_pose, envs, target))
+
+
+def _put(values: torch.Tensor, envs: Any, rows: Any) -> torch.Tensor:
+    """Return a copy of values (N, D) with some rows replaced."""
+    values = values.clone()
+    values[envs] = torch.as_tensor(rows, dtype=values.dtype, device=values.device).reshape(-1, values.shape[1])
+    return values

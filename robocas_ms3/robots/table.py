@@ -27,11 +27,11 @@ class RobotSpec:
     agent: str
 
 
-PANDA = RobotSpec(MOBILE_PANDA, robot_files, "robocas_ms3.robots.mobile_panda:RoboCASMobilePanda")
+PANDA = RobotSpec(MOBILE_PANDA, robot_files, "robocas_ms3.robots.agent:RoboCASMobilePanda")
 STOCK_FINGERS = RobotSpec(
     replace(MOBILE_PANDA, uid=f"{MOBILE_PANDA.uid}_stock_fingers", finger_extension=0.0),
     partial(robot_files, 0.0),
-    "robocas_ms3.robots.mobile_panda:RoboCASMobilePandaStockFingers",
+    "robocas_ms3.robots.agent:RoboCASMobilePandaStockFingers",
 )
 DEFAULT = MOBILE_PANDA.uid
 ROBOTS = Registry(

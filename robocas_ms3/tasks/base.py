@@ -257,12 +257,12 @@ class RoboCASEnv(BaseEnv):
     def state_beside_bodies(self) -> dict:
         """Return targets of controllers, and the ``stages`` (N, stages) bool that were reached so far."""
         stages = self.success_check.reached.T.clone()
-        return {"controller": self.agent.controller_targets(), "task": {"stages": stages}}
+        return {"controller": self.agent.controller.targets(), "task": {"stages": stages}}
 
     def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None) -> None:
         """Set the state. Without targets, the next action starts from where the robot is; without stages, they stay."""
         super().set_state_dict(state, cast("torch.Tensor", env_idx))
-        self.agent.set_controller_targets(state.get("controller"), env_idx)
+        self.agent.controller.set_targets(state.get("controller"), env_idx)
         envs = slice(None) if env_idx is None else env_idx
         self.success_check.restore(state.get("task", {}).get("stages"), envs)
         self.dense_reward.reset(envs)

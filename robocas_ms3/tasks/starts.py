@@ -94,7 +94,7 @@ def place(env: Any, starts: Starts, envs: torch.Tensor) -> None:
     with torch.device(env.device):
         qpos: Any = torch.as_tensor(env.agent.keyframes[env.task_config.robot_start].qpos, dtype=torch.float32)
         env.agent.reset(qpos.repeat(len(envs), 1))
-        env.agent.reset_only(envs)
+        env.agent.controller.reset_only = envs
         env.agent.robot.set_pose(cast("Any", Pose.create(starts.robot_poses)))
         for name, furniture in env.fixtures.furniture.items():
             if isinstance(furniture, Articulation):

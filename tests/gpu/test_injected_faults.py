@@ -12,7 +12,7 @@ from mani_skill.agents.controllers.base_controller import CombinedController
 from mani_skill.envs.scene import ManiSkillScene
 
 from robocas_ms3.robots.agent import MobileManipulator
-from robocas_ms3.robots.combined import RobotController
+from robocas_ms3.robots.joint_controllers import RobotController
 from robocas_ms3.tasks import base
 from robocas_ms3.tasks.bodies import Bodies
 from robocas_ms3.tasks.seeds import EpisodeSeeds

@@ -106,14 +106,14 @@ def test_a_partial_reset_leaves_the_other_envs_unchanged(many):
     base: Any = many.unwrapped
     many.reset(seed=0)
     moved(many, 1, 10)
-    before, targets = base.bodies.read().clone(), base.agent.controller_targets()
+    before, targets = base.bodies.read().clone(), base.agent.controller.targets()
     some = torch.tensor(SOME, device=base.device)
     many.reset(options={"env_idx": some})
     others = torch.tensor([i for i in range(ENVS) if i not in SOME], device=base.device)
     # written back and read again, by way of centres of mass
     torch.testing.assert_close(base.bodies.read()[others], before[others], atol=1e-5, rtol=0)
     assert not torch.equal(base.bodies.read()[some], before[some])
-    for name, found in base.agent.controller_targets().items():
+    for name, found in base.agent.controller.targets().items():
         for key, value in found.items():
             assert torch.equal(value[others], targets[name][key][others])
     assert (base.elapsed_steps[some] == 0).all()

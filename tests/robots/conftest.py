@@ -16,7 +16,7 @@ def make_env():
     import mani_skill.envs  # noqa: F401
     import sapien
 
-    import robocas_ms3.robots.mobile_panda  # noqa: F401
+    import robocas_ms3.robots.agent  # noqa: F401
 
     made = []
 

@@ -9,9 +9,8 @@ import torch
 from mani_skill.agents.controllers import PDJointPosController
 from mani_skill.utils.structs import Pose
 
-from robocas_ms3.robots.combined import RobotController
 from robocas_ms3.robots.ee_controller import RoboCASEEPoseController
-from robocas_ms3.robots.joint_controllers import HeldJointsController
+from robocas_ms3.robots.joint_controllers import HeldJointsController, RobotController
 
 ENVS = 4
 

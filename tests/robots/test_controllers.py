@@ -115,7 +115,7 @@ def test_other_joints_make_up_for_one_at_its_limit(make_env, mode):
     translation, rotation = moved(goal, matrix(agent.tcp_in_arm_base))
     assert np.linalg.norm(translation) < 5e-4
     assert np.linalg.norm(rotation) < 1e-3
-    targets = agent.controller_targets()["arm"]["target_qpos"][0].numpy()
+    targets = agent.controller.targets()["arm"]["target_qpos"][0].numpy()
     lower, upper = np.array(MOBILE_PANDA.arm_limits, np.float32).T
     assert ((targets >= lower) & (targets <= upper)).all()
 

@@ -119,7 +119,7 @@ def test_ee_deltas_start_where_the_arm_is_after_its_state_was_set(make_env):
         env.step(np.array([0, 0, -0.3, 0, 0, 0, 1], np.float32))
     agent.robot.set_qpos(before)
     agent.robot.set_qvel(torch.zeros_like(before))
-    agent.set_controller_targets()
+    agent.controller.set_targets()
     env.step(np.zeros(7, np.float32))
     translation, _ = moved(start, matrix(agent.tcp.pose))
     assert np.linalg.norm(translation) < 2e-3

@@ -7,8 +7,8 @@ import sapien
 from robot_checks import link_poses
 from scipy.spatial.transform import Rotation
 
+from robocas_ms3.robots.agent import RoboCASMobilePanda, RoboCASMobilePandaStockFingers
 from robocas_ms3.robots.description import MOBILE_PANDA
-from robocas_ms3.robots.mobile_panda import RoboCASMobilePanda, RoboCASMobilePandaStockFingers
 from robocas_ms3.robots.urdf import robot_files
 
 EVALUATION = dict(zip(MOBILE_PANDA.arm_joints, MOBILE_PANDA.arm_evaluation_start, strict=True))

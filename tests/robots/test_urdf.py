@@ -165,7 +165,7 @@ def test_negative_extension_is_an_error():
 def test_imports_write_nothing_and_the_urdf_needs_no_sapien(tmp_path):
     code = (
         "import sys, robocas_ms3.robots.urdf; print('sapien' in sys.modules, 'mani_skill' in sys.modules);"
-        "import robocas_ms3.robots.mobile_panda"
+        "import robocas_ms3.robots.agent"
     )
     cache = tmp_path / "cache"
     assert output(python(code, ROBOCAS_CACHE=str(cache))).splitlines()[0] == "False False"

@@ -175,12 +175,12 @@ def check_partial_reset(batch: gym.Env, some: Sequence[int], mode: str) -> None:
         undisturbed = play(batch, actions)
     batch.reset(seed=list(range(count)))
     play(batch, actions[:5])
-    before, targets = base.bodies.read().clone(), base.agent.controller_targets()
+    before, targets = base.bodies.read().clone(), base.agent.controller.targets()
     batch.reset(options={"env_idx": torch.tensor(some, device=base.device)})
     after = base.bodies.read()
     assert torch.equal(after[others], before[others]), "the state of another env has changed"
     assert not torch.equal(after[some], before[some]), "the envs are where they were"
-    for name, values in base.agent.controller_targets().items():
+    for name, values in base.agent.controller.targets().items():
         for key, value in values.items():
             assert torch.equal(value[others], targets[name][key][others]), f"{key} of another env has changed"
     assert base.elapsed_steps.tolist() == [0 if env in some else 5 for env in range(count)]
@@ -211,7 +211,7 @@ def check_state_round_trip(batch: gym.Env, some: Sequence[int], mode: str) -> No
     assert torch.equal(base.get_state()[others], moved[others]), "the state of another env has changed"
     base.set_state_dict(stored)
     _close(base.get_state(), flat, 1e-6, "state")
-    for name, values in base.agent.controller_targets().items():
+    for name, values in base.agent.controller.targets().items():
         for key, value in values.items():
             _close(value, stored["controller"][name][key], 1e-6, f"{name}.{key}")
 

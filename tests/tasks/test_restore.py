@@ -89,7 +89,7 @@ def test_a_state_without_targets_starts_from_where_the_robot_is():
     for _ in range(5):
         env.step(np.array([0, 0, -0.3, 0, 0, 0, 1], np.float32))
     base.set_state_dict({kind: start[kind] for kind in ("actors", "articulations")})
-    targets = base.agent.controller_targets()["arm"]
+    targets = base.agent.controller.targets()["arm"]
     assert torch.allclose(targets["target_pose"], base.agent.tcp_in_arm_base.raw_pose, atol=1e-5)
     assert torch.equal(targets["target_qpos"], base.agent.robot.get_qpos()[:, 3:10])
     env.close()
