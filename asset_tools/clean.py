@@ -200,15 +200,7 @@ def _components(one: Ints, other: Ints, count: int) -> Ints:
 
 @dataclass(frozen=True)
 class _Pieces:
-    """The connected pieces of a mesh. N pieces.
-
-    Attributes:
-        faces: indices of the faces of each.
-        low, high: (N, 3) corners of the bounding boxes.
-        shares: (N,) of the surface.
-        closed: (N,) whether it has no open edge.
-        flat: (N,) whether all its faces are parallel.
-    """
+    """The N connected pieces of a mesh: faces, bounding boxes (N, 3), shares of the surface, closed, flat."""
 
     faces: list[Ints]
     low: Array

@@ -37,13 +37,7 @@ FAR = 1e6  # greatest number of a position, size or angle
 
 @dataclass(frozen=True)
 class Shape:
-    """What the `<geometry>` of a link says.
-
-    Attributes:
-        kind: the tag: ``mesh``, ``box``, ``cylinder``, ``sphere``; another one has no size.
-        size: scale (3,) of a mesh; size (3,) of a box; radius and length; radius. Meters.
-        filename: of a mesh, as the URDF has it.
-    """
+    """A `<geometry>`: its tag; scale of a mesh, size of a box, radius and length, or radius, m; a mesh file."""
 
     kind: str
     size: tuple[float, ...] = ()
@@ -52,12 +46,9 @@ class Shape:
 
 @dataclass(frozen=True)
 class Visual:
-    """A shape of a link.
+    """A shape of a part such as ``drawer_side-23``, at a pose 4x4 in the furniture's frame, joints closed.
 
     Attributes:
-        part: the part of the furniture it belongs to: ``drawer_side-23``.
-        shape: a mesh file or a primitive.
-        pose: 4x4 of it in the furniture's frame, joints closed.
         color: (3,) 0 to 1, of a shape without a material of its own.
     """
 
@@ -69,17 +60,9 @@ class Visual:
 
 @dataclass(frozen=True)
 class MovingLink:
-    """A link that moves.
+    """A link that moves, in the furniture's frame with joints closed; metres, radians.
 
-    Attributes:
-        name: of the link.
-        parent: of the moving link it hangs on; empty: the fixed body.
-        joint: name of its joint.
-        kind: of the joint.
-        axis: (3,) unit vector, furniture's frame, joints closed.
-        origin: (3,) point on the axis, m.
-        limits: of the joint, 0 is closed.
-        visuals: its shapes and those of links fixed to it.
+    Its parent is a moving link, or empty for the fixed body; its shapes include those of links fixed to it.
     """
 
     name: str
@@ -94,15 +77,7 @@ class MovingLink:
 
 @dataclass(frozen=True)
 class Mobility:
-    """A model.
-
-    Attributes:
-        folder: where it was read from.
-        body: shapes of the fixed body.
-        links: moving parts, parents first.
-        joints: names of all joints that could move.
-        repairs: what of the URDF was not taken as it is.
-    """
+    """A model: shapes of the fixed body, moving links (parents first), names of all joints that could move, repairs."""
 
     folder: Path
     body: list[Visual]
@@ -111,7 +86,7 @@ class Mobility:
     repairs: tuple[str, ...] = ()
 
     def visuals(self) -> Iterator[Visual]:
-        """All shapes."""
+        """Yield all shapes."""
         yield from self.body
         for link in self.links:
             yield from link.visuals
@@ -128,13 +103,11 @@ class _Joint:
 
 
 def read_urdf(folder: Path, notes: Mapping[str, JointNote] | None = None, scale: float = 1.0) -> Mobility:
-    """Read a model's links and joints.
-
-    Fixed joints are merged, and so are those without a finite range (casters), unless a note gives their limits.
+    """Read a model's links and joints. Joints without a finite range (casters) are fixed unless a note gives limits.
 
     Args:
         folder: of the model; holds ``mobility.urdf``.
-        notes: what an annotation says of joints, by their names.
+        notes: of an annotation, by joint.
         scale: metres of one unit of the URDF.
 
     Raises:
@@ -208,7 +181,7 @@ class _Reader:
         return body, links
 
     def _range(self, joint: _Joint) -> tuple[float, tuple[float, float]] | None:
-        """Where a joint is closed as the URDF counts, and its limits counted from there; none: it is held."""
+        """Return the closed position in the URDF's count, and the limits from there; None: the joint is fixed."""
         note = self._notes.get(joint.name, JointNote())
         if joint.kind == "fixed" or note.fixed:
             return None
@@ -234,7 +207,7 @@ class _Reader:
         return closed, (low - closed, high - closed)
 
     def _limits(self, joint: _Joint, note: JointNote, unit: float) -> tuple[float, float]:
-        """Limits in m or rad, counted as the URDF does; infinite where there are none."""
+        """Return limits in m or rad, in the URDF's count; infinite where there are none."""
         limit = joint.element.find("limit")
         if limit is None or joint.kind == "continuous":
             return -np.inf, np.inf
@@ -261,7 +234,7 @@ class _Reader:
         return list(names)
 
     def _visuals(self, name: str, link: ET.Element) -> list[Visual]:
-        """Shapes of a link in its frame: those to look at, or where it has none those to touch."""
+        """Return the shapes of a link in its frame: visual ones, or else those for collision."""
         found, tag = link.findall("visual"), "visual"
         if not found and link.find("collision") is not None:
             found, tag = link.findall("collision"), "collision"
@@ -293,7 +266,7 @@ class _Reader:
         return Shape(shape.tag, tuple(sizes.tolist()))
 
     def _color(self, material: ET.Element) -> tuple[float, float, float] | None:
-        """Of a material, which may be declared elsewhere in the file by its name."""
+        """Return the colour of a material, which may be declared elsewhere in the file by its name."""
         name, color = material.get("name", ""), material.find("color")
         if color is None:
             return self._colors.get(name)

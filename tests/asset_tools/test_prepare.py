@@ -6,8 +6,7 @@ import trimesh
 
 from asset_tools.decompose import decompose
 from asset_tools.inertia import principal_inertia
-from asset_tools.level import level_base
-from asset_tools.prepare import prepare
+from asset_tools.prepare import level_base, prepare
 from asset_tools.resting import resting_poses
 from robocas_ms3.core.errors import AssetError
 
