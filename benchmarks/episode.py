@@ -29,7 +29,7 @@ import torch
 import tyro
 
 from robocas_ms3.demos.generator import EpisodeGenerator
-from robocas_ms3.demos.open_loop import Noise
+from robocas_ms3.demos.open_loop import draw_noise
 from robocas_ms3.demos.recordings.motion import Motion, sample_states, sample_stride
 from robocas_ms3.demos.recordings.stored import open_trajectory
 from robocas_ms3.demos.settings import EpisodeSettings
@@ -181,11 +181,10 @@ def judge(found: Seed, generator: EpisodeGenerator, path: Path, args: Args) -> N
     world = generator.worlds[0]
     stride = sample_stride(generator.settings.control_freq, world.rate_hz)
     own = Motion.of(PANDA, states, actions[:, 7], sample_states(len(actions), stride)).actions[:-1].astype(np.float64)
-    noise = Noise(args.noise[0] / 1000, float(np.deg2rad(args.noise[1])))
     for draw in range(-1, args.draws):
         world.reset(found.seed)
         rng = np.random.default_rng([found.seed, FRESH + draw + 1])
-        success = world.play(own if draw < 0 else own + noise.draw(rng, len(own))).success
+        success = world.play(own if draw < 0 else own + draw_noise(rng, len(own), *args.noise)).success
         if draw < 0:
             found.clean = success
         else:

@@ -17,9 +17,8 @@ from robocas_ms3.demos.branches import ForkedBranches
 from robocas_ms3.demos.completing import complete
 from robocas_ms3.demos.forking import say_once, why_not_fork
 from robocas_ms3.demos.ledger import EpisodeResult
-from robocas_ms3.demos.open_loop import Noise, OpenLoop
+from robocas_ms3.demos.open_loop import OpenLoop
 from robocas_ms3.demos.recordings.environment import RecordedEnv
-from robocas_ms3.demos.recordings.motion import sample_stride
 from robocas_ms3.demos.recordings.subgoals import SubGoal
 from robocas_ms3.demos.recordings.writing import EpisodeRecorder
 from robocas_ms3.demos.resimulation import Resimulation
@@ -80,9 +79,7 @@ class EpisodeGenerator:
             scene = {"config": settings.config, "layouts": settings.layouts, **chosen}
             env = RecordedEnv(TASKS[settings.task].env_id, None, scene).with_pack(settings.pack)
             self.worlds = [OpenLoop(env, settings.replay_rate) for _ in range(1 + settings.noisy_trials)]
-            noise = Noise(settings.noise_mm / 1000, float(np.deg2rad(settings.noise_deg)))
-            stride = sample_stride(settings.control_freq, settings.replay_rate)
-            self.trials = Trials(self.worlds, noise, stride)
+            self.trials = Trials(self.worlds, settings)
         self._fork = fork and not settings.keep_recoveries
         reason = why_not_fork(renders=base_env.scene.can_render())
         if self._fork and reason:
@@ -132,7 +129,7 @@ class _Attempts:
     takeover: Takeover | None
 
     def make_from_resets(self, decisions: ForkedBranches | Resimulation) -> None:
-        """Attempt after attempt, each from the reset; within them decisions are made otherwise."""
+        """Make attempts, each from the reset; within them decisions are made otherwise."""
         while not self.result.exhausted:
             number = len(self.result.failures)
 
@@ -145,7 +142,7 @@ class _Attempts:
                 return
 
     def make_in_one_motion(self) -> None:
-        """Attempts one after the other in one motion, as far as what failed can be mended."""
+        """Make attempts one after the other in one motion, as long as failures can be repaired."""
         executor, result = self.executor, self.result
         decisions = StraightDecisions(lambda: len(executor.actions))
         recoveries: list[dict[str, Any]] = []
@@ -215,7 +212,7 @@ class _Attempts:
         self.recorder.finish(self._describe(recoveries))
 
     def _describe(self, recoveries: list[dict[str, Any]]) -> dict[str, Any]:
-        """What the record says of the episode, besides ManiSkill's own."""
+        """Return what the record says of the episode, besides ManiSkill's own."""
         executor, settings, tried = self.executor, self.generator.settings, self.generator.trials is not None
         env, taken = executor.base_env, self.takeover
         target = env.target_asset().asset

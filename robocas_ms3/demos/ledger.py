@@ -98,7 +98,7 @@ class Ledger(ledger.Ledger[Failure]):
         super().__init__(path, Failure)
 
     def by_seed(self) -> dict[int, list[Failure]]:
-        """Lines of each seed, in their order; of one that is there twice the first."""
+        """Return the lines of each seed in order, the first of duplicates."""
         found: dict[int, dict[int, Failure]] = {}
         for failure in self.read():
             found.setdefault(failure.seed, {}).setdefault(failure.attempt, failure)
@@ -129,5 +129,5 @@ def failed_attempts(seed: int, said: Iterable[str], noted: Iterable[Failure]) ->
 
 
 def count_by_stage(failures: Iterable[Failure]) -> dict[str, int]:
-    """``{"stage: reason": count}``, most frequent first."""
+    """Return ``{"stage: reason": count}``, most frequent first."""
     return dict(Counter(f"{f.stage}: {f.reason}" for f in failures if not f.gave_up).most_common())

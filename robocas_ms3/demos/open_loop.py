@@ -21,25 +21,6 @@ SETTLE_SECONDS = 1.0  # after the last action, held still: what was let go comes
 
 
 @dataclass(frozen=True)
-class Noise:
-    """Noise of a robot, at every action: normal, each component by itself.
-
-    Attributes:
-        position: standard deviation of the translation, m.
-        rotation: of the Euler angles, rad.
-    """
-
-    position: float = 5e-4
-    rotation: float = float(np.deg2rad(0.2))
-
-    def draw(self, rng: np.random.Generator, count: int) -> Array:
-        """Noise (count, 7) to add to dataset actions; none on the gripper."""
-        drawn = np.zeros((count, 7))
-        drawn[:, :6] = rng.normal(size=(count, 6)) * np.repeat([self.position, self.rotation], 3)
-        return drawn
-
-
-@dataclass(frozen=True)
 class Playback:
     """Result of playing an episode's actions.
 
@@ -99,7 +80,7 @@ class OpenLoop:
         return self.env.layout()
 
     def tcp_in_base(self) -> NDArray[np.float32]:
-        """(3,) m, where the TCP is, in the arm's base frame."""
+        """Return the TCP (3,) in the arm's base frame, m."""
         return self.env.agent.tcp_in_arm_base.p[0].numpy().copy()
 
     def begin_at(self, state: dict[str, Any], gripper: float) -> None:
@@ -139,3 +120,10 @@ class OpenLoop:
     def close(self) -> None:
         """Close the environment."""
         self._env.close()
+
+
+def draw_noise(rng: np.random.Generator, count: int, std_mm: float, std_deg: float) -> Array:
+    """Draw the noise (count, 7) of a robot to add to dataset actions: normal, each component by itself."""
+    drawn = np.zeros((count, 7))
+    drawn[:, :6] = rng.normal(size=(count, 6)) * np.repeat([std_mm / 1000, np.deg2rad(std_deg)], 3)
+    return drawn

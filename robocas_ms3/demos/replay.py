@@ -235,7 +235,7 @@ def _convert_action(action: np.ndarray, env: RoboCASEnv) -> np.ndarray:
 
 
 def state_distance(state: dict[str, Any], recorded: dict[str, Any]) -> float:
-    """Greatest absolute difference of any number of two states; NaN where one has a NaN."""
+    """Return the greatest absolute difference of any number of two states; NaN where one has a NaN."""
     worst = np.float64(0.0)
     for kind in ("actors", "articulations"):
         for name, value in recorded[kind].items():

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import EpisodeLost
 from robocas_ms3.demos.ledger import NOISY
-from robocas_ms3.demos.open_loop import Noise, OpenLoop
-from robocas_ms3.demos.recordings.motion import Motion, sample_states
+from robocas_ms3.demos.open_loop import OpenLoop, draw_noise
+from robocas_ms3.demos.recordings.motion import Motion, sample_states, sample_stride
+from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.demos.takeover import Takeover
 
 # m by which the target may be off the recording at the end of a part. What else lies about may roll elsewhere: where
@@ -25,13 +26,11 @@ States = dict[str, dict[str, NDArray[np.float32]]]
 
 
 class Trials:
-    """Environments that follow a recording: the first one plays the actions as they are, the others with noise.
+    """Environments that follow a recording: the first one plays the actions as they are, the others with noise."""
 
-    ``stride``: control steps of the recording per action.
-    """
-
-    def __init__(self, worlds: Sequence[OpenLoop], noise: Noise, stride: int) -> None:
-        self._worlds, self._noise, self._stride = worlds, noise, stride
+    def __init__(self, worlds: Sequence[OpenLoop], settings: EpisodeSettings) -> None:
+        self._worlds, self._settings = worlds, settings
+        self._stride = sample_stride(settings.control_freq, worlds[0].rate_hz)
         self._robot = worlds[0].env.robot_spec
         self._seed, self._played = 0, 0
 
@@ -75,7 +74,8 @@ class Trials:
     def _with_noise(self, actions: NDArray[np.float64], number: int) -> NDArray[np.float64]:
         # drawn from the first action on, so that an action's noise is the same however often it is played
         rng = np.random.default_rng([self._seed, number])
-        return actions + self._noise.draw(rng, self._played + len(actions))[self._played :]
+        std = self._settings.noise_mm, self._settings.noise_deg
+        return actions + draw_noise(rng, self._played + len(actions), *std)[self._played :]
 
 
 def _what_is_wrong(world: OpenLoop, states: States, sample: int, finished: bool) -> str:

@@ -64,7 +64,7 @@ class ArmChain:
         self.lower, self.upper = self.limits[:, 0] + LIMIT_MARGIN, self.limits[:, 1] - LIMIT_MARGIN
 
     def ending_behind(self, distance: float) -> ArmChain:
-        """The same arm, whose end is a point this far (m) behind the TCP, against the approach."""
+        """Return the same arm with its end a distance (m) behind the TCP, against the approach."""
         chain, back = copy(self), np.eye(4)
         back[2, 3] = -distance
         chain.links = [*self.links[:-1], self.links[-1] @ back]
@@ -106,7 +106,7 @@ class ArmChain:
 
 
 def turn_between(qpos: Array, near: Array) -> Array:
-    """How far apart configurations (..., 7) are: the largest turn, which sets the time, and a little of all others."""
+    """Return how far apart configurations (..., 7) are: the largest turn, which sets the time, and some of all."""
     away = np.abs(qpos - near)
     return away.max(axis=-1) + 0.2 * np.sqrt((away * away).sum(axis=-1))
 

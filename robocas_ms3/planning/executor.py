@@ -122,7 +122,7 @@ class Executor:
             self.segments.append(Segment(goal_type, goal_description, len(self.actions)))
 
     def flag(self, name: str) -> bool:
-        """A bool of the last ``info``."""
+        """Return a bool of the last ``info``."""
         return bool(self.info[name][0])
 
     def _step(self, action: np.ndarray) -> None:

@@ -74,7 +74,7 @@ class Reachability:
         return kept[:MOST]
 
     def _solve(self, poses: Array, near: Array, step: float) -> Array:
-        """Solutions (N, K, 7) of poses (N, 4, 4) over joint 7, ``near``'s turn of it among those tried."""
+        """Return solutions (N, K, 7) of poses (N, 4, 4) over joint 7, which is also tried at its value in ``near``."""
         first, last = np.ceil((self.lower[6] - near[6]) / step), np.floor((self.upper[6] - near[6]) / step)
         turns = np.clip(near[6] + step * np.arange(first, last + 1), self.lower[6], self.upper[6])
         solved = self._geometry.solve(np.repeat(poses, len(turns), axis=0), np.tile(turns, len(poses)))

@@ -22,6 +22,7 @@ from mani_skill.utils.structs.pose import to_sapien_pose
 
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.core.poses import from_wxyz, inverse
+from robocas_ms3.core.strict import check_number
 from robocas_ms3.planning.protocol import Array, Obstacle, Shape, Trajectory
 from robocas_ms3.planning.rrt_connect import DEFAULT, make_planner
 from robocas_ms3.planning.scene import seen_from
@@ -31,6 +32,7 @@ from robocas_ms3.robots.table import RobotSpec
 from robocas_ms3.robots.urdf import RobotFiles
 
 CONTROL_MODES = ("pd_joint_pos", "pd_joint_pos_vel")
+MIN_LIMIT = 1e-3  # rad/s, rad/s^2
 IGNORED = frozenset({"debug", "visualize_target_grasp_pose", "print_env_info"})
 
 Step = tuple[Any, Any, Any, Any, dict[str, Any]]
@@ -97,8 +99,8 @@ class PandaArmMotionPlanningSolver:
                 found=self.control_mode,
                 fix="Make the environment with control_mode='pd_joint_pos'.",
             )
-        _require_positive(joint_vel_limits, "joint_vel_limits", "rad/s")
-        _require_positive(joint_acc_limits, "joint_acc_limits", "rad/s^2")
+        check_number("joint_vel_limits", joint_vel_limits, MIN_LIMIT)
+        check_number("joint_acc_limits", joint_acc_limits, MIN_LIMIT)
         spec = _robot_spec(cast("BaseAgent", self.base_env.agent))
         self.robot = self.base_env.agent.robot
         self.description = replace(
@@ -136,7 +138,7 @@ class PandaArmMotionPlanningSolver:
             PlanningFailed: the pose is out of reach or in collision, or no path was found.
             RobocasError: ``refine_steps`` is negative, or a number of the pose is NaN or infinite.
         """
-        _require_count(refine_steps, "refine_steps", 0)
+        check_number("refine_steps", refine_steps, 0)
         start, goal = self._prepare(pose)
         result = self.planner.plan_to_pose(start, goal, stage="move_to_pose_with_RRTConnect")
         return result if dry_run else self.follow_path(result, refine_steps)
@@ -146,7 +148,7 @@ class PandaArmMotionPlanningSolver:
 
         Arguments and errors as of ``move_to_pose_with_RRTConnect``.
         """
-        _require_count(refine_steps, "refine_steps", 0)
+        check_number("refine_steps", refine_steps, 0)
         start, goal = self._prepare(pose)
         result = self.planner.plan_straight(start, goal, stage="move_to_pose_with_screw")
         return result if dry_run else self.follow_path(result, refine_steps)
@@ -157,8 +159,8 @@ class PandaArmMotionPlanningSolver:
         Raises:
             RobocasError: the trajectory has no row, or ``refine_steps`` is negative.
         """
-        _require_count(len(result.qpos), "rows of the trajectory", 1)
-        _require_count(refine_steps, "refine_steps", 0)
+        check_number("rows of the trajectory", len(result.qpos), 1)
+        check_number("refine_steps", refine_steps, 0)
         qpos = np.concatenate([result.qpos, np.repeat(result.qpos[-1:], refine_steps, axis=0)])
         qvel = np.gradient(np.concatenate([self._arm_qpos[None], qpos]), result.dt, axis=0)[1:]
         qvel[len(result.qpos) - 1 :] = 0
@@ -243,7 +245,7 @@ class PandaArmMotionPlanningSolver:
         return self._arm_qpos, goal
 
     def _move_gripper(self, t: int, gripper_state: float) -> Step:
-        _require_count(t, "t", 1)
+        check_number("t", t, 1)
         self.gripper_state = gripper_state
         return self._run(np.tile(self._arm_qpos, (t, 1)), np.zeros((t, 7)))
 
@@ -273,18 +275,6 @@ def _require_finite(values: Array, where: str, fix: str = "Check how the numbers
     if not finite.all():
         found = f"{np.size(finite) - np.count_nonzero(finite)} of {np.size(finite)} are not finite"
         raise RobocasError("NaN or infinite numbers", where=where, expected="finite numbers", found=found, fix=fix)
-
-
-def _require_count(count: int, where: str, least: int) -> None:
-    if not count >= least:
-        fix = f"Pass {least} or more."
-        raise RobocasError("number too small", where=where, expected=f"at least {least}", found=count, fix=fix)
-
-
-def _require_positive(limit: float, where: str, unit: str) -> None:
-    if not 0 < limit < np.inf:
-        expected, fix = f"a positive number in {unit}", "Leave it out for 0.9."
-        raise RobocasError("invalid limit", where=where, expected=expected, found=limit, fix=fix)
 
 
 def _robot_spec(agent: BaseAgent) -> RobotSpec:

@@ -43,7 +43,6 @@ class _Tree:
         return int(np.argmin(np.einsum("ij,ij->i", difference, difference)))
 
     def branch(self, node: int) -> list[Array]:
-        """Configurations from the root to a node."""
         chain = []
         while node >= 0:
             chain.append(self.qpos[node].copy())
@@ -68,7 +67,7 @@ class PathSearch:
         self._left = 0
 
     def _checked(self, a: Array, b: Array) -> Array:
-        """Configurations (M, n) along the edge from ``a`` (taken as free) to ``b``; they are paid for."""
+        """Return configurations (M, n) along the edge from ``a`` (taken as free) to ``b``, and count them as checks."""
         count = max(1, int(np.ceil(np.linalg.norm(b - a) / self.spacing)))
         if self._left < count:
             raise BudgetSpent
@@ -104,7 +103,7 @@ class PathSearch:
             return None
 
     def _sample(self, start: Array, goals: list[Array], rng: np.random.Generator) -> Array:
-        """Half the samples lie around start and a goal, since most detours are small."""
+        """Sample half of the configurations around start and a goal, since most detours are small."""
         if rng.random() < 0.5:
             return rng.uniform(self._lower, self._upper)
         goal = goals[int(rng.integers(len(goals)))]
@@ -140,7 +139,7 @@ class PathSearch:
         return path
 
     def _drop_waypoints(self, path: list[Array]) -> list[Array]:
-        """From each waypoint go straight to the furthest one that can be seen, by halving."""
+        """Go straight from each waypoint to the furthest one that can be reached, by halving."""
         kept, index = [path[0]], 0
         while index < len(path) - 1:
             reach = len(path) - 1

@@ -120,7 +120,7 @@ class Planner(Protocol):
         ...
 
     def tcp(self, qpos: Array) -> Array:
-        """Forward kinematics: (7,) -> 4x4 TCP in the arm's base frame."""
+        """Return the TCP (4x4) in the arm's base frame at a configuration (7,)."""
         ...
 
     def collisions(self, qpos: Array, finger_width: float | None = None) -> list[str]:

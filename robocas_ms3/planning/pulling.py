@@ -24,7 +24,7 @@ _BLAS = ThreadpoolController()
 
 
 def turned_about_bar(tcp: Array, angle: float) -> Array:
-    """TCP poses (..., 4, 4) turned about their own x axis by an angle, rad."""
+    """Return TCP poses (..., 4, 4) turned about their own x axis by an angle, rad."""
     turn = np.eye(4)
     turn[1:3, 1:3] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
     return tcp @ turn
@@ -58,12 +58,12 @@ def track(chain: ArmChain, starts: Array, goals: Array) -> Array:
 
 
 def reached(path: Array) -> NDArray[np.int_]:
-    """How many poses (N,) of a ``track`` (T, N, 7) were reached."""
+    """Return how many poses (N,) of a ``track`` (T, N, 7) were reached."""
     return np.isfinite(path[:, :, 0]).sum(axis=0)
 
 
 def _solve(chain: ArmChain, starts: Array, goals: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Damped least squares from (M, 7) to (M, 4, 4); gives (M, 7) and (M,) whether it got there."""
+    """Solve (M, 7) for poses (M, 4, 4) by damped least squares; return (M, 7), and whether (M,) they were reached."""
     qpos, lower, upper = starts.copy(), chain.lower, chain.upper
     middle, half = (lower + upper) / 2, (upper - lower) / 2
     solved = np.zeros(len(qpos), dtype=bool)
@@ -93,7 +93,7 @@ def _solve(chain: ArmChain, starts: Array, goals: Array) -> tuple[Array, NDArray
 
 
 def twist(pose: Array, goal: Array) -> Array:
-    """Position differences and rotation vectors (M, 6), in the base frame, that take ``pose`` to ``goal`` (M, 4, 4)."""
+    """Return position differences and rotation vectors (M, 6) from poses to goals (M, 4, 4), in the base frame."""
     turn = np.einsum("mij,mkj->mik", goal[:, :3, :3], pose[:, :3, :3])
     axis = 0.5 * np.stack(
         [turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], axis=1

@@ -108,7 +108,7 @@ _DOWN = Rotation.from_euler("x", np.pi)
 
 
 def push_direction(rng: np.random.Generator, center: Array, target: Array) -> Array:
-    """The paper's v_push: (3,) level unit vector from the target to the obstacle.
+    """Return the paper's v_push: (3,) level unit vector from the target to the obstacle.
 
     Where they are less than 1 cm apart: within 30 deg of towards the robot, which stands at the origin.
     """
@@ -120,7 +120,7 @@ def push_direction(rng: np.random.Generator, center: Array, target: Array) -> Ar
 
 
 def extent_behind(points: Array, center: Array, direction: Array, height: float) -> float | None:
-    """The paper's d_ext: how far an object reaches from its middle against the push, at a height; none: not there.
+    """Return the paper's d_ext: how far an object reaches from its middle against the push at a height, or None.
 
     Only what the tool would meet counts: points within its width of the line, 1 cm above or below the height.
     """

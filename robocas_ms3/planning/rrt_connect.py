@@ -274,7 +274,7 @@ class RRTConnectPlanner:
 
 
 def _dense(points: Array) -> Array:
-    """Configurations (M, 7) on a polyline (m, 7), near enough to each other for checks."""
+    """Return configurations (M, 7) on a polyline (m, 7), dense enough for checks."""
     return np.concatenate([a + (b - a) * _fractions(a, b)[:, None] for a, b in pairwise(points)])
 
 

@@ -28,19 +28,19 @@ _SHAPES: dict[int, tuple[Part, Shape]] = {}  # by the part's id, which stays its
 
 
 def shape_of(part: Part) -> Shape:
-    """The shape of an asset's part, the same object for as long as the process runs."""
+    """Return the shape of an asset's part, always the same object in a process."""
     if id(part) not in _SHAPES:
         _SHAPES[id(part)] = part, Shape(tuple(part.hulls))
     return _SHAPES[id(part)][1]
 
 
 def _size(part: Part) -> float:
-    """How far a part reaches from its frame's origin, m."""
+    """Return how far a part reaches from its frame's origin, m."""
     return max(math.sqrt(np.einsum("ij,ij->i", hull, hull).max()) for hull in part.hulls)
 
 
 def seen_from(obstacles_in_world: Iterable[Obstacle], arm_base_in_world: Array) -> list[Obstacle]:
-    """Bodies whose poses are the world's, in the frame of an arm's base (4x4)."""
+    """Return bodies with world poses in the frame of an arm's base (4x4)."""
     to_base = inverse(arm_base_in_world)
     return [replace(body, pose_in_base=to_base @ body.pose_in_base) for body in obstacles_in_world]
 
@@ -77,7 +77,7 @@ class PlanningScene:
             part.surface_points(spacing)
 
     def joint_positions(self, furniture: str) -> dict[str, float]:
-        """Positions of a piece of furniture's joints by name, m or rad."""
+        """Return the positions of a piece of furniture's joints by name, m or rad."""
         built = self.env.fixtures.furniture[furniture]
         if not isinstance(built, Articulation):
             return {}
@@ -99,7 +99,7 @@ class PlanningScene:
         return self.env.agent.robot.get_qpos()[0, self.env.agent.description.arm_slice].cpu().numpy().astype(float)
 
     def object_in_base(self, slot: int) -> Array:
-        """4x4 of an object in the arm's base frame."""
+        """Return the pose (4x4) of an object in the arm's base frame."""
         return inverse(self.arm_base_in_world) @ from_wxyz(self.env.object_states[0, slot, :7])
 
     @property
@@ -126,7 +126,7 @@ class PlanningScene:
         without: int | Collection[int] = (),
         without_link: tuple[str, str] | None = None,
     ) -> list[Obstacle]:
-        """The same with their poses in the world, for where the base might stand (`seen_from`)."""
+        """Return the bodies of `obstacles` with their poses in the world (`seen_from`)."""
         left_out = {without} if isinstance(without, int) else without
         return [Obstacle(name, shape_of(part), pose) for name, part, _, pose in self._bodies(left_out, without_link)]
 

@@ -118,7 +118,7 @@ def blended(first: Array, second: Array, rows: int) -> Array:
 
 
 def thinned(points: Array, spacing: float) -> Array:
-    """Those of the configurations (T, n) that lie about ``spacing`` rad apart, first and last included."""
+    """Return configurations (T, n) about ``spacing`` rad apart, first and last included."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     kept = np.unique(np.searchsorted(along, np.arange(0, max(along[-1] - spacing / 2, spacing / 2), spacing)))
     return points[[*kept, len(points) - 1]]

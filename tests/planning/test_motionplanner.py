@@ -184,7 +184,6 @@ def test_invalid_arguments_raise_at_the_call(joint_env, method, arguments, where
     assert caught.value.where == where
     assert caught.value.expected
     assert str(caught.value.found)
-    assert caught.value.fix
     assert (solver.gripper_state, steps(joint_env)) == (gripper, before)
 
 

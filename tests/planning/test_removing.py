@@ -133,7 +133,7 @@ def test_moves_begin_with_pushes_of_what_is_highest(generator):
     moves = list(heap.moves())
     assert target not in {move.slot for move in moves}
     assert len(set(moves)) == len(moves)
-    in_the_way = np.flatnonzero(heap.clutter().obstacles[0].numpy()).tolist()
+    in_the_way = np.flatnonzero(heap.env.clutter().obstacles[0].numpy()).tolist()
     if in_the_way:
         assert moves[0] == Move("push", max(in_the_way, key=lambda slot: surface(arm, slot)[:, 2].max()))
 

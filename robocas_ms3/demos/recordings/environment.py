@@ -87,14 +87,14 @@ class RecordedEnv:
     kwargs: dict[str, Any]
 
     def with_pack(self, pack: str | Path | None) -> RecordedEnv:
-        """The same with the objects of another pack, by name or folder, where one is given."""
+        """Return the same with the objects of another pack, by name or folder, where one is given."""
         if pack is None:
             return self
         named = str(pack) if str(pack) in pack_folders() else str(Path(pack).absolute())
         return replace(self, kwargs={**self.kwargs, "pack": named})
 
     def robot(self, where: object = "robot_uids") -> RobotSpec:
-        """The robot that it was."""
+        """Return its robot."""
         try:
             return find_robot(self.kwargs.get("robot_uids"), where=where)
         except ExtensionError as error:
@@ -154,7 +154,7 @@ def read_env(info: Any, where: object, *, pack: str | Path | None = None) -> Rec
 
 
 def recorded_id(env_id: str) -> str:
-    """A registered id as files have it."""
+    """Return a registered id as files have it."""
     return f"{_PREFIX}{env_id}"
 
 
@@ -171,7 +171,7 @@ def _refusal(error: ValidationError, where: object) -> DatasetError:
 
 
 def _check_settings(settings: Any, where: str, deep: int) -> None:
-    """Settings are numbers, words, and few levels of them."""
+    """Check that settings are numbers and names in few levels."""
     if isinstance(settings, dict) and deep:
         for key, value in settings.items():
             _check_settings(value, f"{where}.{key}", deep - 1)

@@ -27,7 +27,7 @@ _JOINTS = RobotDescription.finger_slice.stop
 
 
 def sample_stride(control_freq: float, rate_hz: float) -> int:
-    """Control steps between two dataset steps."""
+    """Return the control steps between two dataset steps."""
     stride = round(control_freq / rate_hz) if rate_hz > 0 else 0
     if stride < 1 or abs(stride * rate_hz - control_freq) > 1e-6 * control_freq:
         rates = [f"{control_freq / k:g}" for k in range(1, 21) if (control_freq / k).is_integer()]
@@ -41,7 +41,7 @@ def sample_stride(control_freq: float, rate_hz: float) -> int:
 
 
 def sample_states(control_steps: int, stride: int) -> NDArray[np.int64]:
-    """Indices of the states to keep, of ``control_steps + 1``: every ``stride``-th and the last."""
+    """Return the indices of ``control_steps + 1`` states to keep: every ``stride``-th and the last."""
     indices = np.arange(0, control_steps + 1, stride)
     return indices if indices[-1] == control_steps else np.append(indices, control_steps)
 
@@ -71,26 +71,22 @@ def gripper_open(
 
 
 def relative_motion(poses: Array) -> Array:
-    """(T, 4, 4) ``inv(pose[t]) pose[t + 1]``; the last one is the identity."""
+    """Return ``inv(pose[t]) pose[t + 1]`` (T, 4, 4); the last one is the identity."""
     return np.concatenate([inverse(poses[:-1]) @ poses[1:], np.eye(4)[None]])
 
 
 def stored_motion(poses: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """``relative_motion`` as datasets hold it: positions (T, 3) m and quaternions (T, 4) xyzw, w >= 0."""
+    """Return ``relative_motion`` as datasets store it: positions (T, 3) m and quaternions (T, 4) xyzw, w >= 0."""
     motion = relative_motion(poses)
     turns = Rotation.from_matrix(motion[:, :3, :3]).as_quat(canonical=True)
     return motion[:, :3, 3].astype(np.float32), turns.astype(np.float32)
 
 
 def stored_actions(positions: NDArray, turns: NDArray, gripper_status: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """RoboCAS' actions (T, 7) of stored motion; row t leads from step t to t + 1, so the last one holds.
+    """Return RoboCAS' actions (T, 7) of `stored_motion`; row t leads from step t to t + 1, so the last one holds.
 
     Motion in m and, about the fixed axes x, y, z (scipy's "xyz"), Euler angles in rad; the gripper's command is
-    ``gripper_status[t + 1]``, 1 = open.
-
-    Args:
-        positions, turns: of ``stored_motion`` of the TCP in the arm's base.
-        gripper_status: (T,) of ``gripper_open``.
+    ``gripper_status[t + 1]`` of `gripper_open`, 1 = open.
     """
     status = np.asarray(gripper_status, dtype=np.float64)
     actions = np.zeros((len(status), 7))
@@ -173,7 +169,7 @@ class Motion:
     def of_joints(
         cls, robot: RobotSpec, root_in_world: Array, qpos: Array, qvel: Array, opened: NDArray[np.bool_]
     ) -> Motion:
-        """Of a robot, and of what the attributes of these names say."""
+        """Compute the motion of a robot from the attributes of these names."""
         return cls(qpos, qvel, root_in_world, *link_poses(robot, root_in_world, qpos), opened)
 
     @cached_property
@@ -208,12 +204,12 @@ class Motion:
 
 
 def gripper_commands(actions: NDArray[np.floating], control_mode: str) -> NDArray[np.floating]:
-    """(S,) of the gripper, in [-1, 1]: behind 6 numbers of the end effector, or 7 joints, in (S, A) actions."""
+    """Return the gripper's commands (S,) of actions (S, A): after 6 numbers of the end effector, or 7 joints."""
     return actions[:, 6 if "_ee_" in control_mode else 7]
 
 
 def split_states(states: NDArray[np.floating]) -> tuple[Array, Array, Array]:
-    """The robot's root in the world (T, 4, 4), qpos (T, 12) and qvel (T, 12) of its states (T, 37), ManiSkill's."""
+    """Return root in the world (T, 4, 4), qpos (T, 12) and qvel (T, 12) of ManiSkill's robot states (T, 37)."""
     states = np.asarray(states, dtype=np.float64)
     return (
         from_wxyz(states[:, :7]),

@@ -41,12 +41,12 @@ class Recording(Entry):
     robot: RobotSpec
 
     def motion(self, samples: NDArray[np.int64]) -> Motion:
-        """What the robot did, at some of the states, in order."""
+        """Return the robot's motion at some of the states, in order."""
         commands = gripper_commands(self.actions, self.control_mode)
         return Motion.of(self.robot, self.states["articulations"][self.robot.description.uid], commands, samples)
 
     def state(self, index: int) -> dict[str, dict[str, NDArray[np.float32]]]:
-        """One state as ``set_state_dict`` takes it, each array (1, D)."""
+        """Return a state as ``set_state_dict`` takes it, each array (1, D)."""
         return {kind: {n: a[index : index + 1] for n, a in arrays.items()} for kind, arrays in self.states.items()}
 
 
@@ -114,7 +114,7 @@ class TrajectoryFile:
         self._file.close()
 
     def reopened(self) -> TrajectoryFile:
-        """The same file, open again, by the JSON as it was read."""
+        """Return the same file, opened again, with its JSON as it was read."""
         file = copy(self)
         file._file = open_trajectory(self.path)
         return file

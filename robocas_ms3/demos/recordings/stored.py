@@ -110,7 +110,7 @@ def copy_episode(source: h5py.File, number: int, target: h5py.File, new_number: 
 
 
 def read_actions(episode: h5py.Group) -> NDArray[np.float32]:
-    """Actions (S, A) of an episode."""
+    """Return the actions (S, A) of an episode."""
     where = _where(episode)
     with readable(where):
         actions = np.asarray(_read(_found(episode["actions"], 0)), np.float32)
@@ -175,7 +175,7 @@ def _check_orientations(rows: NDArray[Any], name: str, where: str) -> None:
 
 
 def _found(node: Any, deep: int) -> Any:
-    """Nested groups as dicts of their arrays, which are yet to be read."""
+    """Return nested groups as dicts of their arrays, not read yet."""
     if isinstance(node, h5py.Dataset):
         _check_own(node)
         return node

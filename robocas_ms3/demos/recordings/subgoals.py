@@ -103,7 +103,7 @@ def sample_subgoals(subgoals: Sequence[SubGoal], samples: NDArray[np.int64]) -> 
 
 
 def subgoal_runs(types: Sequence[str], texts: Sequence[str]) -> list[SubGoal]:
-    """Sub-goals of steps that follow each other."""
+    """Return sub-goals of steps that follow each other."""
     goals: list[SubGoal] = []
     for (kind, text), steps in groupby(range(len(types)), key=lambda step: (types[step], texts[step])):
         inside = list(steps)

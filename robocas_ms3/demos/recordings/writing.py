@@ -139,14 +139,14 @@ class _Steps:
 
 
 def _of_one_env(data: Any) -> Any:
-    """Nested tensors (1, ...) as arrays (...) of their own."""
+    """Return nested tensors (1, ...) as arrays (...) of their own."""
     if isinstance(data, dict):
         return {key: _of_one_env(value) for key, value in data.items()}
     return common.to_numpy(data)[0].copy()
 
 
 def _stacked(steps: list[Any]) -> Any:
-    """Equal nested dicts of arrays as one, with the steps as the first axis."""
+    """Stack equal nested dicts of arrays along a new first axis."""
     if isinstance(steps[0], dict):
         return {key: _stacked([step[key] for step in steps]) for key in steps[0]}
     return np.stack(steps)

@@ -16,7 +16,7 @@ from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.planning.skills.looking import hidden_share
 from robocas_ms3.planning.skills.pushing import push_away, surface_in_base
 from robocas_ms3.planning.skills.removing import blockers, clear_grasps, remove
-from robocas_ms3.tasks.occlusion import MAX_HIDDEN_SHARE, Clutter
+from robocas_ms3.tasks.occlusion import MAX_HIDDEN_SHARE
 from robocas_ms3.tasks.search import RoboCASSearchEnv
 from robocas_ms3.tasks.terms import FALLEN
 
@@ -60,10 +60,6 @@ class Heap:
         """Since the reset."""
         return sum(self.arm.executor.facts[fact] for fact in FACTS)
 
-    def clutter(self) -> Clutter:
-        """What hides and surrounds the target."""
-        return self.env.clutter()
-
     @property
     def visible(self) -> bool:
         """Whether the gripper's camera sees most of the target."""
@@ -73,7 +69,7 @@ class Heap:
     @property
     def uncovered(self) -> bool:
         """Whether the target is free, by the paper's rule, as the camera above sees it."""
-        return bool(self.clutter().cleared[0])
+        return bool(self.env.clutter().cleared[0])
 
     @property
     def cleared(self) -> bool:
@@ -94,15 +90,15 @@ class Heap:
             yield from (Move("push", self.target, turn) for turn in (0.0, 90.0, -90.0, 180.0))
 
     def _in_the_way(self) -> list[int]:
-        """Slots of what hides or surrounds the target, the highest first, then of what blocks its grasps."""
-        obstacles = np.flatnonzero(self.clutter().obstacles[0].cpu().numpy()).tolist()
+        """Return slots of what hides or surrounds the target, the highest first, then of what blocks its grasps."""
+        obstacles = np.flatnonzero(self.env.clutter().obstacles[0].cpu().numpy()).tolist()
         obstacles.sort(key=lambda slot: -self._points(slot)[:, 2].max())
         order = dict.fromkeys(obstacles[:LOOKED_AT])
         order |= dict.fromkeys(slot for slot in blockers(self.arm, self.target)[:LOOKED_AT] if slot not in order)
         return [slot for slot in order if slot != self.target][:LOOKED_AT]
 
     def make(self, move: Move) -> float:
-        """Make a move; gives what it was worth, in seconds."""
+        """Make a move; return its value in seconds."""
         arm, facts = self.arm, self.arm.executor.facts
         before, target, begun = self.middle(move.slot), self.middle(self.target), len(arm.executor.actions)
         arm.rise_clear()
@@ -122,9 +118,9 @@ class Heap:
         )
 
     def work_left(self) -> float:
-        """What is still in the way, in seconds it may take."""
+        """Return the time that the remaining obstacles may take, s."""
         with self.arm.planning():
-            clutter = self.clutter()
+            clutter = self.env.clutter()
             hidden, obstacles = float(clutter.hidden_share[0]), int(clutter.obstacles[0].sum())
             work = PER_OBSTACLE * max(0, obstacles - 1) + PER_HIDDEN_SHARE * max(0.0, hidden - MAX_HIDDEN_SHARE)
             return work + NO_GRASP * (not clear_grasps(self.arm, self.target))
@@ -141,7 +137,7 @@ class Heap:
             raise PlanningFailed("clear", "at_the_edge")
 
     def middle(self, slot: int) -> Array:
-        """(3,) middle of an object's surface, in the arm's base frame, m."""
+        """Return the middle (3,) of an object's surface."""
         return self._points(slot).mean(axis=0)
 
     def _points(self, slot: int) -> Array:

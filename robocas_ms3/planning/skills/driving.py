@@ -46,19 +46,19 @@ class Surroundings:
 
 
 def surroundings(arm: Arm, *, without: int | tuple[()] = ()) -> Surroundings:
-    """Everything that is there, but for an object."""
+    """Return everything around the robot, without one object."""
     cloud = arm.scene.obstacles_in_base(without=without, radius=np.inf)[::THINNED]
     obstacles = arm.scene.obstacles_in_world(without=without)
     return Surroundings(obstacles, transform(arm.scene.arm_base_in_world, cloud))
 
 
 def base_at(arm: Arm) -> Array:
-    """(3,) where the base was last told to be."""
+    """Return the last commanded base pose (3,)."""
     return np.array(arm.executor.base, dtype=float)
 
 
 def arm_base_in_world(arm: Arm, base: Array) -> Array:
-    """4x4 of the arm's base with the base joints at a pose."""
+    """Return the arm's base (4x4) with the base joints at a pose."""
     root = from_wxyz(arm.env.agent.robot.pose.raw_pose[0])
     return root @ planar(float(base[0]), float(base[1]), arm.robot.arm_base_height, float(base[2]))
 
@@ -77,7 +77,7 @@ def drive(arm: Arm, *goals: Array) -> None:
 
 
 def places_before(arm: Arm, center: Array) -> Array:
-    """Base poses (N, 3) in front of a point (3,) in the world, the most promising first."""
+    """Return base poses (N, 3) in front of a point (3,) in the world, the most promising first."""
     low, high = np.array(arm.robot.base_limits).T + np.array([[LIMIT_MARGIN], [-LIMIT_MARGIN]])
     high[2], low[2] = MAX_YAW, -MAX_YAW
     goals = arm.rng.uniform(low, high, (SAMPLES, 3))

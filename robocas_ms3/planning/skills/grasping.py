@@ -149,7 +149,7 @@ def candidates(arm: Arm, slot: int, approach: Approach = "top", other_than: int 
 
 
 def _of_other_kinds(tcp: Array, count: int) -> list[int]:
-    """Indices of those of the grasps (N, 4, 4) that are none of the first few kinds, in their order."""
+    """Return indices of the grasps (N, 4, 4) without the first few kinds; a kind is all ``ALIKE`` its first."""
     left = np.ones(len(tcp), dtype=bool)
     for _ in range(count):
         if not left.any():
@@ -162,7 +162,7 @@ def _of_other_kinds(tcp: Array, count: int) -> list[int]:
 
 
 def _clear(tcp_in_base: Array, order: NDArray[np.int_], points_in_base: Array) -> Iterator[int]:
-    """Those of the grasps, in their order, whose gripper meets no point on its way in; a few are tested at a time."""
+    """Yield the grasps, in their order, whose gripper meets no point on its way in; a few are tested at a time."""
     for first in range(0, len(order), CLEARED_AT_ONCE):
         some = order[first : first + CLEARED_AT_ONCE]
         yield from some[gripper_is_clear(tcp_in_base[some], points_in_base)].tolist()
@@ -204,7 +204,7 @@ def _plan_withdrawal(arm: Arm, slot: int, start: Array, tcp_in_base: Array) -> t
 
 
 def _ways_up(tcp_in_base: Array, lift_height: float) -> list[Array]:
-    """Where to lift to: straight up, or between that and back the way the gripper came in."""
+    """Return where to lift to: straight up, or between that and back the way the gripper came in."""
     up, back = np.array([0, 0, 1.0]), -tcp_in_base[:3, 2]
     goals = []
     for share in (0.0, 0.5, 1.0):

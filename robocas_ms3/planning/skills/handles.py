@@ -57,7 +57,7 @@ class Part:
 
     @classmethod
     def of(cls, arm: Arm) -> Part:
-        """The part that the task wants opened."""
+        """Return the part that the task wants opened."""
         model = arm.env.model
         opening, joint = model.config.opening, model.opened_joint
         assert opening is not None  # the task has one
@@ -70,11 +70,11 @@ class Part:
         return max(self.joint.limits, key=abs)
 
     def position(self, arm: Arm) -> float:
-        """Where the joint stands, m or rad."""
+        """Return the position of the joint, m or rad."""
         return arm.scene.joint_positions(self.furniture)[self.joint.name]
 
     def way(self, arm: Arm) -> Array:
-        """Joint positions (T,) of a pull, from where the joint stands to where a pull ends at most."""
+        """Return joint positions (T,) of a pull, from the present one to the greatest at which a pull ends."""
         start, far = self.position(arm), OPENED_AT_MOST[self.joint.kind] * self.end
         left = (far - start) * np.sign(far)
         if left < STEP[self.joint.kind]:
@@ -82,26 +82,26 @@ class Part:
         return np.linspace(start, far, int(np.ceil(left / STEP[self.joint.kind])) + 1, dtype=np.float64)
 
     def least(self, arm: Arm) -> float:
-        """How far a pull has to lead to be worth it, m or rad."""
+        """Return the least useful length of a pull, m or rad."""
         way = self.way(arm)
         return min(LEAST_SHARE * abs(self.end), abs(way[-1] - way[0]))
 
     def in_world(self, arm: Arm, positions: Array) -> Array:
-        """4x4 poses (T, 4, 4) of the part's frame in the world, at joint positions (T,)."""
+        """Return poses (T, 4, 4) of the part's frame in the world, at joint positions (T,)."""
         frame = arm.env.model.furniture_poses[self.furniture]
         return np.array([frame @ joint_motion(self.joint, float(q)) for q in positions])
 
     def in_base(self, arm: Arm, positions: Array) -> Array:
-        """The same in the arm's base frame."""
+        """Return the same poses in the arm's base frame."""
         return inverse(arm.scene.arm_base_in_world) @ self.in_world(arm, positions)
 
     def obstacle(self, arm: Arm, pose_in_base: Array) -> Obstacle:
-        """The part as a body at a pose (4x4)."""
+        """Return the part as a body at a pose (4x4)."""
         part = arm.env.model.furniture[self.furniture].links[self.handle.link]
         return Obstacle(self.handle.link, shape_of(part), pose_in_base)
 
     def surface(self, arm: Arm) -> Array:
-        """Samples (P, 3) of the part's surface in its own frame, m."""
+        """Return samples (P, 3) of the part's surface in its own frame, m."""
         return arm.env.model.furniture[self.furniture].links[self.handle.link].surface_points(SPACING)
 
     @property
@@ -233,7 +233,11 @@ def pull_share(arm: Arm, part: Part, arm_base_in_world: Array, others: list[Obst
 
 
 def _paths(arm: Arm, part: Part, frames: Array, deeper: float = 0.0) -> tuple[Array, NDArray[np.int_], Array]:
-    """Many ways to hold the handle and go with it."""
+    """Return ways to hold the handle and follow it.
+
+    Returns:
+        Configurations (T, N, 7); how many of the part's T poses (N,) each reaches; rad (N,) turned about the bar.
+    """
     goals, starts, beyond = [], [], np.eye(4)
     beyond[2, 3] = deeper
     for shift in SHIFTS:
@@ -261,7 +265,7 @@ def _fitting(
     others: list[Obstacle],
     deeper: float = 0.0,
 ) -> list[int]:
-    """Those of the ways to hold the handle in which it is between the open fingers, which touch nothing."""
+    """Return the ways in the order that have the handle between the open fingers and touch nothing."""
     surface = transform(frames[0], part.surface(arm))
     near = surface[np.linalg.norm(surface - (frames[0] @ part.hold)[:3, 3], axis=1) < NEAR]
     arm.planner.set_scene([*others, part.obstacle(arm, frames[0])])
@@ -278,7 +282,7 @@ def _fitting(
 
 
 def _free_length(arm: Arm, part: Part, path: Array, frames: Array, others: list[Obstacle]) -> int:
-    """How many configurations of a path (T, 7) keep clear of everything else and of the part at its poses (T, 4, 4)."""
+    """Return how many configurations of a path (T, 7) are clear of all else, and of the part at its poses (T, 4, 4)."""
     planner, width = arm.planner, part.handle.width
     planner.set_scene(others)
     blocked = np.flatnonzero(~planner.free(path[::3], width))
@@ -300,7 +304,7 @@ def _plan_retreat(arm: Arm, start: Array) -> Trajectory:
 
 
 def _retreatable(arm: Arm, path: Array, least: int) -> int:
-    """How much of a pull (T, 7) to do so that the gripper can step back at its end; at least the first few."""
+    """Return the length of a pull (T, 7) after which the gripper can step back, at least ``least``."""
     for length in range(len(path), max(least, 1) - 1, -3):
         try:
             _plan_retreat(arm, path[length - 1])
@@ -323,5 +327,4 @@ def _timed(path: Array, robot: RobotDescription, dt: float) -> Trajectory:
 
 
 def _reversed(motion: Trajectory, start: Array) -> Trajectory:
-    """A motion that began at ``start``, run backwards."""
     return Trajectory(np.concatenate([motion.qpos[-2::-1], start[None]]), motion.dt)

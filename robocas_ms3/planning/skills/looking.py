@@ -55,7 +55,7 @@ def prepare_looks(arm: Arm) -> None:
 
 
 def hidden_share(arm: Arm, slot: int) -> float:
-    """Share of an object that other objects hide from the gripper's camera, as it stands; 1 where it is out of view.
+    """Return the share of an object that other objects hide from the gripper's camera; 1 where it is out of view.
 
     By ray casting, so that no renderer is needed; the robot is left out.
     """
@@ -72,7 +72,7 @@ def hidden_share(arm: Arm, slot: int) -> float:
 
 
 def camera_in_base(arm: Arm) -> Array:
-    """4x4 of the gripper's camera in the arm's base frame, where the episode has it: x forward, y left, z up."""
+    """Return the gripper's camera (4x4) in the arm's base frame, with its random shift: x forward, y left, z up."""
     config = _camera_config(arm)
     link = arm.env.agent.robot.links_map[str(config.entity_uid)]
     camera_in_link = from_wxyz(config.pose.raw_pose[0]) @ _shift(arm)
@@ -80,7 +80,7 @@ def camera_in_base(arm: Arm) -> Array:
 
 
 def _shift(arm: Arm) -> Array:
-    """4x4 by which the configuration's randomisation has moved the camera, rendered or not, in its own frame."""
+    """Return the random shift (4x4) of the camera in its own frame."""
     by = arm.env.task_config.randomisation.cameras
     if by is None:
         return np.eye(4)

@@ -123,7 +123,7 @@ def _plan_to_one_of(arm: Arm, drops: Array, qpos: Array) -> Trajectory:
 
 
 def held_object(arm: Arm, slot: int) -> tuple[Array, Array]:
-    """4x4 of an object in the frame of the TCP that holds it, and the vertices (V, 3) of its hulls in its own, m."""
+    """Return an object's pose (4x4) in the frame of the TCP that holds it, and the vertices (V, 3) of its hulls, m."""
     vertices = np.concatenate(arm.env.object_assets[0][slot].hulls)
     return inverse(arm.scene.tcp_in_base) @ arm.scene.object_in_base(slot), vertices
 
@@ -158,7 +158,6 @@ def _inside_basket(arm: Arm, arm_base_in_world: Array) -> Inside:
 
 
 def _ways_off(tcp_in_base: Array) -> list[Array]:
-    """Where to step back to above the basket: up, back, or between."""
     back, up = moved_back(tcp_in_base, RETREAT_HEIGHT), RETREAT_HEIGHT
     return [raised(tcp_in_base, up), back, raised(back, up / 2), raised(tcp_in_base, up / 2)]
 

@@ -72,19 +72,18 @@ def _plan_lift(arm: Arm, direction: Array) -> Trajectory:
 
 
 def _lifted(tcp_in_base: Array, direction: Array) -> Array:
-    """The TCP above and a little behind where a push ends."""
+    """Return the TCP above and a little behind the end of a push."""
     back = raised(tcp_in_base, LIFT)
     back[:3, 3] -= STAND_OFF * direction
     return back
 
 
 def _fixed(arm: Arm) -> Array:
-    """Surfaces (P, 3) of furniture and basket in the arm's base frame, m."""
+    """Return surfaces (P, 3) of furniture and basket."""
     return arm.scene.obstacles_in_base(without=range(len(arm.env.objects)))
 
 
 def _fixed_bodies(arm: Arm) -> list[Obstacle]:
-    """The same as bodies."""
     return arm.scene.obstacles(without=range(len(arm.env.objects)))
 
 
@@ -107,7 +106,7 @@ def plan_push(arm: Arm, slot: int, target: int, turn_deg: float = 0.0) -> PushPl
 
 
 def _begun(arm: Arm, slot: int, target: int, turn_deg: float) -> list[tuple[Push, Array, Trajectory]]:
-    """Pushes whose way down to the object is clear of everything: with a configuration (7,) above, and that way."""
+    """Return pushes with a free way down to the object: with a configuration (7,) above, and that way."""
     arm.planner.set_scene(arm.scene.obstacles())
     failure, begun = PlanningFailed("push", "no_room"), []
     for push, qpos in reachable_pushes(arm, slot, target, arm.scene.obstacles_in_base(without=slot), turn_deg):
@@ -170,7 +169,7 @@ def reachable_pushes(
 
 
 def surface_in_base(arm: Arm) -> tuple[Array, Array]:
-    """The whole surface that objects are on: 4x4 of its middle in the arm's base frame, and its half size (2,) m."""
+    """Return the middle (4x4) of the surface that objects are on, and its half size (2,) m."""
     model = arm.env.model
     config = model.config.surface
     surface = model.furniture[config.furniture].asset.surfaces[config.name]

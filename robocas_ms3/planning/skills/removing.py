@@ -57,7 +57,7 @@ def hang_clear(arm: Arm, slot: int) -> None:
 
 
 def lift_height(arm: Arm, slot: int) -> float:
-    """How far to lift an object so that it hangs above all that stands around it, m."""
+    """Return how far to lift an object so that it hangs above everything around it, m."""
     points = transform(arm.scene.object_in_base(slot), np.concatenate(arm.env.object_assets[0][slot].hulls))
     middle = points.mean(axis=0)
     radius = float(np.linalg.norm((points - middle)[:, :2], axis=1).max())
@@ -67,14 +67,14 @@ def lift_height(arm: Arm, slot: int) -> float:
 
 
 def clear_grasps(arm: Arm, slot: int) -> int:
-    """How many of an object's grasps from above, of some of them, nothing is in the way of."""
+    """Return how many of an object's (sampled) grasps from above are clear."""
     grasps = _grasps_from_above(arm, slot)
     near = arm.scene.obstacles_in_base(without=slot)
     return int(gripper_is_clear(grasps, near).sum())
 
 
 def blockers(arm: Arm, slot: int) -> list[int]:
-    """Objects in the way of an object's grasps from above, those first that alone block most of them."""
+    """Return slots of what blocks an object's grasps from above, those first that alone block most of them."""
     grasps, in_the_way = _grasps_from_above(arm, slot), {}
     for other, used in enumerate(arm.env.present[0].tolist()):
         if used and other != slot:
@@ -86,7 +86,7 @@ def blockers(arm: Arm, slot: int) -> list[int]:
 
 
 def _grasps_from_above(arm: Arm, slot: int) -> Array:
-    """Some of an object's grasps (G, 4, 4) that come from above, in the arm's base frame."""
+    """Return some of an object's grasps (G, 4, 4) that come from above."""
     notes, frame = arm.env.object_assets[0][slot].annotations, arm.scene.object_in_base(slot)
     grasps = frame @ notes.grasps_tcp_in_object
     passed = np.logical_and.reduce(list(directions_ok(grasps, frame[:3, 3]).values()))
@@ -193,7 +193,7 @@ def free_places(vertices: Array, others: Array, frame: Array, half: Array, margi
 
 
 def _rim(outline: Array) -> Array:
-    """Points (n, 2) along the convex hull of an outline (V, 2), and its middle."""
+    """Return points (n, 2) along the convex hull of an outline (V, 2), and its middle."""
     corners = outline[ConvexHull(outline).vertices]
     points = [np.zeros((1, 2))]
     for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
@@ -204,6 +204,5 @@ def _rim(outline: Array) -> Array:
 
 
 def _ways_off(tcp_in_base: Array) -> list[Array]:
-    """Where to step back to from what stands there now: up, back, or between."""
     back = moved_back(tcp_in_base, RETREAT)
     return [raised(tcp_in_base, RETREAT), raised(back, RETREAT / 2), back, raised(tcp_in_base, RETREAT / 2)]

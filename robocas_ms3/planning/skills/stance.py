@@ -157,7 +157,7 @@ def drive_to_basket(arm: Arm, slot: int) -> None:
 
 
 def _fold(arm: Arm) -> Surroundings:
-    """Go to the rest configuration; gives what is there."""
+    """Move to the rest configuration; return the surroundings."""
     with arm.planning():
         arm.planner.set_scene(arm.scene.obstacles())
         home = arm.plan_home(arm.at)
@@ -167,7 +167,7 @@ def _fold(arm: Arm) -> Surroundings:
 
 
 def clear_grasps(arm: Arm, slot: int) -> Array:
-    """An object's grasps (G, 4, 4) in the world, whichever side they come from, whose way in is clear."""
+    """Return an object's grasps (G, 4, 4) in the world with a clear way in, from any side."""
     base, object_in_base = arm.scene.arm_base_in_world, arm.scene.object_in_base(slot)
     object_in_world = base @ object_in_base
     notes = arm.env.object_assets[0][slot].annotations
@@ -203,7 +203,7 @@ def reach_share(arm: Arm, base: Array, grasps: Array, others: list[Obstacle], *,
 
 
 def _poses_of_some(arm: Arm, frame: Array, grasps: Array, count: int) -> Array:
-    """Poses (4K, 4, 4), seen from an arm's base: K <= count of the grasps and their twins, then their pre-grasps."""
+    """Return poses (4K, 4, 4) in an arm's base frame: K <= count grasps and their twins, then their pre-grasps."""
     chosen = _from_here(arm, frame, grasps)
     chosen = chosen[np.linspace(0, len(chosen) - 1, min(count, len(chosen))).round().astype(int)]
     poses = inverse(frame) @ np.concatenate([chosen, chosen @ HALF_TURN])
@@ -211,6 +211,6 @@ def _poses_of_some(arm: Arm, frame: Array, grasps: Array, count: int) -> Array:
 
 
 def _from_here(arm: Arm, frame: Array, grasps: Array) -> Array:
-    """Those of the grasps (G, 4, 4) that come from where the arm's base (4x4, world) stands."""
+    """Return the grasps (G, 4, 4) that come from the side of the arm's base (4x4, world)."""
     center = grasps[:, :3, 3].mean(axis=0) if len(grasps) else np.zeros(3)
     return grasps[directions_ok(grasps, center - frame[:3, 3], arm.env.task_config.target.approach)[SIDE]]

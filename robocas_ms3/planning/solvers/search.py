@@ -62,7 +62,7 @@ def attempt(arm: Arm) -> None:
 
 
 def tries(moves_made: int) -> int:
-    """How many moves are gone on from: fewer the more were made, as what made one fail tends to lie farther back."""
+    """Return how many moves to continue from: fewer after more moves, whose failures tend to lie further back."""
     return max(1, 3 - moves_made // 2)
 
 
