@@ -123,11 +123,7 @@ class MobileManipulator(BaseAgent):
             self.robot.set_joint_drive_targets(targets, joints)
 
     def set_action(self, action: Any) -> None:
-        """Hand an action (N, action size) to the controllers.
-
-        Raises:
-            ValueError: on a CPU, a number of it is NaN.
-        """
+        """Hand an action (N, action size) to the controllers."""
         if not self.scene.gpu_sim_enabled and torch.isnan(action).any():
             raise ValueError("Action cannot be NaN. Environment received:", action)
         self.controller.set_action(action)

@@ -57,9 +57,5 @@ def chain(urdf: Path, root: str, tip: str, positions: Array) -> Array:
 
 @lru_cache(maxsize=8)
 def read_joints(urdf: Path, root: str, tip: str) -> tuple[Joint, ...]:
-    """Read the joints from one link of a URDF down to another, fixed ones included, in this order.
-
-    Raises:
-        RobotDescriptionError: the file is missing or malformed, or no joints lead from one link to the other.
-    """
+    """Read the joints from one link of a URDF down to another, fixed ones included, in this order."""
     return tuple(DescriptionFile(urdf).joints_between(root, tip))

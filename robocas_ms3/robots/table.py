@@ -40,11 +40,7 @@ ROBOTS = Registry(
 
 
 def find_robot(name: str | None, *, where: object = "robot") -> RobotSpec:
-    """The robot of a name; None: the default one.
-
-    Raises:
-        ExtensionError: there is none, its package is broken, or its row has not the name of its ``uid``.
-    """
+    """The robot of a name; None: the default one."""
     spec = ROBOTS.find(name or DEFAULT, where=where)
     if spec.description.uid != (name or DEFAULT):
         fix = "Name its entry point as its description's uid."

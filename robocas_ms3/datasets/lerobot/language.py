@@ -26,7 +26,7 @@ from robocas_ms3.core.errors import DatasetError, RobocasError
 from robocas_ms3.core.strict import validate_json
 from robocas_ms3.datasets.checks.scene import sound
 from robocas_ms3.datasets.lerobot import schema
-from robocas_ms3.datasets.pictures.boxes import Box
+from robocas_ms3.datasets.pictures.stored import Box
 from robocas_ms3.demos.recordings.subgoals import SubGoal
 from robocas_ms3.scenes.language.instructions import InstructionSlots, instruction, is_plural, part_name, template_ids
 

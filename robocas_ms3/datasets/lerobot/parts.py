@@ -37,7 +37,7 @@ from robocas_ms3.datasets.lerobot.stats import Levels
 from robocas_ms3.datasets.lerobot.tables import as_column, numbers
 from robocas_ms3.datasets.lerobot.variants import Variant
 from robocas_ms3.datasets.lerobot.video import Encoder, coding_of
-from robocas_ms3.datasets.pictures.boxes import Box
+from robocas_ms3.datasets.pictures.stored import Box
 from robocas_ms3.datasets.schema import episode_folder
 from robocas_ms3.datasets.sources.protocol import Frame, Kind
 from robocas_ms3.datasets.writing.inputs import ConversionInput, complete_arrays

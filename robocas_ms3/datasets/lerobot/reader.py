@@ -34,7 +34,7 @@ from robocas_ms3.datasets.lerobot.tables import (
     read_rows,
 )
 from robocas_ms3.datasets.lerobot.video import read_frames
-from robocas_ms3.datasets.pictures.boxes import Box
+from robocas_ms3.datasets.pictures.stored import Box
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 from robocas_ms3.datasets.sources.protocol import EpisodeSource, Kind, Side, SourceEpisode
 from robocas_ms3.datasets.sources.reader import check_rate

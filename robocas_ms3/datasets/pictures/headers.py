@@ -37,23 +37,13 @@ class PictureHeader:
 
 
 def read_header(path: Path) -> PictureHeader:
-    """Read a picture's header.
-
-    Raises:
-        ValueError: the file is of another format than its suffix says, cut off, damaged, or see `read_picture_bytes`.
-        OSError: the file cannot be read.
-    """
+    """Read a picture's header."""
     data = read_picture_bytes(path)
     return _read_png(data) if path.suffix == ".png" else _decode(data, _FORMATS[path.suffix])
 
 
 def has_both_ends(path: Path) -> bool:
-    """Return whether a picture begins and ends as its format does, which one that was cut off does not.
-
-    Raises:
-        DocumentError: not a regular file.
-        OSError: the file cannot be read.
-    """
+    """Return whether a picture begins and ends as its format does, which one that was cut off does not."""
     check_regular(path)
     with path.open("rb", buffering=0) as file:
         head, size = file.read(_END), os.fstat(file.fileno()).st_size
@@ -67,12 +57,7 @@ def has_both_ends(path: Path) -> bool:
 
 
 def read_picture_bytes(path: Path) -> bytes:
-    """Read a file that a decoder can be given: its picture has at most `LARGEST` pixels per side.
-
-    Raises:
-        DocumentError: the file is not regular, too large, or of another format than its suffix says.
-        OSError: the file cannot be read.
-    """
+    """Read a file that a decoder can be given: its picture has at most `LARGEST` pixels per side."""
     data, wanted = read_bytes(path, BYTES_LIMIT), _FORMATS[path.suffix]
     try:
         with Image.open(BytesIO(data), formats=[wanted]) as picture:

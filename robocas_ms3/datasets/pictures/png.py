@@ -18,11 +18,7 @@ _LEVEL = 1  # of 1 to 12; 2 takes 60 % longer for 4 % less
 
 
 def encode_png(picture: NDArray) -> bytes:
-    """Encode (H, W, 3) uint8 RGB or (H, W) uint16.
-
-    Raises:
-        ValueError: a picture of another kind, or none.
-    """
+    """Encode (H, W, 3) uint8 RGB or (H, W) uint16."""
     if not picture.size or (picture.dtype, picture.shape[2:]) not in ((np.uint8, (3,)), (np.uint16, ())):
         raise ValueError(f"{picture.dtype} {picture.shape}")
     height, width = picture.shape[:2]

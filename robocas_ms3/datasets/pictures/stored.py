@@ -1,4 +1,4 @@
-"""Which pictures a dataset holds, and how they are encoded."""
+"""Which images a dataset holds, and how they are encoded; boxes of objects in them."""
 
 from __future__ import annotations
 
@@ -23,6 +23,9 @@ _QUALITY = {
     "webp": [cv2.IMWRITE_WEBP_QUALITY, 90],
 }
 
+Box = tuple[int, int, int, int]
+"""x_min, y_min, x_max, y_max: first and last column and row of the pixels, from 0 at the top left."""
+
 
 @dataclass(frozen=True)
 class Pictures:
@@ -43,11 +46,7 @@ class Pictures:
     boxes: bool = False
 
     def __post_init__(self) -> None:
-        """Put cameras in order, and check them.
-
-        Raises:
-            DatasetError: a name that no camera can have; no such format; a size below 16 pixels.
-        """
+        """Put cameras in order, and check them."""
         wrong = [name for name in self.cameras if not re.fullmatch(CAMERA_NAME, name)]
         if wrong:
             raise DatasetError("no such camera", where="cameras", expected="names like side_camera", found=wrong)
@@ -94,11 +93,7 @@ class Pictures:
 
 
 def write_picture(path: Path, picture: NDArray) -> float:
-    """Encode (H, W, 3) RGB or (H, W) depth by the file's suffix; gives the seconds that took.
-
-    Raises:
-        DatasetError: it can't be encoded or written.
-    """
+    """Encode (H, W, 3) RGB or (H, W) depth by the file's suffix; gives the seconds that took."""
     begun = time.perf_counter()
     try:
         data = encode_png(picture) if path.suffix == ".png" else _encode(picture, path.suffix)
@@ -116,11 +111,7 @@ def _encode(picture: NDArray[np.uint8], suffix: str) -> bytes:
 
 
 def read_picture(path: Path) -> NDArray:
-    """Decode a picture: (H, W, 3) RGB uint8 or (H, W) uint16.
-
-    Raises:
-        DatasetError: it is missing, damaged, too large, or not a regular file.
-    """
+    """Decode a picture: (H, W, 3) RGB uint8 or (H, W) uint16."""
     try:
         data = np.frombuffer(read_picture_bytes(path), np.uint8)
     except (OSError, ValueError) as error:
@@ -131,3 +122,11 @@ def read_picture(path: Path) -> NDArray:
     if picture is None:
         raise DatasetError("this picture is damaged", where=path, fix="robocas validate lists all that is wrong.")
     return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB) if picture.ndim == 3 else picture
+
+
+def box_of(mask: NDArray[np.bool_]) -> Box | None:
+    """Return the box around the pixels of a mask (H, W), or None where there are none."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if not len(rows):
+        return None
+    return int(columns[0]), int(rows[0]), int(columns[-1]), int(rows[-1])

@@ -45,11 +45,7 @@ def said_of(info: Mapping[str, Any], number: int | None) -> dict[str, Any]:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """A JSON object; empty where there is no such file.
-
-    Raises:
-        DatasetError: it is damaged, or no object.
-    """
+    """A JSON object; empty where there is no such file."""
     try:
         content = load_json(path)
     except FileNotFoundError:
@@ -62,11 +58,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_array(path: Path) -> NDArray[np.float64]:
-    """Read an array of numbers that describes a camera.
-
-    Raises:
-        DatasetError: the file is missing or damaged, or holds something else.
-    """
+    """Read an array of numbers that describes a camera."""
     try:
         array = load_array(path, CAMERA_LIMIT)
         if array.dtype.kind not in "fiu":

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.actions import action_space
-from robocas_ms3.datasets.pictures.boxes import Box
-from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.pictures.stored import Box, Pictures
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.demos.recordings.entries import one_seed
 from robocas_ms3.demos.recordings.subgoals import SubGoal, subgoal_runs

@@ -44,11 +44,7 @@ class Episode(SourceEpisode):
 
     @cached_property
     def arrays(self) -> dict[str, NDArray]:
-        """``episode_info.npz``, by the schema's keys and of its types; what is missing is made where it can be.
-
-        Raises:
-            DatasetError: the file is damaged, or an array is: pickled, or of another type.
-        """
+        """``episode_info.npz``, by the schema's keys and of its types; what is missing is made where it can be."""
         path = self.folder / schema.EPISODE_FILE
         loaded = load_arrays(path)
         if any(spec.name not in loaded.arrays for spec in schema.EPISODE_INFO if not spec.embedding):
@@ -59,11 +55,7 @@ class Episode(SourceEpisode):
         return dict(loaded.arrays)
 
     def read(self, keys: Sequence[str]) -> dict[str, NDArray]:
-        """Some of the arrays.
-
-        Raises:
-            DatasetError: the file or one of them is missing or damaged.
-        """
+        """Some of the arrays."""
         found = read_arrays(self.folder / schema.EPISODE_FILE, keys)
         if found.unreadable or all(key in found.arrays and is_declared(key, found.arrays[key]) for key in keys):
             return found.needed(keys)
@@ -88,20 +80,12 @@ class Episode(SourceEpisode):
 
     @property
     def steps(self) -> int:
-        """T.
-
-        Raises:
-            DatasetError: the arrays do not tell.
-        """
+        """T."""
         return int(self.read(["episode_length"])["episode_length"])
 
     @property
     def instruction(self) -> str:
-        """What the robot was told: by ``data_info.json``, else by the arrays.
-
-        Raises:
-            DatasetError: neither tells.
-        """
+        """What the robot was told: by ``data_info.json``, else by the arrays."""
         said = self._said().get("language_goal")
         return said if isinstance(said, str) else str(self.read(["language_goal"])["language_goal"])
 
@@ -142,20 +126,12 @@ class Episode(SourceEpisode):
         return read_picture(self.image_path(camera, "depth", step))
 
     def intrinsic(self, camera: str) -> NDArray[np.float64]:
-        """(4,) fx, fy, cx, cy in pixels; a 3x3 camera matrix is read as such.
-
-        Raises:
-            DatasetError: the file is missing or damaged.
-        """
+        """(4,) fx, fy, cx, cy in pixels; a 3x3 camera matrix is read as such."""
         array = read_array(self.folder / camera / schema.INTRINSIC_FILE)
         return np.array([array[0, 0], array[1, 1], array[0, 2], array[1, 2]]) if array.shape == (3, 3) else array
 
     def camera_in_parent(self, camera: str) -> NDArray[np.float64]:
-        """(4, 4) OpenCV camera frame in its parent, under either name.
-
-        Raises:
-            DatasetError: there is neither file, or it is damaged.
-        """
+        """(4, 4) OpenCV camera frame in its parent, under either name."""
         names = schema.pose_files(self.camera_parent(camera))
         for name in names:
             if (self.folder / camera / name).is_file():
@@ -168,11 +144,7 @@ class Episode(SourceEpisode):
 
 
 class Dataset(EpisodeSource):
-    """A dataset's folder.
-
-    Raises:
-        DatasetError: no episodes there.
-    """
+    """A dataset's folder."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -209,11 +181,7 @@ class Dataset(EpisodeSource):
 
     @cached_property
     def sides(self) -> tuple[list[int], list[int]]:
-        """Training and validation episodes, as ``data_info.json`` lists them; numbers written as texts count too.
-
-        Raises:
-            DatasetError: a list holds something else.
-        """
+        """Training and validation episodes, as ``data_info.json`` lists them; numbers written as texts count too."""
         return self._side("train_eps"), self._side("val_eps")
 
     def _side(self, key: str) -> list[int]:
@@ -226,11 +194,7 @@ class Dataset(EpisodeSource):
 
     @cached_property
     def rate_hz(self) -> float:
-        """Steps a second: from ``conversion.json``, 5 where there is none.
-
-        Raises:
-            DatasetError: it says something else.
-        """
+        """Steps a second: from ``conversion.json``, 5 where there is none."""
         said = self.settings.get("rate_hz", DEFAULT_RATE)
         if isinstance(said, int | float) and 0 < said < np.inf:
             return float(said)
@@ -238,11 +202,7 @@ class Dataset(EpisodeSource):
 
     @cached_property
     def cameras(self) -> tuple[str, ...]:
-        """Names of the cameras: by ``conversion.json``, else those of the first episode.
-
-        Raises:
-            DatasetError: it says something else.
-        """
+        """Names of the cameras: by ``conversion.json``, else those of the first episode."""
         said = self.settings.get("cameras", self._first.cameras)
         if isinstance(said, list | tuple) and all(re.fullmatch(CAMERA_NAME, str(name)) for name in said):
             return tuple(said)
@@ -269,11 +229,7 @@ class Dataset(EpisodeSource):
 
     @cached_property
     def lengths(self) -> dict[int, int]:
-        """Number -> T, by ``data_info.json``.
-
-        Raises:
-            DatasetError: there is none, or it is damaged.
-        """
+        """Number -> T, by ``data_info.json``."""
         where = self.root / schema.DATA_INFO_FILE
         if not self.info:
             if self.settings:
@@ -295,11 +251,7 @@ class Dataset(EpisodeSource):
             ) from error
 
     def split(self, side: Side) -> list[int]:
-        """Numbers of the episodes of one side, by ``data_info.json``.
-
-        Raises:
-            DatasetError: it gives no length for one of them, or is damaged.
-        """
+        """Numbers of the episodes of one side, by ``data_info.json``."""
         numbers = sorted(self.lengths) if side == "all" else self.sides[side == "val"]
         unknown = [number for number in numbers if number not in self.lengths]
         if unknown:
@@ -317,11 +269,7 @@ class Dataset(EpisodeSource):
         return self.info.get("action_space", {})
 
     def episode(self, number: int) -> Episode:
-        """Open an episode.
-
-        Raises:
-            DatasetError: there is none of this number.
-        """
+        """Open an episode."""
         if number not in self._known:
             known = f"{self.numbers[0]} to {self.numbers[-1]}"
             raise DatasetError("no such episode", where=self.root, expected=known, found=number)
@@ -329,22 +277,14 @@ class Dataset(EpisodeSource):
 
 
 def open_folder(path: Path, *, rate_hz: float | None = None, include_failed: bool = False) -> Dataset:
-    """Open a folder; failed episodes are in it where it was made so.
-
-    Raises:
-        DatasetError: there is none, or it is of another rate.
-    """
+    """Open a folder; failed episodes are in it where it was made so."""
     dataset = Dataset(path)
     check_rate(dataset, rate_hz)
     return dataset
 
 
 def check_rate(source: EpisodeSource, rate_hz: float | None) -> None:
-    """Refuse another rate than a dataset's.
-
-    Raises:
-        DatasetError: it is asked for.
-    """
+    """Refuse another rate than a dataset's."""
     if rate_hz is not None and rate_hz != source.rate_hz:
         raise DatasetError(
             "the dataset has another rate",

@@ -66,11 +66,7 @@ class EpisodeArrays:
         return pickled if "pickle" in text else text
 
     def needed(self, keys: Iterable[str]) -> dict[str, NDArray]:
-        """The arrays of these keys.
-
-        Raises:
-            DatasetError: one is missing, or something could not be read.
-        """
+        """The arrays of these keys."""
         fix = "robocas validate says what is wrong."
         for key, error in self.unreadable.items():
             where = f"{self.path}, {key}" if key else self.path
@@ -107,11 +103,7 @@ def read_arrays(path: Path, keys: Container[str] | None = None) -> EpisodeArrays
 
 
 def load_arrays(path: Path) -> EpisodeArrays:
-    """Read the arrays that the schema knows, cast to its types; those that can't be are unreadable.
-
-    Raises:
-        DatasetError: the file is missing, damaged, or no numpy archive.
-    """
+    """Read the arrays that the schema knows, cast to its types; those that can't be are unreadable."""
     stored = read_arrays(path, SPECS)
     if "" in stored.unreadable:
         error = stored.unreadable[""]
@@ -135,11 +127,7 @@ def _array(value: Any) -> NDArray:
 
 
 def cast(spec: schema.ArraySpec, array: NDArray) -> NDArray:
-    """An array of the schema's type and number of axes; axes of length 1 too many are dropped.
-
-    Raises:
-        ValueError: it says something else.
-    """
+    """An array of the schema's type and number of axes; axes of length 1 too many are dropped."""
     for axis in reversed(range(array.ndim)):
         if array.ndim > len(spec.shape) and array.shape[axis] == 1:
             array = array.squeeze(axis)

@@ -39,16 +39,6 @@ class RecordingInfo:
     scene: dict[str, Any]
     objects: Any
 
-    @classmethod
-    def read(cls, file: TrajectoryFile, index: int) -> RecordingInfo:
-        """Read it.
-
-        Raises:
-            DatasetError: it is damaged.
-        """
-        entry = file.entry(index)
-        return cls(entry, recorded_scene(file, index), file.episodes[index]["robocas"].get("objects"))
-
 
 class TrajectorySource(EpisodeSource):
     """A trajectory file: its episodes as ``robocas convert`` would number and sample them.
@@ -87,11 +77,7 @@ class TrajectorySource(EpisodeSource):
         self.numbers, self.file = list(range(len(self.index))), file
 
     def info(self, number: int) -> RecordingInfo:
-        """Return what the JSON says of an episode.
-
-        Raises:
-            DatasetError: it is damaged.
-        """
+        """Return what the JSON says of an episode."""
         info = self._infos[number]
         if isinstance(info, DatasetError):
             raise info
@@ -102,18 +88,15 @@ class TrajectorySource(EpisodeSource):
         return len(sample_states(self.info(number).entry.control_steps, self.stride))
 
     @cached_property
-    def _sides(self) -> dict[Side, list[int]]:
-        train, val = split_by_seed({number: self.info(number).entry.seed for number in self.numbers})
-        return {"train": train, "val": val, "all": self.numbers}
-
-    @cached_property
     def lengths(self) -> dict[int, int]:
         """Number -> T, by the JSON."""
         return {number: self.steps(number) for number in self.numbers}
 
     def split(self, side: Side) -> list[int]:
         """Numbers of the episodes of one side, by the rule of ``robocas convert``."""
-        return self._sides[side]
+        if side == "all":
+            return self.numbers
+        return split_by_seed({number: self.info(number).entry.seed for number in self.numbers})[side == "val"]
 
     def entry(self, number: int) -> Mapping[str, Any]:
         """Which recording it is."""
@@ -121,36 +104,15 @@ class TrajectorySource(EpisodeSource):
             return recording_entry(file, self.index[number])
 
     def recording(self, number: int, *, bodies: bool = True) -> Recording:
-        """All control steps of an episode, with the states of all bodies or of the robot alone.
-
-        Raises:
-            DatasetError: it is damaged.
-        """
+        """All control steps of an episode, with the states of all bodies or of the robot alone."""
         with self.file.reopened() as file:
             return file.recording(self.index[number], bodies=bodies)
 
     def episode(self, number: int) -> RecordedEpisode:
-        """Open an episode.
-
-        Raises:
-            DatasetError: there is none of this number.
-        """
+        """Open an episode."""
         if not 0 <= number < len(self.index):
             raise DatasetError("no such episode", where=self.root, expected=f"0 to {len(self.index) - 1}", found=number)
         return RecordedEpisode(self, number)
-
-    def scene(self, number: int) -> dict[str, Any]:
-        """What the JSON says of how an episode was made, and what its objects are called, if their pack is here."""
-        info = self.info(number)
-        kwargs = info.scene["env_info"]["env_kwargs"]
-        config, names = kwargs.get("config"), _names(str(kwargs.get("pack", "builtin")))
-        objects = [
-            {"slot": slot, "id": asset, "name": names[asset]}
-            for slot, asset in enumerate(info.objects or ())
-            if isinstance(asset, str) and asset in names
-        ]
-        config = config if isinstance(config, Mapping) else _shipped(str(config))
-        return {**info.scene, "config": config, "objects": objects}
 
 
 class RecordedEpisode(SourceEpisode):
@@ -182,11 +144,7 @@ class RecordedEpisode(SourceEpisode):
 
     @cached_property
     def arrays(self) -> dict[str, NDArray]:
-        """All but the embeddings.
-
-        Raises:
-            DatasetError: it is damaged, or the states are those of another robot.
-        """
+        """All but the embeddings."""
         recording = self.recording(bodies=False)
         samples = sample_states(recording.control_steps, self._source.stride)
         return episode_arrays(recording.motion(samples), recording.instruction, self.goals)
@@ -199,8 +157,17 @@ class RecordedEpisode(SourceEpisode):
 
     @property
     def scene(self) -> dict[str, Any]:
-        """What the JSON says."""
-        return self._source.scene(self._number)
+        """What the JSON says of how it was made, and what its objects are called, if their pack is here."""
+        info = self._source.info(self._number)
+        kwargs = info.scene["env_info"]["env_kwargs"]
+        config, names = kwargs.get("config"), _names(str(kwargs.get("pack", "builtin")))
+        objects = [
+            {"slot": slot, "id": asset, "name": names[asset]}
+            for slot, asset in enumerate(info.objects or ())
+            if isinstance(asset, str) and asset in names
+        ]
+        config = config if isinstance(config, Mapping) else _shipped(str(config))
+        return {**info.scene, "config": config, "objects": objects}
 
     @cached_property
     def layout(self) -> dict[str, Any]:
@@ -213,18 +180,15 @@ class RecordedEpisode(SourceEpisode):
         return {"object_ids": ids, "poses": known, "present": there}
 
     def recording(self, *, bodies: bool = True) -> Recording:
-        """All control steps of it, with the states of all bodies or of the robot alone.
-
-        Raises:
-            DatasetError: it is damaged.
-        """
+        """All control steps of it, with the states of all bodies or of the robot alone."""
         return self._source.recording(self._number, bodies=bodies)
 
 
 def _read_info(file: TrajectoryFile, index: int) -> RecordingInfo | DatasetError:
     """Return what the JSON says, or the error, which is of that episode alone."""
     try:
-        return RecordingInfo.read(file, index)
+        entry = file.entry(index)  # checks the JSON
+        return RecordingInfo(entry, recorded_scene(file, index), file.episodes[index]["robocas"].get("objects"))
     except DatasetError as error:
         return error
 

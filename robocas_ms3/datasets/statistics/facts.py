@@ -73,11 +73,7 @@ class Facts:
 
 
 def facts_of(episode: SourceEpisode) -> Facts:
-    """Facts of an episode, as far as its scene tells them.
-
-    Raises:
-        DatasetError: what is said of the scene is damaged.
-    """
+    """Facts of an episode, as far as its scene tells them."""
     instruction = str(episode.read(["language_goal"])["language_goal"])
     scene = episode.scene
     if not scene:

@@ -23,11 +23,7 @@ _TEXT = 84  # letters of a label
 
 
 def write_stats(stats: Stats, out: Path) -> list[Path]:
-    """Write ``stats.json`` and a PNG of each kind into a folder; gives their paths.
-
-    Raises:
-        MissingExtraError: matplotlib is not installed.
-    """
+    """Write ``stats.json`` and a PNG of each kind into a folder; gives their paths."""
     figure_of = _matplotlib()  # before anything is written
     make_folder(out)
     paths = [out / "stats.json"]

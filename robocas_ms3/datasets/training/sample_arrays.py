@@ -16,11 +16,7 @@ from robocas_ms3.scenes.language.templates import GOAL_TYPES
 
 
 def check_holds(source: EpisodeSource, cameras: Sequence[str], *, depth: bool, embedding: bool) -> None:
-    """Check that a source holds what samples are to be made of.
-
-    Raises:
-        DatasetError: it does not.
-    """
+    """Check that a source holds what samples are to be made of."""
     pictures = source.cameras
     wrong = [camera for camera in cameras if camera not in pictures]
     if wrong and not pictures:
@@ -54,11 +50,7 @@ def type_index(goal_type: str) -> int:
 
 
 def checked_actions(arrays: Mapping[str, NDArray], where: str) -> NDArray[np.float32]:
-    """Actions (T, 7) of an episode, see `episode_actions`.
-
-    Raises:
-        DatasetError: its arrays do not make actions: NaN, quaternions of length 0, different lengths.
-    """
+    """Actions (T, 7) of an episode, see `episode_actions`."""
     for key in ACTION_ARRAYS:
         if not np.isfinite(arrays[key]).all():
             raise DatasetError("not a number", where=f"{where}, {key}", fix="robocas validate says more.")

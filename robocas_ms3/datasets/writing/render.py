@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import inverse
-from robocas_ms3.datasets.pictures.boxes import Box, box_of
-from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.pictures.stored import Box, Pictures, box_of
 from robocas_ms3.datasets.sources.protocol import CameraModel, Frame
 from robocas_ms3.demos.recordings.environment import RecordedEnv
 from robocas_ms3.demos.recordings.reading import Recording

@@ -21,7 +21,7 @@ from robocas_ms3.datasets.lerobot.check import check_lerobot
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.variants import NEWEST, VARIANTS, Version
-from robocas_ms3.datasets.pictures.boxes import box_of
+from robocas_ms3.datasets.pictures.stored import box_of
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.settings import ConversionSettings
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
