@@ -16,7 +16,6 @@ from robocas_ms3.tasks.goals import Moment
 from robocas_ms3.tasks.search import ENVS_AT_ONCE, RoboCASSearchEnv
 
 V0_RADIUS = 0.1  # m between the origins of target and basket in xy: upstream's success
-V0_STEPS = 5  # policy steps like that after which upstream's episode ends
 MEASURES = ("path_length", "contact_impulse", "disturbed_most", "fallen")
 SUMS = (*MEASURES, "v0_steps")  # columns of what is read
 _PATH, _IMPULSE, _DISTURBED, _FALLEN, _V0_STEPS = range(len(SUMS))

@@ -43,16 +43,9 @@ class Motion:
 
 @dataclass(frozen=True)
 class Convention:
-    """A convention of actions.
-
-    Attributes:
-        size: numbers per action.
-        meaning: for people.
-        read: converts actions (E, size) to motions; None: they are joint targets.
-    """
+    """A convention of actions: numbers per action, and how actions (E, size) become motions; None: joint targets."""
 
     size: int
-    meaning: str
     read: Callable[[Array], Motion] | None
 
 
@@ -76,16 +69,16 @@ def _quaternion(actions: Array) -> Motion:
     return Motion(actions[:, :3], Rotation.from_quat(quaternions), actions[:, 7] > 0)
 
 
+# Translation in m, then rotation (Euler angles about fixed axes x, y, z in rad, a rotation vector in rad, or a
+# quaternion wxyz), both in the TCP's frame; the last number is the gripper's, open above 0, of the paper's above 0.5.
 CONVENTIONS: dict[str, Convention] = {
-    "robocas": Convention(
-        7, "m; Euler angles about fixed axes x, y, z, rad; gripper opening, above 0.5 is open: the paper's", _robocas
-    ),
-    "delta_euler": Convention(7, "m; Euler angles about fixed axes x, y, z, rad; gripper, above 0 is open", _euler),
-    "delta_axis_angle": Convention(7, "m; rotation vector, rad; gripper, above 0 is open", _axis_angle),
-    "delta_quaternion": Convention(8, "m; quaternion wxyz; gripper, above 0 is open", _quaternion),
-    "joint_positions": Convention(8, "seven joint targets, rad; gripper, -1 closed to 1 open", None),
+    "robocas": Convention(7, _robocas),
+    "delta_euler": Convention(7, _euler),
+    "delta_axis_angle": Convention(7, _axis_angle),
+    "delta_quaternion": Convention(8, _quaternion),
+    "joint_positions": Convention(8, None),  # seven joint targets, rad; gripper, -1 closed to 1 open
 }
-"""By name. Translation comes first, then rotation, both in the TCP's frame; the last number is the gripper's."""
+"""By name."""
 
 
 @dataclass(frozen=True)
