@@ -84,10 +84,7 @@ def convert_lerobot(
         recorded_settings = {key: plan[key] for key in ("settings", "made_with")}
         with OutputFolder(out, _OUTPUT, recorded_settings, overwrite=settings.overwrite) as output:
             _check_episodes(output, plan)  # everything that may fail comes before the output is touched
-            if settings.needs_device:
-                from robocas_ms3.datasets.writing.render import require_renderer
-
-                require_renderer()
+            settings.check_device()
             written: list[WrittenEpisode] = []
             joining = 0.0
             if output.recorded is None or not (out / INFO_FILE).is_file():

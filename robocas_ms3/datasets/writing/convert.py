@@ -7,8 +7,12 @@ import shutil
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
+from functools import partial
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import write_json
@@ -17,7 +21,7 @@ from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.preview import FEW, finish_previews, on_sheet
 from robocas_ms3.datasets.sources.protocol import EpisodeSource
 from robocas_ms3.datasets.sources.reader import Dataset
-from robocas_ms3.datasets.writing.episode_folder import FolderWriter, TextVectors, find_damaged
+from robocas_ms3.datasets.writing.episode_folder import FolderWriter, find_damaged
 from robocas_ms3.datasets.writing.info import add_failures, write_info
 from robocas_ms3.datasets.writing.inputs import ConversionInput, open_trajectory
 from robocas_ms3.datasets.writing.plan import (
@@ -72,11 +76,8 @@ def convert(
         # Everything that may fail comes before the output is touched.
         entries = ConversionInput(source, pictures, settings.include_failed).entries()
         plan = plan_episodes(output, entries, stored, append=settings.append)
-        if settings.needs_device:
-            from robocas_ms3.datasets.writing.render import require_renderer
-
-            require_renderer()
-        embed = TextVectors(embed_texts(source, entries)) if settings.embeddings else None
+        settings.check_device()
+        embed = partial(_look_up, embed_texts(source, entries)) if settings.embeddings else None
         output.start(plan.content)
         sweep(out / schema.PREVIEW_FOLDER)
         before = _split_before(out)
@@ -132,6 +133,10 @@ def embed_texts(source: EpisodeSource, entries: Sequence[dict[str, Any]]) -> dic
     embedder = TextEmbedder()
     texts = list(dict.fromkeys(text for entry in entries for text in _texts(source, entry["source"])))
     return dict(zip(texts, embedder(texts), strict=True))
+
+
+def _look_up(vectors: dict[str, Any], texts: list[str]) -> NDArray[np.float32]:
+    return np.stack([vectors[text] for text in texts])
 
 
 def _texts(source: EpisodeSource, number: int) -> list[str]:

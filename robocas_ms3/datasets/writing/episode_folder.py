@@ -48,13 +48,7 @@ class FolderWriter:
     sheet: tuple[int, ...] | None = None
 
     def write(self, number: int, given: ConversionInput, source: int) -> WrittenEpisode:
-        """Write an episode's folder.
-
-        Args:
-            number: of the episode in the dataset.
-            given: what is converted.
-            source: its number there.
-        """
+        """Write episode ``source`` of the input as episode ``number`` of the dataset."""
         start, timing, pictures = time.perf_counter(), Timing(), given.pictures
         with replacing_folder(self.out / schema.episode_folder(number), sync=True) as folder:
             for camera in pictures.cameras:
@@ -74,33 +68,16 @@ class FolderWriter:
                     encoders.preview = previews.enter_context(preview)
                 for step, frame in enumerate(timing.each(given.stage, frames)):
                     encoders.add(step, frame)
-            with timing.measure("write"):
-                cameras = {name: episode.camera(name) for name in pictures.cameras}
-                write_cameras(folder, cameras)
-                arrays = with_embeddings(arrays, self.embed) if self.embed else arrays
-                np.savez(folder / schema.EPISODE_FILE, **arrays)
-                text = json_text(episode.scene, f"episode {source}", indent=1, error=DatasetError)
-                (folder / schema.SCENE_FILE).write_text(text + "\n", encoding="utf-8")
-                size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-            renaming = time.perf_counter()
-        timing.write += time.perf_counter() - renaming
+            begin_write = time.perf_counter()
+            write_cameras(folder, {name: episode.camera(name) for name in pictures.cameras})
+            arrays = with_embeddings(arrays, self.embed) if self.embed else arrays
+            np.savez(folder / schema.EPISODE_FILE, **arrays)
+            text = json_text(episode.scene, f"episode {source}", indent=1, error=DatasetError)
+            (folder / schema.SCENE_FILE).write_text(text + "\n", encoding="utf-8")
+            size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+        timing.write += time.perf_counter() - begin_write  # with the renaming of the folder
         timing.total += time.perf_counter() - start
         return WrittenEpisode(number, len(arrays["ee_pos"]), size, timing, encoders.preview and encoders.preview.row)
-
-
-@dataclass(frozen=True)
-class TextVectors:
-    """Looks up embeddings that were computed before, so that no worker loads the model.
-
-    Attributes:
-        vectors: (384,) of every text.
-    """
-
-    vectors: Mapping[str, NDArray[np.float32]]
-
-    def __call__(self, texts: list[str]) -> NDArray[np.float32]:
-        """Return (N, 384)."""
-        return np.stack([self.vectors[text] for text in texts])
 
 
 def write_cameras(folder: Path, cameras: Mapping[str, CameraModel]) -> None:

@@ -16,6 +16,7 @@ from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.actions import action_space
 from robocas_ms3.datasets.sources.provenance import environment_of, task_of
 from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.datasets.sources.records import DataInfoRecord
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.datasets.sources.tolerant import first_line, read_arrays
 from robocas_ms3.demos.ledger import FAILURES_FILE
@@ -59,21 +60,21 @@ def info_of(root: Path, before: tuple[Iterable[int], Iterable[int]] = ((), ())) 
         positions.append(arrays["rel_pos"])
         orientations.append(arrays["rel_orn"])
     train, val = split_by_seed(seeds, before)
-    try:
-        motion = action_space(positions, orientations)
-        json.dumps(motion, allow_nan=False)
-    except (ValueError, IndexError) as error:  # quaternions of length 0; no episode of two steps
-        where = f"{root / schema.DATA_INFO_FILE}, action_space"
-        found = first_line(error)
-        raise DatasetError("the motion has no range", where=where, found=found, fix=_SEE_VALIDATE) from error
-    return {
+    info: dict[str, Any] = {
         "train_eps": train,
         "val_eps": val,
         "ep_length": lengths,
         "language_goal": instructions,
         "step_goals": goals,
-        "action_space": motion,
     }
+    try:
+        info["action_space"] = action_space(positions, orientations)
+        DataInfoRecord.model_validate(info)
+    except (ValueError, IndexError) as error:  # quaternions of length 0; no episode of two steps
+        where = f"{root / schema.DATA_INFO_FILE}, action_space"
+        found = first_line(error)
+        raise DatasetError("the motion has no range", where=where, found=found, fix=_SEE_VALIDATE) from error
+    return info
 
 
 def add_failures(run: Path, out: Path, env_info: Mapping[str, Any]) -> None:

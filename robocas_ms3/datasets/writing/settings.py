@@ -76,6 +76,17 @@ class ConversionSettings:
         """Whether a render device is needed."""
         return self.open_renderer is open_env and self.is_trajectory
 
+    def check_device(self) -> None:
+        """Check that there is a render device, if one is needed.
+
+        Raises:
+            DatasetError: there is none.
+        """
+        if self.needs_device:
+            from robocas_ms3.datasets.writing.render import require_renderer
+
+            require_renderer()
+
 
 @dataclass
 class Timing:

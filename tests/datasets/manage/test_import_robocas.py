@@ -121,19 +121,6 @@ def test_what_upstream_writes_becomes_a_valid_dataset(dataset, made, tmp_path, p
     assert files_of(root) == before
 
 
-def test_the_plain_reader_opens_it_as_it_is(upstream, made):
-    ours, theirs = Dataset(made).episode(1), Dataset(upstream).episode(1)
-    change(upstream / "episode_0000001", language_goal=None, step_goal_type=None, step_lang_goals=None, rel_orn=None)
-    assert theirs.steps == ours.steps == 7
-    for key in ("agv_pose", "rel_agv_pose", "rel_pos", "rel_orn"):
-        np.testing.assert_allclose(theirs.arrays[key], ours.arrays[key], atol=1e-6)
-    for key in ("language_goal", "step_goal_type", "step_lang_goals"):  # from data_info.json
-        np.testing.assert_array_equal(theirs.arrays[key], ours.arrays[key])
-    assert theirs.scene == {}
-    np.testing.assert_array_equal(theirs.camera_in_parent("base_camera"), ours.camera_in_parent("base_camera"))
-    assert Dataset(upstream).rate_hz == 5
-
-
 def test_other_types_and_axes(upstream, made, tmp_path):
     episode = upstream / "episode_0000000"
     arrays = arrays_of(episode)
@@ -221,7 +208,7 @@ def test_values_that_are_taken_as_they_are(upstream, tmp_path):
     assert (violation.key, violation.found) == ("gripper_width", "0.500 to 0.500")
 
 
-@pytest.mark.parametrize("degrees", [90, -90, 180])
+@pytest.mark.parametrize("degrees", [-90])
 def test_a_turned_eef_frame_is_turned_back(upstream, made, tmp_path, degrees):
     """Upstream's TCP is ManiSkill's turned by -90 deg about z; the gripper camera's place tells."""
     turn = np.eye(4)
