@@ -12,7 +12,6 @@ pq = pytest.importorskip("pyarrow.parquet", reason="needs the extra 'lerobot'")
 
 from robocas_ms3.cli import main
 from robocas_ms3.core.errors import DatasetError, OutputExistsError, RobocasError
-from robocas_ms3.core.locks import locked_folder
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check import check_lerobot
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
@@ -231,17 +230,6 @@ def test_an_output_that_exists_is_left_alone(trajectory, tmp_path):
     assert files_of(out) == before
     convert(trajectory, out, overwrite=True, include_failed=True)
     assert LeRobotDataset(out).info["total_episodes"] == 3
-
-
-def test_overwrite_deletes_lerobot_datasets_only(trajectory, made, tmp_path):
-    (tmp_path / "thesis.tex").write_text("years of work")
-    for folder in (tmp_path, made):
-        for overwrite in (False, True):
-            with pytest.raises(OutputExistsError):
-                convert(trajectory, folder, overwrite=overwrite)
-    assert (tmp_path / "thesis.tex").exists()
-    with locked_folder(tmp_path / "out"), pytest.raises(RobocasError, match="another process is writing here"):
-        convert(trajectory, tmp_path / "out")
 
 
 def test_failed_episodes_of_a_folder_stay_out(made, tmp_path):

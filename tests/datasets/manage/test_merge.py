@@ -10,7 +10,7 @@ from robocas_ms3.core.errors import DatasetError, OutputExistsError, RobocasErro
 from robocas_ms3.core.locks import locked_folder
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.manage.copying import CopyOptions, FilePlacer
-from robocas_ms3.datasets.manage.merging import distinct_names, merge
+from robocas_ms3.datasets.manage.merging import merge
 from robocas_ms3.datasets.manage.splitting import Share, resplit
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
@@ -77,13 +77,6 @@ def test_where_a_merged_episode_had_been_before_is_kept(parts, tmp_path):
     merge([tmp_path / "once"], tmp_path / "twice")
     entry = read(tmp_path / "twice" / "conversion.json")["episodes"]["3"]
     assert entry["from"] == {"dataset": "once", "episode": 3, "from": {"dataset": "b", "episode": 1}}
-
-
-def test_names_tell_datasets_apart(tmp_path):
-    roots = [tmp_path / "x" / "ds", tmp_path / "y" / "ds"]
-    assert distinct_names(roots) == ["x/ds", "y/ds"]
-    assert distinct_names(roots[:1]) == ["ds"]
-    assert distinct_names([roots[0], roots[0]]) == [str(roots[0])] * 2
 
 
 def test_duplicates(parts, tmp_path):

@@ -46,16 +46,6 @@ def test_a_tenth_by_seed_is_the_writers_split(count):
     assert cut({n: str(seed) for n, seed in seeds.items()}, [0.9, 0.1]) == list(split_by_seed(seeds))
 
 
-def test_a_tenth_of_the_episodes_is_not_always_a_tenth_of_the_seeds():
-    seeds = {number: number // 5 for number in range(50)}  # ten of five episodes each
-    assert [len(side) for side in split_by_seed(seeds)] == [45, 5]
-    assert [len(side) for side in cut({n: str(seed) for n, seed in seeds.items()}, [0.9, 0.1])] == [45, 5]
-    seeds |= {number: 100 + number for number in range(50, 60)}  # and ten of one
-    assert [len(side) for side in split_by_seed(seeds)] != [
-        len(s) for s in cut({n: str(s) for n, s in seeds.items()}, [0.9, 0.1])
-    ]
-
-
 def test_parts_have_some_of_both_sides():
     """Of 800 episodes, as of a dataset of `reproduce_small.sh`."""
     seeds = {number: 510000 + number for number in range(800)}

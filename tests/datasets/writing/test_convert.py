@@ -146,13 +146,6 @@ def test_resume_keeps_what_is_there(trajectory, tmp_path):
     assert len(list((out / "episode_0000000" / "base_camera" / "rgb").iterdir())) == STEPS // 2 + 1
 
 
-def test_overwrite_deletes_datasets_only(trajectory, tmp_path):
-    (tmp_path / "thesis.tex").write_text("years of work")
-    with pytest.raises(OutputExistsError):
-        run(trajectory, tmp_path, overwrite=True)
-    assert (tmp_path / "thesis.tex").exists()
-
-
 def fails(match, trajectory, out, **kwargs):
     with pytest.raises(RobocasError, match=match) as caught:
         run(trajectory, out, **kwargs)
