@@ -11,6 +11,7 @@ Run: python benchmarks/convert.py [demos/pick/trajectory.h5] [--episodes 2] [--t
 from __future__ import annotations
 
 import json
+import math
 import os
 import resource
 import subprocess
@@ -150,13 +151,13 @@ def alone(cfg: Benchmark, file: TrajectoryFile, source: EnvRenderer, textures: t
 
 def convert_one(cfg: Benchmark, trajectory: Path, work: Path, to: str, depth: bool, jobs: int = 1) -> None:
     """Convert, previews included."""
-    pictures = Pictures(size=cfg.size, depth=depth)
-    common: dict[str, Any] = {"rate_hz": cfg.rate, "pictures": pictures, "jobs": jobs}
+    common: dict[str, Any] = {"rate_hz": cfg.rate, "size": cfg.size, "depth": depth, "jobs": jobs}
+    common |= {"episode_seconds": math.inf, "memory_gb": math.inf}  # without limits, one job runs in this process
     with tempfile.TemporaryDirectory(dir=work) as out:
         if to == "lerobot":
             convert_lerobot(ConversionSettings(trajectory, Path(out) / "out", **common))
             return
-        convert(ConversionSettings(trajectory, Path(out) / "out", embeddings=False, previews=None, **common))
+        convert(ConversionSettings(trajectory, Path(out) / "out", embeddings=False, **common))
 
 
 def generated(out: Path, episodes: int) -> Path:

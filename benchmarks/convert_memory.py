@@ -6,6 +6,7 @@ python benchmarks/convert_memory.py demos/pick/trajectory.h5 --episodes 20 200 -
 from __future__ import annotations
 
 import json
+import math
 import multiprocessing
 import resource
 import tempfile
@@ -116,17 +117,17 @@ def repeated(source: Path, count: int, target: Path) -> Path:
 
 def measure(cfg: Benchmark, trajectory: Path, to: str, out: Path) -> dict[str, Any]:
     """One conversion, in the process that this is called in."""
-    from robocas_ms3.datasets.pictures.stored import Pictures
     from robocas_ms3.datasets.writing.convert import convert
-    from robocas_ms3.datasets.writing.rendering import open_env
     from robocas_ms3.datasets.writing.settings import ConversionSettings
 
     peaks: list[int] = []
     common: dict[str, Any] = {
         "rate_hz": cfg.rate,
-        "pictures": Pictures(size=cfg.size),
+        "size": cfg.size,
         "jobs": cfg.jobs,
-        "open_renderer": StandIn if cfg.stand_in else open_env,
+        "open_renderer": StandIn if cfg.stand_in else None,
+        "episode_seconds": math.inf,  # without limits, one job runs in this process
+        "memory_gb": math.inf,
     }
 
     def on_episode(_: Any) -> None:
@@ -137,7 +138,9 @@ def measure(cfg: Benchmark, trajectory: Path, to: str, out: Path) -> dict[str, A
 
         done = convert_lerobot(ConversionSettings(trajectory, out, **common), on_episode=on_episode)
     else:
-        done = convert(ConversionSettings(trajectory, out, embeddings=False, **common), on_episode=on_episode)
+        done = convert(
+            ConversionSettings(trajectory, out, embeddings=False, video=False, **common), on_episode=on_episode
+        )
     count = len(done.episodes)
     return {
         "to": to,

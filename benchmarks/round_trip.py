@@ -30,7 +30,6 @@ from robocas_ms3.datasets.manage.importing import import_robocas
 from robocas_ms3.datasets.manage.merging import merge
 from robocas_ms3.datasets.manage.splitting import split_by_value, write_split
 from robocas_ms3.datasets.manage.survey import survey
-from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.datasets.writing.settings import ConversionSettings
@@ -79,14 +78,14 @@ def _one(trajectory: Path, ours: Path, size: tuple[int, int] | None) -> dict[str
     report: dict[str, Any] = {}
     base = str(ours).removesuffix("_robocas")
     with _timed(report, "robocas"):
-        convert(ConversionSettings(trajectory, ours, pictures=Pictures(size=size), embeddings=False))
+        convert(ConversionSettings(trajectory, ours, size=size, embeddings=False, video=False))
     report["robocas"] |= {"episodes": len(Dataset(ours).numbers), "violations": len(validate(ours).violations)}
     sources = [("from_hdf5", trajectory, NEWEST), *((f"{version}_from_robocas", ours, version) for version in VARIANTS)]
     for kind, source, version in sources:
         root, name = Path(f"{base}_lerobot_{kind}"), f"lerobot_{kind}"
         with _timed(report, name):
-            pictures = Pictures(size=size if source is trajectory else None)
-            convert_lerobot(ConversionSettings(source, root, pictures=pictures, lerobot_version=version))
+            kept = size if source is trajectory else None
+            convert_lerobot(ConversionSettings(source, root, size=kept, lerobot_version=version))
         report[name] |= _compare(Dataset(ours), LeRobotDataset(root))
         report[name]["violations"] = len(check_lerobot(root, decode=True))
     theirs, back = Path(f"{base}_upstream"), Path(f"{base}_imported")

@@ -24,7 +24,6 @@ from typing import Any
 import tyro
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.datasets.writing.settings import ConversionSettings
 
@@ -68,7 +67,8 @@ def _made_up(folder: Path) -> Path:
             folder / "made_up",
             open_renderer=synthetic.RayCaster,
             embeddings=False,
-            pictures=Pictures(size=(640, 480)),
+            video=False,
+            size=(640, 480),
         )
     )
     return folder / "made_up"

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.datasets.writing.settings import ConversionSettings
@@ -18,9 +17,7 @@ from robocas_ms3.datasets.writing.settings import ConversionSettings
 if len(sys.argv) != 3:
     sys.exit("python examples/03_read_dataset.py TRAJECTORY.h5 OUT")
 trajectory, out = map(Path, sys.argv[1:])
-convert(
-    ConversionSettings(trajectory, out, rate_hz=5, embeddings=False, pictures=Pictures(size=(320, 240)), overwrite=True)
-)
+convert(ConversionSettings(trajectory, out, rate_hz=5, embeddings=False, video=False, size=(320, 240), overwrite=True))
 
 info = json.loads((out / "data_info.json").read_text())
 low, high = map(np.array, info["action_space"]["relative_position"])  # 1st and 99th percentile

@@ -18,7 +18,6 @@ from robocas_ms3.core.errors import PlanError
 from robocas_ms3.core.files import flush_to_disk, json_text, make_folder, replacing, write_json
 from robocas_ms3.core.outputs import sweep
 from robocas_ms3.core.words import count_of
-from robocas_ms3.core.workers import Limits
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.manage.splitting import Share, cut, groups_of
 from robocas_ms3.datasets.sources.provenance import recording_entry
@@ -228,10 +227,13 @@ def _convert_lerobot(plan: Plan, robocas: Path, out: Path, jobs: int) -> None:
     from robocas_ms3.datasets.lerobot.convert import convert_lerobot
     from robocas_ms3.datasets.writing.settings import ConversionSettings
 
-    limits = Limits(plan.limits.render_seconds, plan.limits.memory_gb)
+    seconds, memory_gb = plan.limits.render_seconds, plan.limits.memory_gb
     jobs = min(jobs, os.cpu_count() or 1)  # those of a plan may be a cluster's
     version = plan.lerobot_version
-    convert_lerobot(ConversionSettings(robocas, out, jobs=jobs, limits=limits, lerobot_version=version))
+    settings = ConversionSettings(
+        robocas, out, jobs=jobs, episode_seconds=seconds, memory_gb=memory_gb, lerobot_version=version
+    )
+    convert_lerobot(settings)
 
 
 def _write_statistics(out: Path) -> None:

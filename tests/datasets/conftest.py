@@ -18,7 +18,7 @@ def made(trajectory, tmp_path_factory):
     out = tmp_path_factory.mktemp("made") / "dataset"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("robocas_ms3.datasets.writing.convert.embed_texts", made_up_vectors)
-        convert(ConversionSettings(trajectory, out, open_renderer=RayCaster))
+        convert(ConversionSettings(trajectory, out, video=False, open_renderer=RayCaster))
     return out
 
 

@@ -74,7 +74,9 @@ def arrays_of(episode):
 def make(folder, name, seeds, **kwargs):
     """A dataset of these seeds, without embeddings."""
     trajectory = write_trajectory(folder / f"{name}.h5", seeds=tuple(seeds))
-    convert(ConversionSettings(trajectory, folder / name, embeddings=False, open_renderer=RayCaster, **kwargs))
+    convert(
+        ConversionSettings(trajectory, folder / name, embeddings=False, video=False, open_renderer=RayCaster, **kwargs)
+    )
     return folder / name
 
 

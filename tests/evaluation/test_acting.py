@@ -11,7 +11,6 @@ import pytest
 from robocas_ms3.baselines.training.record import BUNDLED, hash_weights
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.datasets.checks.replay import replay_dataset
-from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.datasets.writing.settings import ConversionSettings
@@ -154,8 +153,8 @@ def test_who_has_closed_the_gripper_beside_is_shown_how_to_go_on(player, generat
 @pytest.mark.parametrize("player", [("random", (31, 31))], indirect=True)
 def test_it_is_converted_from_where_the_policy_was(player, generator, tmp_path, needs_renderer):
     assert generator.generate(2, tmp_path, "one", player.run(2)).success
-    pictures = Pictures(("base_camera",), (64, 48), depth=False)
-    convert(ConversionSettings(tmp_path / "one.h5", tmp_path / "dataset", pictures=pictures, embeddings=False))
+    settings = {"cameras": ("base_camera",), "size": (64, 48), "depth": False, "embeddings": False, "video": False}
+    convert(ConversionSettings(tmp_path / "one.h5", tmp_path / "dataset", **settings))
     report = replay_dataset(tmp_path / "dataset")
     assert report.episodes[0].success is None
     assert "another policy" in report.episodes[0].skipped

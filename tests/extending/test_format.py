@@ -38,7 +38,9 @@ def both(stranger, tmp_path, capsys):
     file = write_trajectory(tmp_path / "F.h5", seeds=(3, 4, 5))
     assert run(["convert", str(file), "--to", "toy", "--out", str(tmp_path / "toy")]) == 0
     assert "3 episodes, 21 steps" in capsys.readouterr().out
-    conversion.convert(ConversionSettings(file, tmp_path / "folder", embeddings=False, open_renderer=RayCaster))
+    conversion.convert(
+        ConversionSettings(file, tmp_path / "folder", embeddings=False, video=False, open_renderer=RayCaster)
+    )
     return tmp_path / "toy", tmp_path / "folder"
 
 

@@ -126,7 +126,7 @@ from robocas_ms3.core.poses import from_wxyz, inverse
 from robocas_ms3.demos.recordings.motion import sample_states, stored_actions
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
 file, out = Path({str(recorded)!r}), Path({str(tmp_path)!r})
-convert(ConversionSettings(file, out / "folder", embeddings=False, open_renderer=RayCaster))
+convert(ConversionSettings(file, out / "folder", embeddings=False, video=False, open_renderer=RayCaster))
 convert_lerobot(ConversionSettings(out / "folder", out / "lerobot"))
 print(json.loads((out / "lerobot/meta/info.json").read_text())["robot_type"])
 arrays = open_source(out / "folder").episode(0).arrays

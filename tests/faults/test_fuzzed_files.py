@@ -19,7 +19,6 @@ from robocas_ms3.core.poses import planar
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.lerobot.check import check_lerobot
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
-from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.datasets.writing.settings import ConversionSettings
@@ -63,11 +62,9 @@ def made(tmp_path_factory):
     """A small dataset of each kind."""
     folder = tmp_path_factory.mktemp("made")
     trajectory = write_trajectory(folder / "trajectory.h5", seeds=(3, 4))
-    pictures = Pictures(size=(64, 48))
-    convert(
-        ConversionSettings(trajectory, folder / "robocas", embeddings=False, open_renderer=RayCaster, pictures=pictures)
-    )
-    convert_lerobot(ConversionSettings(trajectory, folder / "lerobot", open_renderer=RayCaster, pictures=pictures))
+    settings = {"size": (64, 48), "video": False, "open_renderer": RayCaster}
+    convert(ConversionSettings(trajectory, folder / "robocas", embeddings=False, **settings))
+    convert_lerobot(ConversionSettings(trajectory, folder / "lerobot", **settings))
     return folder
 
 

@@ -12,9 +12,7 @@ from faults import SITE, begun, files_of
 from synthetic import RayCaster, write_trajectory
 
 from robocas_ms3.core.errors import IncompleteError
-from robocas_ms3.core.workers import Limits
 from robocas_ms3.datasets.checks.dataset import validate
-from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.datasets.writing.settings import ConversionSettings
 from robocas_ms3.demos.generate import generate
@@ -36,11 +34,11 @@ def befalls(monkeypatch, tmp_path):
 
 def test_a_conversion_leaves_out_what_ends_its_process_twice_and_goes_on_later(befalls, tmp_path):
     trajectory = write_trajectory(tmp_path / "trajectory.h5", seeds=(3, 4, 5))
-    made = {"embeddings": False, "open_renderer": RayCaster, "pictures": Pictures(size=(64, 48))}
+    made = {"embeddings": False, "video": False, "open_renderer": RayCaster, "size": (64, 48)}
     convert(ConversionSettings(trajectory, tmp_path / "whole", **made))
     log = befalls(1, "crash", 2)
     with pytest.raises(IncompleteError, match=r"out: .*\(found episode_0000001: its.*: SIGSEGV\)") as error:
-        convert(ConversionSettings(trajectory, tmp_path / "out", jobs=2, limits=Limits(60, 4), **made))
+        convert(ConversionSettings(trajectory, tmp_path / "out", jobs=2, episode_seconds=60, memory_gb=4, **made))
     assert "\n" not in str(error.value)
     assert sorted(key for _, key in begun(log)) == ["0", "1", "1", "2"]
     there = sorted(path.name for path in (tmp_path / "out").iterdir())

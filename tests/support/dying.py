@@ -42,7 +42,7 @@ if __name__ == "__main__":
             Path(out),
             embeddings=False,
             overwrite=overwrite,
-            previews=bool(previews),
+            video=bool(previews),
             open_renderer=RayCaster,
         )
     )

@@ -14,5 +14,5 @@ def made_up_dataset(folder: Path) -> Path:
     trajectory = write_trajectory(folder / "F.h5", seeds=range(3, 9))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("robocas_ms3.datasets.writing.convert.embed_texts", made_up_vectors)
-        convert(ConversionSettings(trajectory, folder / "dataset", open_renderer=RayCaster))
+        convert(ConversionSettings(trajectory, folder / "dataset", video=False, open_renderer=RayCaster))
     return folder / "dataset"

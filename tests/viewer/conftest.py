@@ -40,7 +40,12 @@ def folder(run_folder, made_up, tmp_path_factory):
     out = tmp_path_factory.mktemp("folder") / "dataset"
     convert(
         ConversionSettings(
-            run_folder / "trajectory.h5", out, open_renderer=made_up.RayCaster, embeddings=False, include_failed=True
+            run_folder / "trajectory.h5",
+            out,
+            open_renderer=made_up.RayCaster,
+            embeddings=False,
+            video=False,
+            include_failed=True,
         )
     )
     (out / "failures.jsonl").write_bytes((run_folder / "failures.jsonl").read_bytes())

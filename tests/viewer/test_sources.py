@@ -184,7 +184,13 @@ def test_a_seed_means_a_scene_of_its_own_environment_only(run_folder, folder, ma
     for path in (run_folder / "trajectory.h5", other):
         convert(
             ConversionSettings(
-                path, both, open_renderer=made_up.RayCaster, embeddings=False, include_failed=True, append=True
+                path,
+                both,
+                open_renderer=made_up.RayCaster,
+                embeddings=False,
+                video=False,
+                include_failed=True,
+                append=True,
             )
         )
     for scene in both.glob("*/scene.json"):  # the frames' source has one task

@@ -78,7 +78,7 @@ def convert_lerobot(
     require_extra()
     check_video_size(settings.pictures.size)
     start, variant, out = time.perf_counter(), find_variant(settings.lerobot_version), settings.out
-    settings = replace(settings, pictures=replace(settings.pictures, boxes=variant.language))
+    settings = replace(settings, boxes=variant.language)
     with closing(open_input(settings)) as given:
         plan = _plan(given, settings.codec, variant)
         recorded_settings = {key: plan[key] for key in ("settings", "made_with")}

@@ -89,7 +89,7 @@ def convert(
         if on_start:
             on_start(len(missing))
         sheet = None
-        if settings.previews or (settings.previews is None and len(plan.tasks) <= FEW):
+        if settings.video and (settings.all_videos or len(plan.tasks) <= FEW):
             sheet = on_sheet(map(int, plan.content["episodes"]))
         continued = len(missing) < len(plan.tasks)
         job = WriteJob(settings, FolderWriter(out, embed, sheet), missing, continued, _FIX)

@@ -20,7 +20,7 @@ from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 from robocas_ms3.datasets.sources.protocol import EpisodeSource, Frame, SourceEpisode
 from robocas_ms3.datasets.sources.tolerant import arrays_fingerprint, first_line
-from robocas_ms3.datasets.writing.rendering import RenderedSource
+from robocas_ms3.datasets.writing.rendering import RenderedSource, open_env
 from robocas_ms3.datasets.writing.settings import ConversionSettings
 
 NEEDED = frozenset(s.name for s in schema.EPISODE_INFO if not s.embedding) - {"base_rel_pos", "base_rel_orn"}
@@ -146,7 +146,7 @@ def open_trajectory(settings: ConversionSettings) -> RenderedSource:
         rate_hz=settings.rate_hz,
         pictures=settings.pictures,
         pack=settings.pack,
-        open_renderer=settings.open_renderer,
+        open_renderer=settings.open_renderer or open_env,
     )
 
 

@@ -89,7 +89,9 @@ def test_appending_to_a_damaged_dataset_says_which_episode(trajectory, tmp_path)
     root = make(tmp_path, "ds", (1, 2))
     (root / "episode_0000000" / "episode_info.npz").write_bytes(b"PK")
     with pytest.raises(DatasetError, match=r"episode_0000000.*this episode can't be read.*robocas validate"):
-        convert(ConversionSettings(trajectory, root, append=True, embeddings=False, open_renderer=RayCaster))
+        convert(
+            ConversionSettings(trajectory, root, append=True, embeddings=False, video=False, open_renderer=RayCaster)
+        )
     assert json.loads((root / "conversion.json").read_text())["episodes"].keys() >= {"0", "1"}
 
 

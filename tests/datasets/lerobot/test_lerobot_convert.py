@@ -17,7 +17,6 @@ from robocas_ms3.datasets.lerobot.check import check_lerobot
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.schema import FileLimits
-from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.tolerant import arrays_fingerprint
 from robocas_ms3.datasets.writing.inputs import open_input
@@ -133,9 +132,7 @@ def test_each_video_frame_is_that_of_its_step(trajectory, tmp_path):
 
     out = tmp_path / "out"
     convert_lerobot(
-        ConversionSettings(
-            trajectory, out, open_renderer=Grey, include_failed=True, pictures=Pictures(("base_camera",))
-        )
+        ConversionSettings(trajectory, out, open_renderer=Grey, include_failed=True, cameras=("base_camera",))
     )
     dataset = LeRobotDataset(out)
     for number, seed in enumerate((3, 4, 5)):
@@ -183,7 +180,7 @@ def test_files_roll_over_at_their_limits(trajectory, tmp_path, monkeypatch):
 
 def test_fewer_pictures_and_another_rate(trajectory, tmp_path):
     out = tmp_path / "out"
-    convert(trajectory, out, rate_hz=10, pictures=Pictures(("static_camera",), (80, 60), depth=False))
+    convert(trajectory, out, rate_hz=10, cameras=("static_camera",), size=(80, 60), depth=False)
     dataset = LeRobotDataset(out)
     assert (dataset.cameras, dataset.has_depth, dataset.rate_hz) == (("static_camera",), False, 10)
     assert sorted(path.name for path in (out / "videos").iterdir()) == ["observation.images.static_camera"]
@@ -206,8 +203,8 @@ def test_errors_leave_nothing_behind(trajectory, made, tmp_path):
     fails("no such trajectory file", tmp_path / "none.h5", out)
     fails("no dataset here", tmp_path, out)
     fails("a dataset keeps its rate .expected 5 Hz, found 10.", made, out, rate_hz=10)
-    fails("a dataset keeps the size of its images .expected 64 x 48", made, out, pictures=Pictures(size=(32, 32)))
-    fails("videos need even sizes .expected .* found 65 x 48", trajectory, out, pictures=Pictures(size=(65, 48)))
+    fails("a dataset keeps the size of its images .expected 64 x 48", made, out, size=(32, 32))
+    fails("videos need even sizes .expected .* found 65 x 48", trajectory, out, size=(65, 48))
     fails("no successful episodes", write_trajectory(tmp_path / "failed.h5", seeds=(1,), failed=(0,)), out)
 
 

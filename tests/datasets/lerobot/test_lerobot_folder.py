@@ -15,7 +15,6 @@ from robocas_ms3.core.errors import DatasetError, IncompleteError
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.manage.splitting import Share, resplit
-from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.datasets.writing.convert import convert
@@ -47,16 +46,14 @@ def test_what_is_not_taken_is_not_looked_at(dataset, tmp_path):
     folder = dataset / "episode_0000001"
     shrink(folder / "static_camera" / "rgb" / "0003.png", (32, 24))
     shrink(folder / "base_camera" / "depth" / "0003.png", (32, 24))
-    done = convert_lerobot(
-        ConversionSettings(dataset, tmp_path / "out", pictures=Pictures(("base_camera",), depth=False))
-    )
+    done = convert_lerobot(ConversionSettings(dataset, tmp_path / "out", cameras=("base_camera",), depth=False))
     assert len(done.episodes) == 2
 
 
 def test_cameras_may_differ(tmp_path):
     """Our own don't; a camera's own size is what its pictures have to have."""
     trajectory = write_trajectory(tmp_path / "F.h5", seeds=(1, 2))
-    convert(ConversionSettings(trajectory, tmp_path / "ds", embeddings=False, open_renderer=RayCaster))
+    convert(ConversionSettings(trajectory, tmp_path / "ds", embeddings=False, video=False, open_renderer=RayCaster))
     for path in (tmp_path / "ds").glob("episode_*/gripper_camera/*/*.png"):
         shrink(path, (32, 24))
     assert len(convert_lerobot(ConversionSettings(tmp_path / "ds", tmp_path / "out")).episodes) == 2

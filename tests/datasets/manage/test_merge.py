@@ -12,7 +12,6 @@ from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.manage.copying import CopyOptions, FilePlacer
 from robocas_ms3.datasets.manage.merging import merge
 from robocas_ms3.datasets.manage.splitting import Share, resplit
-from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.datasets.writing.settings import ConversionSettings
@@ -159,7 +158,7 @@ def test_what_is_appended_leaves_a_split_of_texts_as_it_is(parts, tmp_path):
     for number, seed in ((0, [10]), (1, [11])):  # as ManiSkill writes seeds
         edit(part / f"episode_000000{number}" / "scene.json", lambda c, seed=seed: c.update(seed=seed))
     trajectory = write_trajectory(tmp_path / "more.h5", seeds=(30,))
-    convert(ConversionSettings(trajectory, part, embeddings=False, open_renderer=RayCaster, append=True))
+    convert(ConversionSettings(trajectory, part, embeddings=False, video=False, open_renderer=RayCaster, append=True))
     train, val = Dataset(part).sides
     assert ([n for n in train if n < 2], [n for n in val if n < 2]) == sides
 
@@ -202,7 +201,7 @@ def test_arrays_that_an_import_could_not_make_may_be_missing(parts, tmp_path):
 
 @pytest.mark.parametrize("image_format", ["jpg"])
 def test_other_formats(tmp_path, image_format):
-    part = make(tmp_path, "a", (10,), pictures=Pictures(image_format=image_format))
+    part = make(tmp_path, "a", (10,), image_format=image_format)
     picture = part / "episode_0000000" / "base_camera" / "rgb" / f"0003.{image_format}"
     assert merge([part], tmp_path / "out").written.episodes == 1
     picture.write_bytes(picture.read_bytes()[:-9])
@@ -259,7 +258,7 @@ def test_the_command_wants_datasets(tmp_path, capsys):
 
 def test_a_merged_dataset_can_be_appended_to(parts, tmp_path):
     merge(parts, tmp_path / "out")
-    settings = {"embeddings": False, "append": True, "open_renderer": RayCaster}
+    settings = {"embeddings": False, "video": False, "append": True, "open_renderer": RayCaster}
     known = convert(ConversionSettings(parts[1].with_suffix(".h5"), tmp_path / "out", **settings))
     assert (known.kept, known.episodes) == (2, [])
     new = convert(ConversionSettings(write_trajectory(tmp_path / "c.h5", seeds=(30,)), tmp_path / "out", **settings))

@@ -41,9 +41,7 @@ def shown(out):
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_shows_what_the_dataset_holds(trajectory, tmp_path, jobs):
     out = tmp_path / "out"
-    conversion.convert(
-        ConversionSettings(trajectory, out, embeddings=False, previews=None, jobs=jobs, open_renderer=RayCaster)
-    )
+    conversion.convert(ConversionSettings(trajectory, out, embeddings=False, jobs=jobs, open_renderer=RayCaster))
     assert shown(out) == ["contact_sheet.png", "episode_0000000.mp4", "episode_0000001.mp4"]
     dataset = Dataset(out)
     for number in dataset.numbers:
@@ -121,7 +119,7 @@ def test_a_killed_run_leaves_nothing_half_written(trajectory, tmp_path):
     command = [sys.executable, SUPPORT / "dying.py", "picture", trajectory, out, "previews"]
     assert subprocess.run(command, check=False).returncode == -signal.SIGKILL
     assert [name for name in shown(out) if not name.startswith(".")] == ["episode_0000000.mp4"]
-    settings = ConversionSettings(trajectory, out, embeddings=False, open_renderer=RayCaster, previews=None)
+    settings = ConversionSettings(trajectory, out, embeddings=False, open_renderer=RayCaster)
     conversion.convert(settings)
     assert shown(out) == ["contact_sheet.png", "episode_0000000.mp4", "episode_0000001.mp4"]
 
@@ -140,7 +138,7 @@ def test_a_failed_episode_has_none(trajectory, tmp_path, monkeypatch):
     monkeypatch.setattr(episode_folder, "write_picture", failing)
     with pytest.raises(OSError, match="No space left"):
         conversion.convert(
-            ConversionSettings(trajectory, tmp_path / "out", embeddings=False, previews=True, open_renderer=RayCaster)
+            ConversionSettings(trajectory, tmp_path / "out", embeddings=False, all_videos=True, open_renderer=RayCaster)
         )
     assert shown(tmp_path / "out") == ["episode_0000000.mp4"]
 

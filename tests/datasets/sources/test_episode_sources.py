@@ -27,7 +27,7 @@ def paths(tmp_path_factory):
     """Three episodes as trajectory, RoboCAS folder and LeRobot folder."""
     root = tmp_path_factory.mktemp("sources")
     trajectory = write_trajectory(root / "trajectory.h5", seeds=(1, 2, 3))
-    convert(ConversionSettings(trajectory, root / "folder", embeddings=False, open_renderer=RayCaster))
+    convert(ConversionSettings(trajectory, root / "folder", embeddings=False, video=False, open_renderer=RayCaster))
     convert_lerobot(ConversionSettings(root / "folder", root / "lerobot"))
     return {"trajectory": trajectory, "robocas": root / "folder", "lerobot": root / "lerobot"}
 

@@ -38,7 +38,11 @@ class OfOddSeeds(RayCaster):
 
 
 def run(trajectory, out, **kwargs):
-    return convert(ConversionSettings(trajectory, out, **{"embeddings": False, "open_renderer": RayCaster, **kwargs}))
+    return convert(
+        ConversionSettings(
+            trajectory, out, **{"embeddings": False, "video": False, "open_renderer": RayCaster, **kwargs}
+        )
+    )
 
 
 @pytest.fixture(scope="module")

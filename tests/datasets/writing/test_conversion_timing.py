@@ -28,7 +28,7 @@ def test_sums_and_parts():
 
 @pytest.mark.parametrize("to", ["robocas", "lerobot"])
 def test_each_stage_is_measured(trajectory, tmp_path, to):
-    settings = ConversionSettings(trajectory, tmp_path / "out", embeddings=False, open_renderer=Slow)
+    settings = ConversionSettings(trajectory, tmp_path / "out", embeddings=False, video=False, open_renderer=Slow)
     if to == "robocas":
         done = convert(settings)
     else:

@@ -25,7 +25,7 @@ from robocas_ms3.demos.recordings.reading import TrajectoryFile
 
 
 def run(trajectory, out, on_episode=None, **kwargs):
-    settings = ConversionSettings(trajectory, out, embeddings=False, open_renderer=RayCaster, **kwargs)
+    settings = ConversionSettings(trajectory, out, embeddings=False, video=False, open_renderer=RayCaster, **kwargs)
     return convert(settings, on_episode=on_episode)
 
 
@@ -184,7 +184,7 @@ def test_no_render_device_is_said_before_anything_is_written(trajectory, tmp_pat
 
     monkeypatch.setattr(sapien.render, "RenderMaterial", no_device)
     with pytest.raises(DatasetError, match="no render device. Run scripts/setup.sh or install a Vulkan driver"):
-        convert(ConversionSettings(trajectory, tmp_path / "out", embeddings=False))
+        convert(ConversionSettings(trajectory, tmp_path / "out", embeddings=False, video=False))
     assert not (tmp_path / "out").exists()
 
 
@@ -204,7 +204,7 @@ def test_every_episode_says_how_it_was_made(made, trajectory):
 def test_fewer_and_smaller_pictures(trajectory, tmp_path, image_format):
     out = tmp_path / "out"
     pictures = Pictures(("static_camera", "base_camera"), (80, 60), depth=False, image_format=image_format)
-    run(trajectory, out, pictures=pictures)
+    run(trajectory, out, cameras=pictures.cameras, size=(80, 60), depth=False, image_format=image_format)
     episode = Dataset(out).episode(1)
     assert (episode.cameras, episode.has_depth, episode.image_format) == (
         ("base_camera", "static_camera"),
@@ -299,24 +299,26 @@ def test_what_would_be_numbered_alike_is_refused(trajectory, tmp_path, monkeypat
     more = write_trajectory(tmp_path / "more.h5", seeds=(10,))
     other = write_trajectory(tmp_path / "other.h5", seeds=(11,))
     monkeypatch.setattr("robocas_ms3.datasets.writing.convert.embed_texts", made_up_vectors)
-    convert(ConversionSettings(trajectory, out, open_renderer=RayCaster))
+    convert(ConversionSettings(trajectory, out, video=False, open_renderer=RayCaster))
 
     def meanwhile(file, chosen):
         with pytest.raises(RobocasError, match="another process is writing here"):
-            convert(ConversionSettings(other, out, append=True, open_renderer=RayCaster))
+            convert(ConversionSettings(other, out, append=True, video=False, open_renderer=RayCaster))
         return made_up_vectors(file, chosen)
 
     monkeypatch.setattr("robocas_ms3.datasets.writing.convert.embed_texts", meanwhile)
-    convert(ConversionSettings(more, out, append=True, open_renderer=RayCaster))
+    convert(ConversionSettings(more, out, append=True, video=False, open_renderer=RayCaster))
     monkeypatch.setattr("robocas_ms3.datasets.writing.convert.embed_texts", made_up_vectors)
-    convert(ConversionSettings(other, out, append=True, open_renderer=RayCaster))
+    convert(ConversionSettings(other, out, append=True, video=False, open_renderer=RayCaster))
     ledger = json.loads((out / "conversion.json").read_text())["episodes"]
     assert [entry["seed"] for entry in ledger.values()] == [3, 5, 10, 11]
 
 
 def test_a_recording_that_is_there_twice_is_converted_once(tmp_path, caplog):
     trajectory = write_trajectory(tmp_path / "trajectory.h5", seeds=(3, 4, 3))
-    done = convert(ConversionSettings(trajectory, tmp_path / "out", embeddings=False, open_renderer=RayCaster))
+    done = convert(
+        ConversionSettings(trajectory, tmp_path / "out", embeddings=False, video=False, open_renderer=RayCaster)
+    )
     assert [episode.number for episode in done.episodes] == [0, 1]
     assert "the same recordings again, left out: 2" in caplog.text
     assert validate(tmp_path / "out").violations == []

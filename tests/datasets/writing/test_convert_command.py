@@ -68,7 +68,9 @@ def tried(path, *rates):
 def test_actions_that_were_tried_at_another_rate(tmp_path, caplog, rates, rate_hz, said):
     trajectory = tried(tmp_path / "F.h5", *rates)
     conversion.convert(
-        ConversionSettings(trajectory, tmp_path / "out", rate_hz=rate_hz, embeddings=False, open_renderer=RayCaster)
+        ConversionSettings(
+            trajectory, tmp_path / "out", rate_hz=rate_hz, embeddings=False, video=False, open_renderer=RayCaster
+        )
     )
     warnings = [record.getMessage() for record in caplog.records if record.name.startswith("robocas_ms3")]
     assert len(warnings) == bool(said)
@@ -81,7 +83,7 @@ def test_only_the_recordings_that_are_converted_count(tmp_path, caplog):
     content["episodes"][0]["success"] = False
     path.with_suffix(".json").write_text(json.dumps(content))
     conversion.convert(
-        ConversionSettings(path, tmp_path / "out", rate_hz=10, embeddings=False, open_renderer=RayCaster)
+        ConversionSettings(path, tmp_path / "out", rate_hz=10, embeddings=False, video=False, open_renderer=RayCaster)
     )
     assert caplog.records == []
 
@@ -135,7 +137,7 @@ def test_what_another_trajectory_left_missing_is_said(tmp_path, caplog):
     """--append of b was killed; converting a again can't make b's episodes."""
     a, b = (write_trajectory(tmp_path / f"{n}.h5", seeds=seeds) for n, seeds in (("a", (1, 2)), ("b", (3, 4, 5))))
     out = tmp_path / "out"
-    options = {"embeddings": False, "open_renderer": RayCaster}
+    options = {"embeddings": False, "video": False, "open_renderer": RayCaster}
     conversion.convert(ConversionSettings(a, out, **options))
     conversion.convert(ConversionSettings(b, out, append=True, **options))
     for number in (2, 4):

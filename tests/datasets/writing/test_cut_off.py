@@ -24,7 +24,9 @@ FILES = (
 
 
 def run(trajectory, out, **kwargs):
-    return convert(ConversionSettings(trajectory, out, embeddings=False, open_renderer=RayCaster, **kwargs))
+    return convert(
+        ConversionSettings(trajectory, out, embeddings=False, video=False, open_renderer=RayCaster, **kwargs)
+    )
 
 
 def harm(path, left):
@@ -59,7 +61,7 @@ def test_its_episode_is_written_again(whole, trajectory, tmp_path, caplog, name,
 @pytest.mark.parametrize("image_format", ["png", "jpg", "webp"])
 def test_pictures_of_each_format(trajectory, tmp_path, image_format):
     pictures = Pictures(("base_camera",), image_format=image_format, depth=False)
-    run(trajectory, tmp_path / "out", pictures=pictures)
+    run(trajectory, tmp_path / "out", cameras=("base_camera",), image_format=image_format, depth=False)
     folder = tmp_path / "out" / "episode_0000000"
     assert find_damaged(folder, pictures) is None
     for left in (0.9, 0):

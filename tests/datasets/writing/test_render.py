@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 import pytest
 
-from robocas_ms3.cli.convert import Convert, main
+from robocas_ms3.cli.convert import main
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.checks import depth as geometry
 from robocas_ms3.datasets.checks.dataset import validate
@@ -198,13 +198,13 @@ def test_a_scene_that_is_another_leaves_nothing_behind(recorded, tmp_path):
     metadata["episodes"][0]["episode_seed"] = 12
     (tmp_path / "F.json").write_text(json.dumps(metadata))
     with pytest.raises(DatasetError, match="episode 0, seed 12, object_0: the seed builds another scene"):
-        convert(ConversionSettings(path, tmp_path / "out", embeddings=False, pictures=Pictures(size=SIZE)))
+        convert(ConversionSettings(path, tmp_path / "out", embeddings=False, video=False, size=SIZE))
     assert {entry.name for entry in tmp_path.iterdir()} == {"F.h5", "F.json"}
 
 
 def test_a_real_dataset_is_valid(recorded, tmp_path, capsys):
     out = tmp_path / "out"
-    assert main(Convert(recorded[0], out, embeddings=False, size=SIZE)) == 0
+    assert main(ConversionSettings(recorded[0], out, embeddings=False, size=SIZE)) == 0
     assert "1 episode, 4 steps" in capsys.readouterr().out  # states 0, 4, 8, 9
     assert {path.name for path in (out / "preview").iterdir()} == {"episode_0000000.mp4", "contact_sheet.png"}
     assert validate(out).violations == []

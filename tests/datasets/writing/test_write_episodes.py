@@ -11,7 +11,6 @@ import torch
 from synthetic import RayCaster, write_trajectory
 
 from robocas_ms3.core.errors import DatasetError, MissingExtraError
-from robocas_ms3.core.workers import Limits
 from robocas_ms3.datasets.writing.settings import ConversionSettings, Timing, WrittenEpisode
 from robocas_ms3.datasets.writing.workers import WriteJob, write_episodes
 
@@ -92,7 +91,7 @@ def test_torch_keeps_its_threads_where_images_are_read(job, made):
 
 
 def test_an_episode_that_ends_its_process_is_one_error_after_all_others(job):
-    written, incomplete = write(job(Deadly(), [1, 2, 3], jobs=2, limits=Limits(60, 8)))
+    written, incomplete = write(job(Deadly(), [1, 2, 3], jobs=2, episode_seconds=60, memory_gb=8))
     assert [one.number for one in written] == [1, 3]
     assert incomplete.reasons == {"episode_0000002": "episode_0000002: its process died twice: exit code 9"}
 
