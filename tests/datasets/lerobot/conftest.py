@@ -5,8 +5,6 @@ import shutil
 import pytest
 from lerobot_folders import convert
 
-from robocas_ms3.datasets.pictures.stored import Pictures
-
 
 @pytest.fixture(scope="module")
 def lerobot(trajectory, tmp_path_factory):
@@ -20,7 +18,7 @@ def lerobot(trajectory, tmp_path_factory):
 def valid(trajectory, tmp_path_factory):
     """A dataset of version 0.5 with one camera, for reading only."""
     out = tmp_path_factory.mktemp("checked") / "dataset"
-    convert(trajectory, out, pictures=Pictures(("base_camera",)), lerobot_version="0.5")
+    convert(trajectory, out, cameras=("base_camera",), lerobot_version="0.5")
     return out
 
 
