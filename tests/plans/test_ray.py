@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from threading import Thread
 
@@ -26,41 +27,34 @@ from robocas_ms3.plans.worker import UnitWorker
 SUPPORT = Path(__file__).resolve().parents[1] / "support"
 
 
-class Slow(MadeUp):
-    """Takes its time for an episode."""
+class Acting(MadeUp):
+    """Does something before it writes a recording."""
+
+    def __init__(self, act, plan):
+        super().__init__(plan)
+        self.act = act
 
     def run(self, files):
-        time.sleep(1.0)
+        self.act(files)
         return super().run(files)
 
 
-class Lacking(MadeUp):
-    """Meets the same at every seed."""
-
-    def run(self, files):
-        raise MissingExtraError("nothing to record with")
+def wait_a_second(files):
+    time.sleep(1.0)
 
 
-class Deadly(MadeUp):
-    """Kills the task at the second seed."""
-
-    def run(self, files):
-        if files.seed == 11:
-            os.kill(os.getppid(), signal.SIGKILL)
-            time.sleep(60)
-        return super().run(files)
+def lack_an_extra(files):
+    raise MissingExtraError("nothing to record with")
 
 
-def open_slow(plan, out):
-    return UnitWorker(plan, out, Slow, render)
+def kill_task_at_second_seed(files):
+    if files.seed == 11:
+        os.kill(os.getppid(), signal.SIGKILL)
+        time.sleep(60)
 
 
-def open_lacking(plan, out):
-    return UnitWorker(plan, out, Lacking, render)
-
-
-def open_deadly(plan, out):
-    return UnitWorker(plan, out, Deadly, render)
+def open_acting(act, plan, out):
+    return UnitWorker(plan, out, partial(Acting, act), render)
 
 
 @pytest.fixture(scope="module")
@@ -152,7 +146,7 @@ def test_a_task_that_is_killed_costs_nothing(cluster, tasks, undisturbed, tmp_pa
             killed.append(process.pid)
 
     thread = once(out, kill)
-    run(cluster, out, gather, open_slow)
+    run(cluster, out, gather, partial(open_acting, wait_a_second))
     thread.join()
     assert killed
     assert_same(undisturbed, out)
@@ -162,7 +156,7 @@ def test_a_task_that_is_killed_costs_nothing(cluster, tasks, undisturbed, tmp_pa
 def test_a_node_that_is_lost_costs_nothing(cluster, tasks, undisturbed, tmp_path, gather):
     out = tmp_path / "out"
     thread = once(out, lambda: cluster.remove_node(cluster.second, allow_graceful=False))
-    run(cluster, out, gather, open_slow)
+    run(cluster, out, gather, partial(open_acting, wait_a_second))
     thread.join()
     assert_same(undisturbed, out)
 
@@ -172,7 +166,7 @@ def test_a_task_that_is_cut_off_and_lives_does_no_harm(cluster, tasks, undisturb
     out, node = tmp_path / "out", raylet(cluster)
     thread = once(out, node.suspend)
     try:
-        run(cluster, out, False, open_slow)
+        run(cluster, out, False, partial(open_acting, wait_a_second))
         thread.join()
     finally:
         node.resume()
@@ -205,14 +199,14 @@ def test_a_cluster_that_is_not_there_is_an_error(tmp_path, address):
 @GATHER
 def test_an_error_of_all_seeds_ends_the_plan(cluster, tasks, tmp_path, gather):
     with pytest.raises(MissingExtraError):
-        run(cluster, tmp_path / "out", gather, open_lacking)
+        run(cluster, tmp_path / "out", gather, partial(open_acting, lack_an_extra))
     assert tasks() == []
 
 
 @GATHER
 def test_a_unit_that_goes_on_killing_its_tasks_ends_the_plan(cluster, tasks, tmp_path, gather):
     with pytest.raises(PlanError, match="the jobs of this unit die") as error:
-        run(cluster, tmp_path / "out", gather, open_deadly, jobs=1)
+        run(cluster, tmp_path / "out", gather, partial(open_acting, kill_task_at_second_seed), jobs=1)
     assert error.value.where == Unit(0, 0).folder(PLAN, tmp_path / "out")
     assert tasks() == []
 
