@@ -24,13 +24,10 @@ _log = logging.getLogger(__name__)
 
 
 @contextmanager
-def locked_folder(path: Path | str) -> Iterator[bool]:
-    """Hold a lock on a folder, which may not exist yet.
+def locked_folder(path: Path | str) -> Iterator[None]:
+    """Hold a lock on a folder, which may not exist yet; see `lock_file`.
 
     Parent folders that were made for the lock are removed if the folder does not exist in the end.
-
-    Yields:
-        Whether the lock is held: False on a file system without locks.
 
     Raises:
         RobocasError: another process holds the lock, or the folder is not writable.
@@ -40,10 +37,9 @@ def locked_folder(path: Path | str) -> Iterator[bool]:
     real = path.resolve()  # one lock file whatever link leads to the folder, and outside if the folder may be replaced
     lock = path / LOCK if is_fixed(path) else real.parent / f".{real.name}.lock"
     try:
-        file, held = _open_locked(lock, path)
-        with file:
+        with _open_locked(lock, path):
             try:
-                yield held
+                yield
             finally:
                 lock.unlink(missing_ok=True)
     finally:
@@ -53,16 +49,13 @@ def locked_folder(path: Path | str) -> Iterator[bool]:
                     folder.rmdir()
 
 
-def lock_file(file: IO[Any], path: Path, *, wait: bool) -> bool:
+def lock_file(file: IO[Any], path: Path, *, wait: bool) -> None:
     """Lock an open file until it is closed; a file system without locks gives a warning.
 
     Args:
         file: open for writing.
         path: the folder or file that the lock protects, for messages.
         wait: whether to wait until no other process holds the lock.
-
-    Returns:
-        Whether the lock is held.
 
     Raises:
         RobocasError: another process holds the lock, or locking failed.
@@ -71,7 +64,7 @@ def lock_file(file: IO[Any], path: Path, *, wait: bool) -> bool:
     while True:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-            return True
+            return
         except BlockingIOError as error:
             if time.monotonic() > until:
                 what, fix = "another process is writing here", "Wait until it is done."
@@ -81,10 +74,10 @@ def lock_file(file: IO[Any], path: Path, *, wait: bool) -> bool:
             if error.errno not in _NO_LOCKS:
                 raise RobocasError("can't lock this folder", where=path, found=error.strerror) from error
             _log.warning("%s: its file system has no locks (%s): run one command at a time", path, error.strerror)
-            return False
+            return
 
 
-def _open_locked(lock: Path, path: Path) -> tuple[IO[bytes], bool]:
+def _open_locked(lock: Path, path: Path) -> IO[bytes]:
     """Open and lock a file; again if the process that held the lock has removed the file in between."""
     while True:
         make_folder(lock.parent)
@@ -94,11 +87,11 @@ def _open_locked(lock: Path, path: Path) -> tuple[IO[bytes], bool]:
             what = "can't write into this folder"
             raise RobocasError(what, where=lock.parent, found=error.strerror, fix="Choose another.") from error
         try:
-            held = lock_file(file, path, wait=False)
+            lock_file(file, path, wait=False)
         except BaseException:
             file.close()
             raise
         with suppress(FileNotFoundError):
             if os.path.samestat(os.fstat(file.fileno()), lock.lstat()):
-                return file, held
+                return file
         file.close()

@@ -66,7 +66,6 @@ class OutputFolder:
     Attributes:
         path: of the folder.
         recorded: content of the record; None: the run starts from nothing.
-        has_lock: whether the folder is locked: False on a file system without locks.
 
     Raises:
         OutputExistsError: on entering: the folder was not written by the command, or with other settings.
@@ -78,14 +77,13 @@ class OutputFolder:
     ) -> None:
         self.path = Path(path)
         self.recorded: dict[str, Any] | None = None
-        self.has_lock = False
         self._kind, self._settings, self._overwrite = kind, settings, overwrite
         self._started = False
         self._stack = ExitStack()
 
     def __enter__(self) -> OutputFolder:
         with ExitStack() as stack:
-            self.has_lock = stack.enter_context(locked_folder(self.path))
+            stack.enter_context(locked_folder(self.path))
             self.read()
             self._stack = stack.pop_all()
         return self

@@ -169,7 +169,7 @@ class WorkerProcess(Generic[Task, Result]):
 
     def _end(self) -> None:
         if self._process is not None:
-            kill_tree(self._process)
+            _kill_tree(self._process)
             self._process = None
         if self._connection is not None:
             self._connection.close()
@@ -187,7 +187,7 @@ def _exceeds_memory(pid: int, memory_gb: float) -> bool:
         return False  # it has just ended
 
 
-def kill_tree(process: subprocess.Popen[bytes]) -> None:
+def _kill_tree(process: subprocess.Popen[bytes]) -> None:
     """Kill a process and what it forked, which must not go on writing files, and wait for its end."""
     if process.poll() is not None:
         return  # another process may have its id by now

@@ -130,10 +130,8 @@ def test_folder_removed_during_the_run(tmp_path):
 
 
 def test_two_runs_in_one_folder(tmp_path):
-    with OutputFolder(tmp_path / "out", KIND, SETTINGS) as output:
-        assert output.has_lock
-        with pytest.raises(RobocasError):
-            write_run(tmp_path / "out")
+    with OutputFolder(tmp_path / "out", KIND, SETTINGS), pytest.raises(RobocasError):
+        write_run(tmp_path / "out")
 
 
 def test_output_written_in_one_go(tmp_path):
