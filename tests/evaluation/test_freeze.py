@@ -102,13 +102,6 @@ def test_no_plan(tmp_path, text):
     assert not (tmp_path / "out").exists()
 
 
-def test_rules_that_no_protocol_has_leave_nothing_behind(tmp_path):
-    plan = Plan.model_validate({**PLAN, "rules": {"name": "tiny", "speed": 1}})
-    with pytest.raises(EvaluationError, match="no rules of a protocol.*speed"):
-        list(freeze(plan, tmp_path / "out"))
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.parametrize(
     ("changed", "said"),
     [

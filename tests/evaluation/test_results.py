@@ -1,12 +1,11 @@
 """A result is appended to, gone on with, read in parts and merged."""
 
 import json
-import shutil
 
 import pytest
 from made_up_results import RUN_OF, outcome, write
 
-from robocas_ms3.core.errors import EvaluationError, OutputExistsError, RobocasError
+from robocas_ms3.core.errors import EvaluationError, OutputExistsError
 from robocas_ms3.evaluation.outcomes import failure_stage
 from robocas_ms3.evaluation.results import OUTCOMES, RUN, RunRecord, append, merge, open_result, parts_of, read
 
@@ -193,17 +192,3 @@ def test_the_folder_of_another_command_stays_as_it_is(tmp_path, notes, overwrite
     with pytest.raises(OutputExistsError):
         start(tmp_path, overwrite=overwrite)
     assert (tmp_path / RUN).read_text() == notes
-
-
-def test_episodes_without_what_they_were_measured_with_are_not_gone_on_with(tmp_path):
-    write(tmp_path / "a", [outcome(0)])
-    (tmp_path / "a" / RUN).unlink()
-    with pytest.raises(OutputExistsError):
-        start(tmp_path / "a")
-
-
-def test_a_folder_that_is_removed_during_the_run(tmp_path):
-    with pytest.raises(RobocasError) as error, open_result(tmp_path / "a", RunRecord.of(RUN_OF, "")):
-        shutil.rmtree(tmp_path / "a")
-        append(tmp_path / "a", outcome(0))
-    assert error.value.where == tmp_path / "a"

@@ -38,10 +38,6 @@ def test_bins_of_occlusion(result):
     assert row(markdown(result), "0 to 0.2") == ["0 to 0.2", "0", ""]
 
 
-def test_without_occlusion_there_is_no_such_table(tmp_path):
-    assert "p_vis" not in markdown(write(tmp_path / "a", [outcome(0)]))
-
-
 def test_the_weld_is_named(tmp_path):
     one = write(tmp_path / "a", [outcome(0)], weld=True)
     assert markdown(one).startswith("# mine by made_up with upstream's weld\n\n**With upstream's weld: ")
