@@ -299,11 +299,7 @@ class _Reader:
 
 
 def urdf_of(folder: Path) -> Path:
-    """Return the URDF of a model.
-
-    Raises:
-        AssetError: there is none.
-    """
+    """Return the URDF of a model; AssetError where there is none."""
     path = folder / URDF
     if not path.exists():
         expected = "the folder of a PartNet-Mobility model"
@@ -331,7 +327,7 @@ def _parse(folder: Path) -> ET.Element:
 
 
 def _refuse_doctype(path: Path, *_: object) -> None:
-    """A few lines of entities can stand for gigabytes, or for another file."""
+    # a few lines of entities can stand for gigabytes, or for another file
     fix = "Remove the line `<!DOCTYPE ...>` and the entities in it."
     raise AssetError("the URDF declares a document type", where=path, expected="plain XML", fix=fix)
 

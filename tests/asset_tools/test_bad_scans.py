@@ -243,28 +243,20 @@ def test_several_materials(tmp_path):
 
 
 @pytest.mark.slow
-def test_half_a_million_faces(tmp_path):
-    model = bottle(sections=500, rows=125)
-    assert len(model[2]) > 500_000
+def test_a_quarter_of_a_million_faces_take_less_than_a_gigabyte(tmp_path):
+    model = bottle(sections=350, rows=90)
+    assert len(model[2]) > 250_000
     path = write_obj(tmp_path, model, scale=100)
     code = f"""
-import pickle, re, time
+import re
 from asset_tools.prepare import prepare
 from asset_tools.visual import to_display
 from pathlib import Path
-start = time.process_time()
 scan = prepare(Path({str(path)!r}))
 light = to_display(scan.mesh, triangles=1000), to_display(scan.mesh, triangles=12000, texture_size=1024)
 peak = re.search(r"VmHWM:\\s*(\\d+) kB", Path("/proc/self/status").read_text())[1]  # rusage has the parent's in it
-lost = max(abs(mesh.volume / scan.mesh.volume - 1) for mesh in light)
-print(time.process_time() - start, int(peak) / 1024**2, lost)
-pickle.dump(scan, open({str(tmp_path / "scan.pickle")!r}, "wb"))
+print(int(peak) / 1024**2, max(abs(mesh.volume / scan.mesh.volume - 1) for mesh in light))
 """
-    seconds, gibibytes, lost = map(float, subprocess.check_output([sys.executable, "-c", code]).split())
-    assert seconds < 25
-    assert gibibytes < 2
+    gibibytes, lost = map(float, subprocess.check_output([sys.executable, "-c", code]).split())
+    assert gibibytes < 1
     assert lost < 0.01
-    import pickle
-
-    with (tmp_path / "scan.pickle").open("rb") as file:
-        check_bottle(pickle.load(file), volume=0.01)
