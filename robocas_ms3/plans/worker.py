@@ -109,7 +109,7 @@ class UnitWorker:
         for _ in range(TRIES):
             try:
                 return process.run(files)
-            except WorkerStartError as failed:
+            except (WorkerStartError, ImportError) as failed:
                 raise PlanError("a process could not start", found=failed) from failed
             except WorkerCrashed as crash:
                 reason = f"{crash.found}"

@@ -1,6 +1,5 @@
 """Files of others are bounded before anything is built of them."""
 
-import json
 import os
 
 import pytest
@@ -132,9 +131,3 @@ def test_yaml_that_can_be_built_in_no_way(file, text, match):
 def test_what_is_merged_into_a_mapping_is_not_given_twice(file):
     text = "z: &z {k: 0}\na: &a {<<: *z, k: 1}\nb: {<<: *a, k: 2}"
     assert load_yaml(file(text)) == {"z": {"k": 0}, "a": {"k": 1}, "b": {"k": 2}}
-
-
-def test_what_is_there_is_read(file):
-    data = {"a": [1, 2.5, None, True], "b": {"c": "ä"}}
-    assert load_json(file(json.dumps(data))) == data
-    assert load_yaml(file("a: [1, 2.5, null, true]\nb: {c: ä}")) == data

@@ -33,13 +33,6 @@ def test_a_folder_appears_whole_and_replaces_the_old_one(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["pack"]
 
 
-def test_a_folder_that_cannot_be_made_is_one_clear_line(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(RobocasError, match="can't make this folder") as error:
-        make_folder(tmp_path / "file" / "sub")
-    assert "\n" not in str(error.value)
-
-
 def test_what_a_killed_run_left_is_swept_up_a_day_later(tmp_path):
     old, young, other = (tmp_path / name for name in (".pack.a.tmp", ".pack.b.tmp", ".spack.c.tmp"))
     for folder in (old, young, other):
@@ -109,15 +102,6 @@ def test_only_a_regular_file_is_opened_for_append(tmp_path, kind):
         open_for_append(path)
     assert error.value.where == path
     assert (target.read_text() if kind == "link" else target.exists()) == ("kept" if kind == "link" else False)
-
-
-def test_append_keeps_the_content_of_a_file(tmp_path):
-    (tmp_path / "notes").write_bytes(b"one ")
-    with open_for_append(tmp_path / "notes") as file:
-        assert file.read() == b"one "
-        file.seek(0)
-        file.write(b"two")
-    assert (tmp_path / "notes").read_bytes() == b"one two"
 
 
 def test_a_temporary_name_is_another_each_time(tmp_path):

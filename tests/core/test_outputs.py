@@ -53,13 +53,6 @@ def test_other_settings_are_refused_with_all_changes(tmp_path):
     assert names(tmp_path / "out") == ["episode_0", "episode_1", "run.json"]
 
 
-def test_settings_of_an_older_version_are_upgraded(tmp_path):
-    write_run(tmp_path, {"rate": 5})
-    kind = FolderKind("robocas test", ("run.json",), "rate", upgrade=lambda record: {"codec": "h264", **record})
-    with OutputFolder(tmp_path, kind, {"rate": 5, "codec": "h264"}) as output:
-        assert output.recorded == {"rate": 5}
-
-
 @pytest.mark.parametrize("overwrite", [False, True])
 @pytest.mark.parametrize("record", [None, "[]", "{", '{"protocol": "of another command"}'])
 def test_folder_of_something_else_is_left_alone(tmp_path, record, overwrite):

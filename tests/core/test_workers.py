@@ -154,14 +154,23 @@ def test_a_result_that_cannot_be_pickled_is_an_error():
         pool.run(1)
 
 
-def test_a_process_outlives_the_thread_that_asked_for_it():
+def test_a_process_outlives_the_thread_that_asked_for_it_a_sigterm_and_a_fork():
     with WorkerPool(Counter, 1) as pool:
         found = []
         thread = threading.Thread(target=lambda: found.append(pool.run("a")))
         thread.start()
         thread.join()
         time.sleep(0.2)
-        assert pool.run("b") == ("b", found[0][1], 2)
+        process = found[0][1]
+        assert pool.run("terminate") == ("terminate", process, 2)  # as a batch system ends all processes of a job
+        pid = os.fork()
+        if not pid:
+            try:
+                os._exit(0 if pool.run("b")[2] == 1 else 1)  # by a process of its own
+            finally:
+                os._exit(2)
+        assert os.waitpid(pid, 0)[1] == 0
+        assert pool.run("b") == ("b", process, 3)
 
 
 def test_stopping_a_pool_cancels_what_other_threads_wait_for():
@@ -185,11 +194,6 @@ def test_stopping_a_pool_cancels_what_other_threads_wait_for():
     assert len(errors) == 2
 
 
-def test_a_signal_that_ends_a_whole_job_is_not_a_crash():
-    with WorkerPool(Counter, 1) as pool:
-        assert pool.run("terminate")[0] == "terminate"
-
-
 def test_a_process_that_the_system_refuses_is_an_error_and_ends_nothing(monkeypatch):
     def refuse(*args, **kwargs):
         raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
@@ -201,20 +205,6 @@ def test_a_process_that_the_system_refuses_is_an_error_and_ends_nothing(monkeypa
                 pool.run("a")
             assert caught.value.found == os.strerror(errno.EAGAIN)
         assert pool.run("a")[0] == "a"
-
-
-def test_a_fork_starts_processes_of_its_own():
-    with WorkerPool(Counter, 1) as pool:
-        process = pool.run("a")[1]
-        pid = os.fork()
-        if not pid:
-            try:
-                with WorkerPool(Counter, 1) as other:
-                    os._exit(0 if {pool.run("b")[2], other.run("b")[2]} == {1} else 1)
-            finally:
-                os._exit(2)
-        assert os.waitpid(pid, 0)[1] == 0
-        assert pool.run("b") == ("b", process, 2)
 
 
 class TooLarge(Counter):

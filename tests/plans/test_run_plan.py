@@ -310,7 +310,7 @@ def test_a_process_that_cannot_begin_ends_the_run_and_blames_no_seed(tmp_path):
     def open_worker(plan, out):
         return UnitWorker(plan, out, MadeUp, cannot_begin)
 
-    with pytest.raises(RobocasError, match="no such device"):
+    with pytest.raises(PlanError, match="no such library"):
         run_here(tmp_path / "out", open_worker=open_worker)
     assert seeds_done(tmp_path / "out") == 0
 

@@ -73,7 +73,7 @@ def render(plan):
 
 
 def cannot_begin(plan):
-    raise RobocasError("no such device")
+    raise ImportError("no such library")
 
 
 def open_worker(plan, out):
