@@ -69,12 +69,6 @@ class BcStateConfig(BaselineConfig):
 class StateSamples:
     """Samples of `bc-state`: a batch has ``inputs`` (B, D), ``chunk`` (B, K, 10) and ``key`` (B, 9).
 
-    Args:
-        config: see `BcStateConfig`.
-        path: ``trajectory.h5``.
-        split: of its seeds, as in a conversion.
-        on_read: see `Baseline.data`.
-
     Raises:
         DatasetError: it is no trajectory file, its scenes hold different numbers of objects, or its base drives.
     """

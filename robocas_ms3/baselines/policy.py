@@ -25,9 +25,6 @@ class RunPolicy:
     Args:
         folder: of the run.
         device: ``auto`` (a GPU if there is one), ``cpu`` or ``cuda``.
-
-    Raises:
-        TrainingError: the folder is no run, has no weights yet, or is of another version.
     """
 
     def __init__(self, folder: Path, device: str = "auto") -> None:

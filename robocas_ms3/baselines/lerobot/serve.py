@@ -30,12 +30,6 @@ INFO = "dataset/meta/info.json"
 def open_checkpoint(checkpoint: Path, rate_hz: float, device: str, play: int | None) -> LeRobotPolicy:
     """Load a checkpoint of ``lerobot-train``.
 
-    Args:
-        checkpoint: folder ``pretrained_model``.
-        rate_hz: frames per second of the dataset.
-        device: of torch.
-        play: actions of a chunk before the next one; None: as trained.
-
     Raises:
         EvaluationError: there is none, or it can't play so many actions.
     """
@@ -71,11 +65,7 @@ def open_checkpoint(checkpoint: Path, rate_hz: float, device: str, play: int | N
 
 
 def rate_of(info: Path) -> float:
-    """Return the frames per second of a dataset.
-
-    Raises:
-        EvaluationError: its ``info.json`` has none.
-    """
+    """Return the frames per second of a dataset."""
     try:
         rate_hz = load_json(info)["fps"]
     except (OSError, ValueError, KeyError, TypeError) as error:

@@ -19,13 +19,7 @@ _SCALE = np.array([POSITION_SCALE] * 3 + [ROTATION_SCALE] * 3 + [1.0])
 
 
 class Agent(nn.Module):
-    """Two networks of two layers, on observations normalised by their running statistics.
-
-    Args:
-        observed: size of an observation.
-        acted: size of an action.
-        width: of the layers.
-    """
+    """Two networks of two layers, on observations normalised by their running statistics."""
 
     mean: torch.Tensor
     square: torch.Tensor
@@ -76,12 +70,7 @@ def _layers(inputs: int, width: int, outputs: int, gain: float) -> nn.Sequential
 
 
 class PpoPolicy:
-    """Acts without noise, in the convention of ``pd_ee_delta_pose``.
-
-    Args:
-        facts: of the environments.
-        agent: trained.
-    """
+    """Acts without noise, in the convention of ``pd_ee_delta_pose``."""
 
     def __init__(self, facts: dict[str, Any], agent: Agent) -> None:
         # Rotations are about one axis, where Euler angles and rotation vectors are the same

@@ -75,10 +75,6 @@ def _observation(obs: dict[str, Any]) -> torch.Tensor:
 class PpoEnvironments:
     """Environments to train in; see `Environments`. A success does not end an episode, and each env keeps its objects.
 
-    Args:
-        config: task, scenes and number.
-        device: ``cpu``: in worker processes; ``cuda``: one batch.
-
     Raises:
         ConfigError: there is no such task or configuration.
         TrainingError: the base has to drive.
@@ -125,11 +121,7 @@ class PpoEnvironments:
 
 
 def load_scenes(config: PpoConfig) -> TaskConfig:
-    """Load the scenes of a configuration.
-
-    Raises:
-        ConfigError: there is no such configuration.
-    """
+    """Load the scenes of a configuration."""
     if config.scenes is not None:
         return load_task_config(config.scenes)
     return load_task_config(load_task_config("pick_table_scattered").model_dump(mode="json") | ONE_FRUIT)

@@ -38,18 +38,7 @@ class Rollout:
 
 
 class RolloutCollector:
-    """Steps environments with a policy and its noise, and keeps the outcomes of the last episodes.
-
-    Args:
-        envs: each starts with another layout.
-        agent: that acts.
-        config: see `PpoConfig`.
-        episodes: number of episodes played before.
-        outcomes: (n, 4) `OUTCOMES` of the last of these.
-
-    Attributes:
-        episodes: number of episodes played.
-    """
+    """Steps environments with a policy and its noise, and keeps the outcomes of the last episodes."""
 
     def __init__(self, envs: VectorEnv, agent: Agent, config: PpoConfig, episodes: int, outcomes: torch.Tensor) -> None:
         self.episodes = episodes

@@ -24,12 +24,6 @@ def train_ppo(run: RunFolder, agent: Agent, config: PpoConfig, environments: Ppo
     states of the last update. Its environments start again, with the layouts after those that were used, so it
     does not repeat an uninterrupted run bit for bit.
 
-    Args:
-        run: folder of the run.
-        agent: to train, on its device.
-        config: see `PpoConfig`.
-        environments: to train in.
-
     Raises:
         TrainingError: there are several processes, the loss or the gradient is NaN or infinite, or the checkpoint is
             of something else.

@@ -32,12 +32,6 @@ class RT1Samples:
 
     The last action is the one that leads to an episode's last step, T - 2.
 
-    Args:
-        config: see `RT1Config`.
-        folder: of the dataset.
-        split: of it.
-        on_read: see `Baseline.data`; only numbers and texts are read here.
-
     Raises:
         DatasetError: it lacks embeddings or a camera, is of another rate, has no such split, is damaged, holds NaN, or
             its base drives.

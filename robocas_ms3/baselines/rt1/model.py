@@ -111,10 +111,6 @@ def attention_mask(frames: int, images: int, predicted: int) -> torch.Tensor:
 class RT1Model(nn.Module):
     """Predicts the action of each frame.
 
-    Args:
-        config: see `RT1Config`.
-        facts: of the data, see `RT1Samples`.
-
     Raises:
         TrainingError: the file ``image_weights`` is not one. A missing file is an error of the training alone: trained
             weights need none.

@@ -23,11 +23,6 @@ class RT1Policy:
 
     Images are requested as the dataset stores them, and scaled as its samples are: images rendered at 320 x 256 would
     show another field of view than images of 640 x 480 scaled to that.
-
-    Args:
-        config: of the network.
-        facts: of the data it was trained on.
-        model: the network, on any device.
     """
 
     def __init__(self, config: RT1Config, facts: dict[str, Any], model: RT1Model) -> None:

@@ -43,12 +43,6 @@ _KEYS = ("ee_pos", "ee_orn", "gripper_width", "gripper_status", "base_pos", "bas
 class SmallSamples:
     """Samples of `small`, one of every step.
 
-    Args:
-        config: see `SmallConfig`.
-        path: of the dataset.
-        split: of it.
-        on_read: see `Baseline.data`.
-
     Raises:
         DatasetError: the dataset lacks a camera or embeddings, is of another rate or damaged, its images are smaller
             than ``rendered``, its cameras move between episodes, or memory is too small for the images.

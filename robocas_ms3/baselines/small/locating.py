@@ -62,14 +62,7 @@ def cells_of(places: torch.Tensor, view: View) -> torch.Tensor:
 
 
 class Pointer(nn.Module):
-    """Compares each cell of a feature map with a query.
-
-    Args:
-        view: of the map.
-        channels: of the map.
-        width: of queries, and of the answer.
-        tells: whether it is asked for more than `logits`.
-    """
+    """Compares each cell of a feature map with a query."""
 
     places: torch.Tensor
 

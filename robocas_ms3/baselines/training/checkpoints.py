@@ -40,11 +40,7 @@ class Checkpoint:
         return {key.removeprefix(prefix): value for key, value in self.tensors.items() if key.startswith(prefix)}
 
     def load_model(self, model: torch.nn.Module, part: str = "") -> None:
-        """Load weights into a network.
-
-        Raises:
-            TrainingError: they are of another network.
-        """
+        """Load weights into a network."""
         own, tensors = model.state_dict(), self.part(part) if part else self.tensors
         missing, more = own.keys() - tensors.keys(), tensors.keys() - own.keys()
         shapes = [name for name in own if name in tensors and own[name].shape != tensors[name].shape]
@@ -96,10 +92,6 @@ def _sort_header(content: bytes) -> bytes:
 
 def load(path: Path, expected: Mapping[str, str]) -> Checkpoint:
     """Read the tensors of a file.
-
-    Args:
-        path: of the file.
-        expected: metadata that has to match.
 
     Raises:
         TrainingError: the file is missing or damaged, or its metadata differ.

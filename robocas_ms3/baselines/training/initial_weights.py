@@ -40,12 +40,6 @@ def load_initial_weights(
 ) -> InitialWeights | None:
     """Load the weights of the run to start from, if one is named.
 
-    Args:
-        baseline: to train.
-        start: folder or name of that run.
-        recorded: record of the run in ``out``, if it continues.
-        out: folder of the run.
-
     Raises:
         TrainingError: the weights are missing, or of another baseline or version; or a run that continues has no
             checkpoint yet, and the run that it started from is not named.
@@ -67,11 +61,6 @@ def load_initial_weights(
 
 def combine_facts(own: dict[str, Any], initial: InitialWeights | None, data: Path | None) -> dict[str, Any]:
     """Return the facts of a run; on a dataset, with initial weights, the other run's, whose scales fit the weights.
-
-    Args:
-        own: facts of the data or the environments.
-        initial: weights to start from.
-        data: the dataset; None: environments.
 
     Raises:
         TrainingError: the inputs of the other run differ.

@@ -19,11 +19,6 @@ from robocas_ms3.core.errors import TrainingError
 class Learner:
     """Takes optimiser steps, averages weights and metrics, and saves and restores all of that.
 
-    Args:
-        run: folder of the run, with the checkpoint to continue from.
-        model: on the device of the run.
-        settings: of the training.
-
     Attributes:
         step: number of steps done.
     """
@@ -47,11 +42,7 @@ class Learner:
             run.checkpoint.load_optimizer(self._optimizer)
 
     def update(self, batch: Batch, learning_rate: float) -> None:
-        """Take a step of the optimiser.
-
-        Raises:
-            TrainingError: the loss or the gradient is NaN or infinite. On a GPU `take_means` raises it.
-        """
+        """Take a step of the optimiser; on a GPU, NaN is an error of `take_means`, as a check would wait for the step."""
         for group in self._optimizer.param_groups:
             group["lr"] = learning_rate
         self._model.train()
@@ -60,7 +51,7 @@ class Learner:
         self._accelerator.backward(metrics["loss"])
         clip_norm = self._settings.clip_norm or math.inf
         norm: Any = self._accelerator.clip_grad_norm_(self._model.parameters(), clip_norm)
-        if norm.device.type == "cpu":  # on a GPU the check would wait for the step
+        if norm.device.type == "cpu":
             self.check_finite(self.step + 1, loss=metrics["loss"].detach(), gradient=norm)
         self._norms += norm.detach()
         self._optimizer.step()
@@ -71,11 +62,7 @@ class Learner:
         self._sums = {name: self._sums.get(name, 0.0) + sum_of_batch(value, 1) for name, value in metrics.items()}
 
     def take_means(self) -> dict[str, float]:
-        """Return the means of the metrics since the last call, over all processes.
-
-        Raises:
-            TrainingError: the loss or a gradient was NaN or infinite.
-        """
+        """Return the means of the metrics since the last call, over all processes."""
         means = means_of_sums(self._reduce(self._sums))
         self._sums = {}
         self.check_finite(self.step, loss=means["loss"], gradient=self._norms)
@@ -99,11 +86,7 @@ class Learner:
         return means_of_sums(self._reduce(sums))
 
     def check_finite(self, step: int, **values: torch.Tensor | float) -> None:
-        """Check that values of a step are finite.
-
-        Raises:
-            TrainingError: one is not.
-        """
+        """Raise a TrainingError if values of a step are NaN or infinite."""
         for name, value in values.items():
             if not math.isfinite(value):
                 raise self._run.error(f"the {name} is NaN or infinite", step)

@@ -62,14 +62,7 @@ class MetricsLog:
         return (step, split) in self._written
 
     def add(self, step: int, split: str, about: Mapping[str, float], metrics: Mapping[str, float]) -> None:
-        """Write a line.
-
-        Args:
-            step: number of steps done.
-            split: ``train`` (means since the last line) or ``val``.
-            about: epoch, seconds and learning rate.
-            metrics: by name.
-        """
+        """Write a line."""
         row = {"step": step, "split": split, **about, **metrics}
         is_first = not self._columns
         if is_first:
@@ -103,12 +96,7 @@ class MetricsLog:
 
 
 class TensorBoardWriter:
-    """Writes TensorBoard events without the thread of TensorBoard's own writer, whose errors would come late.
-
-    Args:
-        folder: of the files; a new one is added.
-        first: step from which on events of earlier files are hidden; 0: none are.
-    """
+    """Writes TensorBoard events without the thread of TensorBoard's own writer, whose errors would come late."""
 
     def __init__(self, folder: Path, first: int = 0) -> None:
         from tensorboard.compat.proto import event_pb2, summary_pb2

@@ -27,12 +27,6 @@ class RunFolder:
 
     As a context manager it closes the log.
 
-    Args:
-        output: the locked folder.
-        record: of the run; of a run that continues, the recorded one.
-        accelerator: that it is trained on.
-        progress: functions to report to.
-
     Attributes:
         record: of the run.
         accelerator: that it is trained on.
@@ -61,14 +55,7 @@ class RunFolder:
             self._log.close()
 
     def start(self, step: int, model: torch.nn.Module, weights: Tensors, size: str) -> None:
-        """Write the record and open the log; weights of another step than the checkpoint are written again.
-
-        Args:
-            step: of the checkpoint, or 0.
-            model: to train.
-            weights: of the policy at this step.
-            size: of the data, for the report.
-        """
+        """Write the record and open the log; weights of another step than the checkpoint are written again."""
         accelerator, record = self.accelerator, self.record
         changes = _hardware_changes(record, accelerator)
         if self._output.recorded is not None and changes:

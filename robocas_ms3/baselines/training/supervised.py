@@ -24,13 +24,6 @@ def train_supervised(
 ) -> None:
     """Train a network until all steps are done, from the checkpoint of the run if it has one.
 
-    Args:
-        run: folder of the run.
-        model: to train, on its device.
-        settings: of the training.
-        samples: to train on.
-        validation: samples to validate on; None: no validation.
-
     Raises:
         TrainingError: the loss or the gradient is NaN or infinite, or the checkpoint is of something else.
         RobocasError: somebody removed the folder.

@@ -69,7 +69,7 @@ def shown(widths):
     )
 
 
-def test_what_it_wants_follows_from_the_checkpoint():
+def test_the_spec_follows_from_the_checkpoint():
     spec = made().spec
     assert (spec.convention, spec.reference, spec.rate_hz, spec.language) == ("robocas", "tcp", 5.0, "embedding")
     assert spec.cameras == {"base_camera": (4, 2)}
@@ -117,13 +117,6 @@ def test_envs_play_chunks_of_their_own():
     assert actions[:, :2].tolist() == [[2, 0], [120, 0]]
     assert actions[:, 3].tolist() == [6, 6]  # three of each: nor is what is reset in place shared
     assert policy.act(shown({0: 4}))[0, 0] == 8  # the next chunk
-
-
-def test_weights_are_shared():
-    model = Chunks()
-    policy = made(model)
-    policy.reset([start(0)])
-    assert policy._models[0].weight is model.weight
 
 
 def test_noise_is_the_episode_s_own():

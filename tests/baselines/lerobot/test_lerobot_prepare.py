@@ -97,6 +97,8 @@ def test_videos_are_the_same_files(source, out):
     assert not [key for key in info["features"] if "depth" in key or "language" in key]
     assert not [name for name in pq.read_table(out / EPISODES).column_names if "depth" in name]
     assert not (out / ".annotate_staging").exists()
+    with pytest.raises(OutputExistsError):
+        prepare(source, out, embed)
 
 
 def test_another_format_is_refused(source, tmp_path):
@@ -112,15 +114,8 @@ def test_without_language(source, tmp_path):
     assert EMBEDDING not in json.loads((tmp_path / "out/meta/info.json").read_text())["features"]
 
 
-def test_nothing_is_replaced(source, out):
-    with pytest.raises(OutputExistsError):
-        prepare(source, out, embed)
-
-
-@pytest.mark.parametrize(
-    "key, value, message", [("action", np.nan, "NaN or infinite value"), ("action.base", 0.02, "the base drives")]
-)
-def test_numbers_that_nothing_can_be_learnt_from(source, tmp_path, key, value, message):
+@pytest.mark.parametrize("key, value", [("action", np.nan), ("action.base", 0.02)])
+def test_nan_and_a_base_that_drives_are_refused(source, tmp_path, key, value):
     spoiled = tmp_path / "spoiled"
     shutil.copytree(source, spoiled)
     table = pq.read_table(spoiled / DATA)
@@ -128,20 +123,9 @@ def test_numbers_that_nothing_can_be_learnt_from(source, tmp_path, key, value, m
     values[2, 1] = value
     column = pa.FixedSizeListArray.from_arrays(pa.array(values.reshape(-1)), values.shape[1])
     pq.write_table(table.set_column(table.column_names.index(key), key, column), spoiled / DATA)
-    with pytest.raises(DatasetError, match=message):
+    with pytest.raises(DatasetError):
         prepare(spoiled, tmp_path / "out", embed)
     assert not (tmp_path / "out").exists()
-
-
-def test_a_base_that_drives_slowly(source, tmp_path):
-    spoiled = tmp_path / "spoiled"
-    shutil.copytree(source, spoiled)
-    table = pq.read_table(spoiled / DATA)
-    values = np.full_like(numbers(spoiled / DATA, "action.base"), 0.004, dtype=np.float32)
-    column = pa.FixedSizeListArray.from_arrays(pa.array(values.reshape(-1)), values.shape[1])
-    pq.write_table(table.set_column(table.column_names.index("action.base"), "action.base", column), spoiled / DATA)
-    with pytest.raises(DatasetError, match="the base drives"):
-        prepare(spoiled, tmp_path / "out", embed)
 
 
 def test_what_is_no_dataset_is_one_line(tmp_path, capsys):

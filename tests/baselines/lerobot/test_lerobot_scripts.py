@@ -66,17 +66,6 @@ def test_scripts_run_in_the_environment_of_setup(checkout, name, words, renderer
     assert [path.name for path in checkout.glob(".venv*")] == [".venv-lerobot"]
 
 
-def test_the_checks_install_what_they_import_before_they_run(checkout):
-    _, install, _ = run_script(checkout, "check_lerobot.sh", "data")
-    assert install.startswith("python -m pip") and "openai" in install
-    _, install, check, tests, _ = run_script(checkout, "check_lerobot_env.sh")
-    assert install.startswith("python -m pip") and "pytest" in install and "hypothesis" in install
-    assert check.endswith("check")
-    folders = [word for word in tests.split() if word.startswith("tests/")]
-    assert tests.startswith("python -m pytest") and folders
-    assert all((SCRIPTS.parent / folder).exists() for folder in folders)
-
-
 @pytest.mark.parametrize("version", [version for version in VARIANTS if version != NEWEST])
 def test_older_versions_have_environments_of_their_own(checkout, version):
     create, install, check = run_script(checkout, "check_lerobot.sh", "--version", version, "data")
@@ -85,14 +74,6 @@ def test_older_versions_have_environments_of_their_own(checkout, version):
     assert "scripts/check_lerobot.py" in check
     assert (checkout / f".venv-lerobot-{version}" / "bin" / "python").exists()
     assert run_script(checkout, "check_lerobot.sh", "--version", version, "data") == [check]
-
-
-def test_an_unknown_version_is_refused(tmp_path):
-    (tmp_path / "meta").mkdir()
-    (tmp_path / "meta" / "info.json").write_text("{}")
-    words = ["bash", SCRIPTS / "check_lerobot.sh", "--version", "0.7", tmp_path]
-    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=60)
-    assert (done.returncode, done.stderr) == (2, "unknown LeRobot version '0.7': expected 0.6, 0.5 or 2.1\n")
 
 
 @pytest.mark.parametrize("begun", ["diffusion 0123 ", None])
@@ -110,20 +91,17 @@ def test_an_output_of_another_training_is_refused(tmp_path, begun):
 
 
 @pytest.mark.parametrize(
-    "name, words",
+    ("name", "words"),
     [
         ("train_lerobot.sh", []),
         ("train_lerobot.sh", ["act", "nowhere", "out"]),
         ("serve_lerobot.sh", []),
-        ("check_lerobot.sh", []),
         ("check_lerobot.sh", ["--version", "0.6", "nowhere"]),
+        ("check_lerobot.sh", ["--version", "0.7", "data"]),
     ],
 )
-def test_wrong_arguments_print_the_usage(tmp_path, name, words):
-    done = subprocess.run(
-        ["bash", SCRIPTS / name, *words], cwd=tmp_path, capture_output=True, text=True, check=False, timeout=60
-    )
-    assert done.returncode == 2
-    assert f"bash scripts/{name}" in done.stderr
-    assert done.stderr.count("\n") == 1
-    assert not list(tmp_path.iterdir())
+def test_wrong_arguments_are_one_line(checkout, name, words):
+    command = ["bash", SCRIPTS / name, *words]
+    done = subprocess.run(command, cwd=checkout, capture_output=True, text=True, check=False, timeout=60)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert not list(checkout.glob(".venv*"))

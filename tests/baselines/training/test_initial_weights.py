@@ -20,18 +20,22 @@ SCALES = {"inputs": {"mean": [0.5] * 20}}
 SIMULATION = {"observed": 30, "horizon": 100}
 
 
+def combine(whole, facts, own):
+    change_record(whole, facts=facts)
+    initial = load_initial_weights(MadeUp(), whole, None, whole)
+    return combine_facts(own, initial, None if facts is SIMULATION else Path("data"))
+
+
 @pytest.mark.parametrize(
     ("facts", "own", "expected"),
     [
-        (CALIBRATION, {"calibration": {"x": [1.0004, 2], "hand": True}}, CALIBRATION),  # the same to a mm
+        (CALIBRATION, {"calibration": {"x": [1.0004, 2], "hand": True}}, CALIBRATION),  # equal to a mm
         (SCALES, {"inputs": {"mean": [9.0] * 20}}, SCALES),  # the weights fit the other run's
         (SIMULATION, {"observed": 30, "horizon": 200}, {"observed": 30, "horizon": 200}),  # those of its environments
     ],
 )
-def test_facts_with_initial_weights(whole, made_up, facts, own, expected):
-    change_record(whole, facts=facts)
-    initial = load_initial_weights(MadeUp(), whole, None, whole)
-    assert combine_facts(own, initial, None if facts is SIMULATION else Path("data")) == expected
+def test_facts_with_initial_weights(whole, facts, own, expected):
+    assert combine(whole, facts, own) == expected
 
 
 @pytest.mark.parametrize(
@@ -46,19 +50,11 @@ def test_facts_with_initial_weights(whole, made_up, facts, own, expected):
         (SIMULATION, {"observed": 40, "horizon": 200}, "observed"),
     ],
 )
-def test_other_inputs_are_refused(whole, made_up, facts, own, where):
-    change_record(whole, facts=facts)
-    initial = load_initial_weights(MadeUp(), whole, None, whole)
+def test_other_inputs_are_refused(whole, facts, own, where):
     with pytest.raises(TrainingError) as caught:
-        combine_facts(own, initial, None if facts is SIMULATION else Path("data"))
+        combine(whole, facts, own)
     assert caught.value.where.endswith(f", {where}")
     assert len(str(caught.value)) < 300  # the first difference, not all matrices
-
-
-def test_options_leave_the_other_defaults(made_up, data, tmp_path):
-    record = train("made-up", data, tmp_path / "run", {"train": {"steps": 3}})
-    assert record.config["train"]["steps"] == 3
-    assert record.config["train"]["batch_size"] == 4  # the baseline's, not TrainSettings'
 
 
 @pytest.mark.parametrize("changes", [{"widht": 3}, {"train": {"steps": 0}}, {"width": "wide"}], ids=str)
@@ -87,24 +83,35 @@ def test_a_run_of_something_else_is_not_continued(whole, data, change, where):
     assert (whole / "weights.safetensors").is_file()
 
 
-def test_a_run_starts_from_the_weights_of_another(whole, data, tmp_path):
+def test_a_run_starts_from_weights_and_configuration_of_another(made_up, data, tmp_path):
+    first, second = tmp_path / "first", tmp_path / "second"
+    train("made-up", data, first, {"width": 8, "train": {"steps": 8, "learning_rate": 0.002}})
     data.write_text("more")
-    changes = {"train": {"steps": 1, "learning_rate": 1e-9, "ema": 0}}
-    record = train("made-up", data, tmp_path / "next", changes, start=whole)
-    first, second = (load_file(folder / "weights.safetensors") for folder in (whole, tmp_path / "next"))
-    assert all(torch.allclose(first[key], second[key], atol=1e-6) for key in first)
-    assert record.start.startswith("whole, ")
-    for start, options in ((tmp_path, {}), (whole, {"width": 5})):  # no run; other sizes
+    record = train("made-up", data, second, {"train": {"steps": 1, "learning_rate": 1e-9, "ema": 0}}, start=first)
+    assert record.config["width"] == 8 and record.config["train"]["batch_size"] == 4  # the baseline's default
+    before, after = (load_file(folder / "weights.safetensors") for folder in (first, second))
+    assert all(torch.allclose(before[key], after[key], atol=1e-6) for key in before)
+    assert record.start.startswith("first, ")
+    abouts = [make_policy(str(folder)).describe() for folder in (first, second)]
+    assert abouts[1]["start"] == record.start and abouts[0]["weights"] != abouts[1]["weights"]
+    change_record(second, facts={"inputs": 3, "pictures": {"base_camera": [64, 48]}})
+    for start, options in ((tmp_path, {}), (first, {"width": 5}), (second, {})):  # no run; other sizes; other images
         with pytest.raises(TrainingError):
             train("made-up", data, tmp_path / "other", options, start=start)
     assert not (tmp_path / "other").exists()
 
 
-def test_a_run_that_started_from_weights_continues_with_the_same(whole, data, tmp_path):
+@pytest.mark.parametrize("step", [3, 11])
+def test_a_run_that_started_from_weights_continues_with_the_same(whole, data, tmp_path, step):
+    """At step 3 there is no checkpoint yet: the initial weights are needed again."""
     other = shutil.copytree(whole, tmp_path / "other")
     out, few = tmp_path / "next", {"train": {"steps": 12}}
     with pytest.raises(RuntimeError):
-        train("made-up", data, out, few, start=whole, progress=stop_at(11, RuntimeError("gone")))
+        train("made-up", data, out, few, start=whole, progress=stop_at(step, RuntimeError("gone")))
+    if step == 3:
+        with pytest.raises(TrainingError) as caught:
+            train("made-up", data, out)
+        assert caught.value.where == out and "--start" in caught.value.fix
     for folder in (out, whole):
         with pytest.raises(OutputExistsError, match="start: "):
             train("made-up", data, folder, start=other)
@@ -114,22 +121,9 @@ def test_a_run_that_started_from_weights_continues_with_the_same(whole, data, tm
     assert_same(tmp_path / "unbroken", out)
 
 
-def test_a_run_without_a_checkpoint_needs_its_initial_weights_again(whole, data, tmp_path):
-    out, few = tmp_path / "next", {"train": {"steps": 12}}
-    with pytest.raises(RuntimeError):
-        train("made-up", data, out, few, start=whole, progress=stop_at(3, RuntimeError("gone")))
-    with pytest.raises(TrainingError) as caught:
-        train("made-up", data, out)
-    assert caught.value.where == out and "--start" in caught.value.fix
-    train("made-up", data, out, start=whole)
-    train("made-up", data, tmp_path / "unbroken", few, start=whole)
-    assert_same(tmp_path / "unbroken", out)
-
-
 def test_other_options_are_refused_with_their_values(whole, data):
-    options = {"width": 5, "train": {"learning_rate": 9e-4}}
     with pytest.raises(OutputExistsError) as error:
-        train("made-up", data, whole, options)
+        train("made-up", data, whole, {"width": 5, "train": {"learning_rate": 9e-4}})
     assert sorted(error.value.found.split("; ")) == [
         "config.train.learning_rate: 0.001 -> 0.0009",
         "config.width: 4 -> 5",
@@ -157,24 +151,6 @@ def test_other_hardware_is_recorded(whole, data, recorded, changes):
     train("made-up", data, whole, progress=Progress(note=notes.append))
     assert json.loads((whole / "run.json").read_text())["resumed"] == changes
     assert all(any(change in note for note in notes) for change in changes)
-
-
-def test_the_configuration_of_the_run_to_start_from_is_below_the_options(made_up, data, tmp_path):
-    changes = {"width": 8, "train": {"steps": 8, "learning_rate": 0.002}}
-    train("made-up", data, tmp_path / "first", changes)
-    record = train("made-up", data, tmp_path / "more", {"train": {"steps": 4}}, start=tmp_path / "first")
-    assert (record.config["width"], record.config["train"]["learning_rate"]) == (8, 0.002)
-    assert record.config["train"]["steps"] == 4
-    about = make_policy(str(tmp_path / "more")).describe()
-    assert about["start"] == record.start and len(about["weights"]) == 64
-    assert about["weights"] != make_policy(str(tmp_path / "first")).describe()["weights"]
-
-
-def test_a_run_on_other_images_is_refused_as_a_start(whole, made_up, data, tmp_path):
-    change_record(whole, facts={"inputs": 3, "pictures": {"base_camera": [64, 48]}})
-    with pytest.raises(TrainingError):
-        train("made-up", data, tmp_path / "more", start=whole)
-    assert not (tmp_path / "more").exists()
 
 
 def test_nested_values():

@@ -11,6 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 
+import devices as devices_check
 import made_up_baseline
 import pytest
 import torch
@@ -26,7 +27,7 @@ from robocas_ms3.core.errors import DatasetError, ExtensionError, OutputExistsEr
 from robocas_ms3.evaluation.policies import make_policy
 
 
-def test_files_of_a_run(whole):
+def test_files_of_a_run_and_its_policy(whole):
     assert {path.name for path in whole.iterdir()} == {
         *("run.json", "metrics.csv", "tensorboard", "checkpoint.safetensors", "weights.safetensors")
     }
@@ -36,6 +37,8 @@ def test_files_of_a_run(whole):
     assert {"torch", "numpy", "robocas-ms3"} <= record["versions"].keys()
     assert record["threads"] == torch.get_num_threads()
     assert {path.stat().st_mode & 0o777 for path in whole.glob("*.safetensors")} == {0o644}  # for everybody to read
+    about = make_policy(str(whole)).describe()
+    assert (about["baseline"], about["steps"], about["data"]["samples"]) == ("made-up", 40, 30)
 
 
 def test_metrics_of_a_run(whole):
@@ -63,8 +66,7 @@ def test_a_run_that_was_stopped_continues_to_the_bit(whole, data, tmp_path, step
     assert_same(whole, out)
 
 
-@pytest.mark.parametrize("name", ["weights.safetensors", "checkpoint.safetensors"])
-@pytest.mark.parametrize("step", [20, 40])
+@pytest.mark.parametrize(("name", "step"), [("weights.safetensors", 20), ("checkpoint.safetensors", 40)])
 def test_a_checkpoint_without_room_on_the_disk_is_written_later(whole, data, tmp_path, monkeypatch, name, step):
     save = checkpoints.save
 
@@ -129,24 +131,18 @@ def test_an_interrupted_validation_is_repeated(whole, data, tmp_path, monkeypatc
     assert_same(whole, tmp_path / "again")
 
 
-def test_a_finished_run_stays_as_it_is(whole, data):
+def test_a_finished_run_stays_as_it_is_and_seeds_differ(whole, data, tmp_path):
     before = (whole / "weights.safetensors").read_bytes()
     train("made-up", data, whole)
     assert (whole / "weights.safetensors").read_bytes() == before
-
-
-def test_seeds_differ(whole, data, tmp_path):
     train("made-up", data, tmp_path / "other", {"train": {"seed": 1}})
     first, second = (load_file(folder / "weights.safetensors") for folder in (whole, tmp_path / "other"))
     assert not torch.equal(first["net.0.weight"], second["net.0.weight"])
 
 
-def test_no_such_baseline(data, tmp_path):
+def test_no_such_baseline_and_no_data(made_up, data, tmp_path):
     with pytest.raises(TrainingError, match="small"):
         train("smal", data, tmp_path / "run")
-
-
-def test_no_data(made_up, tmp_path):
     with pytest.raises(TrainingError) as caught:
         train("made-up", tmp_path / "none.h5", tmp_path / "run")
     assert caught.value.where == tmp_path / "none.h5"
@@ -187,7 +183,7 @@ def test_a_nan_ends_the_run_and_the_last_checkpoint_stays(made_up, data, tmp_pat
     assert load_file(out / "checkpoint.safetensors")["optimizer.0.step"] == done[-1]
 
 
-def test_a_nan_that_was_not_checked_is_not_saved(made_up, data, tmp_path, monkeypatch):
+def test_an_unchecked_nan_is_not_saved(made_up, data, tmp_path, monkeypatch):
     """As on a GPU, where steps are not waited for, and without lines of the log, which end the run."""
     monkeypatch.setattr(Learner, "check_finite", lambda self, step, **values: None)
     changes = {"steep_at": 7, "train": {"save_every": 1, "log_every": 100, "check_every": 100}}
@@ -233,16 +229,13 @@ def test_a_baseline_that_changes_the_working_directory(made_up, data, tmp_path, 
     assert not list((tmp_path / "elsewhere").iterdir())
 
 
-def test_without_validation(made_up, data, tmp_path):
+def test_a_validation_split_may_be_empty_but_not_damaged(made_up, data, tmp_path):
     data.write_text("few")
     train("made-up", data, tmp_path / "run")
     assert {row["split"] for row in read_log(tmp_path / "run")} == {"train"}
-
-
-def test_a_damaged_validation_split_is_an_error(made_up, data, tmp_path):
     data.write_text("damaged")
     with pytest.raises(DatasetError):
-        train("made-up", data, tmp_path / "run")
+        train("made-up", data, tmp_path / "other")
 
 
 def test_processes_share_a_batch_evenly(made_up, data, tmp_path, monkeypatch):
@@ -266,13 +259,6 @@ def test_an_error_of_a_worker_is_that_of_the_samples(made_up, data, tmp_path):
     with pytest.raises(DatasetError) as caught:
         train("made-up", data, tmp_path / "run", {"damaged_at": 7, "train": {"workers": 1}})
     assert caught.value.where == "sample 7"
-
-
-def test_a_run_is_a_policy(whole):
-    policy = make_policy(str(whole))
-    assert isinstance(policy, RunPolicy)
-    about = policy.describe()
-    assert (about["baseline"], about["steps"], about["data"]["samples"]) == ("made-up", 40, 30)
 
 
 @pytest.mark.parametrize(
@@ -328,3 +314,9 @@ def test_each_process_continues_with_its_own_random_state(shared):
 def test_a_run_continues_in_as_many_processes(made_up, shared):
     with pytest.raises(TrainingError, match="num_processes 2"):
         train("made-up", shared / "data.h5", shared / "whole")
+
+
+@pytest.mark.parametrize("name", devices_check.CHANGES)
+def test_a_run_in_bf16_continues_and_acts(folder, tmp_path, name):
+    """As tests/gpu checks it on a GPU."""
+    devices_check.check(folder, tmp_path, name, "bf16", "cpu")
