@@ -42,7 +42,7 @@ class Learner:
             run.checkpoint.load_optimizer(self._optimizer)
 
     def update(self, batch: Batch, learning_rate: float) -> None:
-        """Take a step of the optimiser; on a GPU, NaN is an error of `take_means`, as a check would wait for the step."""
+        """Take a step of the optimiser. A GPU is not waited for: there NaN is an error of `take_means`."""
         for group in self._optimizer.param_groups:
             group["lr"] = learning_rate
         self._model.train()
