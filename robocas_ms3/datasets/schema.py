@@ -2,10 +2,10 @@
 
 ::
 
-    data_info.json                    overview and split, see DATA_INFO
+    data_info.json                    overview and split, see `records.DataInfoRecord`
     conversion.json                   settings, and which recording became which episode; the released loader ignores it
     episode_0000000/
-      scene.json                      how the episode was made, see SCENE; the released loader ignores it
+      scene.json                      how the episode was made, see `SceneRecord`; the released loader ignores it
       episode_info.npz                arrays over T steps, see EPISODE_INFO; holds no pickles
       <camera>/                       of each camera, see `robots.cameras`
         cam_pos_wrt_<parent>.npy      4x4 OpenCV camera frame (x right, y down, z forward) in its parent; the paper's
@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Literal
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.robots.cameras import CAMERA_NAME, PARENT_FRAMES, STANDARD_CAMERAS, Parent, standard_parent
+from robocas_ms3.robots.cameras import CAMERA_NAME, PARENT_FRAMES, Parent, standard_parent
 from robocas_ms3.robots.quantities import QUANTITIES, ArraySpec
 from robocas_ms3.scenes.language.embed import DIMENSIONS
 from robocas_ms3.scenes.language.templates import GOAL_TYPES
@@ -63,37 +63,6 @@ EPISODE_INFO: tuple[ArraySpec, ...] = (
 
 RELATIVE_PAIRS = (("ee_pos", "ee_orn", "rel_pos", "rel_orn"), ("base_pos", "base_orn", "base_rel_pos", "base_rel_orn"))
 """Keys of absolute position and orientation, and of the same as relative motion."""
-
-SCENE: dict[str, str] = {
-    "schema_version": f"{SCHEMA_VERSION}",
-    "task": "pick, select, search or open_pick",
-    "env_info": "{env_id, env_kwargs}: what makes the environment",
-    "seed": "of `env.reset`",
-    "reset_options": "further options of `env.reset`",
-    "config": "the whole configuration",
-    "layout": "{object_ids, poses [x, y, z, qw, qx, qy, qz] in the world, present, robot_pose, basket_pose, relation}",
-    "objects": "[{slot, id, name}] those that take part",
-    "target": "{slot, asset_id, name}",
-    "success": "whether the recording ended in success",
-    "control_mode": "of the recorded actions",
-    "control_freq": "of the recorded actions, Hz",
-    "rate_hz": "of this dataset",
-    "source": "{trajectory, episode_id, recording: SHA-256 of seed, control mode, instruction and actions}",
-    "recorded": "what the generator said of the episode: template, relation, facts, attempts, seconds",
-    "versions": "{package: version} the episode was generated with",
-}
-"""Keys of ``scene.json``."""
-
-DATA_INFO: dict[str, str] = {
-    "train_eps": "list of episode numbers",
-    "val_eps": "list of episode numbers: 10 % of the seeds, at least one where there are two",
-    "ep_length": "{number: T}",
-    "language_goal": "{number: instruction}",
-    "step_goals": "{number: [{goal_type, goal_range: [first, last] step, inclusive, goal_description}]}",
-    "action_space": "{relative_position: [1st percentile (3), 99th percentile (3)] of rel_pos in m,"
-    " relative_rotation: the same of rel_orn as Euler xyz angles in rad}; last rows left out",
-}
-"""Keys of ``data_info.json``. JSON turns the episode numbers of ``{number: ...}`` into strings."""
 
 
 def check_version(found: object, where: Path, what: str = "a dataset") -> None:
@@ -152,22 +121,3 @@ def episode_number(folder: str) -> int | None:
 def image_path(episode: Path, camera: str, kind: str, step: int, image_format: ImageFormat = "png") -> Path:
     """Path of a picture; ``kind`` is ``rgb`` or ``depth``, the format that of RGB."""
     return episode / camera / kind / f"{step:04d}.{image_format if kind == 'rgb' else 'png'}"
-
-
-def markdown() -> str:
-    """Tables of the schema for the documentation."""
-    rows = ["| key | dtype | shape | unit | meaning |", "|---|---|---|---|---|"]
-    for spec in EPISODE_INFO:
-        shape = (
-            "scalar" if not spec.shape else "(" + ", ".join(map(str, spec.shape)) + ("," * (len(spec.shape) == 1)) + ")"
-        )
-        rows.append(f"| `{spec.name}` | {spec.dtype} | {shape} | {spec.unit} | {spec.meaning} |")
-    rows += ["", "| camera | parent | pose files |", "|---|---|---|"]
-    rows += [
-        f"| `{c.name}` | {PARENT_FRAMES[c.parent]} | " + ", ".join(f"`{name}`" for name in pose_files(c.parent)) + " |"
-        for c in STANDARD_CAMERAS
-    ]
-    for file, keys in ((DATA_INFO_FILE, DATA_INFO), (SCENE_FILE, SCENE)):
-        rows += ["", f"| key of `{file}` | value |", "|---|---|"]
-        rows += [f"| `{key}` | {meaning} |" for key, meaning in keys.items()]
-    return "\n".join(rows)

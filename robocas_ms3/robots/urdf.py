@@ -6,9 +6,7 @@ import hashlib
 import importlib.metadata
 import importlib.util
 import json
-import os
 import shutil
-import tempfile
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass
@@ -19,7 +17,8 @@ from xml.etree.ElementTree import Element, SubElement
 
 from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.core.files import make_folder, naming
+from robocas_ms3.core.files import make_folder, open_for_append, replacing_folder
+from robocas_ms3.core.locks import lock_file
 from robocas_ms3.core.paths import cache_dir
 from robocas_ms3.robots.description import MOBILE_PANDA as c
 
@@ -266,44 +265,26 @@ def _write(root: Element, path: Path) -> None:
 
 
 def made_once(folder: Path, make: Callable[[Path], None]) -> None:
-    """Have a folder made, unless it is there and complete.
-
-    Two processes may do this at once: a folder appears whole, and the first one wins.
+    """Make a folder unless it is there and complete; of several processes one makes it, and the others wait.
 
     Args:
         folder: its name says all that the files are made from.
         make: writes them into an empty folder.
 
     Raises:
-        RobocasError: it can't be made there.
-        OSError: it can't be written, naming it; nothing is left of it.
+        OSError: it can't be written; nothing is left of it.
     """
     if _is_complete(folder):
         return
     make_folder(folder.parent)
-    with naming(folder):
-        tmp = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".tmp", dir=folder.parent))
-        try:
-            tmp.chmod(0o755)
+    with open_for_append(folder.parent.with_suffix(".lock")) as lock:
+        lock_file(lock, folder, wait=True)
+        if _is_complete(folder):
+            return
+        with replacing_folder(folder) as tmp:
             make(tmp)
             names = sorted(str(path.relative_to(tmp)) for path in tmp.rglob("*") if path.is_file())
             (tmp / "files.json").write_text(json.dumps(names, indent=1), encoding="utf-8")
-            _publish(tmp, folder)
-        finally:
-            shutil.rmtree(tmp, ignore_errors=True)
-
-
-def _publish(tmp: Path, folder: Path) -> None:
-    """Rename ``tmp`` to ``folder``; keep a complete folder another process has put there meanwhile."""
-    try:
-        os.rename(tmp, folder)
-    except OSError:
-        if _is_complete(folder):
-            return
-        damaged = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".old", dir=folder.parent))
-        os.rename(folder, damaged / "old")
-        os.rename(tmp, folder)
-        shutil.rmtree(damaged, ignore_errors=True)
 
 
 def _is_complete(folder: Path) -> bool:

@@ -8,7 +8,7 @@ import pytest
 
 from robocas_ms3.cli.view import View, main
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.sources.records import SCENE_KEYS
 from robocas_ms3.viewer.routes import Routes, script
 from robocas_ms3.viewer.source import open_source
 from robocas_ms3.viewer.table import Failures
@@ -38,7 +38,7 @@ def spoilt(folder, tmp_path):
 def test_wrong_values_in_a_scene(spoilt):
     path = spoilt / "episode_0000001/scene.json"
     whole = path.read_text()
-    for key in schema.SCENE:
+    for key in SCENE_KEYS:
         for value in WRONG:
             path.write_text(whole)
             change(path, **{key: value})

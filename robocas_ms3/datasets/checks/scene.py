@@ -10,14 +10,14 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.violation import Violation, check_form, read_object, shown
 from robocas_ms3.datasets.pictures.stored import Pictures
-from robocas_ms3.datasets.sources.records import ConversionRecord, SceneRecord
+from robocas_ms3.datasets.sources.records import SCENE_KEYS, ConversionRecord, SceneRecord
 from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, arrays_fingerprint, first_line
 from robocas_ms3.demos.recordings.entries import one_seed
 from robocas_ms3.robots.cameras import STANDARD_NAMES
 
 FILE = schema.CONVERSION_FILE
 STANDARD = Pictures(STANDARD_NAMES)
-_UNKNOWN = {**dict.fromkeys(schema.SCENE), "schema_version": schema.SCHEMA_VERSION, "rate_hz": 1.0, "source": {}}
+_UNKNOWN = {**dict.fromkeys(SCENE_KEYS), "schema_version": schema.SCHEMA_VERSION, "rate_hz": 1.0, "source": {}}
 
 
 def check_values(scene: Mapping[str, Any], file: str = schema.SCENE_FILE) -> list[Violation]:

@@ -22,7 +22,7 @@ from robocas_ms3.datasets.manage.survey import ImportedEpisode, Survey, read_epi
 from robocas_ms3.datasets.sources.arrays import with_embeddings
 from robocas_ms3.datasets.sources.protocol import CameraModel
 from robocas_ms3.datasets.sources.reader import Dataset, Episode
-from robocas_ms3.datasets.sources.records import EpisodesRecord
+from robocas_ms3.datasets.sources.records import SCENE_KEYS, EpisodesRecord
 from robocas_ms3.datasets.sources.tolerant import SPECS, EpisodeArrays
 from robocas_ms3.datasets.writing.episode_folder import write_cameras
 from robocas_ms3.datasets.writing.info import write_info
@@ -151,4 +151,4 @@ def _scene(episode: Episode, read: ImportedEpisode, surveyed: Survey) -> dict[st
         "mended": [f"{found.file.split('/', 1)[1]}: {found.problem}" for found in repaired],
     }
     known = {"schema_version": schema.SCHEMA_VERSION, "rate_hz": float(surveyed.rate_hz), "source": source}
-    return {key: known.get(key, before.get(key)) for key in schema.SCENE}
+    return {key: known.get(key, before.get(key)) for key in SCENE_KEYS}

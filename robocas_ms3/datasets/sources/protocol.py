@@ -110,12 +110,12 @@ class SourceEpisode(Protocol):
 
     @property
     def scene(self) -> dict[str, Any]:
-        """How it was made, by the keys of ``schema.SCENE`` that are known; empty where none is."""
+        """How it was made, by the keys of `records.SceneRecord` that are known; empty where none is."""
         return {}
 
     @property
     def layout(self) -> dict[str, Any]:
-        """What stood where at its beginning, as ``layout`` of ``schema.SCENE``; empty where it is not known."""
+        """What stood where at its beginning, as ``layout`` of `records.SceneRecord`; empty where it is not known."""
         return self.scene.get("layout") or {}
 
     @property

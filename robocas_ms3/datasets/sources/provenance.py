@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.sources.records import SCENE_KEYS
 from robocas_ms3.demos.recordings.reading import Recording, TrajectoryFile
 
 
@@ -42,7 +43,7 @@ def unread_entry(file: TrajectoryFile, index: int) -> dict[str, Any]:
 
 
 def recorded_scene(file: TrajectoryFile, index: int) -> dict[str, Any]:
-    """What the JSON beside a trajectory says of how an episode was made, by keys of ``schema.SCENE``."""
+    """What the JSON beside a trajectory says of how an episode was made, by `SCENE_KEYS`."""
     entry, said = file.entry(index), file.episodes[index].get("robocas", {})
     known = {"target", "instruction", "subgoals", "objects"}  # said elsewhere
     return {
@@ -75,7 +76,7 @@ def scene_record(
     """
     record = {**recorded_scene(file, index), **scene, "rate_hz": rate_hz}
     record["source"]["recording"] = fingerprint(recording)
-    return {key: record.get(key) for key in schema.SCENE}
+    return {key: record.get(key) for key in SCENE_KEYS}
 
 
 def succeeded(episode: dict[str, Any]) -> bool:

@@ -131,32 +131,51 @@ class _ActionSpace(_Part):
 
 
 class DataInfoRecord(_Part):
-    """``data_info.json``; see ``schema.DATA_INFO``."""
+    """``data_info.json``. JSON turns the episode numbers of ``{number: ...}`` into strings."""
 
-    train_eps: list[int]
-    val_eps: list[int]
-    ep_length: dict[EpisodeNumber, int]
-    language_goal: dict[EpisodeNumber, str]
-    step_goals: dict[EpisodeNumber, list[SubGoalRecord]]
-    action_space: _ActionSpace
+    train_eps: list[int] = Field(description="list of episode numbers")
+    val_eps: list[int] = Field(
+        description="list of episode numbers: 10 % of the seeds, at least one where there are two"
+    )
+    ep_length: dict[EpisodeNumber, int] = Field(description="{number: T}")
+    language_goal: dict[EpisodeNumber, str] = Field(description="{number: instruction}")
+    step_goals: dict[EpisodeNumber, list[SubGoalRecord]] = Field(
+        description="{number: [{goal_type, goal_range: [first, last] step, inclusive, goal_description}]}"
+    )
+    action_space: _ActionSpace = Field(
+        description="{relative_position: [1st percentile (3), 99th percentile (3)] of rel_pos in m,"
+        " relative_rotation: the same of rel_orn as Euler xyz angles in rad}; last rows left out"
+    )
 
 
 class SceneRecord(_Part):
     """``scene.json``. None is what nobody knows, as of datasets made elsewhere."""
 
-    schema_version: Literal[schema.SCHEMA_VERSION]  # pyright: ignore[reportInvalidTypeForm]
-    task: str | None
-    env_info: _EnvInfo | None
-    seed: Annotated[Any, PlainValidator(_seed)]
-    reset_options: dict[str, Any] | None
-    config: dict[str, Any] | None
-    layout: _Layout | None
-    objects: list[_Object] | None
-    target: _Target | None
-    success: bool | None
-    control_mode: str | None
-    control_freq: Rate | None
-    rate_hz: Rate
-    source: _Source
-    recorded: _Recorded | None
-    versions: dict[str, Any] | None
+    schema_version: Literal[schema.SCHEMA_VERSION] = Field(  # pyright: ignore[reportInvalidTypeForm]
+        description=f"{schema.SCHEMA_VERSION}"
+    )
+    task: str | None = Field(description="pick, select, search or open_pick")
+    env_info: _EnvInfo | None = Field(description="{env_id, env_kwargs}: what makes the environment")
+    seed: Annotated[Any, PlainValidator(_seed)] = Field(description="of `env.reset`")
+    reset_options: dict[str, Any] | None = Field(description="further options of `env.reset`")
+    config: dict[str, Any] | None = Field(description="the whole configuration")
+    layout: _Layout | None = Field(
+        description="{object_ids, poses [x, y, z, qw, qx, qy, qz] in the world, present, robot_pose, basket_pose,"
+        " relation}"
+    )
+    objects: list[_Object] | None = Field(description="[{slot, id, name}] those that take part")
+    target: _Target | None = Field(description="{slot, asset_id, name}")
+    success: bool | None = Field(description="whether the recording ended in success")
+    control_mode: str | None = Field(description="of the recorded actions")
+    control_freq: Rate | None = Field(description="of the recorded actions, Hz")
+    rate_hz: Rate = Field(description="of this dataset")
+    source: _Source = Field(
+        description="{trajectory, episode_id, recording: SHA-256 of seed, control mode, instruction and actions}"
+    )
+    recorded: _Recorded | None = Field(
+        description="what the generator said of the episode: template, relation, facts, attempts, seconds"
+    )
+    versions: dict[str, Any] | None = Field(description="{package: version} the episode was generated with")
+
+
+SCENE_KEYS = tuple(SceneRecord.model_fields)

@@ -19,6 +19,7 @@ from robocas_ms3.datasets.manage.repairs import eef_turn
 from robocas_ms3.datasets.manage.survey import survey
 from robocas_ms3.datasets.pictures.video import PANEL, contact_sheet, video_frame
 from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.datasets.sources.records import SCENE_KEYS
 
 OURS = ("agv_pose", "rel_agv_pose")
 
@@ -112,7 +113,7 @@ def test_what_upstream_writes_becomes_a_valid_dataset(dataset, made, tmp_path, p
         for path in (made / name).glob("*/*/*.png"):
             assert (out / path.relative_to(made)).read_bytes() == path.read_bytes()
         scene = new.episode(number).scene
-        assert list(scene) == list(schema.SCENE)
+        assert list(scene) == list(SCENE_KEYS)
         assert {key for key, value in scene.items() if value is not None} == {"schema_version", "rate_hz", "source"}
         assert scene["source"]["format"] == "robocas v0"
         assert scene["source"]["derived"] == {"agv_pose": "base_pos, base_orn", "rel_agv_pose": "agv_pose"}

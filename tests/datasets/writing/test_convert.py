@@ -15,10 +15,10 @@ from synthetic import STEPS, RayCaster, made_up_vectors, write_trajectory
 
 from robocas_ms3.core.errors import DatasetError, OutputExistsError, RobocasError
 from robocas_ms3.core.poses import from_xyzw
-from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.datasets.sources.records import SCENE_KEYS, DataInfoRecord
 from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.datasets.writing.settings import ConversionSettings
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
@@ -49,7 +49,7 @@ def test_the_folder_is_the_schemas(made):
 
 def test_failed_episodes_stay_out_and_are_numbered_without_a_gap(made, trajectory, tmp_path):
     info = json.loads((made / "data_info.json").read_text())
-    assert set(info) == set(schema.DATA_INFO)
+    assert set(info) == set(DataInfoRecord.model_fields)
     assert sorted(info["train_eps"] + info["val_eps"]) == [0, 1]
     assert len(info["val_eps"]) == 1
     assert info["ep_length"] == {"0": 7, "1": 7}
@@ -190,7 +190,7 @@ def test_no_render_device_is_said_before_anything_is_written(trajectory, tmp_pat
 
 def test_every_episode_says_how_it_was_made(made, trajectory):
     scene = json.loads((made / "episode_0000001" / "scene.json").read_text())
-    assert list(scene) == list(schema.SCENE)
+    assert list(scene) == list(SCENE_KEYS)
     assert scene["seed"] == 5
     assert scene["success"] is True
     assert scene["env_info"]["env_id"] == "robocas_ms3:RoboCASPick-v1"
