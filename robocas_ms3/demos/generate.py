@@ -21,8 +21,7 @@ from robocas_ms3.core.strict import check_number
 from robocas_ms3.core.workers import Worker
 from robocas_ms3.demos.ledger import FAILURES_FILE, EpisodeResult, Failure, Ledger, count_by_stage, failed_attempts
 from robocas_ms3.demos.recordings.entries import GREATEST_SEED, read_json, reason, versions
-from robocas_ms3.demos.recordings.merging import merge
-from robocas_ms3.demos.recordings.stored import open_trajectory
+from robocas_ms3.demos.recordings.stored import merge, open_trajectory
 from robocas_ms3.demos.settings import EpisodeSettings, GenerateSettings
 from robocas_ms3.demos.takeover import Takeover
 from robocas_ms3.demos.workers import generate_seeds, shard_name

@@ -13,18 +13,16 @@ import numpy as np
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.core.errors import EpisodeLost, LayoutError, PlanningFailed
 from robocas_ms3.core.extensions import load
-from robocas_ms3.demos.branches import ForkedBranches
+from robocas_ms3.demos.backtracking import Resimulation
+from robocas_ms3.demos.branches import ForkedBranches, say_once, why_not_fork
 from robocas_ms3.demos.completing import complete
-from robocas_ms3.demos.forking import say_once, why_not_fork
 from robocas_ms3.demos.ledger import EpisodeResult
-from robocas_ms3.demos.open_loop import OpenLoop
+from robocas_ms3.demos.open_loop import OpenLoop, Trials
 from robocas_ms3.demos.recordings.environment import RecordedEnv
 from robocas_ms3.demos.recordings.subgoals import SubGoal
 from robocas_ms3.demos.recordings.writing import EpisodeRecorder
-from robocas_ms3.demos.resimulation import Resimulation
 from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.demos.takeover import Takeover
-from robocas_ms3.demos.trials import Trials
 from robocas_ms3.planning.chain import ArmChain
 from robocas_ms3.planning.decisions import Decisions, StraightDecisions
 from robocas_ms3.planning.executor import Executor
@@ -195,7 +193,7 @@ class _Attempts:
         return self.result.noisy_failures < self.generator.settings.noisy_failures
 
     def rehearse(self, *, finished: bool = False) -> None:
-        """Try what was done so far; see `trials`."""
+        """Try what was done so far; see `Trials`."""
         if self.generator.trials is not None:
             gripper = np.array([action[7] for action in self.executor.actions])
             with self.executor.seconds.spent_on("trial"):

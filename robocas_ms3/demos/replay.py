@@ -24,9 +24,9 @@ from robocas_ms3.core.poses import from_wxyz, inverse
 from robocas_ms3.core.strict import check_number
 from robocas_ms3.demos.recordings.entries import read_json, read_reset, was_taken_over
 from robocas_ms3.demos.recordings.environment import RecordedEnv, read_env
-from robocas_ms3.demos.recordings.merging import merge
 from robocas_ms3.demos.recordings.stored import (
     BODIES,
+    merge,
     named_arrays,
     open_episode,
     open_trajectory,

@@ -26,8 +26,8 @@ from robocas_ms3.datasets.sources.split import SPLIT_RULE, split_by_seed
 from robocas_ms3.datasets.writing.info import write_info
 from robocas_ms3.datasets.writing.plan import dataset_settings, header
 from robocas_ms3.demos.recordings.entries import reason
-from robocas_ms3.demos.recordings.merging import damage_of, merge
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
+from robocas_ms3.demos.recordings.stored import damage_of, merge
 from robocas_ms3.plans.folder import REPORT, UNITS
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.units import Outcome, SeedFiles, Unit

@@ -18,8 +18,7 @@ from branch_notes import Notes
 from robocas_ms3.core.errors import PlanningFailed, RobocasError
 from robocas_ms3.core.remote_errors import RemoteTraceback
 from robocas_ms3.demos import branches
-from robocas_ms3.demos.branches import ForkedBranches
-from robocas_ms3.demos.forking import why_not_fork
+from robocas_ms3.demos.branches import ForkedBranches, why_not_fork
 from robocas_ms3.planning.decisions import Effort
 
 

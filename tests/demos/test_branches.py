@@ -6,9 +6,8 @@ import pytest
 from branch_notes import Notes
 
 from robocas_ms3.core.errors import PlanningFailed
-from robocas_ms3.demos.backtracking import DeadEnd, turns
+from robocas_ms3.demos.backtracking import DeadEnd, Resimulation, turns
 from robocas_ms3.demos.branches import ForkedBranches
-from robocas_ms3.demos.resimulation import Resimulation
 from robocas_ms3.planning.decisions import ONE_BY_ONE, Effort, StraightDecisions
 
 RUNNERS = [ForkedBranches, Resimulation]

@@ -14,13 +14,13 @@ from mani_skill.utils.gym_utils import find_max_episode_steps_value
 from mani_skill.utils.structs import Pose
 
 from robocas_ms3.core.errors import EpisodeLost, PlanningFailed
-from robocas_ms3.demos.forking import Child
+from robocas_ms3.demos.branches import Child
 from robocas_ms3.demos.generate import generate
 from robocas_ms3.demos.generator import EpisodeGenerator
+from robocas_ms3.demos.open_loop import Trials
 from robocas_ms3.demos.recordings.entries import read_json
 from robocas_ms3.demos.replay import replay
 from robocas_ms3.demos.settings import EpisodeSettings, GenerateSettings, ReplaySettings
-from robocas_ms3.demos.trials import Trials
 from robocas_ms3.planning.executor import Executor
 from robocas_ms3.planning.protocol import Trajectory
 from robocas_ms3.robots.description import MOBILE_PANDA

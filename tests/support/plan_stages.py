@@ -42,7 +42,7 @@ class MadeUp:
             raise ValueError("a bug\nof two lines")
         elif fault == "refuse":
             raise MissingExtraError("nothing to record with")
-        elif fault == "limit":  # as `demos.forking` has it
+        elif fault == "limit":  # as `demos.branches` has it
             raise RobocasError("can't start another process")
         elif fault == "damaged":
             raise DatasetError("this recording is damaged")

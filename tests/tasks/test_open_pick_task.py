@@ -12,12 +12,12 @@ import robocas_ms3  # noqa: F401
 from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.datasets.sources.arrays import episode_arrays
 from robocas_ms3.demos.generator import EpisodeGenerator
+from robocas_ms3.demos.open_loop import Trials
 from robocas_ms3.demos.recordings.motion import sample_states
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
 from robocas_ms3.demos.recordings.subgoals import sample_subgoals
 from robocas_ms3.demos.replay import replay
 from robocas_ms3.demos.settings import EpisodeSettings, ReplaySettings
-from robocas_ms3.demos.trials import Trials
 from robocas_ms3.planning.executor import Executor
 from robocas_ms3.planning.skills.driving import base_at, drive
 from robocas_ms3.planning.skills.grasping import plan_grasp

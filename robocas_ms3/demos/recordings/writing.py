@@ -1,4 +1,4 @@
-"""Record episodes in ManiSkill's trajectory format, one file an episode; `merging` makes one of them."""
+"""Record episodes in ManiSkill's trajectory format, one file per episode; `stored.merge` makes one of them."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ import h5py
 import pytest
 from synthetic import write_trajectory
 
-from robocas_ms3.demos.recordings.merging import damage_of, merge
+from robocas_ms3.demos.recordings.stored import damage_of, merge
 
 
 @pytest.fixture

@@ -9,8 +9,8 @@ import pytest
 from synthetic import STEPS, write_trajectory
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.demos.recordings.merging import merge
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
+from robocas_ms3.demos.recordings.stored import merge
 from robocas_ms3.demos.replay import Recorded
 from robocas_ms3.evaluation.policies.replay import ReplayPolicy
 from robocas_ms3.evaluation.policy import EpisodeSpec
