@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, cast
 
@@ -16,12 +15,10 @@ from mani_skill.utils.structs import Actor
 from mani_skill.utils.structs.types import SimConfig
 from numpy.typing import NDArray
 
-from robocas_ms3.assets.pack import VISUALS, LoadedObject, VisualLevel, load_pack
+from robocas_ms3.assets.pack import LoadedObject, VisualLevel, load_pack
 from robocas_ms3.core.arrays import Array, as_tensor, native
-from robocas_ms3.core.errors import ConfigError
 from robocas_ms3.core.extensions import load
 from robocas_ms3.robots.agent import MobileManipulator
-from robocas_ms3.robots.cameras import CameraSpec, Vec3
 from robocas_ms3.robots.table import DEFAULT, find_robot
 from robocas_ms3.scenes import build
 from robocas_ms3.scenes.cache import layout_source
@@ -33,7 +30,7 @@ from robocas_ms3.tasks import engine
 from robocas_ms3.tasks.bodies import Bodies, Contacts, link_poses
 from robocas_ms3.tasks.goals import Goal, InBasket
 from robocas_ms3.tasks.instructions import Instructions
-from robocas_ms3.tasks.observations import over_the_shoulder, privileged_observations
+from robocas_ms3.tasks.observations import over_the_shoulder, place_camera, privileged_observations
 from robocas_ms3.tasks.rewards import DENSE, TRANSFER, DenseReward, RewardTable
 from robocas_ms3.tasks.seeds import EpisodeSeeds
 from robocas_ms3.tasks.starts import place
@@ -47,7 +44,7 @@ class RoboCASEnv(BaseEnv):
 
     A task is a subclass with a ``SPEC``, which overrides ``evaluate``, ``compute_dense_reward`` and
     ``privileged_observations`` where it adds something. N envs, K object slots. A single env is rebuilt at each reset.
-    Several envs, on a GPU, draw their objects once, and each reset draws a new layout and target.
+    Several envs draw their objects once, and each reset draws a new layout and target.
 
     Args:
         config: name, path or content of a task configuration; default: the task's own.
@@ -97,10 +94,7 @@ class RoboCASEnv(BaseEnv):
         num_envs: int = 1,
         **kwargs: Any,
     ) -> None:
-        engine.check_engine(num_envs, **kwargs)
-        if visual_level not in VISUALS:
-            expected = f"one of {list(VISUALS)}"
-            raise ConfigError("no such visual_level", where="visual_level", expected=expected, found=visual_level)
+        engine.check_engine(num_envs, visual_level, **kwargs)
         self.task_config = load_config_of(self.SPEC, config)
         self.robot_spec = find_robot(robot_uids, where="robot_uids")
         load(self.robot_spec.agent)  # registers it with ManiSkill
@@ -109,7 +103,7 @@ class RoboCASEnv(BaseEnv):
         self.model = SceneModel.load(self.task_config, load_pack(pack), load_pack(furniture_pack), robot=robot)
         self._visual_level: VisualLevel = visual_level
         self._resets = 0
-        self._engine_errors: engine.EngineErrors | None = None
+        self._engine_errors = engine.EngineErrors()
         if kwargs.get("reconfiguration_freq") is None:
             kwargs["reconfiguration_freq"] = 1 if num_envs == 1 else 0
         cache, stay = layout_source(self.model, layouts), kwargs["reconfiguration_freq"] == 0
@@ -120,9 +114,7 @@ class RoboCASEnv(BaseEnv):
 
     @property
     def _default_sim_config(self) -> SimConfig:
-        distractors = self.task_config.randomisation.distractors
-        objects = self.task_config.objects.count + (distractors.count[1] if distractors else 0)
-        return engine.sim_config(self.num_envs, objects)
+        return engine.sim_config(self.num_envs, self.task_config)
 
     @property
     def _default_human_render_camera_configs(self) -> CameraConfig:
@@ -146,7 +138,6 @@ class RoboCASEnv(BaseEnv):
         return [int(seed) for seed in self._episode_seed]
 
     def _reconfigure(self, options: dict | None = None) -> None:
-        """Rebuild the scene; see ``BaseEnv``. If a seed has no layout, the old scene stays."""
         assert self._episode_seed is not None
         self.seeds.choose_objects(self._episode_seed, on_gpu=self._sim_device.is_cuda())
         engine.keep_renderer(self.backend.render_device)
@@ -165,32 +156,22 @@ class RoboCASEnv(BaseEnv):
     def close(self) -> None:
         """Close the environment and free what it held."""
         self._resets = -1  # collects garbage
-        if self._engine_errors is not None:
-            self._engine_errors.close()
+        self._engine_errors.close()
         super().close()
 
     def _load_agent(self, options: dict, *args: Any, **kwargs: Any) -> None:
         super()._load_agent(options, sapien.Pose(self.model.robot_pose))
-        self.agent.cameras = tuple(self._placed(camera) for camera in self.cameras)
-
-    def _placed(self, camera: CameraSpec) -> CameraSpec:
-        """Return a camera as it is; an overview camera at the viewpoint of the task."""
-        if not camera.overview:
-            return camera
-        eye, target = self.overview()
-        eye = target + 0.75 * (eye - target)  # nearer than the render camera: it sees 90 deg instead of 60
-        position, look_at = cast("list[Vec3]", [tuple(eye.tolist()), tuple(target.tolist())])
-        return replace(camera, mount="world", position=position, look_at=look_at, overview=False)
+        self.agent.cameras = tuple(place_camera(camera, self.overview()) for camera in self.cameras)
 
     def _load_scene(self, options: dict) -> None:
         self.fixtures = build.build_fixtures(self.scene, self.model, self._visual_level, self.scene_seeds)
         assets, ids = self.model.object_pack.objects, self.seeds.object_ids
         self.object_assets: list[list[LoadedObject]] = [[assets[i] for i in row] for row in ids]
-        slots = len(ids[0])
         self.objects: list[Actor] = [
-            build.build_object_slot(self.scene, slot, [row[slot] for row in self.object_assets], self._visual_level)
-            for slot in range(slots)
+            build.build_object_slot(self.scene, slot, list(assets), self._visual_level)
+            for slot, assets in enumerate(zip(*self.object_assets, strict=True))
         ]
+        slots = len(self.objects)
         if self.task_config.leaves_slots_empty:
             build.build_parking(self.scene, slots)
         self.start_poses = torch.zeros(self.num_envs, slots, 7, device=self.device)
@@ -207,8 +188,8 @@ class RoboCASEnv(BaseEnv):
 
     def _after_reconfigure(self, options: dict) -> None:
         super()._after_reconfigure(options)
-        if self.gpu_sim_enabled and self._engine_errors is None:
-            self._engine_errors = engine.EngineErrors()
+        if self.gpu_sim_enabled:
+            self._engine_errors.open()
         self.bodies = Bodies(self.scene, self.agent.robot, self.objects, self.fixtures.basket)
         gripper = [self.agent.finger1_link, self.agent.finger2_link, self.agent.hand_link]
         self.gripper_contacts = Contacts(self.scene, gripper, self.objects)
@@ -216,8 +197,7 @@ class RoboCASEnv(BaseEnv):
     def reset(self, seed: int | list[int] | None = None, options: dict | None = None) -> tuple[Any, dict]:
         """Reset; see ``BaseEnv``. The same seed gives the same layout, whichever envs are reset.
 
-        With several envs a single seed is the first env's; the others take those after it, within the range if it is of
-        the range.
+        With several envs a single seed is the first env's; the others take those after it, within the range of seeds.
 
         Raises:
             LayoutError: there is no layout for a seed that was asked for, or for many that were drawn.
@@ -226,11 +206,9 @@ class RoboCASEnv(BaseEnv):
         return self.seeds.reset(super().reset, seed, options)
 
     def _set_episode_rng(self, seed: Any, env_idx: torch.Tensor) -> None:
-        """Seed the episodes of some envs; see ``BaseEnv``, which forgets the seeds of the others."""
         self.seeds.seed_episodes(super()._set_episode_rng, seed, env_idx)
 
     def _clear_sim_state(self) -> None:
-        """Stop everything in the envs that are being reset, on a GPU in two writes."""
         if not self.gpu_sim_enabled:
             super()._clear_sim_state()
         else:
@@ -239,8 +217,7 @@ class RoboCASEnv(BaseEnv):
             self.scene._gpu_fetch_all()
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
-        if self._engine_errors is not None:
-            self._engine_errors.check()
+        self._engine_errors.check()
         place(self, self.seeds.find_starts(env_idx.cpu().numpy()), env_idx)
         self.success_check.reset(env_idx)
         self.instructions.reset(env_idx)
@@ -310,8 +287,7 @@ class RoboCASEnv(BaseEnv):
         Raises:
             SimulationError: on a GPU PhysX ran out of memory, and has dropped contacts.
         """
-        if self._engine_errors is not None:
-            self._engine_errors.check()
+        self._engine_errors.check()
         plain = self._obs_mode == "none" and self._reward_mode == "none" and isinstance(action, np.ndarray)
         if not plain or self.gpu_sim_enabled or action.shape != self._orig_single_action_space.shape:
             return super().step(action)
@@ -322,9 +298,8 @@ class RoboCASEnv(BaseEnv):
     def evaluate(self) -> dict[str, torch.Tensor]:
         """Return stages, ``success`` and ``fail`` of each env, (N,) bool, and ``disturbed`` (N,) int.
 
-        Stages stay true until the reset; ``success`` and ``fail`` are of this moment. docs/tasks.md defines them.
-        ``disturbed`` counts the objects other than the target that are more than 3 cm from where they stood, or have
-        fallen over (30 deg), relative to the door or drawer that they are on.
+        Stages stay true until the reset; ``success`` and ``fail`` are of this moment (docs/tasks.md). ``disturbed``
+        counts other objects that moved by 3 cm or fell over (30 deg), relative to the door or drawer that they are on.
         """
         return self.success_check.check()
 
@@ -337,7 +312,6 @@ class RoboCASEnv(BaseEnv):
         return [self.instructions.of(env).text for env in range(self.num_envs)]
 
     def _get_obs_extra(self, info: dict) -> dict[str, torch.Tensor]:
-        """``tcp_pose`` (N, 7) in the world; before it, in state modes, the privileged observations."""
         mode = self.obs_mode_struct
         privileged = self.privileged_observations() if mode.state or mode.state_dict else {}
         return {**privileged, "tcp_pose": as_tensor(self.tcp_in_world())}
@@ -347,7 +321,6 @@ class RoboCASEnv(BaseEnv):
         return privileged_observations(self)
 
     def _get_obs_sensor_data(self, apply_texture_transforms: bool = True) -> dict:
-        """Return images by camera and kind; see ``BaseEnv``."""
         last = self._last_obs.get("sensor_data") if isinstance(self._last_obs, dict) else None
         if self.looks or last is None:  # None: point clouds, made of images
             return super()._get_obs_sensor_data(apply_texture_transforms)
@@ -356,8 +329,8 @@ class RoboCASEnv(BaseEnv):
     def get_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
         """Return the reward (N,) of the env's mode, and remember the action.
 
-        ``normalized_dense`` is in [0, 1]: 1 on success and only then, 0 on ``fail``. ``dense`` is this times the total
-        of ``REWARDS``. ``progress`` is how much the first has changed since the last step.
+        ``normalized_dense`` is 1 on success and only then, 0 on ``fail``; ``dense`` is this times ``REWARDS.total``;
+        ``progress`` is how much ``normalized_dense`` has changed since the last step.
         """
         if self._reward_mode == "progress":
             reward = self.dense_reward.gain(self.compute_normalized_dense_reward(obs, action, info))

@@ -18,8 +18,10 @@ from mani_skill.render.utils import can_render
 from mani_skill.utils.structs.types import GPUMemoryConfig, SceneConfig, SimConfig
 from numpy.typing import NDArray
 
+from robocas_ms3.assets.pack import VISUALS
 from robocas_ms3.assets.physics import CONTACT_OFFSET
 from robocas_ms3.core.errors import ConfigError, SimulationError, VectorEnvError
+from robocas_ms3.scenes.config import TaskConfig
 from robocas_ms3.scenes.task_specs import SIM_FREQ, STANDARD_FREQ
 
 # What one env has at most, counted on a CPU (4 seeds of each shipped configuration, the arm moving about): 25 contact
@@ -41,14 +43,22 @@ _FIX = (
 
 
 def check_engine(
-    num_envs: int, sim_backend: str = "auto", render_backend: str | None = None, obs_mode: str | None = None, **_: Any
+    num_envs: int,
+    visual_level: str,
+    sim_backend: str = "auto",
+    render_backend: str | None = None,
+    obs_mode: str | None = None,
+    **_: Any,
 ) -> None:
     """Check arguments of an environment against what this machine and process can run.
 
     Raises:
         VectorEnvError: there are several envs, and physics would run on a CPU.
-        ConfigError: images are observed, and nothing is to be rendered.
+        ConfigError: there is no such level of detail, or images are observed and nothing is to be rendered.
     """
+    if visual_level not in VISUALS:
+        expected = f"one of {list(VISUALS)}"
+        raise ConfigError("no such visual_level", where="visual_level", expected=expected, found=visual_level)
     if num_envs > 1 and (sim_backend in CPU_SIM_BACKENDS or not torch.cuda.is_available()):
         found = f"sim_backend={sim_backend!r}" if sim_backend in CPU_SIM_BACKENDS else "no CUDA device"
         fix = "On a CPU use robocas_ms3.make_vec(env_id, num_envs), which runs them in processes."
@@ -59,8 +69,10 @@ def check_engine(
         raise ConfigError("images need a renderer", where="render_backend", found=found, fix=fix)
 
 
-def sim_config(num_envs: int, objects: int) -> SimConfig:
-    """Return the default configuration of the simulation of a number of envs with ``objects`` each."""
+def sim_config(num_envs: int, config: TaskConfig) -> SimConfig:
+    """Return the default configuration of the simulation of a number of envs."""
+    distractors = config.randomisation.distractors
+    objects = config.objects.count + (distractors.count[1] if distractors else 0)
     return SimConfig(
         sim_freq=SIM_FREQ,
         control_freq=STANDARD_FREQ,
@@ -125,8 +137,13 @@ class EngineErrors:
     """Reads what this process writes to standard error: PhysX only prints there that it dropped contacts."""
 
     def __init__(self) -> None:
-        self._log = open(_log_standard_error(), "rb", buffering=0)  # noqa: SIM115  (closed in `close`)
-        self._log.seek(0, os.SEEK_END)
+        self._log: IO[bytes] | None = None
+
+    def open(self) -> None:
+        """Start reading, unless it has."""
+        if self._log is None:
+            self._log = open(_log_standard_error(), "rb", buffering=0)  # noqa: SIM115  (closed in `close`)
+            self._log.seek(0, os.SEEK_END)
 
     def check(self) -> None:
         """Check what was written since the last check.
@@ -134,7 +151,7 @@ class EngineErrors:
         Raises:
             SimulationError: an engine of this process ran out of memory.
         """
-        if os.fstat(self._log.fileno()).st_size == self._log.tell():
+        if self._log is None or os.fstat(self._log.fileno()).st_size == self._log.tell():
             return
         for line in self._log.read().split(b"\n"):
             if _OUT_OF_MEMORY.search(line):
@@ -143,7 +160,8 @@ class EngineErrors:
 
     def close(self) -> None:
         """Stop reading."""
-        self._log.close()
+        if self._log is not None:
+            self._log.close()
 
 
 _tees: list[tuple[subprocess.Popen, IO[bytes], os.stat_result]] = []  # each with its log and its pipe

@@ -1,4 +1,4 @@
-"""What an environment is made with to learn in it by trial and error."""
+"""Arguments of environments for reinforcement learning."""
 
 from __future__ import annotations
 
@@ -7,18 +7,17 @@ from typing import Any
 
 from robocas_ms3.core.errors import ConfigError
 from robocas_ms3.scenes.config import TaskConfig, load_config_of
-from robocas_ms3.scenes.task_specs import TASKS, TaskSpec
+from robocas_ms3.scenes.task_specs import TASKS
 
 CONTROL_FREQ = 5  # Hz: `pd_ee_delta_pose` was made for it
 DRIVING_SECONDS = 30  # more where the base drives
 
 
 def rl_kwargs(task: str, config: str | Path | dict | TaskConfig | None = None) -> dict[str, Any]:
-    """Give keyword arguments for ``gym.make`` and `make_vec` to train with: states, dense rewards, 5 Hz, a fit horizon.
+    """Return keyword arguments for ``gym.make`` and `make_vec` to train with: states, dense rewards, 5 Hz.
 
     ``max_episode_steps`` holds a demonstration (docs/rl.md). Where the configuration lets the base drive
-    (``base_motion``), an action moves it too, and there are more steps. ``rl_kwargs("pick") | {"reward_mode":
-    "progress"}`` changes one of them.
+    (``base_motion``), actions move it too, and there are more steps.
 
     Args:
         task: its name, ``pick``, or environment, ``RoboCASPick-v1``.
@@ -27,7 +26,10 @@ def rl_kwargs(task: str, config: str | Path | dict | TaskConfig | None = None) -
     Raises:
         ConfigError: there is no such task or configuration, or the task can't run it.
     """
-    spec = _find(task)
+    spec = next((spec for spec in TASKS.values() if task in (spec.name, spec.env_id)), None)
+    if spec is None:
+        known = ", ".join(f"{spec.name} or {spec.env_id}" for spec in TASKS.values())
+        raise ConfigError("no such task", where="rl_kwargs", expected=known, found=repr(task))
     drives = load_config_of(spec, config).base_motion
     return {
         **({} if config is None else {"config": config}),
@@ -38,11 +40,3 @@ def rl_kwargs(task: str, config: str | Path | dict | TaskConfig | None = None) -
         "max_episode_steps": (spec.training_seconds + drives * DRIVING_SECONDS) * CONTROL_FREQ,
         "render_backend": "none",
     }
-
-
-def _find(task: str) -> TaskSpec:
-    for spec in TASKS.values():
-        if task in (spec.name, spec.env_id):
-            return spec
-    known = ", ".join(f"{spec.name} or {spec.env_id}" for spec in TASKS.values())
-    raise ConfigError("no such task", where="rl_kwargs", expected=known, found=repr(task))

@@ -51,6 +51,7 @@ def test_capacities_grow_with_envs_and_objects_by_hand():
 def listening() -> Iterator[EngineErrors]:
     """Not a fixture: between fixtures and tests pytest replaces standard error itself."""
     errors = EngineErrors()
+    errors.open()
     try:
         yield errors
     finally:
@@ -99,7 +100,7 @@ def test_two_envs_of_a_process_hear_it(capfd):
 def test_what_a_crashing_process_says_is_not_lost():
     program = (
         "import faulthandler, os\nfrom robocas_ms3.tasks.engine import EngineErrors\nfaulthandler.enable()\n"
-        "errors = EngineErrors()\nos.write(2, b'x' * 300_000 + b'\\n')\nos.abort()\n"
+        "errors = EngineErrors()\nerrors.open()\nos.write(2, b'x' * 300_000 + b'\\n')\nos.abort()\n"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=60, check=False)
     assert done.returncode == -signal.SIGABRT
