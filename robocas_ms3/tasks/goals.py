@@ -18,7 +18,6 @@ from robocas_ms3.tasks import rewards, terms
 _RIM = 0.05  # m around the basket's inside that still count as over it for a target that falls
 _DROP_HEIGHT, _LOWERING = 0.1, 0.25  # m above the basket's rim: where a carry leads; from where on lowering counts
 _FAR = 0.2  # m from there at which half of the carry is done
-_LIFT = 0.03  # m, that of `terms.lifted`
 
 
 class Moment(NamedTuple):
@@ -170,7 +169,7 @@ class InBasket(Goal):
         start = terms.of_target(native(env.start_poses)[..., 2], slot)
         return stage, {
             "reach": rewards.closeness(env.tcp_in_world()[:, :3], center),
-            "lift": rewards.rise(target[:, 2], start, _LIFT),
+            "lift": rewards.rise(target[:, 2], start, terms.LIFT),
             "carry": rewards.closeness(center, self.point(now.basket), half=_FAR),
             "place": 1 - rewards.rise(inside[:, 2], high[2], _LOWERING),
             "released": rewards.let_go(now.held, now.touched),

@@ -70,7 +70,6 @@ def test_finger_grasps_refuses_a_force_across_the_closing_axis(make):
     closing = make([[0.0, 1, 0]])
     across = make([[[3.0, 0.1, 0]]])  # 88 degrees off
     assert not terms.finger_grasps(across, -across, closing).any()
-    assert terms.finger_grasps(across, -across, closing, max_angle_deg=89).all()
 
 
 def test_pressed_asks_for_both_fingers_but_no_direction(make):
@@ -150,7 +149,6 @@ def test_a_target_fell_off_below_what_it_stood_on_beside_the_basket_and_out_of_t
     height = make([0.57, 0.54, 0.54, 0.54])  # of a surface at 0.6
     above, touched = make([False, False, True, False]), make([False, False, False, True])
     assert terms.fell_off(height, 0.6, above, touched).tolist() == [False, True, False, False]
-    assert not terms.fell_off(height, 0.6, above, touched, by=0.07).any()
 
 
 @pytest.mark.parametrize(("degrees", "drop", "expected"), [(59, 0.09, False), (61, 0.0, True), (0, 0.11, True)])
