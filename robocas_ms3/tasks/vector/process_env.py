@@ -19,10 +19,10 @@ import torch
 from gymnasium.vector.utils import batch_space
 from mani_skill.utils.registration import REGISTERED_ENVS
 
-from robocas_ms3.core.errors import VectorEnvError, WorkerCrashed, WorkerDied
+from robocas_ms3.core.errors import VectorEnvError, WorkerCrashed, WorkerDied, WorkerStartError
 from robocas_ms3.core.workers import NO_LIMITS, Limits, WorkerPool
 from robocas_ms3.tasks.seeds import following_seeds
-from robocas_ms3.tasks.vector.worker import EnvDescription, EnvSettings, EnvWorker, Rows, join_rows, split_rows
+from robocas_ms3.tasks.vector.worker import AT_WORK, EnvDescription, EnvSettings, EnvWorker, Rows, join_rows, split_rows
 
 
 class ProcessEnv(gym.Env):
@@ -42,7 +42,7 @@ class ProcessEnv(gym.Env):
 
     Raises:
         VectorEnvError: they can't be sent to processes.
-        WorkerStartError: a process died while it made its environments.
+        WorkerDied: a process died.
         Exception: whatever making an environment raises.
 
     Attributes:
@@ -74,11 +74,11 @@ class ProcessEnv(gym.Env):
         if module == "__main__":
             fix = f'Put it into a module, and pass "the_module:{self.spec.id}".'
             raise VectorEnvError("registered in the program itself, which processes don't know", where=env_id, fix=fix)
-        running = tempfile.NamedTemporaryFile(prefix="robocas-envs-")  # noqa: SIM115  (closed in `_stop`)
-        running.write(bytes(num_envs))
-        running.flush()
-        self._running = np.memmap(running.name, np.bool_, "r")
-        settings = EnvSettings(env_id, module, kwargs, tuple(wrappers), running.name)
+        states = tempfile.NamedTemporaryFile(prefix="robocas-envs-")  # noqa: SIM115  (closed in `_stop`)
+        states.write(bytes(num_envs))
+        states.flush()
+        self._states = np.memmap(states.name, np.uint8, "r")
+        settings = EnvSettings(env_id, module, kwargs, tuple(wrappers), states.name)
         try:
             pickled = cloudpickle.dumps(settings)
         except Exception as error:
@@ -90,7 +90,7 @@ class ProcessEnv(gym.Env):
             WorkerPool(partial(EnvWorker, pickled, share), 1, limits=limits, retries=0) for share in self._shares
         ]
         # also when this is collected, or when Python ends
-        self._stop = weakref.finalize(self, _stop, self._pools, running)
+        self._stop = weakref.finalize(self, _stop, self._pools, states)
         try:
             made: list[EnvDescription] = self._ask([("describe",)] * workers)
         except BaseException:
@@ -199,8 +199,8 @@ class ProcessEnv(gym.Env):
         for share, wait in zip(self._shares, waits, strict=True):
             try:
                 answers.append(wait())
-            except WorkerCrashed as crash:
-                envs = [env for env in share if self._running[env]] or list(share)
+            except (WorkerCrashed, WorkerStartError) as crash:
+                envs = [env for env in share if self._states[env] == AT_WORK] or list(share)
                 died = WorkerDied("its process died", where=name_envs(envs), found=crash.found, fix="Make them again.")
                 died.envs = tuple(envs)
                 self.close()
@@ -263,10 +263,10 @@ def name_envs(envs: Sequence[int]) -> str:
     return f"env{'s' * (len(envs) > 1)} {', '.join(map(str, envs))}"
 
 
-def _stop(pools: list[WorkerPool[Any, Any]], running: Any) -> None:
+def _stop(pools: list[WorkerPool[Any, Any]], states: Any) -> None:
     for pool in pools:
         pool.stop()
-    running.close()
+    states.close()
 
 
 def _as_tensor(row: Any) -> Any:

@@ -15,11 +15,12 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-from robocas_ms3.core.errors import LayoutError
+from robocas_ms3.core.errors import LayoutError, WorkerCrashed
 from robocas_ms3.core.remote_errors import RemoteError
 from robocas_ms3.core.workers import use_one_torch_thread
 from robocas_ms3.tasks.base import RoboCASEnv
 
+UNMADE, IDLE, AT_WORK = range(3)
 FIRST_SEED = 2022  # of env 0's resets without a seed, as in ManiSkill; env 1 has the next
 Rows = dict[tuple[str, ...], Any]
 """By path in nested dictionaries: an array (E, ...) of all envs, or a list of E where an env has none of that shape."""
@@ -35,14 +36,14 @@ class EnvSettings:
         module: that registers the environment.
         kwargs: for ``gym.make``.
         wrappers: put around each environment, the first one first.
-        running: file of (num_envs,) bool that says which envs are being stepped or reset, for when a process dies.
+        states: file of (num_envs,) bytes, ``UNMADE``, ``IDLE`` or ``AT_WORK``, for when a process dies.
     """
 
     env_id: str
     module: str
     kwargs: dict[str, Any]
     wrappers: tuple[Callable[[gym.Env], gym.Env], ...]
-    running: str
+    states: str
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,9 @@ class EnvWorker:
         os.environ.setdefault("LP_NUM_THREADS", "1")  # several processes render in software
         use_one_torch_thread()
         self._settings: EnvSettings = pickle.loads(settings)
-        self._running = np.memmap(self._settings.running, np.bool_, "r+")
+        self._states = np.memmap(self._settings.states, np.uint8, "r+")
+        if self._states[envs.start] != UNMADE:  # the pool replaces a process that died
+            raise WorkerCrashed("its worker process died", found="it ended between two calls")
         self._first, self._envs = envs.start, dict[int, gym.Env]()
         _, failed = self._each(envs, self._make)
         if failed:
@@ -119,12 +122,12 @@ class EnvWorker:
     def _each(self, envs: Iterable[int], act: Callable[[int], Any]) -> tuple[list[Any], RemoteError | None]:
         results, failed = [], None
         for env in list(envs):
-            self._running[env] = True
+            self._states[env] = AT_WORK
             try:
                 results.append(act(env))
             except Exception as error:  # raised again in the main process
                 failed = failed or RemoteError.of(error, f"env {env}")
-            self._running[env] = False
+            self._states[env] = IDLE
         return results, failed
 
     def _make(self, env: int) -> None:

@@ -125,6 +125,18 @@ def test_what_goes_wrong_in_a_process(capfd):
 
 
 @slow
+def test_a_process_that_is_killed_between_two_steps_is_not_replaced():
+    with closing(make(2, 2)) as env:
+        env.reset(seed=0)
+        pids = env.unwrapped.pids
+        os.kill(pids[1], signal.SIGKILL)
+        with pytest.raises(WorkerDied, match="env 1: its process died") as died:
+            env.step(doing(0, 0))
+        assert died.value.envs == (1,)
+        assert gone(pids)
+
+
+@slow
 def test_a_busy_process_is_not_waited_for():
     env = make(1, 1, wrappers=[Misbehaves])
     env.reset(seed=0)
