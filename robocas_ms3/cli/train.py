@@ -94,53 +94,35 @@ class Other(Training):
     """Folder of a dataset, or a trajectory.h5, if the baseline learns from data."""
 
 
-def small(cfg: Small) -> int:
-    """Run ``small``."""
-    return train("small", cfg, cfg.data)
+def command(baseline: str, settings: type[Training]) -> Callable[[Any], int]:
+    """Return the command that trains a baseline with settings of a type."""
 
+    def run(cfg: Training) -> int:
+        return train(baseline, cfg)
 
-def bc_state(cfg: BCState) -> int:
-    """Run ``bc-state``."""
-    return train("bc-state", cfg, cfg.data)
-
-
-def rt1(cfg: RT1) -> int:
-    """Run ``rt1``."""
-    return train("rt1", cfg, cfg.data)
-
-
-def ppo(cfg: PPO) -> int:
-    """Run ``ppo``."""
-    return train("ppo", cfg, None)
-
-
-def other(name: str) -> Callable[[Other], int]:
-    """Return the command of a baseline of another package."""
-
-    def command(cfg: Other) -> int:
-        return train(name, cfg, cfg.data)
-
-    return command
+    run.__annotations__["cfg"] = settings
+    return run
 
 
 COMMANDS = {
-    "small": small,
-    "bc-state": bc_state,
-    "rt1": rt1,
-    "ppo": ppo,
-    **{name: other(name) for name in BASELINES.entry_points},
+    "small": command("small", Small),
+    "bc-state": command("bc-state", BCState),
+    "rt1": command("rt1", RT1),
+    "ppo": command("ppo", PPO),
+    **{name: command(name, Other) for name in BASELINES.entry_points},
 }
 DEFAULT = "small"
 
 
 @resumable
-def train(baseline: str, cfg: Training, data: Path | None) -> int:
+def train(baseline: str, cfg: Training) -> int:
     """Train a baseline, with a progress bar."""
     from robocas_ms3.baselines.training.record import find_run
     from robocas_ms3.baselines.training.session import Progress, RunOptions, train_run
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.terminal import say
 
+    data = getattr(cfg, "data", None)
     out = cfg.out or _default_out(baseline, data)
     start = None if cfg.start is None else find_run(Path(cfg.start)).absolute()
     with bar("episodes read", transient=True) as reading, bar("steps trained") as stepping:
@@ -151,15 +133,8 @@ def train(baseline: str, cfg: Training, data: Path | None) -> int:
 
         first = os.environ.get("RANK", "0") == "0"  # one of several processes writes to the terminal
         progress = Progress(stepping.note, reading.at, step) if first else Progress()
-        options = RunOptions(
-            baseline,
-            data,
-            out.absolute(),
-            changes_of(cfg),
-            start=start,
-            device=cfg.device,
-            overwrite=cfg.overwrite,
-        )
+        changes, place = changes_of(cfg), out.absolute()
+        options = RunOptions(baseline, data, place, changes, start=start, device=cfg.device, overwrite=cfg.overwrite)
         train_run(options, progress)
     if first:
         say(f"{out}: trained. Next: robocas eval TASK --policy {out} --protocol {'paper-v1' if data else 'P'}")

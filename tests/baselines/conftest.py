@@ -11,7 +11,7 @@ from made_up_runs import train
 
 from robocas_ms3.baselines.registry import BASELINES
 from robocas_ms3.cli.main import run
-from robocas_ms3.cli.train import COMMANDS, other
+from robocas_ms3.cli.train import COMMANDS, Other, command
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[2]
 @pytest.fixture
 def made_up(monkeypatch):
     monkeypatch.setitem(BASELINES.builtin, "made-up", MadeUp)
-    monkeypatch.setitem(COMMANDS, "made-up", other("made-up"))
+    monkeypatch.setitem(COMMANDS, "made-up", command("made-up", Other))
     return MadeUp
 
 

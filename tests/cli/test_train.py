@@ -9,14 +9,14 @@ from made_up_baseline import MadeUp
 
 from robocas_ms3.baselines.registry import BASELINES
 from robocas_ms3.cli.main import run
-from robocas_ms3.cli.train import COMMANDS, Training, changes_of, other
+from robocas_ms3.cli.train import COMMANDS, Other, Training, changes_of, command
 from robocas_ms3.core.errors import TrainingError
 
 
 @pytest.fixture
 def made_up(monkeypatch):
     monkeypatch.setitem(BASELINES.builtin, "made-up", MadeUp)
-    monkeypatch.setitem(COMMANDS, "made-up", other("made-up"))
+    monkeypatch.setitem(COMMANDS, "made-up", command("made-up", Other))
 
 
 def test_options_win_over_the_file_and_later_ones_over_earlier(tmp_path):
