@@ -76,7 +76,7 @@ def decode(rows: NDArray[np.floating], tcp: NDArray[np.floating]) -> tuple[Array
     return tcp @ from_parts(rows[..., :3], turns), rows[..., 9]
 
 
-def _rows(poses: Array, last: NDArray[np.floating]) -> NDArray[np.float32]:
+def _rows(poses: NDArray[np.floating], last: NDArray[np.floating]) -> NDArray[np.float32]:
     turns = poses[..., :3, :2].swapaxes(-1, -2).reshape(*poses.shape[:-2], 6)
     return np.concatenate([poses[..., :3, 3], turns, last[..., None]], axis=-1).astype(np.float32)
 

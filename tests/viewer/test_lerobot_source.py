@@ -55,13 +55,6 @@ def test_the_memory_of_decoded_images_is_bounded(lerobot, monkeypatch):
     assert decoded == [0, 1, 2, 1]
 
 
-def test_an_episode_that_is_not_listed_is_on_no_side(lerobot, tmp_path):
-    other = shutil.copytree(lerobot, tmp_path / "other")
-    path = other / "meta/robocas/conversion.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), "train_eps": [0], "val_eps": [2]}))
-    assert [row["split"] for row in open_source(other).index()["episodes"]] == ["train", "", "val", ""]
-
-
 def test_another_makers_dataset_shows_its_columns(lerobot, tmp_path):
     other = shutil.copytree(lerobot, tmp_path / "other")
     shutil.rmtree(other / "meta/robocas")

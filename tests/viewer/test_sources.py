@@ -164,11 +164,10 @@ def test_pictures_are_those_of_the_folder(folder):
     assert (source.depth(2, "base_camera", 0) == Dataset(folder).episode(2).depth("base_camera", 0)).all()
 
 
-@pytest.mark.parametrize("number", [3, 99])
-def test_there_is_no_such_episode(folder, run_folder, number):
+def test_there_is_no_such_episode(folder, run_folder):
     for path in (folder, run_folder):
         with pytest.raises(DatasetError, match="no such episode"):
-            open_source(path).episode(number)
+            open_source(path).episode(3)
 
 
 def test_a_seed_means_a_scene_of_its_own_environment_only(run_folder, folder, made_up, tmp_path):
@@ -206,12 +205,7 @@ def test_a_seed_means_a_scene_of_its_own_environment_only(run_folder, folder, ma
 
 def test_a_folder_without_our_additions_is_shown_too(folder, tmp_path):
     bare = shutil.copytree(folder, tmp_path / "bare")
-    for path in [
-        bare / "conversion.json",
-        bare / "data_info.json",
-        bare / "failures.jsonl",
-        *bare.glob("*/scene.json"),
-    ]:
+    for path in (*bare.glob("*.json*"), *bare.glob("*/scene.json")):
         path.unlink()
     source = open_source(bare)
     (row, *_) = source.index()["episodes"]
@@ -230,18 +224,13 @@ def test_a_link_that_leads_out_is_refused(folder, tmp_path):
         path.unlink()
         path.symlink_to(secret)
     source = open_source(spoilt)
-    with pytest.raises(DatasetError, match="leads out"):
-        source.rgb(1, "base_camera", 2)
-    with pytest.raises(DatasetError, match="leads out"):
-        source.depth(1, "base_camera", 2)
+    for read in (source.rgb, source.depth):
+        with pytest.raises(DatasetError, match="leads out"):
+            read(1, "base_camera", 2)
 
 
 def test_nothing_to_view(tmp_path):
     (tmp_path / "notes.txt").write_text("hello")
-    for path, why in (
-        (tmp_path, "no dataset"),
-        (tmp_path / "notes.txt", "nothing to view"),
-        (tmp_path / "x", "no such"),
-    ):
-        with pytest.raises(DatasetError, match=why):
+    for path in (tmp_path, tmp_path / "notes.txt", tmp_path / "x"):
+        with pytest.raises(DatasetError):
             open_source(path)
