@@ -55,7 +55,7 @@ class Executor(ABC):
         try:
             self.options: Any = self.options_type.model_validate_strings(dict(options or {}))
         except ValidationError as error:
-            about = f"not a valid option of {type(self).__name__}"
+            about = "not a valid option of this executor"
             raise refusal(error, self.options_type, PlanError, where="--executor-option", about=about) from error
         self.units_per_job: int = getattr(self.options, "units_per_job", 1)
         self.check()
