@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from robocas_ms3.cli.main import run
+
 pytest.importorskip("websockets")
 pytest.importorskip("msgpack")
 
@@ -96,8 +98,6 @@ def test_the_size_of_batches_is_announced(tmp_path):
 
 
 @pytest.mark.parametrize(("option", "value"), [("--port", "99999"), ("--max-batch", "0"), ("--max-batch", "257")])
-def test_an_option_out_of_range(option, value):
-    words = [sys.executable, ROOT / "robocas_cli.py", "serve-policy", "still", option, value]
-    done = subprocess.run(words, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr.startswith(f"error: {option[2:].replace('-', '_')}: ")
+def test_an_option_out_of_range(capsys, option, value):
+    assert run(["serve-policy", "still", option, value]) == 1
+    assert capsys.readouterr().err.startswith(f"error: {option[2:].replace('-', '_')}: ")
