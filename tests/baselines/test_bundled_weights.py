@@ -1,4 +1,4 @@
-"""The weights that come with the package: small enough to ship, of this version, and the policy `small` by name."""
+"""The bundled weights: small, of this version, and the policy `small` by name."""
 
 import json
 from pathlib import Path
@@ -28,21 +28,21 @@ def test_they_are_a_policy_by_name():
     assert policy.describe()["steps"] > 0
 
 
-def test_they_are_a_start_by_name_as_they_are_a_policy(tmp_path, monkeypatch):
+def test_they_are_initial_weights_by_name(tmp_path, monkeypatch):
     """Also where a folder is called so, which a longer path names."""
     monkeypatch.chdir(tmp_path)
-    begun = load_initial_weights(BASELINE, Path("small"), None, tmp_path / "out")
-    assert begun is not None and begun.weights
-    assert begun.record == read_run(BUNDLED / "small")
+    initial = load_initial_weights(BASELINE, Path("small"), None, tmp_path / "out")
+    assert initial is not None and initial.weights
+    assert initial.record == read_run(BUNDLED / "small")
     Path("small").mkdir()
     again = load_initial_weights(BASELINE, Path("small"), None, tmp_path / "out")
-    assert again is not None and again.name == begun.name
+    assert again is not None and again.name == initial.name
     with pytest.raises(TrainingError, match="no run of robocas train"):
         load_initial_weights(BASELINE, tmp_path / "small", None, tmp_path / "out")
 
 
 @pytest.mark.slow
-def test_they_reach_what_is_meant(short, tmp_path, needs_renderer):
+def test_they_reach_the_target(short, tmp_path, needs_renderer):
     """Of three objects one at least: which of them depends on how a processor rounds."""
     words = ["eval", "--policy", "small", "--protocol", short, "--envs", "2"]
     assert run([*words, "--out", str(tmp_path / "eval")]) == 0

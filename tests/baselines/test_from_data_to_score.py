@@ -1,4 +1,4 @@
-"""From a demonstration to a score, as a user goes about it: generate, convert, train, eval."""
+"""From demonstrations to a score: generate, convert, train, eval."""
 
 import json
 
@@ -41,9 +41,9 @@ def test_bc_state(demos, tmp_path, monkeypatch):
 
     samples = BASELINE.data(BcStateConfig(), demos, "train", lambda done, total: None)
     batch = samples.__getitems__(list(range(len(samples))))
-    towards = batch["inputs"][:, -19:-16].numpy()  # tcp_to_target; then 3 towards the goal, 3 extents, 10 of the arm
-    assert np.linalg.norm(towards[0]) > 0.1  # it begins away from the target,
-    assert np.linalg.norm(towards, axis=1).min() < 0.03  # and takes it
+    to_target = batch["inputs"][:, -19:-16].numpy()  # tcp_to_target; then 3 towards the goal, 3 extents, 10 of the arm
+    assert np.linalg.norm(to_target[0]) > 0.1  # it begins away from the target,
+    assert np.linalg.norm(to_target, axis=1).min() < 0.03  # and takes it
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Training on a device in a precision, broken off and gone on with, and what comes of it acting."""
+"""A training on a device in a precision that is interrupted and continues, and its policy."""
 
 import json
 

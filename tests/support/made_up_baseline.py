@@ -1,7 +1,7 @@
-"""A baseline that learns nothing worth knowing, in milliseconds.
+"""A baseline that trains in milliseconds.
 
-`python made_up_baseline.py DATA OUT` trains it in several processes, as RANK and WORLD_SIZE say: a run without a break,
-and one that crashes and goes on.
+`python made_up_baseline.py DATA OUT` trains it in several processes, as RANK and WORLD_SIZE say: an uninterrupted run,
+and one that crashes and continues.
 """
 
 import sys

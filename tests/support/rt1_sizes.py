@@ -1,4 +1,4 @@
-"""Sizes of rt1 that tests can afford, and norms that have seen pictures."""
+"""Small sizes of rt1, and norms that have seen images."""
 
 from torch import nn
 

@@ -1,4 +1,4 @@
-"""Sizes of a `small` that learns by heart in seconds."""
+"""Sizes of a `small` that trains in seconds."""
 
 from robocas_ms3.baselines.small.config import View
 

@@ -1,4 +1,4 @@
-"""What the policy's numbers mean: the same where it learns and where it is measured."""
+"""Actions and observations of ppo: the same in training and evaluation."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def see(count, state=4):
     return observe(range(count), state=np.zeros((count, state), np.float32))
 
 
-def policy_that_says(numbers):
+def policy_with(numbers):
     """Whatever it sees."""
     agent = BASELINE.model(PpoConfig(width=4), FACTS)
     torch.nn.init.zeros_(agent.actor[-1].weight)
@@ -38,13 +38,13 @@ def test_five_numbers_are_seven():
 
 
 def test_motions_are_metres_and_radians():
-    found = policy_that_says([0.5, -1.0, 2.0, 0.4, 0.1]).act(see(2))
+    found = policy_with([0.5, -1.0, 2.0, 0.4, 0.1]).act(see(2))
     assert found.shape == (2, 7)
     np.testing.assert_allclose(found[1], [0.025, -0.05, 0.05, 0, 0, 0.1, 1], atol=1e-6)
 
 
-def test_the_evaluation_does_what_the_training_did():
-    policy = policy_that_says([0.5, -1.0, 0.3, 0.4, -0.2])
+def test_actions_are_the_same_in_evaluation_and_training():
+    policy = policy_with([0.5, -1.0, 0.3, 0.4, -0.2])
     assert control_mode(policy.spec.convention) == "pd_ee_delta_pose"
     motion = CONVENTIONS[policy.spec.convention].read(policy.act(see(1)))
     assert isinstance(motion.rotation, Rotation)
@@ -54,18 +54,18 @@ def test_the_evaluation_does_what_the_training_did():
     np.testing.assert_allclose(again, learned[:, :6].numpy(), atol=1e-6)
 
 
-def test_it_says_what_it_wants():
-    spec = policy_that_says([0.0] * 5).spec
+def test_the_spec():
+    spec = policy_with([0.0] * 5).spec
     assert (spec.reference, spec.rate_hz, spec.state, spec.language) == ("target", 5, True, "none")
     assert not spec.cameras
 
 
 def test_other_scenes_are_refused():
     with pytest.raises(EvaluationError, match="24 numbers.*30"):
-        policy_that_says([0.0] * 5).act(see(1, state=10))
+        policy_with([0.0] * 5).act(see(1, state=10))
 
 
-def test_what_was_observed_is_what_observations_are_measured_by():
+def test_observations_are_normalised_by_running_statistics():
     agent = Agent(1, 1, 4)
     agent.update_statistics(torch.tensor([[1.0], [3.0]]))
     agent.update_statistics(torch.tensor([[5.0], [7.0]]))

@@ -1,4 +1,4 @@
-"""Learning in an environment of a few lines: it learns, stops, goes on, and keeps what it knew. And once for real."""
+"""PPO in an environment of a few lines: it learns, is interrupted and continues; and once in the simulator."""
 
 import pytest
 import torch
@@ -31,7 +31,7 @@ def test_it_learns(made_up, tmp_path):
     assert RunPolicy(tmp_path / "run").describe()["steps"] == 1280
 
 
-def test_ctrl_c_keeps_what_was_learned(made_up, tmp_path):
+def test_after_ctrl_c_a_run_continues(made_up, tmp_path):
     run = tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):
         train("ppo", None, run, SMALL, progress=stop_at(640, KeyboardInterrupt()))
@@ -52,7 +52,7 @@ def test_ctrl_c_keeps_what_was_learned(made_up, tmp_path):
     assert len(read_log(run, "val")) == 1
 
 
-def test_what_goes_on_is_what_was_there(made_up, tmp_path):
+def test_a_checkpoint_is_restored_whole(made_up, tmp_path):
     run = tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):
         train("ppo", None, run, SMALL, progress=stop_at(640, KeyboardInterrupt()))
@@ -65,7 +65,7 @@ def test_what_goes_on_is_what_was_there(made_up, tmp_path):
     assert all(torch.equal(before[name], again[name]) for name in before)
 
 
-def test_a_gradient_that_is_no_number_is_not_saved(made_up, monkeypatch, tmp_path):
+def test_a_nan_gradient_is_not_saved(made_up, monkeypatch, tmp_path):
     """Not even that of an update's last step, whose losses are numbers."""
     clip, calls = torch.nn.utils.clip_grad_norm_, []
 
@@ -93,7 +93,7 @@ def test_data_is_refused(made_up, tmp_path):
     assert caught.value.where == "--data"
 
 
-def test_other_scenes_do_not_go_on(made_up, monkeypatch, tmp_path):
+def test_a_run_of_other_scenes_is_not_continued(made_up, monkeypatch, tmp_path):
     train("ppo", None, tmp_path / "run", SMALL | {"trials": 0})
     monkeypatch.setattr(MadeUpEnvironments, "hash", "5678")
     with pytest.raises(OutputExistsError):
