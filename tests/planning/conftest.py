@@ -5,6 +5,8 @@ from __future__ import annotations
 import pytest
 from planning_scenes import Checker
 
+from robocas_ms3.planning.chain import ArmChain
+from robocas_ms3.planning.kinematics import Reachability
 from robocas_ms3.planning.rrt_connect import RRTConnectPlanner
 from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.urdf import RobotFiles, robot_files
@@ -31,3 +33,8 @@ def make_planner(panda_files: RobotFiles):
 @pytest.fixture
 def planner(make_planner) -> RRTConnectPlanner:
     return make_planner()
+
+
+@pytest.fixture(scope="session")
+def reachability(panda_files) -> Reachability:
+    return Reachability(ArmChain(panda_files.arm_urdf, MOBILE_PANDA))

@@ -12,8 +12,6 @@ from planning_scenes import REST
 from robocas_ms3.assets.kinematics import joint_motion
 from robocas_ms3.assets.manifest import Handle, Joint
 from robocas_ms3.core.errors import PlanningFailed
-from robocas_ms3.planning.chain import ArmChain
-from robocas_ms3.planning.kinematics import Reachability
 from robocas_ms3.planning.protocol import AttachedBody, Obstacle, Shape
 from robocas_ms3.planning.pulling import MAX_SLIP, reached, track
 from robocas_ms3.planning.skills.driving import Surroundings, body_is_free, free_route
@@ -25,11 +23,6 @@ SLIDE = Joint(name="slide", kind="prismatic", axis=(-1.0, 0.0, 0.0), limits=(0.0
 HINGE = Joint(
     name="hinge", kind="revolute", axis=(0, 0, 1), origin=(0.7, -0.3, 0), limits=(0.0, 2.0), friction=0, damping=0
 )
-
-
-@pytest.fixture(scope="module")
-def reachability(panda_files) -> Reachability:
-    return Reachability(ArmChain(panda_files.arm_urdf, MOBILE_PANDA))
 
 
 def level_hold(x: float, y: float, z: float) -> np.ndarray:

@@ -15,11 +15,6 @@ from robocas_ms3.planning.pulling import twist
 from robocas_ms3.robots.description import MOBILE_PANDA
 
 
-@pytest.fixture(scope="module")
-def reachability(panda_files) -> Reachability:
-    return Reachability(ArmChain(panda_files.arm_urdf, MOBILE_PANDA))
-
-
 def grasp_poses(count: int, seed: int) -> np.ndarray:
     """Poses over and around a table, leaning up to 60 deg from straight down."""
     rng, poses = np.random.default_rng(seed), []

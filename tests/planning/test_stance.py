@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 from planning_scenes import REST
 
-from robocas_ms3.planning.chain import ArmChain
-from robocas_ms3.planning.kinematics import Reachability
 from robocas_ms3.planning.skills import stance
 from robocas_ms3.planning.skills.driving import arm_base_in_world
 from robocas_ms3.robots.description import MOBILE_PANDA
@@ -27,11 +25,6 @@ class _Planner:
     def free(self, qpos) -> np.ndarray:
         away = np.abs(qpos[:, None] - self.blocked[None]).max(axis=2)
         return (away > 1e-6).all(axis=1)
-
-
-@pytest.fixture(scope="module")
-def reachability(panda_files) -> Reachability:
-    return Reachability(ArmChain(panda_files.arm_urdf, MOBILE_PANDA))
 
 
 @pytest.fixture
