@@ -1,35 +1,6 @@
-"""The LeRobot datasets that are written here, declared once: writer, reader, check, documentation and tests read it.
+"""The LeRobot datasets that are written here, declared once; docs/lerobot.md lists their files.
 
-Format v3.0 (`variants.V3`)::
-
-    meta/info.json                              version, rate, sizes, features
-    meta/stats.json                             statistics of every numeric feature over the whole dataset
-    meta/tasks.parquet                          instruction -> task_index
-    meta/subtasks.parquet                       text of a sub-goal -> subtask_index; without language columns only
-    meta/episodes/chunk-000/file-000.parquet    one row per episode: its files, tasks and statistics
-    data/chunk-000/file-000.parquet             one row per frame
-    videos/<key>/chunk-000/file-000.mp4         RGB and native depth, episodes one after the other
-    depth/<camera>/chunk-000/file-000.mkv       16-bit depth, FFV1; ours, LeRobot does not read it
-
-Format v2.1 (`variants.V21`)::
-
-    meta/info.json, stats.json, subtasks.parquet   as in v3.0
-    meta/tasks.jsonl                               instruction and task_index
-    meta/episodes.jsonl                            tasks and length of each episode
-    meta/episodes_stats.jsonl                      statistics of each episode
-    meta/modality.json                             slices of state and action, for GR00T
-    data/chunk-000/episode_000000.parquet
-    videos/chunk-000/<key>/episode_000000.mp4
-    depth/chunk-000/<camera>/episode_000000.mkv
-
-Both::
-
-    meta/robocas/conversion.json                how the dataset was made, and which episode is which recording; ours
-    meta/robocas/episodes.parquet               scene.json and cameras of each episode; ours
-    meta/robocas/checksums.json                 SHA-256 of the files of data, videos and depth; ours
-    .annotate_staging/episode_000000/*.jsonl    the language rows, where lerobot-annotate looks for rows to keep
-
-Metres and radians; quaternions are xyzw.
+Writer, reader, checks, documentation and tests read it. Metres and radians; quaternions are xyzw.
 """
 
 from __future__ import annotations

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import pyarrow as pa
@@ -25,14 +25,6 @@ OBJECTS_LIMIT = 2**26
 """Bytes of values that are read at once to become Python objects, which take about ten times as much."""
 INTEGER, NUMBER, TEXT = "integers", "numbers", "texts"
 INTEGERS, NUMBERS, TEXTS = "integers or lists of integers", "numbers or lists of numbers", "lists of texts"
-Kind = Literal[
-    "integers",
-    "numbers",
-    "texts",
-    "integers or lists of integers",
-    "numbers or lists of numbers",
-    "lists of texts",
-]
 TEXT_INDEX = "__index_level_0__"  # pandas' name of an index without one
 _EPISODE = "episode_index"
 
@@ -41,7 +33,7 @@ _EPISODE = "episode_index"
 class Column:
     """Declaration of a column: a kind of values and, of integers and numbers, their range."""
 
-    kind: Kind
+    kind: str
     least: float = 0
     greatest: float = 2**53
 
@@ -168,7 +160,7 @@ def is_numeric(kind: pa.DataType) -> bool:
     return _is_kind(kind, NUMBERS)
 
 
-def _is_kind(found: pa.DataType, kind: Kind) -> bool:
+def _is_kind(found: pa.DataType, kind: str) -> bool:
     lists = pa.types.is_list, pa.types.is_fixed_size_list, pa.types.is_large_list
     if kind in (INTEGERS, NUMBERS, TEXTS):
         depth = 0
@@ -251,3 +243,22 @@ def read_texts(path: Path, name: str, most_rows: float = np.inf) -> list[str]:
         expected = f"0 to {len(places) - 1}, each once"
         raise DatasetError("wrong numbers of texts", where=f"{path}, {name}", expected=expected, fix=SEE_VALIDATE)
     return [texts[place] for place in order.tolist()]
+
+
+def write_texts(path: Path, name: str, texts: Sequence[str]) -> None:
+    """Write a table of texts and their numbers; the texts are the index of pandas, by which LeRobot finds them."""
+    text = {"pandas_type": "unicode", "numpy_type": "object"}
+    number = {"pandas_type": "int64", "numpy_type": "int64"}
+    about = {
+        "index_columns": [TEXT_INDEX],
+        "column_indexes": [{"name": None, "field_name": None, **text, "metadata": {"encoding": "UTF-8"}}],
+        "columns": [
+            {"name": name, "field_name": name, **number, "metadata": None},
+            {"name": None, "field_name": TEXT_INDEX, **text, "metadata": None},
+        ],
+        "creator": {"library": "pyarrow", "version": pa.__version__},
+        "pandas_version": "2.0.0",
+    }
+    table = pa.table({name: pa.array(range(len(texts)), pa.int64()), TEXT_INDEX: pa.array(list(texts), pa.string())})
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pq.write_table(table.replace_schema_metadata({"pandas": json.dumps(about)}), path)

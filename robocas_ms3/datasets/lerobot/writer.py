@@ -23,7 +23,7 @@ from robocas_ms3.datasets.lerobot.language import EVENTS, Row
 from robocas_ms3.datasets.lerobot.parts import FRAMES_FILE, SUBGOAL, Part, numeric_keys, read_parts, video_name
 from robocas_ms3.datasets.lerobot.schema import FileLimits
 from robocas_ms3.datasets.lerobot.stats import Histogram, Levels, Range, Stats, vector_stats
-from robocas_ms3.datasets.lerobot.tables import TEXT_INDEX
+from robocas_ms3.datasets.lerobot.tables import write_texts
 from robocas_ms3.datasets.lerobot.variants import CHUNK_FILES, Variant, find_variant
 from robocas_ms3.datasets.lerobot.video import Joiner, packet_times
 from robocas_ms3.datasets.sources.protocol import Kind
@@ -342,22 +342,3 @@ def _write_lines(path: Path, records: Iterable[Mapping[str, Any]]) -> None:
 
 def _line(record: Mapping[str, Any]) -> str:
     return json.dumps(record, ensure_ascii=False, allow_nan=False) + "\n"
-
-
-def write_texts(path: Path, name: str, texts: Sequence[str]) -> None:
-    """Write a table of texts and their numbers; the texts are the index of pandas, by which LeRobot finds them."""
-    text = {"pandas_type": "unicode", "numpy_type": "object"}
-    number = {"pandas_type": "int64", "numpy_type": "int64"}
-    about = {
-        "index_columns": [TEXT_INDEX],
-        "column_indexes": [{"name": None, "field_name": None, **text, "metadata": {"encoding": "UTF-8"}}],
-        "columns": [
-            {"name": name, "field_name": name, **number, "metadata": None},
-            {"name": None, "field_name": TEXT_INDEX, **text, "metadata": None},
-        ],
-        "creator": {"library": "pyarrow", "version": pa.__version__},
-        "pandas_version": "2.0.0",
-    }
-    table = pa.table({name: pa.array(range(len(texts)), pa.int64()), TEXT_INDEX: pa.array(list(texts), pa.string())})
-    path.parent.mkdir(parents=True, exist_ok=True)
-    pq.write_table(table.replace_schema_metadata({"pandas": json.dumps(about)}), path)

@@ -1,4 +1,4 @@
-"""Shows recorded states through ManiSkill's cameras: the scene is rebuilt from its seed, physics never steps."""
+"""Renders recorded states with ManiSkill's cameras: the scene is rebuilt from its seed, physics never steps."""
 
 from __future__ import annotations
 
@@ -24,20 +24,18 @@ _SAME_PLACE = 1e-3  # m
 
 
 class EnvRenderer:
-    """Renders with the environment that recorded a trajectory: a `rendering.Renderer`.
+    """Renders recorded states in the environment that recorded them.
 
-    Attributes:
-        env: the environment.
+    Args:
+        env: the recorded environment.
+        control_mode: of the recorded actions.
+        pictures: images to render; None: all.
+
+    Raises:
+        DatasetError: there is no render device, or no such environment.
     """
 
     def __init__(self, env: RecordedEnv, control_mode: str, pictures: Pictures | None = None) -> None:
-        """Make the environment, with cameras.
-
-        Args:
-            env: what the trajectory was recorded in.
-            control_mode: of its actions.
-            pictures: which ones to render; default: all.
-        """
         sensors = dict(env.kwargs.get("sensor_configs") or {})
         self._pictures = (pictures or Pictures()).choose([camera.name for camera in env.cameras()], env.env_id)
         if self._pictures.size is not None:
@@ -51,64 +49,57 @@ class EnvRenderer:
             sensor_configs=sensors,
         )
         self._base: Any = self.env.unwrapped
-        self._loaded = False
 
     def close(self) -> None:
         """Free the renderer."""
         self.env.close()
 
     def load(self, recording: Recording) -> None:
-        """Rebuild a recording's scene."""
+        """Rebuild the scene of a recording."""
         self.env.reset(seed=recording.seed, options=dict(recording.reset_options))
         for name in set(self._base._sensors) - set(self._pictures.cameras):
             del self._base._sensors[name]  # they are made anew at each reset; what is there is rendered
         self._check_scene(recording)
 
     def _check_scene(self, recording: Recording) -> None:
-        where = f"episode {recording.episode_id}, seed {recording.seed}"
-        fix = "Use the pack, configuration and versions it was recorded with."
+        for name, expected, found in self._scene_differences(recording):
+            where = f"episode {recording.episode_id}, seed {recording.seed}{f', {name}' if name else ''}"
+            what, fix = (
+                "the seed builds another scene",
+                "Use the pack, configuration and versions it was recorded with.",
+            )
+            raise DatasetError(what, where=where, expected=expected, found=found, fix=fix)
+
+    def _scene_differences(self, recording: Recording) -> Iterator[tuple[str, object, object]]:
+        """Yield name, expected and found of differences between the rebuilt and the recorded scene."""
         built = self._base.get_state_dict()
         for kind in ("actors", "articulations"):
             mine, theirs = set(built.get(kind, {})), set(recording.states.get(kind, {}))
             if mine != theirs:
-                raise DatasetError(
-                    "the seed builds another scene", where=where, expected=sorted(theirs), found=sorted(mine), fix=fix
-                )
+                yield "", sorted(theirs), sorted(mine)
         placed = {} if recording.taken_over else recording.states.get("actors", {})
         for name, states in placed.items():
             distance = float(np.linalg.norm(built["actors"][name][0, :3].cpu().numpy() - states[0, :3]))
             if distance > _SAME_PLACE:
-                raise DatasetError(
-                    "the seed builds another scene",
-                    where=f"{where}, {name}",
-                    expected="the recorded place",
-                    found=f"{distance * 1000:.1f} mm away",
-                    fix=fix,
-                )
+                yield name, "the recorded place", f"{distance * 1000:.1f} mm away"
         instruction = self._base.get_language_instruction()[0]
         if instruction != recording.instruction:
-            raise DatasetError(
-                "the seed builds another scene",
-                where=where,
-                expected=recording.instruction,
-                found=instruction,
-                fix=fix,
-            )
+            yield "", recording.instruction, instruction
 
     def frames(self, recording: Recording, samples: NDArray[np.int64]) -> Iterator[Frame]:
-        """Show some of the states, in order; ``load`` comes first."""
+        """Render some of the states of the loaded recording, in order."""
         for index in samples:
             yield self._frame(recording.state(int(index)))
 
     def _frame(self, state: dict[str, dict[str, NDArray[np.float32]]]) -> Frame:
-        """Show one state, without a step of physics."""
+        """Render one state, without a step of physics."""
         tensors = {kind: {k: torch.from_numpy(v) for k, v in arrays.items()} for kind, arrays in state.items()}
         self._base.set_state_dict(tensors)
         textures = self._base._get_obs_sensor_data(apply_texture_transforms=False)
         shaders = {name: self._base._sensors[name].config.shader_config for name in self._pictures.cameras}
         return Frame(
-            rgb={name: rgb_of(textures[name], shader) for name, shader in shaders.items()},
-            depth={name: depth_of(textures[name], shader) for name, shader in shaders.items() if self._pictures.depth},
+            rgb={name: _rgb_of(textures[name], shader) for name, shader in shaders.items()},
+            depth={name: _depth_of(textures[name], shader) for name, shader in shaders.items() if self._pictures.depth},
             boxes=self._boxes(textures, shaders) if self._pictures.boxes else {},
         )
 
@@ -116,11 +107,11 @@ class EnvRenderer:
         """Return the box of the target's visible pixels in the cameras that see it."""
         slot = int(self._base.target_slot[0])
         number = int(self._base.scene.actors[f"object_{slot}"].per_scene_id[0])
-        masks = {name: segmentation_of(textures[name], shader) == number for name, shader in shaders.items()}
+        masks = {name: _segmentation_of(textures[name], shader) == number for name, shader in shaders.items()}
         return {name: box for name, mask in masks.items() if (box := box_of(mask)) is not None}
 
     def cameras(self) -> dict[str, CameraModel]:
-        """Intrinsics, and poses in the parents, at the state shown last."""
+        """Return the camera models at the state rendered last."""
         agent = self._base.agent
         parents = {"ee": agent.tcp.pose, "arm_base": agent.arm_base_link.pose}
         models = {}
@@ -139,34 +130,30 @@ class EnvRenderer:
         return models
 
     def scene(self) -> dict[str, Any]:
-        """Task, configuration, layout and objects, for ``scene.json``."""
-        return describe_scene(self._base)
-
-
-def describe_scene(env: Any) -> dict[str, Any]:
-    """Task, configuration, layout and objects of an environment (one env)."""
-    layout = env.layout()
-    return {
-        "task": env.SPEC.name,
-        "config": env.task_config.model_dump(mode="json"),
-        "layout": {
-            "object_ids": list(layout.object_ids),
-            "poses": [_numbers(pose) for pose in layout.object_poses],
-            "present": layout.present.tolist(),
-            "robot_pose": _numbers(layout.robot_pose),
-            "basket_pose": None if layout.basket_pose is None else _numbers(layout.basket_pose),
-            "relation": layout.relation,
-        },
-        "objects": [
-            {"slot": slot, "id": asset.asset.id, "name": asset.asset.name}
-            for slot, asset in enumerate(env.object_assets[0])
-            if layout.present[slot]
-        ],
-    }
+        """Return ``task``, ``config``, ``layout`` and ``objects`` of ``scene.json``."""
+        env = self._base
+        layout = env.layout()
+        return {
+            "task": env.SPEC.name,
+            "config": env.task_config.model_dump(mode="json"),
+            "layout": {
+                "object_ids": list(layout.object_ids),
+                "poses": [_numbers(pose) for pose in layout.object_poses],
+                "present": layout.present.tolist(),
+                "robot_pose": _numbers(layout.robot_pose),
+                "basket_pose": None if layout.basket_pose is None else _numbers(layout.basket_pose),
+                "relation": layout.relation,
+            },
+            "objects": [
+                {"slot": slot, "id": asset.asset.id, "name": asset.asset.name}
+                for slot, asset in enumerate(env.object_assets[0])
+                if layout.present[slot]
+            ],
+        }
 
 
 def _numbers(pose: NDArray[np.float64]) -> list[float]:
-    """x, y, z, qw, qx, qy, qz of a 4x4."""
+    """Return x, y, z, qw, qx, qy, qz of a pose (4, 4)."""
     quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True)
     return [round(float(value), 9) for value in (*pose[:3, 3], quaternion[3], *quaternion[:3])]
 
@@ -182,28 +169,27 @@ def require_renderer() -> None:
     try:
         sapien.render.RenderMaterial()  # the cheapest thing that needs the device
     except RuntimeError as error:
-        raise DatasetError(
-            "no render device", fix="Run scripts/setup.sh or install a Vulkan driver; robocas doctor says more."
-        ) from error
+        fix = "Run scripts/setup.sh or install a Vulkan driver; robocas doctor says more."
+        raise DatasetError("no render device", fix=fix) from error
 
 
-def rgb_of(textures: dict[str, torch.Tensor], shader: ShaderConfig) -> NDArray[np.uint8]:
-    """A camera's picture, (H, W, 3) RGB, contiguous, of what its shader rendered, (1, H, W, C)."""
+def _rgb_of(textures: dict[str, torch.Tensor], shader: ShaderConfig) -> NDArray[np.uint8]:
+    """Return an RGB image (H, W, 3), contiguous, from the textures of a camera."""
     colour = textures["Color"]
     if colour.dtype == torch.uint8:  # OpenCV takes 0.03 ms to drop alpha at 640 x 480, copying a slice 2
         return cv2.cvtColor(colour[0].cpu().numpy(), cv2.COLOR_RGBA2RGB).astype(np.uint8, copy=False)
     return np.ascontiguousarray(shader.texture_transforms["Color"](colour)["rgb"][0].cpu().numpy())
 
 
-def depth_of(textures: dict[str, torch.Tensor], shader: ShaderConfig) -> NDArray[np.uint16]:
-    """A camera's depth, (H, W) mm, as it is stored: what is behind the camera or nowhere becomes 0."""
+def _depth_of(textures: dict[str, torch.Tensor], shader: ShaderConfig) -> NDArray[np.uint16]:
+    """Return depth (H, W) in mm; nothing, or something behind the camera, is 0."""
     name = next(name for name, kinds in shader.texture_names.items() if "depth" in kinds)
     depth = shader.texture_transforms[name](textures[name])["depth"][0, ..., 0]  # int16
     return depth.clamp(min=0).cpu().numpy().astype(np.uint16)
 
 
-def segmentation_of(textures: dict[str, torch.Tensor], shader: ShaderConfig) -> NDArray[np.int16]:
-    """Return a camera's segmentation, (H, W): the number of the actor or link in each pixel, 0 = none."""
+def _segmentation_of(textures: dict[str, torch.Tensor], shader: ShaderConfig) -> NDArray[np.int16]:
+    """Return the number of the actor or link in each pixel (H, W), 0 = none."""
     name = next(name for name, kinds in shader.texture_names.items() if "segmentation" in kinds)
     return shader.texture_transforms[name](textures[name])["segmentation"][0, ..., 0].cpu().numpy()
 

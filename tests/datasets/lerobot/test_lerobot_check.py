@@ -10,9 +10,8 @@ pq = pytest.importorskip("pyarrow.parquet", reason="needs the extra 'lerobot'")
 
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check import check_lerobot
-from robocas_ms3.datasets.lerobot.tables import as_column, numbers
+from robocas_ms3.datasets.lerobot.tables import as_column, numbers, write_texts
 from robocas_ms3.datasets.lerobot.video import CODINGS, Encoder
-from robocas_ms3.datasets.lerobot.writer import write_texts
 
 
 def found(root, **options):
