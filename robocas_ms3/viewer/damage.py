@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 from robocas_ms3.core.documents import DAMAGED
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.datasets.checks.scene import sound
+from robocas_ms3.datasets.checks.scene import valid_values
 from robocas_ms3.datasets.checks.violation import check_form
 from robocas_ms3.datasets.sources.records import RateRecord
 
@@ -69,7 +69,7 @@ def read_object(read: Callable[[], Any], name: str) -> tuple[dict[Any, Any], str
 
 def read_scene(read: Callable[[], Any], name: str) -> tuple[dict[str, Any], str]:
     """Return the valid values of a ``scene.json``, or of what has some of its keys, and what is wrong with the rest."""
-    (found, wrong), failed = attempt(lambda: sound(read(), name), ({}, ""))
+    (found, wrong), failed = attempt(lambda: valid_values(read(), name), ({}, ""))
     return found, f"{name}: {failed}" if failed else wrong
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.checks.violation import Violation, check_form, read_object, shown
+from robocas_ms3.datasets.checks.violation import Violation, check_form, read_object, shorten
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.records import SCENE_KEYS, ConversionRecord, SceneRecord
 from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, arrays_fingerprint, first_line
@@ -31,10 +31,10 @@ def check_values(scene: Mapping[str, Any], file: str = schema.SCENE_FILE) -> lis
     return wrong
 
 
-def sound(scene: Any, file: str = schema.SCENE_FILE) -> tuple[dict[str, Any], str]:
+def valid_values(scene: Any, file: str = schema.SCENE_FILE) -> tuple[dict[str, Any], str]:
     """Return the usable part of a ``scene.json``, and what is wrong with the rest; missing keys are allowed."""
     if not isinstance(scene, Mapping):
-        return {}, "" if scene is None else f"{file}: expected an object, found {shown(scene)}"
+        return {}, "" if scene is None else f"{file}: expected an object, found {shorten(scene)}"
     wrong = check_values({**_UNKNOWN, **scene}, file)
     return _usable(scene, wrong), "; ".join(map(str, wrong))
 
@@ -94,7 +94,7 @@ def check_ledger(
         name = schema.episode_folder(number)
         if ledger is not None and str(number) not in ledger:
             yield Violation(FILE, f"episodes.{number}", "an entry of every episode", "none")
-        entry, known = (ledger or {}).get(str(number), {}), sound(scene)[0]
+        entry, known = (ledger or {}).get(str(number), {}), valid_values(scene)[0]
         for key, expected, found in (
             ("source.recording", entry.get("recording"), known.get("source", {}).get("recording")),
             ("seed", one_seed(entry.get("seed")), one_seed(known.get("seed"))),

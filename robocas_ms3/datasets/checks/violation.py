@@ -85,11 +85,11 @@ def _violation(file: str, mistake: Mistake) -> Violation:
     if mistake.kind in ("too_short", "too_long"):
         limit = mistake.context.get("min_length", mistake.context.get("max_length"))
         return Violation(file, mistake.key, f"{limit} values", f"{mistake.context['actual_length']}")
-    found = "no such key" if mistake.kind == "missing" else shown(mistake.value)
+    found = "no such key" if mistake.kind == "missing" else shorten(mistake.value)
     return Violation(file, mistake.key, mistake.expected or mistake.what.removeprefix(f"{mistake.key}: "), found)
 
 
-def shown(value: Any) -> str:
+def shorten(value: Any) -> str:
     """Return a JSON value in at most 60 characters."""
     text = json.dumps(value, default=str)
     return text if len(text) <= 60 else text[:57] + "..."

@@ -24,7 +24,7 @@ from pydantic import BaseModel, ValidationError
 
 from robocas_ms3.core.errors import DatasetError, RobocasError
 from robocas_ms3.core.strict import validate_json
-from robocas_ms3.datasets.checks.scene import sound
+from robocas_ms3.datasets.checks.scene import valid_values
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.pictures.stored import Box
 from robocas_ms3.demos.recordings.subgoals import SubGoal
@@ -98,7 +98,7 @@ def paraphrases(scene: Mapping[str, Any], text: str) -> list[str]:
     Returns:
         Texts, the instruction first; empty where there is no paraphrase.
     """
-    known, _ = sound(scene)
+    known, _ = valid_values(scene)
     task, target, recorded = known.get("task"), known.get("target") or {}, known.get("recorded") or {}
     if not (task and target.get("name") and recorded.get("support")):
         return []

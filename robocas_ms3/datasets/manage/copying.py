@@ -78,7 +78,7 @@ def open_finished(root: Path, name: str = "") -> FinishedDataset:
         raise DatasetError("this dataset is not finished", where=path, found="no file", fix=fix)
     listed = [number for side in dataset.sides for number in side]
     if sorted(listed) != dataset.numbers:
-        found = f"{shown(sorted(set(listed) ^ set(dataset.numbers)))} missing, twice, or not on disk"
+        found = f"{list_first(sorted(set(listed) ^ set(dataset.numbers)))} missing, twice, or not on disk"
         fix = "Finish it with robocas convert, or accept what is there with robocas split --in-place."
         raise DatasetError("not the episodes on disk", where=root / schema.DATA_INFO_FILE, found=found, fix=fix)
     where = root / schema.CONVERSION_FILE
@@ -86,7 +86,7 @@ def open_finished(root: Path, name: str = "") -> FinishedDataset:
     ledger = {int(number): entry for number, entry in dataset.settings.get("episodes", {}).items()}
     unlisted = [number for number in dataset.numbers if number not in ledger]
     if unlisted:
-        raise DatasetError("these episodes are not listed", where=where, found=shown(unlisted))
+        raise DatasetError("these episodes are not listed", where=where, found=list_first(unlisted))
     for number in dataset.numbers:
         episode = dataset.episode(number)
         found = episode.scene.get("schema_version", 1)
@@ -94,7 +94,7 @@ def open_finished(root: Path, name: str = "") -> FinishedDataset:
     return FinishedDataset(dataset, name or root.resolve().name, ledger)
 
 
-def shown(values: Iterable[object], most: int = 8) -> str:
+def list_first(values: Iterable[object], most: int = 8) -> str:
     """Return the first of several values, for messages."""
     values = [str(value) for value in values]
     return ", ".join(values[:most]) + (f" and {len(values) - most} more" if len(values) > most else "")

@@ -15,8 +15,8 @@ from robocas_ms3.datasets.manage.copying import (
     CopyResult,
     FinishedDataset,
     copy_episodes,
+    list_first,
     open_finished,
-    shown,
 )
 from robocas_ms3.datasets.writing.plan import SETTINGS
 
@@ -59,7 +59,7 @@ def merge(
                 duplicates.append((first, member))
     if duplicates and not skip_duplicates:
         pairs = (f"{a.source.name} {a.number} = {b.source.name} {b.number}" for a, b in duplicates)
-        where, found = ", ".join(map(str, roots)), f"{len(duplicates)}: {shown(pairs, 4)}"
+        where, found = ", ".join(map(str, roots)), f"{len(duplicates)}: {list_first(pairs, 4)}"
         fix = "Pass --skip-duplicates to take each once."
         raise DatasetError("the same recording twice", where=where, found=found, fix=fix)
     (written,) = copy_episodes({out: list(members.values())}, KEEP_RULE, options or CopyOptions())

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.checks.scene import sound
+from robocas_ms3.datasets.checks.scene import valid_values
 from robocas_ms3.datasets.sources.protocol import SourceEpisode
 from robocas_ms3.datasets.sources.provenance import task_of
 
@@ -78,7 +78,7 @@ def facts_of(episode: SourceEpisode) -> Facts:
     scene = episode.scene
     if not scene:
         return Facts(instruction)
-    _, wrong = sound(scene)
+    _, wrong = valid_values(scene)
     if wrong:
         where, fix = f"{episode.where}/{schema.SCENE_FILE}", "robocas validate says what is wrong."
         raise DatasetError("this description of a scene is damaged", where=where, found=wrong[:200], fix=fix)

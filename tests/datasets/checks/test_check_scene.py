@@ -5,7 +5,7 @@ import json
 import pytest
 
 from robocas_ms3.datasets.checks.dataset import validate
-from robocas_ms3.datasets.checks.scene import check_values, sound
+from robocas_ms3.datasets.checks.scene import check_values, valid_values
 from robocas_ms3.datasets.sources.records import SCENE_KEYS, SceneRecord
 
 FILE = "episode_0000001/scene.json"
@@ -50,7 +50,7 @@ def test_the_declared_keys_are_those_of_the_schema():
 
 def test_what_is_whole_has_no_violations():
     assert check_values(WHOLE) == []
-    assert sound(WHOLE) == (WHOLE, "")
+    assert valid_values(WHOLE) == (WHOLE, "")
 
 
 def test_what_nobody_knows_is_null():
@@ -63,7 +63,7 @@ def test_what_nobody_knows_is_null():
 def test_each_key_is_missed(key):
     without = {name: value for name, value in WHOLE.items() if name != key}
     assert [said(v) for v in check_values(without)] == [(key, "this key", "no such key")]
-    assert sound(without) == (without, "")  # an older file, which can be shown as far as it goes
+    assert valid_values(without) == (without, "")  # an older file, which can be shown as far as it goes
 
 
 @pytest.mark.parametrize(
@@ -87,8 +87,8 @@ def test_one_violation_a_fault(new, key, expected, found):
 
 
 def test_scenes_that_are_no_objects():
-    assert sound(None) == ({}, "")
-    assert sound([1]) == ({}, "scene.json: expected an object, found [1]")
+    assert valid_values(None) == ({}, "")
+    assert valid_values([1]) == ({}, "scene.json: expected an object, found [1]")
 
 
 @pytest.mark.parametrize(

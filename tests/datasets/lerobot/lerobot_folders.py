@@ -1,7 +1,6 @@
 """Convert small trajectories to LeRobot datasets, and read and change their files."""
 
-import json
-
+from managing import edit, files_of
 from synthetic import RayCaster
 
 DATA = "data/chunk-000/file-000.parquet"
@@ -20,13 +19,9 @@ def convert(source, out, on_episode=None, **settings):
     return convert_lerobot(settings, on_episode=on_episode)
 
 
-def files_of(root):
-    """Return the bytes of each file by its path."""
-    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
-
-
-def edit_json(root, name, edit):
+def edit_json(root, name, change):
     """Change a JSON file in place."""
-    content = json.loads((root / name).read_text())
-    edit(content)
-    (root / name).write_text(json.dumps(content))
+    edit(root / name, change)
+
+
+__all__ = ["DATA", "DEPTH", "EPISODES", "VIDEO", "convert", "edit_json", "files_of"]
