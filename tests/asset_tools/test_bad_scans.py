@@ -11,6 +11,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
+import unicodedata
 
 import numpy as np
 import pytest
@@ -260,3 +261,57 @@ print(int(peak) / 1024**2, max(abs(mesh.volume / scan.mesh.volume - 1) for mesh 
     gibibytes, lost = map(float, subprocess.check_output([sys.executable, "-c", code]).split())
     assert gibibytes < 1
     assert lost < 0.01
+
+
+@pytest.mark.parametrize(("scale", "unit", "words"), [(100, "cm", "centimetres"), (1000, "mm", "millimetres")])
+def test_other_units_and_y_up(tmp_path, scale, unit, words):
+    scan = prepare(write_obj(tmp_path, scale=scale, y_up=True))
+    assert (scan.up, scan.unit) == ("y", unit)
+    assert scan.repairs == ("turned y up, a guess", f"scaled from {words}")
+    turned = scan.mesh.copy(include_cache=True), scan.closed.copy()
+    # y up by [1, 2, 0] and back by a quarter turn about x leaves a quarter turn about z
+    for mesh in turned:
+        mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [0, 0, 1]))
+    check_bottle(type(scan)(*turned, scan.up, scan.unit, scan.repairs))
+
+
+def test_a_wrong_unit_is_an_error(tmp_path):
+    path = write_obj(tmp_path, scale=1000)
+    with pytest.raises(AssetError, match=r"no size that can be picked up.*160 m, taking its 160 for metres.*--units"):
+        prepare(path, unit="m")
+
+
+def test_double_vertices_and_faces(tmp_path):
+    vertices, uv, faces = bottle()
+    soup = np.arange(3 * len(faces)).reshape(-1, 3)
+    model = (vertices[faces].reshape(-1, 3), uv[faces].reshape(-1, 2), np.concatenate([soup, soup[:10]]))
+    scan = prepare(write_obj(tmp_path, model))
+    assert scan.repairs[1:] == ("dropped 10 double or degenerate faces",)
+    assert scan.repairs[0] == f"merged {3 * len(faces) - len(vertices)} duplicate vertices"
+    check_bottle(scan)
+
+
+def test_no_colours(tmp_path):
+    vertices, _, faces = bottle()
+    trimesh.Trimesh(vertices, faces).export(tmp_path / "scan.stl")
+    scan = prepare(tmp_path / "scan.stl")
+    assert "has no colours" in scan.repairs
+    check_bottle(scan, colors=False)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "cp1252"])
+def test_names_with_accents(tmp_path, encoding):
+    path = write_obj(
+        tmp_path / "Öl", name="Flasche für Öl", mtl="matériau", texture="étiquette n° 1.png", encoding=encoding
+    )
+    scan = prepare(path)
+    assert scan.repairs == ()
+    check_bottle(scan)
+
+
+def test_names_in_other_scripts_and_accents_written_apart(tmp_path):
+    check_bottle(prepare(write_obj(tmp_path / "瓶", name="瓶子", mtl="材质", texture="标签.png")))
+    apart = unicodedata.normalize("NFD", "étiquette.png")
+    scan = prepare(write_obj(tmp_path / "b", texture=apart, named=unicodedata.normalize("NFC", apart)))
+    assert len(scan.repairs) == 1 and scan.repairs[0].startswith("took ")
+    check_bottle(scan)

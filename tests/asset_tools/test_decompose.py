@@ -124,3 +124,32 @@ def test_the_can_of_the_reference_material(shared_dir):
     assert time.process_time() - start < 15
     assert can.closed.volume > 0.8 * can.mesh.convex_hull.volume  # a solid, not a shell
     assert found.volume_iou >= 0.9 and len(found.hulls) <= 16
+
+
+def test_few_flat_faces_keep_their_vertices():
+    angles = np.arange(30) * 2 * np.pi / 30
+    ring = 0.2 * np.stack([np.cos(angles), np.sin(angles)], axis=1)  # each corner is 4 mm outside of the others' hull
+    column = np.concatenate([np.column_stack([ring, np.full(30, z)]) for z in (0.0, 0.5)])
+    assert flat_faces(column) == 32
+    assert sorted(few_vertices(column).round(9).tolist()) == sorted(column.round(9).tolist())
+
+
+def test_vertices_that_the_engine_would_drop_are_left_out():
+    cube = np.array([[x, y, z] for x in (0, 0.1) for y in (0, 0.1) for z in (0, 0.1)])
+    bumps = [[0.05, 0.05, 0.1006], [0.05, 0.05, -0.0006], [0.1006, 0.05, 0.05]]
+    assert len(few_vertices(np.concatenate([cube, bumps]))) == 8
+    higher = few_vertices(np.concatenate([cube, [[0.05, 0.05, 0.102]]]))
+    assert len(higher) == 9
+
+
+def test_a_box_is_one_hull_and_a_u_is_several():
+    assert len(decompose(trimesh.creation.box([0.1, 0.05, 0.03])).hulls) == 1
+    parts = [
+        ([0.1, 0.02, 0.02], [0, 0, 0]),
+        ([0.02, 0.02, 0.08], [-0.04, 0, 0.03]),
+        ([0.02, 0.02, 0.08], [0.04, 0, 0.03]),
+    ]
+    boxes = [trimesh.creation.box(size, trimesh.transformations.translation_matrix(at)) for size, at in parts]
+    found = decompose(trimesh.boolean.union(boxes))
+    assert len(found.hulls) >= 3
+    assert found.volume_iou > 0.9

@@ -99,3 +99,23 @@ def test_same_chance_same_grasps():
     np.testing.assert_array_equal(first.tcp_in_object, again.tcp_in_object)
     np.testing.assert_array_equal(first.widths, again.widths)
     assert len(other) == 50 and not np.allclose(other.tcp_in_object, first.tcp_in_object[:50])
+
+
+def test_sphere_is_held_through_its_centre():
+    _, grasps = mesh_and_grasps("sphere")
+    closing, approach, tcp = (grasps.tcp_in_object[:, :3, i] for i in (1, 2, 3))
+    depth = np.einsum("ni,ni->n", tcp, approach)
+    # Off centre by s, both contacts lie at asin(s / r) to the normal, so mu <= 0.2 keeps s under 0.2 r.
+    assert np.linalg.norm(tcp - depth[:, None] * approach, axis=1).max() <= 0.2 * 0.036 + 5e-4
+    assert np.abs(np.einsum("ni,ni->n", tcp, closing)).max() <= 1e-3
+    assert grasps.qualities.max() <= 0.2
+    for direction in np.concatenate([np.eye(3), -np.eye(3)]):
+        assert towards(grasps, direction, 0.85) >= 15
+
+
+def test_near_the_centre_of_mass_first():
+    bar = trimesh.creation.box((0.03, 0.03, 0.3))
+    grasps = sample_grasps(bar, np.array([0, 0, 0.1]), np.random.default_rng(0), count=100)
+    along = grasps.tcp_in_object[:, 2, 3]
+    assert abs(along[0] - 0.1) <= 0.04
+    assert along.min() < -0.1 and along.max() > 0.1  # the rest reach both ends

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from asset_tools.import_ycb import ycb_id, ycb_jobs, ycb_source
+from asset_tools.import_ycb import default_root, ycb_id, ycb_jobs, ycb_source
 from robocas_ms3.core.errors import AssetError
 
 SIZES = {
@@ -104,3 +104,12 @@ def test_a_damaged_list_is_one_error(root, text):
     (root / "info_pick_v0.json").write_text(text)
     with pytest.raises(AssetError, match=r"info_pick_v0\.json"):
         ycb_jobs(root)
+
+
+def test_the_default_folder_is_maniskills():
+    import mani_skill
+    from mani_skill.utils.assets.data import DATA_SOURCES, initialize_data_sources
+
+    if not DATA_SOURCES:
+        initialize_data_sources()
+    assert default_root() == mani_skill.ASSET_DIR / DATA_SOURCES["ycb"].target_path

@@ -12,12 +12,14 @@ from shapely import Polygon
 from trimesh.creation import box, cone, cylinder, icosphere
 
 from asset_tools.build import build_object
-from asset_tools.decompose import decompose, for_engine
+from asset_tools.decompose import decompose, few_vertices, for_engine
+from asset_tools.grasps import sample_grasps
 from asset_tools.repair import close
 from asset_tools.simplify import simplified
 from asset_tools.sources import ObjectSource
 from asset_tools.visual import to_display
 from robocas_ms3.assets.cooking import OBLONG, SHRINKAGE, cook_hulls, cooking_faults
+from robocas_ms3.core.errors import AssetError
 
 
 def moved(mesh, *by):
@@ -212,3 +214,54 @@ def test_an_object_is_built(mesh, tmp_path):
     assert cooking_faults(tmp_path) == []
     if mesh is DIE:  # m a2 / 6 = 2.7e-10 kg m2: rounded to a nanounit it would have none
         assert asset.inertia == pytest.approx([1e-4 * 0.004**2 / 6] * 3, rel=1e-8)
+
+
+def test_open_pegs_are_kept_since_they_are_much_of_the_surface():
+    pegs = joined(*PEGS)
+    pegs.update_faces(pegs.face_normals[:, 2] > -0.9)
+    mesh = joined(box([0.12, 0.08, 0.006]), pegs)
+    closed = close(mesh)
+    np.testing.assert_allclose(closed.mesh.bounds, mesh.bounds, atol=1e-6)
+    assert closed.mesh.volume > 0.12 * 0.08 * 0.006 * 1.1
+
+
+def test_simplifying_keeps_a_large_part_of_few_faces():
+    """Edges of a box among bristles that can't be simplified are the first to collapse."""
+    bristles = placed(
+        cylinder(0.0006, 0.025, sections=6), np.linspace(-0.06, 0.06, 20), np.linspace(-0.01, 0.01, 8), 0.02
+    )
+    brush = joined(box([0.15, 0.03, 0.015]), *bristles)
+    light = to_display(brush, triangles=1000)
+    assert light.area == pytest.approx(brush.area, rel=0.1)
+    np.testing.assert_allclose(light.bounds, brush.bounds, atol=1e-3)
+
+
+def test_flat_bodies_are_an_error():
+    tilted = trimesh.transformations.rotation_matrix(0.7, [1, 2, 3])
+    flat = trimesh.Trimesh(
+        [[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 1e-9]], [[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]]
+    )
+    for mesh in (flat, flat.copy().apply_transform(tilted)):
+        with pytest.raises(AssetError):
+            close(mesh)
+
+
+def test_thin_parts_of_a_solid_survive_its_simplification():
+    bristles = placed(
+        cylinder(0.0003, 0.025, sections=12), np.linspace(-0.07, 0.07, 30), np.linspace(-0.01, 0.01, 8), 0
+    )
+    brush = joined(box([0.15, 0.03, 0.004]), *bristles)
+    np.testing.assert_allclose(close(brush).mesh.bounds, brush.bounds, atol=2e-4)
+
+
+def test_a_sheet_thinner_than_the_gripper_sees_has_no_grasps():
+    sheet = icosphere(2, 0.05)
+    sheet.vertices[:, 2] *= 0.005
+    assert len(sample_grasps(sheet, np.zeros(3), np.random.default_rng(0))) == 0
+
+
+def test_few_vertices_of_extreme_points_in_one_plane():
+    """All extreme ones along the axes and diagonals are corners of a base; the apex is next to it."""
+    base = np.array([[x, y, -0.3 * (x + y)] for x in (-0.03, 0.03) for y in (-0.03, 0.03)])
+    points = np.concatenate([base, base * [0.5, 0.5, 0.5] - [0, 0, 0.0005], [[0, 0, -0.004]]])
+    assert trimesh.convex.convex_hull(few_vertices(points)).volume > 0

@@ -2,6 +2,7 @@
 
 import os
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -338,3 +339,62 @@ def test_texture_coordinates_without_bounds_show_a_plain_colour(folder, value):
     (folder / "cube.obj").write_text(text)
     source = read(folder, urdf(tray=mesh("cube.obj")))
     assert colors_of(source.links[0].mesh) == {(0, 0, 255)} and len(source.repairs) == 1
+
+
+def test_the_scale_of_an_annotation_is_that_of_the_whole_model(folder):
+    text = urdf(tray=mesh("cube.obj"), joint='<limit lower="-0.1" upper="0.2"/>')
+    (whole,), (half,) = read(folder, text).links, read(folder, text, scale=0.5).links
+    assert half.mesh.bounds == pytest.approx(whole.mesh.bounds / 2)
+    assert half.joint.origin == pytest.approx(np.array(whole.joint.origin) / 2)
+    assert half.joint.limits == pytest.approx((0, 0.15))
+    (turned,) = read(folder, urdf(kind="revolute", joint='<limit lower="0" upper="1.5"/>'), scale=0.5).links
+    assert turned.joint.limits == pytest.approx((0, 1.5))
+
+
+def test_stl_meshes_have_the_colour_of_the_urdf(folder):
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(folder / "cube.STL", file_type="stl")
+    tray = mesh("cube.STL").replace("</visual>", '<material name="a"><color rgba="0 1 0 1"/></material></visual>')
+    (link,) = read(folder, urdf(tray=tray)).links
+    assert link.mesh.extents == pytest.approx([0.1, 0.1, 0.1]) and colors_of(link.mesh) == {(0, 255, 0)}
+
+
+def test_mimic_joints_move_on_their_own(folder):
+    source = read(folder, urdf(joint=RANGE + '<mimic joint="other"/>'))
+    assert len(source.links) == len(source.repairs) == 1
+
+
+@pytest.mark.parametrize("name", ["../x", "/x", "A", "", "x" * 300, "a\n"])
+def test_sources_refuse_names_that_are_no_folder_of_a_pack(folder, name):
+    source = read(folder, urdf())
+    for change in (
+        lambda: replace(source, id=name),
+        lambda: replace(source.links[0], name=name),
+        lambda: replace(source, finishes={"wall": {name: source.mesh}}),
+    ):
+        with pytest.raises(AssetError):
+            change()
+
+
+def test_a_linked_folder_is_the_model_itself(folder, tmp_path):
+    (folder / "mobility.urdf").write_text(urdf(tray=mesh("cube.obj")))
+    (tmp_path / "alias").symlink_to(folder)
+    assert read_partnet(tmp_path / "alias", Annotation.model_validate(NOTE)).id == "model"
+
+
+@pytest.mark.parametrize(
+    ("head", "mtl"),
+    [
+        ("mtllib\tpaint.mtl\nusemtl\t red\n", "newmtl\t\tred\nmap_Kd\twood.png\n"),
+        ("mtllib paint.mtl\nusemtl  RED\n", "NEWMTL red\nMAP_KD WOOD.png\n"),
+        ("  mtllib other.mtl paint.mtl\n  usemtl red\n", "  newmtl red\n  map_Kd -s 1 1 1 -clamp on wood.png\n"),
+        ("mtllib paint.mtl\n", "newmtl red\nmap_Kd wood.png\n"),
+        ("mtllib gone.mtl\nusemtl red\n", "newmtl blue\nmap_Kd gone.png\nnewmtl red\nmap_Kd wood.png\n"),
+    ],
+)
+def test_textures_are_found(folder, head, mtl):
+    Image.new("RGB", (4, 4), (10, 150, 20)).save(folder / "wood.png")
+    (folder / "cube.obj").write_text(OBJ.format(head))
+    for name in ("paint.mtl", "cube.mtl"):
+        (folder / name).write_text(mtl)
+    (link,) = read(folder, urdf(tray=mesh("cube.obj"))).links
+    assert colors_of(link.mesh) == {(10, 150, 20)}

@@ -67,3 +67,24 @@ def test_what_stands_in_life_stands_here(shared_dir, name):
     assert found.volume_iou >= 0.9
     assert len(found.hulls) <= 8
     assert poses_of(scan.closed).display_pose >= 0
+
+
+QUARTER = trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0])
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        carton(0.0),
+        carton(-0.003),  # hollowed: it stands on its edges
+        trimesh.creation.icosphere(4, 0.04),
+        trimesh.creation.capsule(0.1, 0.02),
+        trimesh.creation.cylinder(0.03, 0.1, sections=64, transform=QUARTER),
+    ],
+    ids=["flat", "hollow", "ball", "capsule", "lying"],
+)
+def test_other_bases_stay(body):
+    repairs: list[str] = []
+    mesh, closed = level_base(body.copy(), body, repairs)
+    assert repairs == []
+    assert closed is body and mesh.volume == pytest.approx(body.volume)

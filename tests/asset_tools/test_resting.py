@@ -7,6 +7,7 @@ import pytest
 import trimesh
 from sapien import physx
 
+from asset_tools import resting
 from asset_tools.resting import RestingPoses, resting_poses
 from asset_tools.stability import toppling_angle
 from robocas_ms3.core.errors import AssetError
@@ -139,3 +140,65 @@ def test_a_body_that_only_rocks_is_put_down_on_its_blunt_edges_too() -> None:
     np.testing.assert_allclose(np.abs(broad), [(np.sin(slant), 0, np.cos(slant))] * 2, atol=1e-3)  # halves are merged
     assert broad[:, 2].min() < 0 < broad[:, 2].max()
     assert result.probabilities[np.abs(ups[:, 2]) > 0.9].sum() > 0.5
+
+
+def test_box_with_its_weight_at_one_end_never_stands_on_a_slanted_far_end() -> None:
+    # A bar along x, 0.2 long: its far end (x = 0.1) is cut so that the face's normal leans 45 deg, and its weight
+    # sits at x = -0.08. From there the foot on the cut face's plane falls outside the bar.
+    points = np.array(
+        [(x, y, z) for y in (-0.03, 0.03) for x, z in ((-0.1, -0.03), (-0.1, 0.03), (0.1, -0.03), (0.04, 0.03))]
+    )
+    center = np.array([-0.08, 0.0, 0.0])
+    result = resting_poses([points], mass=0.3, center_of_mass=center, inertia=(2e-4, 4e-4, 4e-4), inertia_wxyz=IDENTITY)
+    check(result, points, center)
+    downs = -result.poses[:, 2, :3]
+    assert (downs[:, 0] < 0.1).all()
+    # the heavy end, near the weight, and the four sides hold
+    assert len(downs) == 5
+    assert downs[0] @ [-1, 0, 0] == pytest.approx(1, abs=1e-4)
+
+
+def test_weight_far_from_the_middle_is_felt() -> None:
+    points = box_points(0.05, 0.05, 0.05)
+    low = resting_poses([points], mass=0.1, center_of_mass=(0, 0, -0.02), inertia=(4e-5,) * 3, inertia_wxyz=IDENTITY)
+    assert low.display_pose == 0
+    # solid angle of the 0.05 m square seen from 5 mm above its middle
+    assert low.probabilities[0] == pytest.approx(
+        np.arctan(0.025**2 / (0.005 * np.sqrt(0.005**2 + 2 * 0.025**2))) / np.pi, abs=0.01
+    )
+
+
+def test_ball_gets_a_pose_that_stays() -> None:
+    result = solid(trimesh.creation.icosphere(subdivisions=2, radius=0.035))
+    assert 1 <= len(result.poses) <= 12
+    np.testing.assert_allclose(result.poses[:, 2, 3], 0.035, atol=1.5e-3)
+
+
+def test_two_pieces_stand_on_both_and_every_pose_stays_for_three_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    # A table of two legs: the convex hull bridges the gap, the pieces carry the weight
+    legs = [box_points(0.02, 0.06, 0.05) + [side * 0.05, 0, 0] for side in (-1, 1)]
+    center, inertia = np.zeros(3), np.array([1e-4, 6e-4, 6e-4])
+    result = resting_poses(
+        legs, mass=0.2, center_of_mass=center, inertia=inertia, inertia_wxyz=IDENTITY, minimum_probability=0.0
+    )
+    check(result, np.concatenate(legs), center)
+    assert len(result.poses) == 6
+    points = np.concatenate(legs)
+    body = resting._Body(legs, points, points, 0.2, center, inertia, np.array(IDENTITY), 0.99)
+    monkeypatch.setattr(resting, "STEPS", 300)
+    ends = resting._simulate(body, result.poses)
+    np.testing.assert_allclose(ends[:, :3, 3], result.poses[:, :3, 3], atol=1e-3)
+
+
+def test_a_pen_is_not_put_down_on_its_end() -> None:
+    """4 mm across and 15 cm long it lets go at 1.5 deg, and then it falls."""
+    points = box_points(0.004, 0.004, 0.15)
+    result = resting_poses(
+        [points],
+        mass=0.01,
+        center_of_mass=(0, 0, 0),
+        inertia=box_inertia(0.01, 0.004, 0.004, 0.15),
+        inertia_wxyz=IDENTITY,
+        minimum_probability=0.0,
+    )
+    assert np.abs(result.poses[:, 2, 2]).max() < 0.1

@@ -64,3 +64,10 @@ def test_any_axis_can_be_turned_up(up):
     np.testing.assert_array_equal(turned.vertices[-1], [0, 0, 1])
     assert turned.volume == pytest.approx(6)  # turned, not mirrored
     np.testing.assert_array_equal(marked.vertices[-1], tip)  # the scan itself stays
+
+
+def test_a_bottle_in_millimetres_among_boxes_in_centimetres():
+    """149 mm would be 1.49 m, which a hand could still pick up, but no such thing lies among boxes of 10 cm."""
+    sides = {"butter": 10.3, "cheese": 10.4, "dressing": 14.7, "ketchup": 148.6}
+    assert guess_units(sides) == {"butter": "cm", "cheese": "cm", "dressing": "cm", "ketchup": "mm"}
+    assert guess_units({**sides, "ketchup": 60.0})["ketchup"] == "cm"  # a long thing of 60 cm

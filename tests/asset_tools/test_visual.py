@@ -99,8 +99,12 @@ def test_sides_have_flat_normals_though_vertices_meet(light_box):
 
 @pytest.mark.parametrize(
     "make",
-    [lambda: textured_box(130), lambda: trimesh.creation.icosphere(subdivisions=7, radius=SIDE)],
-    ids=["box", "ball"],
+    [
+        lambda: textured_box(130),
+        lambda: trimesh.creation.icosphere(subdivisions=7, radius=SIDE),
+        lambda: dense_bottle(400, 300),
+    ],
+    ids=["box", "ball", "bottle"],
 )
 def test_dense_meshes_do_not_fold_over(make):
     dense = make()
@@ -199,3 +203,72 @@ def test_a_label_close_to_a_bottle_keeps_its_colour(triangles):
     ]
     assert label.sum() > 200 and bottle.sum() > 200
     assert (seen[label, 1] > 200).mean() > 0.99 and (seen[bottle, 1] < 60).mean() > 0.99
+
+
+def dense_bottle(sections: int, rows: int) -> trimesh.Trimesh:
+    """A body, a shoulder and a neck, closed: its wall is straight upwards, and finely divided all the same."""
+    angle = np.linspace(0, 2 * np.pi, sections, endpoint=False)
+    ring = np.column_stack([np.cos(angle), np.sin(angle)])
+    heights = np.linspace(0, 2 * SIDE, rows + 1)
+    radii = np.interp(heights / SIDE, [0, 1.2, 1.5, 2], [0.3, 0.3, 0.1, 0.1]) * SIDE
+    wall = np.column_stack([(radii[:, None, None] * ring).reshape(-1, 2), np.repeat(heights, sections)])
+    row, column = (grid.reshape(-1) for grid in np.meshgrid(np.arange(rows), np.arange(sections), indexing="ij"))
+    a, b = row * sections + column, row * sections + (column + 1) % sections
+    low, high, k = len(wall), len(wall) + 1, np.arange(sections)
+    top, after = k + rows * sections, (k + 1) % sections
+    faces = [
+        np.column_stack([a, b, b + sections]),
+        np.column_stack([a, b + sections, a + sections]),
+        np.column_stack([after, k, np.full(sections, low)]),
+        np.column_stack([top, after + rows * sections, np.full(sections, high)]),
+    ]
+    vertices = np.vstack([wall, [[0, 0, 0], [0, 0, 2 * SIDE]]])
+    return trimesh.Trimesh(vertices, np.concatenate(faces), process=False)
+
+
+def test_round_things_have_smooth_normals():
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.05)
+    light = to_display(ball, triangles=800)
+    assert len(light.faces) <= 800
+    outward = light.vertices / np.linalg.norm(light.vertices, axis=1, keepdims=True)
+    assert (outward * light.vertex_normals).sum(axis=1).min() > 0.98
+    assert len(light.vertices) < len(light.faces)  # shared
+
+
+def test_light_mesh_keeps_geometry_and_uvs_and_shrinks_the_texture():
+    box = textured_box(4)
+    light = to_display(box, triangles=192, texture_size=256)
+    np.testing.assert_array_equal(light.vertices, box.vertices)
+    np.testing.assert_array_equal(light.faces, box.faces)
+    np.testing.assert_array_equal(light.visual.uv, box.visual.uv)
+    assert light.visual.material.baseColorTexture.size == (255, 256)  # of 1020 x 1024
+    points, colors = seen_colors(light)
+    assert np.abs(colors - COLORS[side_of(points)]).max() <= 3
+
+
+@pytest.mark.parametrize("cells", [4, 20])
+def test_inward_mesh_is_turned_outward(cells):
+    box = textured_box(cells)
+    box.invert()
+    light = to_display(box, triangles=200, texture_size=64)
+    assert light.volume == pytest.approx(SIDE**3, rel=1e-2)
+    assert (np.einsum("fcd,fd->fc", light.vertex_normals[light.faces], light.face_normals) > 0.5).all()
+
+
+def test_plain_mesh_has_a_colour_and_no_texture():
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    ball.visual.face_colors = [124, 188, 255, 255]
+    light = to_display(ball, triangles=500)
+    assert light.visual.material.baseColorTexture is None
+    assert light.visual.material.baseColorFactor.tolist() == [51, 128, 255, 255]  # linear, as glTF has it
+
+
+def test_texture_that_repeats_is_looked_up_with_its_wrap():
+    box = textured_box(20)
+    shifted = box.copy()
+    shifted.visual.uv = box.visual.uv + [3, -2]
+    images = [
+        np.asarray(to_display(m, triangles=300, texture_size=64).visual.material.baseColorTexture)
+        for m in (box, shifted)
+    ]
+    assert np.abs(images[0].astype(int) - images[1]).max() <= 1

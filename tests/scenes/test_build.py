@@ -11,6 +11,8 @@ from robocas_ms3.assets.spawn import spawn
 from robocas_ms3.core.errors import ConfigError
 from robocas_ms3.core.paths import task_configs_dir
 from robocas_ms3.scenes import build
+from robocas_ms3.scenes.config import TaskConfig
+from robocas_ms3.scenes.lookup import find_objects, furniture_pose
 
 
 def pick_config(**changes):
@@ -102,3 +104,19 @@ def test_objects_cast_shadows_and_the_room_does_not(needs_renderer):
     ratio = images[1] / images[0].clamp(min=1)
     assert ratio.median() > 0.98
     assert 0.002 < (ratio < 0.85).float().mean() < 0.2
+
+
+def objects_of(ids):
+    return find_objects(load_pack("builtin"), TaskConfig.model_validate(pick_config(objects={"ids": ids, "count": 2})))
+
+
+def test_objects_by_id_or_by_graspnet_number():
+    assert objects_of([5, "apple", 31]) == ["banana", "apple", "toy_airplane_k"]
+    assert len(objects_of("all")) == 46
+
+
+def test_furniture_stands_on_its_lowest_point():
+    pack = load_pack("builtin")
+    config = TaskConfig.model_validate(pick_config())
+    pose = furniture_pose(config.basket, pack.furniture["basket"])
+    np.testing.assert_allclose(pose[:3, 3], [1.3, 0.9, 0.61 + 0.096])

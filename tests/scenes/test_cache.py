@@ -206,3 +206,8 @@ def test_a_process_whose_physx_has_a_gpu_makes_the_same_layouts():
         said.append(done.stdout)
     assert len(said[0]) > 100
     assert said[0] == said[1]
+
+
+def test_each_object_seed_goes_with_itself_and_all_layout_seeds():
+    assert pairs_of([0, 1]) == [(0, 0), (1, 1)]
+    assert pairs_of([0, 1], [1, 7]) == [(1, 1), (1, 0), (7, 7), (7, 0), (7, 1)]

@@ -85,3 +85,8 @@ def test_what_is_named_differs_from_all_others(points):
         found = related(relation, here)
         if found is not None:
             assert np.delete(key, found).max() <= key[found] - MARGIN + 1e-12
+
+
+def test_distance_is_horizontal_and_from_the_robot():
+    # 0.5 ahead and 0.3 aside (0.583) is farther than 0.54 straight ahead
+    assert related("nearest", np.array([[0.5, 0.3], [0.54, 0.0]])) == 1

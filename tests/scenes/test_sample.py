@@ -273,3 +273,16 @@ def test_joints_and_openings(name, opening, joints, words):
             load_scene(name, **changes)
     else:
         assert load_scene(name, **changes).opened_position == pytest.approx(0.44)
+
+
+def test_orderly_objects_come_in_kinds():
+    scene = load_scene(layout={"kind": "orderly", "copies": 3}, objects={"ids": "all", "count": 7})
+    ids = object_set(scene, 0)
+    assert [ids.count(kind) for kind in dict.fromkeys(ids)] == [3, 3, 1]
+
+
+def test_one_of_several_object_sets_is_drawn():
+    sets = [["apple", "lemon", "peach"], ["mug", "banana", "padlock"]]
+    scene = load_scene(objects={"ids": "all", "count": 3}, randomisation={"object_sets": sets})
+    drawn = {frozenset(object_set(scene, seed)) for seed in range(20)}
+    assert drawn == {frozenset(one) for one in sets}

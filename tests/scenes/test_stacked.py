@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial import ConvexHull
 
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.errors import LayoutError
@@ -88,3 +89,13 @@ def test_objects_fall_into_the_middle_of_the_bucket_or_all_over_it():
     strewn = places()
     assert (np.ptp(strewn, axis=0) > 0.3 * (high - low)).all()
     assert (strewn > low + 0.02).all() and (strewn < high - 0.02).all()  # clear of the walls
+
+
+def test_an_outline_is_the_object_but_for_its_hollows():
+    assets = load_pack("builtin").objects
+    for name in ("sugar_box", "mug", "apple"):
+        points, outline = np.concatenate(assets[name].hulls), stacked.outline(assets[name])
+        assert len(outline) <= 64
+        planes = ConvexHull(outline).equations
+        depth = (points @ planes[:, :3].T + planes[:, 3]).max(axis=1)
+        assert depth.max() < 0.002  # nothing of the object stands out of it farther than that

@@ -140,3 +140,21 @@ def test_what_they_refuse(tmp_path, words, said):
     done, calls = called(tmp_path, *words)
     assert (done.returncode, calls) == (2, [])
     assert said in done.stderr
+
+
+def test_few_episodes_are_shared_among_the_parts_that_get_one(tmp_path):
+    _, calls = called(tmp_path, "reproduce_small.sh", "search", str(tmp_path / "out"), EPISODES="7")
+    recorded = [(call[1], int(call[call.index("-n") + 1])) for call in calls if call[0] == "generate"]
+    assert recorded == [("pick", 4), ("search", 3)]  # of 65, 13 and 22 percent
+
+
+def test_processes_are_one_a_core_whatever_torch_is_told(tmp_path):
+    _, calls = called(tmp_path, "reproduce_small.sh", "pick", str(tmp_path / "out"), JOBS="", OMP_NUM_THREADS="1")
+    jobs = {call[call.index("--jobs") + 1] for call in calls if "--jobs" in call}
+    assert jobs == {str(len(os.sched_getaffinity(0)))}
+
+
+def test_a_study_leaves_out_what_it_is_about(tmp_path):
+    _, calls = called(tmp_path, "study_small.sh", str(reproduced(tmp_path, 10)), "no-language", "no-gripper-camera")
+    settings = [call[call.index("--set") + 1] for call in calls if call[0] == "train"]
+    assert settings == ["language=false", "views.gripper_camera=null"]

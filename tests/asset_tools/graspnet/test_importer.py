@@ -6,7 +6,7 @@ import trimesh
 
 from asset_tools.graspnet.importer import graspnet_jobs, graspnet_source
 from asset_tools.graspnet.labels import view_directions
-from asset_tools.grasps import sample_grasps
+from asset_tools.grasps import sample_grasps, surface_samples
 from robocas_ms3.core.errors import AssetError
 
 BOX = (0.04, 0.10, 0.06)
@@ -108,3 +108,25 @@ def test_a_banana_with_labels(labelled_banana):
     for pose in source.grasps.tcp_in_object[:fit]:
         assert np.abs(labelled - pose).max(axis=(1, 2)).min() < 1e-5
     assert source.grasps.qualities[:fit] == pytest.approx(np.full(fit, 0.2), abs=1e-6)
+
+
+def test_enough_labels_are_all_there_is(tmp_path):
+    write_models(tmp_path, [1])
+    plain = graspnet_source(tmp_path, 1)
+    grasps = sample_grasps(plain.closed, plain.closed.center_mass, np.random.default_rng(0), count=90)
+    write_labels(tmp_path / "grasp_label" / "001_labels.npz", grasps.tcp_in_object)
+    source = graspnet_source(tmp_path, 1)
+    assert source.grasps is not None
+    assert 50 <= len(source.grasps) <= 90
+    assert not any("label" in note for note in source.repairs)
+    assert source.grasps.qualities == pytest.approx(np.full(len(source.grasps), 0.2), abs=1e-6)
+
+
+def test_labelled_grasps_have_the_object_between_the_fingers(labelled_banana):
+    source, _ = labelled_banana
+    points = surface_samples(source.closed, 4000, np.random.default_rng(0))[0]
+    for pose in source.grasps.tcp_in_object[:10]:
+        x, y, z = np.abs((points - pose[:3, 3]) @ pose[:3, :3]).T
+        between = (x < 0.01) & (z < 0.0085)  # m, the pads
+        assert between.sum() > 5
+        assert y[between].max() < 0.04

@@ -52,3 +52,14 @@ def test_each_grasp_is_for_itself(block):
     assert together.tolist() == [hold_test(solid, grasp[None])[0] for grasp in both]
     assert together.tolist() == hold_test(solid, both).tolist()
     assert hold_test(solid, both[:0]).shape == (0,)
+
+
+def test_a_thin_block_stays_too(block):
+    assert hold_test(block(0.05, 0.004, 0.05, mass=0.05), grasps(CENTRE)).all()
+
+
+def test_a_slippery_block_slips_through(block, monkeypatch):
+    # With slippery fingers as well (the engine takes the mean of both), 2 * 0.05 * 35 N = 3.5 N carry 0.36 kg at rest.
+    assert hold_test(block(0.05, 0.05, 0.05, mass=0.5), grasps(CENTRE)).all()
+    monkeypatch.setattr(holding, "FINGER_FRICTION", 0.05)
+    assert not hold_test(block(0.05, 0.05, 0.05, mass=0.5, friction=0.05), grasps(CENTRE)).any()

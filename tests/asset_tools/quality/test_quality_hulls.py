@@ -52,3 +52,11 @@ def test_what_is_thin():
     cube = box(0.1, 0.1, 0.1)
     assert hull_quality(cube, [vertices(cube)]).compact
     assert not hull_quality(cube, [vertices(cube)], hollow=True).compact
+
+
+def test_hulls_inside_one_another_count_once():
+    body = box(0.1, 0.1, 0.1)
+    found = hull_quality(body, [vertices(body), vertices(box(0.05, 0.05, 0.05))])
+    assert found.hull_count == 2
+    assert found.volume_iou == pytest.approx(1, abs=1e-5)
+    assert found.surface_p95 < 1e-6

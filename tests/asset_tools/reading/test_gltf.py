@@ -221,3 +221,63 @@ def test_data_in_uris(tmp_path):
     path = tmp_path / "b.gltf"
     path.write_text(json.dumps(gltf.tree))
     assert (shown_colors(read_model(path).mesh) == RED).all()
+
+
+def test_vertex_colours_times_a_texture(tmp_path):
+    gltf, _ = with_uvs(0.125)
+    colors = np.ones((gltf.count, 4), "<f4")
+    colors[:, 0] = 0
+    gltf.attribute("COLOR_0", colors)
+    check(gltf, tmp_path, (0, RED[1], RED[2]))
+
+
+def test_several_plain_materials_keep_their_colours(tmp_path):
+    gltf = Gltf()
+    gltf.material(pbrMetallicRoughness={"baseColorFactor": [1, 0, 0, 1]})
+    second = {**gltf.primitive, "attributes": dict(gltf.primitive["attributes"])}
+    gltf.tree["meshes"].append({"primitives": [second]})
+    gltf.tree["nodes"].append({"mesh": 1, "translation": [1, 0, 0]})
+    gltf.tree["scenes"][0]["nodes"] = [0, 1]
+    gltf.tree["materials"].append({"pbrMetallicRoughness": {"baseColorFactor": [0.2, 0.2, 0.2, 1]}})
+    second["material"] = 1
+    model = read_model(gltf.write(tmp_path / "mug.glb"))
+    colors = shown_colors(model.mesh)
+    left = model.mesh.triangles_center[:, 0] < 0.5
+    assert (colors[left] == [255, 0, 0]).all() and (colors[~left] == 124).all()
+
+
+@pytest.mark.parametrize("base", [{"baseColorFactor": [0, 0, 0, 1]}, {}])
+def test_emissive_texture(tmp_path, base):
+    """On black it is all there is to see; on other colours it is added."""
+    gltf, texture = with_uvs(0.625)
+    gltf.tree["materials"][0] = {
+        "pbrMetallicRoughness": base or {"baseColorFactor": [1, 0, 0, 1]},
+        "emissiveTexture": texture,
+        "emissiveFactor": [1, 1, 1],
+    }
+    check(gltf, tmp_path, BLUE if base else (255, *BLUE[1:]))
+
+
+def test_older_materials_and_light(tmp_path):
+    gltf, texture = with_uvs(0.625)
+    gltf.tree["materials"][0] = {
+        "extensions": {
+            "KHR_materials_pbrSpecularGlossiness": {"diffuseTexture": texture, "diffuseFactor": [1, 1, 0, 1]},
+            "KHR_materials_emissive_strength": {"emissiveStrength": 2},
+        },
+        "emissiveFactor": [0.5, 0, 0],
+    }
+    check(gltf, tmp_path, (255, BLUE[1], 0))
+
+
+def test_compression_that_is_not_required_is_an_error_all_the_same(tmp_path):
+    gltf, _ = with_uvs(0.125)
+    gltf.tree["textures"][0] = {"extensions": {"KHR_texture_basisu": {"source": 0}}}
+    with pytest.raises(AssetError):
+        read_model(gltf.write(tmp_path / "a.glb"))
+    gltf = Gltf()
+    gltf.primitive["extensions"] = {"KHR_draco_mesh_compression": {}}
+    assert len(read_model(gltf.write(tmp_path / "b.glb")).mesh.faces) == 12  # with a fallback
+    del gltf.tree["accessors"][gltf.primitive["attributes"]["POSITION"]]["bufferView"]
+    with pytest.raises(AssetError):
+        read_model(gltf.write(tmp_path / "b.glb"))

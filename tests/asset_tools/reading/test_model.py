@@ -1,7 +1,10 @@
 """Reading a model: what is wrong with a file is one typed error, and what the format says is kept."""
 
+import json
+
 import numpy as np
 import pytest
+import trimesh
 from models import GREEN, RED, Gltf, box, image_file, shown_colors, write_obj
 from PIL import Image
 
@@ -206,3 +209,52 @@ def test_values_that_are_not_finite(tmp_path):
     gltf.attribute("COLOR_0", np.full((gltf.count, 3), np.nan, "<f4"))
     model = read_model(gltf.write(tmp_path / "cup.glb"))
     assert (shown_colors(model.mesh) == 255).all() and any(note.startswith("warning:") for note in model.notes)
+
+
+def test_a_missing_path(tmp_path):
+    with pytest.raises(AssetError):
+        read_model(tmp_path / "lost.obj")
+    with pytest.raises(AssetError):
+        read_model(tmp_path / "lost")
+
+
+def test_the_axis_that_a_format_says_is_up(tmp_path):
+    assert read_model(Gltf().write(tmp_path / "a.glb")).up == "y"
+    assert read_model(write_obj(tmp_path)).up is None
+
+
+def test_files_that_were_read_are_known(tmp_path):
+    path = write_obj(tmp_path)
+    image_file(tmp_path / "other.png")
+    assert {file.name for file in read_model(path).files} == {"mug.obj", "skin.mtl", "skin.png"}
+
+
+def test_colours_of_vertices_and_faces(tmp_path):
+    mesh = box()
+    mesh.visual.face_colors = np.tile([*GREEN, 255], (12, 1)).astype(np.uint8)
+    mesh.export(tmp_path / "faces.ply")
+    assert (shown_colors(read_model(tmp_path / "faces.ply").mesh) == GREEN).all()
+    mesh.visual = trimesh.visual.ColorVisuals(vertex_colors=np.tile([*RED, 255], (8, 1)).astype(np.uint8))
+    mesh.export(tmp_path / "vertices.ply")
+    assert (shown_colors(read_model(tmp_path / "vertices.ply").mesh) == RED).all()
+
+
+@pytest.mark.parametrize("mode", ["P", "LA", "RGBA", "1", "CMYK"])
+def test_textures_of_all_modes(tmp_path, mode):
+    path = write_obj(tmp_path, color=None, mtl="newmtl skin\nmap_Kd skin.tif\n")
+    Image.new("RGB", (4, 4), (255, 255, 255)).convert(mode).save(tmp_path / "skin.tif")
+    assert (shown_colors(read_model(path).mesh) == 255).all()
+
+
+def test_json_of_gltf_may_hold_unknown_keys(tmp_path):
+    gltf = Gltf()
+    gltf.tree |= {"extras": {"deep": [{}]}, "unknown": 5, "asset": {"version": "2.0", "extras": 3}}
+    model = read_model(gltf.write(tmp_path / "mug.glb"))
+    assert json.dumps(model.notes) == "[]" and len(model.mesh.faces) == 12
+
+
+def test_several_textures_of_the_name_that_is_searched_are_a_warning(tmp_path):
+    for name in ("a", "b"):
+        image_file(tmp_path / name / "skin.png")
+    write_obj(tmp_path, color=None)
+    assert any(note.startswith("warning:") for note in read_model(tmp_path).notes)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from models import Gltf, image_file, write_obj
 
+from asset_tools.inspection import ModelSource, inspect_models
 from asset_tools.reading.files import LARGEST_FILE, ModelFiles, read_file
 from asset_tools.reading.limits import reading_limits
 from asset_tools.reading.model import read_model
@@ -112,3 +113,11 @@ def test_a_folder_of_links_to_models_elsewhere(tmp_path):
     (tmp_path / "scans").mkdir()
     (tmp_path / "scans" / "mug").symlink_to(tmp_path / "disk" / "mug")
     assert len(read_model(tmp_path / "scans" / "mug", tmp_path / "scans").files) == 3
+
+
+def test_one_model_that_cannot_be_read_does_not_end_the_inspection(tmp_path):
+    write_obj(tmp_path / "good")
+    write_obj(tmp_path / "bad").write_text("v nonsense")
+    found = inspect_models({name: ModelSource((tmp_path / name,), tmp_path) for name in ("good", "bad")})
+    assert found["good"].longest == pytest.approx(0.1) and found["good"].error is None
+    assert isinstance(found["bad"].error, AssetError)

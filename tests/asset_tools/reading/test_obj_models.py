@@ -5,7 +5,7 @@ import pytest
 from models import GREEN, RED, box, image_file, shown_colors, write_obj
 
 from asset_tools.reading.model import read_model
-from asset_tools.reading.obj import parse_obj
+from asset_tools.reading.obj import parse_mtl, parse_obj
 from robocas_ms3.core.errors import AssetError
 
 
@@ -130,3 +130,45 @@ def test_many_concave_polygons_take_linear_time():
     sides = mesh.vertices[mesh.faces]
     areas = np.cross(sides[:, 1] - sides[:, 0], sides[:, 2] - sides[:, 0])[:, 2] / 2
     assert (areas > 0).all() and areas.sum() == pytest.approx(10_000)
+
+
+def test_lines_indented_by_spaces_and_continued(tmp_path):
+    path = write_obj(tmp_path)
+    text = path.read_text().replace("\n", "\n   ").replace("usemtl skin", "usemtl \\\n skin")
+    path.write_text(text)
+    np.testing.assert_array_equal(shown_colors(read_model(path).mesh), np.tile(RED, (12, 1)))
+
+
+def test_options_of_a_map_statement():
+    found = parse_mtl("newmtl a\nmap_Kd -S 2 3 1 -o 0.5 -bm 1 my skin.png\n")["a"]
+    assert (found.image, found.uv_scale, found.uv_offset) == ("my skin.png", (2.0, 3.0), (0.5, 0.0))
+
+
+def test_vertex_colours_next_to_a_texture_are_ignored_with_a_warning(tmp_path):
+    path = write_obj(tmp_path)
+    lines = [f"{line} 0.5 0.5 0.5" if line.startswith("v ") else line for line in path.read_text().splitlines()]
+    path.write_text("\n".join(lines))
+    model = read_model(path)
+    assert (shown_colors(model.mesh) == RED).all() and len(warnings(model)) == 1
+
+
+@pytest.mark.parametrize(("kd", "factor"), [("0.8 0.8 0.8", 1.0), ("1 0 0", 0.0)])
+def test_a_coloured_kd_tints_a_texture_and_a_grey_one_does_not(tmp_path, kd, factor):
+    path = write_obj(tmp_path, mtl=f"newmtl skin\nKd {kd}\nmap_Kd skin.png\n")
+    expected = [RED[0], factor * RED[1], factor * RED[2]]
+    np.testing.assert_allclose(shown_colors(read_model(path).mesh), np.tile(expected, (12, 1)), atol=1)
+
+
+@pytest.mark.parametrize("name", ["mug.mtl", "MUG.MTL"])
+def test_the_material_file_next_to_a_mesh_that_names_none(tmp_path, name):
+    path = write_obj(tmp_path, mtl=None, head="", uvs=False)
+    (tmp_path / name).write_text("newmtl skin\nKd 0 0 1\n")
+    assert (shown_colors(read_model(path).mesh) == [0, 0, 255]).all()
+
+
+def test_tabs_in_options_comments_at_ends_of_lines_and_transparency(tmp_path):
+    path = write_obj(tmp_path, mtl="newmtl skin\nd 0.5\nmap_Kd -s\t1 1 1\tskin.png\n")
+    path.write_text(path.read_text().replace("\nf ", " # seam\nf "))
+    model = read_model(path)
+    assert (shown_colors(model.mesh) == RED).all()
+    assert warnings(model) == ["warning: ignored transparency"]

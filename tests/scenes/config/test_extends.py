@@ -154,6 +154,12 @@ def test_a_chain_has_a_limit(tmp_path):
     assert error_of(tmp_path / names[0]).expected == f"at most {CHAIN_LIMIT} files"
 
 
+@pytest.mark.parametrize("text", ["- a", "a: [", "a: 1\na: 2", ""])
+def test_a_broken_base_is_named(tmp_path, text):
+    path = write(tmp_path, mine={"extends": "base.yaml"}, base=text)
+    assert error_of(path).where == tmp_path / "base.yaml"
+
+
 def test_a_misspelt_extends_gets_the_right_word(tmp_path):
     assert error_of(write(tmp_path, mine={"extend": "pick_heap"})).fix == "Did you mean extends?"
 
@@ -165,6 +171,8 @@ def test_a_mapping_inside_itself_is_an_error(tmp_path):
 def test_only_files_outside_of_protocols_extend():
     with pytest.raises(ConfigError, match="extends"):
         load_task_config({"extends": "pick_table_scattered"})
+    error = error_of("pick_table_scattered", changes={"extends": "pick_table_scattered"})
+    assert error.where == "changes"
     check_no_base(shipped_configs()["pick_table_scattered"])
     with pytest.raises(ConfigError, match="not allowed in a protocol"):
         check_no_base(shipped_configs()["pick_shelf_scattered"])

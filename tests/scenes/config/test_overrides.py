@@ -126,3 +126,13 @@ def test_a_recording_has_the_resolved_configuration_and_continues_with_no_other(
     assert "settings.config.objects.count: 3 -> 4" in capsys.readouterr().err
     assert {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()} == before
     assert run([*words, "objects.count=3"]) == 0
+
+
+@pytest.mark.slow
+def test_layouts_are_those_of_the_resolved_configuration(tmp_path, capsys):
+    build = ["layouts", "build", NAME, "--seeds", "0:1", "--jobs", "1", "--out", str(tmp_path)]
+    assert run(build) == 0
+    assert run([*build, "--set", "objects.count=4"]) == 0
+    assert run([*build, "--set", "objects.count=10"]) == 0  # as the file has it: the same cache
+    found = [json.loads(path.read_text()) for path in tmp_path.glob("*/*.json")]
+    assert sorted(about["config"]["objects"]["count"] for about in found) == [4, 10]

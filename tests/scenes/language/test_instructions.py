@@ -185,3 +185,9 @@ def test_unknown_templates(template_id):
     with pytest.raises(RobocasError) as caught:
         instruction(slots(), template_id)
     assert caught.value.where == template_id
+
+
+def test_unknown_objects_and_supports_go_by_their_own_names():
+    about = slots(object="gizmo {0}", support="lectern")
+    assert {choose(seed, about).object_word for seed in range(20)} == {"gizmo {0}"}
+    assert "on the lectern" in instruction(about, "pick/train/05").text
