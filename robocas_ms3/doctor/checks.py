@@ -143,14 +143,7 @@ def check_folders() -> list[Finding]:
 
 
 def check_writable(name: str, folder: Path, variable: str, *, required: bool) -> Finding:
-    """Check that a file can be created in a folder, or in its nearest parent that exists.
-
-    Args:
-        name: name in the report.
-        folder: may not exist yet.
-        variable: environment variable that sets the folder.
-        required: whether a folder that is not writable is a failure.
-    """
+    """Check that a file can be created in a folder, or in its nearest parent that exists."""
     existing = next((parent for parent in (folder, *folder.parents) if parent.exists()), Path("/"))
     try:
         with tempfile.TemporaryDirectory(dir=existing):
@@ -173,14 +166,7 @@ def check_disk(folder: Path) -> Finding:
 
 
 def probe(name: str, trial: str, *, fix: str, required: bool = True) -> Finding:
-    """Run a probe in a child process.
-
-    Args:
-        name: name in the report.
-        trial: name of the probe, see `probes.PROBES`.
-        fix: what to do if it fails.
-        required: whether a failure is ``fail`` instead of ``limited``.
-    """
+    """Run a probe, one of `probes.PROBES`, in a child process; ``limited`` if it fails and is not required."""
     bad: Literal["fail", "limited"] = "fail" if required else "limited"
     try:
         done = subprocess.run(
@@ -199,12 +185,7 @@ def probe(name: str, trial: str, *, fix: str, required: bool = True) -> Finding:
 
 
 def requirements(distribution: str, extra: str = "") -> Iterator[Requirement]:
-    """Yield the requirements of an installed distribution on this Python.
-
-    Args:
-        distribution: name; one that is not installed has no requirements.
-        extra: yield only what this extra adds.
-    """
+    """Yield the requirements of an installed distribution on this Python, or only what an extra adds."""
     try:
         lines = metadata.requires(distribution) or []
     except metadata.PackageNotFoundError:

@@ -73,11 +73,7 @@ class PageContent:
         }
 
     def episode(self, number: int) -> dict[str, Any]:
-        """Return everything of an episode except its images.
-
-        Raises:
-            DatasetError: there is no such episode, or it can't be read.
-        """
+        """Return everything of an episode except its images."""
         where = f"{self.root.name}, episode {number}"
         with readable(where):
             scene, _ = self._scene(number)  # the table says what is wrong
@@ -94,19 +90,11 @@ class PageContent:
             }
 
     def rgb(self, number: int, camera: str, step: int) -> EncodedImage:
-        """Return an image, as it is stored if it is stored encoded.
-
-        Raises:
-            DatasetError: there is none.
-        """
+        """Return an image, as it is stored if it is stored encoded."""
         return encode_jpeg(self._image(number, camera, "rgb", step))
 
     def depth(self, number: int, camera: str, step: int) -> NDArray[np.uint16]:
-        """Return (H, W) depth in mm; 0: no measurement.
-
-        Raises:
-            DatasetError: there is none.
-        """
+        """Return (H, W) depth in mm; 0: no measurement."""
         return self._image(number, camera, "depth", step)
 
     def _row(self, number: int, steps: int, split: str) -> tuple[Row, Any]:

@@ -24,15 +24,9 @@ def export(
     depth: bool = True,
     on_episode: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[int, dict[int, str]]:
-    """Write ``index.html`` and all it needs. Damaged values are left out; the table of the page says so.
+    """Write ``index.html`` and all it needs; an existing folder is replaced, so the caller checks that it may be.
 
-    Args:
-        source: what to show.
-        out: folder; an existing one is replaced, so the caller makes sure that it may be.
-        episodes: numbers; default: all.
-        width: of the images, pixels.
-        depth: whether depth is written too.
-        on_episode: called with the number of episodes written, and of all.
+    Damaged values are left out; the table of the page says so.
 
     Returns:
         The number of episodes, and what is wrong with the damaged ones.

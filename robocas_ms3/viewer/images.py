@@ -19,23 +19,14 @@ _QUALITY = 85
 
 @dataclass(frozen=True)
 class EncodedImage:
-    """An image as a file.
-
-    Attributes:
-        media_type: ``image/png``, ``image/jpeg`` or ``image/webp``.
-        data: content of the file.
-    """
+    """An image as a file."""
 
     media_type: str
     data: bytes
 
 
 def check_inside(path: Path, root: Path) -> Path:
-    """Return the path of an image, if it is no link that leads out of the dataset.
-
-    Raises:
-        DatasetError: it is such a link.
-    """
+    """Return the path of an image, if it is no link that leads out of the dataset."""
     if not path.resolve().is_relative_to(root.resolve()):
         raise DatasetError("this link leads out of the dataset", where=path)
     return path
@@ -58,11 +49,7 @@ def thumbnail(image: EncodedImage) -> EncodedImage:
 
 
 def decode(image: EncodedImage, flags: int = cv2.IMREAD_COLOR) -> NDArray[np.uint8]:
-    """Return (H, W, 3) RGB.
-
-    Raises:
-        DatasetError: the image is damaged.
-    """
+    """Return (H, W, 3) RGB."""
     pixels = cv2.imdecode(np.frombuffer(image.data, np.uint8), flags) if image.data else None
     if pixels is None:
         raise DatasetError("this picture is damaged", fix="robocas validate lists all that is wrong.")

@@ -104,11 +104,7 @@ class Routes:
 
 
 def make_thumbnail(source: PageContent, index: dict[str, Any], number: int) -> EncodedImage:
-    """Return the first image of the camera that shows most: the static one if there is one.
-
-    Raises:
-        DatasetError: there is no such episode, or there are no images.
-    """
+    """Return the first image of the camera that shows most: the static one if there is one."""
     cameras = index["cameras"]
     if not cameras:
         raise DatasetError("no pictures", where=source.root)

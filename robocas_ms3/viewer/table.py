@@ -90,12 +90,7 @@ class Failures:
         return [] if seed is None else [failure for failure in self.by_seed.get(seed, []) if failure.is_of(env_info)]
 
     def given_up(self, rows: Sequence[Row], env_infos: Sequence[Any]) -> list[Row]:
-        """Return rows of the seeds that were given up and have no episode.
-
-        Args:
-            rows: rows of the episodes.
-            env_infos: environment of each of them, as far as it is known.
-        """
+        """Return rows of the seeds that were given up and have no episode."""
         environments: dict[int | None, list[Any]] = defaultdict(list)
         for row, env_info in zip(rows, env_infos, strict=True):
             environments[row.seed].append(env_info)

@@ -116,14 +116,7 @@ def evaluate_agent(agent: Agent, environments: PpoEnvironments, count: int) -> t
 
 
 class _TrainingState:
-    """Agent, optimiser, and counts of a training.
-
-    Attributes:
-        step: number of steps done, of all environments together.
-        episodes: number of episodes played.
-        outcomes: (n, 4) `OUTCOMES` of the last episodes.
-        is_tested: whether the test at the end is done.
-    """
+    """Agent, optimiser, and counts of a training."""
 
     def __init__(self, agent: Agent, config: PpoConfig, checkpoint: Checkpoint | None) -> None:
         self.optimizer = torch.optim.Adam(agent.parameters(), lr=config.train.learning_rate, eps=1e-5)

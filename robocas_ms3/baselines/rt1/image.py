@@ -98,9 +98,6 @@ class ImageEncoder(nn.Module):
 
         Args:
             path: of a safetensors file, or one of ``torch.save``.
-
-        Raises:
-            TrainingError: it can't be read, or lacks weights of these shapes.
         """
         tensors = {name.removeprefix("efficientnet."): value for name, value in _read_weights(path).items()}
         own = self.net.state_dict()

@@ -137,12 +137,7 @@ class RT1Model(nn.Module):
         self.register_buffer("from_imagenet", torch.tensor(has_weights))
 
     def encode(self, images: torch.Tensor, language: torch.Tensor) -> torch.Tensor:
-        """Return image tokens (N, images, token_width) of frames.
-
-        Args:
-            images: (N, cameras, 3, height, width) uint8.
-            language: (N, 384) embeddings.
-        """
+        """Return tokens (N, images, token_width) of images (N, cameras, 3, h, w) uint8 and embeddings (N, 384)."""
         scaled = (crop_rows(images, self.config.crop_height, anywhere=self.training) - self.mean) / self.std
         return torch.cat([encoder(scaled[:, view], language) for view, encoder in enumerate(self.encoders)], dim=1)
 
@@ -154,11 +149,7 @@ class RT1Model(nn.Module):
         return self.transformer(tokens.unflatten(0, (-1, frames))).float()
 
     def forward(self, batch: Batch) -> dict[str, torch.Tensor]:
-        """Return the cross entropy, and the accuracy of tokens: of actions, of the gripper, of the end.
-
-        Raises:
-            TrainingError: the training is to start from a file of weights that is missing.
-        """
+        """Return the cross entropy, and the accuracy of tokens: of actions, of the gripper, of the end."""
         if self.training and self.config.image_weights is not None and not self.from_imagenet:
             raise TrainingError("no such file", where=f"image_weights {self.config.image_weights}")
         logits, mask = self.logits(batch), batch["mask"]
@@ -175,11 +166,7 @@ class RT1Model(nn.Module):
         }
 
     def act(self, tokens: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the actions (B, 7) of the last frames and whether they end the episode (B,) bool.
-
-        Args:
-            tokens: (B, frames, images, token_width), see `encode`.
-        """
+        """Return actions (B, 7) and whether they end the episode (B,), for tokens (B, frames, images, token_width)."""
         predicted = likeliest_tokens(self.transformer(tokens)[:, -1].float())
         return self.bins.decode(predicted[:, :ACTION_TOKENS]), predicted[:, ACTION_TOKENS] == TERMINATE
 

@@ -228,11 +228,7 @@ def _spread_of_words(words: NDArray[np.floating]) -> dict[str, Any]:
 
 
 def crop_image(image: NDArray[Any], view: View, where: object = "") -> NDArray[Any]:
-    """Return the part (h, w, 3) of an image (H, W, 3) that a view shows, scaled by areas.
-
-    Raises:
-        DatasetError: the image is smaller than ``rendered``, or of another shape.
-    """
+    """Return the part (h, w, 3) of an image (H, W, 3) that a view shows, scaled by areas."""
     width, height = view.rendered
     if image.shape[1::-1] != (width, height):
         if image.shape[1] * height != image.shape[0] * width or image.shape[1] < width:

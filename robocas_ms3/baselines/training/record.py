@@ -84,11 +84,7 @@ def find_run(run: Path) -> Path:
 
 
 def read_run(folder: Path) -> RunRecord:
-    """Read the record of a run.
-
-    Raises:
-        TrainingError: there is none, or it is damaged.
-    """
+    """Read the record of a run."""
     path = folder / RUN
     if not path.is_file():
         fix = "Name the --out of a `robocas train`."
@@ -118,9 +114,6 @@ def hash_dataset(data: Path) -> str:
 
     Hashed are the bytes of a trajectory and of the JSON next to it; of a folder the JSON files, tables, arrays and the
     sizes of all files.
-
-    Raises:
-        TrainingError: there is nothing.
     """
     digest = hashlib.sha256()
     if data.is_file():
