@@ -4,26 +4,26 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import tyro
 
 from robocas_ms3.robots.table import DEFAULT as DEFAULT_ROBOT
 from robocas_ms3.scenes.task_specs import STANDARD_FREQ, TASKS
 
-if TYPE_CHECKING:
-    TaskName = str
-else:
-    TaskName = tyro.extras.literal_type_from_choices(TASKS)
-
 _NO_HINT = tyro.conf.arg(help_behavior_hint="")  # the help text says what the default is
+
+
+def _task_names() -> type:
+    """Return a type of the tasks' names, when the command line is parsed: it loads those of other packages."""
+    return tyro.extras.literal_type_from_choices(TASKS)
 
 
 @dataclass(frozen=True)
 class EpisodeSettings:
     """How episodes are generated; the same for all seeds of a run."""
 
-    task: Annotated[TaskName, tyro.conf.Positional]
+    task: Annotated[str, tyro.conf.Positional, tyro.conf.arg(constructor_factory=_task_names)]
     """Which task."""
     config: Annotated[str | dict[str, Any], tyro.conf.arg(constructor=str, help_behavior_hint="")] = ""
     """Name of a shipped task configuration, or a YAML file. Default: the task's own (see `robocas list`)."""
