@@ -73,27 +73,23 @@ def draw_frame(story: Story, step: int, pictures: Pictures, panel: Size) -> NDAr
     return np.asarray(canvas)
 
 
-def row_steps(steps: int, columns: int = COLUMNS) -> list[int]:
-    """Which steps a row shows: evenly spaced, from the first to the last."""
-    return np.linspace(0, steps - 1, columns).round().astype(int).tolist()
+def row_steps(steps: int) -> list[int]:
+    """Return the steps that a row shows: evenly spaced, from the first to the last."""
+    return np.linspace(0, steps - 1, COLUMNS).round().astype(int).tolist()
 
 
-def draw_row(
-    story: Story, shown: Mapping[int, Pictures], rate_hz: float, columns: int = COLUMNS, thumbnail: Size = THUMBNAIL
-) -> NDArray[np.uint8]:
-    """A contact sheet's part of one episode, (H, W, 3) RGB: a row a camera, below the instruction.
+def draw_row(story: Story, shown: Mapping[int, Pictures], rate_hz: float) -> NDArray[np.uint8]:
+    """Return a contact sheet's part of one episode, (H, W, 3) RGB: a row per camera, below the instruction.
 
     Args:
         story: of the episode.
-        shown: pictures of (at least) the steps of `row_steps`.
+        shown: pictures of at least the steps of `row_steps`.
         rate_hz: steps a second.
-        columns: pictures a row.
-        thumbnail: size of each.
     """
-    width, height = thumbnail
-    steps = row_steps(story.steps, columns)
+    width, height = THUMBNAIL
+    steps = row_steps(story.steps)
     cameras = list(shown[0])
-    size = _LEFT + columns * (width + _GAP), _CAPTION + len(cameras) * (height + _GAP) + _BELOW
+    size = _LEFT + COLUMNS * (width + _GAP), _CAPTION + len(cameras) * (height + _GAP) + _BELOW
     row = Image.new("RGB", size, _PAPER)
     draw = ImageDraw.Draw(row)
     _text(draw, (8, 6), f"{story.number}   {story.instruction}", 18, _INK, row.width - 16)
@@ -103,23 +99,12 @@ def draw_row(
             draw.text((8, y + 6 + 20 * line), word, _FAINT, _font(16))
         for column, step in enumerate(steps):
             x = _LEFT + column * (width + _GAP)
-            row.paste(_fit(shown[step][camera], thumbnail), (x, y))
+            row.paste(_fit(shown[step][camera], THUMBNAIL), (x, y))
             if index == 0:
                 _label(draw, (x + 5, y + 4), f"{step / rate_hz:.1f} s", 13)
             if index == len(cameras) - 1:
                 _label(draw, (x + 5, y + height - 22), str(story.goal_types[step]), 13)
     return np.asarray(row)
-
-
-def stack_rows(rows: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
-    """A contact sheet of rows, which may differ in width."""
-    width = max((row.shape[1] for row in rows), default=_LEFT)
-    sheet = np.full((sum(len(row) for row in rows), width, 3), _PAPER, np.uint8)
-    top = 0
-    for row in rows:
-        sheet[top : top + len(row), : row.shape[1]] = row
-        top += len(row)
-    return sheet
 
 
 def _fit(picture: NDArray[np.uint8], size: Size) -> Image.Image:

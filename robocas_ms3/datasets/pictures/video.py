@@ -15,18 +15,14 @@ from numpy.typing import NDArray
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import replacing
 from robocas_ms3.datasets.pictures.drawing import (
-    COLUMNS,
-    THUMBNAIL,
     Pictures,
-    Size,
     Story,
     draw_frame,
     draw_row,
     row_steps,
-    stack_rows,
 )
 from robocas_ms3.datasets.pictures.png import encode_png
-from robocas_ms3.datasets.sources.protocol import EpisodeSource, Kind, SourceEpisode, shots
+from robocas_ms3.datasets.sources.protocol import EpisodeSource, Kind, shots
 
 PANEL = (426, 320)
 """Width and height of one camera's picture in a video."""
@@ -63,7 +59,6 @@ def write_video(
     *,
     speed: float = 1.0,
     kind: Kind = "rgb",
-    panel: Size = PANEL,
 ) -> Path:
     """Write an episode as MP4 (H.264, yuv420p): the cameras side by side, instruction and sub-goal below.
 
@@ -73,7 +68,6 @@ def write_video(
         path: of the video.
         speed: 1 is real time.
         kind: ``rgb``, or ``depth`` in colours.
-        panel: width and height of one camera's picture.
 
     Raises:
         DatasetError: no such episode, or no such speed.
@@ -89,25 +83,12 @@ def write_video(
         closing(shots(episode, episode.cameras, kind)) as run,
     ):
         for step, pictures in enumerate(run):
-            video.append_data(draw_frame(story, step, _coloured(pictures, kind), panel))
+            video.append_data(draw_frame(story, step, _coloured(pictures, kind), PANEL))
     return path
 
 
-def video_frame(
-    episode: SourceEpisode, step: int, *, number: int = 0, kind: Kind = "rgb", panel: Size = PANEL
-) -> NDArray[np.uint8]:
-    """One picture of the video, (H, W, 3) RGB, both even."""
-    return draw_frame(Story.of(number, episode.arrays), step, _pictures(episode, step, kind), panel)
-
-
 def contact_sheet(
-    dataset: EpisodeSource,
-    out: Path | str,
-    *,
-    episodes: Sequence[int] | None = None,
-    columns: int = COLUMNS,
-    thumbnail: Size = THUMBNAIL,
-    kind: Kind = "rgb",
+    dataset: EpisodeSource, out: Path | str, *, episodes: Sequence[int] | None = None, kind: Kind = "rgb"
 ) -> Path:
     """Write a PNG with a row for each episode and camera, of evenly spaced steps from first to last.
 
@@ -115,27 +96,25 @@ def contact_sheet(
         dataset: the dataset.
         out: path of the PNG.
         episodes: numbers; None: the first ten.
-        columns: pictures a row.
-        thumbnail: width and height of a picture.
         kind: ``rgb``, or ``depth`` in colours.
     """
     numbers = dataset.numbers[:SHEET] if episodes is None else list(episodes)
-    return write_sheet([sheet_row(dataset, number, columns, thumbnail, kind) for number in numbers], out)
+    return write_sheet([sheet_row(dataset, number, kind) for number in numbers], out)
 
 
-def sheet_row(
-    dataset: EpisodeSource, number: int, columns: int = COLUMNS, thumbnail: Size = THUMBNAIL, kind: Kind = "rgb"
-) -> NDArray[np.uint8]:
-    """An episode's part of a contact sheet, (H, W, 3) RGB."""
-    episode = dataset.episode(number)
-    shown = {step: _pictures(episode, step, kind) for step in row_steps(episode.steps, columns)}
-    return draw_row(Story.of(number, episode.arrays), shown, dataset.rate_hz, columns, thumbnail)
+def sheet_row(dataset: EpisodeSource, number: int, kind: Kind = "rgb") -> NDArray[np.uint8]:
+    """Return an episode's part of a contact sheet, (H, W, 3) RGB."""
+    episode, shown = dataset.episode(number), {}
+    picture = episode.rgb if kind == "rgb" else episode.depth
+    for step in row_steps(episode.steps):
+        shown[step] = _coloured({camera: picture(camera, step) for camera in episode.cameras}, kind)
+    return draw_row(Story.of(number, episode.arrays), shown, dataset.rate_hz)
 
 
 def write_sheet(rows: Sequence[NDArray[np.uint8]], path: Path | str) -> Path:
     """Write a contact sheet as PNG."""
     with replacing(path) as tmp:
-        tmp.write_bytes(encode_png(stack_rows(rows)))
+        tmp.write_bytes(encode_png(np.concatenate(rows)))
     return Path(path)
 
 
@@ -146,12 +125,6 @@ def colour_depth(depth: NDArray[np.uint16]) -> NDArray[np.uint8]:
     colours = cv2.applyColorMap((share * 255).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1].copy()
     colours[depth == 0] = 0
     return colours.astype(np.uint8)
-
-
-def _pictures(episode: SourceEpisode, step: int, kind: Kind) -> Pictures:
-    """Of every camera."""
-    picture = episode.rgb if kind == "rgb" else episode.depth
-    return _coloured({camera: picture(camera, step) for camera in episode.cameras}, kind)
 
 
 def _coloured(pictures: Mapping[str, NDArray], kind: Kind) -> Pictures:

@@ -14,9 +14,9 @@ from synthetic import RayCaster, render_by, write_trajectory
 from robocas_ms3.cli.main import run
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.pictures import preview
-from robocas_ms3.datasets.pictures.drawing import Story, draw_frame, row_steps, stack_rows
+from robocas_ms3.datasets.pictures.drawing import Story, draw_frame, row_steps
 from robocas_ms3.datasets.pictures.preview import PANEL
-from robocas_ms3.datasets.pictures.video import _pictures, contact_sheet
+from robocas_ms3.datasets.pictures.video import contact_sheet
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing import convert as conversion
 from robocas_ms3.datasets.writing.settings import ConversionSettings
@@ -51,7 +51,8 @@ def test_shows_what_the_dataset_holds(trajectory, tmp_path, jobs):
         assert len(frames) == 7
         episode = dataset.episode(number)
         for step, frame in enumerate(frames):
-            drawn = draw_frame(Story.of(number, episode.arrays), step, _pictures(episode, step, "rgb"), PANEL)
+            pictures = {camera: episode.rgb(camera, step) for camera in episode.cameras}
+            drawn = draw_frame(Story.of(number, episode.arrays), step, pictures, PANEL)
             assert frame.shape == drawn.shape == (PANEL[1] + 64, 3 * PANEL[0], 3)
             assert np.abs(frame.astype(int) - drawn).mean() < 4, "H.264 loses little"
     of_pictures = np.asarray(Image.open(contact_sheet(Dataset(out), tmp_path / "sheet.png")))
@@ -145,13 +146,4 @@ def test_a_failed_episode_has_none(trajectory, tmp_path, monkeypatch):
 
 def test_steps_of_a_row():
     assert row_steps(65) == [0, 9, 18, 27, 37, 46, 55, 64]
-    assert row_steps(3, 4) == [0, 1, 1, 2]
-    assert row_steps(1, 3) == [0, 0, 0]
-
-
-def test_rows_of_different_widths():
-    sheet = stack_rows([np.full((2, 5, 3), 1, np.uint8), np.full((3, 7, 3), 2, np.uint8)])
-    assert sheet.shape == (5, 7, 3)
-    assert (sheet[:2, :5] == 1).all()
-    assert (sheet[:2, 5:] == (24, 26, 30)).all()
-    assert (sheet[2:] == 2).all()
+    assert row_steps(3) == [0, 0, 1, 1, 1, 1, 2, 2]

@@ -5,8 +5,14 @@ from PIL import Image
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.datasets.pictures.video import PANEL, colour_depth, contact_sheet, video_frame, write_video
+from robocas_ms3.datasets.pictures.drawing import THUMBNAIL, Story, draw_frame
+from robocas_ms3.datasets.pictures.video import PANEL, colour_depth, contact_sheet, write_video
 from robocas_ms3.datasets.sources.reader import Dataset
+
+
+def video_frame(episode, step, number=0):
+    pictures = {camera: episode.rgb(camera, step) for camera in episode.cameras}
+    return draw_frame(Story.of(number, episode.arrays), step, pictures, PANEL)
 
 
 def test_videos_show_every_step_in_real_time(made, tmp_path):
@@ -19,7 +25,7 @@ def test_videos_show_every_step_in_real_time(made, tmp_path):
     assert facts["pix_fmt"].startswith("yuv420p")
     assert len(frames) == 7
     assert frames[0].shape == (320 + 64, 3 * 426, 3)
-    drawn = video_frame(Dataset(made).episode(1), 6, number=1)
+    drawn = video_frame(Dataset(made).episode(1), 6, 1)
     assert np.abs(frames[6].astype(int) - drawn).mean() < 4, "H.264 loses little"
 
 
@@ -48,13 +54,12 @@ def test_long_texts_stay_inside(made, tmp_path):
 
 
 def test_contact_sheet(made, tmp_path):
-    sheet = np.asarray(Image.open(contact_sheet(Dataset(made), tmp_path / "sheet.png", columns=4, thumbnail=(64, 48))))
-    assert sheet.shape == (2 * (30 + 3 * 51 + 10), 110 + 4 * 67, 3)
+    sheet = np.asarray(Image.open(contact_sheet(Dataset(made), tmp_path / "sheet.png")))
+    (width, height), part = THUMBNAIL, 30 + 3 * 163 + 10
+    assert sheet.shape == (2 * part, 110 + 8 * (width + 3), 3)
     # Row of episode 1, static camera, last column: its last step.
-    top, left = 193 + 30 + 2 * 51, 110 + 3 * 67
-    shown = sheet[top : top + 48, left : left + 64]
-    seen = Dataset(made).episode(1).rgb("static_camera", 6)
-    np.testing.assert_array_equal(shown[:20], seen[:20])  # below stands the sub-goal
+    row, column = part + 30 + 2 * (height + 3) + height // 2, 110 + 7 * (width + 3) + width // 2
+    np.testing.assert_array_equal(sheet[row, column], Dataset(made).episode(1).rgb("static_camera", 6)[24, 32])
 
 
 def test_depth_colours():
