@@ -76,11 +76,7 @@ def load_json(path: Path) -> Any:
 
 
 def json_values(text: str | bytes) -> Any:
-    """Read the values of a JSON text. NaN, infinity, integers beyond 64 bits and lone surrogates are refused.
-
-    Raises:
-        DocumentError: the text is not JSON, is nested too deeply, or has a value that `json_fault` names.
-    """
+    """Read the values of a JSON text; raise DocumentError if it is not JSON, or has a value that `json_fault` names."""
     try:
         values = json.loads(text)
     except ValueError as error:
@@ -96,9 +92,7 @@ def json_values(text: str | bytes) -> Any:
 def json_fault(values: Any, depth: int = 0) -> tuple[tuple[Any, ...], str] | None:
     """Return keys and description of the first value that the package does not keep in JSON, or None.
 
-    Args:
-        values: from a JSON text, or to be written as one.
-        depth: number of lists and dicts around them.
+    These are NaN, infinity, integers beyond 64 bits, lone surrogates, and what is nested too deeply.
     """
     if not isinstance(values, _CONTAINERS):
         return ((), found) if (found := _scalar_fault(values)) else None

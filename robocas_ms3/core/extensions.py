@@ -57,11 +57,7 @@ class Registry(Mapping[str, T]):
         return sum(1 for _ in self)
 
     def find(self, name: str, *, where: object = "") -> T:
-        """Return the object of a name.
-
-        Raises:
-            ExtensionError: the name is unknown, or its entry point can't be loaded.
-        """
+        """Return the object of a name; raise ExtensionError if it is unknown, or its entry point can't be loaded."""
         if name in self:
             return self[name]
         known = list(self)
@@ -105,11 +101,7 @@ def package_of(point: EntryPoint) -> str:
 
 
 def load(path: str) -> Any:
-    """Return the object of an import path, ``package.module:name``.
-
-    Raises:
-        ExtensionError: there is no such module or name.
-    """
+    """Return the object of an import path, ``package.module:name``; raise ExtensionError if there is none."""
     module, _, name = path.partition(":")
     try:
         with no_exit(path):

@@ -186,11 +186,7 @@ def _restore_and_sweep(path: Path) -> None:
 
 
 def make_folder(path: Path | str) -> Path:
-    """Make a folder and its parents, and check that it can be written to.
-
-    Raises:
-        RobocasError: it can't be made or written to.
-    """
+    """Make a folder and its parents; raise RobocasError if it can't be made or written to."""
     path = Path(path)
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -205,11 +201,7 @@ def make_folder(path: Path | str) -> Path:
 
 
 def flush_to_disk(folder: Path | str) -> None:
-    """Write all files of a folder's file system to the disk, in one call: they survive a power cut.
-
-    Raises:
-        OSError: it can't be written, naming the folder.
-    """
+    """Write all files of a folder's file system to the disk, in one call: they survive a power cut."""
     syncfs = getattr(ctypes.CDLL(None, use_errno=True), "syncfs", None)
     if syncfs is None:
         os.sync()

@@ -58,12 +58,7 @@ class Ledger(Generic[Record]):
         self._form: TypeAdapter[Record] = _form_of(record)
 
     def lines(self) -> list[Line[Record]]:
-        """Return all lines but empty ones, the damaged ones too; none if there is no file.
-
-        Raises:
-            OSError: the file cannot be read.
-            DocumentError: the path leads to a pipe or a device, or the file is too large.
-        """
+        """Return all lines but empty ones, the damaged ones too; none if there is no file. Raises as `read_bytes`."""
         try:
             pieces = read_bytes(self.path, _LIMIT).split(b"\n")
         except FileNotFoundError:

@@ -105,21 +105,13 @@ class OutputFolder:
                     self.path.rmdir()
 
     def read(self) -> None:
-        """Check the folder without locking it, as is enough for further processes of one run.
-
-        Raises:
-            OutputExistsError: the folder was not written by the command, or with other settings.
-        """
+        """Check the folder without locking it, as is enough for further processes of one run."""
         self.recorded = self._load_matching()
         if self._settings is not None:
             self.check_settings(self._settings)
 
     def check_settings(self, settings: Mapping[str, Any]) -> None:
-        """Check that recorded settings match; not those of a folder that is to be overwritten.
-
-        Raises:
-            OutputExistsError: some differ.
-        """
+        """Raise OutputExistsError if recorded settings differ; not those of a folder that is to be overwritten."""
         if self.recorded is None:
             return
         now = json.loads(json_text(settings, self.path))
@@ -132,14 +124,7 @@ class OutputFolder:
             raise OutputExistsError("written with other settings", where=self._record_path(), found=found, fix=fix)
 
     def start(self, record: Mapping[str, Any]) -> None:
-        """Make the folder, delete content that is overwritten and leftovers of a killed run, and write the record.
-
-        Args:
-            record: holds the settings.
-
-        Raises:
-            RobocasError: the folder can't be made or replaced, or the record is no JSON.
-        """
+        """Make the folder, delete content that is overwritten and leftovers of a killed run, and write the record."""
         if self._overwrite and not self._started and self.path.is_dir():
             self._hide_content()
         self._started = True
@@ -155,11 +140,7 @@ class OutputFolder:
                 os.replace(entry, old / entry.name)
 
     def check_exists(self) -> None:
-        """Check that nobody removed the folder: writers make missing folders, and would begin another one.
-
-        Raises:
-            RobocasError: the record is gone.
-        """
+        """Raise RobocasError if somebody removed the folder: writers make missing folders, and would go on there."""
         if not self._record_path().is_file():
             what, fix = "the output folder was removed or emptied during the run", "Start again."
             raise RobocasError(what, where=self.path, expected=self._record_path().name, fix=fix)

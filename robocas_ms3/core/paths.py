@@ -23,8 +23,7 @@ _log = logging.getLogger(__name__)
 def data_dir() -> Path:
     """Return the folder of the user's asset packs: ``$ROBOCAS_DATA``, by default the user's data folder.
 
-    Raises:
-        RobocasError: the variable is not set, and the user has no home folder.
+    Raises RobocasError if the variable is not set and the user has no home folder.
     """
     return Path(os.environ.get(DATA) or _of_user(platformdirs.user_data_path))
 
@@ -33,9 +32,7 @@ def cache_dir() -> Path:
     """Return the cache folder: ``$ROBOCAS_CACHE``, by default the user's cache folder.
 
     If the variable is not set and the user's folder is not writable, it is a private one among the temporary files.
-
-    Raises:
-        RobocasError: the variable is not set, and the user has no home folder.
+    Raises RobocasError if the variable is not set and the user has no home folder.
     """
     chosen = os.environ.get(CACHE)
     return Path(chosen) if chosen else _cache_of_user(_of_user(platformdirs.user_cache_path))

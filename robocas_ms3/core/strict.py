@@ -118,11 +118,7 @@ def parse_json(
 
 
 def validate_json(form: type[BaseModel] | TypeAdapter[Any], text: str | bytes) -> Any:
-    """Read JSON strictly in a declared form; every number is finite and every integer has at most 64 bits.
-
-    Raises:
-        ValidationError: it has another form.
-    """
+    """Read JSON strictly in a declared form, or raise ValidationError; numbers are finite, integers have 64 bits."""
     validate = form.validate_json if isinstance(form, TypeAdapter) else form.model_validate_json
     found = validate(text, strict=True)
     if _OUT_OF_RANGE.search(text.encode() if isinstance(text, str) else text):  # hardly ever: then it is read once more
@@ -176,11 +172,7 @@ def mistakes(
 
 
 def check_number(name: str, value: float, least: float, greatest: int | None = None) -> None:
-    """Check the range of a number.
-
-    Raises:
-        RobocasError: it is outside.
-    """
+    """Raise RobocasError if a number is out of range."""
     if not least <= value < math.inf or (greatest is not None and value > greatest):
         expected = f"at least {least}" if greatest is None else f"{least} to {greatest}"
         raise RobocasError("this number is out of range", where=name, expected=expected, found=value)

@@ -82,14 +82,7 @@ class WorkerProcess(Generic[Task, Result]):
         self._checked = 0.0  # time of the last check of the memory limit
 
     def run(self, task: Task) -> Result:
-        """Run a task.
-
-        Raises:
-            WorkerStartError: the process can't start, or died before its first task.
-            WorkerCrashed: it died, or exceeded a limit.
-            CancelledError: the pool was stopped.
-            Exception: whatever the task, or making the worker, raises.
-        """
+        """Run a task; raises WorkerStartError, WorkerCrashed, CancelledError, or the error of the task."""
         if self._process is None or self._process.poll() is not None:
             try:
                 self._start()

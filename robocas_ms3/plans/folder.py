@@ -32,11 +32,7 @@ KIND = FolderKind("robocas plan run", (PLAN,), "plan", upgrade=settings_of)
 
 
 def read_plan_record(out: Path) -> dict[str, Any]:
-    """Read `plan.json`.
-
-    Raises:
-        PlanError: it is missing or damaged.
-    """
+    """Read `plan.json`; raise PlanError if it is missing or damaged."""
     path = out / PLAN
     try:
         record = load_json(path)
@@ -49,20 +45,12 @@ def read_plan_record(out: Path) -> dict[str, Any]:
 
 
 def read_plan(out: Path) -> Plan:
-    """Read the plan that a folder was started with.
-
-    Raises:
-        PlanError: `plan.json` is missing, damaged or not a valid plan.
-    """
+    """Read the plan that a folder was started with; raise PlanError if there is none."""
     return parse(Plan, read_plan_record(out)["plan"], PlanError, where=out / PLAN, about="not a valid plan")
 
 
 def check_plan_record(out: Path, plan: Plan) -> None:
-    """Check that a folder was started with this plan, except for the keys in `FREE`, and these versions.
-
-    Raises:
-        PlanError: the plan, or a version on this machine, differs.
-    """
+    """Raise PlanError if a folder was started with another plan, except for the keys in `FREE`, or other versions."""
     before, now = settings_of(read_plan_record(out)), settings_of(plan_record(plan))
     if changes := [change for key in now for change in setting_changes(before[key], now[key], key)]:
         fix = "Use the same plan and versions on every machine, another --out, or --overwrite."

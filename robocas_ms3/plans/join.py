@@ -43,7 +43,7 @@ _log = logging.getLogger(__name__)
 
 
 def join(plan: Plan, out: Path, chosen: Chosen, *, jobs: int = 1, say: Say = lambda text: None) -> dict[str, Any]:
-    """Join all episodes; after a kill at any moment, another call continues and makes the same.
+    """Join all episodes, and return the content of ``report.json``; another call after a kill makes the same.
 
     Files of units are deleted once the joined files are on the disk and complete.
 
@@ -53,9 +53,6 @@ def join(plan: Plan, out: Path, chosen: Chosen, *, jobs: int = 1, say: Say = lam
         chosen: the episodes.
         jobs: processes that make the LeRobot dataset, at most one per core.
         say: called with each stage.
-
-    Returns:
-        The content of ``report.json``.
 
     Raises:
         PlanError: a joined file is damaged, and the files of units are gone; or the disk does not keep it.

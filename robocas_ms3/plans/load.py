@@ -71,11 +71,7 @@ def most_seeds(episodes: int, block: int) -> int:
 
 
 def check_packs(plan: Plan, packs: Iterable[str]) -> None:
-    """Check that packs, and that of the furniture, are those that a plan was loaded with.
-
-    Raises:
-        PlanError: a pack has changed, or differs on this machine.
-    """
+    """Raise PlanError if a pack, or that of the furniture, differs from the one that a plan was loaded with."""
     for pack in {_FURNITURE_PACK, *packs}:
         expected, found = plan.packs.get(pack), _digest(pack)
         if expected and found and found != expected:

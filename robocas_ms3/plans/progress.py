@@ -17,11 +17,7 @@ Shard = tuple[int, int]
 
 
 def parse_shard(text: str) -> Shard:
-    """Parse ``K/N``.
-
-    Raises:
-        PlanError: it has another form, or K is not less than N.
-    """
+    """Parse ``K/N``; raise PlanError if it has another form, or K is not less than N."""
     found = re.fullmatch(r"(\d{1,9})/(\d{1,9})", text)
     if not found or int(found[1]) >= int(found[2]):
         raise PlanError("invalid shard", where="--shard", expected="K/N with K < N, such as 0/4", found=repr(text))
@@ -80,11 +76,7 @@ class Progress:
         self._first[part] = block, seeds, successes
 
     def check_failures(self) -> None:
-        """Check that seeds succeed.
-
-        Raises:
-            PlanError: almost all seeds of a part fail.
-        """
+        """Raise PlanError if almost all seeds of a part fail."""
         if self._failing:
             raise self._failing
 

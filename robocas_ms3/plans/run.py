@@ -52,16 +52,15 @@ def run_plan(
     overwrite: bool = False,
     callbacks: Callbacks = Callbacks(),  # noqa: B008  (frozen)
 ) -> dict[str, Any]:
-    """Make the dataset of a plan, or continue; its content depends on the plan alone.
+    """Make the dataset of a plan, or continue, and return the content of ``report.json``.
+
+    The dataset depends on the plan alone.
 
     Args:
         executor: has the units done. Its output folder gets ``plan.json``, ``units/``, and in the end ``demos/``,
             ``datasets/``, ``statistics/``, ``report.json``.
         overwrite: replace the content of the folder.
         callbacks: see there.
-
-    Returns:
-        The content of ``report.json``.
 
     Raises:
         OutputExistsError: the folder was started with another plan or other versions, or by another command.
@@ -96,11 +95,7 @@ def run_shard(
 ) -> bool:
     """Do the work units of a shard that are needed and not done, next to other shards in the same folder.
 
-    Returns:
-        Whether no unit of the plan is missing: `join_plan` can join it.
-
-    Raises:
-        RobocasError: as `run_plan`.
+    Returns whether no unit of the plan is missing: `join_plan` can join it. Raises as `run_plan` does.
     """
     plan, out = executor.plan, executor.out
     check_plan(plan)
@@ -118,10 +113,7 @@ def run_shard(
 
 
 def join_plan(out: Path, *, jobs: int = 1, say: Callable[[str], None] = lambda text: None) -> dict[str, Any]:
-    """Join the episodes of a plan whose work units are done.
-
-    Returns:
-        The content of ``report.json``.
+    """Join the episodes of a plan whose work units are done; return the content of ``report.json``.
 
     Raises:
         PlanError: units are missing, files are damaged, or this machine has other versions.

@@ -59,11 +59,7 @@ class Status:
 
 
 def read_status(out: Path) -> Status:
-    """Read the status of the plan in a folder.
-
-    Raises:
-        PlanError: no plan was started there.
-    """
+    """Read the status of the plan in a folder; raise PlanError if there is none."""
     return status_of(Progress(read_plan(out), out), finished=(out / REPORT).is_file())
 
 
