@@ -74,7 +74,7 @@ class EpisodeMetrics:
         self._in_v0 = self._near & open_command
 
     def _tcp_pos(self) -> Any:
-        return native(link_poses(self._env.scene, [self._env.agent.tcp]))[:, 0, :3]  # a fourth of `tcp.pose`'s time
+        return link_poses(self._env.scene, [self._env.agent.tcp])[:, 0, :3]  # a fourth of `tcp.pose`'s time
 
     def end_step(self) -> None:
         """Count a policy step, after its last control step."""

@@ -16,7 +16,7 @@ from mani_skill.utils.structs.types import SimConfig
 from numpy.typing import NDArray
 
 from robocas_ms3.assets.pack import LoadedObject, VisualLevel, load_pack
-from robocas_ms3.core.arrays import Array, as_tensor, native
+from robocas_ms3.core.arrays import Array, as_tensor
 from robocas_ms3.core.extensions import load
 from robocas_ms3.robots.agent import MobileManipulator
 from robocas_ms3.robots.table import DEFAULT, find_robot
@@ -263,7 +263,7 @@ class RoboCASEnv(BaseEnv):
 
     def tcp_in_world(self) -> Array:
         """(N, 7) pose of the TCP in the world, native (`arrays`)."""
-        return native(link_poses(self.scene, [self.agent.tcp]))[:, 0]
+        return link_poses(self.scene, [self.agent.tcp])[:, 0]
 
     def target_center(self, objects: Array) -> Array:
         """(N, 3) m, the target's centre of mass in the world, from states (N, K, 13); native (`arrays`)."""

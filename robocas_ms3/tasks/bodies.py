@@ -161,12 +161,12 @@ class Bodies:
         return torch.cat(parts, dim=1)
 
 
-def link_poses(scene: ManiSkillScene, links: Sequence[Link]) -> torch.Tensor:
-    """(N, L, 7) poses of links in the world: position m, quaternion wxyz."""
+def link_poses(scene: ManiSkillScene, links: Sequence[Link]) -> Array:
+    """Return the poses (N, L, 7) of links in the world: position m, quaternion wxyz; native (`arrays`)."""
     if scene.gpu_sim_enabled:
         return torch.stack([link.pose.raw_pose for link in links], dim=1)
     poses = [link._bodies[0].entity_pose for link in links]
-    return torch.from_numpy(np.array([[*pose.p, *pose.q] for pose in poses], np.float32))[None]
+    return np.array([[[*pose.p, *pose.q] for pose in poses]], np.float32)
 
 
 class Contacts:

@@ -116,17 +116,18 @@ class InBasket(Goal):
         assert inner is not None  # the model saw to it
         low, high = (torch.tensor(corner, device=env.device) for corner in (inner.min, inner.max))
         aside = torch.tensor([_RIM, _RIM, torch.inf], device=env.device)
-        self._inside, self._above = (low, high), (low - aside, high + aside)
-        self._drop = torch.cat([(low + high)[:2] / 2, high[2:] + _DROP_HEIGHT])  # in the basket's frame
+        self._inside = native(low), native(high)
+        self._above = native(low - aside), native(high + aside)
+        self._drop = native(torch.cat([(low + high)[:2] / 2, high[2:] + _DROP_HEIGHT]))  # in the basket's frame
 
     def holds(self, centers: Array, basket: Array | None) -> Array:
         """See `Goal`."""
-        return terms.inside_box(centers, *_split(basket), *map(native, self._inside))
+        return terms.inside_box(centers, *_split(basket), *self._inside)
 
     def point(self, basket: Array | None) -> Array:
         """See `Goal`: over the middle of the basket's rim."""
         position, quaternion = _split(basket)
-        return position + rotations.rotate(quaternion, native(self._drop))
+        return position + rotations.rotate(quaternion, self._drop)
 
     def measures(self, basket: Array | None) -> dict[str, Array]:
         """``basket_stands``."""
@@ -143,7 +144,7 @@ class InBasket(Goal):
 
     def catches(self, positions: Array, basket: Array | None) -> Array | None:
         """See `Goal`: those above the basket."""
-        return terms.inside_box(positions, *_split(basket), *map(native, self._above))
+        return terms.inside_box(positions, *_split(basket), *self._above)
 
     def progress(self, now: Moment, brought: Array, table: rewards.RewardTable) -> tuple[Array, dict[str, Array]]:
         """See `Goal`: grasp, lift, carry, place, release, rest."""
@@ -152,7 +153,7 @@ class InBasket(Goal):
         target, center = terms.of_target(now.objects, slot), env.target_center(now.objects)
         basket, turned = _split(now.basket)
         inside = rotations.rotate_inverse(turned, center - basket)  # the target in the basket's frame
-        low, high = map(native, self._inside)
+        low, high = self._inside
         over = ((inside[:, :2] >= low[:2]) & (inside[:, :2] <= high[:2])).all(-1) & (inside[:, 2] >= low[2])  # pyright: ignore[reportOperatorIssue]
         delivered = brought & now.at_goal
         stage = rewards.furthest(

@@ -13,7 +13,6 @@ from robocas_ms3.core import rotations
 from robocas_ms3.core.arrays import Array, as_tensor, join, native
 from robocas_ms3.robots.cameras import CameraSpec, Vec3
 from robocas_ms3.scenes.model import SceneModel
-from robocas_ms3.tasks import terms
 
 
 def privileged_observations(env: Any) -> dict[str, torch.Tensor]:
@@ -33,7 +32,7 @@ def privileged_observations(env: Any) -> dict[str, torch.Tensor]:
     else:
         seen = in_tcp_frame(tcp, join([to_target, point - center]).reshape(-1, 2, 3))
         observations |= {"tcp_to_target": seen[:, 0], env.goal.TOWARDS: seen[:, 1]}
-    return observations | {"target_extents": as_tensor(terms.of_target(env.success_check.extents, env.target_slot))}
+    return observations | {"target_extents": env.success_check.target_extents}
 
 
 def in_tcp_frame(tcp: Array, vectors: Array) -> torch.Tensor:

@@ -53,7 +53,7 @@ class RoboCASOpenPickEnv(RoboCASEnv):
         self._opening = furniture, [active.name for active in furniture.active_joints].index(joint.name)
         handle = self.model.furniture[opening.furniture].asset.handles[opening.handle]
         # the frames of all parts coincide while everything is shut
-        self._handle = furniture.links_map[handle.link], torch.tensor([handle.position], device=self.device)
+        self._handle = furniture.links_map[handle.link], native(torch.tensor([handle.position], device=self.device))
 
     def opening_position(self) -> torch.Tensor:
         """Return the position (N,) m or rad of the joint that has to be opened."""
@@ -63,8 +63,8 @@ class RoboCASOpenPickEnv(RoboCASEnv):
     def handle_in_world(self) -> Array:
         """Return where the handle is, (N, 3) m, native (`arrays`)."""
         link, position = self._handle
-        pose = native(link_poses(self.scene, [link]))[:, 0]
-        return pose[:, :3] + rotations.rotate(pose[:, 3:], native(position))
+        pose = link_poses(self.scene, [link])[:, 0]
+        return pose[:, :3] + rotations.rotate(pose[:, 3:], position)
 
     def furniture_opened(self) -> torch.Tensor:
         """Return whether the furniture is open now, (N,) bool."""
@@ -80,7 +80,7 @@ class RoboCASOpenPickEnv(RoboCASEnv):
     def compute_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
         """Return the reward; see `RoboCASEnv`. The furniture must have been opened before the target may be grasped."""
         stage, found = self.dense_reward.of_goal()
-        shut = (stage == self.REWARDS.index("grasp")) & ~native(self.success_check.stages["furniture_opened"])
+        shut = (stage == self.REWARDS.index("grasp")) & ~self.success_check.stages["furniture_opened"]
         if not known_all_false(shut):
             found["handle"] = rewards.closeness(self.tcp_in_world()[:, :3], self.handle_in_world())
             found["open"] = self._opened_share()

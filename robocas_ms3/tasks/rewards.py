@@ -178,7 +178,7 @@ class DenseReward:
 
     def of_goal(self) -> tuple[Array, dict[str, Array]]:
         """Return stages (N,) and terms by name, (N,) in [0, 1] each, of the goal; native (`arrays`)."""
-        brought = native(self._env.success_check.stages["target_lifted"])
+        brought = self._env.success_check.stages["target_lifted"]
         return self._env.goal.progress(self._env.success_check.moment, brought, self._table)
 
     def weigh(self, stage: Array, found: dict[str, Array], action: Any, info: dict[str, Any]) -> torch.Tensor:

@@ -116,7 +116,7 @@ class RoboCASSearchEnv(RoboCASEnv):
     def _due(self) -> Array:
         """(N,) bool, native: whose clutter is measured in this step."""
         stages = self.success_check.stages
-        settled = native(stages["target_grasped"]) | native(stages["obstacles_cleared"])
+        settled = stages["target_grasped"] | stages["obstacles_cleared"]
         return ((native(self.elapsed_steps) % self._measure_period == 0) | native(self._measure_now)) & ~settled
 
     def _measure(self, due: torch.Tensor, poses: torch.Tensor) -> torch.Tensor:
@@ -154,7 +154,7 @@ class RoboCASSearchEnv(RoboCASEnv):
         """Return the reward; see `RoboCASEnv`. Before the target may be grasped, it has to be cleared or held once."""
         stage, found = self.dense_reward.of_goal()
         stages = self.success_check.stages
-        settled = native(stages["obstacles_cleared"]) | native(stages["target_grasped"])
+        settled = stages["obstacles_cleared"] | stages["target_grasped"]
         covered = (stage == self.REWARDS.index("grasp")) & ~settled
         if not known_all_false(covered):
             found["push_point"] = rewards.closeness(self.tcp_in_world()[:, :3], native(self._push_point))

@@ -29,9 +29,9 @@ class SuccessCheck:
 
     Attributes:
         reached: (stages, N) bool.
-        stages: its rows by name; views.
+        stages: its rows by name; views, native (`arrays`).
         moment: what the last check found; the same object as before where nothing has changed since.
-        extents: (N, K, 3) m, of the objects.
+        target_extents: (N, 3) m, since the reset.
         surface: height of what objects stand on, m.
         fallen_below: height below which an object counts as fallen off it, m.
     """
@@ -41,22 +41,24 @@ class SuccessCheck:
     def __init__(self, env: Any, stages: Sequence[str]) -> None:
         self._env = env
         self.reached = torch.zeros(len(stages), env.num_envs, dtype=torch.bool, device=env.device)
-        self.stages = dict(zip(stages, self.reached, strict=True))
+        self.stages = dict(zip(stages, native(self.reached), strict=True))
         self._last: tuple[object, dict[str, torch.Tensor]] | None = None
         shut = env.model.support_motion(opened=False)
-        self._support_shut = torch.as_tensor(shut, dtype=torch.float32, device=env.device)
+        self._support_shut = native(torch.as_tensor(shut, dtype=torch.float32, device=env.device))
         facts = [[asset.asset for asset in row] for row in env.object_assets]
         centers = [[fact.center_of_mass for fact in row] for row in facts]
-        self._centers_of_mass = torch.tensor(centers, dtype=torch.float32, device=env.device)
+        self._centers_of_mass = native(torch.tensor(centers, dtype=torch.float32, device=env.device))
         extents = [[fact.extents for fact in row] for row in facts]
-        self.extents = torch.tensor(extents, dtype=torch.float32, device=env.device)
-        self._sideways = torch.tensor([[0.0, 1.0, 0.0]], device=env.device)
+        self._extents = torch.tensor(extents, dtype=torch.float32, device=env.device)
+        self.target_extents = self._extents[:, 0]
+        self._sideways = native(torch.tensor([[0.0, 1.0, 0.0]], device=env.device))
         self.surface = float(env.model.support_pose[2, 3]) + env.model.region.z
         self.fallen_below = self.surface - terms.FALLEN
 
     def reset(self, envs: torch.Tensor) -> None:
-        """Forget the stages of some envs (E,)."""
+        """Forget the stages of some envs (E,), whose targets may be others."""
         self.reached[:, envs] = False
+        self.target_extents = self._extents[torch.arange(len(self._extents), device=envs.device), self._env.target_slot]
         self._last = None
 
     def restore(self, reached: Any, envs: Any) -> None:
@@ -68,9 +70,9 @@ class SuccessCheck:
 
     def reach(self, stage: str, now: Array) -> torch.Tensor:
         """Note which envs are at a stage now, (N,) bool, native (`arrays`); return which have reached it, (N,) bool."""
-        row = native(self.stages[stage])
+        row = self.stages[stage]
         row |= now
-        return self.stages[stage].clone()
+        return as_tensor(row).clone()
 
     def check(self) -> dict[str, torch.Tensor]:
         """Return stages, ``success`` and ``fail`` (N,) bool and ``disturbed`` (N,) int; don't write to them."""
@@ -112,7 +114,7 @@ class SuccessCheck:
                 self.reach(stage, flags)
         success = reduce(and_, measures.values())
         if goal.LIFTS:
-            success = native(self.stages["target_lifted"]) & success
+            success = self.stages["target_lifted"] & success
         fail = self._has_failed(measures, objects, basket)
         stages = dict(zip(self.stages, self.reached.clone(), strict=True))
         disturbed = self._disturbed(objects[..., :7])
@@ -122,12 +124,12 @@ class SuccessCheck:
 
     def centers(self, objects: Array) -> Array:
         """Return the centres of mass (N, K, 3) of the objects in the world, from their states (N, K, 13)."""
-        return objects[..., :3] + rotations.rotate(objects[..., 3:7], native(self._centers_of_mass))
+        return objects[..., :3] + rotations.rotate(objects[..., 3:7], self._centers_of_mass)
 
     def target_center(self, objects: Array) -> Array:
         """Return the target's centre of mass (N, 3) in the world, from the objects' states (N, K, 13)."""
         slot = native(self._env.target_slot)
-        target, center = terms.of_target(objects, slot), terms.of_target(native(self._centers_of_mass), slot)
+        target, center = terms.of_target(objects, slot), terms.of_target(self._centers_of_mass, slot)
         return target[:, :3] + rotations.rotate(target[:, 3:7], center)
 
     def grasped(self, forces: Array) -> Array:
@@ -135,9 +137,9 @@ class SuccessCheck:
         pressed = terms.pressed(forces[:, 0], forces[:, 1])
         if known_all_false(pressed):  # as most of the time: no need to ask in which direction
             return pressed
-        finger = native(link_poses(self._env.scene, [self._env.agent.finger1_link]))[:, 0]
+        finger = link_poses(self._env.scene, [self._env.agent.finger1_link])[:, 0]
         # the left finger opens along its own +y
-        opening = rotations.rotate(finger[:, 3:], native(self._sideways))
+        opening = rotations.rotate(finger[:, 3:], self._sideways)
         return terms.finger_grasps(forces[:, 0], forces[:, 1], opening)
 
     def measures(self) -> dict[str, torch.Tensor]:
@@ -190,7 +192,7 @@ class SuccessCheck:
         support = env.fixtures.furniture[env.task_config.surface.furniture]
         if isinstance(support, Articulation) and env.model.support_link:
             links = [support.links_map[name] for name in (BODY, env.model.support_link)]
-            body, part = native(link_poses(env.scene, links)).swapaxes(0, 1)
-            undo = terms.way_back(body, part, native(self._support_shut))
+            body, part = link_poses(env.scene, links).swapaxes(0, 1)
+            undo = terms.way_back(body, part, self._support_shut)
         moved = terms.disturbed(poses, native(env.start_poses), undo) & native(env.present)
         return moved & (count_up(moved.shape[1], moved) != native(env.target_slot)[:, None])

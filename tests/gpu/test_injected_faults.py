@@ -13,7 +13,7 @@ from mani_skill.envs.scene import ManiSkillScene
 
 from robocas_ms3.robots.agent import MobileManipulator
 from robocas_ms3.robots.joint_controllers import RobotController
-from robocas_ms3.tasks import base
+from robocas_ms3.tasks import success
 from robocas_ms3.tasks.bodies import Bodies
 from robocas_ms3.tasks.seeds import EpisodeSeeds
 from robocas_ms3.tasks.starts import Starts
@@ -91,7 +91,7 @@ def test_a_cpu_tensor_mixed_in(batch, monkeypatch, field):
 
 
 def test_an_array_of_numpy_mixed_in(batch, monkeypatch):
-    monkeypatch.setattr(base, "native", lambda tensor: tensor.numpy())
+    monkeypatch.setattr(success, "native", lambda tensor: tensor.numpy())
     with pytest.raises(RuntimeError, match="numpy"):
         batch.reset(seed=0)
 
