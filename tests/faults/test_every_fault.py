@@ -269,7 +269,7 @@ def stopped_half_way(command, out, log):
 CUT = {
     "generate": ("episodes/seed_*.h5", "episodes/seed_*.json"),
     "convert": ("episode_*/episode_info.npz", "episode_*/base_camera/rgb/0001.png", "episode_*/scene.json"),
-    "plan run": ("units/*/*/*/outcome.json",),
+    "plan run": ("units/*/*/[0-9]*/outcome.json",),
     "eval": ("episodes.jsonl",),
 }
 

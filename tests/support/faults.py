@@ -68,7 +68,7 @@ class Command:
         patterns = {
             "generate": "episodes/seed_*.h5",
             "convert": "episode_*",
-            "plan run": "units/*/*/*/outcome.json",
+            "plan run": "units/*/*/[0-9]*/outcome.json",  # not in a temporary folder
             "eval": "episodes.jsonl",
         }
         found = list(out.glob(patterns[self.name])) + list(out.glob("trajectory.h5")) * EPISODES
