@@ -104,6 +104,6 @@ def test_it_is_measured_by_its_name(site, tmp_path):
     robocas(site, *command, "--backend", "processes", "--envs", 1, cwd=tmp_path)
     result = results.read(tmp_path / "eval" / "descend")
     assert result.run.policy.name == "descend"
-    assert result.run.policy.entries()["class"] == "my_policies:Descend"
+    assert result.run.policy.model_dump()["class"] == "my_policies:Descend"
     (outcome,) = result.outcomes.values()
     assert (outcome.task, outcome.error, outcome.steps) == ("pick", "", 3)

@@ -158,7 +158,8 @@ def test_a_protocol_of_its_own_is_frozen_and_measured_with(measured):
     folder, (frozen, scripted, still, verified, compared) = measured
     assert "2 episodes" in frozen
     assert "| push_zone | 2 | 100 % (16 to 100) | 100 % |  | 100 % | 0 % | 100 % |  |" in scripted
-    assert "| push_zone | reached_any 2 |" in still
+    assert "| configuration | n | failed | an object touched |" in still
+    assert "| push_zone | 2 | 2 | 2 |" in still
     assert "2 episodes of push-zone-v1, all well" in verified
     assert "| push_zone | A, B | 2 | 0 | 2 |" in compared
     page = (folder / "eval" / "still" / "report.html").read_text()

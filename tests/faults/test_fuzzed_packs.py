@@ -117,9 +117,9 @@ def test_arrays_that_unpack_to_more_than_there_may_be(tmp_path, monkeypatch):
     path = tmp_path / "annotations.npz"
     np.savez_compressed(path, zeros=np.zeros(2**20))
     assert path.stat().st_size < 2**14
-    with pytest.raises(DocumentError, match="more than 1 MB of arrays"):
+    with pytest.raises(DocumentError):
         open_arrays(path)
-    with pytest.raises(AssetError, match="can't read the annotations"):
+    with pytest.raises(AssetError):
         Annotations.load(path)
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("resting_poses.npy", b"\x93NUMPY\x01\x00")
