@@ -23,6 +23,7 @@ from robocas_ms3.core.files import empty_folder, json_text, make_folder, remove,
 from robocas_ms3.core.locks import LOCK, locked_folder
 
 _LEFTOVERS = (".*.tmp*", ".*.old")  # of `files.replacing` and `files.replacing_folder` in a process that was killed
+_OVERWRITTEN = "overwritten"  # key of a record whose content is being moved away; a run that finds it starts again
 _SHOWN_CHANGES = 8
 _SHOWN_VALUE = 60  # characters
 
@@ -134,7 +135,10 @@ class OutputFolder:
 
     def _hide_content(self) -> None:
         """Move the content into a temporary folder, which `sweep` deletes; the record is the last that is moved."""
-        old, record = Path(tempfile.mkdtemp(prefix=".", suffix=".old", dir=make_folder(self.path))), self._record_path()
+        record = self._record_path()
+        make_folder(record.parent)
+        write_json(record, {self._kind.key: None, _OVERWRITTEN: True}, sync=True)
+        old = Path(tempfile.mkdtemp(prefix=".", suffix=".old", dir=self.path))
         for entry in sorted(self.path.iterdir(), key=record.is_relative_to):
             if entry.name not in (LOCK, old.name):
                 os.replace(entry, old / entry.name)
@@ -159,6 +163,8 @@ class OutputFolder:
             record = load_json(self._record_path())
         if not isinstance(record, dict) or self._kind.key not in record:
             record = None
+        if record is not None and record.get(_OVERWRITTEN) is True:  # killed while it moved the content
+            self._overwrite = True
         if record is None:
             if not any((self.path / mark).exists() for mark in self._kind.marks):
                 known_by = [f"{self._kind.records[0]} with {self._kind.key!r}", *self._kind.marks]

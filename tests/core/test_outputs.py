@@ -99,6 +99,32 @@ def test_overwritten_folder_stays_until_the_start(tmp_path):
     assert names(tmp_path / "out") == ["episode_0", "run.json"]
 
 
+@pytest.mark.parametrize("record", ["run.json", "meta/run.json"])
+@pytest.mark.parametrize("moves", range(4))
+def test_run_killed_while_it_overwrites_is_started_again(tmp_path, monkeypatch, record, moves):
+    kind, out, replace, left = FolderKind("robocas test", (record,), "rate"), tmp_path / "out", os.replace, [moves]
+    with OutputFolder(out, kind, SETTINGS) as output:
+        output.start(SETTINGS)
+        for name in ("episode_0", "summary.json", "videos"):
+            (out / name).write_text("old")
+
+    def replace_some(source, target):
+        if Path(target).parent.name.endswith(".old"):
+            left[0] -= 1
+            if left[0] < 0:
+                raise KeyboardInterrupt
+        replace(source, target)
+
+    with monkeypatch.context() as patch, OutputFolder(out, kind, SETTINGS, overwrite=True) as output:
+        patch.setattr(os, "replace", replace_some)
+        with pytest.raises(KeyboardInterrupt):
+            output.start(SETTINGS)
+    with OutputFolder(out, kind, {"rate": 10}) as output:
+        assert output.recorded is None
+        output.start({"rate": 10})
+        assert names(out) == [record.split("/")[0]]
+
+
 def test_link_to_an_overwritten_folder_stays(tmp_path):
     write_run(tmp_path / "disk" / "data")
     (tmp_path / "out").symlink_to(tmp_path / "disk" / "data")
