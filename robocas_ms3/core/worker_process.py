@@ -52,6 +52,10 @@ class Limits:
 NO_LIMITS = Limits()
 
 
+class ProcessDied(WorkerCrashed):
+    """The process of a task died; other than a `WorkerCrashed` that the task itself raised."""
+
+
 class Worker(Protocol[Task_contra, Result_co]):
     """Keeps what tasks need, and runs one task after the other."""
 
@@ -82,11 +86,11 @@ class WorkerProcess(Generic[Task, Result]):
         self._checked = 0.0  # time of the last check of the memory limit
 
     def run(self, task: Task) -> Result:
-        """Run a task; raises WorkerStartError, WorkerCrashed, CancelledError, or the error of the task."""
+        """Run a task; raises WorkerStartError, ProcessDied, CancelledError, or the error of the task."""
         if self._process is None or self._process.poll() is not None:
             try:
                 self._start()
-            except WorkerCrashed as crash:
+            except ProcessDied as crash:
                 what, fix = "a worker process died before its first task", "See its output above, and robocas doctor."
                 raise WorkerStartError(what, found=crash.found, fix=fix) from crash
             except BaseException:
@@ -147,7 +151,7 @@ class WorkerProcess(Generic[Task, Result]):
             answer.reraise()
         return answer
 
-    def _crash(self, reason: str = "") -> WorkerCrashed:
+    def _crash(self, reason: str = "") -> ProcessDied:
         """End the process, and return the error that says why."""
         assert self._process is not None
         if not reason:
@@ -158,7 +162,7 @@ class WorkerProcess(Generic[Task, Result]):
             if code in (-signal.SIGTERM, -signal.SIGKILL):
                 wait([self._stop], _JOB_KILL_SECONDS)  # else the task would be blamed for the end of all
         self._end()
-        return WorkerCrashed("its worker process died", found=reason)
+        return ProcessDied("its worker process died", found=reason)
 
     def _end(self) -> None:
         if self._process is not None:

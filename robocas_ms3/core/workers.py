@@ -29,7 +29,7 @@ from typing import Any, Generic, TypeVar
 
 from robocas_ms3.core.errors import WorkerCrashed, WorkerStartError
 from robocas_ms3.core.exits import deferred_interrupts
-from robocas_ms3.core.worker_process import NO_LIMITS, Limits, Worker, WorkerProcess
+from robocas_ms3.core.worker_process import NO_LIMITS, Limits, ProcessDied, Worker, WorkerProcess
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -194,7 +194,7 @@ class WorkerPool(Generic[Task, Result]):
             except WorkerStartError:
                 if not retries_left:
                     raise
-            except WorkerCrashed as crash:
+            except ProcessDied as crash:
                 reason = str(crash.found)
                 if retries_left:
                     _log.warning("%.80s: its worker process died (%s); it is tried again", task, reason)

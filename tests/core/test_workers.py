@@ -131,6 +131,21 @@ def test_a_crash_is_an_error_by_default():
         assert (caught.value.where, caught.value.found) == ("die", "SIGSEGV")
 
 
+def run_pool_in_task(path):
+    path.write_text(path.read_text() + "x")
+    with WorkerPool(Counter, 1, retries=0) as pool:
+        return pool.run("die")
+
+
+def test_a_crash_in_a_pool_of_the_task_is_an_error_of_the_task(tmp_path):
+    (tmp_path / "log").write_text("")
+    make_worker = partial(FunctionWorker, run_pool_in_task)
+    with WorkerPool(make_worker, 1, on_crash=lambda _, why: why) as pool, pytest.raises(WorkerCrashed) as caught:
+        pool.run(tmp_path / "log")
+    assert caught.value.where == "die"
+    assert (tmp_path / "log").read_text() == "x"  # not tried again
+
+
 @pytest.mark.parametrize(
     ("task", "limits", "reason"),
     [("hang", Limits(seconds=1.2), "too slow"), ("grow", Limits(memory_gb=0.3), "too much memory")],
