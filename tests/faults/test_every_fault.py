@@ -130,7 +130,7 @@ def test_a_task_whose_process(command, undisturbed, tmp_path, row, fault, times)
         succeed(words)
         row.judge(expected, content(command, out))
         return
-    assert code == 0, said[-2000:]
+    assert code == (command.name == "eval"), said[-2000:]  # an episode with an error: exit status 1
     found = content(command, out)
     row.judge(expected, found, without=(1,))
     if command.name == "eval":
