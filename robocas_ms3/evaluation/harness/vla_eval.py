@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import EvaluationError
+from robocas_ms3.evaluation.harness.proprioception import WIDTHS, Proprioception
 from robocas_ms3.evaluation.metrics import MEASURES
 from robocas_ms3.evaluation.outcomes import STAGES
 from robocas_ms3.evaluation.policy import ExternalPolicy, Observations
@@ -23,7 +24,7 @@ from robocas_ms3.evaluation.protocol import Episode
 from robocas_ms3.evaluation.remote.messages import actions_of, read_policy_spec
 from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
-from robocas_ms3.robots.description import RobotDescription
+from robocas_ms3.robots.table import find_robot
 
 # vla-eval's names of rotations
 _ROTATIONS = {
@@ -66,6 +67,7 @@ class RoboCAS:
             self._of_config.setdefault(episode.config, []).append(episode)
         self._episode: Episode | None = None
         self._seen: Observations | None = None
+        self._proprioception = Proprioception()
         self._recorder: Any = None
         self._started = 0.0  # clock time, s
 
@@ -111,7 +113,7 @@ class RoboCAS:
         from vla_eval.specs import IMAGE_RGB, LANGUAGE, DimSpec  # pyright: ignore[reportMissingImports]
 
         images = dict.fromkeys(["image", *self._spec.cameras] if self._spec.cameras else [], IMAGE_RGB)
-        return {**images, "state": DimSpec("state", 18, "robocas"), "language": LANGUAGE}
+        return {**images, "state": DimSpec("state", WIDTHS["agent_pos"], "robocas"), "language": LANGUAGE}
 
     def get_hold_action(self, last_action: dict[str, Any] | None) -> dict[str, Any]:
         """Refuse mode ``live``, in which clock time chooses the steps."""
@@ -130,6 +132,8 @@ class RoboCAS:
         episode = episodes[number]
         self._episode, self._recorder, self._started = episode, recorder, time.monotonic()
         self._seen = self._session.reset([episode.episode])
+        robot = find_robot(self._session.protocol.rules.robot)
+        self._proprioception.reset(0, self._session.observation, robot)
         self._record()
 
     async def apply_action(self, action: Mapping[str, Any]) -> None:
@@ -143,12 +147,15 @@ class RoboCAS:
         self._record()
 
     async def get_observation(self) -> dict[str, Any]:
-        """Return ``images`` (H, W, 3) uint8 by camera, ``state`` (18,) and ``task_description``."""
+        """Return ``images`` (H, W, 3) uint8 by camera, ``state`` and ``task_description``.
+
+        ``state`` (18,) float32 is ``observation.state`` of our LeRobot datasets.
+        """
         seen = self._seen
         assert seen is not None  # vla-eval asks for no observation of an episode that has ended
         return {
             "images": {name: images[0] for name, images in seen.images.items()},
-            "state": state_of(seen),
+            "state": self._proprioception.read(0, self._session.observation, None)["agent_pos"],
             "task_description": seen.instructions[0],
         }
 
@@ -190,17 +197,6 @@ class RoboCAS:
     def _record(self) -> None:
         if self._recorder is not None:
             self._recorder.record_video(self.render())
-
-
-def state_of(seen: Observations) -> NDArray[np.float32]:
-    """Return the state (18,) as in ``observation.state`` of our LeRobot datasets.
-
-    TCP in the arm's base frame, position m and quaternion xyzw; seven joints, rad; width of the gripper, m; the base's
-    x, y, m, and yaw, rad.
-    """
-    tcp, qpos = seen.tcp_in_base[0], seen.qpos[0]
-    arm, base = qpos[RobotDescription.arm_slice], qpos[RobotDescription.base_slice]
-    return np.concatenate([tcp[:3], tcp[[4, 5, 6, 3]], arm, seen.gripper_width[0], base]).astype(np.float32)
 
 
 def _gripper(spec: Any) -> Any:

@@ -91,9 +91,10 @@ def test_what_is_seen(benchmark):
     seen = asyncio.run(play(benchmark, {**benchmark.get_tasks()[0], "episode_idx": 0}))["seen"]
     assert [one["images"]["base_camera"].max() for one in seen] == [0, 1, 2, 3, 4]
     assert seen[0]["images"]["base_camera"].shape == (4, 6, 3)
-    # position, quaternion xyzw of one stored wxyz, joints 3 to 9, width, base
-    expected = [1, 2, 3, 0.1, 0.2, 0.3, 0.4, 13, 14, 15, 16, 17, 18, 19, 0.05, 10, 11, 12]
-    np.testing.assert_allclose(seen[0]["state"], expected)
+    state = seen[0]["state"]
+    np.testing.assert_allclose(state[7:14], [13, 14, 15, 16, 17, 18, 19])  # arm joints 3 to 9
+    assert state[14] == 41  # the fingers, 20 and 21
+    np.testing.assert_allclose(state[15:], [0, 0, 0], atol=1e-5)  # base in the world, not its joints 10, 11, 12
     assert seen[0]["state"].dtype == np.float32
 
 
