@@ -205,7 +205,7 @@ def read_episode(
     if read.usable:
         cameras = [Finding(number, f"{name}/{file}", text, "left out") for file, text in _check_cameras(episode)]
         read = read.extended(cameras)
-    if read.usable and turn_eef and EE_CAMERA in episode.cameras:
+    if read.usable and turn_eef and EE_CAMERA in episode.cameras and not episode.scene.get("env_info"):
         turn = eef_turn(episode.camera_in_parent(EE_CAMERA))
         if turn:
             text = f"EEF frame turned by {turn} degrees about z, to be ManiSkill's TCP"

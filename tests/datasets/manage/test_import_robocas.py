@@ -241,6 +241,21 @@ def test_a_turned_eef_frame_is_turned_back(upstream, made, tmp_path, degrees):
         )
 
 
+def test_a_recorded_episode_is_not_turned_wherever_its_camera_is(dataset):
+    def turned():
+        return [finding.episode for finding in survey(dataset).findings if "ee_orn" in finding.file]
+
+    (dataset / "conversion.json").unlink()
+    folder = dataset / schema.episode_folder(1)
+    pose = np.load(folder / "gripper_camera" / "cam_pos_wrt_ee.npy")
+    pose[:2, 3] = 0, 0.05
+    np.save(folder / "gripper_camera" / "cam_pos_wrt_ee.npy", pose)
+    assert turned() == []
+    scene = json.loads((folder / "scene.json").read_text())
+    (folder / "scene.json").write_text(json.dumps({**scene, "env_info": None}))  # as of a dataset made elsewhere
+    assert turned() == [1]
+
+
 def test_the_turn_by_hand():
     def camera_at(x, y):
         pose = np.eye(4)
