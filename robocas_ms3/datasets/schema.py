@@ -43,7 +43,6 @@ ImageFormat = Literal["png", "jpg", "webp"]
 IMAGE_FORMATS: tuple[ImageFormat, ...] = ("png", "jpg", "webp")
 """Of RGB; the released loader opens ``png`` only. Depth is always PNG, which loses nothing."""
 MAX_STEPS = 10_000  # four digits in image names
-MAX_DEPTH_MM = 65_535
 
 
 EPISODE_INFO: tuple[ArraySpec, ...] = (

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import pi
 from typing import Literal
+
+from robocas_ms3.core.errors import ExtensionError
 
 Vec3 = tuple[float, float, float]
 Mount = Literal["world", "base", "hand"]
@@ -35,6 +38,9 @@ class CameraSpec:
         fov: vertical field of view, rad.
         width, height: pixels.
         near, far: range of the depth, m.
+
+    Raises:
+        ExtensionError: the name is another one; datasets know camera folders by their names.
     """
 
     name: str
@@ -48,6 +54,11 @@ class CameraSpec:
     height: int = 480
     near: float = 0.01
     far: float = 10.0
+
+    def __post_init__(self) -> None:
+        """Check the name."""
+        if not re.fullmatch(CAMERA_NAME, self.name):
+            raise ExtensionError("invalid camera name", expected="a name like side_camera", found=self.name)
 
     @property
     def parent(self) -> Parent:

@@ -8,6 +8,7 @@ import pytest
 
 from robocas_ms3.assets.annotations import GRIPPER_BOXES
 from robocas_ms3.core.errors import ExtensionError, RobocasError
+from robocas_ms3.robots.cameras import CameraSpec
 from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.table import DEFAULT, PANDA, ROBOTS, find_robot
 from robocas_ms3.robots.urdf import robot_files
@@ -55,3 +56,9 @@ def test_a_row_by_another_name_is_refused(monkeypatch):
     monkeypatch.setitem(ROBOTS.builtin, "other", PANDA)
     with pytest.raises(ExtensionError, match="a robot by another name .expected robocas_mobile_panda, found other"):
         find_robot("other")
+
+
+@pytest.mark.parametrize("name", ["top", "Side_camera", "../side_camera", ""])
+def test_a_camera_whose_name_datasets_would_not_know(name):
+    with pytest.raises(ExtensionError):
+        CameraSpec(name)

@@ -145,12 +145,3 @@ class Levels:
             found[name] = values[(below < share * total[:, None]).sum(axis=1)]
         shaped = {name: row.reshape(-1, 1, 1).tolist() for name, row in found.items()}
         return {**shaped, "count": [self.images]}
-
-
-def shape_of(value: Any) -> tuple[int, ...] | str:
-    """Return the shape of numbers in nested lists, or that they are no numbers."""
-    try:
-        array = np.asarray(value)
-    except ValueError:  # lists of different lengths
-        return "no numbers"
-    return array.shape if array.dtype.kind in "iuf" else "no numbers"
