@@ -20,6 +20,8 @@ from typing import Any
 
 import yaml
 
+from robocas_ms3.core.words import one_line
+
 JSON_LIMIT = 256 * 2**20
 """Bytes: a hundred thousand recordings have 230 MB of it."""
 YAML_LIMIT = 4 * 2**20
@@ -133,7 +135,7 @@ def load_yaml(path: Path) -> Any:
         try:
             return yaml.load(text, Loader=_Loader)  # noqa: S506  (a SafeLoader)
         except (yaml.YAMLError, ValueError, AttributeError, LookupError, TypeError, OverflowError) as error:
-            raise DocumentError(" ".join(str(error).split())) from error
+            raise DocumentError(one_line(error)) from error
 
 
 def open_arrays(path: Path) -> Any:

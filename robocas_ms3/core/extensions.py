@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 from robocas_ms3.core.errors import ExtensionError
 from robocas_ms3.core.exits import no_exit
-from robocas_ms3.core.words import nearest
+from robocas_ms3.core.words import error_line, nearest
 
 _log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -87,8 +87,8 @@ class Registry(Mapping[str, T]):
         except ExtensionError:
             raise
         except Exception as error:  # code of another package may raise anything
-            message = " ".join(f"{type(error).__name__}: {error}".split())
-            raise ExtensionError(f"this {self.kind} can't be loaded", where=where, found=message, fix=fix) from error
+            what = f"this {self.kind} can't be loaded"
+            raise ExtensionError(what, where=where, found=error_line(error), fix=fix) from error
         if not isinstance(found, self.type):
             expected, what = f"a {self.type.__name__}", f"not a {self.kind}"
             raise ExtensionError(what, where=where, expected=expected, found=type(found).__name__, fix=fix)

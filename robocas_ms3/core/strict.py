@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError, model_
 
 from robocas_ms3.core.documents import DocumentError, json_values
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.core.words import nearest
+from robocas_ms3.core.words import nearest, one_line
 
 _Model = TypeVar("_Model", bound=BaseModel)
 _Error = TypeVar("_Error", bound=RobocasError)
@@ -193,11 +193,11 @@ def _mistake(key: str, same: list[Any], schema: dict[str, Any], words: Mapping[s
         what, expected = f"wrong value for '{f'{key}.{tag}' if key else tag}'", f"one of {kinds}"
         found, fix = repr(name) if name else "nothing", nearest(name, kinds)
     elif kind == "value_error":
-        message = _line(details["msg"].removeprefix("Value error, "))
+        message = one_line(details["msg"].removeprefix("Value error, "))
         what = f"{key}: {message}" if key else message
         found = repr(value)[:_FOUND_LENGTH] if isinstance(value, str | int | float) and str(value) not in what else ""
     elif kind == "json_invalid":
-        what, found = "this is not valid JSON", _line(context["error"])
+        what, found = "this is not valid JSON", one_line(context["error"])
     else:
         expected = " or ".join(dict.fromkeys(_expected(details, words) for details in same))
         found = "nothing" if kind == "missing" else repr(value)
@@ -212,7 +212,7 @@ def _expected(details: Any, words: Mapping[str, str]) -> str:
     if kind == "string_pattern_mismatch":
         return f"a string like {details['ctx']['pattern']}"
     message = re.sub(r"^(Value error, )?(Input|List|Tuple|Dictionary|String) should (be |have )?", "", details["msg"])
-    return words.get(kind, _line(message.replace(" after validation", "")))
+    return words.get(kind, one_line(message.replace(" after validation", "")))
 
 
 def _place(location: tuple[int | str, ...], schema: dict[str, Any]) -> tuple[list[str], dict[str, Any]]:
@@ -232,7 +232,7 @@ def _place(location: tuple[int | str, ...], schema: dict[str, Any]) -> tuple[lis
         elif choices:
             node = next((choice for choice in choices if choice.get("type") == "array"), {})
         else:
-            keys.append(" ".join(str(part).split()))
+            keys.append(one_line(part))
             inner = node.get("properties", {}).get(part) or node.get("additionalProperties") or node.get("items")
             node = inner if isinstance(inner, dict) else {}
         node = _resolved(node, schema)
@@ -243,7 +243,3 @@ def _resolved(node: dict[str, Any], schema: dict[str, Any]) -> dict[str, Any]:
     real = [choice for choice in node.get("anyOf", ()) if choice.get("type") != "null"]
     node = real[0] if len(real) == 1 else node  # X | None
     return schema["$defs"][node["$ref"].rsplit("/", 1)[-1]] if "$ref" in node else node
-
-
-def _line(text: object) -> str:
-    return " ".join(str(text).split())

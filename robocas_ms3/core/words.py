@@ -12,6 +12,8 @@ from difflib import get_close_matches
 from types import TracebackType
 from typing import Any
 
+from robocas_ms3.core.errors import RobocasError
+
 # C0, DEL and C1 control characters, line and paragraph separators, marks and overrides of the text direction, lone
 # surrogates (bytes of a file name that are not UTF-8)
 _UNPRINTABLE = r"[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]"
@@ -48,6 +50,24 @@ def printable(text: str, *, lines: bool = False) -> str:
     """
     pattern = _CONTROL_IN_LINES if lines else _CONTROL
     return pattern.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
+
+
+def one_line(text: object, most: int | None = None) -> str:
+    """Return a text or an error's message as one printable line; an error without a message gives its type's name.
+
+    Args:
+        text: from anywhere.
+        most: characters of the text that are shown; None: all.
+    """
+    if isinstance(text, KeyError) and text.args:
+        text = f"no key {text}"
+    line = " ".join(str(text).split()) or (type(text).__name__ if isinstance(text, BaseException) else "")
+    return printable(line[:most])
+
+
+def error_line(error: BaseException, most: int | None = None) -> str:
+    """Return an error as `one_line` does, after the name of its type where it is not one of ours."""
+    return one_line(error if isinstance(error, RobocasError) else f"{type(error).__name__}: {error}", most)
 
 
 def in_markdown(text: str) -> str:

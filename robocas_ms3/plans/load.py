@@ -13,7 +13,8 @@ from robocas_ms3.assets.pack import MANIFEST, pack_folders, sha256
 from robocas_ms3.core.documents import DocumentError, load_yaml
 from robocas_ms3.core.errors import MissingExtraError, PlanError, RobocasError
 from robocas_ms3.core.paths import plans_dir
-from robocas_ms3.core.strict import nearest, parse
+from robocas_ms3.core.strict import parse
+from robocas_ms3.core.words import error_line, nearest
 from robocas_ms3.demos.recordings.entries import GREATEST_SEED
 from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.plans.plan import PartConfig, Plan
@@ -135,7 +136,7 @@ def opening_part(plan: Plan, part: int) -> Iterator[None]:
     except Exception as error:
         if isinstance(error, OSError) and error.errno:
             raise
-        found, fix = " ".join(f"{type(error).__name__}: {error}".split()), "Repair it, and run the command again."
+        found, fix = error_line(error), "Repair it, and run the command again."
         raise PlanError("this part can't be opened", where=f"part {config.name}", found=found, fix=fix) from error
 
 

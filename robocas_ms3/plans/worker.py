@@ -21,6 +21,7 @@ from robocas_ms3.core.errors import (
 )
 from robocas_ms3.core.files import remove
 from robocas_ms3.core.outputs import sweep
+from robocas_ms3.core.words import error_line
 from robocas_ms3.core.workers import Limits, Worker, WorkerPool
 from robocas_ms3.plans.folder import check_plan_record
 from robocas_ms3.plans.plan import Plan
@@ -116,7 +117,7 @@ class UnitWorker:
             except Exception as error:
                 if not _is_of_a_seed(error):
                     raise
-                reason = f"{type(error).__name__}: {error}".splitlines()[0][:200]
+                reason = error_line(error, 200)
             deaths.append(f"{stage}: {reason}")
             sweep(files.folder)
         return {"success": False, "failures": [deaths[-1]]}

@@ -3,7 +3,8 @@ import re
 import subprocess
 import sys
 
-from robocas_ms3.core.words import called, count_of, in_markdown, printable
+from robocas_ms3.core.errors import RobocasError
+from robocas_ms3.core.words import called, count_of, error_line, in_markdown, one_line, printable
 
 
 def test_one_is_no_plural():
@@ -43,6 +44,14 @@ def test_a_text_in_markdown_has_no_markup():
         assert not re.search(r"(?<![\w\\])_|(?<!\\)_(?!\w)", shown)
         assert re.sub(r"\\([!-/:-@\[-`{-~])", r"\1", shown) == printable(text)
     assert in_markdown("pick_table_scattered 0.5 \x1b") == "pick_table_scattered 0.5 \\u001b"
+
+
+def test_an_error_is_one_line():
+    assert one_line(ValueError("a\n  b\x1b"), 3) == "a b"
+    assert one_line(TimeoutError()) == "TimeoutError"
+    assert one_line(KeyError("steps")) == "no key 'steps'"
+    assert error_line(OSError("no\nroom")) == "OSError: no room"
+    assert error_line(RobocasError("bad", where="file")) == "file: bad"
 
 
 def test_log_lines_of_this_package_are_one_line_without_control_characters(tmp_path):

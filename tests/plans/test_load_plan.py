@@ -89,11 +89,7 @@ def test_a_pack_that_was_changed_is_noticed(written, tmp_path):
 @pytest.mark.parametrize(
     ("error", "raised", "match"),
     [
-        (
-            ConfigError("no such thing"),
-            PlanError,
-            "part a: .*found ConfigError: no",
-        ),
+        (ConfigError("no such thing"), PlanError, "part a: .*found no such thing"),
         (RuntimeError("no device\nat all"), PlanError, "found RuntimeError: no device at all"),
         (OSError("can't be read"), PlanError, "found OSError: can't be read"),
         (OSError(errno.EIO, "Input/output error", "x"), OSError, "Input/output error"),

@@ -22,6 +22,7 @@ from robocas_ms3.core.errors import MissingExtraError, PlanError, RobocasError
 from robocas_ms3.core.exits import deferred_interrupts
 from robocas_ms3.core.files import ABANDONED, make_folder, write_json
 from robocas_ms3.core.strict import StrictModel
+from robocas_ms3.core.words import one_line
 from robocas_ms3.plans.executors import ThreadExecutor
 from robocas_ms3.plans.folder import PLAN, read_plan_record
 from robocas_ms3.plans.plan import Plan
@@ -92,10 +93,10 @@ class RayExecutor(ThreadExecutor):
         except ray.exceptions.RayTaskError as error:
             if isinstance(error.cause, RobocasError | OSError):
                 raise error.cause from error
-            fix = "Do all nodes have robocas-ms3, in the same Python?"
-            raise PlanError("a task of Ray failed", where="--executor ray", found=_line(error), fix=fix) from error
+            found, fix = one_line(error)[-300:], "Do all nodes have robocas-ms3, in the same Python?"
+            raise PlanError("a task of Ray failed", where="--executor ray", found=found, fix=fix) from error
         except ray.exceptions.RayError as error:
-            _log.warning("a task of Ray was lost: %s", _line(error))
+            _log.warning("a task of Ray was lost: %s", one_line(error)[-300:])
         finally:
             self._tasks.discard(task)
 
@@ -146,7 +147,7 @@ def _connect(options: RayOptions, jobs: int) -> None:
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **chosen)
     except (ray.exceptions.RayError, OSError, OverflowError, RuntimeError, ValueError) as error:
         fix = "See `ray status` there."
-        raise PlanError("no cluster of Ray answers", where=address, found=_line(error), fix=fix) from error
+        raise PlanError("no cluster of Ray answers", where=address, found=one_line(error)[-300:], fix=fix) from error
     wanted = {"CPU": options.num_cpus, "GPU": options.num_gpus}
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
     if not any(all(node.get(kind, 0) >= count for kind, count in wanted.items()) for node in nodes):
@@ -226,7 +227,3 @@ def _temporary_folder() -> Iterator[Path]:
                 shutil.rmtree(path, ignore_errors=True)
     with tempfile.TemporaryDirectory(prefix=_TEMPORARY, ignore_cleanup_errors=True) as folder:
         yield Path(folder)
-
-
-def _line(error: Exception) -> str:
-    return " ".join(f"{error}".split())[-300:]
