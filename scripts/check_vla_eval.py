@@ -44,6 +44,7 @@ from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
 from robocas_ms3.robots.description import RobotDescription
+from robocas_ms3.robots.quantities import GRIPPER_WIDTH, STATE, columns_of
 
 OURS = "robocas_ms3.evaluation.harness.vla_eval:RoboCAS"
 TASKS, EACH, CHUNK = ["pick", "select"], 2, 4
@@ -72,7 +73,7 @@ class Remembering(ScriptedPolicy):
         actions = super().act(observations)
         images = {name: images[0] for name, images in observations.images.items()}
         parts = (observations.tcp_in_base[0, :3], observations.qpos[0, RobotDescription.arm_slice])
-        state = np.concatenate([*parts, observations.gripper_width[0]])
+        state = np.concatenate([*parts, observations.robot[GRIPPER_WIDTH][0]])
         self.now.append({"actions": actions[0], "state": state, **images})
         return actions
 
@@ -97,7 +98,9 @@ class RememberingServer(PredictModelServer):
                 file.write(json.dumps([name, number, obs["task_description"]]) + "\n")
         then = {key: self.memory[f"{name} {number} {key}"] for key in ("actions", "state", *CAMERAS)}
         # without quaternion, whose sign is free, and base, which a policy does not see
-        assert np.allclose(np.delete(obs["state"][:15], slice(3, 7)), then["state"][ctx.step], atol=1e-4)
+        columns = [columns_of(STATE)[key] for key in ("ee_pos", "robot_joints", GRIPPER_WIDTH)]
+        state = np.concatenate([obs["state"][part] for part in columns])
+        assert np.allclose(state, then["state"][ctx.step], atol=1e-4)
         assert list(obs["images"]) == list(CAMERAS)
         for camera, image in obs["images"].items():
             assert image.shape == then[camera][ctx.step].shape

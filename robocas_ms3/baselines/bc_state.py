@@ -28,6 +28,7 @@ from robocas_ms3.demos.recordings.motion import sample_states, sample_stride
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
 from robocas_ms3.evaluation.policy import Observations, PolicySpec, privileged
 from robocas_ms3.robots.description import RobotDescription
+from robocas_ms3.robots.quantities import GRIPPER_WIDTH
 
 _CACHE_VERSION = 3
 _PACKAGES = ("robocas-ms3", "mani_skill", "sapien")
@@ -256,7 +257,9 @@ class BcState:
         def predict(seen: Observations, row: int) -> NDArray[np.floating]:
             assert seen.state is not None
             one = slice(row, row + 1)
-            inputs = inputs_of(seen.state[one], from_wxyz(seen.tcp_in_base[one]), seen.gripper_width.reshape(-1)[one])
+            inputs = inputs_of(
+                seen.state[one], from_wxyz(seen.tcp_in_base[one]), seen.robot[GRIPPER_WIDTH].reshape(-1)[one]
+            )
             if inputs.shape[1] != size:
                 what, fix = "the policy was trained in other scenes", "Evaluate it in the task and scenes of its data."
                 raise EvaluationError(

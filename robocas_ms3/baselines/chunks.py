@@ -20,6 +20,7 @@ from torch.nn import functional as F
 from robocas_ms3.baselines.baseline import Batch
 from robocas_ms3.core.poses import Array, from_parts, from_wxyz, inverse
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
+from robocas_ms3.robots.quantities import GRIPPER_WIDTH
 
 ROW = 10
 _MIN_DEVIATION = np.array([0.004] * 3 + [0.02] * 6)  # m and 1: smaller deviations are noise
@@ -215,7 +216,7 @@ class ChunkPolicy:
             if not plans or plans[0].age >= self._play:
                 chunk = self._predict(observations, row)  # alone: in a batch, its last bits depend on the other rows
                 plans.insert(0, _Plan(*decode(chunk, tcp[row])))
-                if self._is_stuck(env, tcp[row, :3, 3], float(observations.gripper_width.reshape(-1)[row])):
+                if self._is_stuck(env, tcp[row, :3, 3], float(observations.robot[GRIPPER_WIDTH].reshape(-1)[row])):
                     plans = [replace(plan, opened=np.ones_like(plan.opened)) for plan in plans]  # else outvoted
             self._plans[env] = plans
         return np.stack([self._next(self._plans[env], here) for env, here in zip(envs, tcp, strict=True)])

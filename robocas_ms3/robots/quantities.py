@@ -98,7 +98,10 @@ def continuous_xyzw(poses: Array) -> Array:
 
 _JOINTS = tuple(f"joint_{number}" for number in range(1, 8))
 _XYZ, _XYZW = ("x", "y", "z"), ("qx", "qy", "qz", "qw")
-_STATE, _ARM_BASE = "observation.state", "observation.arm_base"
+GRIPPER_WIDTH = "gripper_width"
+"""Key of the distance between the finger pads, in observations, remote messages and recordings."""
+STATE, ARM_BASE = "observation.state", "observation.arm_base"
+"""LeRobot features that hold several quantities."""
 _EE = "EEF (TCP) in the arm base frame (panda_link0)"
 _BASE = "arm base in the world"
 
@@ -153,7 +156,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         "m",
         _EE,
         recorded=lambda motion: motion.tcp_in_base[:, :3, 3],
-        feature=_STATE,
+        feature=STATE,
         components=_XYZ,
     ),
     Quantity(
@@ -164,7 +167,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         _EE,
         quaternion=True,
         recorded=lambda motion: continuous_xyzw(motion.tcp_in_base),
-        feature=_STATE,
+        feature=STATE,
         components=_XYZW,
     ),
     Quantity(
@@ -174,7 +177,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         "rad",
         "arm joints",
         recorded=lambda motion: motion.qpos[:, RobotDescription.arm_slice],
-        feature=_STATE,
+        feature=STATE,
         components=_JOINTS,
     ),
     Quantity(
@@ -194,7 +197,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         "m",
         _BASE,
         recorded=lambda motion: motion.arm_base_in_world[:, :3, 3],
-        feature=_ARM_BASE,
+        feature=ARM_BASE,
         components=_XYZ,
     ),
     Quantity(
@@ -205,7 +208,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         _BASE,
         quaternion=True,
         recorded=lambda motion: continuous_xyzw(motion.arm_base_in_world),
-        feature=_ARM_BASE,
+        feature=ARM_BASE,
         components=_XYZW,
     ),
     Quantity(
@@ -226,16 +229,16 @@ QUANTITIES: tuple[Quantity, ...] = (
         recorded=lambda motion: motion.base_motion[1],
     ),
     Quantity(
-        "gripper_width",
+        GRIPPER_WIDTH,
         "float32",
         ("T",),
         "m",
         "distance between the finger pads: sum of both finger joints",
         limits=(-0.005, 0.085),
         observed=lambda agent: agent.gripper_width[:, None],
-        policy="gripper_width",
+        policy=GRIPPER_WIDTH,
         recorded=lambda motion: motion.qpos[:, RobotDescription.finger_slice].sum(axis=1),
-        feature=_STATE,
+        feature=STATE,
     ),
     Quantity(
         "gripper_status",
@@ -254,7 +257,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         "m, m, rad",
         "mobile base in the world: x, y, yaw, which never jumps",
         recorded=lambda motion: motion.agv_pose,
-        feature=_STATE,
+        feature=STATE,
         components=("agv_x", "agv_y", "agv_yaw"),
     ),
     Quantity(
@@ -275,3 +278,11 @@ def features() -> dict[str, list[Quantity]]:
         if quantity.feature:
             found.setdefault(quantity.feature, []).append(quantity)
     return found
+
+
+def columns_of(feature: str) -> dict[str, slice]:
+    """Return the columns of each quantity in a LeRobot feature (T, D), by its name."""
+    columns, first = {}, 0
+    for quantity in features()[feature]:
+        columns[quantity.name] = slice(first, first := first + quantity.width)
+    return columns

@@ -13,13 +13,14 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import from_xyzw
 from robocas_ms3.core.words import called
 from robocas_ms3.demos.recordings.subgoals import subgoal_runs
+from robocas_ms3.robots.quantities import GRIPPER_WIDTH
 
 XYZ = ("x", "y", "z")
 ROLL_PITCH_YAW = ("roll", "pitch", "yaw")
 ARM = tuple(f"j{i}" for i in range(1, 8))
 _OPEN_WIDTH = 0.08  # m
 _NEEDED = (
-    *("ee_pos", "ee_orn", "base_pos", "base_orn", "rel_pos", "rel_orn", "robot_joints", "gripper_width"),
+    *("ee_pos", "ee_orn", "base_pos", "base_orn", "rel_pos", "rel_orn", "robot_joints", GRIPPER_WIDTH),
     *("step_goal_type", "step_lang_goals"),
 )
 
@@ -74,7 +75,7 @@ def show_arrays(
             plot("TCP position, arm base", "m", XYZ, a["ee_pos"]),
             plot("TCP orientation, arm base", "quaternion", ("x", "y", "z", "w"), continuous(a["ee_orn"])),
             plot("Arm joints", "rad", ARM, a["robot_joints"]),
-            gripper_plot(a["gripper_width"], a.get("gripper_status")),
+            gripper_plot(a[GRIPPER_WIDTH], a.get("gripper_status")),
             *actions,
             *(base_plot(a["agv_pose"]) if "agv_pose" in a else []),
         ],

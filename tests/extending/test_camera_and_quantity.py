@@ -9,11 +9,17 @@ import sys
 import pytest
 from strangers import ROOT
 
-# runs when Python starts, in workers too; in the package this is an entry of the list
+# runs when Python starts, in workers too; in the package these are entries of the list
 ENTRY = """
 from robocas_ms3.robots import quantities
 
-quantities.QUANTITIES += (
+quantities.QUANTITIES = (
+    quantities.Quantity(
+        "yaw", "float32", ("T",), "rad", "of the base, in its root",
+        recorded=lambda motion: motion.qpos[:, 2],
+        feature="observation.state",
+    ),
+    *quantities.QUANTITIES,
     quantities.Quantity(
         "fingers", "float32", ("T", 2), "m", "positions of both fingers",
         observed=lambda agent: agent.robot.get_qpos()[:, 10:],
@@ -79,6 +85,7 @@ def main():
         assert run(words.split()) == 0, words
     sources = [open_source(Path(name)) for name in ("demos/trajectory.h5", "robocas", "lerobot")]
     arrays = [source.episode(0).arrays["fingers"] for source in sources]
+    assert np.array_equal(sources[2].episode(0).arrays["yaw"], sources[0].episode(0).arrays["yaw"])
     assert arrays[0].shape == (sources[0].lengths[0], 2) and arrays[0].max() > 0.03
     for source, fingers in zip(sources[1:], arrays[1:]):
         assert source.cameras == CAMERAS and np.array_equal(fingers, arrays[0])

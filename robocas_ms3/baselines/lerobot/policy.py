@@ -17,14 +17,15 @@ from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.robots.cameras import CAMERA_NAME
 from robocas_ms3.robots.description import RobotDescription
+from robocas_ms3.robots.quantities import GRIPPER_WIDTH, STATE
 
-STATE, EMBEDDING, ACTION = "observation.state", "observation.environment_state", "action"
+EMBEDDING, ACTION = "observation.environment_state", "action"
 """Keys of LeRobot. Its policies take what is no robot's as the environment's state; ours holds the instruction."""
 STATE_NAMES = (
     *("x", "y", "z"),
     *("xx", "xy", "xz", "yx", "yy", "yz"),
     *(f"joint_{number}" for number in range(1, 8)),
-    "gripper_width",
+    GRIPPER_WIDTH,
 )
 """TCP in the arm's base, m; its x and y axes there; rad; m."""
 DIMENSIONS = 384  # of an embedding
@@ -125,7 +126,7 @@ class LeRobotPolicy:
         one = slice(row, row + 1)
         tcp = observations.tcp_in_base[one]
         joints = observations.qpos[one, RobotDescription.arm_slice]
-        state = state_of(tcp[:, :3], tcp[:, [4, 5, 6, 3]], joints, observations.gripper_width[one])
+        state = state_of(tcp[:, :3], tcp[:, [4, 5, 6, 3]], joints, observations.robot[GRIPPER_WIDTH][one])
         item: dict[str, Any] = {"task": observations.instructions[row], STATE: torch.from_numpy(state[0])}
         if EMBEDDING in self._inputs:
             assert observations.embeddings is not None

@@ -28,7 +28,6 @@ from robocas_ms3.baselines.lerobot.policy import (
     ACTION,
     DIMENSIONS,
     EMBEDDING,
-    STATE,
     STATE_NAMES,
     scale_embeddings,
     state_of,
@@ -43,6 +42,7 @@ from robocas_ms3.datasets.lerobot.schema import FEATURES, INDICES, INFO_FILE, ST
 from robocas_ms3.datasets.lerobot.tables import Column, check_columns, numbers, open_table, read_columns
 from robocas_ms3.datasets.lerobot.variants import V3
 from robocas_ms3.datasets.sources.files import read_json
+from robocas_ms3.robots.quantities import GRIPPER_WIDTH, STATE, columns_of
 
 Embed = Callable[[Sequence[str]], NDArray[np.float32]]
 _WIDTHS = {feature.key: feature.width for feature in FEATURES}
@@ -120,8 +120,8 @@ def _columns(
     ends = np.flatnonzero(np.diff(table["episode_index"].to_numpy())) + 1
     for motion in np.split(read["action.base"], ends):
         check_base_stands(motion, path)
-    state = read[STATE]
-    columns = {STATE: state_of(state[:, :3], state[:, 3:7], state[:, 7:14], state[:, 14:15]), ACTION: read[ACTION]}
+    parts = (read[STATE][:, columns_of(STATE)[key]] for key in ("ee_pos", "ee_orn", "robot_joints", GRIPPER_WIDTH))
+    columns = {STATE: state_of(*parts), ACTION: read[ACTION]}
     if vectors is not None:
         places = table["task_index"].to_numpy()
         if len(places) and places.max() >= len(vectors):

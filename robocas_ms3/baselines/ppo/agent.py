@@ -14,6 +14,7 @@ from robocas_ms3.baselines.ppo.environments import expand_action, join_observati
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.robots.ee_deltas import POSITION_SCALE, ROTATION_SCALE
+from robocas_ms3.robots.quantities import GRIPPER_WIDTH
 
 _SCALE = np.array([POSITION_SCALE] * 3 + [ROTATION_SCALE] * 3 + [1.0])
 
@@ -89,9 +90,8 @@ class PpoPolicy:
             EvaluationError: the scenes hold another number of objects than those of the training.
         """
         assert observations.state is not None
-        obs = join_observation(
-            observations.qpos, observations.tcp_in_base, observations.gripper_width, observations.state
-        )
+        width = observations.robot[GRIPPER_WIDTH]
+        obs = join_observation(observations.qpos, observations.tcp_in_base, width, observations.state)
         if obs.shape[1] != self._size:
             what, fix = "the policy was trained in other scenes", "Evaluate it in the task and scenes of its training."
             raise EvaluationError(what, where="ppo", expected=f"{self._size} numbers", found=obs.shape[1], fix=fix)

@@ -15,6 +15,7 @@ from gymnasium.vector.utils import batch_space
 import robocas_ms3
 from robocas_ms3.baselines.ppo.config import ONE_FRUIT, ONE_FRUIT_STEPS, PpoConfig
 from robocas_ms3.core.errors import TrainingError
+from robocas_ms3.robots.quantities import GRIPPER_WIDTH
 from robocas_ms3.scenes.config import TaskConfig, load_task_config
 from robocas_ms3.scenes.task_specs import TASKS
 from robocas_ms3.tasks.rl import CONTROL_FREQ
@@ -37,9 +38,9 @@ def expand_action(action: torch.Tensor) -> torch.Tensor:
     return torch.stack([x / 2, y / 2, z / 2, zero, zero, yaw / 2, command], dim=-1)
 
 
-def join_observation(qpos: Any, tcp_in_base: Any, gripper_width: Any, state: Any) -> torch.Tensor:
+def join_observation(qpos: Any, tcp_in_base: Any, width: Any, state: Any) -> torch.Tensor:
     """Return (N, O) float32 of entries of `Observations`: proprioception and privileged state."""
-    return torch.cat([torch.as_tensor(part).float() for part in (qpos, tcp_in_base, gripper_width, state)], dim=1)
+    return torch.cat([torch.as_tensor(part).float() for part in (qpos, tcp_in_base, width, state)], dim=1)
 
 
 class TopDown(gym.Wrapper):
@@ -69,7 +70,7 @@ class TopDown(gym.Wrapper):
 def _observation(obs: dict[str, Any]) -> torch.Tensor:
     agent = obs["agent"]
     state = [value for name, value in obs["extra"].items() if name != "tcp_pose"]  # as in `privileged`
-    return join_observation(agent["qpos"], agent["tcp_in_arm_base"], agent["gripper_width"], torch.cat(state, dim=1))
+    return join_observation(agent["qpos"], agent["tcp_in_arm_base"], agent[GRIPPER_WIDTH], torch.cat(state, dim=1))
 
 
 class PpoEnvironments:

@@ -16,6 +16,7 @@ from robocas_ms3.baselines.small.data import SmallSamples, crop_image
 from robocas_ms3.baselines.small.model import SmallModel
 from robocas_ms3.core.poses import from_wxyz
 from robocas_ms3.evaluation.policy import Observations, PolicySpec
+from robocas_ms3.robots.quantities import GRIPPER_WIDTH
 
 
 class Small:
@@ -40,7 +41,7 @@ class Small:
         def predict(seen: Observations, row: int) -> NDArray[np.floating]:
             words = seen.embeddings[row] if seen.embeddings is not None else np.zeros(384, np.float32)
             one = slice(row, row + 1)
-            state = state_of(from_wxyz(seen.tcp_in_base[one]), seen.gripper_width.reshape(-1)[one])
+            state = state_of(from_wxyz(seen.tcp_in_base[one]), seen.robot[GRIPPER_WIDTH].reshape(-1)[one])
             images = {camera: crop_image(seen.images[camera][row], view) for camera, view in config.views.items()}
             batch = {**images, "words": words, "state": state[0]}
             with torch.inference_mode():

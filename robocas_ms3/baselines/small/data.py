@@ -33,11 +33,12 @@ from robocas_ms3.baselines.small.objects import (
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import Array, from_xyzw
 from robocas_ms3.datasets.formats import open_source
+from robocas_ms3.robots.quantities import GRIPPER_WIDTH
 
 _log = logging.getLogger(__name__)
 _MIN_HEIGHT_DEVIATION = 0.01  # m
 _MIN_WORD_DEVIATION = 0.01  # of a number of an embedding; all are about 0.05
-_KEYS = ("ee_pos", "ee_orn", "gripper_width", "gripper_status", "base_pos", "base_orn")
+_KEYS = ("ee_pos", "ee_orn", GRIPPER_WIDTH, "gripper_status", "base_pos", "base_orn")
 
 
 class SmallSamples:
@@ -134,7 +135,7 @@ class SmallSamples:
                 raise DatasetError("NaN or infinite value", where=where, fix="robocas validate says more.")
         poses = from_xyzw(arrays["ee_pos"].astype(np.float64), arrays["ee_orn"].astype(np.float64))
         opened, rows = arrays["gripper_status"].reshape(-1), slice(start, start + length)
-        self._state[rows] = torch.from_numpy(state_of(poses, arrays["gripper_width"].reshape(-1)))
+        self._state[rows] = torch.from_numpy(state_of(poses, arrays[GRIPPER_WIDTH].reshape(-1)))
         self._chunks[rows] = torch.from_numpy(encode(poses, opened, config.chunk))
         keys = next_keys(poses, opened)
         at_keys = (poses[:, :3, :3] @ keys[:, :3, None])[..., 0] + poses[:, :3, 3]  # in the arm's base

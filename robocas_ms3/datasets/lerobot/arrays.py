@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from robocas_ms3.core.poses import from_xyzw
 from robocas_ms3.datasets.schema import EPISODE_INFO
 from robocas_ms3.demos.recordings.motion import relative_motion
-from robocas_ms3.robots.quantities import features
+from robocas_ms3.robots.quantities import columns_of, features
 
 
 def frame_columns(arrays: dict[str, NDArray]) -> dict[str, NDArray]:
@@ -45,11 +45,10 @@ def robocas_arrays(
         "step_goal_type": types,
     }
     for key, quantities in features().items():
-        column, first = columns[key].reshape(len(columns["action"]), -1), 0
+        column = columns[key].reshape(len(columns["action"]), -1)
         for quantity in quantities:
-            part = column[:, first : first + quantity.width].reshape(quantity.shape_for(len(column)))
+            part = column[:, columns_of(key)[quantity.name]].reshape(quantity.shape_for(len(column)))
             values[quantity.name] = part > 0.5 if quantity.dtype == "bool" else part
-            first += quantity.width
     for pos, orn, rel in (("ee_pos", "ee_orn", "rel"), ("base_pos", "base_orn", "base_rel")):
         poses = from_xyzw(values[pos].astype(np.float64), values[orn].astype(np.float64))
         motion = relative_motion(poses)

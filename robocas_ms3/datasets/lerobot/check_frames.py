@@ -23,6 +23,7 @@ from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.records import frame_columns
 from robocas_ms3.datasets.lerobot.tables import faults, numbers, open_table, read_rows
 from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, first_line
+from robocas_ms3.robots.quantities import ARM_BASE, STATE, columns_of
 
 TOLERANCE = 1e-4
 """Of times, s: what LeRobot tolerates."""
@@ -164,18 +165,18 @@ def _check_content(columns: Columns, types: list[Any], instruction: str) -> Iter
     """Check the values by the rules for RoboCAS folders, and that each action leads to the next state."""
     arrays: dict[str, NDArray] = {"step_goal_type": np.array([str(kind) for kind in types], np.str_)}
     if set(schema.OUR_KEYS) <= set(columns):
-        state, command, status = columns["observation.state"], columns["action"], columns["observation.gripper_open"]
+        state, command, status = columns[STATE], columns["action"], columns["observation.gripper_open"]
+        joints = state[:, columns_of(STATE)["robot_joints"]]
         if not np.array_equal(command[:, 6], np.append(status[1:], status[-1:])):
             yield "action", "the gripper's command of the next step", "another"
-        if not np.array_equal(columns["action.joint"][:, :7], np.concatenate([state[1:, 7:14], state[-1:, 7:14]])):
+        if not np.array_equal(columns["action.joint"][:, :7], np.concatenate([joints[1:], joints[-1:]])):
             yield "action.joint", "the next step's joints", "others"
-        quaternions = np.linalg.norm([state[:, 3:7], columns["observation.arm_base"][:, 3:]], axis=-1)
-        if quaternions.min() < 0.5:
-            yield "observation.state, observation.arm_base", "unit quaternions", "others"
+        turns = state[:, columns_of(STATE)["ee_orn"]], columns[ARM_BASE][:, columns_of(ARM_BASE)["base_orn"]]
+        if np.linalg.norm(turns, axis=-1).min() < 0.5:
+            yield f"{STATE}, {ARM_BASE}", "unit quaternions", "others"
             return
-        turns = Rotation.from_euler("xyz", command[:, 3:6]).as_quat()
         whole = robocas_arrays(dict(columns), instruction, [], arrays["step_goal_type"].tolist())
-        arrays = {**whole, "rel_orn": turns}
+        arrays = {**whole, "rel_orn": Rotation.from_euler("xyz", command[:, 3:6]).as_quat()}
     for wrong in laws.violations_of(EpisodeArrays(Path(), arrays), (laws.check_units, *laws.CONTENT)):
         key = schema.SUBGOAL_TYPE.key if wrong.key == "step_goal_type" else wrong.key
         yield key, wrong.expected, wrong.found

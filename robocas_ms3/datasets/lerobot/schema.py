@@ -15,7 +15,7 @@ from typing import Any
 from robocas_ms3.core.documents import check_regular
 from robocas_ms3.core.errors import DatasetError, MissingExtraError
 from robocas_ms3.datasets.lerobot.variants import Variant
-from robocas_ms3.robots.quantities import Quantity
+from robocas_ms3.robots.quantities import STATE, Quantity, columns_of
 from robocas_ms3.robots.quantities import features as quantities_of_features
 from robocas_ms3.robots.table import DEFAULT
 
@@ -181,15 +181,13 @@ def single_features(variant: Variant) -> tuple[Feature, ...]:
 
 def modality_json(cameras: Sequence[str]) -> dict[str, Any]:
     """Return ``meta/modality.json``, by which GR00T reads a dataset of format v2.1."""
-    state = {quantity.name: quantity.width for quantity in quantities_of_features()["observation.state"]}
-    action = {"rel_pos": 3, "rel_orn": 3, "gripper_open": 1}
-    slices = {"state": {}, "action": {}}
-    for name, widths in (("state", state), ("action", action)):
-        end = 0
-        for key, width in widths.items():
-            slices[name][key] = {"start": end, "end": (end := end + width)}
+    action = {"rel_pos": slice(0, 3), "rel_orn": slice(3, 6), "gripper_open": slice(6, 7)}
+    parts = {"state": columns_of(STATE), "action": action}
     return {
-        **slices,
+        **{
+            name: {key: {"start": columns.start, "end": columns.stop} for key, columns in part.items()}
+            for name, part in parts.items()
+        },
         "video": {camera: {"original_key": image_key(camera)} for camera in cameras},
         "annotation": {"human.task_description": {"original_key": "task_index"}},
     }

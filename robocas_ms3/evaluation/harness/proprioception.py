@@ -14,16 +14,14 @@ from robocas_ms3.datasets.lerobot.arrays import frame_columns
 from robocas_ms3.datasets.sources.arrays import episode_arrays
 from robocas_ms3.demos.recordings.motion import Motion, gripper_open
 from robocas_ms3.robots.forward import chain
-from robocas_ms3.robots.quantities import features
+from robocas_ms3.robots.quantities import ARM_BASE, STATE, columns_of, features
 from robocas_ms3.robots.table import RobotSpec
 
-KEYS = {"agent_pos": "observation.state"} | {
-    key.removeprefix("observation."): key for key in features() if key != "observation.state"
-}
+KEYS = {"agent_pos": STATE} | {key.removeprefix("observation."): key for key in features() if key != STATE}
 """Key of an environment's observation -> column of our LeRobot datasets."""
 WIDTHS = {name: next(one.width for one in schema.FEATURES if one.key == column) for name, column in KEYS.items()}
-_TURNS = {"agent_pos": slice(3, 7), "arm_base": slice(3, 7)}  # quaternions
-_YAW = 17  # index in agent_pos
+_QUATERNIONS = {"agent_pos": columns_of(STATE)["ee_orn"], "arm_base": columns_of(ARM_BASE)["base_orn"]}
+_YAW = columns_of(STATE)["agv_pose"].stop - 1  # in agent_pos
 
 
 def depth_key(camera: str) -> str:
@@ -80,7 +78,7 @@ def _continued(
 ) -> dict[str, NDArray[np.float32]]:
     """Return the values without sign flips of quaternions and jumps by full turns, as in an episode of a dataset."""
     found = {name: values.copy() for name, values in now.items()}
-    for name, turn in _TURNS.items():
+    for name, turn in _QUATERNIONS.items():
         if before[name][turn] @ found[name][turn] < 0:
             found[name][turn] *= -1
     yaw, last = found["agent_pos"][_YAW], before["agent_pos"][_YAW]

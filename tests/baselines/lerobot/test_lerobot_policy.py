@@ -7,10 +7,11 @@ import pytest
 import torch
 from made_up_observations import observe, start
 
-from robocas_ms3.baselines.lerobot.policy import EMBEDDING, STATE, LeRobotPolicy, scale_embeddings, state_of
+from robocas_ms3.baselines.lerobot.policy import EMBEDDING, LeRobotPolicy, scale_embeddings, state_of
 from robocas_ms3.baselines.lerobot.serve import main, open_checkpoint, rate_of
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.policy import describe
+from robocas_ms3.robots.quantities import STATE
 
 INPUTS = {STATE: (17,), "observation.images.base_camera": (3, 2, 4), EMBEDDING: (384,)}
 HALF = float(np.sqrt(0.5))
