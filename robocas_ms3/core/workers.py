@@ -22,6 +22,7 @@ import threading
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import CancelledError
 from contextlib import suppress
+from functools import partial
 from itertools import islice
 from multiprocessing import Pipe
 from queue import Empty, SimpleQueue
@@ -36,6 +37,7 @@ Result = TypeVar("Result")
 
 _POLL_SECONDS = 0.2  # between two checks of signals
 _TASKS_PER_WORKER = 2  # running and queued, so that no worker waits for its next task
+_RESULTS_PER_WORKER = 8  # that wait for that of an earlier task
 _log = logging.getLogger(__name__)
 
 
@@ -104,7 +106,12 @@ class WorkerPool(Generic[Task, Result]):
         return result
 
     def submit(self, task: Task) -> Callable[[], Result]:
-        """Start a task in a worker process; return a function that waits for its result, and raises as `map` does."""
+        """Start a task in a worker process; return a function that waits for its result, and raises as `map` does.
+
+        Without processes the function runs the task.
+        """
+        if self._num_workers == 0:
+            return partial(self.run, task)
         job = _Job(task, SimpleQueue())
         self._submit(job)
 
@@ -132,16 +139,20 @@ class WorkerPool(Generic[Task, Result]):
         remaining = iter(tasks)
         pending: list[_Job[Task, Result]] = []  # in the order of the tasks
         finished: SimpleQueue[_Job[Task, Result]] = SimpleQueue()
+        most = (_TASKS_PER_WORKER + _RESULTS_PER_WORKER) * self._num_workers
         try:
             while True:
-                for task in islice(remaining, _TASKS_PER_WORKER * self._num_workers - len(pending)):
+                unfinished = sum(not job.done for job in pending)
+                free = min(_TASKS_PER_WORKER * self._num_workers - unfinished, most - len(pending))
+                for task in islice(remaining, max(0, free)):
                     pending.append(_Job(task, finished))
                     self._submit(pending[-1])
                 if not pending:
                     return
-                job = pending[0] if ordered else self._next(finished)
-                while not job.done:
+                job = pending[0] if ordered else next((job for job in pending if job.done), pending[0])
+                if not job.done:
                     self._next(finished)
+                    continue
                 pending.remove(job)
                 if job.error is not None:
                     raise job.error

@@ -62,6 +62,8 @@ class RRTConnectPlanner:
         dt: float,
         planning_time: float = 2.0,
     ) -> None:
+        import toppra  # noqa: F401  (0.2 s: before this process forks)
+
         if not dt > 0:
             raise RobocasError("the time step must be positive", where="dt", found=dt)
         self._world = FclWorld(urdf, srdf, robot)

@@ -9,13 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
-import toppra
-import toppra.algorithm
-import toppra.constraint
 from scipy.interpolate import CubicSpline, PPoly
-from toppra.interpolator import AbstractGeometricPath
 
 from robocas_ms3.planning.protocol import Array, Trajectory
 
@@ -23,8 +20,8 @@ GRID = 0.04  # rad between grid points of TOPP-RA
 SAFETY = 0.98  # limits hold between grid points too
 
 
-class JointPath(AbstractGeometricPath):
-    """A path through joint space by (nearly) its own length.
+class JointPath:
+    """A path through joint space by (nearly) its own length, an `AbstractGeometricPath` of TOPP-RA.
 
     Args:
         curve: piecewise polynomial over [0, length], values (n,).
@@ -32,7 +29,6 @@ class JointPath(AbstractGeometricPath):
     """
 
     def __init__(self, curve: PPoly, goal: Array) -> None:
-        super().__init__()
         self._curve, self.goal = curve, goal
 
     def __call__(self, path_positions: Array | float, order: int = 0) -> Array:
@@ -129,8 +125,10 @@ def timed(path: JointPath, *, velocity: float, acceleration: float, dt: float) -
 
     The motion is stretched to a whole number of steps, so that row i lies exactly at ``(i + 1) * dt``.
     """
+    from toppra.algorithm import TOPPRA  # imports matplotlib (0.2 s), which checks of settings do not need
+
     bounds = _bounds(path.dof, velocity, acceleration)
-    solver = toppra.algorithm.TOPPRA(bounds, path, gridpoints=path.grid(), parametrizer="ParametrizeConstAccel")
+    solver = TOPPRA(bounds, path, gridpoints=path.grid(), parametrizer="ParametrizeConstAccel")
     motion = solver.compute_trajectory(0.0, 0.0)
     if motion is None:
         return None
@@ -139,11 +137,13 @@ def timed(path: JointPath, *, velocity: float, acceleration: float, dt: float) -
 
 
 @lru_cache(maxsize=64)  # making them takes a quarter of the time that timing takes: TOPP-RA words what it prints
-def _bounds(dof: int, velocity: float, acceleration: float) -> list[toppra.constraint.Constraint]:
+def _bounds(dof: int, velocity: float, acceleration: float) -> list[Any]:
+    from toppra.constraint import JointAccelerationConstraint, JointVelocityConstraint
+
     ones = np.ones(dof) * SAFETY
     return [
-        toppra.constraint.JointVelocityConstraint(np.stack([-ones, ones], 1) * velocity),
-        toppra.constraint.JointAccelerationConstraint(np.stack([-ones, ones], 1) * acceleration),
+        JointVelocityConstraint(np.stack([-ones, ones], 1) * velocity),
+        JointAccelerationConstraint(np.stack([-ones, ones], 1) * acceleration),
     ]
 
 

@@ -96,6 +96,29 @@ def test_results_are_ordered_or_come_when_they_are_there_and_tasks_may_be_endles
         assert [next(squares) for _ in range(20)] == [number**2 for number in range(20)]
 
 
+def touch_or_wait(path):
+    path.touch()
+    while not path.with_name("9").exists() and path.name == "0":
+        time.sleep(0.01)
+    return path.name
+
+
+def test_the_other_workers_go_on_while_a_slow_task_holds_up_results_and_few_of_these_wait(tmp_path):
+    taken = []
+    tasks = (taken.append(number) or tmp_path / f"{number}" for number in count())
+    with WorkerPool(partial(FunctionWorker, touch_or_wait), 2, limits=Limits(seconds=60), retries=0) as pool:
+        results = pool.map(tasks)
+        assert [next(results), next(results)] == ["0", "1"]  # "0" ends after "9" has begun
+        assert len(taken) < 25
+
+
+@pytest.mark.parametrize("num_workers", [0, 1])
+def test_a_submitted_task_is_run(num_workers):
+    with WorkerPool(Counter, num_workers) as pool:
+        waits = [pool.submit(task) for task in "ab"]
+        assert tasks_of(wait() for wait in waits) == ["a", "b"]
+
+
 @pytest.mark.parametrize("num_workers", [0, 1])
 def test_an_error_is_raised_as_it_is_and_the_worker_is_made_again(num_workers):
     with WorkerPool(Counter, num_workers) as pool:
