@@ -4,33 +4,27 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Generator
-from contextlib import closing
+from collections import defaultdict
+from collections.abc import Callable, Generator, Iterator
+from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, fields
+from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.errors import DatasetError, RobocasError
 from robocas_ms3.core.files import flush_to_disk, make_folder, write_json
+from robocas_ms3.core.ledger import Ledger
 from robocas_ms3.core.outputs import FolderKind, OutputFolder
-from robocas_ms3.core.strict import check_number
-from robocas_ms3.core.workers import Worker
-from robocas_ms3.demos.ledger import FAILURES_FILE, EpisodeResult, Failure, Ledger, count_by_stage, failed_attempts
-from robocas_ms3.demos.recordings.entries import GREATEST_SEED, read_json, reason, versions
+from robocas_ms3.core.workers import Limits, Worker, WorkerPool, use_one_torch_thread
+from robocas_ms3.demos.ledger import FAILURES_FILE, EpisodeResult, Failure, Takeover, count_by_stage, failed_attempts
+from robocas_ms3.demos.recordings.entries import read_json, reason, versions
 from robocas_ms3.demos.recordings.stored import merge, open_trajectory
 from robocas_ms3.demos.settings import EpisodeSettings, GenerateSettings
-from robocas_ms3.demos.takeover import Takeover
-from robocas_ms3.demos.workers import generate_seeds, shard_name
-from robocas_ms3.planning.rrt_connect import BACKENDS
-from robocas_ms3.planning.seconds import Seconds
-from robocas_ms3.robots.table import find_robot
-from robocas_ms3.scenes.config import load_config_of
-from robocas_ms3.scenes.model import SceneModel
-from robocas_ms3.scenes.task_specs import SIM_FREQ, TASKS
+from robocas_ms3.planning.decisions import Seconds
 
 RUN = "run.json"
 WEIGHTS = "after_policy_weights"
@@ -95,7 +89,8 @@ def generate(
         settings: options of the run.
         on_start: called with the number of existing episodes, after all checks.
         on_result: called for each new seed, in order.
-        players: opens the worker that runs ``after_policy`` in the scene of a seed, in a process (is pickled).
+        players: makes the worker that runs ``after_policy`` in the scene of a seed, in processes of its own: a process
+            that renders or uses CUDA can't be forked.
         weights: hash of that policy's weights, if it has some; a run continues with the same.
 
     Raises:
@@ -104,15 +99,9 @@ def generate(
             fail.
     """
     settings = settings.resolve()
+    settings.check()
     assert settings.out is not None
-    check_number("episodes", settings.episodes, 1)
-    check_number("seed", settings.seed, 0, GREATEST_SEED)
-    check_number("jobs", settings.jobs, 0)
-    check_number("episode_seconds", settings.episode_seconds, 1)
-    check_number("memory_gb", settings.memory_gb, 0.1)
-    check_episode_settings(settings.episode)
-    if bool(settings.episode.after_policy) != (players is not None):
-        raise RobocasError("after_policy needs players, and players need after_policy", where="after_policy")
+    assert bool(settings.episode.after_policy) == (players is not None)
     record = {"settings": asdict(settings.episode), "first_seed": settings.seed, "versions": versions()}
     if weights:
         record[WEIGHTS] = weights
@@ -145,41 +134,6 @@ def generate(
         return run.finish(results)
 
 
-def check_episode_settings(settings: EpisodeSettings) -> None:
-    """Check settings before anything is written.
-
-    Raises:
-        RobocasError: a number is out of its range, the task can't run the configuration, or there is no such planner,
-            robot or pack.
-    """
-    control, replay = settings.control_freq, settings.replay_rate or 0
-    check_number("max_attempts", settings.max_attempts, 1)
-    check_number("control_freq", control, 1, SIM_FREQ)
-    if SIM_FREQ % control:
-        raise RobocasError(
-            "the control rate must divide the rate of physics",
-            where="control_freq",
-            expected=f"one of {', '.join(str(f) for f in range(1, SIM_FREQ + 1) if SIM_FREQ % f == 0)}",
-            found=control,
-        )
-    for name in ("noisy_trials", "noisy_failures", "noise_mm", "noise_deg"):
-        check_number(name, getattr(settings, name), 0)
-    check_number("replay_rate", replay, 0, control)
-    if replay and (control % replay or SIM_FREQ % replay):
-        raise RobocasError(
-            "the rate of the open-loop check must divide the control rate and the rate of physics",
-            where="replay_rate",
-            expected=f"a divisor of {control}, or 0 for no check",
-            found=replay,
-        )
-    check_number("after_steps", settings.after_steps[0], 1)
-    check_number("after_steps", settings.after_steps[1], settings.after_steps[0])
-    BACKENDS.find(settings.planner, where="planner")
-    robot = find_robot(settings.robot)
-    config = load_config_of(TASKS[settings.task], settings.config)
-    SceneModel.load(config, load_pack(settings.pack), load_pack("builtin"), robot=robot.description)
-
-
 def _results(
     settings: GenerateSettings, run: _Run, players: Callable[[], Worker[int, Takeover]] | None
 ) -> Generator[EpisodeResult, None, None]:
@@ -188,6 +142,64 @@ def _results(
     with closing(generate_seeds(settings, missing, run.shards, players)) as new:
         for seed in count(settings.seed):
             yield run.earlier[seed] if seed in run.earlier else next(new)
+
+
+def generate_seeds(
+    settings: GenerateSettings,
+    seeds: Iterator[int],
+    folder: Path,
+    players: Callable[[], Worker[int, Takeover]] | None = None,
+) -> Generator[EpisodeResult, None, None]:
+    """Yield the results of endless seeds in their order; each episode gets a file in ``folder``."""
+    limits = Limits(settings.episode_seconds, settings.memory_gb)
+    with ExitStack() as stack:
+        tasks: Iterator[int | Takeover] = seeds
+        if players is not None:
+            make_player = partial(_make_player, players, settings.jobs)
+            on_crash = partial(_crashed_takeover, settings.episode.after_policy)
+            acting = WorkerPool(make_player, settings.jobs, limits=limits, on_crash=on_crash)
+            tasks = stack.enter_context(closing(stack.enter_context(acting).map(seeds)))
+        make_worker = partial(_EpisodeWorker, settings, folder)
+        pool = WorkerPool(make_worker, settings.jobs, limits=limits, on_crash=_crashed_episode)
+        yield from stack.enter_context(pool).map(tasks)
+
+
+class _EpisodeWorker:
+    """Keeps the environment from one seed to the next."""
+
+    def __init__(self, settings: GenerateSettings, folder: Path) -> None:
+        from robocas_ms3.demos.generator import EpisodeGenerator  # takes seconds, and only workers need it
+
+        if settings.jobs:  # the user's own process keeps its threads
+            use_one_torch_thread()
+        self._generator, self._folder = EpisodeGenerator(settings.episode, fork=settings.fork), folder
+
+    def run(self, task: int | Takeover) -> EpisodeResult:
+        seed, takeover = (task, None) if isinstance(task, int) else (task.seed, task)
+        return self._generator.generate(seed, self._folder, shard_name(seed), takeover)
+
+    def close(self) -> None:
+        self._generator.close()
+
+
+def _make_player(players: Callable[[], Worker[int, Takeover]], jobs: int) -> Worker[int, Takeover]:
+    if jobs:
+        use_one_torch_thread()
+    return players()
+
+
+def _crashed_takeover(policy: str, seed: int, reason: str) -> Takeover:
+    return Takeover(seed, policy, 0, {}, 1.0, reason)
+
+
+def _crashed_episode(task: int | Takeover, reason: str) -> EpisodeResult:
+    seed = task if isinstance(task, int) else task.seed
+    return EpisodeResult(seed, success=False, attempts=1, failures=[Failure(seed, 0, "worker", reason, 0.0)])
+
+
+def shard_name(seed: int) -> str:
+    """Return the name of an episode's file before merging."""
+    return f"seed_{seed:09d}"
 
 
 def _lines(result: EpisodeResult) -> list[Failure]:
@@ -207,12 +219,16 @@ class _Run:
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._trajectory = folder, folder / "trajectory.h5"
-        self.shards, self.ledger = make_folder(folder / "episodes"), Ledger(folder / FAILURES_FILE)
-        noted = self.ledger.by_seed()
+        self.shards = make_folder(folder / "episodes")
+        self.ledger: Ledger[Failure] = Ledger(folder / FAILURES_FILE, Failure)
+        noted: dict[int, dict[int, Failure]] = defaultdict(dict)  # by seed and attempt, the first of duplicates
+        for failure in self.ledger.read():
+            noted[failure.seed].setdefault(failure.attempt, failure)
+        self._noted = noted
         self.earlier = {
-            seed: EpisodeResult(seed, success=False, failures=lines[:-1])
+            seed: EpisodeResult(seed, success=False, failures=list(lines.values())[:-1])
             for seed, lines in noted.items()
-            if [line.attempt for line in lines] == [*range(len(lines) - 1), -1]  # else lines are lost: run it again
+            if list(lines) == [*range(len(lines) - 1), -1]  # else lines are lost: run it again
         }
         for path in sorted(self.shards.glob("seed_*.h5")):
             try:
@@ -221,18 +237,24 @@ class _Run:
             except RobocasError:
                 path.unlink()
         self.earlier |= self._merged()
-        self.ledger.settle([line for seed in sorted(self.earlier) for line in _lines(self.earlier[seed])])
+        self._rewrite_ledger([self.earlier[seed] for seed in sorted(self.earlier)])
+
+    def _rewrite_ledger(self, results: list[EpisodeResult]) -> None:
+        """See that the ledger has the lines of these results, whatever a kill has lost, doubled or left behind."""
+        lines = [line for result in results for line in _lines(result)]
+        if [line.record for line in self.ledger.lines()] != lines:
+            self.ledger.rewrite(lines)
 
     def _read(self, path: Path) -> dict[int, EpisodeResult]:
         """Return the results of the episodes in a file by seed."""
-        results, noted = {}, self.ledger.by_seed()
+        results = {}
         for episode in read_json(path)["episodes"]:
             try:
                 # the block is written last: without it the episode was cut short
                 if about := episode.get("robocas"):
                     seed = int(episode["episode_seed"])
                     result = EpisodeResult(seed, True, int(episode["elapsed_steps"]), int(about["attempts"]))
-                    result.failures = failed_attempts(seed, about["failed_attempts"], noted.get(seed, []))
+                    result.failures = failed_attempts(seed, about["failed_attempts"], self._noted[seed])
                     for part, value in about["seconds"].items():
                         setattr(result.seconds, part, float(value))
                     results[seed] = result
@@ -264,7 +286,7 @@ class _Run:
             merge(([self._trajectory] if merged else []) + new, self._trajectory)
             flush_to_disk(self._folder)  # before the files are deleted that it is made of
         shutil.rmtree(self.shards)
-        self.ledger.settle([line for result in results for line in _lines(result)])
+        self._rewrite_ledger(results)
         seconds = {part.name: [getattr(result.seconds, part.name) for result in results] for part in fields(Seconds)}
         summary = Summary(
             self._trajectory,

@@ -16,13 +16,12 @@ from robocas_ms3.core.extensions import load
 from robocas_ms3.demos.backtracking import Resimulation
 from robocas_ms3.demos.branches import ForkedBranches, say_once, why_not_fork
 from robocas_ms3.demos.completing import complete
-from robocas_ms3.demos.ledger import EpisodeResult
+from robocas_ms3.demos.ledger import EpisodeResult, Takeover
 from robocas_ms3.demos.open_loop import OpenLoop, Trials
 from robocas_ms3.demos.recordings.environment import RecordedEnv
 from robocas_ms3.demos.recordings.subgoals import SubGoal
 from robocas_ms3.demos.recordings.writing import EpisodeRecorder
 from robocas_ms3.demos.settings import EpisodeSettings
-from robocas_ms3.demos.takeover import Takeover
 from robocas_ms3.planning.chain import ArmChain
 from robocas_ms3.planning.decisions import Decisions, StraightDecisions
 from robocas_ms3.planning.executor import Executor

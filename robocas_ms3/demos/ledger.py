@@ -1,20 +1,22 @@
-"""Results of seeds, and ``failures.jsonl``: one line per failed attempt, and one per seed that was given up."""
+"""Results of seeds, the lines of ``failures.jsonl``, and starts that a policy left. Loads no simulator.
+
+``failures.jsonl`` has one line per failed attempt, and one per seed that was given up.
+"""
 
 from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
+from numpy.typing import NDArray
 from pydantic import Field
 
-from robocas_ms3.core import ledger
-from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.errors import EpisodeLost, PlanningFailed
 from robocas_ms3.demos.recordings.entries import GREATEST_SEED
-from robocas_ms3.planning.seconds import Seconds
+from robocas_ms3.planning.decisions import Seconds
 
 FAILURES_FILE = "failures.jsonl"
 NOISY = "noisy_"  # begins the reasons of attempts that failed for noise alone
@@ -91,38 +93,38 @@ class EpisodeResult:
         vars(self).update({key: value for key, value in vars(other).items() if key != "seconds"})
 
 
-class Ledger(ledger.Ledger[Failure]):
-    """The file, appended to seed by seed."""
+@dataclass(frozen=True)
+class Takeover:
+    """State in which a policy left a scene.
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(path, Failure)
-
-    def by_seed(self) -> dict[int, list[Failure]]:
-        """Return the lines of each seed in order, the first of duplicates."""
-        found: dict[int, dict[int, Failure]] = {}
-        for failure in self.read():
-            found.setdefault(failure.seed, {}).setdefault(failure.attempt, failure)
-        return {seed: list(attempts.values()) for seed, attempts in found.items()}
-
-    def settle(self, failures: list[Failure]) -> None:
-        """See that these are the lines, whatever a kill has lost, doubled or left behind."""
-        if [line.record for line in self.lines()] != failures:
-            self.rewrite(failures)
-
-
-def failed_attempts(seed: int, said: Iterable[str], noted: Iterable[Failure]) -> list[Failure]:
-    """Return the failed attempts of a recorded seed.
-
-    Args:
-        seed: of the episode.
-        said: ``stage: reason`` of each attempt in the record.
-        noted: lines of the seed in the file, as far as they are complete.
+    Attributes:
+        seed: of the scene.
+        policy: its name.
+        policy_steps: for which it acted.
+        state: as ``set_state_dict`` takes it, each array (1, D) float32 or bool; without targets of controllers.
+        gripper: last command of the gripper, -1 closed or 1 open.
+        refused: why nothing can be taken over, in a few words that can be counted; empty: it can.
     """
-    there = {failure.attempt: failure for failure in noted}
+
+    seed: int
+    policy: str
+    policy_steps: int
+    state: dict[str, dict[str, NDArray[Any]]]
+    gripper: float
+    refused: str = ""
+
+    def check(self) -> None:
+        """Raise ``EpisodeLost`` if nothing can be taken over."""
+        if self.refused:
+            raise EpisodeLost("takeover", self.refused)
+
+
+def failed_attempts(seed: int, recorded: Iterable[str], noted: Mapping[int, Failure]) -> list[Failure]:
+    """Return the failed attempts of a recorded seed (``stage: reason`` each), with seconds where lines have them."""
     failures = []
-    for attempt, text in enumerate(said):
+    for attempt, text in enumerate(recorded):
         stage, _, reason = text.partition(": ")
-        known = there.get(attempt)
+        known = noted.get(attempt)
         same = known is not None and (known.stage, known.reason) == (stage, reason)
         failures.append(known if known and same else Failure(seed, attempt, stage, reason, 0.0))
     return failures

@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.core.errors import DatasetError, EpisodeLost
-from robocas_ms3.demos.ledger import NOISY
+from robocas_ms3.demos.ledger import NOISY, Takeover
 from robocas_ms3.demos.recordings.environment import RecordedEnv
 from robocas_ms3.demos.recordings.motion import Array, Motion, sample_states, sample_stride
 from robocas_ms3.demos.settings import EpisodeSettings
-from robocas_ms3.demos.takeover import Takeover
 from robocas_ms3.robots.ee_deltas import to_ee_delta_action
 from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.tasks.base import RoboCASEnv

@@ -8,8 +8,12 @@ from typing import Annotated, Any
 
 import tyro
 
+from robocas_ms3.core.errors import RobocasError
+from robocas_ms3.core.strict import check_number
+from robocas_ms3.demos.recordings.entries import GREATEST_SEED
 from robocas_ms3.robots.table import DEFAULT as DEFAULT_ROBOT
-from robocas_ms3.scenes.task_specs import STANDARD_FREQ, TASKS
+from robocas_ms3.robots.table import find_robot
+from robocas_ms3.scenes.task_specs import SIM_FREQ, STANDARD_FREQ, TASKS
 
 _NO_HINT = tyro.conf.arg(help_behavior_hint="")  # the help text says what the default is
 
@@ -64,6 +68,44 @@ class EpisodeSettings:
         object.__setattr__(self, "config", config)
         object.__setattr__(self, "replay_rate", rate)
 
+    def check(self) -> None:
+        """Check the settings before anything is written.
+
+        Raises:
+            RobocasError: a number is out of its range, the task can't run the configuration, or there is no such
+                planner, robot or pack.
+        """
+        from robocas_ms3.assets.pack import load_pack
+        from robocas_ms3.planning.rrt_connect import BACKENDS
+        from robocas_ms3.scenes.config import load_config_of
+        from robocas_ms3.scenes.model import SceneModel
+
+        control, replay = self.control_freq, self.replay_rate or 0
+        check_number("max_attempts", self.max_attempts, 1)
+        check_number("control_freq", control, 1, SIM_FREQ)
+        if SIM_FREQ % control:
+            raise RobocasError(
+                "the control rate must divide the rate of physics",
+                where="control_freq",
+                expected=f"one of {', '.join(str(f) for f in range(1, SIM_FREQ + 1) if SIM_FREQ % f == 0)}",
+                found=control,
+            )
+        for name in ("noisy_trials", "noisy_failures", "noise_mm", "noise_deg"):
+            check_number(name, getattr(self, name), 0)
+        check_number("replay_rate", replay, 0, control)
+        if replay and (control % replay or SIM_FREQ % replay):
+            raise RobocasError(
+                "the rate of the open-loop check must divide the control rate and the rate of physics",
+                where="replay_rate",
+                expected=f"a divisor of {control}, or 0 for no check",
+                found=replay,
+            )
+        check_number("after_steps", self.after_steps[0], 1)
+        check_number("after_steps", self.after_steps[1], self.after_steps[0])
+        BACKENDS.find(self.planner, where="planner")
+        robot, config = find_robot(self.robot), load_config_of(TASKS[self.task], self.config)
+        SceneModel.load(config, load_pack(self.pack), load_pack("builtin"), robot=robot.description)
+
 
 @dataclass(frozen=True)
 class GenerateSettings:
@@ -115,6 +157,15 @@ class GenerateSettings:
         stem = Path(name).stem if isinstance(name, str) else episode.task
         out = self.out or Path("demos") / f"{stem}-{Path(episode.pack).name}"
         return replace(self, episode=episode, out=out, set=(), noise=None)
+
+    def check(self) -> None:
+        """Check the settings before anything is written; raises `RobocasError`."""
+        check_number("episodes", self.episodes, 1)
+        check_number("seed", self.seed, 0, GREATEST_SEED)
+        check_number("jobs", self.jobs, 0)
+        check_number("episode_seconds", self.episode_seconds, 1)
+        check_number("memory_gb", self.memory_gb, 0.1)
+        self.episode.check()
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ import numpy as np
 
 from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.datasets.writing.render import require_renderer
+from robocas_ms3.demos.ledger import Takeover
 from robocas_ms3.demos.settings import EpisodeSettings
-from robocas_ms3.demos.takeover import Takeover
 from robocas_ms3.evaluation.policies import open_policy
 from robocas_ms3.evaluation.policy import EpisodeSpec, Policy
 from robocas_ms3.evaluation.protocol import load_protocol

@@ -1,13 +1,15 @@
-"""Decisions of a scripted policy: several ways to go on from one moment, of which the best is gone on from.
+"""Decisions of a scripted policy, and where the time of its episode goes.
 
-A decision is a list of candidates, a function that plays one of them and scores what came of it, and whoever runs them:
-`demos.branches` undoes what was tried, `StraightDecisions` can't.
+A decision is a list of candidates, a function that plays one and returns its score, and a `Decisions` that tries them
+and continues from the best: `demos.branches` undoes what was tried, `StraightDecisions` can't.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
@@ -81,3 +83,22 @@ class StraightDecisions:
                 if self.done() > before:
                     raise
         raise failure
+
+
+@dataclass
+class Seconds:
+    """Where an episode's time went: CPU seconds of this process and of all its branches that could be played."""
+
+    reset: float = 0.0
+    planning: float = 0.0
+    simulation: float = 0.0
+    trial: float = 0.0
+
+    @contextmanager
+    def spent_on(self, part: str) -> Iterator[None]:
+        """Add the time spent inside to a part."""
+        start = time.process_time()
+        try:
+            yield
+        finally:
+            setattr(self, part, getattr(self, part) + time.process_time() - start)

@@ -9,8 +9,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from robocas_ms3.planning.decisions import Seconds
 from robocas_ms3.planning.protocol import Array, Trajectory
-from robocas_ms3.planning.seconds import Seconds
 from robocas_ms3.tasks.base import RoboCASEnv
 
 OPEN, CLOSED = 1.0, -1.0

@@ -87,11 +87,10 @@ def check_plan(plan: Plan) -> None:
     Raises:
         RobocasError: a rate, a size or a pack is invalid, or an extra is missing.
     """
-    from robocas_ms3.demos.generate import check_episode_settings
     from robocas_ms3.demos.recordings.motion import sample_stride
 
     for number in range(len(plan.parts)):
-        check_episode_settings(recording_settings(plan, number))
+        recording_settings(plan, number).check()
     if plan.makes_datasets:
         sample_stride(plan.control_freq, plan.rate)
         if plan.embeddings:

@@ -9,6 +9,7 @@ from synthetic import write_trajectory
 
 from robocas_ms3.core.documents import DocumentError
 from robocas_ms3.core.errors import RobocasError, TrainingError
+from robocas_ms3.core.ledger import Ledger
 from robocas_ms3.core.outputs import OutputFolder
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.provenance import recorded_scene, recording_entry
@@ -16,7 +17,7 @@ from robocas_ms3.datasets.sources.trajectory import TrajectorySource
 from robocas_ms3.datasets.statistics.collect import collect
 from robocas_ms3.datasets.writing.plan import DATASET, dataset_settings, plan_episodes
 from robocas_ms3.demos.generate import OUTPUT
-from robocas_ms3.demos.ledger import Ledger, count_by_stage
+from robocas_ms3.demos.ledger import Failure, count_by_stage
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
 from robocas_ms3.plans.folder import PLAN, check_plan_record, plan_record, read_plan
 from robocas_ms3.plans.load import load_plan, shipped_plans
@@ -71,11 +72,11 @@ def test_files_of_a_generation(tmp_path):
     run = {"env_id": "x", "settings": {"task": "pick", "control_freq": 20}, "versions": {"a": "1"}, "seed": 0}
     path = tmp_path / "run.json"
     path.write_text(json.dumps(run))
-    ledger = Ledger(tmp_path / "failures.jsonl")
+    ledger = Ledger(tmp_path / "failures.jsonl", Failure)
     failure = {"seed": 1, "attempt": 0, "stage": "a", "reason": "b", "seconds": 1.0}
     ledger.path.write_text(json.dumps(failure) + "\n")
     assert refused(lambda: OutputFolder(tmp_path, OUTPUT, run).read(), path, run)
-    refused(lambda: (ledger.by_seed(), count_by_stage(ledger.read())), ledger.path, failure, line=True)
+    refused(lambda: count_by_stage(ledger.read()), ledger.path, failure, line=True)
     for changes in ({"attempt": -2}, {"seed": 2**62}, {"seconds": 1e308}, {"seconds": True}):
         ledger.path.write_text(json.dumps({**failure, **changes}) + "\n")
         assert ledger.read() == []

@@ -15,11 +15,11 @@ from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.datasets.writing.settings import ConversionSettings
 from robocas_ms3.demos.generator import EpisodeGenerator
+from robocas_ms3.demos.ledger import Takeover
 from robocas_ms3.demos.recordings.entries import read_json
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
 from robocas_ms3.demos.replay import replay
 from robocas_ms3.demos.settings import EpisodeSettings, ReplaySettings
-from robocas_ms3.demos.takeover import Takeover
 from robocas_ms3.evaluation.acting import Player, check_acting, steps_of
 from robocas_ms3.evaluation.policies.replay import ReplayPolicy
 

@@ -11,16 +11,18 @@ import sys
 import time
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
+from itertools import groupby
 from pathlib import Path
 
 import h5py
 import numpy as np
 import psutil
 
+from robocas_ms3.core.ledger import Ledger
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.episode_folder import find_damaged
-from robocas_ms3.demos.ledger import FAILURES_FILE, Ledger
+from robocas_ms3.demos.ledger import FAILURES_FILE, Failure
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
 from robocas_ms3.demos.recordings.stored import open_trajectory
 from robocas_ms3.evaluation import results
@@ -81,8 +83,9 @@ def content(command, out):
     """(episode, what came of it), without what a clock said; none may be there twice."""
     if command.name == "generate":
         episodes = json.loads((out / "trajectory.json").read_text())["episodes"]
-        failed = Ledger(out / FAILURES_FILE).by_seed()
-        assert list(failed) == sorted(failed)
+        lines: list[Failure] = Ledger(out / FAILURES_FILE, Failure).read()
+        failed = {seed: list(of) for seed, of in groupby(lines, lambda line: line.seed)}
+        assert list(failed) == sorted({line.seed for line in lines})
         with open_trajectory(out / "trajectory.h5") as file:
             found = [
                 (seed, (_of_recording(one, file[f"traj_{one['episode_id']}"]), _causes(failed.get(seed, []))))
