@@ -25,6 +25,7 @@ from asset_tools.reading.images import open_texture
 from asset_tools.reading.obj import MOST_FACES, MOST_VERTICES, decode_text
 from asset_tools.reading.surface import Material, Part, decode_srgb
 from robocas_ms3.core.errors import AssetError, MissingExtraError
+from robocas_ms3.core.words import error_line
 
 TEXTURE_COMMENT = re.compile(rb"comment\s+TextureFile\s+(.*)", re.IGNORECASE)
 PLY_UVS = {b"s", b"t", b"u", b"v", b"texture_u", b"texture_v", b"texcoord"}
@@ -63,7 +64,7 @@ def read_exchange(path: Path, files: ModelFiles) -> list[Part]:
     except AssetError:
         raise
     except Exception as error:  # whatever trimesh's parsers trip over
-        found = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        found = error_line(error)
         raise AssetError("can't read this mesh", where=path, found=found, fix="Export it again.") from error
     if textures.error is not None:
         raise textures.error

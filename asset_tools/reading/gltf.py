@@ -22,6 +22,7 @@ from asset_tools.reading.obj import MOST_FACES
 from asset_tools.reading.surface import Material, Part
 from robocas_ms3.core.documents import json_values
 from robocas_ms3.core.errors import AssetError
+from robocas_ms3.core.words import one_line
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -57,7 +58,7 @@ def read_gltf(path: Path, files: ModelFiles) -> list[Part]:
     except ValidationError as error:
         raise _damaged(path, f"an extension: {error.errors()[0]['msg']}") from error
     except (ValueError, IndexError, OverflowError) as error:
-        raise _damaged(path, " ".join(str(error).split())) from error
+        raise _damaged(path, one_line(error)) from error
     files.notes.extend(f"warning: {path.name}: ignored {what}" for what in sorted(ignored))
     return parts
 

@@ -10,6 +10,7 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError
 
 from robocas_ms3.core.errors import AssetError
+from robocas_ms3.core.words import one_line
 
 LARGEST_IMAGE = 16384**2  # pixels: 0.8 GB once unpacked
 USEFUL_SIDE = 4096  # pixels of the longer side; larger textures are shrunk before anything is done with them
@@ -42,7 +43,7 @@ def open_texture(data: bytes, where: object, notes: list[str]) -> Image.Image:
         expected = "at most 16384 x 16384 pixels"
         raise AssetError("the texture is too large", where=where, expected=expected) from error
     except (OSError, SyntaxError, ValueError, EOFError, ArithmeticError, LookupError, TypeError) as error:
-        found = "no image" if isinstance(error, UnidentifiedImageError) else " ".join(str(error).split())
+        found = "no image" if isinstance(error, UnidentifiedImageError) else one_line(error)
         raise AssetError("can't read the texture", where=where, found=found, fix="Save it as PNG.") from error
 
 

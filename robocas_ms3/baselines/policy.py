@@ -11,6 +11,7 @@ from robocas_ms3.baselines.registry import find_baseline
 from robocas_ms3.baselines.training.record import BUNDLED, RUN, WEIGHTS, hash_weights, read_run
 from robocas_ms3.core.errors import TrainingError
 from robocas_ms3.core.strict import parse
+from robocas_ms3.core.words import error_line
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, Policy, PolicySpec
 
 
@@ -87,6 +88,6 @@ def _damaged_facts(path: Path) -> Iterator[None]:
     try:
         yield
     except (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError) as error:
-        found = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        found = error_line(error)
         what = "no network can be built from this configuration and these facts"
         raise TrainingError(what, where=path, found=found) from error

@@ -19,9 +19,10 @@ from robocas_ms3.core.errors import DatasetError, RobocasError
 from robocas_ms3.core.files import flush_to_disk, make_folder, write_json
 from robocas_ms3.core.ledger import Ledger
 from robocas_ms3.core.outputs import FolderKind, OutputFolder
+from robocas_ms3.core.words import one_line
 from robocas_ms3.core.workers import Limits, Worker, WorkerPool, use_one_torch_thread
 from robocas_ms3.demos.ledger import FAILURES_FILE, EpisodeResult, Failure, Takeover, count_by_stage, failed_attempts
-from robocas_ms3.demos.recordings.entries import read_json, reason, versions
+from robocas_ms3.demos.recordings.entries import read_json, versions
 from robocas_ms3.demos.recordings.stored import merge, open_trajectory
 from robocas_ms3.demos.settings import EpisodeSettings, GenerateSettings
 from robocas_ms3.planning.decisions import Seconds
@@ -261,7 +262,7 @@ class _Run:
             except (KeyError, TypeError, ValueError, AttributeError) as error:
                 where, fix = path.with_suffix(".json"), "Choose another --out, or --overwrite."
                 what = "`robocas generate` did not write this file"
-                raise DatasetError(what, where=where, found=reason(error), fix=fix) from error
+                raise DatasetError(what, where=where, found=one_line(error), fix=fix) from error
         return results
 
     def _merged(self) -> dict[int, EpisodeResult]:

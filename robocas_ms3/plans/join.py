@@ -17,7 +17,7 @@ from robocas_ms3.core.documents import DAMAGED, load_array, load_json
 from robocas_ms3.core.errors import PlanError
 from robocas_ms3.core.files import flush_to_disk, json_text, make_folder, replacing, write_json
 from robocas_ms3.core.outputs import sweep
-from robocas_ms3.core.words import count_of
+from robocas_ms3.core.words import count_of, one_line
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.manage.splitting import Share, cut, groups_of
 from robocas_ms3.datasets.sources.provenance import recording_entry
@@ -25,7 +25,6 @@ from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.split import SPLIT_RULE, split_by_seed
 from robocas_ms3.datasets.writing.info import write_info
 from robocas_ms3.datasets.writing.plan import dataset_settings, header
-from robocas_ms3.demos.recordings.entries import reason
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
 from robocas_ms3.demos.recordings.stored import damage_of, merge
 from robocas_ms3.plans.folder import REPORT, UNITS
@@ -148,7 +147,7 @@ def _dataset_damage(root: Path, count: int) -> str:
 
 
 def _reason(error: Exception) -> str:
-    return "it does not exist" if isinstance(error, FileNotFoundError) else reason(error)
+    return "it does not exist" if isinstance(error, FileNotFoundError) else one_line(error)
 
 
 def _dataset_sources(plan: Plan, root: Path, files: EpisodeFiles) -> Iterator[Path]:

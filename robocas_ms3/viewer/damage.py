@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 from robocas_ms3.core.documents import DAMAGED
 from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.words import error_line
 from robocas_ms3.datasets.checks.scene import valid_values
 from robocas_ms3.datasets.checks.violation import check_form
 from robocas_ms3.datasets.sources.records import RateRecord
@@ -28,10 +29,8 @@ def readable(where: object) -> Iterator[None]:
     try:
         yield
     except _WRONG as error:
-        text = str(error).strip().splitlines()
-        found = f"{type(error).__name__}: {text[0]}" if text else type(error).__name__
         fix = "robocas validate says what is wrong."
-        raise DatasetError("damaged, can't be shown", where=where, found=found, fix=fix) from error
+        raise DatasetError("damaged, can't be shown", where=where, found=error_line(error), fix=fix) from error
 
 
 def attempt(read: Callable[[], T], otherwise: T) -> tuple[T, str]:

@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.documents import DAMAGED, load_array
 from robocas_ms3.core.poses import from_xyzw
-from robocas_ms3.core.words import count_of
+from robocas_ms3.core.words import count_of, one_line
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks import depth as geometry
 from robocas_ms3.datasets.checks.violation import NO_FILE, Violation
 from robocas_ms3.datasets.pictures.headers import PictureHeader, read_header
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.files import CAMERA_LIMIT
-from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, first_line
+from robocas_ms3.datasets.sources.tolerant import EpisodeArrays
 from robocas_ms3.robots.cameras import Parent
 
 SURPLUS = "a file beyond them"
@@ -51,7 +51,7 @@ def check_cameras(folder: Path, pictures: Pictures) -> Iterator[Violation]:
                 yield Violation(file, "", "this file", NO_FILE)
                 continue
             except DAMAGED as error:
-                yield Violation(file, "", "a numpy array", first_line(error))
+                yield Violation(file, "", "a numpy array", one_line(error))
                 continue
             wrong = list(check_camera_file(file, found, pose=name in pose_files))
             yield from wrong
@@ -123,7 +123,7 @@ def _read_headers(
         try:
             found[name] = read(first.with_name(name)) if name in there else NO_FILE
         except (OSError, ValueError) as error:
-            found[name] = getattr(error, "strerror", None) or first_line(error)
+            found[name] = getattr(error, "strerror", None) or one_line(error)
     return {**found, **dict.fromkeys(sorted(there - set(wanted)), SURPLUS)}
 
 

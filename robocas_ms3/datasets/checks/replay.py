@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from robocas_ms3.core.errors import RobocasError
+from robocas_ms3.core.words import one_line
 from robocas_ms3.datasets.actions import episode_actions
 from robocas_ms3.datasets.sources.reader import Dataset, Episode
-from robocas_ms3.datasets.sources.tolerant import first_line
 from robocas_ms3.demos.open_loop import OpenLoop
 from robocas_ms3.demos.recordings.entries import one_seed, read_reset_options, was_taken_over
 from robocas_ms3.demos.recordings.environment import read_env
@@ -122,7 +122,7 @@ class _Player:
             played = open_loop.play(episode_actions(arrays)[:-1])
             error = np.linalg.norm(played.tcp_in_base - arrays["ee_pos"], axis=1)
         except (RobocasError, ValueError, TypeError, KeyError, IndexError, AttributeError, OSError) as error:
-            return EpisodeReplay(number, task, None, skipped=first_line(error))
+            return EpisodeReplay(number, task, None, skipped=one_line(error))
         return EpisodeReplay(
             number, task, played.success, float(error.mean()), float(error.max()), clipped=played.clipped
         )

@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.words import one_line
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.violation import Violation, check_form, read_object, shorten
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.records import SCENE_KEYS, ConversionRecord, SceneRecord
-from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, arrays_fingerprint, first_line
+from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, arrays_fingerprint
 from robocas_ms3.demos.recordings.entries import one_seed
 from robocas_ms3.robots.cameras import STANDARD_NAMES
 
@@ -65,7 +66,7 @@ def read_settings(root: Path) -> tuple[dict[str, Any], Pictures, list[Violation]
         try:
             pictures = Pictures(tuple(content["cameras"]), size, content["depth"], content["image_format"])
         except DatasetError as error:
-            wrong.append(Violation(FILE, "", "settings of a dataset", first_line(error)))
+            wrong.append(Violation(FILE, "", "settings of a dataset", one_line(error)))
     first: dict[str, str] = {}
     for number, entry in usable.get("episodes", {}).items():
         other = first.setdefault(str(entry.get("recording") or number), number)

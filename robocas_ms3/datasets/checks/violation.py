@@ -12,7 +12,7 @@ from pydantic import BaseModel, ValidationError
 
 from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.strict import Mistake, mistakes
-from robocas_ms3.datasets.sources.tolerant import first_line
+from robocas_ms3.core.words import one_line
 
 NO_FILE = "no file"
 _WORDS = {"int_type": "an integer", "string_type": "text", "dict_type": "an object", "model_type": "an object"}
@@ -62,7 +62,7 @@ def read_object(
     except FileNotFoundError:
         return {}, [Violation(name, "", absent, missing)]
     except (OSError, ValueError) as error:
-        return {}, [Violation(name, "", expected, first_line(error))]
+        return {}, [Violation(name, "", expected, one_line(error))]
     if not isinstance(content, dict):
         return {}, [Violation(name, "", "an object", type(content).__name__)]
     return content, check_form(model, content, name) if model else []

@@ -7,6 +7,7 @@ from pathlib import Path, PurePosixPath
 
 from robocas_ms3.core.documents import DocumentError
 from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.words import one_line
 from robocas_ms3.datasets.checks.dataset import Report
 from robocas_ms3.datasets.checks.scene import check_values
 from robocas_ms3.datasets.checks.violation import Violation, read_object
@@ -26,7 +27,6 @@ from robocas_ms3.datasets.lerobot.records import (
     unknown_numbers,
 )
 from robocas_ms3.datasets.lerobot.tables import faults, open_table
-from robocas_ms3.datasets.sources.tolerant import first_line
 
 
 def check_lerobot(
@@ -67,7 +67,7 @@ def check_lerobot(
         if schema.SUBTASK_INDEX.key in features:
             texts[schema.SUBTASK_INDEX.key] = dataset.subtasks
     except DatasetError as error:
-        return [Violation("meta", "", "readable tables", first_line(error))]
+        return [Violation("meta", "", "readable tables", one_line(error))]
     data, ranges = check_data(dataset, texts, on_episode or (lambda *_: None))
     videos = [key for key, feature in features.items() if feature["dtype"] == "video"]
     return [
@@ -150,7 +150,7 @@ def _check_checksums(root: Path) -> Iterator[Violation]:
             try:
                 found = schema.checksum(root / name)
             except (OSError, DocumentError) as error:
-                found = first_line(error)
+                found = one_line(error)
             if found != expected:
                 yield Violation(name, "", f"the bytes that were written, SHA-256 {expected}", found)
 
@@ -171,7 +171,7 @@ def _check_scenes(dataset: LeRobotDataset) -> Iterator[Violation]:
     try:
         described = dataset.described
     except DatasetError as error:
-        yield Violation(schema.SCENES_FILE, "", "a readable table", first_line(error))
+        yield Violation(schema.SCENES_FILE, "", "a readable table", one_line(error))
         return
     if described and described.keys() != dataset.row_of.keys():
         found = sorted(described.keys() ^ dataset.row_of.keys())[:5]
@@ -183,7 +183,7 @@ def _check_scenes(dataset: LeRobotDataset) -> Iterator[Violation]:
             for camera in dataset.cameras:
                 episode.intrinsic(camera)
         except DatasetError as error:
-            yield Violation(schema.SCENES_FILE, "", "scene and cameras", first_line(error))
+            yield Violation(schema.SCENES_FILE, "", "scene and cameras", one_line(error))
 
 
 def report_lerobot(root: Path, *, on_episode: Callable[[int, int], None] | None = None) -> Report:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.words import one_line
 from robocas_ms3.datasets.checks.violation import Violation, read_object
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check_frames import TOLERANCE, Ranges
@@ -17,7 +18,6 @@ from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.records import StatsLine, read_lines
 from robocas_ms3.datasets.lerobot.stats import QUANTILES
 from robocas_ms3.datasets.lerobot.video import packet_times, read_frames
-from robocas_ms3.datasets.sources.tolerant import first_line
 
 _MILLISECONDS = 0.6e-3  # Matroska rounds to them
 _STATISTICS = {"min", "max", "mean", "std", "count"}
@@ -152,7 +152,7 @@ def _check_lines(dataset: LeRobotDataset) -> Iterator[Violation]:
     try:
         lines = read_lines(dataset.root / schema.STATS_LINES, StatsLine, len(dataset.rows))
     except DatasetError as error:
-        yield Violation(schema.STATS_LINES, "", "readable lines", first_line(error))
+        yield Violation(schema.STATS_LINES, "", "readable lines", one_line(error))
         return
     if sorted(line.episode_index for line in lines) != sorted(dataset.row_of):
         yield Violation(schema.STATS_LINES, "episode_index", "each episode once", "others")

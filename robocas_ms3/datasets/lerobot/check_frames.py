@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.words import count_of
+from robocas_ms3.core.words import count_of, one_line
 from robocas_ms3.datasets.checks import arrays as laws
 from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.lerobot import schema
@@ -22,7 +22,7 @@ from robocas_ms3.datasets.lerobot.language import EVENTS, PERSISTENT, Row, box_i
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.records import frame_columns
 from robocas_ms3.datasets.lerobot.tables import faults, numbers, open_table, read_rows
-from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, first_line
+from robocas_ms3.datasets.sources.tolerant import EpisodeArrays
 from robocas_ms3.robots.quantities import ARM_BASE, STATE, columns_of
 
 TOLERANCE = 1e-4
@@ -79,7 +79,7 @@ def check_data(
                 done += 1
                 on_episode(done, len(dataset.rows))
         except DatasetError as error:
-            violations.append(Violation(name, "", "a readable table", first_line(error)))
+            violations.append(Violation(name, "", "a readable table", one_line(error)))
     others = sorted(path for path in (root / "data").rglob("*") if path.is_file() and path not in by_file)
     violations += [Violation(str(path.relative_to(root)), "", "files of episodes only", "of none") for path in others]
     return violations, ranges

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from robocas_ms3.core.documents import DocumentError, json_values
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.strict import parse
+from robocas_ms3.core.words import one_line
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.arrays import robocas_arrays
 from robocas_ms3.datasets.lerobot.depth import to_depth
@@ -38,7 +39,6 @@ from robocas_ms3.datasets.pictures.stored import Box
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 from robocas_ms3.datasets.sources.protocol import EpisodeSource, Kind, Side, SourceEpisode
 from robocas_ms3.datasets.sources.reader import check_rate
-from robocas_ms3.datasets.sources.tolerant import first_line
 from robocas_ms3.demos.recordings.subgoals import SubGoal, subgoal_runs
 from robocas_ms3.robots.cameras import Parent, standard_parent
 
@@ -166,7 +166,7 @@ class LeRobotEpisode(SourceEpisode):
         try:
             return robocas_arrays(self.columns, self.instruction, texts, types)
         except ValueError as error:  # a quaternion of length 0, a text that is not ASCII
-            raise DatasetError("wrong values", where=self.where, found=first_line(error), fix=SEE_VALIDATE) from error
+            raise DatasetError("wrong values", where=self.where, found=one_line(error), fix=SEE_VALIDATE) from error
 
     @property
     def goals(self) -> list[SubGoal]:

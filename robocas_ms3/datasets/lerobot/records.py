@@ -12,12 +12,12 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, NonNegativeIn
 from robocas_ms3.core.documents import JSON_LIMIT, json_values, read_text
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.strict import parse
+from robocas_ms3.core.words import one_line
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.tables import INTEGER, INTEGERS, NUMBER, NUMBERS, TEXT, TEXTS, Column
 from robocas_ms3.datasets.lerobot.variants import CHUNK_FILES, LAYOUTS
 from robocas_ms3.datasets.sources.protocol import CameraModel
 from robocas_ms3.datasets.sources.records import EntryRecord
-from robocas_ms3.datasets.sources.tolerant import first_line
 from robocas_ms3.robots.cameras import Parent, standard_parent
 
 MAX_EPISODES = 10**6
@@ -123,7 +123,7 @@ def read_lines(path: Path, form: type[_Line], most: int) -> list[_Line]:
             raise DatasetError("too many lines", where=path, expected=f"{most} at most", found=len(lines))
         values = [json_values(line) for line in lines]
     except (OSError, ValueError) as error:
-        raise DatasetError("these JSON lines can't be read", where=path, found=first_line(error)) from error
+        raise DatasetError("these JSON lines can't be read", where=path, found=one_line(error)) from error
     return [parse(form, found, DatasetError, where=f"{path}, line {n}") for n, found in enumerate(values, 1)]
 
 

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.documents import check_regular
 from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.words import one_line
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
-from robocas_ms3.datasets.sources.tolerant import first_line
 
 _ARRAYS_LIMIT = 2**29  # bytes of arrays that are read at once: 40 million equal rows are a file of 1 MB
 OBJECTS_LIMIT = 2**26
@@ -86,7 +86,7 @@ def open_table(path: Path, *, most_rows: float = np.inf) -> Iterator[pq.ParquetF
                 raise DatasetError(what, where=path, expected=expected, found=footer.num_rows, fix=SEE_VALIDATE)
             yield file
     except (OSError, ValueError, LookupError, MemoryError, pa.ArrowException) as error:
-        what, found = "this table can't be read", first_line(error)
+        what, found = "this table can't be read", one_line(error)
         raise DatasetError(what, where=path, found=found, fix=SEE_VALIDATE) from error
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.words import one_line
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.headers import LARGEST, read_picture_bytes
 from robocas_ms3.datasets.pictures.png import encode_png
@@ -98,7 +99,7 @@ def write_picture(path: Path, picture: NDArray) -> float:
     try:
         data = encode_png(picture) if path.suffix == ".png" else _encode(picture, path.suffix)
     except (ValueError, cv2.error) as error:
-        raise DatasetError("can't encode this picture", where=path, found=str(error).splitlines()[0]) from error
+        raise DatasetError("can't encode this picture", where=path, found=one_line(error)) from error
     path.write_bytes(data)  # unlike cv2.imwrite this says when the disk is full
     return time.perf_counter() - begun
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.documents import DAMAGED, load_array, load_json
 from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.words import one_line
 from robocas_ms3.datasets import schema
 
 CAMERA_LIMIT = 2**22
@@ -51,7 +52,7 @@ def read_json(path: Path) -> dict[str, Any]:
     except FileNotFoundError:
         return {}
     except (OSError, ValueError) as error:
-        raise DatasetError("this JSON is damaged", where=path, found=str(error).splitlines()[0]) from error
+        raise DatasetError("this JSON is damaged", where=path, found=one_line(error)) from error
     if not isinstance(content, dict):
         raise DatasetError("this JSON is damaged", where=path, expected="an object", found=type(content).__name__)
     return content
@@ -64,7 +65,5 @@ def read_array(path: Path) -> NDArray[np.float64]:
         if array.dtype.kind not in "fiu":
             raise ValueError("no array of numbers")
     except DAMAGED as error:
-        raise DatasetError(
-            "this array can't be read", where=path, found=str(error).splitlines()[0], fix=SEE_VALIDATE
-        ) from error
+        raise DatasetError("this array can't be read", where=path, found=one_line(error), fix=SEE_VALIDATE) from error
     return array

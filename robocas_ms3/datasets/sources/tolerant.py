@@ -15,17 +15,13 @@ from numpy.typing import NDArray
 from robocas_ms3.core.documents import DAMAGED, open_arrays
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import from_xyzw
+from robocas_ms3.core.words import one_line
 from robocas_ms3.datasets import schema
 from robocas_ms3.demos.recordings.motion import planar_motion, stored_motion
 
 SPECS = {spec.name: spec for spec in schema.EPISODE_INFO}
 PICKLED = "pickled objects, which are never loaded"
 _IDENTITY = ("ee_pos", "ee_orn", "robot_joints", "gripper_status", "language_goal", "step_lang_goals")
-
-
-def first_line(error: Exception) -> str:
-    """What an error says, in one line; its type where it says nothing."""
-    return next(iter(str(error).strip().splitlines()), type(error).__name__)
 
 
 @dataclass(frozen=True)
@@ -61,7 +57,7 @@ class EpisodeArrays:
     def reason(self, key: str = "") -> str:
         """Why a key could not be read, in words."""
         error = self.unreadable[key]
-        text = getattr(error, "strerror", None) or first_line(error)
+        text = getattr(error, "strerror", None) or one_line(error)
         pickled = PICKLED if key else f"another file, or {PICKLED}"
         return pickled if "pickle" in text else text
 

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.words import one_line
 from robocas_ms3.datasets.actions import ACTION_ARRAYS, episode_actions
 from robocas_ms3.datasets.sources.protocol import EpisodeSource
-from robocas_ms3.datasets.sources.tolerant import first_line
 from robocas_ms3.scenes.language.templates import GOAL_TYPES
 
 
@@ -58,7 +58,7 @@ def checked_actions(arrays: Mapping[str, NDArray], where: str) -> NDArray[np.flo
         return episode_actions(arrays)
     except ValueError as error:
         raise DatasetError(
-            "these arrays make no actions", where=where, found=first_line(error), fix="robocas validate says more."
+            "these arrays make no actions", where=where, found=one_line(error), fix="robocas validate says more."
         ) from error
 
 

@@ -12,13 +12,14 @@ import numpy as np
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import write_json
 from robocas_ms3.core.ledger import Ledger
+from robocas_ms3.core.words import one_line
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.actions import action_space
 from robocas_ms3.datasets.sources.provenance import environment_of, task_of
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.records import DataInfoRecord
 from robocas_ms3.datasets.sources.split import split_by_seed
-from robocas_ms3.datasets.sources.tolerant import first_line, read_arrays
+from robocas_ms3.datasets.sources.tolerant import read_arrays
 from robocas_ms3.demos.ledger import FAILURES_FILE
 from robocas_ms3.demos.recordings.entries import one_seed
 from robocas_ms3.demos.recordings.subgoals import subgoal_runs
@@ -72,7 +73,7 @@ def info_of(root: Path, before: tuple[Iterable[int], Iterable[int]] = ((), ())) 
         DataInfoRecord.model_validate(info)
     except (ValueError, IndexError) as error:  # quaternions of length 0; no episode of two steps
         where = f"{root / schema.DATA_INFO_FILE}, action_space"
-        found = first_line(error)
+        found = one_line(error)
         raise DatasetError("the motion has no range", where=where, found=found, fix=_SEE_VALIDATE) from error
     return info
 

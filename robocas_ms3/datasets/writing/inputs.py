@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.documents import DAMAGED
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.words import count_of
+from robocas_ms3.core.words import count_of, one_line
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 from robocas_ms3.datasets.sources.protocol import EpisodeSource, Frame, SourceEpisode
-from robocas_ms3.datasets.sources.tolerant import arrays_fingerprint, first_line
+from robocas_ms3.datasets.sources.tolerant import arrays_fingerprint
 from robocas_ms3.datasets.writing.rendering import RenderedSource, open_env
 from robocas_ms3.datasets.writing.settings import ConversionSettings
 
@@ -156,7 +156,7 @@ def complete_arrays(episode: SourceEpisode) -> dict[str, NDArray]:
     try:
         arrays = episode.arrays
     except DAMAGED as error:
-        found = first_line(error)
+        found = one_line(error)
         raise DatasetError("these arrays can't be read", where=episode.where, found=found, fix=fix) from error
     there = NEEDED & set(arrays)
     for key in sorted(there):

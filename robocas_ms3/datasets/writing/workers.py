@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Protocol
 
-from robocas_ms3.core.errors import DatasetError, IncompleteError, MissingExtraError, RobocasError
+from robocas_ms3.core.errors import DatasetError, IncompleteError, MissingExtraError
 from robocas_ms3.core.outputs import OutputFolder
 from robocas_ms3.core.remote_errors import RemoteError
-from robocas_ms3.core.words import count_of
+from robocas_ms3.core.words import count_of, error_line
 from robocas_ms3.core.workers import NO_LIMITS, WorkerPool, use_one_torch_thread
 from robocas_ms3.datasets.schema import episode_folder
 from robocas_ms3.datasets.writing.inputs import ConversionInput, open_input
@@ -101,9 +101,7 @@ class _Failure:
 
     @property
     def reason(self) -> str:
-        error = self.sent.error
-        message = str(error) if isinstance(error, RobocasError) else f"{type(error).__name__}: {error}"
-        return " ".join(message.split()).rstrip(".")
+        return error_line(self.sent.error).rstrip(".")
 
 
 def _death(task: Task, why: str) -> _Failure:

@@ -17,6 +17,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat,
 from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.strict import parse
+from robocas_ms3.core.words import one_line
 from robocas_ms3.demos.recordings.subgoals import SubGoal, SubGoalsRecord
 
 GREATEST_SEED = 2**32 - 1  # numpy's older generators, which ManiSkill uses, take no greater one
@@ -173,12 +174,6 @@ def read_json(trajectory: Path) -> dict[str, Any]:
     try:
         metadata = load_json(path)
     except (ValueError, RecursionError) as error:
-        raise DatasetError(about, where=path, expected="env_info and episodes", found=reason(error)) from error
+        raise DatasetError(about, where=path, expected="env_info and episodes", found=one_line(error)) from error
     parse(TrajectoryRecord, metadata, DatasetError, where=path, about=about)
     return metadata
-
-
-def reason(error: Exception) -> str:
-    """Return what an error says, in a line."""
-    text = str(error).strip() or type(error).__name__
-    return f"no key {text}" if isinstance(error, KeyError) else text.splitlines()[0]

@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from robocas_ms3.core.documents import DocumentError, check_regular
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import replacing, write_json
-from robocas_ms3.demos.recordings.entries import one_seed, read_json, reason
+from robocas_ms3.core.words import one_line
+from robocas_ms3.demos.recordings.entries import one_seed, read_json
 
 BODIES = ("actors", "articulations")
 """Kinds of states whose rows are a position, a wxyz quaternion and more."""
@@ -63,7 +64,7 @@ def readable(where: object, what: str = "this episode is damaged") -> Iterator[N
     try:
         yield
     except (OSError, KeyError, RuntimeError, AttributeError, ValueError, TypeError, MemoryError) as error:
-        raise DatasetError(what, where=where, found=reason(error)) from error
+        raise DatasetError(what, where=where, found=one_line(error)) from error
 
 
 def open_trajectory(path: Path) -> h5py.File:
@@ -77,7 +78,7 @@ def open_trajectory(path: Path) -> h5py.File:
         raise DatasetError(
             "can't read this HDF5 file: it is cut off, damaged, or no HDF5",
             where=path,
-            found=reason(error),
+            found=one_line(error),
             fix="Generate it again.",
         ) from error
 

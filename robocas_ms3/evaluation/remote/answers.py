@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import EvaluationError, PolicyFailed, RobocasError, WireError
 from robocas_ms3.core.paths import builtin_packs_dir, data_dir, protocols_dir
+from robocas_ms3.core.words import error_line, one_line
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, Policy, as_chunks, policy_code
 from robocas_ms3.evaluation.remote.messages import (
     ACTIONS,
@@ -27,7 +28,7 @@ from robocas_ms3.evaluation.remote.messages import (
     batch_of,
     read_observations,
 )
-from robocas_ms3.evaluation.remote.wire import one_line, unpack
+from robocas_ms3.evaluation.remote.wire import unpack
 
 _log = logging.getLogger(__name__)
 _MAX_ENVS = 1024  # of all clients
@@ -160,7 +161,7 @@ class Answers:
             return self._act(observations, starts), {}
         except PolicyFailed as failed:
             _log.warning("%s", failed)
-            reasons, text = {env: one_line(reason, 300) for env, reason in failed.reasons.items()}, error_line(failed)
+            reasons, text = {env: one_line(reason) for env, reason in failed.reasons.items()}, error_line(failed)
             if failed.actions is not None:
                 return as_chunks(failed.actions, len(observations.envs), None), reasons
         except RobocasError as error:
@@ -170,11 +171,6 @@ class Answers:
             _log.exception("the policy failed")
             text = error_line(error)
         return None, {env: reasons.get(env, text) for env in observations.envs.tolist()}
-
-
-def error_line(error: BaseException) -> str:
-    """Return an error as a line without control characters, for the other end of a connection."""
-    return one_line(error if isinstance(error, RobocasError) else f"{type(error).__name__}: {error}", 300)
 
 
 def read_episode_spec(message: Mapping[str, Any], env: int) -> EpisodeSpec:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from websockets.asyncio.client import ClientConnection
 
 from robocas_ms3.core.errors import EvaluationError, PolicyFailed, WireError
+from robocas_ms3.core.words import one_line
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.evaluation.remote.address import Address, read_address
 from robocas_ms3.evaluation.remote.connection import (
@@ -22,7 +23,6 @@ from robocas_ms3.evaluation.remote.connection import (
     close_connection,
     open_connection,
     read_message,
-    reason_of,
     server_error,
 )
 from robocas_ms3.evaluation.remote.messages import (
@@ -240,7 +240,7 @@ class RemotePolicy:
             self._last_answer = time.monotonic()
             return read_message(answer.result())
         except LOST as error:
-            raise ConnectionLost(f"the connection is lost: {reason_of(error)}") from error
+            raise ConnectionLost(f"the connection is lost: {one_line(error)}") from error
         finally:
             answer.cancel()
 

@@ -15,8 +15,9 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import WebSocketException
 
 from robocas_ms3.core.errors import EvaluationError, WireError
+from robocas_ms3.core.words import one_line
 from robocas_ms3.evaluation.remote.messages import ServerMetadata, read_metadata
-from robocas_ms3.evaluation.remote.wire import one_line, unpack
+from robocas_ms3.evaluation.remote.wire import unpack
 
 PING_INTERVAL = 10.0  # s
 PING_TIMEOUT = 60.0  # s without an answer to a ping
@@ -59,7 +60,7 @@ async def open_connection(url: str, connect_s: float, *, pings: bool) -> tuple[C
         except LOST as error:
             if deadline - time.monotonic() < _RETRY_S:
                 what, fix = f"no server within {connect_s:g} s", "Start it, then run the command again."
-                raise EvaluationError(what, where=url, found=reason_of(error), fix=fix) from error
+                raise EvaluationError(what, where=url, found=one_line(error), fix=fix) from error
             if not warned:
                 _log.warning("waiting for a policy server at %s, up to %g s", url, connect_s)
                 warned = True
@@ -96,12 +97,7 @@ def read_message(message: str | bytes) -> Any:
 def server_error(text: str) -> EvaluationError:
     """Return the error of a server's text, whose last line names it in a traceback."""
     lines = [line for line in text.splitlines() if line.strip()] or ["nothing"]
-    return EvaluationError(f"the server failed: {one_line(lines[-1], 300)}")
-
-
-def reason_of(error: BaseException) -> str:
-    """Return an error of `LOST` as a line."""
-    return one_line(error, 300) or type(error).__name__
+    return EvaluationError(f"the server failed: {one_line(lines[-1])}")
 
 
 async def _handshake(url: str, pings: bool) -> tuple[ClientConnection, str | bytes]:

@@ -20,8 +20,9 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PositiveInt,
 from robocas_ms3.core.errors import EvaluationError, WireError
 from robocas_ms3.core.paths import protocols_dir
 from robocas_ms3.core.strict import refusal
+from robocas_ms3.core.words import one_line
 from robocas_ms3.evaluation.policy import CONVENTIONS, ROBOT, EpisodeSpec, Observations, PolicySpec
-from robocas_ms3.evaluation.remote.wire import MAX_BYTES, one_line
+from robocas_ms3.evaluation.remote.wire import MAX_BYTES
 from robocas_ms3.robots.table import DEFAULT
 
 ENV, RESET, START, PROMPT, ACTIONS, BATCH, ERROR = "env_id", "reset", "start", "prompt", "actions", "batch", "error"

@@ -18,10 +18,11 @@ from websockets.http11 import Request, Response
 
 from robocas_ms3 import __version__
 from robocas_ms3.core.errors import EvaluationError, RobocasError, WireError
+from robocas_ms3.core.words import error_line
 from robocas_ms3.evaluation.policy import Policy, describe, policy_code, policy_spec_values
 from robocas_ms3.evaluation.remote import connection
 from robocas_ms3.evaluation.remote.address import netloc, strip_brackets
-from robocas_ms3.evaluation.remote.answers import Answers, ServedFiles, error_line
+from robocas_ms3.evaluation.remote.answers import Answers, ServedFiles
 from robocas_ms3.evaluation.remote.messages import DEFAULT_BATCH, ServerMetadata, batch_limit, message_bytes
 from robocas_ms3.evaluation.remote.wire import pack
 

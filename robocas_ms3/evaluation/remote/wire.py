@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import WireError
-from robocas_ms3.core.words import printable
+from robocas_ms3.core.words import one_line
 
 MAX_BYTES = 64 * 2**20  # of a message
 MAX_DEPTH = 16  # of nested maps and lists
@@ -58,11 +58,6 @@ def unpack(data: bytes, max_bytes: int = MAX_BYTES) -> Any:
     except (ValueError, OverflowError, RecursionError, msgpack.UnpackException) as error:
         raise WireError("no message", found=one_line(error)) from error
     return _decode(value, 0)
-
-
-def one_line(text: object, length: int = 200) -> str:
-    """Return the start of a text as one line without control characters."""
-    return printable(" ".join(str(text).split())[:length])
 
 
 def _encode(value: Any) -> dict[bytes, Any]:

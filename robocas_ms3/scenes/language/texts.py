@@ -12,6 +12,7 @@ from pydantic import Field, model_validator
 from robocas_ms3.core.documents import load_yaml
 from robocas_ms3.core.errors import ConfigError
 from robocas_ms3.core.strict import StrictModel, parse
+from robocas_ms3.core.words import one_line
 from robocas_ms3.scenes.relations import Relation
 from robocas_ms3.scenes.task_specs import TASKS, TaskSpec
 
@@ -54,8 +55,7 @@ class Templates(Synonyms):
             templates = cls.model_validate(spec.instructions)
             templates.check(spec)
         except ValueError as error:  # pydantic's as well
-            found = " ".join(str(error).split())
-            raise ConfigError("wrong instructions", where=f"task {spec.name}", found=found) from error
+            raise ConfigError("wrong instructions", where=f"task {spec.name}", found=one_line(error)) from error
         return templates
 
     def check(self, spec: TaskSpec) -> None:
