@@ -64,7 +64,7 @@ def read_exchange(path: Path, files: ModelFiles) -> list[Part]:
     except AssetError:
         raise
     except Exception as error:  # whatever trimesh's parsers trip over
-        found = error_line(error)
+        found = error_line(error, 200)
         raise AssetError("can't read this mesh", where=path, found=found, fix="Export it again.") from error
     if textures.error is not None:
         raise textures.error

@@ -88,6 +88,6 @@ def _damaged_facts(path: Path) -> Iterator[None]:
     try:
         yield
     except (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError) as error:
-        found = error_line(error)
+        found = error_line(error, 200)
         what = "no network can be built from this configuration and these facts"
         raise TrainingError(what, where=path, found=found) from error

@@ -161,15 +161,18 @@ class Answers:
             return self._act(observations, starts), {}
         except PolicyFailed as failed:
             _log.warning("%s", failed)
-            reasons, text = {env: one_line(reason) for env, reason in failed.reasons.items()}, error_line(failed)
+            reasons, text = (
+                {env: one_line(reason, 300) for env, reason in failed.reasons.items()},
+                error_line(failed, 300),
+            )
             if failed.actions is not None:
                 return as_chunks(failed.actions, len(observations.envs), None), reasons
         except RobocasError as error:
             _log.warning("the policy failed: %s", error)
-            text = error_line(error)
+            text = error_line(error, 300)
         except Exception as error:  # a policy may raise anything; other clients are still served
             _log.exception("the policy failed")
-            text = error_line(error)
+            text = error_line(error, 300)
         return None, {env: reasons.get(env, text) for env in observations.envs.tolist()}
 
 
@@ -182,7 +185,7 @@ def read_episode_spec(message: Mapping[str, Any], env: int) -> EpisodeSpec:
     blank = EpisodeSpec(env, 0, "", "", "", "", 0, message.get(PROMPT, ""))
     said = message.get(START, {})
     if not isinstance(said, dict) or not said.keys() <= {field.name for field in fields(blank)} - {"env"}:
-        raise WireError("invalid start of an episode", where=START, found=one_line(said))
+        raise WireError("invalid start of an episode", where=START, found=one_line(said, 300))
     for name, value in said.items():
         fits = (
             len(value) <= MAX_TEXT if isinstance(value, str) else type(value) is int and 0 <= value <= _LARGEST_NUMBER

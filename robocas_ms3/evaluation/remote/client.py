@@ -240,7 +240,7 @@ class RemotePolicy:
             self._last_answer = time.monotonic()
             return read_message(answer.result())
         except LOST as error:
-            raise ConnectionLost(f"the connection is lost: {one_line(error)}") from error
+            raise ConnectionLost(f"the connection is lost: {one_line(error, 300)}") from error
         finally:
             answer.cancel()
 

@@ -60,7 +60,7 @@ async def open_connection(url: str, connect_s: float, *, pings: bool) -> tuple[C
         except LOST as error:
             if deadline - time.monotonic() < _RETRY_S:
                 what, fix = f"no server within {connect_s:g} s", "Start it, then run the command again."
-                raise EvaluationError(what, where=url, found=one_line(error), fix=fix) from error
+                raise EvaluationError(what, where=url, found=one_line(error, 300), fix=fix) from error
             if not warned:
                 _log.warning("waiting for a policy server at %s, up to %g s", url, connect_s)
                 warned = True
@@ -97,7 +97,7 @@ def read_message(message: str | bytes) -> Any:
 def server_error(text: str) -> EvaluationError:
     """Return the error of a server's text, whose last line names it in a traceback."""
     lines = [line for line in text.splitlines() if line.strip()] or ["nothing"]
-    return EvaluationError(f"the server failed: {one_line(lines[-1])}")
+    return EvaluationError(f"the server failed: {one_line(lines[-1], 300)}")
 
 
 async def _handshake(url: str, pings: bool) -> tuple[ClientConnection, str | bytes]:

@@ -85,7 +85,7 @@ def read_policy_spec(message: Any, where: object) -> PolicySpec:
     except ValidationError as problem:
         raise refusal(problem, _POLICY_SPEC, EvaluationError, where=where, about=what) from problem
     except (TypeError, ValueError) as error:
-        raise EvaluationError(what, where=where, found=one_line(error)) from error
+        raise EvaluationError(what, where=where, found=one_line(error, 300)) from error
 
 
 def observation_message(
@@ -165,12 +165,12 @@ def actions_of(answer: Any, convention: str) -> NDArray[np.float32]:
     try:
         actions = np.asarray(values)
     except ValueError as error:  # lists of different lengths
-        raise WireError("no actions", expected=f"(chunk, {size})", found=one_line(error)) from error
+        raise WireError("no actions", expected=f"(chunk, {size})", found=one_line(error, 300)) from error
     if actions.dtype.kind not in "iuf" or actions.ndim not in (1, 2) or actions.shape[-1] != size or not actions.size:
-        found = one_line(answer) if values is None else f"{actions.shape} {actions.dtype}"
+        found = one_line(answer, 300) if values is None else f"{actions.shape} {actions.dtype}"
         raise WireError("no actions", expected=f"(chunk, {size}) numbers", found=found)
     if not (np.abs(actions.astype(np.float64)) <= _LARGEST_ACTION).all():  # NaN too
-        expected, found = f"{_LARGEST_ACTION:g} at most", one_line(actions.tolist())
+        expected, found = f"{_LARGEST_ACTION:g} at most", one_line(actions.tolist(), 300)
         raise WireError("action value out of range", expected=expected, found=found)
     return actions.reshape(-1, size).astype(np.float32)
 

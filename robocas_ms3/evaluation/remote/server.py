@@ -173,13 +173,13 @@ class PolicyServer:
             return pack(self._answers.answer(message, envs)), 0
         except WireError as error:
             _log.warning("a client sent an invalid message: %s", error)
-            return error_line(error), _GARBAGE
+            return error_line(error, 300), _GARBAGE
         except RobocasError as error:
             _log.warning("the policy failed: %s", error)
-            return error_line(error), _FAILED
+            return error_line(error, 300), _FAILED
         except Exception as error:  # a policy may raise anything; other clients are still served
             _log.exception("the policy failed")
-            return error_line(error), _FAILED
+            return error_line(error, 300), _FAILED
 
 
 def _health(client: ServerConnection, request: Request) -> Response | None:
