@@ -216,7 +216,7 @@ class _Attempts:
         if taken is not None:
             executor.segments[0].first = 0  # what freed the way to it is part of it
         bounds = [part.first for part in executor.segments] + [len(executor.actions)]
-        said, layout = env.instructions.of(0), env.layout()
+        said, layout = env.instruction(), env.layout()
         assert layout is not None  # there was a reset
         return {
             "instruction": said.text,

@@ -107,7 +107,7 @@ class Player:
         self._open.close()
 
     def _episode(self, seed: int) -> EpisodeSpec:
-        settings, text = self._settings, self._base.instructions.of(0).text
+        settings, text = self._settings, self._base.instruction().text
         files = (str(self._config), settings.layouts, settings.pack)
         return EpisodeSpec(-1, 0, settings.task, *files, seed, text, robot=settings.robot)
 

@@ -207,9 +207,9 @@ def _instruction(part: Part, env: RoboCASEnv, seed: int) -> str:
     if part.words == "empty":
         return ""
     if part.words == "asked":
-        return env.instructions.of(0).text
-    others = sorted(env.instructions.names(0) - {env.target_asset().asset.name})
+        return env.instruction().text
+    others = sorted(env.object_names() - {env.target_asset().asset.name})
     if not others:
         raise EvaluationError("no other object whose name would be wrong", where=f"{part.file}, seed {seed}")
     rng = np.random.default_rng([seed, _WRONG])
-    return env.instructions.choose(0, others[int(rng.integers(len(others)))]).text
+    return env.instruction_for(others[int(rng.integers(len(others)))]).text

@@ -9,6 +9,7 @@ import numpy as np
 import sapien
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
 from mani_skill.utils.structs import Actor
@@ -17,19 +18,20 @@ from numpy.typing import NDArray
 
 from robocas_ms3.assets.pack import LoadedObject, VisualLevel, load_pack
 from robocas_ms3.core.arrays import Array, as_tensor
+from robocas_ms3.core.errors import LayoutError, RobocasError
 from robocas_ms3.core.extensions import load
 from robocas_ms3.robots.agent import MobileManipulator
 from robocas_ms3.robots.table import DEFAULT, find_robot
 from robocas_ms3.scenes import build
 from robocas_ms3.scenes.cache import layout_source
 from robocas_ms3.scenes.config import TaskConfig, load_config_of
+from robocas_ms3.scenes.language.instructions import Instruction, episode_instruction
 from robocas_ms3.scenes.layout import Layout, LayoutSource
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.task_specs import TaskSpec
 from robocas_ms3.tasks import engine
 from robocas_ms3.tasks.bodies import Bodies, Contacts, link_poses
 from robocas_ms3.tasks.goals import Goal, InBasket
-from robocas_ms3.tasks.instructions import Instructions
 from robocas_ms3.tasks.observations import over_the_shoulder, place_camera, privileged_observations
 from robocas_ms3.tasks.rewards import DENSE, TRANSFER, DenseReward, RewardTable
 from robocas_ms3.tasks.seeds import EpisodeSeeds
@@ -107,8 +109,8 @@ class RoboCASEnv(BaseEnv):
         if kwargs.get("reconfiguration_freq") is None:
             kwargs["reconfiguration_freq"] = 1 if num_envs == 1 else 0
         cache, stay = layout_source(self.model, layouts), kwargs["reconfiguration_freq"] == 0
-        self.seeds = EpisodeSeeds(self, num_envs, cache, seed_range=seeds, objects_stay=stay)
-        self.instructions = Instructions(self)
+        self.seeds = EpisodeSeeds(num_envs, cache, seed_range=seeds, objects_stay=stay)
+        self._instructions: dict[int, Instruction] = {}  # by env, made when they are asked for
         self.dense_reward = DenseReward(self, self.REWARDS)
         super().__init__(num_envs=num_envs, robot_uids=robot.uid, **kwargs)
 
@@ -139,7 +141,7 @@ class RoboCASEnv(BaseEnv):
 
     def _reconfigure(self, options: dict | None = None) -> None:
         assert self._episode_seed is not None
-        self.seeds.choose_objects(self._episode_seed, on_gpu=self._sim_device.is_cuda())
+        self.seeds.choose_objects(self._episode_seed, self.device, on_gpu=self._sim_device.is_cuda())
         engine.keep_renderer(self.backend.render_device)
         super()._reconfigure(options)
 
@@ -203,10 +205,35 @@ class RoboCASEnv(BaseEnv):
             LayoutError: there is no layout for a seed that was asked for, or for many that were drawn.
             RobocasError: ``options`` has ``reset_to_env_states``.
         """
-        return self.seeds.reset(super().reset, seed, options)
+        options, envs = dict(options or {}), list(range(self.num_envs))
+        if "reset_to_env_states" in options:
+            fix = "Reset with the seed of the recorded episode, then call set_state_dict."
+            raise RobocasError("a state lacks objects, target and stages", where="reset_to_env_states", fix=fix)
+        if "env_idx" in options:
+            index = torch.as_tensor(options["env_idx"], device=self.device)
+            options["env_idx"] = index.nonzero()[:, 0] if index.dtype == torch.bool else index
+            envs = options["env_idx"].tolist() if self.num_envs > 1 else envs
+        seed = self.seeds.start_reset(seed, envs)
+        while True:
+            try:
+                return super().reset(seed, options)
+            except LayoutError as error:
+                if not self.seeds.retry_reset(error):
+                    raise
+                seed = None
 
     def _set_episode_rng(self, seed: Any, env_idx: torch.Tensor) -> None:
-        self.seeds.seed_episodes(super()._set_episode_rng, seed, env_idx)
+        index = env_idx.cpu().numpy()
+        seeds: Any = None if seed is None else self.seeds.within_range(seed)
+        if seeds is None or self._batched_episode_rng is None or len(index) == self.num_envs:
+            super()._set_episode_rng(seeds, env_idx)
+        else:  # ManiSkill's would seed all envs
+            if len(seeds) == 1 and len(index) > 1:
+                seeds = np.concatenate([seeds, np.random.RandomState(seeds[0]).randint(2**31, size=len(index) - 1)])
+            self._episode_seed[index] = seeds
+            self._batched_episode_rng[index] = BatchedRNG.from_seeds(seeds, backend=self._batched_rng_backend)
+        drawn = None if seeds is None else self._episode_seed[index]
+        self.seeds.set_layout_seeds(index, drawn, self._batched_episode_rng)
 
     def _clear_sim_state(self) -> None:
         if not self.gpu_sim_enabled:
@@ -218,9 +245,11 @@ class RoboCASEnv(BaseEnv):
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         self._engine_errors.check()
-        place(self, self.seeds.find_starts(env_idx.cpu().numpy()), env_idx)
+        envs = env_idx.cpu().numpy()
+        place(self, self.seeds.find_starts(envs, self.device), env_idx)
         self.success_check.reset(env_idx)
-        self.instructions.reset(env_idx)
+        for env in envs.tolist():
+            self._instructions.pop(env, None)
         self.dense_reward.reset(env_idx)
 
     def layout(self, env: int = 0) -> Layout:
@@ -307,9 +336,25 @@ class RoboCASEnv(BaseEnv):
         """Return what has to hold at the same moment for success, besides the lift: (N,) bool each."""
         return self.success_check.measures()
 
+    def instruction(self, env: int = 0) -> Instruction:
+        """Return the instruction of an env."""
+        if env not in self._instructions:
+            self._instructions[env] = self.instruction_for(self.target_asset(env).asset.name, env)
+        return self._instructions[env]
+
+    def instruction_for(self, name: str, env: int = 0) -> Instruction:
+        """Return the instruction that an env would have if its target had this name."""
+        seed = int(self.seeds.layout_seeds[env])
+        return episode_instruction(self.task_config, self.layout(env), seed, name, self.object_names(env))
+
+    def object_names(self, env: int = 0) -> set[str]:
+        """Return the names of the objects in an env."""
+        present = self.layout(env).present
+        return {asset.asset.name for asset, used in zip(self.object_assets[env], present, strict=True) if used}
+
     def get_language_instruction(self) -> list[str]:
         """Return the text of each env's instruction."""
-        return [self.instructions.of(env).text for env in range(self.num_envs)]
+        return [self.instruction(env).text for env in range(self.num_envs)]
 
     def _get_obs_extra(self, info: dict) -> dict[str, torch.Tensor]:
         mode = self.obs_mode_struct

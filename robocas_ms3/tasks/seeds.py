@@ -8,10 +8,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
 from numpy.typing import NDArray
 
-from robocas_ms3.core.errors import ConfigError, LayoutError, RobocasError
+from robocas_ms3.core.errors import ConfigError, LayoutError
 from robocas_ms3.scenes.cache import LayoutCache
 from robocas_ms3.scenes.layout import Layout, LayoutSource, ObjectIds
 from robocas_ms3.scenes.table import FrozenLayouts, LayoutTable, Pair, State
@@ -46,7 +45,6 @@ class EpisodeSeeds:
     A requested seed without a layout is an error; an unseeded reset draws another seed.
 
     Args:
-        env: the environment, whose random generators are used.
         num_envs: N.
         layouts: where layouts come from.
         seed_range: least and greatest seed of unseeded resets; default: that of frozen layouts, `SEVERAL_ENVS_SEEDS`
@@ -66,13 +64,7 @@ class EpisodeSeeds:
     """
 
     def __init__(
-        self,
-        env: Any,
-        num_envs: int,
-        layouts: LayoutSource,
-        *,
-        seed_range: tuple[int, int] | None,
-        objects_stay: bool,
+        self, num_envs: int, layouts: LayoutSource, *, seed_range: tuple[int, int] | None, objects_stay: bool
     ) -> None:
         if seed_range is not None and not 0 <= seed_range[0] <= seed_range[1]:
             raise ConfigError("invalid range of seeds", where="seeds", expected="0 <= first <= last", found=seed_range)
@@ -85,81 +77,50 @@ class EpisodeSeeds:
         self.object_ids: list[ObjectIds] = []
         self.table: LayoutTable | None = None
         self.tabled: TabledStarts | None = None
-        self._env = env
         self._num_envs = num_envs
         self._objects_stay = objects_stay
         self.first_reset = True
         self._requested: set[int] = set()  # envs whose seeds were asked for
+        self._generators: Any = None  # a BatchedRNG, of the envs' episodes
         self._other_seeds = _FIRST_SEEDS
+        self._attempts = 0  # left to the present reset
+        self._before: tuple[NDArray[np.int64], dict[int, Layout]] = (self.layout_seeds, {})  # the present reset
         self._found: dict[int, Layout] = {}  # by env
         self._built_with: dict[int, Layout] = {}  # by seed
         self._failed: dict[Pair, LayoutError] = {}  # finding out takes long
 
-    def reset(self, reset: Callable[..., _T], seed: Any, options: dict[str, Any] | None) -> _T:
-        """Reset some envs; if there is no layout, all seeds stay as they were.
+    def start_reset(self, seed: Any, envs: list[int]) -> Any:
+        """Return the seeds of a reset of some envs.
 
         Args:
-            reset: ``BaseEnv.reset``.
-            seed: of each env; a single one is the first env's, and the others take the seeds after it.
-            options: of ``BaseEnv``. ``env_idx`` may be an array or a mask too.
-
-        Raises:
-            LayoutError: there is no layout for a requested seed, or for many that were drawn.
-            RobocasError: ``reset_to_env_states`` was given.
+            seed: of each env; a single one is the first env's, and the others take the seeds after it; or None.
+            envs: their numbers.
         """
-        options, device = dict(options or {}), self._env.device
-        if "reset_to_env_states" in options:
-            fix = "Reset with the seed of the recorded episode, then call set_state_dict."
-            raise RobocasError("a state lacks objects, target and stages", where="reset_to_env_states", fix=fix)
-        envs = list(range(self._num_envs))
-        if "env_idx" in options:
-            index = torch.as_tensor(options["env_idx"], device=device)
-            options["env_idx"] = index.nonzero()[:, 0] if index.dtype == torch.bool else index
-            envs = options["env_idx"].tolist() if self._num_envs > 1 else envs
         first, self.first_reset = self.first_reset, False
         seeded = seed is not None and not first
         self._requested = set(envs) if seeded else set()
-        if self._num_envs > 1:
-            within = self.range or SEVERAL_ENVS_SEEDS
-            if first:
-                seed = following_seeds(within[0], self._num_envs, within)
-            elif seed is not None and np.ndim(seed) == 0:
-                self._requested = set(envs[:1])
-                seed = following_seeds(int(np.asarray(seed)), len(envs), within)
-        before = self.layout_seeds.copy(), dict(self._found)
-        attempts = self._other_seeds + 1 if self._num_envs == 1 and not seeded else 1
-        while True:
-            attempts -= 1
-            try:
-                return reset(seed, options)
-            except LayoutError as error:
-                if not attempts:
-                    self.layout_seeds[:], self._found = before
-                    raise
-                _log.log(_level(error), "no layout for the seed of this reset, another is drawn: %s", error)
-                seed = None
+        self._before = self.layout_seeds.copy(), dict(self._found)
+        self._attempts = self._other_seeds if self._num_envs == 1 and not seeded else 0
+        if self._num_envs == 1:
+            return seed
+        within = self.range or SEVERAL_ENVS_SEEDS
+        if first:
+            return following_seeds(within[0], self._num_envs, within)
+        if seed is not None and np.ndim(seed) == 0:
+            self._requested = set(envs[:1])
+            return following_seeds(int(np.asarray(seed)), len(envs), within)
+        return seed
 
-    def seed_episodes(self, seed_all: Callable[[Any, torch.Tensor], None], seed: Any, env_idx: torch.Tensor) -> None:
-        """Seed the episodes of some envs (E,), with a seed each, or by their generators.
+    def retry_reset(self, error: LayoutError) -> bool:
+        """Return whether to reset again, with a drawn seed; if not, all seeds are as they were before the reset."""
+        if not self._attempts:
+            self.layout_seeds[:], self._found = self._before
+            return False
+        self._attempts -= 1
+        _log.log(_level(error), "no layout for the seed of this reset, another is drawn: %s", error)
+        return True
 
-        Args:
-            seed_all: ``BaseEnv._set_episode_rng``.
-            seed: (E,), a single one, or None.
-            env_idx: (E,).
-        """
-        env, index = self._env, env_idx.cpu().numpy()
-        seed = None if seed is None else self._within_range(seed)
-        if seed is None or env._batched_episode_rng is None or len(index) == self._num_envs:
-            seed_all(seed, env_idx)
-        else:
-            if len(seed) == 1 and len(index) > 1:
-                seed = np.concatenate([seed, np.random.RandomState(seed[0]).randint(2**31, size=len(index) - 1)])
-            env._episode_seed[index] = seed
-            env._batched_episode_rng[index] = BatchedRNG.from_seeds(seed, backend=env._batched_rng_backend)
-        for i in index:
-            self.layout_seeds[i] = self._draw(i) if seed is None else env._episode_seed[i]
-
-    def _within_range(self, seed: Any) -> NDArray[np.int64]:
+    def within_range(self, seed: Any) -> NDArray[np.int64]:
         """Return the seeds (E,) of a reset, moved into the range if nobody asked for them."""
         seed = np.atleast_1d(np.asarray(seed, dtype=np.int64))
         if self._requested or self.range is None:
@@ -167,15 +128,19 @@ class EpisodeSeeds:
         low, high = self.range
         return np.where((seed >= low) & (seed <= high), seed, low + seed % (high - low + 1))
 
+    def set_layout_seeds(self, envs: NDArray[np.int64], seeds: NDArray[np.int64] | None, generators: Any) -> None:
+        """Set the layout seeds of some envs (E,); None: draw each with its env's generator of a ``BatchedRNG``."""
+        self._generators = generators
+        for i, env in enumerate(envs):
+            self.layout_seeds[env] = self._draw(env) if seeds is None else seeds[i]
+
     def _draw(self, env: int) -> int:
         """Draw a seed of the range with an env's generator."""
-        generators = self._env._batched_episode_rng
-        assert isinstance(generators, BatchedRNG)
-        drawn = int(generators[env].randint(2**31))
+        drawn = int(self._generators[env].randint(2**31))
         low, high = self.range or (0, 2**31 - 1)
         return low + drawn % (high - low + 1)
 
-    def choose_objects(self, seeds: NDArray[np.int64], *, on_gpu: bool) -> None:
+    def choose_objects(self, seeds: NDArray[np.int64], device: torch.device, *, on_gpu: bool) -> None:
         """Choose the objects that each env is built with from its seed (N,), which changes if it has no layout."""
         self._built_with = {}
         if isinstance(self.layouts, LayoutCache) and (self._objects_stay or on_gpu):
@@ -183,13 +148,13 @@ class EpisodeSeeds:
             self._other_seeds = _OTHER_SEEDS if self.table else self._other_seeds
         self.object_ids = [self._first_possible(self._objects_of, env, seeds) for env in range(self._num_envs)]
         self.objects_seeds = np.array(seeds)
-        self.tabled = TabledStarts(self.table, self.objects_seeds, self._env.device) if self.table else None
+        self.tabled = TabledStarts(self.table, self.objects_seeds, device) if self.table else None
 
-    def find_starts(self, envs: NDArray[np.int64]) -> Starts:
+    def find_starts(self, envs: NDArray[np.int64], device: torch.device) -> Starts:
         """Return where some envs' episodes start; gathered on their device if the cache's table holds them all."""
         self.forget_layouts(envs)
         if self.tabled is None:
-            return Starts.of([self.layout(env) for env in envs.tolist()], self._env.device)
+            return Starts.of([self.layout(env) for env in envs.tolist()], device)
         for env in envs[~self.tabled.good(envs, self.layout_seeds[envs])].tolist():
             self.layout(env)  # may draw another seed, which the table holds
         tabled = self.tabled.good(envs, self.layout_seeds[envs])
@@ -197,7 +162,7 @@ class EpisodeSeeds:
         if tabled.all():
             return found
         others = [self.layout(env) for env in envs[~tabled].tolist()]
-        return found.with_rows(tabled, Starts.of(others, self._env.device))
+        return found.with_rows(tabled, Starts.of(others, device))
 
     def forget_layouts(self, envs: NDArray[np.int64]) -> None:
         """Forget the layouts of some envs, whose seeds have changed."""

@@ -5,13 +5,15 @@ from __future__ import annotations
 import gymnasium as gym
 import pytest
 import torch
-from batches import check_equals_singles, set_control_mode
+from batches import check_equals_singles, make_batch, make_singles, set_control_mode
 from gpu_emulation import emulated_envs
 
 from robocas_ms3.tasks import TASKS
 
 JOINT_MODES = ("pd_joint_pos", "pd_joint_delta_pos", "pd_joint_pos_base", "pd_joint_delta_pos_base")
 END_EFFECTOR_MODES = ("pd_ee_delta_pose", "pd_ee_pose", "pd_ee_delta_pose_base", "pd_ee_pose_base")
+MODES = {task: ("pd_joint_pos", "pd_ee_delta_pose_base") for task in TASKS}
+MODES["pick"] = (*JOINT_MODES, *END_EFFECTOR_MODES)  # a controller is the same in all tasks
 
 pytestmark = [
     pytest.mark.gpu,
@@ -19,21 +21,30 @@ pytestmark = [
 ]
 
 
-@pytest.mark.parametrize("mode", JOINT_MODES)
-def test_joint_modes(task, batch_and_singles, mode):
-    batch, singles = batch_and_singles
-    set_control_mode([batch, *singles], mode)
-    check_equals_singles(batch, singles, mode, steps=10)
+@pytest.mark.parametrize("task", sorted(TASKS))
+def test_states_stages_rewards_and_observations(task):
+    batch, singles = make_batch(task, emulated_envs()), make_singles(task, emulated_envs())
+    for mode in MODES[task]:
+        set_control_mode([batch, *singles], mode)
+        check_equals_singles(batch, singles, mode, steps=20)
+    for env in (batch, *singles):
+        env.close()
 
 
-@pytest.mark.parametrize("mode", END_EFFECTOR_MODES)
-def test_end_effector_modes(task, batch_and_singles, mode):
-    batch, singles = batch_and_singles
-    set_control_mode([batch, *singles], mode)
-    check_equals_singles(batch, singles, mode, steps=50)
+@pytest.mark.parametrize("name", ["rigid_dynamic_data", "articulation_qpos", "articulation_target_position"])
+def test_a_missing_apply_is_found(monkeypatch, name):
+    mode = "pd_joint_pos"
+    batch = make_batch("pick", emulated_envs(), control_mode=mode)
+    singles = make_singles("pick", emulated_envs(), control_mode=mode)
+    monkeypatch.setattr(type(batch.unwrapped.scene.px), f"gpu_apply_{name}", lambda self: None)
+    with pytest.raises(AssertionError):
+        check_equals_singles(batch, singles, mode, steps=5)
+    for env in (batch, *singles):
+        env.close()
 
 
 @pytest.mark.emulated_gpu_full
+@pytest.mark.parametrize("task", sorted(TASKS))
 def test_images(needs_renderer, task):
     settings = dict(obs_mode="rgb+depth", reward_mode="none", sensor_configs=dict(width=64, height=48))
     spec, count = TASKS[task].env_id, emulated_envs()

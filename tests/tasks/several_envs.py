@@ -17,7 +17,7 @@ def several(folder, monkeypatch, num_envs=4, **arguments) -> tuple[RoboCASPickEn
         index = torch.as_tensor((options or {}).get("env_idx", range(num_envs)))
         env._set_episode_rng(seed, index)
         if (options or {}).get("reconfigure"):
-            env.seeds.choose_objects(env._episode_seed, on_gpu=True)
+            env.seeds.choose_objects(env._episode_seed, env.device, on_gpu=True)
             env._set_episode_rng(env._episode_seed, index)
         env.seeds.forget_layouts(index.numpy())
         env.layouts = [env.layout(i) for i in index.tolist()]

@@ -27,12 +27,11 @@ class FourEnvs(RoboCASEnv):
     def __init__(self, seed_range=None) -> None:
         self.num_envs, self._enhanced_determinism, self._batched_rng_backend = 4, False, "numpy:random_state"
         self._episode_seed, self._batched_episode_rng = None, None
-        self.seeds = EpisodeSeeds(self, 4, Mock(), seed_range=seed_range, objects_stay=True)
+        self.seeds = EpisodeSeeds(4, Mock(), seed_range=seed_range, objects_stay=True)
         self.seeds.first_reset = False
 
     def seed(self, seeds, envs=(0, 1, 2, 3)) -> None:
-        index = torch.tensor(envs)
-        self.seeds.reset(lambda seeds, options: self._set_episode_rng(seeds, index), seeds, {"env_idx": index})
+        self._set_episode_rng(self.seeds.start_reset(seeds, list(envs)), torch.tensor(envs))
 
 
 def states(env: FourEnvs) -> list[tuple]:

@@ -50,7 +50,7 @@ def test_several_envs_reset_from_a_table_built_for_them(tabled, monkeypatch):
     env, asked = several(tabled, monkeypatch, seeds=(0, 1))
     everyone = np.arange(4)
     one_by_one = Starts.of([env.layout(i) for i in range(4)], "cpu")
-    assert_same(env.seeds.find_starts(everyone), one_by_one)
+    assert_same(env.seeds.find_starts(everyone, env.device), one_by_one)
     assert asked == [[(0, 0), (1, 1), (0, 0), (1, 1)]]
     for _ in range(20):
         env.reset()
@@ -58,7 +58,7 @@ def test_several_envs_reset_from_a_table_built_for_them(tabled, monkeypatch):
     assert all([objects for objects, _ in one] == [0, 1, 0, 1] for one in asked)
     env.reset(options={"env_idx": torch.tensor([2])})
     assert [objects for objects, _ in asked[-1]] == [0]
-    assert_same(env.seeds.find_starts(np.array([2])), Starts.of([env.layout(2)], "cpu"))
+    assert_same(env.seeds.find_starts(np.array([2]), env.device), Starts.of([env.layout(2)], "cpu"))
     assert env.layouts[0].object_ids == env.seeds.object_ids[2] == env.seeds.object_ids[0] != env.seeds.object_ids[1]
 
 
@@ -70,7 +70,7 @@ def test_what_moves_where_it_would_run_is_drawn_no_more_and_an_error_where_it_is
     assert env.seeds.objects_seeds.tolist() == [0, 1]  # env 1 keeps its objects, and begins with another layout of them
     for _ in range(20):
         env.reset()
-        assert env.seeds.find_starts(np.arange(2)).targets.shape == (2,)
+        assert env.seeds.find_starts(np.arange(2), env.device).targets.shape == (2,)
         assert 1 not in env.seeds.layout_seeds
     with pytest.raises(LayoutError, match="objects seed 0, seed 1: objects move as soon as this engine runs"):
         env.reset(seed=[1, 0])
@@ -85,7 +85,7 @@ def test_many_layouts_may_move_and_all_of_some_objects(tabled, monkeypatch, capl
         assert env.seeds.objects_seeds.tolist() == [0, 0]
         for _ in range(10):
             env._set_episode_rng(None, torch.tensor([0, 1]))
-            assert env.seeds.find_starts(np.arange(2)).targets.shape == (2,)
+            assert env.seeds.find_starts(np.arange(2), env.device).targets.shape == (2,)
             assert env.seeds.layout_seeds.tolist() == [1, 1]
     assert not [record for record in caplog.records if record.levelname == "WARNING"]
 
@@ -115,7 +115,7 @@ def test_where_a_table_lacks_layouts_the_bank_makes_them(built, tmp_path, monkey
     env.reset(seed=[1, 7])
     assert env.seeds.table is not None
     assert env.seeds.table.state((1, 7)) == State.LACKING
-    found = env.seeds.find_starts(np.array([0, 1]))
+    found = env.seeds.find_starts(np.array([0, 1]), env.device)
     assert_same(found, Starts.of([env.seeds.layouts(0, 1), env.seeds.layouts(1, 7)], "cpu"))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TypeVar, get_args
+from typing import TYPE_CHECKING, TypeVar, cast, get_args
 
 import numpy as np
 
@@ -13,6 +13,11 @@ from robocas_ms3.scenes.language.texts import Split, Templates, instruction_text
 from robocas_ms3.scenes.relations import Relation
 from robocas_ms3.scenes.task_specs import TASKS
 
+if TYPE_CHECKING:
+    from robocas_ms3.scenes.config import TaskConfig
+    from robocas_ms3.scenes.layout import Layout
+
+_LANGUAGE = 100  # stream of an episode's seed; those of layouts are in scenes/sample.py
 SPLITS: tuple[Split, ...] = get_args(Split)
 
 _T = TypeVar("_T")
@@ -125,6 +130,28 @@ def choose_instruction(
         phrases += relation.of(split) if relation else ()
     drawn = _pick(objects, draws[1]), _pick(supports, draws[2]), _pick(phrases, draws[3])
     return _render(slots, split, _pick(range(len(templates)), draws[0]), drawn)
+
+
+def episode_instruction(config: TaskConfig, layout: Layout, seed: int, name: str, names: Iterable[str]) -> Instruction:
+    """Draw the instruction of an episode.
+
+    Args:
+        config: of the task.
+        layout: of the episode.
+        seed: of the layout.
+        name: of the target.
+        names: of all objects in the scene.
+    """
+    opening, language = config.opening, config.language
+    slots = InstructionSlots(
+        config.task,
+        object=name,
+        support=config.support,
+        relation=cast("Relation | None", layout.relation or None),
+        part=opening.part or part_name(opening.handle) if opening else "",
+    )
+    rng, others = np.random.default_rng([seed, _LANGUAGE]), sorted(set(names) - {name})
+    return choose_instruction(rng, slots, language.split, others=others, synonyms=language.synonyms)
 
 
 def template_ids(task: str, split: Split) -> list[str]:
