@@ -42,10 +42,8 @@ def main(cfg: ServePolicy) -> int:
     from robocas_ms3.core.strict import check_number
     from robocas_ms3.evaluation.policies import open_policy
     from robocas_ms3.evaluation.protocol import load_protocol
-    from robocas_ms3.evaluation.remote.address import strip_brackets
-    from robocas_ms3.evaluation.remote.answers import ServedFiles
     from robocas_ms3.evaluation.remote.messages import LARGEST_BATCH
-    from robocas_ms3.evaluation.remote.server import PolicyServer
+    from robocas_ms3.evaluation.remote.server import PolicyServer, ServedFiles, strip_brackets
 
     check_number("port", cfg.port, 0, 2**16 - 1)
     check_number("max_batch", cfg.max_batch, 1, LARGEST_BATCH)

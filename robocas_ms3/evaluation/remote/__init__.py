@@ -1,7 +1,7 @@
 """Policies behind a websocket, in messages that openpi's client and server understand too.
 
-``client`` is the `Policy` that asks a server; ``server`` lets any `Policy` give ``answers``. ``messages`` and ``wire``
-are the format, described in docs/remote_policies.md.
+`client` is the policy that asks a server; `server` serves any policy. `messages` and `wire` are the format, which
+docs/remote_policies.md describes.
 """
 
 from robocas_ms3.core.errors import MissingExtraError

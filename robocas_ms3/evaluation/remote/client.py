@@ -17,11 +17,11 @@ from websockets.asyncio.client import ClientConnection
 from robocas_ms3.core.errors import EvaluationError, PolicyFailed, WireError
 from robocas_ms3.core.words import one_line
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
-from robocas_ms3.evaluation.remote.address import Address, read_address
 from robocas_ms3.evaluation.remote.connection import (
     LOST,
     close_connection,
     open_connection,
+    read_address,
     read_message,
     server_error,
 )
@@ -43,7 +43,7 @@ _SHARED = -1  # key of the connection for batched requests; other keys are numbe
 _T = TypeVar("_T")
 
 
-class ConnectionLost(EvaluationError):
+class _ConnectionLost(EvaluationError):
     """The connection to a policy server was closed during an episode."""
 
 
@@ -75,7 +75,7 @@ class RemotePolicy:
     """
 
     def __init__(self, address: str) -> None:
-        self._address: Address = read_address(address)
+        self._address = read_address(address)
         self._loop = asyncio.new_event_loop()  # answers pings while the caller simulates
         self._thread = threading.Thread(target=self._loop.run_forever, name="robocas-remote", daemon=True)
         self._thread.start()
@@ -83,7 +83,7 @@ class RemotePolicy:
         self._starts: dict[int, EpisodeSpec] = {}  # of episodes that the server does not know yet
         self._chunk_length: int | None = None
         self._last_answer = 0.0  # clock time, s
-        self._metadata: ServerMetadata = ServerMetadata()
+        self._metadata = ServerMetadata()
         try:
             self._metadata = self._run(self._read_metadata())
             spec = self._spec_of(self._metadata)
@@ -94,7 +94,6 @@ class RemotePolicy:
         self.spec: PolicySpec = replace(spec, look_every=1) if self._address.play else spec
 
     def describe(self) -> dict[str, Any]:
-        """Return the entries of a result: the server's description."""
         rename = {"rename": self._address.rename} if self._address.rename else {}
         return {"server": self._metadata.policy, "play": self._address.play, **rename}
 
@@ -131,17 +130,14 @@ class RemotePolicy:
         return actions
 
     def close(self) -> None:
-        """Close all connections."""
         if self._loop.is_closed():
             return
-        if self._connections:
-            self._run(self._close_all())
+        self._run(self._close(*self._connections))
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
         self._loop.close()
 
     def _run(self, work: Coroutine[Any, Any, _T]) -> _T:
-        """Run a coroutine in the thread of the event loop and return its result."""
         future = asyncio.run_coroutine_threadsafe(work, self._loop)
         try:
             return future.result()
@@ -156,7 +152,6 @@ class RemotePolicy:
         return {rename.get(key.removeprefix(PREFIX), key): value for key, value in message.items()}
 
     def _chunk(self, answer: Any) -> NDArray[np.float32]:
-        """Return the (H, A) actions of an answer; raise if it is an error."""
         if isinstance(answer, EvaluationError):
             raise answer
         chunk = actions_of(answer, self.spec.convention)[: self._address.play]
@@ -191,13 +186,13 @@ class RemotePolicy:
                 if envs[row] in known | starting:
                     groups.setdefault(key, []).append(row)
                 else:
-                    answers[row] = ConnectionLost("the connection is lost")
+                    answers[row] = _ConnectionLost("the connection is lost")
             # A plain openpi server accepts no connection during inference, so all are opened before the first request.
             missing = groups.keys() - self._connections.keys()
             await asyncio.gather(*(self._connect(key) for key in missing))
             parts = [(key, group[at : at + size]) for key, group in groups.items() for at in range(0, len(group), size)]
             await asyncio.gather(*(request(key, part) for key, part in parts))
-            rows = [row for row in rows if envs[row] in starting and isinstance(answers[row], ConnectionLost)]
+            rows = [row for row in rows if envs[row] in starting and isinstance(answers[row], _ConnectionLost)]
         return answers
 
     async def _request(
@@ -207,7 +202,7 @@ class RemotePolicy:
         connection = self._connections.get(key)
         try:
             if connection is None:  # another request has lost it
-                raise ConnectionLost("the connection is lost")
+                raise _ConnectionLost("the connection is lost")
             if self._metadata.max_batch is None:
                 answers = [await self._answer(connection.socket, messages[rows[0]])]
             else:
@@ -240,12 +235,11 @@ class RemotePolicy:
             self._last_answer = time.monotonic()
             return read_message(answer.result())
         except LOST as error:
-            raise ConnectionLost(f"the connection is lost: {one_line(error, 300)}") from error
+            raise _ConnectionLost(f"the connection is lost: {one_line(error, 300)}") from error
         finally:
             answer.cancel()
 
     async def _read_metadata(self) -> ServerMetadata:
-        """Return what the server announces."""
         socket, metadata = await self._open()
         await close_connection(socket)
         return metadata
@@ -257,16 +251,13 @@ class RemotePolicy:
             raise EvaluationError("another policy is served now", where=self._address.url)
         self._connections[key] = _Connection(socket)
 
-    async def _close_all(self) -> None:
-        await asyncio.gather(*map(self._close, list(self._connections)))
-
     async def _open(self) -> tuple[ClientConnection, ServerMetadata]:
         address = self._address
         return await open_connection(address.url, address.connect_s, pings=self._metadata.answers_pings)
 
-    async def _close(self, key: int) -> None:
-        if connection := self._connections.pop(key, None):
-            await close_connection(connection.socket)
+    async def _close(self, *keys: int) -> None:
+        found = [self._connections.pop(key) for key in keys if key in self._connections]
+        await asyncio.gather(*(close_connection(connection.socket) for connection in found))
 
     def _spec_of(self, metadata: ServerMetadata) -> PolicySpec:
         """Return the policy's specification, from its server or the address; raise if both have one."""

@@ -1,4 +1,4 @@
-"""Connections to a policy server, and detection of dead peers.
+"""Addresses of policy servers, connections to them, and detection of dead peers.
 
 TCP keepalive is on at both ends, and websocket pings are sent to peers that answer them.
 """
@@ -9,13 +9,18 @@ import asyncio
 import logging
 import socket
 import time
-from typing import Any
+from dataclasses import dataclass, field, fields
+from typing import Annotated, Any
+from urllib.parse import parse_qsl, urlsplit, urlunsplit
 
+from pydantic import ConfigDict, Field, PositiveInt, TypeAdapter, ValidationError
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import WebSocketException
 
 from robocas_ms3.core.errors import EvaluationError, WireError
+from robocas_ms3.core.strict import refusal
 from robocas_ms3.core.words import one_line
+from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.remote.messages import ServerMetadata, read_metadata
 from robocas_ms3.evaluation.remote.wire import unpack
 
@@ -28,6 +33,65 @@ LOST = (OSError, EOFError, asyncio.TimeoutError, WebSocketException)
 _RETRY_S = 0.2  # between attempts to connect
 _CLOSE_S = 1.0  # for a server's answer to a close frame
 _log = logging.getLogger(__name__)
+_Seconds = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+_Text = Annotated[str, Field(min_length=1)]
+
+
+@dataclass(frozen=True)
+class Address:
+    """Where a remote policy is, and how to talk to it.
+
+    Attributes:
+        url: without options.
+        spec: the policy's specification, for servers that do not announce it; None: not given.
+        rename: other keys of an observation, by name: of a camera, ``qpos``, ``prompt``, ...
+        play: number of actions of a chunk that are executed before the server is asked again; None: all.
+        max_in_flight: number of requests without an answer, for servers without batches; None: one per env.
+        timeout_s: clock time in which the server has to answer one of the requests.
+        connect_s: clock time in which a connection has to be open, when an episode starts.
+    """
+
+    __pydantic_config__ = ConfigDict(extra="forbid")
+
+    url: str
+    spec: PolicySpec | None = None
+    rename: dict[_Text, _Text] = field(default_factory=dict)
+    play: PositiveInt | None = None
+    max_in_flight: PositiveInt | None = None
+    timeout_s: _Seconds = 120.0
+    connect_s: _Seconds = 30.0
+
+
+_FORM = TypeAdapter(Address)
+
+
+def read_address(text: str) -> Address:
+    """Read an address. Its options are the fields of `PolicySpec` and `Address`.
+
+    ``cameras=base_camera:224x224,gripper_camera:224x224`` (width x height) and
+    ``rename=base_camera:observation/image,qpos:observation/state`` are lists of pairs.
+
+    Raises:
+        EvaluationError: the address or an option is invalid.
+    """
+    try:
+        parts = urlsplit(text)
+        valid = parts.scheme in ("ws", "wss") and bool(parts.hostname) and parts.port != 0
+    except ValueError:  # of brackets or a port
+        valid = False
+    if not valid:
+        raise EvaluationError("invalid address of a policy", where=text, expected="ws://host:port or ws://[::1]:port")
+    options: dict[str, Any] = dict(parse_qsl(parts.query, keep_blank_values=True))
+    for name in options.keys() & {"cameras", "rename"}:
+        options[name] = {key: value for key, _, value in (pair.partition(":") for pair in options[name].split(","))}
+    if "cameras" in options:
+        options["cameras"] = {camera: size.split("x") for camera, size in options["cameras"].items()}
+    spec = {name: options.pop(name) for name in options.keys() & {one.name for one in fields(PolicySpec)}}
+    url = urlunsplit((parts.scheme, parts.netloc, parts.path, "", ""))
+    try:
+        return _FORM.validate_python({**options, "url": url, "spec": spec or None})
+    except ValidationError as problem:
+        raise refusal(problem, _FORM, EvaluationError, where=text, about="invalid address of a policy") from problem
 
 
 def enable_tcp_keepalive(connection: Any) -> None:

@@ -29,11 +29,12 @@ ENV, RESET, START, PROMPT, ACTIONS, BATCH, ERROR = "env_id", "reset", "start", "
 PREFIX = "observation/"
 DEFAULT_BATCH, LARGEST_BATCH = 64, 256  # envs
 FILE_NAME_PARTS = 3  # of a file's name in messages: folder of the protocol, folder in it, file
-MAX_TEXT = 10_000  # characters
 _LARGEST_ACTION = 1e3  # m or rad; physics breaks far below it
 _OTHER_BYTES = 8 * 2**20  # of a request, besides images
 _MAX_DESCRIPTION = 2**20  # characters of JSON
 _POLICY_SPEC = TypeAdapter(PolicySpec)
+_Text = Annotated[str, Field(max_length=10_000)]
+_Number = Annotated[int, Field(ge=0, le=2**32 - 1)]
 
 
 def _as_json(description: Any) -> Any:
@@ -61,6 +62,49 @@ class ServerMetadata(BaseModel):
     answers_pings: bool = Field(default=False, alias="robocas_answers_pings")
 
 
+class _Start(BaseModel):
+    """An `EpisodeSpec` in a request, without its env; some clients send none."""
+
+    model_config = ConfigDict(strict=True, extra="forbid")
+
+    episode: _Number = 0
+    task: _Text = ""
+    config_file: _Text = ""
+    layouts_file: _Text = ""
+    pack: _Text = ""
+    seed: _Number = 0
+    instruction: _Text | None = None
+    robot: _Text = DEFAULT
+
+
+class Request(BaseModel):
+    """The keys of a request that are not of an observation (`read_observations`)."""
+
+    model_config = ConfigDict(strict=True)
+
+    env_id: int = 0
+    reset: bool | None = None
+    prompt: _Text = ""
+    start: _Start = _Start()
+
+    def episode_spec(self, env: int) -> EpisodeSpec:
+        """Return the episode that starts, in an env of the policy."""
+        values = self.start.model_dump(exclude_none=True)
+        return EpisodeSpec(env=env, **{"instruction": self.prompt} | values)
+
+
+def read_request(message: Mapping[str, Any]) -> Request:
+    """Read the keys of a request; unknown keys are ignored.
+
+    Raises:
+        WireError: a value is of another type or size.
+    """
+    try:
+        return Request.model_validate(message)
+    except ValidationError as problem:
+        raise refusal(problem, Request, WireError, where="", about="invalid request") from problem
+
+
 def read_metadata(message: Any, url: str) -> ServerMetadata:
     """Read a server's metadata; keys of other packages are ignored.
 
@@ -85,7 +129,7 @@ def read_policy_spec(message: Any, where: object) -> PolicySpec:
     except ValidationError as problem:
         raise refusal(problem, _POLICY_SPEC, EvaluationError, where=where, about=what) from problem
     except (TypeError, ValueError) as error:
-        raise EvaluationError(what, where=where, found=one_line(error, 300)) from error
+        raise EvaluationError(what, where=where, found=one_line(error, 200)) from error
 
 
 def observation_message(
@@ -101,16 +145,16 @@ def observation_message(
     message: dict[str, Any] = {ENV: int(observations.envs[row]), RESET: reset, PROMPT: observations.instructions[row]}
     message |= {PREFIX + name: array for name, array in arrays.items()}
     if start is not None:
-        said = {name: value for name, value in vars(start).items() if name != "env"}
-        said |= {name: name_of(said[name]) for name in ("config_file", "layouts_file")}
+        values = {name: value for name, value in vars(start).items() if name != "env"}
+        values |= {name: file_name(values[name]) for name in ("config_file", "layouts_file")}
         if start.robot == DEFAULT:  # unknown to servers of older versions
-            del said["robot"]
-        message[START] = said
+            del values["robot"]
+        message[START] = values
     return message
 
 
 def read_observations(messages: Sequence[Mapping[str, Any]], envs: Sequence[int], spec: PolicySpec) -> Observations:
-    """Return the observations of messages of one env each, whose numbers are ``envs``, as a policy gets them.
+    """Return the observations of requests of one env each, whose numbers are ``envs``, as a policy gets them.
 
     Raises:
         WireError: an entry is missing, or has another shape or type.
@@ -131,13 +175,10 @@ def read_observations(messages: Sequence[Mapping[str, Any]], envs: Sequence[int]
             raise WireError("observations of a batch differ in shape", where=PREFIX + name)
         return np.stack(arrays).astype(dtype)
 
-    prompts = [message.get(PROMPT, "") for message in messages]
-    if not all(isinstance(prompt, str) and len(prompt) <= MAX_TEXT for prompt in prompts):
-        raise WireError("invalid instruction", where=PROMPT, expected=f"a text of {MAX_TEXT} characters at most")
     sizes = {name: (height, width) for name, (width, height) in spec.cameras.items()}
     return Observations(
         envs=np.array(envs),
-        instructions=prompts if spec.language != "none" else [""] * len(prompts),
+        instructions=["" if spec.language == "none" else message.get(PROMPT, "") for message in messages],
         embeddings=stack("embedding", "float32", None) if spec.language == "embedding" else None,
         images={name: stack(name, "uint8", *size, 3) for name, size in sizes.items()},
         depths={name: stack(f"{name}_depth", "int16", *size, 1) for name, size in sizes.items()} if spec.depth else {},
@@ -146,7 +187,7 @@ def read_observations(messages: Sequence[Mapping[str, Any]], envs: Sequence[int]
     )
 
 
-def name_of(path: str) -> str:
+def file_name(path: str) -> str:
     """Return the name of a protocol's file in messages; its path if a shipped protocol has that name."""
     parts, shipped = Path(path).parts[-FILE_NAME_PARTS:], protocols_dir()
     if len(parts) < FILE_NAME_PARTS or ((shipped / parts[0]).exists() and not Path(path).is_relative_to(shipped)):
@@ -165,12 +206,12 @@ def actions_of(answer: Any, convention: str) -> NDArray[np.float32]:
     try:
         actions = np.asarray(values)
     except ValueError as error:  # lists of different lengths
-        raise WireError("no actions", expected=f"(chunk, {size})", found=one_line(error, 300)) from error
+        raise WireError("no actions", expected=f"(chunk, {size})", found=one_line(error, 200)) from error
     if actions.dtype.kind not in "iuf" or actions.ndim not in (1, 2) or actions.shape[-1] != size or not actions.size:
-        found = one_line(answer, 300) if values is None else f"{actions.shape} {actions.dtype}"
+        found = one_line(answer, 200) if values is None else f"{actions.shape} {actions.dtype}"
         raise WireError("no actions", expected=f"(chunk, {size}) numbers", found=found)
     if not (np.abs(actions.astype(np.float64)) <= _LARGEST_ACTION).all():  # NaN too
-        expected, found = f"{_LARGEST_ACTION:g} at most", one_line(actions.tolist(), 300)
+        expected, found = f"{_LARGEST_ACTION:g} at most", one_line(actions.tolist(), 200)
         raise WireError("action value out of range", expected=expected, found=found)
     return actions.reshape(-1, size).astype(np.float32)
 

@@ -4,34 +4,100 @@ from __future__ import annotations
 
 import asyncio
 import http
+import itertools
 import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
+from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
+from numpy.typing import NDArray
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from robocas_ms3 import __version__
-from robocas_ms3.core.errors import EvaluationError, RobocasError, WireError
-from robocas_ms3.core.words import error_line
-from robocas_ms3.evaluation.policy import Policy, describe, policy_code, policy_spec_values
+from robocas_ms3.core.errors import EvaluationError, PolicyFailed, RobocasError, WireError
+from robocas_ms3.core.paths import builtin_packs_dir, data_dir, protocols_dir
+from robocas_ms3.core.words import error_line, one_line
+from robocas_ms3.evaluation.policy import (
+    EpisodeSpec,
+    Observations,
+    Policy,
+    as_chunks,
+    describe,
+    policy_code,
+    policy_spec_values,
+)
 from robocas_ms3.evaluation.remote import connection
-from robocas_ms3.evaluation.remote.address import netloc, strip_brackets
-from robocas_ms3.evaluation.remote.answers import Answers, ServedFiles
-from robocas_ms3.evaluation.remote.messages import DEFAULT_BATCH, ServerMetadata, batch_limit, message_bytes
-from robocas_ms3.evaluation.remote.wire import pack
+from robocas_ms3.evaluation.remote.messages import (
+    ACTIONS,
+    BATCH,
+    DEFAULT_BATCH,
+    ENV,
+    ERROR,
+    FILE_NAME_PARTS,
+    RESET,
+    ServerMetadata,
+    batch_limit,
+    batch_of,
+    message_bytes,
+    read_observations,
+    read_request,
+)
+from robocas_ms3.evaluation.remote.wire import pack, unpack
 
 HEALTH = "/healthz"
 MAX_CONNECTIONS = 256
 _log = logging.getLogger(__name__)
+_MAX_ENVS = 1024  # of all clients
 _IDLE = 3600.0  # s without a message, after which a connection is closed
 _STOP_S = 5.0  # for the network's thread to end
 _FAILED, _GARBAGE, _FULL = 1011, 1008, 1013  # close codes
+
+
+@dataclass(frozen=True)
+class ServedFiles:
+    """Files and packs that clients may choose by name. No text of a message becomes a path.
+
+    Attributes:
+        files: paths of configurations and layouts, by the names that messages have for them, such as
+            ``smoke/configs/pick.yaml``, and by themselves, for clients on the same machine.
+        packs: names, or folders as protocols of the server have them.
+    """
+
+    files: dict[str, str]
+    packs: frozenset[str]
+
+    @classmethod
+    def of(cls, protocols: Iterable[Path] = (), packs: Iterable[str] = ()) -> ServedFiles:
+        """Collect the files of shipped protocols and installed packs, and of other protocols and their packs.
+
+        Raises:
+            EvaluationError: two protocols have the same name.
+        """
+        folders = {folder.name: folder for folder in protocols_dir().iterdir()}
+        for folder in protocols:
+            if folder.resolve() != folders.setdefault(folder.name, folder).resolve():
+                what, fix = "two protocols have one name", "Rename the folder."
+                raise EvaluationError(what, where=folder, found=folders[folder.name], fix=fix)
+        files = {}
+        for pattern in ("configs/*.yaml", "layouts/*.npy"):
+            for path in itertools.chain.from_iterable(folder.glob(pattern) for folder in folders.values()):
+                files["/".join(path.parts[-FILE_NAME_PARTS:])] = files[str(path)] = str(path)
+        installed = (builtin_packs_dir(), data_dir() / "packs")
+        names = {folder.name for parent in installed if parent.is_dir() for folder in parent.iterdir()}
+        return cls(files, frozenset({*names, *packs}))
+
+    def resolved(self, start: EpisodeSpec) -> EpisodeSpec:
+        """Return a client's episode with paths of this machine; empty: files and packs that are not served."""
+        config, layouts = (self.files.get(name, "") for name in (start.config_file, start.layouts_file))
+        pack = start.pack if start.pack in self.packs else ""
+        return replace(start, config_file=config, layouts_file=layouts, pack=pack)
 
 
 class PolicyServer:
@@ -61,15 +127,14 @@ class PolicyServer:
             spec = policy.spec
         max_batch = batch_limit(spec, max_batch)
         self._max_bytes = message_bytes(spec, max_batch)
-        about = {**describe(policy), "robocas_ms3": __version__}
         metadata = ServerMetadata(
             robocas_wants=policy_spec_values(spec),
-            robocas_policy=about,
+            robocas_policy={**describe(policy), "robocas_ms3": __version__},
             robocas_max_batch=max_batch,
             robocas_answers_pings=True,
         )
         self._metadata = pack(metadata.model_dump(by_alias=True))
-        self._answers = Answers(policy, files or ServedFiles.of(), self._max_bytes, max_batch)
+        self._answers = _Answers(policy, files or ServedFiles.of(), max_batch)
         self._calls: SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None] = SimpleQueue()
         self._connections = 0
 
@@ -127,10 +192,9 @@ class PolicyServer:
         try:
             running = await server
         except (OSError, UnicodeError) as error:
-            raise EvaluationError("can't listen", where=netloc(self._host, self._port), found=error) from error
+            raise EvaluationError("can't listen", where=_netloc(self._host, self._port), found=error) from error
         async with running:
-            port = next(iter(running.sockets)).getsockname()[1]
-            url = f"ws://{netloc(self._host, port)}"
+            url = f"ws://{_netloc(self._host, next(iter(running.sockets)).getsockname()[1])}"
             started.set_result((url, lambda: loop.call_soon_threadsafe(ended.set)))
             await ended.wait()
 
@@ -170,16 +234,113 @@ class PolicyServer:
     def _reply(self, message: str | bytes, envs: dict[int, int]) -> tuple[str | bytes, int]:
         """Return an answer, and the code to close the connection with; 0: it stays open."""
         try:
-            return pack(self._answers.answer(message, envs)), 0
+            value = unpack(message, self._max_bytes) if isinstance(message, bytes) else None
+            return pack(self._answers.answer(value, envs)), 0
         except WireError as error:
             _log.warning("a client sent an invalid message: %s", error)
             return error_line(error, 300), _GARBAGE
-        except RobocasError as error:
-            _log.warning("the policy failed: %s", error)
-            return error_line(error, 300), _FAILED
         except Exception as error:  # a policy may raise anything; other clients are still served
-            _log.exception("the policy failed")
-            return error_line(error, 300), _FAILED
+            return _log_failure(error), _FAILED
+
+
+class _Answers:
+    """Convert requests to calls of a policy, and actions to answers.
+
+    A batched request is one call of ``reset`` with all episodes that start and one call of ``act`` with all
+    observations, both in the request's order, as in an evaluation without a server. A request without a batch is a
+    call with one env. An env keeps the client's number unless another client uses it. Clients that send neither
+    ``env_id`` nor ``reset``, such as openpi's, have one episode per connection.
+    """
+
+    def __init__(self, policy: Policy, files: ServedFiles, max_batch: int) -> None:
+        self._policy, self._files, self._max_batch = policy, files, max_batch
+        with policy_code(policy):
+            self._spec = policy.spec
+        self._used: set[int] = set()  # envs of the policy
+
+    def answer(self, message: Any, envs: dict[int, int]) -> dict[str, Any]:
+        """Return the answer to a message.
+
+        ``envs`` has the policy's env by the client's, of this connection; new ones are added.
+
+        Raises:
+            WireError: the request is invalid.
+            Exception: whatever the policy raises, without a batch.
+        """
+        if not isinstance(message, dict):
+            raise WireError("no observation", expected="a map")
+        if BATCH not in message:
+            return {ACTIONS: self._act(*self._read([message], envs))[0]}
+        observations, starts = self._read(batch_of(message, 1, self._max_batch), envs)
+        actions, reasons = self._act_or_explain(observations, starts)
+        rows = enumerate(observations.envs.tolist())
+        return {BATCH: [{ERROR: reasons[env]} if env in reasons else {ACTIONS: actions[row]} for row, env in rows]}
+
+    def release(self, envs: dict[int, int]) -> None:
+        """Make the envs of a closed connection available."""
+        self._used -= set(envs.values())
+
+    def _read(self, messages: Sequence[dict[str, Any]], envs: dict[int, int]) -> tuple[Observations, list[EpisodeSpec]]:
+        """Return the observations of some messages, and the episodes that start."""
+        numbers, starts = [], []
+        for message in messages:
+            request = read_request(message)
+            number, is_new = self._env(request.env_id, request.reset, envs)
+            numbers.append(number)
+            if is_new or request.reset:
+                starts.append(self._files.resolved(request.episode_spec(number)))
+        if len(set(numbers)) < len(numbers):
+            raise WireError("invalid batch", where=ENV, expected="each env once", found=sorted(numbers))
+        return read_observations(messages, numbers, self._spec), starts
+
+    def _env(self, env: int, reset: bool | None, envs: dict[int, int]) -> tuple[int, bool]:
+        """Return the policy's number of a client's env, and whether it is new."""
+        if env in envs:
+            return envs[env], False
+        if reset is False:
+            raise WireError("no episode is running", where=f"{ENV} {env}", expected=f"{RESET}: true first")
+        if len(self._used) >= _MAX_ENVS:
+            raise WireError("too many envs", expected=f"{_MAX_ENVS} at most")
+        wanted = [env] if 0 <= env < _MAX_ENVS else []  # the client's number, if it is free
+        envs[env] = next(number for number in itertools.chain(wanted, itertools.count()) if number not in self._used)
+        self._used.add(envs[env])
+        return envs[env], True
+
+    def _act(self, observations: Observations, starts: list[EpisodeSpec]) -> NDArray[Any]:
+        """Return the policy's (E, H, A) actions."""
+        with policy_code(self._policy):
+            if starts:
+                self._policy.reset(starts)
+            return as_chunks(self._policy.act(observations), len(observations.envs), None)
+
+    def _act_or_explain(self, observations: Observations, starts: list[EpisodeSpec]) -> tuple[Any, dict[int, str]]:
+        """Return the policy's (E, H, A) actions, and by env why it has none; an error without an env is that of all."""
+        reasons: dict[int, str] = {}
+        try:
+            return self._act(observations, starts), {}
+        except PolicyFailed as failed:
+            text = _log_failure(failed)
+            reasons = {env: one_line(reason, 300) for env, reason in failed.reasons.items()}
+            if failed.actions is not None:
+                return as_chunks(failed.actions, len(observations.envs), None), reasons
+        except Exception as error:  # a policy may raise anything; other clients are still served
+            text = _log_failure(error)
+        return None, {env: reasons.get(env, text) for env in observations.envs.tolist()}
+
+
+def strip_brackets(host: str) -> str:
+    """Return a host without the brackets that an IPv6 address has in a URL."""
+    return host[1:-1] if host.startswith("[") and host.endswith("]") else host
+
+
+def _netloc(host: str, port: int) -> str:
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
+def _log_failure(error: Exception) -> str:
+    """Log an error of a policy, with a traceback if it is none of ours, and return it as a line for its client."""
+    _log.warning("the policy failed: %s", error, exc_info=None if isinstance(error, RobocasError) else error)
+    return error_line(error, 300)
 
 
 def _health(client: ServerConnection, request: Request) -> Response | None:

@@ -56,7 +56,7 @@ def unpack(data: bytes, max_bytes: int = MAX_BYTES) -> Any:
             data, object_hook=count, list_hook=count, max_array_len=_MAX_LIST, max_map_len=_MAX_MAP, max_ext_len=0
         )
     except (ValueError, OverflowError, RecursionError, msgpack.UnpackException) as error:
-        raise WireError("no message", found=one_line(error, 300)) from error
+        raise WireError("no message", found=one_line(error, 200)) from error
     return _decode(value, 0)
 
 
@@ -77,14 +77,14 @@ def _decode(value: Any, depth: int) -> Any:
         return [_decode(one, depth + 1) for one in value]
     if not isinstance(value, dict):
         if isinstance(value, msgpack.ExtType):
-            raise WireError("no message", found=one_line(value, 300))
+            raise WireError("no message", found=one_line(value, 200))
         return value
     if _ARRAY in value:
         return _array(value)
     if _SCALAR in value:
         return _scalar(value)
     if not all(isinstance(key, str) for key in value):
-        raise WireError("keys have to be text", found=one_line(list(value), 300))
+        raise WireError("keys have to be text", found=one_line(list(value), 200))
     return {key: _decode(one, depth + 1) for key, one in value.items()}
 
 
@@ -99,18 +99,18 @@ def _array(value: dict[Any, Any]) -> NDArray[Any]:
         or len(data) != math.prod(shape) * dtype.itemsize
     ):
         found = f"{type(data).__name__} of {len(data) if isinstance(data, bytes) else '?'} bytes, shape {shape}"
-        raise WireError("invalid array", expected="data, dtype and a shape that fit", found=one_line(found, 300))
+        raise WireError("invalid array", expected="data, dtype and a shape that fit", found=one_line(found, 200))
     stored = np.dtype(np.uint8) if dtype.kind == "b" else dtype  # a bool's byte may be any, and NumPy expects 0 or 1
     try:
         return np.ndarray(shape, stored, buffer=data).astype(dtype.newbyteorder("="))
     except ValueError as error:  # an empty array with lengths beyond NumPy's
-        raise WireError("invalid array", found=one_line(error, 300)) from error
+        raise WireError("invalid array", found=one_line(error, 200)) from error
 
 
 def _scalar(value: dict[Any, Any]) -> bool | int | float:
     number = value.get(b"data")
     if len(value) != 3 or not isinstance(number, bool | int | float):
-        raise WireError("invalid scalar", expected="data and dtype of a number", found=one_line(value, 300))
+        raise WireError("invalid scalar", expected="data and dtype of a number", found=one_line(value, 200))
     _dtype(value.get(b"dtype"))
     return number
 
@@ -118,4 +118,4 @@ def _scalar(value: dict[Any, Any]) -> bool | int | float:
 def _dtype(text: Any) -> np.dtype:
     if isinstance(text, str) and _DTYPE.fullmatch(text):
         return np.dtype(text)
-    raise WireError("invalid type of numbers", expected="such as <f4 or |u1", found=one_line(repr(text), 300))
+    raise WireError("invalid type of numbers", expected="such as <f4 or |u1", found=one_line(repr(text), 200))

@@ -13,17 +13,17 @@ from robocas_ms3.core.paths import protocols_dir
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 
 CAMERA = (6, 4)  # width, height
-LAYOUTS = "layouts/pick_table_scattered.npy"
+IN_A_HURRY = "timeout_s=0.5&connect_s=0.5"  # options of an address: as long as a test can wait
 
 
 def a_start(env: int = 0, episode: int = 3, seed: int = 7) -> EpisodeSpec:
-    smoke = protocols_dir() / "smoke"
-    config, layouts = (str(smoke / name) for name in ("configs/pick_table_scattered.yaml", LAYOUTS))
-    return EpisodeSpec(env, episode, "pick", config, layouts, "builtin", seed, "take the apple")
+    smoke, name = protocols_dir() / "smoke", "pick_table_scattered"
+    files = (str(smoke / f"configs/{name}.yaml"), str(smoke / f"layouts/{name}.npy"))
+    return EpisodeSpec(env, episode, "pick", *files, "builtin", seed, "take the apple")
 
 
-def some_observations(*envs: int, seed: int = 0, cameras: bool = False) -> Observations:
-    rng, count = np.random.default_rng(seed), len(envs)
+def some_observations(*envs: int, cameras: bool = False) -> Observations:
+    rng, count = np.random.default_rng(0), len(envs)
     width, height = CAMERA
     shape = (count, height, width)
     return Observations(
@@ -44,9 +44,8 @@ def some_observations(*envs: int, seed: int = 0, cameras: bool = False) -> Obser
 class Told:
     """A policy that keeps what it is told, and acts by what it sees."""
 
-    def __init__(self, spec: PolicySpec | None = None, chunk: int = 3) -> None:
+    def __init__(self, spec: PolicySpec | None = None) -> None:
         self.spec = spec or PolicySpec()
-        self.chunk = chunk
         self.starts: list[EpisodeSpec] = []
         self.seen: list[Observations] = []
 
@@ -55,7 +54,7 @@ class Told:
 
     def act(self, observations: Observations) -> np.ndarray:
         self.seen.append(observations)
-        return np.repeat(observations.tcp_in_base[:, None, :7].astype(float), self.chunk, axis=1)
+        return np.repeat(observations.tcp_in_base[:, None, :7].astype(float), 3, axis=1)
 
 
 @contextmanager
@@ -80,11 +79,11 @@ def serving(policy: Any, port: int = 0, **options: Any) -> Iterator[str]:
 
 
 @contextmanager
-def talking(talk: Callable[[Any], None], port: int = 0) -> Iterator[str]:
+def talking(talk: Callable[[Any], None]) -> Iterator[str]:
     """A server that does anything; gives the address."""
     from websockets.sync.server import serve
 
-    with serve(talk, "127.0.0.1", port, compression=None, max_size=None, close_timeout=0.1) as server:
+    with serve(talk, "127.0.0.1", 0, compression=None, max_size=None, close_timeout=0.1) as server:
         thread = threading.Thread(target=server.serve_forever, daemon=True)
         thread.start()
         try:
@@ -93,4 +92,15 @@ def talking(talk: Callable[[Any], None], port: int = 0) -> Iterator[str]:
             server.shutdown()
 
 
-IN_A_HURRY = "timeout_s=0.5&connect_s=0.5"  # options of an address: as long as a test can wait
+def answering(answer: Any, metadata: dict[str, Any] | None = None) -> Any:
+    """A server with this answer, bytes or a text; or what a function makes of the connection and a message."""
+    from robocas_ms3.evaluation.remote.wire import pack
+
+    def talk(socket: Any) -> None:
+        socket.send(pack(metadata or {}))
+        for data in socket:
+            reply = answer(socket, data) if callable(answer) else answer
+            if reply is not None:
+                socket.send(reply)
+
+    return talking(talk)

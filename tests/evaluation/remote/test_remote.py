@@ -1,8 +1,12 @@
 """Our client and our server, and openpi's client and a server as openpi writes one."""
 
 import multiprocessing
+import re
 import socket
+import subprocess
+import sys
 from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,17 +14,21 @@ import pytest
 pytest.importorskip("websockets")
 pytest.importorskip("msgpack")
 
-from remote_ends import CAMERA, Told, a_start, serving, some_observations, talking
+from counting_env import CountingEnv
+from remote_ends import CAMERA, IN_A_HURRY, Told, a_start, answering, serving, some_observations
 
 from robocas_ms3.core.errors import EvaluationError, PolicyFailed
 from robocas_ms3.evaluation.policies import make_policy
 from robocas_ms3.evaluation.policy import PolicySpec
-from robocas_ms3.evaluation.remote.answers import ServedFiles, read_episode_spec
 from robocas_ms3.evaluation.remote.client import RemotePolicy
-from robocas_ms3.evaluation.remote.messages import observation_message
-from robocas_ms3.evaluation.remote.wire import pack, unpack
+from robocas_ms3.evaluation.remote.connection import Address, read_address
+from robocas_ms3.evaluation.remote.messages import batch_limit, message_bytes, observation_message, read_request
+from robocas_ms3.evaluation.remote.server import PolicyServer, ServedFiles
+from robocas_ms3.evaluation.remote.wire import MAX_BYTES
+from robocas_ms3.evaluation.rollout import EndConditions, EpisodeBatch, rollout
 
 ALL = PolicySpec(cameras={"base_camera": CAMERA}, depth=True, state=True, rate_hz=10, reference="tcp")
+PAGE = Path(__file__).resolve().parents[3] / "docs/remote_policies.md"
 
 
 def test_a_served_policy_observes_and_answers_the_same():
@@ -41,7 +49,94 @@ def test_a_served_policy_observes_and_answers_the_same():
             assert getattr(one, "dtype", None) == getattr(other, "dtype", None)
 
 
-def test_who_is_asked_more_often_than_it_would_looks_more_often():
+class SharedNoise(Told):
+    """Draw the noise of all envs of a call from one generator, so that an outcome follows from the calls."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.calls: list[tuple[list[int], list[int]]] = []
+        self._rng = np.random.default_rng(0)
+        self._started: list[int] = []
+
+    def reset(self, starts):
+        super().reset(starts)
+        self._started = [start.env for start in starts]
+        self._rng.bytes(len(starts))
+
+    def act(self, observations):
+        self.calls.append((self._started, observations.envs.tolist()))
+        self._started = []
+        noise = self._rng.normal(size=(len(observations.envs), 2, 7)).astype(np.float32)
+        return noise * observations.tcp_in_base[:, None] + noise.mean()
+
+
+def play(policy):
+    """Play eight episodes in three envs that end after different numbers of steps."""
+    env = CountingEnv(3, np.array([3, 4, 7]), steps=True)
+    starts = [a_start(-1, episode=number, seed=number) for number in range(8)]
+    batch = EpisodeBatch(env, policy.spec, EndConditions(9), 0.05, refill=True)
+    return [replace(one, inference_seconds=0.0) for one in rollout(batch, policy, starts)], env.actions
+
+
+def test_a_remote_run_is_equal_to_a_local_run_bit_for_bit():
+    local, served = SharedNoise(), SharedNoise()
+    expected, expected_actions = play(local)
+    with serving(served) as url:
+        remote = RemotePolicy(url)
+        played, actions = play(remote)
+        remote.close()
+    assert served.calls == local.calls
+    assert any(envs != sorted(envs) for _, envs in local.calls), "the order of rows would not be tested"
+    assert served.starts == local.starts
+    assert played == expected
+    assert [step.tobytes() for step in actions] == [step.tobytes() for step in expected_actions]
+
+
+def test_a_batch_of_the_announced_size_fits_in_a_message():
+    for camera in ((8, 8), (224, 224), (640, 480), (4096, 4096)):
+        spec = PolicySpec(cameras=dict.fromkeys(("base_camera", "gripper_camera", "static_camera"), camera), depth=True)
+        envs = batch_limit(spec, 256)
+        images = 3 * camera[0] * camera[1] * 5
+        assert envs == 1 or envs * images + 4 * 2**20 <= message_bytes(spec, envs) <= MAX_BYTES
+        assert batch_limit(spec, 1) == 1
+
+
+class FailingIn(Told):
+    """Fail in one env by `PolicyFailed`, and in another one by an exception."""
+
+    failing, raising = 1, 4
+
+    def act(self, observations):
+        actions = super().act(observations)
+        if self.raising in observations.envs:
+            raise RuntimeError("out of memory")
+        if self.failing in observations.envs:
+            raise PolicyFailed({self.failing: "no\nplan"}, actions)
+        return actions
+
+
+def test_batches_are_split_and_failures_end_their_episodes_alone():
+    policy, seen = FailingIn(), some_observations(*range(6))
+    with serving(policy, max_batch=2) as url:
+        remote = RemotePolicy(url)
+        remote.reset([a_start(env) for env in range(6)])
+        with pytest.raises(PolicyFailed) as failed:
+            remote.act(seen)
+        assert [one.envs.tolist() for one in policy.seen] == [[0, 1], [2, 3], [4, 5]]
+        exception = "the server failed: RuntimeError: out of memory"
+        assert failed.value.reasons == {1: "the server failed: no plan", 4: exception, 5: exception}
+        np.testing.assert_array_equal(failed.value.actions[[0, 2, 3]], Told().act(seen)[[0, 2, 3]])
+        assert remote.act(some_observations(0, 2)).shape == (2, 3, 7)
+        with pytest.raises(PolicyFailed, match="connection is lost"):
+            remote.act(some_observations(1))
+        policy.failing = -1
+        remote.reset([a_start(1, episode=9)])
+        assert remote.act(some_observations(0, 1)).shape == (2, 3, 7)
+        remote.close()
+    assert policy.starts[6:] == [a_start(1, episode=9)]
+
+
+def test_with_play_each_observation_has_images():
     with serving(Told(PolicySpec(look_every=3))) as url:
         for address, looks in ((url, 3), (f"{url}?play=2", 1)):
             remote = RemotePolicy(address)
@@ -68,8 +163,7 @@ def test_a_forked_process_asks_over_a_connection_of_its_own():
         child.kill()
         child.join()
         assert child.exitcode == 0
-        remote.reset([a_start(0)])
-        assert remote.act(some_observations(0)).shape == (1, 3, 7)
+        ask_once(url)
         remote.close()
 
 
@@ -97,17 +191,32 @@ def test_an_ipv6_address_is_in_brackets(host):
         pytest.skip("no IPv6 here")
     with serving(Told(), host=host) as url:
         assert url.startswith("ws://[::1]:")
-        remote = RemotePolicy(url)
-        remote.reset([a_start()])
-        assert remote.act(some_observations(0)).shape == (1, 3, 7)
-        remote.close()
+        ask_once(url)
 
 
 def test_a_port_that_is_taken():
-    from robocas_ms3.evaluation.remote.server import PolicyServer
-
     with serving(Told()) as url, pytest.raises(EvaluationError, match="can't listen"):
         PolicyServer(Told(), port=int(url.rpartition(":")[2])).run()
+
+
+def test_the_next_episode_finds_a_server_that_came_back_with_the_same_policy():
+    with serving(Told()) as url:
+        remote = RemotePolicy(f"{url}?{IN_A_HURRY}")
+        remote.reset([a_start(0), a_start(1)])
+        remote.act(some_observations(0, 1))
+    port = int(url.rpartition(":")[2])
+    policy = Told()
+    with serving(policy, port):
+        remote.reset([a_start(1, episode=9)])
+        with pytest.raises(PolicyFailed, match="connection is lost") as failed:
+            remote.act(some_observations(0, 1))
+        assert failed.value.reasons.keys() == {0}
+        assert policy.starts == [a_start(1, episode=9)]
+    with serving(Told(PolicySpec(convention="delta_euler")), port):
+        remote.reset([a_start(0)])
+        with pytest.raises(EvaluationError, match="another policy is served now"):
+            remote.act(some_observations(0))
+    remote.close()
 
 
 def test_a_start_names_the_robot_where_it_is_another():
@@ -116,7 +225,7 @@ def test_a_start_names_the_robot_where_it_is_another():
         start = replace(a_start(), robot=robot)
         message = observation_message(some_observations(0), 0, start, reset=True)
         assert message["start"].keys() & {"robot"} == keys
-        assert ServedFiles.of().resolved(read_episode_spec(message, 0)) == start
+        assert ServedFiles.of().resolved(read_request(message).episode_spec(0)) == start
 
 
 def test_openpis_client_asks_our_server():
@@ -135,22 +244,15 @@ def test_openpis_client_asks_our_server():
             client.infer({"prompt": "take the apple"})
 
 
-def openpi_server(replies, metadata, seen):
-    """As openpi's own talks: packed by its packer, metadata first."""
-    openpi = pytest.importorskip("openpi_client.msgpack_numpy")
-
-    def talk(socket):
-        socket.send(openpi.packb(metadata))
-        for message in socket:
-            seen.append(openpi.unpackb(message))
-            socket.send(openpi.packb({"actions": replies, "server_timing": {"infer_ms": np.float64(1)}}))
-
-    return talking(talk)
-
-
 def test_our_client_asks_a_plain_openpi_server():
-    seen = []
-    with openpi_server(np.ones((10, 8), np.float32) / 10, {"reset_pose": np.zeros(3)}, seen) as url:
+    openpi, seen = pytest.importorskip("openpi_client.msgpack_numpy"), []
+
+    def answer(socket, data):
+        seen.append(openpi.unpackb(data))
+        timing = {"infer_ms": np.float64(1)}
+        return openpi.packb({"actions": np.ones((10, 8), np.float32) / 10, "server_timing": timing})
+
+    with answering(answer, {"reset_pose": np.zeros(3)}) as url:
         options = "convention=joint_positions&cameras=base_camera:6x4&play=4&language=text"
         remote = RemotePolicy(f"{url}?{options}&rename=base_camera:observation/image,prompt:text")
         assert remote.spec == PolicySpec(convention="joint_positions", cameras={"base_camera": (6, 4)})
@@ -163,22 +265,59 @@ def test_our_client_asks_a_plain_openpi_server():
     assert "start" not in seen[0]
 
 
-def test_a_server_that_says_what_it_wants_is_not_told():
+def test_the_server_of_the_documentation():
+    pytest.importorskip("openpi_client")
+    (program,) = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+    last = "    server.serve_forever()"
+    assert '"127.0.0.1", 8000' in program and last in program
+    program = program.replace("8000", "0").replace(
+        last, f"    print(server.socket.getsockname()[1], flush=True)\n{last}"
+    )
+    served = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
+    try:
+        assert served.stdout is not None
+        remote = RemotePolicy(f"ws://127.0.0.1:{int(served.stdout.readline())}")
+        assert dict(remote.spec.cameras) == {"base_camera": (224, 224)}
+        remote.reset([a_start(env) for env in range(5)])
+        seen = some_observations(*range(5))
+        seen.images["base_camera"] = np.zeros((5, 224, 224, 3), np.uint8)
+        assert remote.act(seen).shape == (5, 5, 7)
+        remote.close()
+    finally:
+        served.kill()
+        served.communicate()
+
+
+def test_addresses_have_options():
+    assert read_address("ws://127.0.0.1:8000") == Address("ws://127.0.0.1:8000")
+    assert read_address("wss://[::1]/policy").url == "wss://[::1]/policy"
+    text = "ws://host:1?cameras=base_camera:320x240,gripper_camera:64x64&depth=1&rate_hz=5&rename=qpos:state&play=5"
+    assert read_address(f"{text}&max_in_flight=2&timeout_s=9") == Address(
+        "ws://host:1",
+        spec=PolicySpec(cameras={"base_camera": (320, 240), "gripper_camera": (64, 64)}, depth=True, rate_hz=5.0),
+        rename={"qpos": "state"},
+        play=5,
+        max_in_flight=2,
+        timeout_s=9.0,
+    )
     with serving(Told()) as url, pytest.raises(EvaluationError, match="announces its policy specification"):
         RemotePolicy(f"{url}?convention=delta_euler")
 
 
-def plain(socket):
-    socket.send(pack({}))
-    for message in socket:
-        socket.send(pack({"actions": [[0.0] * 7] * (1 + unpack(message)["env_id"])}))
-
-
-def test_lists_are_actions_too_and_chunks_are_of_one_length():
-    with talking(plain) as url:
-        remote = RemotePolicy(url)
-        remote.reset([a_start(0), a_start(1)])
-        with pytest.raises(PolicyFailed) as failed:
-            remote.act(some_observations(0, 1))
-        assert "differ in length" in failed.value.reasons[1]
-        assert failed.value.actions.shape == (2, 1, 7)
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("ws://", "ws://host:99999", "ws://host:0", "ws://[::1", "ws://[1]:2"),
+        *(f"ws://host:1?{option}={'9' * 5000}" for option in ("play", "cameras=base_camera:2x")),
+        *(
+            f"ws://host:1?{option}"
+            for option in (
+                *("camera=base_camera:2x2", "cameras=base_camera:2", "cameras=base_camera", "depth=maybe", "play=0"),
+                *("max_in_flight=0", "timeout_s=-1", "rate_hz=nan", "rename="),
+            )
+        ),
+    ],
+)
+def test_errors_of_an_address_come_before_any_connection(text):
+    with pytest.raises(EvaluationError):
+        make_policy(text)

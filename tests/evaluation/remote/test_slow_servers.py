@@ -1,5 +1,7 @@
-"""A dead network is noticed, and a slow server is not taken for one."""
+"""Slow servers are waited for, all of them at the same time, and a dead network is noticed."""
 
+import asyncio
+import multiprocessing
 import os
 import socket as sockets
 import subprocess
@@ -10,12 +12,14 @@ import urllib.request
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip("websockets")
 pytest.importorskip("msgpack")
 
-from remote_ends import Told, a_start, serving, some_observations
+from remote_ends import Told, a_start, answering, serving, some_observations
+from websockets.asyncio.server import serve
 from websockets.sync.client import connect
 
 from robocas_ms3.core.errors import PolicyFailed
@@ -23,6 +27,8 @@ from robocas_ms3.evaluation.remote import connection
 from robocas_ms3.evaluation.remote.client import RemotePolicy
 from robocas_ms3.evaluation.remote.messages import observation_message
 from robocas_ms3.evaluation.remote.wire import pack, unpack
+
+ENVS = 5
 
 
 class Slow(Told):
@@ -45,11 +51,93 @@ def fast_pings(monkeypatch):
     monkeypatch.setattr(connection, "PING_TIMEOUT", 1.0)
 
 
+def with_numbers(answer):
+    """Serve what a function of the env's number returns, a thread per connection."""
+    return answering(lambda _, data: pack({"actions": np.full((1, 7), answer(unpack(data)["env_id"]))}))
+
+
+def started(url):
+    remote = RemotePolicy(url)
+    remote.reset([a_start(env) for env in range(ENVS)])
+    return remote
+
+
+@pytest.mark.parametrize("in_turn", [True, False])
+def test_requests_of_all_envs_are_in_flight_together_or_in_their_order(in_turn):
+    """Each answer has the time limit for itself where a server computes one after another."""
+    asked, turn, arrived = [], threading.Lock(), threading.Barrier(1 if in_turn else ENVS)
+
+    def answer(env):
+        arrived.wait(20)  # nobody is answered before all have asked
+        assert turn.acquire(blocking=not in_turn)
+        asked.append(env)
+        time.sleep(0.1 if in_turn else 0.5)
+        turn.release()
+        return env
+
+    with with_numbers(answer) as url:
+        remote = started(f"{url}?{'max_in_flight=1' if in_turn else 'timeout_s=1.5'}")
+        for order in ([0, 1, 2, 3, 4], [3, 0, 4, 2, 1]):  # answers in any order belong to their envs
+            assert remote.act(some_observations(*order))[:, 0, 0].tolist() == order
+        remote.close()
+    assert asked == [0, 1, 2, 3, 4, 3, 0, 4, 2, 1] or not in_turn
+
+
+def blocking_server(pipe):
+    """Serve as openpi does: nothing else happens during inference, neither pings nor new connections."""
+
+    async def talk(client):
+        await client.send(pack({}))
+        async for data in client:
+            time.sleep(0.8)
+            await client.send(pack({"actions": np.full((1, 7), unpack(data)["env_id"])}))
+
+    async def run():
+        async with serve(talk, "127.0.0.1", 0, compression=None, max_size=None) as server:
+            pipe.send(next(iter(server.sockets)).getsockname()[1])
+            await server.serve_forever()
+
+    asyncio.run(run())
+
+
+def test_connections_are_opened_before_the_server_computes():
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    server = context.Process(target=blocking_server, args=(theirs,), daemon=True)
+    server.start()
+    try:
+        remote = started(f"ws://127.0.0.1:{ours.recv()}?connect_s=0.6")
+        assert remote.act(some_observations(*range(ENVS)))[:, 0, 0].tolist() == [*range(ENVS)]
+        remote.close()
+    finally:
+        server.terminate()
+        server.join()
+
+
+def test_an_env_without_an_answer_fails_alone():
+    ended = threading.Event()
+
+    def answer(env):
+        if env == 2:
+            ended.wait(20)
+        return env
+
+    with with_numbers(answer) as url:
+        remote = started(f"{url}?timeout_s=1")
+        with pytest.raises(PolicyFailed) as failed:
+            remote.act(some_observations(*range(ENVS)))
+        ended.set()
+        assert failed.value.reasons == {2: "no answer within 1 s"}
+        assert failed.value.actions[[0, 1, 3, 4], 0, 0].tolist() == [0, 1, 3, 4]
+        remote.reset([a_start(2)])
+        assert remote.act(some_observations(2, 3))[:, 0, 0].tolist() == [2, 3]
+        remote.close()
+
+
 def test_a_slow_server_is_not_dropped_and_answers_health_checks(fast_pings):
     policy = Slow(4.0)  # several times what an answer to a ping may take
     with serving(policy) as url:
-        remote = RemotePolicy(url)
-        remote.reset([a_start(0)])
+        remote = started(url)
         answers = []
         asking = threading.Thread(target=lambda: answers.append(remote.act(some_observations(0))))
         asking.start()
@@ -95,11 +183,9 @@ def test_a_dead_network_is_noticed_by_both_ends(fast_pings):
         remote.reset([a_start(0)])
         remote.act(some_observations(0))
         cut.set()
-        start = time.monotonic()
         with pytest.raises(PolicyFailed, match="keepalive ping timeout"):
             remote.act(some_observations(0))
-        assert time.monotonic() - start < 20
-        while time.monotonic() - start < 20:  # until the server has released the env
+        for _ in range(100):  # until the server has released the env
             other = RemotePolicy(url)
             other.reset([a_start(0)])
             other.act(some_observations(0))
@@ -133,28 +219,21 @@ def test_a_request_whose_client_is_gone_is_skipped():
 CUT = """
 import os, subprocess, sys, threading, time
 subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
-from remote_ends import a_start, some_observations, talking
+from remote_ends import a_start, answering, some_observations
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.remote import connection
 from robocas_ms3.evaluation.remote.client import RemotePolicy
-from robocas_ms3.evaluation.remote.wire import pack
 
 connection.TCP_OPTIONS = {"TCP_KEEPIDLE": 1, "TCP_KEEPINTVL": 1, "TCP_KEEPCNT": 2}
 
-def talk(socket):  # a plain openpi server, which answers no pings
-    socket.send(pack({}))
-    for _ in socket:
-        time.sleep(1000)
-
-with talking(talk) as url:
+with answering(lambda *_: time.sleep(1000)) as url:  # a plain openpi server, which answers no pings
     policy = RemotePolicy(url + "?timeout_s=300&connect_s=0.5")
     policy.reset([a_start(0)])
     threading.Timer(1, lambda: subprocess.run(["ip", "link", "set", "lo", "down"], check=True)).start()
-    start = time.monotonic()
     try:
         policy.act(some_observations(0))
     except EvaluationError as failed:
-        print("no server within" in str(failed), time.monotonic() - start, flush=True)
+        print("no server within" in str(failed), flush=True)
     os._exit(0)
 """
 
@@ -170,6 +249,4 @@ def test_tcp_keepalive_notices_a_dead_network_without_pings():
     env = os.environ | {"PYTHONPATH": os.pathsep.join([str(here), str(here.parents[2])])}
     words += [sys.executable, "-c", CUT]
     done = subprocess.run(words, capture_output=True, text=True, timeout=120, env=env, check=False)
-    lost, seconds = done.stdout.split() or pytest.fail(done.stderr)
-    assert lost == "True"
-    assert float(seconds) < 30
+    assert done.stdout == "True\n", done.stderr

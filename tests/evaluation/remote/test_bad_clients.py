@@ -16,9 +16,12 @@ from websockets.sync.client import connect
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.policies.scripted import ScriptedPolicy
-from robocas_ms3.evaluation.remote.answers import ServedFiles
-from robocas_ms3.evaluation.remote.messages import name_of, observation_message
+from robocas_ms3.evaluation.policy import PolicySpec
+from robocas_ms3.evaluation.remote.messages import file_name, observation_message
+from robocas_ms3.evaluation.remote.server import ServedFiles
 from robocas_ms3.evaluation.remote.wire import pack
+
+GARBAGE, TOO_LARGE = 1008, 1009
 
 
 class Failing(Told):
@@ -40,14 +43,17 @@ class Reading(Told):
         ScriptedPolicy().reset(starts)
 
 
-def asked(url, changes=None, **more):
-    """The answer to a first message with a changed start; None where the server hangs up without one."""
-    message = observation_message(some_observations(0), 0, a_start(), reset=True)
-    message["start"] |= changes or {}
+def message(env=0, start=None, **more):
+    made = observation_message(some_observations(env), 0, a_start(env), reset=True)
+    return made | {"start": made["start"] | (start or {})} | more
+
+
+def ask(url, request):
+    """The answer to a first message, and the close code; None where the server hangs up without an answer."""
     with connect(url, proxy=None, compression=None) as client:
         client.recv()
         try:
-            client.send(pack(message | more))
+            client.send(pack(request))
             answer = client.recv(20)
         except ConnectionClosed:
             return None, client.close_code
@@ -66,7 +72,7 @@ def test_no_text_of_a_client_becomes_a_path(tmp_path, monkeypatch, name):
     policy = Reading()
     with serving(policy) as url:
         for path in (f"{tmp_path}/secret.yaml", f"smoke/configs/../../{tmp_path}/secret.yaml", "new", "a\0b"):
-            answer, _ = asked(url, {name: path})
+            answer, _ = ask(url, message(start={name: path}))
             assert getattr(policy.starts[-1], name) == ""
             assert isinstance(answer, str) and len(answer.splitlines()) == 1
             assert "hunter2" not in answer
@@ -83,33 +89,65 @@ def test_shipped_files_and_those_of_the_servers_own_protocols_are_served(tmp_pat
     assert Path(ours.layouts_file) == tmp_path / theirs.layouts_file
     assert ours.pack == "packs/own"
     assert ServedFiles.of().resolved(theirs) == replace(theirs, config_file="", layouts_file="", pack="")
-    assert name_of(a_start().config_file) == "smoke/configs/pick_table_scattered.yaml"
+    assert file_name(a_start().config_file) == "smoke/configs/pick_table_scattered.yaml"
     (tmp_path / "smoke").mkdir()
     with pytest.raises(EvaluationError):
         ServedFiles.of([tmp_path / "smoke"])
     like_a_shipped_one = str(tmp_path / "smoke/configs/pick_table_scattered.yaml")
-    assert name_of(like_a_shipped_one) == like_a_shipped_one
+    assert file_name(like_a_shipped_one) == like_a_shipped_one
 
 
 @pytest.mark.parametrize("name", ["task", "robot"])
 def test_a_task_or_robot_that_the_server_lacks_is_one_line_of_its_log(caplog, name):
     with serving(Reading()) as url, caplog.at_level(logging.WARNING):
-        answer, code = asked(url, {name: "nothing"})
+        answer, code = ask(url, message(start={name: "nothing"}))
     assert isinstance(answer, str) and answer.startswith(f"start.{name}:") and code
     assert [record.exc_info for record in caplog.records if record.name.startswith("robocas_ms3")] == [None]
 
 
 @pytest.mark.parametrize("error", [ValueError("a\nb\x1b[31m" + "c" * 9999), SystemExit(0), RecursionError()])
 def test_a_failing_policy_is_one_line_to_its_client_and_others_are_served(error):
-    policy = Failing(error)
-    with serving(policy) as url:
-        answer, code = asked(url)
+    with serving(Failing(error)) as url:
+        answer, code = ask(url, message())
         assert isinstance(answer, str) and len(answer) < 1000
         assert answer.isprintable() and code
-        assert isinstance(asked(url)[0], str)
+        assert isinstance(ask(url, message())[0], str)
 
 
-def test_messages_are_no_larger_than_a_policys_pictures_need():
+def test_messages_are_no_larger_than_a_policys_images_need():
     with serving(Told()) as url:
-        answer, code = asked(url, **{"observation/more": np.zeros(16 * 2**20, np.uint8)})
-    assert (answer, code) == (None, 1009)
+        assert ask(url, message(**{"observation/more": np.zeros(16 * 2**20, np.uint8)})) == (None, TOO_LARGE)
+
+
+@pytest.mark.parametrize(
+    "request_",
+    [
+        7,
+        *({"batch": batch} for batch in (7, [], {}, [7])),
+        {"batch": [message(), message()]},
+        {"batch": [message(env) for env in range(5)]},
+        {"batch": [message(), message(1, env_id="1")]},
+        {"batch": [message(), message(1, **{"observation/qpos": np.zeros(3, np.float32)})]},
+        {"batch": [message(), message(1, reset=False)]},
+        {"batch": [message(), message(1, reset=1)]},
+        {"batch": [{"batch": [message()]}]},
+        *(message(start=start) for start in ({"seed": -1}, {"seed": 2**62}, {"episode": -1}, {"seed": True})),
+        *(message(start=start) for start in ({"env": 0}, {"task": 5}, {"instruction": "x" * 100_000})),
+        message(prompt="x" * 100_000),
+    ],
+    ids=range(20),
+)
+def test_an_invalid_request_is_one_line_to_its_client(request_):
+    policy = Told()
+    with serving(policy, max_batch=4) as url:
+        answer, code = ask(url, request_)
+    assert isinstance(answer, str) and answer.isprintable()
+    assert (code, policy.seen, policy.starts) == (GARBAGE, [], [])
+
+
+def test_embeddings_of_a_batch_have_one_length():
+    policy = Told(PolicySpec(language="embedding"))
+    batch = [message(env, **{"observation/embedding": np.zeros(384 - env, np.float32)}) for env in range(2)]
+    with serving(policy) as url:
+        assert ask(url, {"batch": batch})[1] == GARBAGE
+    assert policy.seen == []
