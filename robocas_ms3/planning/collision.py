@@ -28,7 +28,7 @@ CHUNK = 128  # configurations of a path checked at once
 
 
 class FclWorld:
-    """The arm, the obstacles and the held object.
+    """The arm, the obstacles and the held object; see `protocol.Planner` for methods without a docstring.
 
     Every instance owns all FCL objects that it moves, so that instances in several threads are independent.
 
@@ -39,8 +39,6 @@ class FclWorld:
 
     Attributes:
         chain: kinematic chain of the arm.
-        open_width: distance between the pads of the open gripper, m.
-        finger_width: distance between the pads in checks that name none, m.
 
     Raises:
         RobotDescriptionError: a file is missing or unusable, or a geometry is not supported.
@@ -48,18 +46,13 @@ class FclWorld:
 
     def __init__(self, urdf: Path | str, srdf: Path | str, robot: RobotDescription) -> None:
         self.chain = ArmChain(urdf, robot)
-        self.open_width = self.finger_width = robot.open_width
+        self._open_width = self._finger_width = robot.open_width
         self._shapes = CollisionShapes()
         self._request, self._result = fcl.CollisionRequest(), fcl.CollisionResult()
         self._held = False
         self._pieces: list[tuple[Pieces, int, Array]] = []
         self._obstacles: dict[int, Any] = {}  # FCL object by index of the piece, placed when it is first needed
-        self._read_arm(urdf, srdf)
-        self.set_obstacles([])
-
-    def _read_arm(self, urdf: Path | str, srdf: Path | str) -> None:
-        """Read the parts of the arm. The held object is the last part, with no geometry until it is attached."""
-        robot = self.chain.robot
+        # The held object is the last part, with no geometry until it is attached.
         parts = read_collision_parts(urdf, self.chain)
         held, pairs = len(parts), read_link_pairs(urdf, srdf, parts)
         self._names = [*(part.link for part in parts), ATTACHED]
@@ -68,7 +61,7 @@ class FclWorld:
         self._slides = np.array([*(part.slide for part in parts), np.zeros(3)])
         self._parts: list[Any] = [fcl.CollisionObject(part.geometry, _fcl_pose(part.pose)) for part in parts]
         self._parts.append(None)
-        open_finger, empty = self.open_width / 2, np.zeros((2, 3))
+        open_finger, empty = robot.open_width / 2, np.zeros((2, 3))
         self._closed_bounds = np.array([*(part.bounds(0.0) for part in parts), empty])  # (P, 2, 3)
         self._open_bounds = np.array([*(part.bounds(open_finger) for part in parts), empty])
         self._moving = np.flatnonzero(self._frames != BASE)
@@ -76,22 +69,28 @@ class FclWorld:
         others = (robot.arm_base_link, robot.base_link, *robot.arm_links[:-1])
         self._own_pairs = len(pairs)  # without the held object
         self._pairs = np.array([*pairs, *((i, held) for i, part in enumerate(parts) if part.link in others)], dtype=int)
+        self.set_scene([])
+
+    @property
+    def finger_width(self) -> float:
+        return self._finger_width
+
+    @finger_width.setter
+    def finger_width(self, width: float) -> None:
+        self._finger_width = float(np.clip(width, 0.0, self._open_width))
 
     def tcp(self, qpos: Array) -> Array:
-        """Return the TCP's pose in the base frame (4, 4) at arm joints (7,)."""
         return self.chain.tcp(np.asarray(qpos, dtype=np.float64)[None])[0]
 
-    def set_points(self, points_in_base: Array) -> None:
-        """Replace the obstacles by points (P, 3); points inside the robot's own base or out of reach are dropped."""
-        points = np.asarray(points_in_base, dtype=np.float64).reshape(-1, 3)
-        points = np.ascontiguousarray(points[self.keeps(points)])
-        self._set_pieces([(CLOUD, self._shapes.cloud(points), np.eye(4))] if len(points) else [])
-
-    def set_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
-        """Replace the obstacles by rigid bodies; they are not checked against the robot's own base."""
-        self._set_pieces([(o.name, self._shapes.obstacle(o.shape, o.room), o.pose_in_base) for o in obstacles])
-
-    def _set_pieces(self, bodies: list[tuple[str, Pieces, Array]]) -> None:
+    def set_scene(self, obstacles: Sequence[Obstacle] | Array) -> None:
+        bodies: list[tuple[str, Pieces, Array]] = []
+        if isinstance(obstacles, np.ndarray):
+            points = np.asarray(obstacles, dtype=np.float64).reshape(-1, 3)
+            points = np.ascontiguousarray(points[self.keeps(points)])
+            if len(points):
+                bodies = [(CLOUD, self._shapes.cloud(points), np.eye(4))]
+        else:  # not checked against the robot's own base
+            bodies = [(o.name, self._shapes.obstacle(o.shape, o.room), o.pose_in_base) for o in obstacles]
         for index, placed in self._obstacles.items():
             pieces, piece, _ = self._pieces[index]
             pieces.spares[piece].append(placed)
@@ -114,7 +113,6 @@ class FclWorld:
         return keep
 
     def attach(self, body: AttachedBody | None) -> None:
-        """Attach the convex hull of a held object to the TCP, or detach it."""
         self._held = body is not None
         if body is None:
             return
@@ -126,16 +124,19 @@ class FclWorld:
         vertices = pieces.vertices @ pose[:3, :3].T + pose[:3, 3]
         self._closed_bounds[-1] = self._open_bounds[-1] = vertices.min(axis=0), vertices.max(axis=0)
 
-    def free(self, qpos: Array, *, obstacles: bool = True, finger_width: float | None = None) -> NDArray[np.bool_]:
+    def free(self, qpos: Array, finger_width: float | None = None, *, obstacles: bool = True) -> NDArray[np.bool_]:
         """Return which configurations (M, 7) are free of collisions; without ``obstacles`` only of the robot's own."""
-        width = self.finger_width if finger_width is None else finger_width
-        return np.array([next(found, None) is None for found in self._collisions(qpos, width, obstacles)], dtype=bool)
+        qpos = np.asarray(qpos, dtype=np.float64).reshape(-1, 7)
+        width = self._open_width if finger_width is None else finger_width
+        return np.array(
+            [next(found, None) is None for found in self._pairs_in_contact(qpos, width, obstacles)], dtype=bool
+        )
 
     def free_until(self, qpos: Array, *, obstacles: bool = True) -> int:
         """Return how many configurations of a path (M, 7) are free before the first one that is not."""
         for first in range(0, len(qpos), CHUNK):
             chunk = qpos[first : first + CHUNK]
-            for row, found in enumerate(self._collisions(chunk, self.finger_width, obstacles)):
+            for row, found in enumerate(self._pairs_in_contact(chunk, self.finger_width, obstacles)):
                 if next(found, None) is not None:
                     return first + row
         return len(qpos)
@@ -150,12 +151,12 @@ class FclWorld:
             qpos = qpos[first:]
         return self.free_until(qpos, obstacles=obstacles) == len(qpos)
 
-    def contacts(self, qpos: Array, finger_width: float) -> list[str]:
-        """Return the sorted names of what is in collision at a configuration (7,): links, obstacles, 'attached'."""
-        found = next(self._collisions(np.asarray(qpos, dtype=np.float64)[None], finger_width, True))
+    def collisions(self, qpos: Array, finger_width: float | None = None) -> list[str]:
+        width = self._open_width if finger_width is None else finger_width
+        found = next(self._pairs_in_contact(np.asarray(qpos, dtype=np.float64)[None], width, True))
         return sorted({name for pair in found for name in pair})
 
-    def _collisions(self, qpos: Array, width: float, obstacles: bool) -> Iterator[Iterator[tuple[str, str]]]:
+    def _pairs_in_contact(self, qpos: Array, width: float, obstacles: bool) -> Iterator[Iterator[tuple[str, str]]]:
         """Yield for each configuration (M, 7) an iterator over the names of its colliding pairs, checked one by one."""
         assert np.isfinite(qpos).all(), "comparisons with NaN would pass as free"
         if not len(qpos):
@@ -222,7 +223,7 @@ class FclWorld:
         Returns:
             (n, 2) configuration and pair of parts; (m, 3) configuration, part and obstacle's piece.
         """
-        bounds = self._closed_bounds + (self._open_bounds - self._closed_bounds) * (width / self.open_width)
+        bounds = self._closed_bounds + (self._open_bounds - self._closed_bounds) * (width / self._open_width)
         moving = self._moving if self._held else self._moving[:-1]
         frames, count = self._frames[moving], rotations.shape[1]
         turned = rotations[frames]  # (P, M, 3, 3)

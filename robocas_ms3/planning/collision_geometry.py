@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import RobotDescriptionError
+from robocas_ms3.core.words import error_line
 from robocas_ms3.planning.chain import ArmChain
 from robocas_ms3.planning.protocol import Array
 from robocas_ms3.planning.shapes import convex_hull, fcl_convex
@@ -79,7 +80,9 @@ def read_collision_parts(urdf: Path | str, chain: ArmChain) -> list[CollisionPar
             child_pose = pose @ joint.origin
             child_slide = slide
             if joint.name in robot.finger_joints:
-                child_slide = slide + child_pose[:3, :3] @ _slide_axis(joint, file.path)
+                if joint.kind != "prismatic":
+                    raise file.error(f"finger joint {joint.name!r} does not slide", "type prismatic", joint.kind)
+                child_slide = slide + child_pose[:3, :3] @ joint.axis
             yield from visit(joint.child, frame, child_pose, child_slide)
 
     return list(visit(robot.arm_base_link, BASE, np.eye(4), np.zeros(3)))
@@ -98,18 +101,6 @@ def read_link_pairs(urdf: Path | str, srdf: Path | str, parts: list[CollisionPar
     ]
 
 
-def _slide_axis(joint: Joint, urdf: Path) -> Array:
-    if joint.kind != "prismatic":
-        raise RobotDescriptionError(
-            f"finger joint {joint.name!r} does not slide",
-            where=urdf,
-            expected="type prismatic",
-            found=joint.kind,
-            fix="Name sliding joints as finger_joints of the robot's description.",
-        )
-    return joint.axis
-
-
 def _collision_geometries(link: Element, name: str, file: DescriptionFile) -> Iterator[tuple[Any, Array, Array]]:
     """Return the FCL geometry, the corners (V, 3) and the pose (4, 4) of each collision element of a link."""
     for collision in link.iterfind("collision"):
@@ -122,8 +113,9 @@ def _collision_geometries(link: Element, name: str, file: DescriptionFile) -> It
 def _geometry(shape: Element, link: str, file: DescriptionFile) -> tuple[Any, Array]:
     if shape.tag == "mesh":
         scale = np.array(file.numbers(shape, "scale", 3, "1 1 1"))
-        path = _mesh_path(file.path, file.attribute(shape, "filename"), link)
-        corners, faces = _read_hull(path, scale, link)
+        mesh = file.path.parent / file.attribute(shape, "filename")
+        hull = mesh.with_name(mesh.name + HULL_SUFFIX)
+        corners, faces = _read_hull(hull if hull.is_file() else mesh, scale, link)
         return fcl_convex(corners, faces), corners
     if shape.tag == "box":
         x, y, z = file.numbers(shape, "size", 3)
@@ -134,32 +126,11 @@ def _geometry(shape: Element, link: str, file: DescriptionFile) -> tuple[Any, Ar
     if shape.tag == "sphere":
         (radius,) = file.numbers(shape, "radius", 1)
         return fcl.Sphere(radius), _box_corners(2 * radius, 2 * radius, 2 * radius)
-    raise RobotDescriptionError(
-        f"unsupported collision geometry of link {link!r}",
-        where=file.path,
-        expected="mesh, box, cylinder or sphere",
-        found=shape.tag,
-        fix="Replace it by one of these.",
-    )
+    raise file.error(f"unsupported geometry of link {link!r}", "mesh, box, cylinder or sphere", shape.tag)
 
 
 def _box_corners(x: float, y: float, z: float) -> Array:
     return np.array(list(itertools.product((-x / 2, x / 2), (-y / 2, y / 2), (-z / 2, z / 2))))
-
-
-def _mesh_path(urdf: Path, filename: str, link: str) -> Path:
-    """Return the file of a mesh, or the file of its convex hull where there is one next to it."""
-    mesh = urdf.parent / filename
-    hull = mesh.with_name(mesh.name + HULL_SUFFIX)
-    if hull.is_file():
-        return hull
-    if not mesh.is_file():
-        raise RobotDescriptionError(
-            f"missing collision mesh of link {link!r}",
-            where=mesh,
-            fix=f"Copy the mesh there, or correct its file name in {urdf}: a path relative to the URDF's folder.",
-        )
-    return mesh
 
 
 def _read_hull(path: Path, scale: Array, link: str) -> tuple[Array, NDArray[np.int32]]:
@@ -174,7 +145,7 @@ def _read_hull(path: Path, scale: Array, link: str) -> tuple[Array, NDArray[np.i
             f"unusable collision mesh of link {link!r}",
             where=path,
             expected="a mesh with a volume in a format that trimesh loads, such as STL or OBJ",
-            found=f"{type(error).__name__}: {str(error).partition(chr(10))[0]}",
+            found=error_line(error),
             fix="Export the mesh again, as STL.",
         ) from error
     return corners, faces

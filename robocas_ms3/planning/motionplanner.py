@@ -51,8 +51,7 @@ class PandaArmMotionPlanningSolver:
             ManiSkill's ``panda`` or ``panda_wristcam`` or a robot of this package; wrappers are stepped too.
         base_pose: pose of the robot's root link; default: the pose in the simulation at each call.
         vis: whether to show every step in ManiSkill's viewer, which needs a display.
-        joint_vel_limits: velocity limit of every arm joint, rad/s.
-        joint_acc_limits: acceleration limit of every arm joint, rad/s^2.
+        joint_vel_limits, joint_acc_limits: of every arm joint, rad/s and rad/s^2.
         backend: name of the motion planner.
         ignored: arguments of ManiSkill's solver without effect here, see ``IGNORED``.
 
@@ -61,8 +60,7 @@ class PandaArmMotionPlanningSolver:
         gripper_state: gripper command that motions hold, 1 open to -1 closed.
 
     Raises:
-        RobocasError: the environment has several envs, another control mode or another robot, the base's pose has a NaN
-            or infinite number, or a limit is not a positive number.
+        RobocasError: the environment does not fit, a limit is not positive, or a pose or point is NaN or infinite.
         ExtensionError: no motion planner has this name.
     """
 
@@ -83,22 +81,13 @@ class PandaArmMotionPlanningSolver:
             raise TypeError(f"unexpected arguments: {', '.join(sorted(unknown))}")
         self.env, self.base_env, self.vis = env, cast("BaseEnv", env.unwrapped), vis
         if self.base_env.num_envs != 1:
-            raise RobocasError(
-                "the solver plans for one environment",
-                where="num_envs",
-                expected=1,
-                found=self.base_env.num_envs,
-                fix="Make the environment with num_envs=1.",
-            )
+            what, fix = "the solver plans for one environment", "Make the environment with num_envs=1."
+            raise RobocasError(what, where="num_envs", expected=1, found=self.base_env.num_envs, fix=fix)
         self.control_mode = str(self.base_env.control_mode)
         if self.control_mode not in CONTROL_MODES:
-            raise RobocasError(
-                "the solver sends joint positions",
-                where="control_mode",
-                expected=" or ".join(CONTROL_MODES),
-                found=self.control_mode,
-                fix="Make the environment with control_mode='pd_joint_pos'.",
-            )
+            what, fix = "the solver sends joint positions", "Make the environment with control_mode='pd_joint_pos'."
+            expected = " or ".join(CONTROL_MODES)
+            raise RobocasError(what, where="control_mode", expected=expected, found=self.control_mode, fix=fix)
         check_number("joint_vel_limits", joint_vel_limits, MIN_LIMIT)
         check_number("joint_acc_limits", joint_acc_limits, MIN_LIMIT)
         spec = _robot_spec(cast("BaseAgent", self.base_env.agent))
@@ -115,7 +104,7 @@ class PandaArmMotionPlanningSolver:
 
     @property
     def arm_base_in_world(self) -> Array:
-        """Pose of the arm's base in the world frame, 4x4."""
+        """4x4."""
         arm_base = from_wxyz(self.robot.links_map[self.description.arm_base_link].pose.raw_pose[0])
         if self._base_pose is None:
             return arm_base
@@ -124,97 +113,52 @@ class PandaArmMotionPlanningSolver:
     def move_to_pose_with_RRTConnect(
         self, pose: sapien.Pose | Pose, dry_run: bool = False, refine_steps: int = 0
     ) -> Any:
-        """Move the TCP to a pose on any collision-free path.
-
-        Args:
-            pose: goal of the TCP.
-            dry_run: return the planned trajectory and do not step the environment.
-            refine_steps: how many times to send the last joint target again.
+        """Move the TCP to a pose on any collision-free path, and send the last target ``refine_steps`` times again.
 
         Returns:
-            The last step, or the trajectory of a dry run.
-
-        Raises:
-            PlanningFailed: the pose is out of reach or in collision, or no path was found.
-            RobocasError: ``refine_steps`` is negative, or a number of the pose is NaN or infinite.
+            The last step; the planned trajectory of a ``dry_run``, which does not step the environment.
         """
-        check_number("refine_steps", refine_steps, 0)
         start, goal = self._prepare(pose)
         result = self.planner.plan_to_pose(start, goal, stage="move_to_pose_with_RRTConnect")
         return result if dry_run else self.follow_path(result, refine_steps)
 
     def move_to_pose_with_screw(self, pose: sapien.Pose | Pose, dry_run: bool = False, refine_steps: int = 0) -> Any:
-        """Move the TCP to a pose on a straight, collision-free line with the shortest rotation.
-
-        Arguments and errors as of ``move_to_pose_with_RRTConnect``.
-        """
-        check_number("refine_steps", refine_steps, 0)
+        """Do the same on a straight line with the shortest rotation."""
         start, goal = self._prepare(pose)
         result = self.planner.plan_straight(start, goal, stage="move_to_pose_with_screw")
         return result if dry_run else self.follow_path(result, refine_steps)
 
     def follow_path(self, result: Trajectory, refine_steps: int = 0) -> Step:
-        """Send the joint targets of a planned trajectory, one per control step, and hold the gripper command.
-
-        Raises:
-            RobocasError: the trajectory has no row, or ``refine_steps`` is negative.
-        """
-        check_number("rows of the trajectory", len(result.qpos), 1)
-        check_number("refine_steps", refine_steps, 0)
+        """Send the joint targets of a planned trajectory, one per control step, and hold the gripper command."""
         qpos = np.concatenate([result.qpos, np.repeat(result.qpos[-1:], refine_steps, axis=0)])
         qvel = np.gradient(np.concatenate([self._arm_qpos[None], qpos]), result.dt, axis=0)[1:]
         qvel[len(result.qpos) - 1 :] = 0
         return self._run(qpos, qvel)
 
     def open_gripper(self, t: int = 6, gripper_state: float = OPEN) -> Step:
-        """Open the gripper for ``t`` control steps while the arm holds its position; later motions hold the command.
-
-        Raises:
-            RobocasError: ``t`` is less than 1.
-        """
+        """Open the gripper for ``t`` control steps while the arm holds its position; later motions hold the command."""
         return self._move_gripper(t, gripper_state)
 
     def close_gripper(self, t: int = 6, gripper_state: float = CLOSED) -> Step:
-        """Close the gripper for some control steps while the arm holds its position; see ``open_gripper``."""
+        """Close the gripper likewise."""
         return self._move_gripper(t, gripper_state)
 
     def add_box_collision(self, extents: Array, pose: sapien.Pose | Pose) -> None:
-        """Add a box with edge lengths (3,) m and its centre at a pose to the obstacles.
-
-        Raises:
-            RobocasError: an edge length is not positive, or a number is NaN or infinite.
-        """
+        """Add a box with edge lengths (3,) m and its centre at a pose to the obstacles."""
         edges = np.asarray(extents, dtype=np.float64)
-        if edges.shape != (3,) or not ((edges > 0) & (edges < np.inf)).all():
-            raise RobocasError(
-                "invalid extents of a box",
-                where="add_box_collision",
-                expected="three positive edge lengths in m",
-                found=edges.tolist(),
-                fix="Give a flat box a thickness, such as 0.001.",
-            )
+        if not ((edges > 0) & (edges < np.inf)).all():
+            what, expected = "invalid extents of a box", "three positive edge lengths in m"
+            fix = "Give a flat box a thickness, such as 0.001."
+            raise RobocasError(what, where="add_box_collision", expected=expected, found=edges.tolist(), fix=fix)
         corners = np.array(list(product((-0.5, 0.5), repeat=3))) * edges
         self.add_obstacles([Obstacle("box", Shape(hulls=(corners,)), _matrix(pose, "add_box_collision"))])
 
     def add_collision_pts(self, pts: Array) -> None:
-        """Add surface points (P, 3) m, about 5 mm apart, to the obstacles; no points add no obstacle.
-
-        Raises:
-            RobocasError: the array has another shape, or a coordinate is NaN or infinite.
-        """
-        points = np.asarray(pts, dtype=np.float64)
-        if not points.size:
-            return
-        if points.shape[-1:] != (3,):
-            raise RobocasError(
-                "invalid shape of points",
-                where="add_collision_pts",
-                expected="(P, 3)",
-                found=points.shape,
-                fix="Put x, y and z of a point into one row.",
-            )
+        """Add surface points (P, 3) m, about 5 mm apart, to the obstacles; no points add no obstacle."""
+        points = np.asarray(pts, dtype=np.float64).reshape(-1, 3)
         _require_finite(points, "add_collision_pts", "Remove the points, e.g. pts[np.isfinite(pts).all(axis=1)].")
-        self.add_obstacles([Obstacle("points", Shape(points=points.reshape(-1, 3)), np.eye(4))])
+        if len(points):
+            self.add_obstacles([Obstacle("points", Shape(points=points), np.eye(4))])
 
     def add_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
         """Add bodies whose ``pose_in_base`` is in the world frame, as ``PlanningScene.obstacles_in_world`` returns."""
@@ -229,7 +173,6 @@ class PandaArmMotionPlanningSolver:
 
     @property
     def _arm_qpos(self) -> Array:
-        """(7,) rad."""
         return self._qpos(self.description.arm_joints)
 
     def _qpos(self, joints: Sequence[str]) -> Array:
@@ -245,22 +188,17 @@ class PandaArmMotionPlanningSolver:
         return self._arm_qpos, goal
 
     def _move_gripper(self, t: int, gripper_state: float) -> Step:
-        check_number("t", t, 1)
         self.gripper_state = gripper_state
         return self._run(np.tile(self._arm_qpos, (t, 1)), np.zeros((t, 7)))
 
     def _run(self, qpos: Array, qvel: Array) -> Step:
         """Send targets (T, 7) rad and (T, 7) rad/s."""
-        step = self._step(qpos[0], qvel[0])
-        for row in zip(qpos[1:], qvel[1:], strict=True):
-            step = self._step(*row)
-        return step
-
-    def _step(self, qpos: Array, qvel: Array) -> Step:
         arm = (qpos, qvel) if self.control_mode == "pd_joint_pos_vel" else (qpos,)
-        step = self.env.step(np.hstack([*arm, self.gripper_state]).astype(np.float32))
-        if self.vis:
-            self.base_env.render_human()
+        gripper, step = np.full((len(qpos), 1), self.gripper_state), None
+        for action in np.hstack([*arm, gripper]).astype(np.float32):
+            step = self.env.step(action)
+            if self.vis:
+                self.base_env.render_human()
         return cast("Step", step)
 
 

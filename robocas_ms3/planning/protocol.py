@@ -14,19 +14,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.core.errors import RobocasError
-
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Joint positions at exact control steps.
-
-    Attributes:
-        qpos: (T, 7) rad; row i is reached ``(i + 1) * dt`` after the start; the last row is the goal exactly.
-        dt: seconds between rows.
-    """
+    """Joint positions (T, 7) in rad, ``dt`` seconds apart; row 0 is reached after ``dt``, the last row is the goal."""
 
     qpos: Array
     dt: float
@@ -52,7 +45,7 @@ class AttachedBody:
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """The form of a rigid body, in its own frame; backends keep what they make of it for as long as it lives.
+    """The form of a rigid body in its own frame: hulls or points. Backends keep what they make of it while it lives.
 
     Attributes:
         hulls: vertices (V, 3) of its convex pieces, m.
@@ -61,16 +54,6 @@ class Shape:
 
     hulls: tuple[Array, ...] = ()
     points: Array | None = None
-
-    def __post_init__(self) -> None:
-        if not self.hulls and self.points is None:
-            raise RobocasError(
-                "a shape has neither hulls nor points",
-                where="Shape",
-                expected="at least one hull, or points",
-                found="hulls=(), points=None",
-                fix="Leave out an obstacle that has no collision geometry.",
-            )
 
 
 @dataclass(frozen=True)

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from robocas_ms3.core.errors import PlanningFailed, RobocasError
+from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.core.extensions import Registry
 from robocas_ms3.planning.chain import turn_between
 from robocas_ms3.planning.collision import FclWorld
 from robocas_ms3.planning.kinematics import Reachability, follow_line
 from robocas_ms3.planning.path_search import PathSearch
-from robocas_ms3.planning.protocol import Array, AttachedBody, Obstacle, Planner, Trajectory
+from robocas_ms3.planning.protocol import Array, Planner, Trajectory
 from robocas_ms3.planning.timing import JointPath, blended, rounded, stopping, thinned, through, timed
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.robots.table import RobotSpec
@@ -37,20 +36,13 @@ TCP_SPEED_LIMIT = 0.45  # m/s: at 5 Hz pd_ee_delta_pose moves 0.1 m a step at mo
 Timed = TypeVar("Timed", Trajectory, Trajectory | None)
 
 
-class RRTConnectPlanner:
-    """Plan for the arm in its base frame; implements ``planning.protocol.Planner``.
+class RRTConnectPlanner(FclWorld):
+    """Plan for the arm in its base frame; see `protocol.Planner` for methods without a docstring.
 
     Args:
-        urdf: the arm alone, rooted at its base.
-        srdf: pairs of its links that need no check.
-        robot: description of the robot that carries the arm.
+        urdf, srdf, robot: see `FclWorld`.
         dt: seconds between rows of a trajectory.
         planning_time: budget of one search, in seconds of a quiet core; counted in collision checks, not by the clock.
-
-    Raises:
-        RobotDescriptionError: the URDF, the SRDF or a collision mesh is missing or unusable, or a geometry is not
-            supported.
-        RobocasError: ``dt`` is not positive.
     """
 
     def __init__(
@@ -64,69 +56,27 @@ class RRTConnectPlanner:
     ) -> None:
         import toppra  # noqa: F401  (0.2 s: before this process forks)
 
-        if not dt > 0:
-            raise RobocasError("the time step must be positive", where="dt", found=dt)
-        self._world = FclWorld(urdf, srdf, robot)
-        self._reachability = Reachability(self._world.chain)
+        super().__init__(urdf, srdf, robot)
+        self._reachability = Reachability(self.chain)
         self._dt = dt
         self._limits = {"velocity": robot.arm_velocity_limit, "acceleration": robot.arm_acceleration_limit}
         self._budget = int(planning_time * CHECKS_PER_SECOND)
-        chain = self._world.chain
-        self._search = PathSearch(self._world.free_until, chain.lower, chain.upper, step=RRT_RANGE, spacing=SPACING)
+        lower, upper = self.chain.lower, self.chain.upper
+        self._search = PathSearch(self.free_until, lower, upper, step=RRT_RANGE, spacing=SPACING)
         self._rng = np.random.default_rng(0)
 
-    @property
-    def finger_width(self) -> float:
-        """Opening of the gripper during motions, m: the sum of both fingers."""
-        return self._world.finger_width
-
-    @finger_width.setter
-    def finger_width(self, width: float) -> None:
-        self._world.finger_width = float(np.clip(width, 0.0, self._world.open_width))
-
     def seed(self, seed: int) -> None:
-        """Make everything that follows repeat exactly for the same calls."""
         self._rng = np.random.default_rng(seed)
 
-    def set_scene(self, obstacles: Sequence[Obstacle] | Array) -> None:
-        """Replace the obstacles by bodies, or by a point cloud (P, 3) m; see the protocol."""
-        if isinstance(obstacles, np.ndarray):
-            self._world.set_points(obstacles)
-        else:
-            self._world.set_obstacles(obstacles)
-
-    def attach(self, body: AttachedBody | None) -> None:
-        """Attach a held object to the TCP, or nothing."""
-        self._world.attach(body)
-
-    def tcp(self, qpos: Array) -> Array:
-        """Give the TCP's pose in the base frame (4x4) at joints (7,)."""
-        return self._world.tcp(qpos)
-
-    def collisions(self, qpos: Array, finger_width: float | None = None) -> list[str]:
-        """Name what touches at a configuration (7,): links, 'cloud', 'attached'; see the protocol."""
-        width = self._world.open_width if finger_width is None else finger_width
-        return self._world.contacts(np.asarray(qpos, dtype=np.float64), width)
-
-    def free(self, qpos: Array, finger_width: float | None = None) -> NDArray[np.bool_]:
-        """Say which configurations (M, 7) touch nothing: (M,); see the protocol."""
-        width = self._world.open_width if finger_width is None else finger_width
-        return self._world.free(np.asarray(qpos, dtype=np.float64).reshape(-1, 7), finger_width=width)
-
     def ik(self, tcp_in_base: Array, near: Array, *, avoid_collisions: bool = True) -> list[Array]:
-        """Solve inverse kinematics; see the protocol."""
         near = np.asarray(near, dtype=np.float64)
         found = self._reachability.solutions(tcp_in_base, near)
         if not avoid_collisions or not found:
             return found
-        return [qpos for qpos, ok in zip(found, self._world.free(np.array(found)), strict=True) if ok]
+        return [qpos for qpos, ok in zip(found, self.free(np.array(found), self.finger_width), strict=True) if ok]
 
     def plan_to_pose(self, start: Array, tcp_in_base: Array, *, stage: str) -> Trajectory:
-        """Plan a collision-free motion (see ``plan_to_qpos``) that ends with the TCP at a pose (4x4).
-
-        Raises:
-            PlanningFailed: ``no_ik``, ``goal_in_collision``, or as ``plan_to_qpos``.
-        """
+        """Plan as `plan_to_qpos` does to the configurations of a pose (4x4); reasons: ``no_ik``, or as there."""
         goals = self.ik(tcp_in_base, start, avoid_collisions=False)
         if not goals:
             raise PlanningFailed(stage, "no_ik")
@@ -134,12 +84,6 @@ class RRTConnectPlanner:
 
     def plan_to_qpos(self, start: Array, goals: list[Array], *, stage: str, search: bool = True) -> Trajectory:
         """Plan a collision-free motion to the nearest of several configurations that can be reached.
-
-        Args:
-            start: (7,), free of collisions.
-            goals: (7,) each.
-            stage: name for errors.
-            search: look for a way around what is in the way of a straight motion.
 
         Raises:
             PlanningFailed: ``start_in_collision``, ``start_outside_limits``, ``no_goals`` (the list is empty),
@@ -150,11 +94,11 @@ class RRTConnectPlanner:
         wanted = np.array(goals, dtype=np.float64).reshape(-1, 7)
         if not len(wanted):
             raise PlanningFailed(stage, "no_goals")
-        lower, upper = self._world.chain.limits.T
+        lower, upper = self.chain.limits.T
         wanted = wanted[np.all((wanted >= lower) & (wanted <= upper), axis=1)]
         if not len(wanted):
             raise PlanningFailed(stage, "goal_outside_limits")
-        wanted = wanted[self._world.free(wanted)]
+        wanted = wanted[self.free(wanted, self.finger_width)]
         if not len(wanted):
             raise PlanningFailed(stage, "goal_in_collision")
         free = list(wanted[np.argsort(turn_between(wanted, start), kind="stable")])
@@ -190,14 +134,14 @@ class RRTConnectPlanner:
     def plan_straight(
         self, start: Array, tcp_in_base: Array, *, stage: str, check_collisions: bool = True, speed: float = 1.0
     ) -> Trajectory:
-        """Move the TCP on a straight line; see the protocol.
+        """Move the TCP on a straight line.
 
         Raises:
             PlanningFailed: ``start_in_collision``, ``start_outside_limits``, ``line_unreachable``, ``line_joint_jump``,
                 ``straight_line_blocked``, ``timing_failed``.
         """
         start = self._checked_start(start, stage, obstacles=check_collisions)
-        waypoints = follow_line(self._world.chain, start, np.asarray(tcp_in_base, dtype=np.float64), stage=stage)
+        waypoints = follow_line(self.chain, start, np.asarray(tcp_in_base, dtype=np.float64), stage=stage)
         if np.linalg.norm(waypoints[-1] - start) < STILL:
             return Trajectory(waypoints[-1:].copy(), self._dt)
         path = through(waypoints)
@@ -209,7 +153,6 @@ class RRTConnectPlanner:
         return trajectory
 
     def join(self, start: Array, first: Trajectory, second: Trajectory) -> Trajectory:
-        """Run one motion on into the next without a stop; see the protocol."""
         a, b = np.concatenate([np.asarray(start)[None], first.qpos]), second.qpos
         best = Trajectory(np.concatenate([first.qpos, b]), self._dt)
         for seconds in BLENDS:
@@ -219,10 +162,10 @@ class RRTConnectPlanner:
             points = blended(a, b, rows)
             path = through(thinned(points, BLEND_SPACING))
             driven, end = path.dense(FINE_SPACING), points[min(len(a), len(points) - 1)]
-            lower, upper = self._world.chain.limits.T  # the sum of two motions may leave what either keeps to
+            lower, upper = self.chain.limits.T  # the sum of two motions may leave what either keeps to
             # up to the end of the corner: what follows was planned among other obstacles
             corner = int(np.linalg.norm(driven - end, axis=1).argmin()) + 1
-            if not np.all((lower <= driven) & (driven <= upper)) or not self._world.all_free(driven[:corner]):
+            if not np.all((lower <= driven) & (driven <= upper)) or not self.all_free(driven[:corner]):
                 continue
             trajectory = self._timed(partial(timed, path))
             if trajectory is not None and len(trajectory.qpos) < len(best.qpos):
@@ -231,18 +174,18 @@ class RRTConnectPlanner:
 
     def _checked_start(self, start: Array, stage: str, *, obstacles: bool = True) -> Array:
         start = np.asarray(start, dtype=np.float64)
-        lower, upper = self._world.chain.limits.T
+        lower, upper = self.chain.limits.T
         if not np.all((lower - 1e-3 <= start) & (start <= upper + 1e-3)):
             raise PlanningFailed(stage, "start_outside_limits")
-        if not self._world.all_free(start[None], obstacles=obstacles):
+        if not self.all_free(start[None], obstacles=obstacles):
             raise PlanningFailed(stage, "start_in_collision")
         return start
 
     def _straight_free(self, start: Array, goal: Array) -> bool:
-        return self._world.all_free(start + (goal - start) * _fractions(start, goal)[1:-1, None])
+        return self.all_free(start + (goal - start) * _fractions(start, goal)[1:-1, None])
 
     def _path_free(self, path: JointPath, *, obstacles: bool = True) -> bool:
-        return self._world.all_free(path.dense(FINE_SPACING), obstacles=obstacles)
+        return self.all_free(path.dense(FINE_SPACING), obstacles=obstacles)
 
     def _finish(self, waypoints: list[Array]) -> Trajectory | None:
         """Round corners, check the very path that will be driven, and time it; none when it touches something."""
@@ -258,14 +201,14 @@ class RRTConnectPlanner:
                 trajectory = self._timed(partial(timed, path))
                 if trajectory is not None:
                     return trajectory
-        return self._timed(partial(stopping, corners)) if self._world.all_free(_dense(corners)) else None
+        return self._timed(partial(stopping, corners)) if self.all_free(_dense(corners)) else None
 
     def _timed(self, time: Callable[..., Timed], speed: float = 1.0) -> Timed:
         """Time a motion within a fraction of the limits, and slower where the TCP would be faster than its limit."""
         limits = {name: value * speed for name, value in self._limits.items()}
         trajectory = time(**limits, dt=self._dt)
         if trajectory is not None and len(trajectory.qpos) > 1:
-            places = self._world.chain.tcp(trajectory.qpos)[:, :3, 3]
+            places = self.chain.tcp(trajectory.qpos)[:, :3, 3]
             fastest = float(np.linalg.norm(np.diff(places, axis=0), axis=1).max()) / self._dt
             if fastest > TCP_SPEED_LIMIT:
                 # Slower by s: velocities by s, accelerations by its square. Then all of the motion is, ramps too.
@@ -296,7 +239,7 @@ def make_planner(name: str, robot: RobotSpec, *, dt: float) -> Planner:
 
     Raises:
         ExtensionError: there is no such planner, or another package's can't be loaded.
-        RobocasError: it can't load the robot's files.
+        RobotDescriptionError: it can't load the robot's files.
     """
     backend, files = BACKENDS.find(name, where="planner"), robot.files()
     return backend(files.arm_urdf, files.arm_srdf, robot=robot.description, dt=dt)

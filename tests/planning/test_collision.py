@@ -34,9 +34,9 @@ def test_a_cloud_of_5_mm_spacing_has_no_holes(world):
     for _ in range(40):
         shift = np.append(rng.uniform(0, 0.005, 2), 0.0)
         # The plane lies across the approach, so that both pads meet it flat.
-        world.set_points((plane + shift + [0, 0, -0.004]) @ tcp[:3, :3].T + lowest)
-        assert world.contacts(REST, 0.08) == ["cloud", "panda_leftfinger", "panda_rightfinger"]
-        world.set_points((plane + shift + [0, 0, 0.010]) @ tcp[:3, :3].T + lowest)
+        world.set_scene((plane + shift + [0, 0, -0.004]) @ tcp[:3, :3].T + lowest)
+        assert world.collisions(REST, 0.08) == ["cloud", "panda_leftfinger", "panda_rightfinger"]
+        world.set_scene((plane + shift + [0, 0, 0.010]) @ tcp[:3, :3].T + lowest)
         assert world.free(REST[None])[0]
 
 
@@ -44,10 +44,10 @@ def test_cached_clouds_give_the_same_verdicts(world):
     wide = cloud([Box(tuple(world.tcp(REST)[:3, 3]), (0.09, 0.09, 0.03))])
     clouds = [cloud([Box((0.6, 0, 0.1 * i), (0.1, 0.1, 0.1))]) for i in range(20)]
     for _ in range(2):
-        world.set_points(wide)
+        world.set_scene(wide)
         assert not world.free(REST[None])[0]
         for points in clouds:
-            world.set_points(points)
+            world.set_scene(points)
             assert world.free(REST[None])[0]
 
 
@@ -57,8 +57,8 @@ def test_points_in_the_base_and_out_of_reach_are_dropped(world):
     inside_pedestal = np.stack([x, y, np.full(len(x), -0.001)], axis=1)
     inside_pedestal = inside_pedestal[(np.abs(x) < 0.12) & (np.abs(y) < 0.09)]
     floor = np.stack([x, y, np.full(len(x), -0.49)], axis=1)  # 1 cm below the mobile base
-    world.set_points(np.concatenate([inside_pedestal, floor]))
-    assert world.contacts(REST, 0.08) == []
+    world.set_scene(np.concatenate([inside_pedestal, floor]))
+    assert world.collisions(REST, 0.08) == []
     points = np.array(
         [[0, 0, -0.05], [0.05, 0, 0.1], [0.2, 0, -0.3], [0.3, 0, 0], [0, 0.2, -0.1], [1.51, 0, 0], [1.49, 0, 0]]
     )
@@ -68,21 +68,21 @@ def test_points_in_the_base_and_out_of_reach_are_dropped(world):
 def test_points_beyond_the_octree_are_no_obstacles(world):
     """Keys of octomap have 16 bits: 327.68 m away a point has the key of a point at the TCP."""
     at_tcp = Shape(points=world.tcp(REST)[None, :3, 3] + np.array([[0, 0, 0], [0.042, 0, 0], [0, 0.042, 0]]))
-    world.set_obstacles([Obstacle("near", at_tcp, np.eye(4))])
-    assert "near" in world.contacts(REST, 0.0)
+    world.set_scene([Obstacle("near", at_tcp, np.eye(4))])
+    assert "near" in world.collisions(REST, 0.0)
     far = [Shape(points=at_tcp.points + offset) for offset in ([327.68, 0, 0], [0, -327.68, 0], [0, 0, 1e300])]
     mixed = Shape(points=np.concatenate([far[0].points, [[-1, -1, -1], [0, 1, 1]]]))  # a box around all holds the arm
-    world.set_obstacles([Obstacle("far", shape, np.eye(4)) for shape in (*far, mixed)])
-    assert world.contacts(REST, 0.0) == []
+    world.set_scene([Obstacle("far", shape, np.eye(4)) for shape in (*far, mixed)])
+    assert world.collisions(REST, 0.0) == []
 
 
 def test_self_collisions_are_checked_without_obstacles(world):
-    world.set_points(cloud([Box(tuple(world.tcp(REST)[:3, 3]), (0.09, 0.09, 0.03))]))
+    world.set_scene(cloud([Box(tuple(world.tcp(REST)[:3, 3]), (0.09, 0.09, 0.03))]))
     assert not world.free(REST[None])[0]
     assert world.free(REST[None], obstacles=False)[0]
     folded = np.array([0.0, -1.7, 0.0, -3.0, 0.0, 0.0, 0.0])
     assert not world.free(folded[None], obstacles=False)[0]
-    assert len(world.contacts(folded, 0.08)) >= 2
+    assert len(world.collisions(folded, 0.08)) >= 2
 
 
 def body(box: Box) -> Obstacle:
@@ -96,9 +96,9 @@ def test_bodies_and_their_clouds_give_the_same_verdicts(world):
     boxes = table_scene(0)
     low, high = world.chain.lower, world.chain.upper
     qpos = np.clip(REST + np.random.default_rng(0).normal(0, 0.6, (400, 7)), low, high)
-    world.set_points(cloud(boxes))
+    world.set_scene(cloud(boxes))
     by_points = world.free(qpos)
-    world.set_obstacles([body(box) for box in boxes])
+    world.set_scene([body(box) for box in boxes])
     by_bodies = world.free(qpos)
     assert 20 < np.sum(~by_bodies) < 380
     assert np.mean(by_points == by_bodies) > 0.98
@@ -116,7 +116,7 @@ def verdicts(panda_files) -> bytes:
     qpos = REST + np.random.default_rng(0).uniform(-0.8, 0.8, (300, 7))
     found = []
     for obstacles in (cloud(boxes), [body(box) for box in boxes]):
-        world.set_points(obstacles) if isinstance(obstacles, np.ndarray) else world.set_obstacles(obstacles)
+        world.set_scene(obstacles) if isinstance(obstacles, np.ndarray) else world.set_scene(obstacles)
         for held in (None, AttachedBody(corners(0.05, 0.05, 0.1), np.eye(4))):
             world.attach(held)
             found.append(world.free(qpos))
@@ -125,7 +125,7 @@ def verdicts(panda_files) -> bytes:
 
 
 def test_world_made_before_a_fork_gives_the_same_verdicts(world):
-    world.set_obstacles([body(box) for box in table_scene(0)])
+    world.set_scene([body(box) for box in table_scene(0)])
     qpos = REST + np.random.default_rng(0).uniform(-0.8, 0.8, (300, 7))
     reading, writing = os.pipe()
     child = os.fork()
@@ -153,9 +153,7 @@ def test_obstacles_that_share_a_shape_are_all_checked(world):
     near, far = np.eye(4), np.eye(4)
     near[:3, 3], far[:3, 3] = tcp[:3, 3], (0.6, 0.5, 0.8)
     for _ in range(2):
-        world.set_obstacles(
-            [Obstacle("far", cube, far), Obstacle("near", cube, near), Obstacle("also near", cube, near)]
-        )
-        assert {"near", "also near"} == {name for name in world.contacts(REST, 0.0) if "panda" not in name}
-        world.set_obstacles([Obstacle("near", cube, far), Obstacle("far", cube, near)])
-        assert {"far"} == {name for name in world.contacts(REST, 0.0) if "panda" not in name}
+        world.set_scene([Obstacle("far", cube, far), Obstacle("near", cube, near), Obstacle("also near", cube, near)])
+        assert {"near", "also near"} == {name for name in world.collisions(REST, 0.0) if "panda" not in name}
+        world.set_scene([Obstacle("near", cube, far), Obstacle("far", cube, near)])
+        assert {"far"} == {name for name in world.collisions(REST, 0.0) if "panda" not in name}

@@ -52,8 +52,8 @@ def touches_cube(world: FclWorld, checker: Checker, position: np.ndarray) -> boo
     """Whether the hand touches a cube of 5.2 mm with its margin, at a position relative to ``AHEAD``."""
     pose = checker.link_pose("panda_hand", REST).copy()
     pose[:3, 3] += pose[:3, :3] @ (AHEAD + position)
-    world.set_obstacles([Obstacle("cube", Shape((corners(*[0.0026 - MARGIN] * 3),)), pose)])
-    return "cube" in world.contacts(REST, 0.0)
+    world.set_scene([Obstacle("cube", Shape((corners(*[0.0026 - MARGIN] * 3),)), pose)])
+    return "cube" in world.collisions(REST, 0.0)
 
 
 @pytest.mark.parametrize(

@@ -198,15 +198,12 @@ def arm(panda_files, checker) -> ExactArm:
 def test_verdicts_of_fcl_are_exact(panda_files, arm, draw, seed):
     world = FclWorld(panda_files.arm_urdf, panda_files.arm_srdf, MOBILE_PANDA)
     scene = draw(world, np.random.default_rng([seed, 1]), seed)
-    if len(scene.voxels):
-        world.set_points(scene.voxels)
-    else:
-        world.set_obstacles(scene.obstacles)
+    world.set_scene(scene.voxels if len(scene.voxels) else scene.obstacles)
     world.attach(scene.held)
     count = 0
     for qpos, width in scene.configurations:
         contacts, undecided = scene.decide(arm, qpos, width)
-        found = set(world.contacts(qpos, width))
+        found = set(world.collisions(qpos, width))
         assert found - undecided == contacts
         assert world.free(qpos[None], finger_width=width)[0] == (not found)
         count += len(contacts)
