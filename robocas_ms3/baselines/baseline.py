@@ -1,4 +1,4 @@
-"""Interfaces of a baseline, and the settings that baselines share."""
+"""What a baseline is made of, and the settings that baselines share."""
 
 from __future__ import annotations
 
@@ -138,83 +138,31 @@ class Samples(Protocol):
         ...
 
 
-class Environments(Protocol):
-    """Environments of a baseline that learns in simulation.
+@dataclass(frozen=True)
+class Baseline:
+    """A baseline. It learns from demonstrations (``data``), or in simulation (``environments`` and ``train``).
 
-    Attributes:
-        name: of the scenes, for the record of the run.
-        hash: of the scenes.
-        facts: JSON values that the network and the policy need.
-        episodes: number of different episodes.
-    """
-
-    name: str
-    hash: str
-    facts: dict[str, Any]
-    episodes: int
-
-    def __len__(self) -> int:
-        """Return the number of steps to take."""
-        ...
-
-    def close(self) -> None:
-        """Close the environments and their processes."""
-        ...
-
-
-class AnyBaseline(Protocol):
-    """What every baseline has.
+    Of demonstrations, the network's ``forward(batch)`` returns metrics by name: means over the batch (), ``loss`` among
+    them. A metric of only some samples is a sum and the number of these samples (2,).
 
     Attributes:
         name: on the command line.
         version: of weights and inputs; runs of other versions can be neither continued nor used.
-        about: a line for `robocas list`.
         Config: model of its configuration.
+        model: makes the network of a configuration and the facts of its data.
+        policy: makes the policy that acts with a configuration, facts and a trained network.
+        data: reads the samples of a configuration, a dataset's path and a split, and reports its progress. Raises
+            DatasetError if the dataset lacks what the baseline needs, EmptySplitError if the split has no episodes.
+        environments: makes the environments of a configuration on ``cpu`` or ``cuda``: `Samples` without batches, with
+            ``name`` and ``hash`` of their scenes for the record of the run, and ``close()``.
+        train: trains into a `RunFolder` the network of a configuration in these environments; see `train_ppo`.
     """
 
     name: str
     version: int
-    about: str
     Config: type[BaselineConfig] | type[RLConfig]
-
-    def model(self, config: Any, facts: dict[str, Any]) -> torch.nn.Module:
-        """Build the network."""
-        ...
-
-    def policy(self, config: Any, facts: dict[str, Any], model: Any) -> Policy:
-        """Return a policy that acts with a trained network."""
-        ...
-
-
-class Baseline(AnyBaseline, Protocol):
-    """A baseline that learns from demonstrations.
-
-    The network's ``forward(batch)`` returns metrics by name: means over the batch (), ``loss`` among them. A metric
-    of only some samples is a sum and the number of these samples (2,).
-    """
-
-    def data(self, config: Any, folder: Path, split: Split, on_read: OnRead) -> Samples:
-        """Read the samples of a split.
-
-        Args:
-            config: of the baseline.
-            folder: the dataset, a file or a folder.
-            split: of the dataset.
-            on_read: reports progress.
-
-        Raises:
-            DatasetError: the dataset lacks what the baseline needs, or the split holds no episodes.
-        """
-        ...
-
-
-class RLBaseline(AnyBaseline, Protocol):
-    """A baseline that learns in simulation, with a training loop of its own and without ``data``."""
-
-    def environments(self, config: Any, device: str) -> Environments:
-        """Create the environments on ``cpu`` or ``cuda``."""
-        ...
-
-    def train(self, run: Any, model: Any, config: Any, environments: Any) -> None:
-        """Train until all steps are done, into a `RunFolder`; see `train_ppo`."""
-        ...
+    model: Callable[[Any, dict[str, Any]], torch.nn.Module]
+    policy: Callable[[Any, dict[str, Any], Any], Policy]
+    data: Callable[[Any, Path, Split, OnRead], Samples] | None = None
+    environments: Callable[[Any, str], Any] | None = None
+    train: Callable[[Any, Any, Any, Any], None] | None = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from contextlib import suppress
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from torch import nn
 
-from robocas_ms3.baselines.baseline import BaselineConfig, Batch, OnRead, Split, TrainSettings, no_episodes
+from robocas_ms3.baselines.baseline import Baseline, BaselineConfig, Batch, OnRead, Split, TrainSettings, no_episodes
 from robocas_ms3.baselines.chunks import ROW, ChunkPolicy, Scale, chunk_losses, encode, next_keys, spread, state_of
 from robocas_ms3.baselines.dataset_checks import check_base_stands
 from robocas_ms3.baselines.training.record import hash_dataset
@@ -23,7 +24,6 @@ from robocas_ms3.core.files import replacing
 from robocas_ms3.core.paths import cache_dir
 from robocas_ms3.core.poses import from_wxyz
 from robocas_ms3.datasets.sources.split import split_by_seed
-from robocas_ms3.demos.recordings.entries import versions
 from robocas_ms3.demos.recordings.motion import sample_states, sample_stride
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
 from robocas_ms3.evaluation.policy import Observations, PolicySpec, privileged
@@ -137,7 +137,7 @@ def _cache_path(path: Path, rate_hz: float) -> Path:
     for file in (path, path.with_suffix(".json")):
         digest.update(f"{hash_dataset(file) if file.is_file() else None}\n".encode())
     for package in _PACKAGES:
-        digest.update(f"{package} {versions()[package]}\n".encode())
+        digest.update(f"{package} {version(package)}\n".encode())
     return cache_dir() / "bc-state" / f"{digest.hexdigest()[:32]}.npz"
 
 
@@ -235,41 +235,24 @@ class BcStateModel(nn.Module):
         return torch.cat([self.chunk_scale.back(chunk[..., :9]), chunk[..., 9:].sigmoid()], dim=-1)
 
 
-class BcState:
-    """See `Baseline`."""
+def make_policy(config: BcStateConfig, facts: dict[str, Any], model: BcStateModel) -> ChunkPolicy:
+    """Return the policy."""
+    device, size = next(model.parameters()).device, len(facts["inputs"]["mean"])
 
-    name, version = "bc-state", 1
-    about = "privileged state of the simulator; chunks of poses by residual layers"
-    Config = BcStateConfig
+    def predict(seen: Observations, row: int) -> NDArray[np.floating]:
+        assert seen.state is not None
+        one = slice(row, row + 1)
+        inputs = inputs_of(
+            seen.state[one], from_wxyz(seen.tcp_in_base[one]), seen.robot[GRIPPER_WIDTH].reshape(-1)[one]
+        )
+        if inputs.shape[1] != size:
+            what, fix = "the policy was trained in other scenes", "Evaluate it in the task and scenes of its data."
+            raise EvaluationError(what, where="bc-state", expected=f"{size} numbers", found=inputs.shape[1], fix=fix)
+        with torch.inference_mode():
+            return model.act(torch.from_numpy(inputs).to(device))[0].cpu().numpy()
 
-    def data(self, config: BcStateConfig, folder: Path, split: Split, on_read: OnRead) -> StateSamples:
-        """Read the samples of a ``trajectory.h5``."""
-        return StateSamples(config, folder, split, on_read)
-
-    def model(self, config: BcStateConfig, facts: dict[str, Any]) -> BcStateModel:
-        """Build the network."""
-        return BcStateModel(config, facts)
-
-    def policy(self, config: BcStateConfig, facts: dict[str, Any], model: BcStateModel) -> ChunkPolicy:
-        """Return the policy."""
-        device, size = next(model.parameters()).device, len(facts["inputs"]["mean"])
-
-        def predict(seen: Observations, row: int) -> NDArray[np.floating]:
-            assert seen.state is not None
-            one = slice(row, row + 1)
-            inputs = inputs_of(
-                seen.state[one], from_wxyz(seen.tcp_in_base[one]), seen.robot[GRIPPER_WIDTH].reshape(-1)[one]
-            )
-            if inputs.shape[1] != size:
-                what, fix = "the policy was trained in other scenes", "Evaluate it in the task and scenes of its data."
-                raise EvaluationError(
-                    what, where="bc-state", expected=f"{size} numbers", found=inputs.shape[1], fix=fix
-                )
-            with torch.inference_mode():
-                return model.act(torch.from_numpy(inputs).to(device))[0].cpu().numpy()
-
-        spec = PolicySpec("robocas", reference="tcp", rate_hz=facts["rate_hz"], state=True, language="none")
-        return ChunkPolicy(spec, predict, min(config.play, config.chunk), config.fade)
+    spec = PolicySpec("robocas", reference="tcp", rate_hz=facts["rate_hz"], state=True, language="none")
+    return ChunkPolicy(spec, predict, min(config.play, config.chunk), config.fade)
 
 
-BASELINE = BcState()
+BASELINE = Baseline("bc-state", 1, BcStateConfig, BcStateModel, make_policy, StateSamples)

@@ -12,7 +12,7 @@ from robocas_ms3.core.exits import no_exit
 from robocas_ms3.core.extensions import Registry
 
 if TYPE_CHECKING:
-    from robocas_ms3.baselines.baseline import Baseline, RLBaseline  # which import torch
+    from robocas_ms3.baselines.baseline import Baseline  # which imports torch
 
 GROUP = "robocas_ms3.baselines"
 
@@ -23,18 +23,18 @@ class Builtin:
 
     Attributes:
         folder: next to this file.
-        about: the baseline's own ``about``, for listings that do not import it.
+        about: a line for `robocas list`.
     """
 
     folder: str
     about: str
 
-    def __call__(self) -> Baseline | RLBaseline:
+    def __call__(self) -> Baseline:
         """Return the baseline."""
         return import_module(f"robocas_ms3.baselines.{self.folder}").BASELINE
 
 
-BASELINES: Registry[Callable[[], Baseline | RLBaseline]] = Registry(
+BASELINES: Registry[Callable[[], Baseline]] = Registry(
     "baseline",
     GROUP,
     Callable,
@@ -48,7 +48,7 @@ BASELINES: Registry[Callable[[], Baseline | RLBaseline]] = Registry(
 """Functions that return a baseline, by its name."""
 
 
-def find_baseline(name: str, *, where: object = "") -> Baseline | RLBaseline:
+def find_baseline(name: str, *, where: object = "") -> Baseline:
     """Return the baseline of a name.
 
     Raises:

@@ -1,11 +1,12 @@
 """A made-up baseline, and a small dataset for real ones."""
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import yaml
-from made_up_baseline import MadeUp
+from made_up_baseline import MADE_UP
 from made_up_dataset import made_up_dataset
 from made_up_runs import train
 
@@ -18,9 +19,14 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @pytest.fixture
 def made_up(monkeypatch):
-    monkeypatch.setitem(BASELINES.builtin, "made-up", MadeUp)
+    """A function that changes the made-up baseline, which is registered."""
+
+    def change(**values):
+        monkeypatch.setitem(BASELINES.builtin, "made-up", lambda: replace(MADE_UP, **values))
+
+    change()
     monkeypatch.setitem(COMMANDS, "made-up", command("made-up", Other))
-    return MadeUp
+    return change
 
 
 @pytest.fixture(scope="session")

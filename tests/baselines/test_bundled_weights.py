@@ -7,8 +7,8 @@ import pytest
 
 from robocas_ms3.baselines.policy import RunPolicy
 from robocas_ms3.baselines.small import BASELINE
-from robocas_ms3.baselines.training.initial_weights import load_initial_weights
 from robocas_ms3.baselines.training.record import BUNDLED, CHECKPOINT, read_run
+from robocas_ms3.baselines.training.session import load_initial_weights
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import TrainingError
 from robocas_ms3.evaluation.policies import make_policy

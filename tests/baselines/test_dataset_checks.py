@@ -17,7 +17,7 @@ from robocas_ms3.baselines.rt1 import BASELINE as RT1
 from robocas_ms3.baselines.rt1.config import RT1Config
 from robocas_ms3.baselines.small import BASELINE as SMALL
 from robocas_ms3.baselines.small.config import SmallConfig
-from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.errors import DatasetError, EmptySplitError
 from robocas_ms3.datasets.formats import open_source
 
 LEARNERS = {"rt1": (RT1, RT1Config(**SIZES)), "small": (SMALL, SmallConfig(**TINY))}
@@ -26,6 +26,52 @@ LEARNERS = {"rt1": (RT1, RT1Config(**SIZES)), "small": (SMALL, SmallConfig(**TIN
 def read(name, path, split="train"):
     baseline, config = LEARNERS[name]
     return baseline.data(config, path, split, lambda done, total: None)
+
+
+def spoil_arrays(folder, number, **columns):
+    """Write a NaN, or add values to columns of an array."""
+    path = folder / f"episode_{number:07d}" / "episode_info.npz"
+    arrays = dict(np.load(path))
+    for key, change in columns.items():
+        arrays[key][:] = change(arrays[key])
+    np.savez(path, **arrays)
+
+
+def set_values(folder, name="conversion.json", **values):
+    path = folder / name
+    path.write_text(json.dumps({**json.loads(path.read_text()), **values}))
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+@pytest.mark.parametrize(
+    "values", [{"embeddings": False}, {"cameras": ["base_camera"]}, {"cameras": []}, {"rate_hz": 10.0}], ids=str
+)
+def test_a_dataset_without_what_a_baseline_needs(name, values, folder, tmp_path):
+    copy = shutil.copytree(folder, tmp_path / "dataset")
+    set_values(copy, **values)
+    with pytest.raises(DatasetError) as caught:
+        read(name, copy)
+    assert caught.value.where == copy
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_a_split_without_episodes(name, folder, tmp_path):
+    copy = shutil.copytree(folder, tmp_path / "dataset")
+    set_values(copy, "data_info.json", val_eps=[])
+    with pytest.raises(EmptySplitError):
+        read(name, copy, "val")
+
+
+@pytest.mark.parametrize(
+    ("name", "key"),
+    [("rt1", "rel_pos"), ("rt1", "language_embedding"), ("small", "ee_pos"), ("small", "gripper_width")],
+)
+def test_nan_is_found_before_the_first_step(name, key, folder, tmp_path):
+    copy = shutil.copytree(folder, tmp_path / "dataset")
+    number = open_source(copy).split("train")[-1]
+    spoil_arrays(copy, number, **{key: lambda values: np.nan})
+    with pytest.raises(DatasetError, match=f"episode {number}, {key}: "):
+        read(name, copy)
 
 
 def test_a_base_that_trembles_stands():
@@ -49,11 +95,7 @@ def test_a_base_that_drives_in_one_step_or_slowly(column, rows):
 def test_baselines_refuse_a_base_that_drives(folder, tmp_path, name, split):
     copy = shutil.copytree(folder, tmp_path / "dataset")
     number = open_source(copy).split(split)[0]
-    path = copy / f"episode_{number:07d}" / "episode_info.npz"
-    arrays = dict(np.load(path))
-    arrays["agv_pose"][:, 0] += np.linspace(0, 0.5, len(arrays["agv_pose"]), dtype=np.float32)
-    arrays["rel_agv_pose"][:-1] = np.diff(arrays["agv_pose"], axis=0)
-    np.savez(path, **arrays)
+    spoil_arrays(copy, number, rel_agv_pose=lambda motion: motion + np.float32([0.08, 0, 0]))
     with pytest.raises(DatasetError, match=f"episode {number}: the base drives"):
         read(name, copy, split)
 
@@ -78,8 +120,8 @@ def test_actions_of_a_turned_tcp_are_refused(folder, tmp_path, name, camera, tur
         pose[:2, 3] = camera
         np.save(path, pose)
     read(name, copy)  # a configuration may move the camera
-    for path in copy.glob("episode_*/scene.json"):  # as of a dataset made elsewhere
-        path.write_text(json.dumps({**json.loads(path.read_text()), "env_info": None}))
+    for episode in copy.glob("episode_*"):  # as of a dataset made elsewhere
+        set_values(episode, "scene.json", env_info=None)
     with pytest.raises(DatasetError, match=f"turned by {turn} degrees.*import-robocas"):
         read(name, copy)
 
@@ -87,8 +129,7 @@ def test_actions_of_a_turned_tcp_are_refused(folder, tmp_path, name, camera, tur
 def test_without_a_gripper_camera_a_scene_is_needed(folder, tmp_path):
     """RoboCAS-v0's episodes have none."""
     copy = shutil.copytree(folder, tmp_path / "dataset")
-    settings = json.loads((copy / "conversion.json").read_text())
-    (copy / "conversion.json").write_text(json.dumps({**settings, "cameras": ["base_camera"]}))
+    set_values(copy, cameras=["base_camera"])
     check_tcp_frame(open_source(copy), 0)
     (copy / "episode_0000000" / "scene.json").unlink()
     with pytest.raises(DatasetError, match=r"episode_0000000: .*import-robocas"):

@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
-from made_up_baseline import MadeUp
+from made_up_baseline import MADE_UP
 
 from robocas_ms3.baselines.registry import BASELINES
 from robocas_ms3.cli.main import run
@@ -15,7 +15,7 @@ from robocas_ms3.core.errors import TrainingError
 
 @pytest.fixture
 def made_up(monkeypatch):
-    monkeypatch.setitem(BASELINES.builtin, "made-up", MadeUp)
+    monkeypatch.setitem(BASELINES.builtin, "made-up", lambda: MADE_UP)
     monkeypatch.setitem(COMMANDS, "made-up", command("made-up", Other))
 
 

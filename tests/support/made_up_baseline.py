@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from made_up_runs import stop_at, train
 
-from robocas_ms3.baselines.baseline import BaselineConfig, TrainSettings
+from robocas_ms3.baselines.baseline import Baseline, BaselineConfig, TrainSettings
 from robocas_ms3.baselines.registry import BASELINES
 from robocas_ms3.core.errors import DatasetError, EmptySplitError
 from robocas_ms3.evaluation.policy import PolicySpec
@@ -68,9 +68,6 @@ class MadeUpModel(torch.nn.Module):
 class MadeUpPolicy:
     spec = PolicySpec(language="none")
 
-    def __init__(self, model):
-        self.model = model
-
     def reset(self, starts):
         pass
 
@@ -78,26 +75,20 @@ class MadeUpPolicy:
         return np.zeros((len(observations.envs), 7))
 
 
-class MadeUp:
-    name, version, about, Config = "made-up", 1, "for tests", MadeUpConfig
+def read_samples(config, folder, split, on_read):
+    if split == "val" and folder.read_text() == "few":
+        raise EmptySplitError("this split holds no episodes", where=folder)
+    if split == "val" and folder.read_text() == "damaged":
+        raise DatasetError("this split is damaged", where=folder)
+    bad = config.broken_at, config.steep_at, config.damaged_at
+    return MadeUpSamples(*(bad if split == "train" else (-1, -1)))
 
-    def data(self, config, folder, split, on_read):
-        if split == "val" and folder.read_text() == "few":
-            raise EmptySplitError("this split holds no episodes", where=folder)
-        if split == "val" and folder.read_text() == "damaged":
-            raise DatasetError("this split is damaged", where=folder)
-        bad = config.broken_at, config.steep_at, config.damaged_at
-        return MadeUpSamples(*(bad if split == "train" else (-1, -1)))
 
-    def model(self, config, facts):
-        return MadeUpModel(config, facts)
-
-    def policy(self, config, facts, model):
-        return MadeUpPolicy(model)
+MADE_UP = Baseline("made-up", 1, MadeUpConfig, MadeUpModel, lambda config, facts, model: MadeUpPolicy(), read_samples)
 
 
 if __name__ == "__main__":
-    BASELINES.builtin["made-up"] = MadeUp
+    BASELINES.builtin["made-up"] = lambda: MADE_UP
     data, out = map(Path, sys.argv[1:])
     train("made-up", data, out / "whole")
     try:

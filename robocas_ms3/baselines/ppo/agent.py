@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import nn
 from torch.distributions import Normal
 
+from robocas_ms3.baselines.ppo.config import PpoConfig
 from robocas_ms3.baselines.ppo.environments import expand_action, join_observation
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
@@ -60,6 +61,11 @@ class Agent(nn.Module):
         return self.actor(self.normalize(obs))
 
 
+def make_agent(config: PpoConfig, facts: dict[str, Any]) -> Agent:
+    """Return the networks of policy and value."""
+    return Agent(facts["observed"], facts["acted"], config.width)
+
+
 def _layers(inputs: int, width: int, outputs: int, gain: float) -> nn.Sequential:
     last = nn.Linear(width, outputs)
     layers = nn.Sequential(nn.Linear(inputs, width), nn.Tanh(), nn.Linear(width, width), nn.Tanh(), last)
@@ -73,7 +79,7 @@ def _layers(inputs: int, width: int, outputs: int, gain: float) -> nn.Sequential
 class PpoPolicy:
     """Acts without noise, in the convention of ``pd_ee_delta_pose``."""
 
-    def __init__(self, facts: dict[str, Any], agent: Agent) -> None:
+    def __init__(self, config: PpoConfig, facts: dict[str, Any], agent: Agent) -> None:
         # Rotations are about one axis, where Euler angles and rotation vectors are the same
         self.spec = PolicySpec(
             "delta_axis_angle", reference="target", rate_hz=facts["rate_hz"], state=True, language="none"

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections import deque
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from robocas_ms3.baselines.rt1.config import RT1Config
 from robocas_ms3.baselines.rt1.model import RT1Model
+from robocas_ms3.datasets.training.sample_pictures import resize
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 
 
@@ -70,17 +70,8 @@ class RT1Policy:
     def _encode(self, observations: Observations, row: int) -> torch.Tensor:
         """Return the image tokens (images, token_width) of an env."""
         assert observations.embeddings is not None
-        views = [scale_image(observations.images[name][row], self._config.picture) for name in self._config.cameras]
+        views = [resize(observations.images[name][row], self._config.picture) for name in self._config.cameras]
         device = self._model.mean.device
         images = torch.from_numpy(np.stack(views).transpose(0, 3, 1, 2)[None].copy()).to(device)
         with torch.inference_mode():
             return self._model.encode(images, torch.from_numpy(observations.embeddings[row : row + 1]).to(device))[0]
-
-
-def scale_image(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
-    """Scale an image (H, W, 3) to a width and height, as samples of a dataset are: down by areas."""
-    if image.shape[1::-1] == tuple(size):
-        return image
-    smaller = size[0] <= image.shape[1] and size[1] <= image.shape[0]
-    found: Any = cv2.resize(image, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
-    return found

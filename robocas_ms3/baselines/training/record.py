@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 import hashlib
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
@@ -99,14 +99,8 @@ def read_run(folder: Path) -> RunRecord:
 
 
 def package_versions() -> dict[str, str]:
-    """Return the versions of the installed packages that results depend on."""
-    versions = {}
-    for name in _PACKAGES:
-        try:
-            versions[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return versions
+    """Return the versions of the packages that results depend on."""
+    return {name: version(name) for name in _PACKAGES}
 
 
 def hash_dataset(data: Path) -> str:

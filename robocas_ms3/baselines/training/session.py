@@ -2,25 +2,44 @@
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
-from robocas_ms3.baselines.baseline import Baseline, Precision, Progress, RLBaseline, Samples
+from robocas_ms3.baselines.baseline import Baseline, OnRead, Precision, Progress, Samples, Split
 from robocas_ms3.baselines.registry import find_baseline, need_extra
-from robocas_ms3.baselines.training.initial_weights import InitialWeights, combine_facts, load_initial_weights
-from robocas_ms3.baselines.training.record import RUN, DataRecord, RunRecord, hash_dataset, package_versions
+from robocas_ms3.baselines.training.record import (
+    CHECKPOINT,
+    RUN,
+    WEIGHTS,
+    DataRecord,
+    RunRecord,
+    find_run,
+    hash_dataset,
+    hash_weights,
+    package_versions,
+    read_run,
+)
 from robocas_ms3.core.errors import EmptySplitError, TrainingError
 from robocas_ms3.core.exits import no_exit
 from robocas_ms3.core.outputs import FolderKind, OutputFolder
 from robocas_ms3.core.strict import parse
 
+if TYPE_CHECKING:
+    from robocas_ms3.baselines.training.checkpoints import Checkpoint
+
 OUTPUT = FolderKind("robocas train", (RUN,), "baseline")
+_INPUTS = ("rate_hz", "pictures", "cameras", "calibration", "observed", "acted")
+"""Facts that have to be the same in both runs. Others, such as scales, need the same shape."""
+_TOLERANCE = 1e-3  # of these: camera poses differ in the last bits
+_SHOWN = 8  # values of a list in a message
 
 
 @dataclass(frozen=True)
@@ -46,6 +65,21 @@ class RunOptions:
     overwrite: bool = False
 
 
+@dataclass(frozen=True)
+class InitialWeights:
+    """Weights of another run.
+
+    Attributes:
+        record: of that run.
+        name: of its folder, with a hash of its weights.
+        weights: None if the new run has a checkpoint already.
+    """
+
+    record: RunRecord
+    name: str
+    weights: Checkpoint | None
+
+
 def train_run(options: RunOptions, progress: Progress | None = None) -> RunRecord:
     """Train a baseline, or continue a run with the same settings.
 
@@ -56,8 +90,7 @@ def train_run(options: RunOptions, progress: Progress | None = None) -> RunRecor
         KeyboardInterrupt: Ctrl-C; the run can be continued.
     """
     need_extra("accelerate", "safetensors", "tensorboard", "transformers")
-    from robocas_ms3.baselines.training.devices import describe_hardware, make_accelerator
-    from robocas_ms3.baselines.training.run_folder import RunFolder
+    from robocas_ms3.baselines.training.run_folder import RunFolder, describe_hardware, make_accelerator
     from robocas_ms3.baselines.training.supervised import train_supervised
 
     baseline: Any = find_baseline(options.baseline)
@@ -86,7 +119,7 @@ def train_run(options: RunOptions, progress: Progress | None = None) -> RunRecor
         if data is not None:
             progress.note(f"reading {data}")
             source = baseline.data(config, data, "train", progress.read)
-            validation = _read_validation(baseline, config, data, progress)
+            validation = _read_validation(partial(baseline.data, config, data), progress)
         record = recorded or RunRecord(
             baseline=baseline.name,
             version=baseline.version,
@@ -118,12 +151,76 @@ def merge_configs(defaults: Mapping[str, Any], changes: Mapping[str, Any]) -> di
     return result
 
 
-def _check_data(baseline: Baseline | RLBaseline, data: Path | None) -> None:
-    needs_data = hasattr(baseline, "data")
-    if data is None and needs_data:
+def load_initial_weights(
+    baseline: Baseline, start: Path | None, recorded: RunRecord | None, out: Path
+) -> InitialWeights | None:
+    """Load the weights of the run to start from, if one is named.
+
+    Raises:
+        TrainingError: the weights are missing, or of another baseline or version; or a run that continues has no
+            checkpoint yet, and the run that it started from is not named.
+    """
+    from robocas_ms3.baselines.training import checkpoints
+
+    has_checkpoint = recorded is not None and (out / CHECKPOINT).is_file()
+    if start is None:
+        if recorded is not None and recorded.start and not has_checkpoint:
+            what = "this run has no checkpoint yet, and starts from the weights of another"
+            raise TrainingError(what, where=out, expected=recorded.start, fix="Name that run by --start again.")
+        return None
+    start = find_run(start)
+    record = read_run(start)
+    expected = {"baseline": baseline.name, "version": str(baseline.version)}
+    weights = None if has_checkpoint else checkpoints.load(start / WEIGHTS, expected)
+    return InitialWeights(record, f"{start.resolve().name}, {hash_weights(start)[:12]}", weights)
+
+
+def combine_facts(own: dict[str, Any], initial: InitialWeights | None, data: Path | None) -> dict[str, Any]:
+    """Return the facts of a run; on a dataset, with initial weights, the other run's, whose scales fit the weights.
+
+    Raises:
+        TrainingError: the inputs of the other run differ.
+    """
+    if initial is None:
+        return own
+    others = initial.record.facts
+    scales = () if data is None else (key for key in own if key in others and key not in _INPUTS)
+    for key in (*_INPUTS, *scales):
+        tolerance = _TOLERANCE if key in _INPUTS else math.inf
+        if (difference := _first_difference(others.get(key), own.get(key), key, tolerance)) is not None:
+            name, expected, found = difference
+            raise TrainingError(
+                f"the run of --start has other {key}",
+                where=f"{data or initial.name}, {name}",
+                expected=expected,
+                found=found,
+                fix="Start from a run with the same inputs, convert the data as for that run, or leave out --start.",
+            )
+    return own if data is None else others
+
+
+def _first_difference(one: Any, other: Any, name: str, tolerance: float) -> tuple[str, Any, Any] | None:
+    """Return name and values of the first JSON values that differ, numbers by more than a tolerance."""
+    if isinstance(one, dict) and isinstance(other, dict) and one.keys() == other.keys():
+        found = (_first_difference(one[key], other[key], f"{name}.{key}", tolerance) for key in one)
+        return next(filter(None, found), None)
+    if isinstance(one, list) and isinstance(other, list):
+        if len(one) != len(other):
+            is_short = max(len(one), len(other)) <= _SHOWN
+            return (name, one, other) if is_short else (name, f"{len(one)} values", f"{len(other)} values")
+        pairs = enumerate(zip(one, other, strict=True))
+        found = (_first_difference(*pair, f"{name}[{index}]", tolerance) for index, pair in pairs)
+        return next(filter(None, found), None)
+    if isinstance(one, float) and isinstance(other, float):
+        return (name, float(f"{one:.4g}"), float(f"{other:.4g}")) if abs(one - other) > tolerance else None
+    return (name, one, other) if one != other else None
+
+
+def _check_data(baseline: Baseline, data: Path | None) -> None:
+    if data is None and baseline.data is not None:
         expected = "a dataset's folder or a trajectory.h5"
         raise TrainingError(f"{baseline.name} needs a dataset", where="--data", expected=expected)
-    if data is not None and not needs_data:
+    if data is not None and baseline.data is None:
         raise TrainingError(f"{baseline.name} takes no dataset", where="--data", fix="Leave it out.")
 
 
@@ -139,7 +236,7 @@ def _open_output(options: RunOptions) -> Iterator[OutputFolder]:
         yield output
 
 
-def _read_recorded(output: OutputFolder, baseline: Baseline | RLBaseline) -> RunRecord | None:
+def _read_recorded(output: OutputFolder, baseline: Baseline) -> RunRecord | None:
     """Return the record of a run that continues; options that are newer than it have their defaults."""
     output.check_settings({"baseline": baseline.name, "version": baseline.version, "versions": package_versions()})
     if output.recorded is None:
@@ -159,17 +256,15 @@ def _precision(precision: Precision, recorded: RunRecord | None) -> Precision:
     return "bf16" if recorded.precision == "bf16" else "fp32"
 
 
-def _read_validation(baseline: Baseline, config: Any, data: Path, progress: Progress) -> Samples | None:
+def _read_validation(read: Callable[[Split, OnRead], Samples], progress: Progress) -> Samples | None:
     try:
-        return baseline.data(config, data, "val", progress.read)
+        return read("val", progress.read)
     except EmptySplitError:
         progress.note("no validation: there are too few episodes")
         return None
 
 
-def _make_model(
-    baseline: Baseline | RLBaseline, config: Any, record: RunRecord, initial: InitialWeights | None
-) -> torch.nn.Module:
+def _make_model(baseline: Baseline, config: Any, record: RunRecord, initial: InitialWeights | None) -> torch.nn.Module:
     """Return the network with random or initial weights."""
     torch.manual_seed(config.train.seed)
     model = baseline.model(config, record.facts)

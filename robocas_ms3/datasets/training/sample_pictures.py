@@ -70,7 +70,7 @@ class PictureStack:
                         expected="(H, W, 3) uint8" if kind == "rgb" else "(H, W) uint16",
                         found=f"{picture.shape} {picture.dtype}",
                     )
-                shots.append(_resize(picture, self.size))
+                shots.append(resize(picture, self.size))
         return shots
 
     def _stack(self, episode: SourceEpisode, shots: Sequence[NDArray]) -> NDArray:
@@ -94,7 +94,7 @@ def _settle_process() -> None:
             cv2.setNumThreads(0)
 
 
-def _resize(picture: NDArray, size: tuple[int, int] | None) -> NDArray:
+def resize(picture: NDArray, size: tuple[int, int] | None) -> NDArray:
     """Scale to width and height: RGB by areas, depth by the nearest pixel, which mixes no distances."""
     if size is None or picture.shape[1::-1] == tuple(size):
         return picture

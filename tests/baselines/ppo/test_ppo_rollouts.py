@@ -5,7 +5,7 @@ from made_up_envs import LeftOrRight
 
 from robocas_ms3.baselines.ppo.agent import Agent
 from robocas_ms3.baselines.ppo.config import PpoConfig
-from robocas_ms3.baselines.ppo.rollouts import (
+from robocas_ms3.baselines.ppo.train import (
     OUTCOMES,
     RolloutCollector,
     advantages,

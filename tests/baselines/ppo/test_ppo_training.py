@@ -1,5 +1,7 @@
 """PPO in an environment of a few lines: it learns, is interrupted and continues; and once in the simulator."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from made_up_envs import LeftOrRight, MadeUpEnvironments
@@ -8,6 +10,7 @@ from safetensors.torch import load_file
 
 from robocas_ms3.baselines.policy import RunPolicy
 from robocas_ms3.baselines.ppo import BASELINE
+from robocas_ms3.baselines.registry import BASELINES
 from robocas_ms3.baselines.training.session import Progress
 from robocas_ms3.core.errors import OutputExistsError, TrainingError
 
@@ -16,7 +19,7 @@ SMALL = {"width": 16, "envs": 4, "trials": 20, "layouts": 10, "train": {"steps":
 
 @pytest.fixture
 def made_up(monkeypatch):
-    monkeypatch.setattr(type(BASELINE), "environments", staticmethod(MadeUpEnvironments))
+    monkeypatch.setitem(BASELINES.builtin, "ppo", lambda: replace(BASELINE, environments=MadeUpEnvironments))
     monkeypatch.setattr(MadeUpEnvironments, "made", [])
 
 

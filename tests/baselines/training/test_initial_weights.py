@@ -6,12 +6,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from made_up_baseline import MadeUp
+from made_up_baseline import MADE_UP
 from made_up_runs import assert_same, change_record, stop_at, train
 from safetensors.torch import load_file
 
-from robocas_ms3.baselines.training.initial_weights import combine_facts, load_initial_weights
-from robocas_ms3.baselines.training.session import Progress, merge_configs
+from robocas_ms3.baselines.training.session import Progress, combine_facts, load_initial_weights, merge_configs
 from robocas_ms3.core.errors import OutputExistsError, TrainingError
 from robocas_ms3.evaluation.policies import make_policy
 
@@ -22,7 +21,7 @@ SIMULATION = {"observed": 30, "horizon": 100}
 
 def combine(whole, facts, own):
     change_record(whole, facts=facts)
-    initial = load_initial_weights(MadeUp(), whole, None, whole)
+    initial = load_initial_weights(MADE_UP, whole, None, whole)
     return combine_facts(own, initial, None if facts is SIMULATION else Path("data"))
 
 
@@ -119,15 +118,6 @@ def test_a_run_that_started_from_weights_continues_with_the_same(whole, data, tm
     train("made-up", data, out)
     train("made-up", data, tmp_path / "unbroken", few, start=whole)
     assert_same(tmp_path / "unbroken", out)
-
-
-def test_other_options_are_refused_with_their_values(whole, data):
-    with pytest.raises(OutputExistsError) as error:
-        train("made-up", data, whole, {"width": 5, "train": {"learning_rate": 9e-4}})
-    assert sorted(error.value.found.split("; ")) == [
-        "config.train.learning_rate: 0.001 -> 0.0009",
-        "config.width: 4 -> 5",
-    ]
 
 
 def test_an_option_that_is_newer_than_the_run_has_its_default(whole, data):

@@ -1,6 +1,5 @@
 """Training runs: interrupted and continued to the bit, and refused if they are of something else."""
 
-import errno
 import json
 import os
 import shutil
@@ -19,7 +18,7 @@ from made_up_runs import assert_finite, assert_same, change_record, read_log, st
 from safetensors.torch import load_file
 
 from robocas_ms3.baselines.policy import RunPolicy
-from robocas_ms3.baselines.training import checkpoints, devices
+from robocas_ms3.baselines.training import checkpoints, run_folder
 from robocas_ms3.baselines.training.learner import Learner
 from robocas_ms3.baselines.training.session import Progress, merge_configs
 from robocas_ms3.cli.main import run
@@ -63,24 +62,6 @@ def test_a_run_that_was_stopped_continues_to_the_bit(whole, data, tmp_path, step
         train("made-up", data, out, progress=stop_at(step, error("stopped")))
     train("made-up", data, out, progress=Progress(step=lambda done, total: steps.append(done)))
     assert steps[0] == continued_at
-    assert_same(whole, out)
-
-
-@pytest.mark.parametrize(("name", "step"), [("weights.safetensors", 20), ("checkpoint.safetensors", 40)])
-def test_a_checkpoint_without_room_on_the_disk_is_written_later(whole, data, tmp_path, monkeypatch, name, step):
-    save = checkpoints.save
-
-    def full(path, tensors, metadata, at):
-        if path.name == name and at == step:
-            raise OSError(errno.ENOSPC, "No space left on device", str(path))
-        save(path, tensors, metadata, at)
-
-    out = tmp_path / "again"
-    with monkeypatch.context() as patch:
-        patch.setattr(checkpoints, "save", full)
-        with pytest.raises(OSError, match=name):
-            train("made-up", data, out)
-    train("made-up", data, out)
     assert_same(whole, out)
 
 
@@ -212,8 +193,8 @@ def test_a_removed_folder_is_an_error(made_up, data, tmp_path, monkeypatch):
     assert caught.value.where == out
 
 
-def test_a_baseline_can_not_end_the_process(made_up, data, tmp_path, monkeypatch):
-    monkeypatch.setattr(made_up, "model", lambda self, config, facts: sys.exit(0))
+def test_a_baseline_can_not_end_the_process(made_up, data, tmp_path):
+    made_up(model=lambda config, facts: sys.exit(0))
     with pytest.raises(ExtensionError) as caught:
         train("made-up", data, tmp_path / "run")
     assert caught.value.where == "baseline made-up"
@@ -222,8 +203,8 @@ def test_a_baseline_can_not_end_the_process(made_up, data, tmp_path, monkeypatch
 def test_a_baseline_that_changes_the_working_directory(made_up, data, tmp_path, monkeypatch):
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path)
-    model = made_up.model
-    monkeypatch.setattr(made_up, "model", lambda *args: os.chdir(tmp_path / "elsewhere") or model(*args))
+    make = made_up_baseline.MadeUpModel
+    made_up(model=lambda *args: os.chdir(tmp_path / "elsewhere") or make(*args))
     assert run(["train", "made-up", "--data", data.name, "--out", "run", "--steps", "4", "--device", "cpu"]) == 0
     assert (tmp_path / "run" / "run.json").is_file()
     assert not list((tmp_path / "elsewhere").iterdir())
@@ -239,20 +220,10 @@ def test_a_validation_split_may_be_empty_but_not_damaged(made_up, data, tmp_path
 
 
 def test_processes_share_a_batch_evenly(made_up, data, tmp_path, monkeypatch):
-    monkeypatch.setattr(devices, "make_accelerator", lambda *_: SimpleNamespace(num_processes=3))
+    monkeypatch.setattr(run_folder, "make_accelerator", lambda *_: SimpleNamespace(num_processes=3))
     with pytest.raises(TrainingError) as caught:
         train("made-up", data, tmp_path / "run")
     assert caught.value.where == "train.batch_size"
-
-
-def test_leftovers_of_a_kill_are_removed(whole, made_up, data, tmp_path):
-    """Before there was a record, and during the write of a checkpoint."""
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / ".run.123.tmp.json").write_text("{")
-    (whole / ".checkpoint.123.tmp.safetensors").write_bytes(b"half")
-    for out, changes in ((tmp_path / "run", {"train": {"steps": 4}}), (whole, {})):
-        train("made-up", data, out, changes)
-        assert not list(out.glob(".*"))
 
 
 def test_an_error_of_a_worker_is_that_of_the_samples(made_up, data, tmp_path):
