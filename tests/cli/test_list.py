@@ -2,7 +2,6 @@ import json
 
 import pytest
 
-from robocas_ms3.baselines.registry import BASELINES
 from robocas_ms3.cli.list import List, collect, main
 from robocas_ms3.core.paths import data_dir
 from robocas_ms3.scenes.config import load_task_config, shipped_configs
@@ -16,13 +15,6 @@ def test_tasks_and_configs_are_listed():
     for name, row in configs.items():
         assert row["description"], f"{name} doesn't say what it is"
         assert row["scene"].startswith(f"{load_task_config(name).objects.count} objects")
-
-
-def test_baselines_are_listed_as_they_say_of_themselves():
-    rows = {row["name"]: row for row in collect()["baselines"]}
-    assert list(rows)[:4] == ["small", "bc-state", "rt1", "ppo"]
-    for name, give in BASELINES.builtin.items():
-        assert rows[name] == {"name": name, "package": "robocas_ms3", "about": give().about}
 
 
 def test_builtin_pack_is_listed():
