@@ -33,19 +33,18 @@ def check_videos(dataset: LeRobotDataset, key: str, decode: bool) -> Iterator[Vi
     """
     root, layout, info, rows = dataset.root, dataset.layout, dataset.info, dataset.rows
     camera, shape = schema.camera_of(key), info["features"][key]["shape"]
-    kinds = [(f"videos/{key}", layout.video)]
+    prefixes = [f"videos/{key}"]
     if rows and f"depth/{camera}/file_index" in rows[0]:
-        kinds.append((f"depth/{camera}", layout.depth))
-    for prefix, pattern in kinds:
+        prefixes.append(f"depth/{camera}")
+    for prefix in prefixes:
         by_file: dict[Path, list[dict[str, Any]]] = defaultdict(list)
         for row in rows:
-            place = row[f"{prefix}/chunk_index"], row[f"{prefix}/file_index"]
-            by_file[layout.path(root, pattern, *place, video_key=key, camera=camera)].append(row)
+            by_file[layout.path_of(root, prefix, row)].append(row)
         for path, inside in by_file.items():
             yield from _check_times(inside, prefix, info["fps"])
             frames, name = sum(row["length"] for row in inside), str(path.relative_to(root))
             yield from (Violation(name, *fault) for fault in _video_faults(path, frames, info["fps"], shape, decode))
-        folder = layout.path(root, pattern, 0, 0, video_key=key, camera=camera).parent  # chunk-000, or below it
+        folder = layout.path(root, prefix, 0, 0).parent  # chunk-000, or below it
         chunks = folder.parent.parent.glob(f"*/{folder.name}") if layout.one_file_per_episode else [folder.parent]
         for path in sorted(path for chunk in chunks for path in chunk.rglob("*") if path.is_file()):
             if path not in by_file:

@@ -47,8 +47,7 @@ def check_data(
     wanted = sorted(key for key, feature in features.items() if feature["dtype"] != "video")
     by_file: dict[Path, list[dict[str, Any]]] = defaultdict(list)
     for row in dataset.rows:
-        place = row["data/chunk_index"], row["data/file_index"]
-        by_file[layout.path(root, layout.data, *place)].append(row)
+        by_file[layout.path_of(root, "data", row)].append(row)
     violations: list[Violation] = []
     ranges: Ranges = {}
     done = 0

@@ -29,6 +29,7 @@ from robocas_ms3.datasets.lerobot.schema import (
     whole_rate,
 )
 from robocas_ms3.datasets.lerobot.variants import Variant, find_variant
+from robocas_ms3.datasets.schema import episode_folder
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.datasets.writing.inputs import ConversionInput, open_input
 from robocas_ms3.datasets.writing.plan import LEFT_OUT, with_versions
@@ -162,10 +163,10 @@ def _is_same(before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
 
 def _missing_parts(settings: ConversionSettings, variant: Variant, count: int, plan: Mapping[str, Any]) -> WriteJob:
     """Return the parts that are missing; damaged ones are removed."""
-    from robocas_ms3.datasets.lerobot.parts import Part, PartWriter, part_folder
+    from robocas_ms3.datasets.lerobot.parts import Part, PartWriter
 
     parts = settings.out / _PARTS
-    folders = [part_folder(parts, index) for index in range(count)]
+    folders = [parts / episode_folder(index) for index in range(count)]
     for folder in folders:
         if folder.is_dir() and not Part(folder).is_whole:
             _log.warning("%s: damaged since it was written; it is written again", folder)
@@ -176,10 +177,9 @@ def _missing_parts(settings: ConversionSettings, variant: Variant, count: int, p
 
 def _join(out: Path, plan: dict[str, Any], incomplete: IncompleteError | None) -> dict[str, Any]:
     """Make the dataset of the parts that are there; return the plan of those."""
-    from robocas_ms3.datasets.lerobot.parts import part_folder
     from robocas_ms3.datasets.lerobot.writer import join_parts
 
-    folders = {index: part_folder(out / _PARTS, index) for index in range(len(plan["episodes"]))}
+    folders = {index: out / _PARTS / episode_folder(index) for index in range(len(plan["episodes"]))}
     if incomplete:
         why = {index: incomplete.reasons.get(folder.name) for index, folder in folders.items()}
         folders = {index: folder for index, folder in folders.items() if folder.is_dir()}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,15 +17,13 @@ from pydantic import BaseModel, ConfigDict
 
 from robocas_ms3.core.documents import JSON_LIMIT, read_text
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.files import json_text, replacing_folder
+from robocas_ms3.core.files import replacing_folder
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.arrays import frame_columns
 from robocas_ms3.datasets.lerobot.depth import to_levels
 from robocas_ms3.datasets.lerobot.language import (
     EVENTS,
     EVENTS_TYPE,
-    PERSISTENT,
-    PERSISTENT_TYPE,
     Row,
     event_rows,
     paraphrases,
@@ -34,7 +31,7 @@ from robocas_ms3.datasets.lerobot.language import (
 )
 from robocas_ms3.datasets.lerobot.records import CameraRecord
 from robocas_ms3.datasets.lerobot.stats import Levels
-from robocas_ms3.datasets.lerobot.tables import as_column, numbers
+from robocas_ms3.datasets.lerobot.tables import as_column
 from robocas_ms3.datasets.lerobot.variants import Variant
 from robocas_ms3.datasets.lerobot.video import Encoder, coding_of
 from robocas_ms3.datasets.pictures.stored import Box
@@ -72,13 +69,7 @@ class EpisodeRecord(BaseModel):
     sizes: dict[str, int]
 
 
-def part_folder(parts: Path, index: int) -> Path:
-    """Return the folder of the part of an episode."""
-    return parts / episode_folder(index)
-
-
 def video_name(camera: str, kind: Kind, codec: str, variant: Variant) -> str:
-    """Return the name of a video in a part."""
     return f"{kind}_{camera}{coding_of(kind, codec, variant).suffix}"
 
 
@@ -103,7 +94,7 @@ class PartWriter:
     def write(self, number: int, given: ConversionInput, source: int) -> WrittenEpisode:
         """Write episode ``source`` of the input as part ``number``."""
         start, timing, fps = time.perf_counter(), Timing(), schema.whole_rate(given.source.rate_hz)
-        with replacing_folder(part_folder(self.parts, number), sync=True) as folder:
+        with replacing_folder(self.parts / episode_folder(number), sync=True) as folder:
             with timing.measure("load"):
                 episode = given.source.episode(source)
                 arrays = complete_arrays(episode)
@@ -124,8 +115,7 @@ class PartWriter:
                 levels={key: levels.counts.tolist() for key, levels in videos.levels.items()},
                 sizes=_sizes(folder),
             )
-            text = json_text(record.model_dump(), f"episode {source}", error=DatasetError)
-            (folder / EPISODE_FILE).write_text(text, encoding="utf-8")
+            (folder / EPISODE_FILE).write_text(record.model_dump_json(), encoding="utf-8")
             size = sum(file.stat().st_size for file in folder.iterdir())
         timing.write += time.perf_counter() - begin_write  # with the renaming of the folder
         timing.total += time.perf_counter() - start
@@ -196,19 +186,9 @@ class _Videos:
 
 @dataclass(frozen=True)
 class Part:
-    """An episode that was written by itself.
-
-    Attributes:
-        folder: of it.
-        index: of the episode in the dataset.
-        start: index of its first frame in the dataset.
-        success: whether the episode is known to have succeeded.
-    """
+    """An episode that was written by itself."""
 
     folder: Path
-    index: int = 0
-    start: int = 0
-    success: bool = False
 
     @property
     def is_whole(self) -> bool:
@@ -240,56 +220,10 @@ class Part:
         except (OSError, pa.ArrowException) as error:
             raise _damaged(path) from error
 
-    def columns(self, variant: Variant, tasks: dict[str, int], subgoals: dict[str, int]) -> dict[str, NDArray]:
-        """Return the numeric features (T, D), with the numbers that depend on the episodes before."""
-        steps = len(self.table)
-        last = np.arange(steps)[:, None] == steps - 1
-        made = {
-            "episode_index": np.full((steps, 1), self.index, np.int64),
-            "index": np.arange(self.start, self.start + steps)[:, None],
-            "task_index": np.full((steps, 1), tasks[self.record.instruction], np.int64),
-            schema.REWARD.key: (last & self.success).astype(np.float32),
-            schema.SUCCESS.key: last & self.success,
-            schema.DONE.key: last,
-        }
-        if not variant.language:
-            places = [subgoals[text] for text in self.table.column(SUBGOAL).to_pylist()]
-            made[schema.SUBTASK_INDEX.key] = np.array(places, np.int64)[:, None]
-        keys = numeric_keys(variant)
-        return {key: made[key] if key in made else numbers(self.table.column(key)) for key in keys}
-
-    def persistent(self, fps: int) -> list[Row]:
-        """Return the persistent language rows of the episode."""
+    def persistent_rows(self, fps: int) -> list[Row]:
         types, goals = (self.table.column(key).to_pylist() for key in (schema.SUBGOAL_TYPE.key, SUBGOAL))
         texts = paraphrases(self.record.scene, self.record.instruction)
         return persistent_rows(subgoal_runs(types, goals), texts, fps)
-
-    def data(self, variant: Variant, columns: dict[str, NDArray], persistent: list[Row]) -> pa.Table:
-        """Return the rows of the data, columns in the order of the features."""
-        made: dict[str, Any] = {feature.key: as_column(columns[feature.key]) for feature in schema.FEATURES}
-        for feature in schema.single_features(variant):
-            is_text = feature.dtype == "string"
-            made[feature.key] = self.table.column(feature.key) if is_text else as_column(columns[feature.key])
-        if variant.language:
-            same = pa.array(np.zeros(len(self.table), np.int64))  # every frame has all rows of its episode
-            made[PERSISTENT] = pa.array([persistent], PERSISTENT_TYPE).take(same)
-            made[EVENTS] = self.table.column(EVENTS).cast(EVENTS_TYPE)
-        return pa.table(made | {key: as_column(columns[key]) for key in schema.INDICES})
-
-
-def numeric_keys(variant: Variant) -> tuple[str, ...]:
-    """Return the keys of the numeric features that are stored in tables."""
-    single = (feature.key for feature in schema.single_features(variant) if feature.dtype != "string")
-    return (*schema.OUR_KEYS, *single, *schema.INDICES)
-
-
-def read_parts(folders: Sequence[Path], entries: Sequence[dict[str, Any]]) -> Iterator[Part]:
-    """Yield parts in order, one in memory at a time; entries of ``conversion.json`` say which episodes succeeded."""
-    start = 0
-    for index, (folder, entry) in enumerate(zip(folders, entries, strict=True)):
-        part = Part(folder, index, start, entry.get("success") is True)
-        yield part
-        start += len(part.table)
 
 
 def _damaged(path: Path) -> DatasetError:

@@ -138,8 +138,7 @@ class LeRobotEpisode(SourceEpisode):
     @cached_property
     def table(self) -> pa.Table:
         """Frames of the episode."""
-        row, layout = self.row, self.dataset.layout
-        path = layout.path(self.dataset.root, layout.data, row["data/chunk_index"], row["data/file_index"])
+        path = self.dataset.layout.path_of(self.dataset.root, "data", self.row)
         table = read_rows(path, self.number, self.dataset.info["total_frames"])
         if len(table) != self.steps:
             what = "another number of rows than the table of episodes says"
@@ -233,14 +232,12 @@ class LeRobotEpisode(SourceEpisode):
 
     def video(self, camera: str, kind: Kind) -> tuple[Path, int]:
         """Return the file of a camera's video and the number of its first frame there."""
-        row, layout = self.row, self.dataset.layout
-        native = kind == "depth" and self.dataset.depth_feature(camera) is not None
-        key = schema.depth_key(camera) if native else schema.image_key(camera)
-        in_videos = kind == "rgb" or native
-        prefix, pattern = (f"videos/{key}", layout.video) if in_videos else (f"depth/{camera}", layout.depth)
-        place = row[f"{prefix}/chunk_index"], row[f"{prefix}/file_index"]
-        path = layout.path(self.dataset.root, pattern, *place, video_key=key, camera=camera)
-        return path, round(row[f"{prefix}/from_timestamp"] * self.dataset.info["fps"])
+        prefix = f"videos/{schema.image_key(camera)}"
+        if kind == "depth":
+            is_native = self.dataset.depth_feature(camera) is not None
+            prefix = f"videos/{schema.depth_key(camera)}" if is_native else f"depth/{camera}"
+        path = self.dataset.layout.path_of(self.dataset.root, prefix, self.row)
+        return path, round(self.row[f"{prefix}/from_timestamp"] * self.dataset.info["fps"])
 
     def frames(
         self, camera: str, kind: Kind = "rgb", first: int = 0, count: int | None = None

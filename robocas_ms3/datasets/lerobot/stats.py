@@ -8,8 +8,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
-_BINS = 5000
-_LEAST_WIDTH = np.finfo(np.float64).tiny  # of a bin, as values are divided by it
 _FINE = 300  # larger images are subsampled for statistics, as LeRobot does it
 _THINNED = 150
 
@@ -17,7 +15,7 @@ Stats = dict[str, Any]
 
 
 def vector_stats(values: NDArray) -> Stats:
-    """Return the statistics of a feature (T, D) of an episode: lists of D numbers."""
+    """Return the statistics of a feature (T, D): lists of D numbers."""
     values = values.astype(np.int64) if values.dtype == bool else values
     numbers = values.astype(np.float64)
     quantiles = np.quantile(numbers, list(QUANTILES.values()), axis=0)
@@ -29,64 +27,6 @@ def vector_stats(values: NDArray) -> Stats:
         "count": [len(values)],
         **{name: row.tolist() for name, row in zip(QUANTILES, quantiles, strict=True)},
     }
-
-
-class Range:
-    """Count, mean, spread and range of a feature over episodes that are added one at a time."""
-
-    def __init__(self) -> None:
-        self.count = 0
-        self.low = self.high = self._mean = self._squares = np.zeros(0)
-
-    def add(self, values: NDArray) -> None:
-        """Add the values (T, D) of an episode."""
-        numbers = values.astype(np.float64)
-        count, mean = len(numbers), numbers.mean(axis=0)
-        squares = ((numbers - mean) ** 2).sum(axis=0)
-        low, high = numbers.min(axis=0), numbers.max(axis=0)
-        if not self.count:
-            self.count, self._mean, self._squares, self.low, self.high = count, mean, squares, low, high
-            return
-        total, apart = self.count + count, mean - self._mean
-        self._squares = self._squares + squares + apart**2 * self.count * count / total  # Chan et al. 1979
-        self._mean = self._mean + apart * count / total
-        self.low, self.high, self.count = np.minimum(self.low, low), np.maximum(self.high, high), total
-
-    def stats(self, histogram: Histogram, integer: bool) -> Stats:
-        """Return the statistics of all values; the quantiles come from their histogram."""
-        whole = np.int64 if integer else np.float64
-        return {
-            "min": self.low.astype(whole).tolist(),
-            "max": self.high.astype(whole).tolist(),
-            "mean": self._mean.tolist(),
-            "std": np.sqrt(self._squares / self.count).tolist(),
-            "count": [self.count],
-            **histogram.quantiles(),
-        }
-
-
-class Histogram:
-    """Counts of a feature within its range, for quantiles over any number of episodes."""
-
-    def __init__(self, low: NDArray, high: NDArray) -> None:
-        width = (high - low) / _BINS
-        self._low, self._width = low, np.where(width > _LEAST_WIDTH, width, 1 / _BINS)
-        self._counts = np.zeros((len(low), _BINS), np.int64)
-
-    def add(self, values: NDArray) -> None:
-        """Add the values (T, D) of an episode."""
-        bins = np.clip((values - self._low) / self._width, 0, _BINS - 1).astype(np.int64)
-        for column in range(len(self._counts)):
-            self._counts[column] += np.bincount(bins[:, column], minlength=_BINS)
-
-    def quantiles(self) -> dict[str, list[float]]:
-        """Return the quantiles, exact to 1/5000 of the range."""
-        total = self._counts.sum(axis=1, keepdims=True)
-        below = np.cumsum(self._counts, axis=1)
-        return {
-            name: (self._low + self._width * (below < share * total).sum(axis=1)).tolist()
-            for name, share in QUANTILES.items()
-        }
 
 
 class Levels:
@@ -105,12 +45,10 @@ class Levels:
 
     @classmethod
     def rgb(cls) -> Levels:
-        """Return empty counts of RGB images."""
         return cls(np.zeros((3, 256)))
 
     @classmethod
-    def depth(cls) -> Levels:
-        """Return empty counts of 12-bit depth images."""
+    def depth(cls) -> Levels:  # 12 bits
         return cls(np.zeros((1, 4096)))
 
     def add(self, image: NDArray) -> None:
@@ -124,7 +62,6 @@ class Levels:
         self.images += 1
 
     def merge(self, other: Levels) -> None:
-        """Add the counts of other images."""
         self.counts += other.counts
         self.images += other.images
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 from robocas_ms3.core.errors import DatasetError
 
 CHUNK_FILES = 1000
 """Files per chunk folder."""
 _FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+_EPISODES = f"meta/episodes/{_FILE}.parquet"
 _EPISODE = "episode_{episode_index:06d}"
 _EPISODE_CHUNK = "chunk-{episode_chunk:03d}"
 
@@ -33,17 +35,24 @@ class Layout:
     depth: str
     one_file_per_episode: bool = False
 
-    def path(self, root: Path, pattern: str, chunk: int, file: int, **names: str) -> Path:
+    def path(self, root: Path, prefix: str, chunk: int, file: int) -> Path:
         """Return the path of a numbered file.
 
         Args:
             root: folder of the dataset.
-            pattern: ``data``, ``video`` or ``depth`` of the layout.
+            prefix: of its columns in ``meta/episodes``: ``data``, ``videos/KEY``, ``depth/CAMERA`` or
+                ``meta/episodes``.
             chunk, file: numbers of the chunk and of the file in it.
-            names: ``video_key`` of a video, ``camera`` of a depth video.
         """
-        episode = {"episode_chunk": chunk, "episode_index": chunk * CHUNK_FILES + file}
-        return root / pattern.format(chunk_index=chunk, file_index=file, **episode, **names)
+        kind, _, name = prefix.partition("/")
+        pattern = {"data": self.data, "videos": self.video, "depth": self.depth, "meta": _EPISODES}[kind]
+        numbers = {"chunk_index": chunk, "episode_chunk": chunk, "file_index": file}
+        numbers["episode_index"] = chunk * CHUNK_FILES + file
+        return root / pattern.format(**numbers, video_key=name, camera=name)
+
+    def path_of(self, root: Path, prefix: str, row: Mapping[str, Any]) -> Path:
+        """Return the path of a file of an episode, from its row of ``meta/episodes``."""
+        return self.path(root, prefix, row[f"{prefix}/chunk_index"], row[f"{prefix}/file_index"])
 
 
 V3 = Layout("v3.0", f"data/{_FILE}.parquet", f"videos/{{video_key}}/{_FILE}.mp4", f"depth/{{camera}}/{_FILE}.mkv")
@@ -55,8 +64,7 @@ V21 = Layout(
     one_file_per_episode=True,
 )
 LAYOUTS = {layout.codebase_version: layout for layout in (V3, V21)}
-"""Layouts by ``codebase_version``."""
-
+"""By ``codebase_version``."""
 
 Version = Literal["0.6", "0.5", "2.1"]  # a literal, because the command line and type checkers read it
 
@@ -93,9 +101,7 @@ NEWEST: Version = get_args(Version)[0]
 
 
 def find_variant(version: str) -> Variant:
-    """Return the variant of a version."""
     if version not in VARIANTS:
-        raise DatasetError(
-            "unknown LeRobot version", where="--lerobot-version", expected=", ".join(VARIANTS), found=version
-        )
+        what, known = "unknown LeRobot version", ", ".join(VARIANTS)
+        raise DatasetError(what, where="--lerobot-version", expected=known, found=version)
     return VARIANTS[version]

@@ -1,4 +1,4 @@
-"""Writes a LeRobot dataset from the parts of its episodes: tables and videos one after the other, not encoded again."""
+"""Joins the parts of a conversion to a LeRobot dataset: tables and videos one after the other, not encoded again."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from robocas_ms3.core.files import write_json
 from robocas_ms3.core.words import count_of
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.depth import DEPTH_INFO
-from robocas_ms3.datasets.lerobot.language import EVENTS, Row
-from robocas_ms3.datasets.lerobot.parts import FRAMES_FILE, SUBGOAL, Part, numeric_keys, read_parts, video_name
+from robocas_ms3.datasets.lerobot.language import EVENTS, EVENTS_TYPE, PERSISTENT, PERSISTENT_TYPE, Row
+from robocas_ms3.datasets.lerobot.parts import FRAMES_FILE, SUBGOAL, EpisodeRecord, Part, video_name
 from robocas_ms3.datasets.lerobot.schema import FileLimits
-from robocas_ms3.datasets.lerobot.stats import Histogram, Levels, Range, Stats, vector_stats
-from robocas_ms3.datasets.lerobot.tables import write_texts
+from robocas_ms3.datasets.lerobot.stats import Levels, Stats, vector_stats
+from robocas_ms3.datasets.lerobot.tables import as_column, numbers, write_texts
 from robocas_ms3.datasets.lerobot.variants import CHUNK_FILES, Variant, find_variant
 from robocas_ms3.datasets.lerobot.video import Joiner, packet_times
 from robocas_ms3.datasets.sources.protocol import Kind
 
 _GROUP = 64  # episodes per row group of the tables about episodes
-_FLOATS = {*schema.OUR_KEYS, "timestamp", schema.REWARD.key}
 _log = logging.getLogger(__name__)
 
 
 def join_parts(folders: Sequence[Path], plan: Mapping[str, Any], root: Path, limits: FileLimits) -> None:
-    """Write a dataset from all parts of a plan.
+    """Write a dataset from all parts of a plan, one part in memory at a time.
 
     Args:
         folders: of the parts.
@@ -42,102 +42,82 @@ def join_parts(folders: Sequence[Path], plan: Mapping[str, Any], root: Path, lim
         root: an empty folder.
         limits: of the sizes of files.
     """
-    writer = LeRobotWriter(root, plan, limits)
-    for part in read_parts(folders, plan["episodes"]):
-        writer.survey(part)
+    writer = LeRobotWriter(root, plan, limits, Part(folders[0]).record)
     with writer:
-        for part, entry in zip(read_parts(folders, plan["episodes"]), plan["episodes"], strict=True):
-            writer.add_episode(part, entry)
+        for folder, entry in zip(folders, plan["episodes"], strict=True):
+            writer.add_episode(Part(folder), entry)
     writer.finalize()
 
 
 class LeRobotWriter:
     """Writes episodes, and at the end what ``meta`` says of all of them.
 
-    Every part is surveyed before the first is added: texts are numbered, and histograms need the range of each feature.
+    Args:
+        root, plan, limits: see `join_parts`.
+        first: the first episode, which has the cameras and the robot of all.
     """
 
-    def __init__(self, root: Path, plan: Mapping[str, Any], limits: FileLimits) -> None:
-        self._root, self._plan, self._limits = root, plan, limits
+    def __init__(self, root: Path, plan: Mapping[str, Any], limits: FileLimits, first: EpisodeRecord) -> None:
+        self._root, self._plan, self._limits, self._first = root, plan, limits, first
         self._variant: Variant = find_variant(plan["settings"]["lerobot_version"])
         self._layout, self._fps = self._variant.layout, int(plan["settings"]["rate_hz"])
-        self._first: Part | None = None
+        single = (feature.key for feature in schema.single_features(self._variant) if feature.dtype != "string")
+        self._numbers: dict[str, list[NDArray]] = {
+            key: [] for key in (*schema.OUR_KEYS, *single, *schema.INDICES)
+        }  # numeric features of each episode, about 300 bytes per frame
         self._tasks: dict[str, int] = {}
         self._subgoals: dict[str, int] = {}
-        self._ranges = {key: Range() for key in numeric_keys(self._variant)}
         self._levels: dict[str, Levels] = {}
-        self._frames = self._clipped = 0
+        self._episodes_done = self._frames = self._clipped = 0
         self._stack = ExitStack()
-
-    def survey(self, part: Part) -> None:
-        """Number the texts of a part, and extend the ranges of the features."""
-        self._first = self._first or part
-        self._tasks.setdefault(part.record.instruction, len(self._tasks))
-        for text in part.table.column(SUBGOAL).to_pylist():
-            self._subgoals.setdefault(text, len(self._subgoals))
-        for key, values in part.columns(self._variant, self._tasks, self._subgoals).items():
-            self._ranges[key].add(values)
 
     def __enter__(self) -> LeRobotWriter:
         layout, root, limits = self._layout, self._root, self._limits
         data_mb, video_mb = (0, 0) if layout.one_file_per_episode else (limits.data_mb, limits.video_mb)
-        self._histograms = {key: Histogram(found.low, found.high) for key, found in self._ranges.items()}
-        self._data = RollingTable(partial(layout.path, root, layout.data), data_mb)
-        self._scenes = RollingTable(lambda *_: root / schema.SCENES_FILE, np.inf, group=_GROUP, compression="zstd")
-        self._episodes = (
-            _EpisodesLines(root)
-            if layout.one_file_per_episode
-            else _EpisodesTable(partial(layout.path, root, schema.EPISODES_PATH), limits.data_mb)
-        )
+        self._data = self._stack.enter_context(closing(RollingTable(partial(layout.path, root, "data"), data_mb)))
+        scenes = RollingTable(lambda *_: root / schema.SCENES_FILE, np.inf, group=_GROUP, compression="zstd")
+        self._scenes = self._stack.enter_context(closing(scenes))
+        self._episodes = RollingTable(partial(layout.path, root, "meta/episodes"), limits.data_mb, group=_GROUP)
+        self._stack.enter_context(closing(self._episodes))
         self._streams = list(self._open_streams(video_mb))
-        joiners = [stream.joiner for stream in self._streams]
-        for writer in (self._data, self._scenes, self._episodes, *joiners):
-            self._stack.enter_context(closing(writer))
         return self
 
     def __exit__(self, *error: Any) -> None:
         self._stack.__exit__(*error)
 
     def _open_streams(self, limit_mb: float) -> Iterable[_Stream]:
-        assert self._first is not None
-        layout, variant, codec = self._layout, self._variant, self._plan["settings"]["codec"]
-        kinds: tuple[Kind, ...] = ("rgb", "depth") if self._first.record.depth else ("rgb",)
-        for camera in self._first.record.cameras:
+        variant, codec = self._variant, self._plan["settings"]["codec"]
+        kinds: tuple[Kind, ...] = ("rgb", "depth") if self._first.depth else ("rgb",)
+        for camera in self._first.cameras:
             for kind in kinds:
-                if kind == "rgb" or variant.native_depth:
-                    key = schema.image_key(camera) if kind == "rgb" else schema.depth_key(camera)
-                    path, prefix = partial(layout.path, self._root, layout.video, video_key=key), f"videos/{key}"
-                else:
-                    key, path = "", partial(layout.path, self._root, layout.depth, camera=camera)
-                    prefix = f"depth/{camera}"
+                key = schema.image_key(camera) if kind == "rgb" else schema.depth_key(camera)
+                prefix = f"videos/{key}" if kind == "rgb" or variant.native_depth else f"depth/{camera}"
+                path = partial(self._layout.path, self._root, prefix)
                 joiner = Joiner(path, self._fps, limit_mb, self._limits.video_seconds)
-                yield _Stream(kind, key, prefix, video_name(camera, kind, codec, variant), joiner, path)
+                self._stack.enter_context(closing(joiner))
+                yield _Stream(kind, prefix, video_name(camera, kind, codec, variant), joiner)
 
     def add_episode(self, part: Part, entry: Mapping[str, Any]) -> None:
-        """Append an episode.
-
-        Args:
-            part: of the episode.
-            entry: its entry in ``conversion.json``.
-        """
+        """Append an episode with its entry in ``conversion.json``."""
         record, steps, variant, fps = part.record, len(part.table), self._variant, self._fps
-        columns = part.columns(variant, self._tasks, self._subgoals)
-        persistent = part.persistent(fps) if variant.language else []
+        index, start = self._episodes_done, self._frames
+        columns = self._columns(part, index, start, succeeded=entry.get("success") is True)
+        persistent = part.persistent_rows(fps) if variant.language else []
         stats = {key: vector_stats(values) for key, values in columns.items()}
-        for key, histogram in self._histograms.items():
-            histogram.add(columns[key])
+        for key, values in columns.items():
+            self._numbers[key].append(values)
         for key, counts in record.levels.items():
             levels = Levels(counts, steps)
             stats[key] = levels.stats()
             self._levels.setdefault(key, Levels(np.zeros_like(counts))).merge(levels)
         chunk, file = self._data.place((part.folder / FRAMES_FILE).stat().st_size)
-        self._data.add(part.data(variant, columns, persistent))
+        self._data.add(self._frame_table(part, columns, persistent))
         row = {
-            "episode_index": part.index,
+            "episode_index": index,
             "tasks": [record.instruction],
             "length": steps,
-            "dataset_from_index": part.start,
-            "dataset_to_index": part.start + steps,
+            "dataset_from_index": start,
+            "dataset_to_index": start + steps,
             "data/chunk_index": chunk,
             "data/file_index": file,
         }
@@ -146,21 +126,60 @@ class LeRobotWriter:
             row[f"{stream.prefix}/chunk_index"], row[f"{stream.prefix}/file_index"] = chunk, file
             row[f"{stream.prefix}/from_timestamp"] = first / fps
             row[f"{stream.prefix}/to_timestamp"] = (first + steps) / fps
-        self._episodes.add(row, stats)
+        self._add_row(row, stats)
         cameras = {name: camera.model_dump(exclude_none=True) for name, camera in record.cameras.items()}
         texts = {
             "scene": json.dumps(record.scene, ensure_ascii=False),
             "cameras": json.dumps(cameras),
             "source": json.dumps(entry, ensure_ascii=False),
         }
-        self._scenes.add(
-            pa.table({"episode_index": [part.index], **{key: pa.array([text]) for key, text in texts.items()}})
-        )
+        self._scenes.add(pa.table({"episode_index": [index], **{key: [text] for key, text in texts.items()}}))
         if variant.language:
             events, times = part.table.column(EVENTS).to_pylist(), columns["timestamp"][:, 0].tolist()
-            self._stage_rows(part.index, persistent, events, times)
-        self._frames += steps
+            self._stage_rows(index, persistent, events, times)
+        self._episodes_done, self._frames = index + 1, start + steps
         self._clipped += record.depth_clipped
+
+    def _add_row(self, row: dict[str, Any], stats: Mapping[str, Stats]) -> None:
+        """Add a row of ``meta/episodes``; in format v2.1 a line of each of two files."""
+        if self._layout.one_file_per_episode:
+            episode = {key: row[key] for key in ("episode_index", "tasks", "length")}
+            _write_lines(self._root / schema.EPISODES_LINES, [episode], "a")
+            statistics = {"episode_index": row["episode_index"], "stats": stats}
+            _write_lines(self._root / schema.STATS_LINES, [statistics], "a")
+        else:
+            chunk, file = self._episodes.place()
+            places = {"meta/episodes/chunk_index": chunk, "meta/episodes/file_index": file}
+            numbers = {f"stats/{key}/{name}": value for key, found in stats.items() for name, value in found.items()}
+            self._episodes.add(pa.Table.from_pylist([{**row, **places, **numbers}]))
+
+    def _columns(self, part: Part, index: int, start: int, *, succeeded: bool) -> dict[str, NDArray]:
+        """Return the numeric features (T, D), with the numbers that depend on the episodes before."""
+        steps, task = len(part.table), self._tasks.setdefault(part.record.instruction, len(self._tasks))
+        last = np.arange(steps)[:, None] == steps - 1
+        texts = part.table.column(SUBGOAL).to_pylist()
+        subgoals = [self._subgoals.setdefault(text, len(self._subgoals)) for text in texts]
+        made = {
+            "episode_index": np.full((steps, 1), index, np.int64),
+            "index": np.arange(start, start + steps)[:, None],
+            "task_index": np.full((steps, 1), task, np.int64),
+            schema.SUBTASK_INDEX.key: np.array(subgoals, np.int64)[:, None],
+            schema.REWARD.key: (last & succeeded).astype(np.float32),
+            schema.SUCCESS.key: last & succeeded,
+            schema.DONE.key: last,
+        }
+        return {key: made[key] if key in made else numbers(part.table.column(key)) for key in self._numbers}
+
+    def _frame_table(self, part: Part, columns: dict[str, NDArray], persistent: list[Row]) -> pa.Table:
+        """Return the rows of the data, columns in the order of the features."""
+        made: dict[str, Any] = {}
+        for key in (*schema.OUR_KEYS, *(feature.key for feature in schema.single_features(self._variant))):
+            made[key] = as_column(columns[key]) if key in columns else part.table.column(key)
+        if self._variant.language:
+            same = pa.array(np.zeros(len(part.table), np.int64))  # every frame has all rows of its episode
+            made[PERSISTENT] = pa.array([persistent], PERSISTENT_TYPE).take(same)
+            made[EVENTS] = part.table.column(EVENTS).cast(EVENTS_TYPE)
+        return pa.table(made | {key: as_column(columns[key]) for key in schema.INDICES})
 
     def _stage_rows(self, index: int, persistent: list[Row], events: list[list[Row]], times: list[float]) -> None:
         """Write language rows where ``lerobot-annotate`` looks for rows to keep; it removes all others.
@@ -177,36 +196,39 @@ class LeRobotWriter:
 
     def finalize(self) -> None:
         """Write texts, statistics, ``info.json``, ``conversion.json`` and checksums."""
-        assert self._first is not None
-        root, layout, record = self._root, self._layout, self._first.record
+        root, layout = self._root, self._layout
         if self._clipped:
             limit = schema.MAX_DEPTH_MM
             _log.warning("%s: depth above %d mm is stored as %d mm", count_of(self._clipped, "episode"), limit, limit)
         if layout.one_file_per_episode:
             tasks = ({"task_index": index, "task": task} for task, index in self._tasks.items())
             _write_lines(root / schema.TASKS_LINES, tasks)
-            write_json(root / schema.MODALITY_FILE, schema.modality_json(list(record.cameras)))
+            write_json(root / schema.MODALITY_FILE, schema.modality_json(list(self._first.cameras)))
         else:
             write_texts(root / schema.TASKS_FILE, "task_index", list(self._tasks))
         if not self._variant.language:
             write_texts(root / schema.SUBTASKS_FILE, schema.SUBTASK_INDEX.key, list(self._subgoals))
-        stats = {key: found.stats(self._histograms[key], key not in _FLOATS) for key, found in self._ranges.items()}
+        stats = {key: vector_stats(np.concatenate(episodes)) for key, episodes in self._numbers.items()}
         write_json(root / schema.STATS_FILE, stats | {key: found.stats() for key, found in self._levels.items()})
-        write_json(root / schema.INFO_FILE, self._info(schema.robot_type(record.scene)))
+        write_json(root / schema.INFO_FILE, self._info())
         write_json(root / schema.CONVERSION_FILE, self._plan)
         sums = {str(path.relative_to(root)): schema.checksum(path) for path in schema.content_files(root)}
         write_json(root / schema.CHECKSUMS_FILE, sums)
 
-    def _info(self, robot_type: str) -> dict[str, Any]:
-        layout, limits, count = self._layout, self._limits, len(self._plan["episodes"])
-        videos = {stream.key: self._describe(stream) for stream in self._streams if stream.key}
+    def _info(self) -> dict[str, Any]:
+        layout, limits, count = self._layout, self._limits, self._episodes_done
+        videos = {
+            stream.prefix.removeprefix("videos/"): self._describe(stream)
+            for stream in self._streams
+            if stream.prefix.startswith("videos/")
+        }
         if layout.one_file_per_episode:
             files = {"total_videos": count * len(videos), "total_chunks": -(-count // CHUNK_FILES)}
         else:
             files = {"data_files_size_in_mb": limits.data_mb, "video_files_size_in_mb": limits.video_mb}
         return {
             "codebase_version": layout.codebase_version,
-            "robot_type": robot_type,
+            "robot_type": schema.robot_type(self._first.scene),
             "total_episodes": count,
             "total_frames": self._frames,
             "total_tasks": len(self._tasks),
@@ -222,7 +244,8 @@ class LeRobotWriter:
     def _describe(self, stream: _Stream) -> dict[str, Any]:
         """Return ``info`` of the feature of a video."""
         mark = "is_depth_map" if self._variant.native_depth else "video.is_depth_map"
-        return {**packet_times(stream.path(0, 0))[1], **(DEPTH_INFO if stream.kind == "depth" else {mark: False})}
+        description = packet_times(self._layout.path(self._root, stream.prefix, 0, 0))[1]
+        return {**description, **(DEPTH_INFO if stream.kind == "depth" else {mark: False})}
 
 
 @dataclass(frozen=True)
@@ -231,19 +254,15 @@ class _Stream:
 
     Attributes:
         kind: of images.
-        key: of the feature; empty: LeRobot does not read these videos.
         prefix: of the columns of ``meta/episodes``.
         part_name: of the video of a part.
         joiner: writes them.
-        path: of a numbered file: (chunk, file) -> path.
     """
 
     kind: Kind
-    key: str
     prefix: str
     part_name: str
     joiner: Joiner
-    path: Callable[[int, int], Path]
 
 
 class RollingTable:
@@ -287,7 +306,6 @@ class RollingTable:
             self._flush()
 
     def close(self) -> None:
-        """Finish the file that is being written."""
         if self._writer is not None:
             self._flush()
             self._writer.close()
@@ -301,44 +319,7 @@ class RollingTable:
             self._waiting.clear()
 
 
-class _EpisodesTable:
-    """``meta/episodes`` of format v3.0; statistics are columns."""
-
-    def __init__(self, path: Callable[[int, int], Path], limit_mb: float) -> None:
-        self._rows = RollingTable(path, limit_mb, group=_GROUP)
-
-    def add(self, row: dict[str, Any], stats: Mapping[str, Stats]) -> None:
-        chunk, file = self._rows.place()
-        places = {"meta/episodes/chunk_index": chunk, "meta/episodes/file_index": file}
-        numbers = {f"stats/{key}/{name}": value for key, found in stats.items() for name, value in found.items()}
-        self._rows.add(pa.Table.from_pylist([{**row, **places, **numbers}]))
-
-    def close(self) -> None:
-        self._rows.close()
-
-
-class _EpisodesLines:
-    """``meta/episodes.jsonl`` and ``meta/episodes_stats.jsonl`` of format v2.1."""
-
-    def __init__(self, root: Path) -> None:
-        (root / schema.EPISODES_LINES).parent.mkdir(parents=True, exist_ok=True)
-        self._episodes = (root / schema.EPISODES_LINES).open("w", encoding="utf-8")
-        self._stats = (root / schema.STATS_LINES).open("w", encoding="utf-8")
-
-    def add(self, row: dict[str, Any], stats: Mapping[str, Stats]) -> None:
-        self._episodes.write(_line({key: row[key] for key in ("episode_index", "tasks", "length")}))
-        self._stats.write(_line({"episode_index": row["episode_index"], "stats": stats}))
-
-    def close(self) -> None:
-        self._episodes.close()
-        self._stats.close()
-
-
-def _write_lines(path: Path, records: Iterable[Mapping[str, Any]]) -> None:
+def _write_lines(path: Path, records: Iterable[Mapping[str, Any]], mode: str = "w") -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", encoding="utf-8") as file:
-        file.writelines(map(_line, records))
-
-
-def _line(record: Mapping[str, Any]) -> str:
-    return json.dumps(record, ensure_ascii=False, allow_nan=False) + "\n"
+    with path.open(mode, encoding="utf-8") as file:
+        file.writelines(json.dumps(record, ensure_ascii=False, allow_nan=False) + "\n" for record in records)
