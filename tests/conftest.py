@@ -25,7 +25,7 @@ PROBES = ROOT / "robocas_ms3" / "doctor" / "probes.py"
 LONGEST = {
     "tests/asset_tools/test_bad_scans.py",
     "tests/asset_tools/builtin/test_builtin_furniture.py",
-    "tests/asset_tools/builtin/test_builtin_toys.py",
+    "tests/asset_tools/builtin/test_builtin_shapes.py",
     "tests/datasets/writing/test_render.py",
     "tests/demos/test_generate.py",
     "tests/evaluation/test_run.py",

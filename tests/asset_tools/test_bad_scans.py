@@ -172,11 +172,6 @@ def test_thousands_of_loose_bits(tmp_path):
     check_bottle(scan)
 
 
-def test_a_missing_texture_is_an_error_that_names_it(tmp_path):
-    with pytest.raises(AssetError, match=r"textures/lost\.png: the texture file that the material names is missing"):
-        prepare(write_obj(tmp_path, named="textures\\lost.png"))
-
-
 @pytest.mark.parametrize("size", [(8192, 8192), pytest.param((16384, 12288), marks=pytest.mark.slow)], ids=str)
 def test_a_huge_texture_is_shrunk(tmp_path, size):
     scan = prepare(write_obj(tmp_path, image=picture(size)))
@@ -197,26 +192,11 @@ def test_a_texture_beyond_all_bounds_is_an_error(tmp_path):
         prepare(path)
 
 
-def test_colours_of_vertices_only(tmp_path):
-    vertices, _, faces = bottle(sections=96)
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
-    colors = COLORS[quarter_of(np.asarray(mesh.vertices) @ np.array([[1, 0.001, 0], [-0.001, 1, 0], [0, 0, 1]]))]
-    mesh.visual.vertex_colors = np.column_stack([colors, np.full(len(colors), 255)]).astype(np.uint8)
-    mesh.export(tmp_path / "scan.ply")
-    scan = prepare(tmp_path / "scan.ply", up="z")
-    assert "baked colours into a texture" in scan.repairs
-    check_bottle(scan, volume=0.01)
-
-
 @pytest.mark.parametrize(
     ("named", "texture", "repair"),
     [
-        ("textures/skin.png", "textures/skin.png", ()),
         ("textures\\skin.png", "textures/skin.png", ("read textures\\skin.png as textures/skin.png",)),
-        ("textures\\skin.png", "skin.png", ("took skin.png for textures\\skin.png",)),
         ("C:\\Users\\me\\my scan\\skin.png", "skin.png", ("took skin.png for C:\\Users\\me\\my scan\\skin.png",)),
-        ("/home/me/skin.png", "maps/skin.png", ("took maps/skin.png for /home/me/skin.png",)),
-        ("SKIN.PNG", "skin.png", ("took skin.png for SKIN.PNG",)),
         ("-clamp on -o 0 0 0 my skin.png", "my skin.png", ()),
     ],
 )
@@ -224,23 +204,6 @@ def test_paths_of_textures(tmp_path, named, texture, repair):
     scan = prepare(write_obj(tmp_path, named=named, texture=texture))
     assert scan.repairs == repair
     check_bottle(scan)
-
-
-def test_several_materials(tmp_path):
-    """Each quarter has a texture of its own."""
-    vertices, uv, faces = bottle()
-    path = write_obj(tmp_path, texture="")
-    lines = [line for line in path.read_text().splitlines() if not line.startswith(("f ", "usemtl"))]
-    quarter = quarter_of(vertices[faces].mean(axis=1))
-    mtl = ""
-    for k, color in enumerate(COLORS):
-        lines += [f"usemtl part {k}"]
-        lines += ["f " + " ".join(f"{i + 1}/{i + 1}" for i in face) for face in faces[quarter == k]]
-        mtl += f"newmtl part {k}\nmap_Kd part{k}.png\n"
-        Image.new("RGB", (16, 16), tuple(color.tolist())).save(tmp_path / f"part{k}.png")
-    path.write_text("\n".join(lines))
-    (tmp_path / "scan.mtl").write_text(mtl)
-    check_bottle(prepare(path, up="z"))
 
 
 @pytest.mark.slow
@@ -289,14 +252,6 @@ def test_double_vertices_and_faces(tmp_path):
     assert scan.repairs[1:] == ("dropped 10 double or degenerate faces",)
     assert scan.repairs[0] == f"merged {3 * len(faces) - len(vertices)} duplicate vertices"
     check_bottle(scan)
-
-
-def test_no_colours(tmp_path):
-    vertices, _, faces = bottle()
-    trimesh.Trimesh(vertices, faces).export(tmp_path / "scan.stl")
-    scan = prepare(tmp_path / "scan.stl")
-    assert "has no colours" in scan.repairs
-    check_bottle(scan, colors=False)
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "cp1252"])

@@ -141,6 +141,7 @@ def test_a_part_that_cuts_into_the_body_is_trimmed(chest):
             ("'top'", "unknown link", "tray"),
         ),
         ({"joints": {"slide": {"limits": [0.1, 0.2]}}}, ("slide", "closed")),
+        ({"mass": 20.0}, ("moving parts", "under `joints`")),
     ],
 )
 def test_what_does_not_fit_the_model_is_named(chest, more, words):
@@ -232,20 +233,3 @@ def test_a_template_names_the_models_own_joints_and_is_an_annotation(shared_dir,
     note = find_annotation("45949", tmp_path)
     assert set(note.joints) == {"joint_0", "joint_1", "joint_2"} and len(note.handles) == 3
     assert text.count("prismatic") == 1 and note.surfaces["link_2"].link == "link_2"
-
-
-def test_missing_files_are_named(chest, tmp_path):
-    (chest / "tray.obj").unlink()
-    with pytest.raises(AssetError, match=r"tray\.obj"):
-        read(chest)
-    (chest / "mobility.urdf").write_text("<robot>")
-    for folder in (chest, tmp_path / "nothing"):
-        with pytest.raises(AssetError) as raised:
-            read(folder)
-        assert raised.value.where == folder / "mobility.urdf"
-
-
-def test_furniture_with_joints_can_have_no_mass_of_its_own(shared_dir):
-    note = load_annotation(SHIPPED / "45855.yaml").model_copy(update={"mass": 20.0})
-    with pytest.raises(AssetError, match="45855: furniture with moving parts stands fixed.*under `joints`"):
-        read_partnet(shared_dir / "partnet_mobility" / "45855", note)

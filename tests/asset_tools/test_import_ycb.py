@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from asset_tools.import_ycb import default_root, ycb_id, ycb_jobs, ycb_source
+from asset_tools.import_ycb import ycb_id, ycb_jobs, ycb_source
 from robocas_ms3.core.errors import AssetError
 
 SIZES = {
@@ -88,28 +88,8 @@ def test_an_invalid_scale_fails_that_object_alone(root, scales):
         job.make(root / "out")
 
 
-def test_a_real_model(shared_dir, root):
-    folder = root / "models" / "011_banana"
-    shutil.copytree(shared_dir / "graspnet_sample" / "models" / "005", folder)
-    info = json.loads((root / "info_pick_v0.json").read_text())
-    (root / "info_pick_v0.json").write_text(json.dumps(info | {"011_banana": {"scales": [1.0]}}))
-    source = ycb_source(root, "011_banana")
-    assert (source.id, source.graspnet_id) == ("banana", 5)
-    assert source.closed.is_watertight
-    assert source.mesh.visual.material.image is not None
-
-
 @pytest.mark.parametrize("text", ["{", "[]", '{"003_cracker_box": 3}', '{"../..": {}}'])
 def test_a_damaged_list_is_one_error(root, text):
     (root / "info_pick_v0.json").write_text(text)
     with pytest.raises(AssetError, match=r"info_pick_v0\.json"):
         ycb_jobs(root)
-
-
-def test_the_default_folder_is_maniskills():
-    import mani_skill
-    from mani_skill.utils.assets.data import DATA_SOURCES, initialize_data_sources
-
-    if not DATA_SOURCES:
-        initialize_data_sources()
-    assert default_root() == mani_skill.ASSET_DIR / DATA_SOURCES["ycb"].target_path

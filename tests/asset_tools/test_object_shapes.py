@@ -13,13 +13,11 @@ from trimesh.creation import box, cone, cylinder, icosphere
 
 from asset_tools.build import build_object
 from asset_tools.decompose import decompose, few_vertices, for_engine
-from asset_tools.grasps import sample_grasps
 from asset_tools.repair import close
 from asset_tools.simplify import simplified
 from asset_tools.sources import ObjectSource
 from asset_tools.visual import to_display
 from robocas_ms3.assets.cooking import OBLONG, SHRINKAGE, cook_hulls, cooking_faults
-from robocas_ms3.core.errors import AssetError
 
 
 def moved(mesh, *by):
@@ -236,28 +234,12 @@ def test_simplifying_keeps_a_large_part_of_few_faces():
     np.testing.assert_allclose(light.bounds, brush.bounds, atol=1e-3)
 
 
-def test_flat_bodies_are_an_error():
-    tilted = trimesh.transformations.rotation_matrix(0.7, [1, 2, 3])
-    flat = trimesh.Trimesh(
-        [[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 1e-9]], [[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]]
-    )
-    for mesh in (flat, flat.copy().apply_transform(tilted)):
-        with pytest.raises(AssetError):
-            close(mesh)
-
-
 def test_thin_parts_of_a_solid_survive_its_simplification():
     bristles = placed(
         cylinder(0.0003, 0.025, sections=12), np.linspace(-0.07, 0.07, 30), np.linspace(-0.01, 0.01, 8), 0
     )
     brush = joined(box([0.15, 0.03, 0.004]), *bristles)
     np.testing.assert_allclose(close(brush).mesh.bounds, brush.bounds, atol=2e-4)
-
-
-def test_a_sheet_thinner_than_the_gripper_sees_has_no_grasps():
-    sheet = icosphere(2, 0.05)
-    sheet.vertices[:, 2] *= 0.005
-    assert len(sample_grasps(sheet, np.zeros(3), np.random.default_rng(0))) == 0
 
 
 def test_few_vertices_of_extreme_points_in_one_plane():

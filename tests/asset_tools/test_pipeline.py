@@ -12,7 +12,6 @@ import pytest
 import trimesh
 from made_up_assets import furniture_asset
 
-from asset_tools import pipeline
 from asset_tools.pipeline import Job, content_hash, made_of, make_assets, write_pack
 from robocas_ms3.assets.hulls import write_hulls
 from robocas_ms3.assets.pack import HULLS, VISUALS, load_pack, sha256
@@ -77,15 +76,6 @@ def test_hulls_that_the_engine_would_shrink_make_no_pack(tmp_path):
         ("cube", False),
     ]
     assert load_pack(tmp_path / "pack").furniture.keys() == {"cube"}
-
-
-def test_a_pack_knows_what_a_pack_was_made_from(tmp_path):
-    log = tmp_path / "log"
-    assert not made_of(jobs(log, a="1" * 64), tmp_path / "pack")
-    write_pack(jobs(log, a="1" * 64), tmp_path / "pack", tmp_path / "kept")
-    assert made_of(jobs(log, a="1" * 64), tmp_path / "pack")
-    assert not made_of(jobs(log, a="2" * 64), tmp_path / "pack")
-    assert not made_of(jobs(log, a="1" * 64, b="1" * 64), tmp_path / "pack")
 
 
 def test_a_failure_names_the_asset_leaves_no_pack_and_loses_nothing(tmp_path):
@@ -190,18 +180,6 @@ def test_a_killed_run_goes_on_where_it_stopped(tmp_path):
     assert len(load_pack(tmp_path / "pack").furniture) == 8
     assert len(made_in(tmp_path / "log")) - before == 8 - finished
     assert len(json.loads((tmp_path / "pack" / "made_from.json").read_text())["content"]) == 8
-
-
-def test_content_counts_yaml_beside_the_code(tmp_path, monkeypatch):
-    monkeypatch.setattr(pipeline, "__file__", str(tmp_path / "pipeline.py"))
-    (tmp_path / "products").mkdir()
-    found = []
-    for name, text in (("toys.yaml", "a: 1"), ("toys.yaml", "a: 2"), ("toys.py", "A = 2"), ("notes.txt", "none")):
-        (tmp_path / "products" / name).write_text(text)
-        pipeline._code.cache_clear()
-        found.append(pipeline._code("products"))
-    pipeline._code.cache_clear()
-    assert len(set(found)) == 3 and found[2] == found[3]  # notes make nothing
 
 
 def test_assets_not_asked_for_in_months_are_forgotten(tmp_path):

@@ -92,12 +92,6 @@ def test_bodies_that_overlap_count_once(can):
     assert closed_volume(trimesh.util.concatenate([can, box]), "") == pytest.approx(can.volume + 4e-6, rel=1e-4)
 
 
-def test_seams_of_the_texture_are_no_holes(can):
-    split = trimesh.Trimesh(can.triangles.reshape(-1, 3), np.arange(3 * len(can.faces)).reshape(-1, 3), process=False)
-    assert not split.is_watertight
-    assert closed_volume(split, "duplicate vertices") == pytest.approx(can.volume, rel=1e-4)
-
-
 def test_faces_without_size_are_an_error():
     with pytest.raises(AssetError, match="no faces of any size"):
         close(trimesh.Trimesh([[0, 0, 0], [1, 0, 0]], [[0, 1, 1], [0, 0, 1]], process=False))

@@ -102,9 +102,8 @@ def test_sides_have_flat_normals_though_vertices_meet(light_box):
     [
         lambda: textured_box(130),
         lambda: trimesh.creation.icosphere(subdivisions=7, radius=SIDE),
-        lambda: dense_bottle(400, 300),
     ],
-    ids=["box", "ball", "bottle"],
+    ids=["box", "ball"],
 )
 def test_dense_meshes_do_not_fold_over(make):
     dense = make()
@@ -203,27 +202,6 @@ def test_a_label_close_to_a_bottle_keeps_its_colour(triangles):
     ]
     assert label.sum() > 200 and bottle.sum() > 200
     assert (seen[label, 1] > 200).mean() > 0.99 and (seen[bottle, 1] < 60).mean() > 0.99
-
-
-def dense_bottle(sections: int, rows: int) -> trimesh.Trimesh:
-    """A body, a shoulder and a neck, closed: its wall is straight upwards, and finely divided all the same."""
-    angle = np.linspace(0, 2 * np.pi, sections, endpoint=False)
-    ring = np.column_stack([np.cos(angle), np.sin(angle)])
-    heights = np.linspace(0, 2 * SIDE, rows + 1)
-    radii = np.interp(heights / SIDE, [0, 1.2, 1.5, 2], [0.3, 0.3, 0.1, 0.1]) * SIDE
-    wall = np.column_stack([(radii[:, None, None] * ring).reshape(-1, 2), np.repeat(heights, sections)])
-    row, column = (grid.reshape(-1) for grid in np.meshgrid(np.arange(rows), np.arange(sections), indexing="ij"))
-    a, b = row * sections + column, row * sections + (column + 1) % sections
-    low, high, k = len(wall), len(wall) + 1, np.arange(sections)
-    top, after = k + rows * sections, (k + 1) % sections
-    faces = [
-        np.column_stack([a, b, b + sections]),
-        np.column_stack([a, b + sections, a + sections]),
-        np.column_stack([after, k, np.full(sections, low)]),
-        np.column_stack([top, after + rows * sections, np.full(sections, high)]),
-    ]
-    vertices = np.vstack([wall, [[0, 0, 0], [0, 0, 2 * SIDE]]])
-    return trimesh.Trimesh(vertices, np.concatenate(faces), process=False)
 
 
 def test_round_things_have_smooth_normals():

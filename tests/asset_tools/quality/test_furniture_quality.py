@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from asset_tools.quality.furniture import examine_furniture, measure_furniture
-from asset_tools.quality.surfaces import clearances, probes
+from asset_tools.quality.surfaces import clearances
 from asset_tools.sources import FurnitureSource, LinkSource
 from robocas_ms3.assets.manifest import Handle, Joint, Surface
 
@@ -152,18 +152,8 @@ def test_bad_surfaces_do_not_hold(change, why):
     assert not examine_furniture(cabinet(surfaces={"top": top})).surfaces["top"].holds, why
 
 
-def test_furniture_without_joints_or_surfaces_has_no_shares():
-    quality = measure_furniture(cabinet(links=(), surfaces={}, handles={}))
-    assert (quality.joints_open, quality.surfaces_hold) == (None, None)
-
-
 def test_clearances_of_a_board_under_another():
     boards = [box((0, 0, 0), (1, 1, 0.1)), box((0, 0, 0.5), (1, 1, 0.6))]
     below, above = clearances(boards, np.array([(0.5, 0.5, 0.3), (0.5, 0.5, 0.05), (2, 0.5, 0.3), (0.5, 0.5, 1.0)]))
     assert below == pytest.approx([0.2, 0.0, np.inf, 0.4])
     assert above == pytest.approx([0.2, 0.0, np.inf, np.inf])
-
-
-def test_probes_reach_the_edges_of_a_surface():
-    found = probes(Surface(min_xy=(0, 0), max_xy=(0.4, 0.06), z=0))
-    assert [tuple(np.round(probe.xy, 3)) for probe in found] == [(0.03, 0.03), (0.2, 0.03), (0.37, 0.03)]

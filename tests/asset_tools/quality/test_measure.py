@@ -104,12 +104,6 @@ def test_medians_of_the_pack():
     assert judge({}) == []
 
 
-def test_too_few_grasps_need_a_reason():
-    found = judge({"a": object_asset(), "few": object_asset(grasp_count=49)})
-    assert [(broken.asset, broken.what, broken.found) for broken in found] == [("few", "number of grasps", "49")]
-    assert judge({"a": object_asset(), "few": object_asset(grasp_count=49, no_grasps_because="wide")}) == []
-
-
 def test_what_the_manifest_says_is_compared():
     def loaded(grasps):
         notes = SimpleNamespace(grasp_widths=np.zeros(grasps))

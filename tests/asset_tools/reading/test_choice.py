@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
-from models import Gltf, box, image_file, write_obj
+from models import box, image_file, write_obj
 
 from asset_tools.import_scans import ImportSettings, find_scans, scan_jobs
 from asset_tools.reading.model import read_model
@@ -165,27 +165,11 @@ def test_of_versions_without_texture_the_most_detailed_one_is_taken(tmp_path):
     assert len(read_model(tmp_path).mesh.faces) == 48
 
 
-def test_a_gltf_next_to_its_own_files_is_one_model(tmp_path):
-    Gltf(mug()).write(tmp_path / "mug.glb")
-    image_file(tmp_path / "preview.png")
-    assert len(read_model(tmp_path).mesh.faces) == 12
-
-
 def test_a_collision_mesh_above_the_folder_of_the_visual_one(tmp_path):
     write_obj(tmp_path / "visual", "mug", mug())
     box().export(tmp_path / "collision.obj")
     model = read_model(tmp_path)
     assert any(path.name == "skin.png" for path in model.files) and "ignored collision.obj" in notes_of(model)
-
-
-def test_versions_in_several_folders(tmp_path):
-    write_obj(tmp_path / "meshes", "mug", mug())
-    mug().export(tmp_path / "mug.stl")
-    (tmp_path / "collision").mkdir()
-    mug().export(tmp_path / "collision" / "a.stl")
-    model = read_model(tmp_path)
-    assert "used meshes/mug.obj" in notes_of(model)
-    assert "ignored mug.stl" in notes_of(model) and "ignored collision/a.stl" in notes_of(model)
 
 
 def test_a_textured_label_around_a_can(tmp_path):

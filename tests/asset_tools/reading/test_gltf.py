@@ -223,29 +223,6 @@ def test_data_in_uris(tmp_path):
     assert (shown_colors(read_model(path).mesh) == RED).all()
 
 
-def test_vertex_colours_times_a_texture(tmp_path):
-    gltf, _ = with_uvs(0.125)
-    colors = np.ones((gltf.count, 4), "<f4")
-    colors[:, 0] = 0
-    gltf.attribute("COLOR_0", colors)
-    check(gltf, tmp_path, (0, RED[1], RED[2]))
-
-
-def test_several_plain_materials_keep_their_colours(tmp_path):
-    gltf = Gltf()
-    gltf.material(pbrMetallicRoughness={"baseColorFactor": [1, 0, 0, 1]})
-    second = {**gltf.primitive, "attributes": dict(gltf.primitive["attributes"])}
-    gltf.tree["meshes"].append({"primitives": [second]})
-    gltf.tree["nodes"].append({"mesh": 1, "translation": [1, 0, 0]})
-    gltf.tree["scenes"][0]["nodes"] = [0, 1]
-    gltf.tree["materials"].append({"pbrMetallicRoughness": {"baseColorFactor": [0.2, 0.2, 0.2, 1]}})
-    second["material"] = 1
-    model = read_model(gltf.write(tmp_path / "mug.glb"))
-    colors = shown_colors(model.mesh)
-    left = model.mesh.triangles_center[:, 0] < 0.5
-    assert (colors[left] == [255, 0, 0]).all() and (colors[~left] == 124).all()
-
-
 @pytest.mark.parametrize("base", [{"baseColorFactor": [0, 0, 0, 1]}, {}])
 def test_emissive_texture(tmp_path, base):
     """On black it is all there is to see; on other colours it is added."""

@@ -176,20 +176,6 @@ def test_ply_with_coordinates_and_no_image(tmp_path, names, color, shown):
     assert shown_colors(model.mesh).tolist() == [list(shown)] and model.notes == ()
 
 
-@pytest.mark.parametrize(
-    ("name", "text"),
-    [
-        ("a.ply", PLY.format(colors="", color="").replace("face 1", "face 9")),
-        ("a.ply", PLY.format(colors="", color="").replace("3 0 1 2\n", "")),
-        ("a.off", "OFF\n3 2 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"),
-    ],
-)
-def test_a_text_file_cut_short(tmp_path, name, text):
-    (tmp_path / name).write_text(text)
-    with pytest.raises(AssetError):
-        read_model(tmp_path / name)
-
-
 def test_the_texture_of_another_object_is_not_taken(tmp_path):
     image_file(tmp_path / "banana" / "skin.png", GREEN)
     path = write_obj(tmp_path, color=None)
