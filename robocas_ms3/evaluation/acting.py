@@ -52,11 +52,7 @@ def check_acting(settings: EpisodeSettings) -> str:
 
 
 class Player:
-    """A worker (`core.workers.Worker`) in which a policy acts in scenes, with one environment.
-
-    Args:
-        settings: of the demonstrations.
-    """
+    """A worker (`core.workers.Worker`) in which a policy acts in scenes, with one environment."""
 
     def __init__(self, settings: EpisodeSettings) -> None:
         self._settings, self._open = settings, ExitStack()
@@ -91,18 +87,13 @@ class Player:
             return Takeover(seed, settings.after_policy, 0, {}, 1.0, "no_layout")
         if played.error:
             _log.warning("seed %d: %s", seed, played.error)
-        ends = {
-            "policy_failed": bool(played.error),
-            "succeeded": played.at_end["success"],
-            "failed": played.at_end["fail"],
-        }
+        ends = {"policy_failed": played.error, "succeeded": played.at_end["success"], "failed": played.at_end["fail"]}
         refused = next((reason for reason, true in ends.items() if true), "")
         state = {kind: _of_one_env(of) for kind, of in self._base.get_state_dict().items() if kind != "controller"}
         gripper = 1.0 if self._env.gripper_open else -1.0
         return Takeover(seed, settings.after_policy, played.steps, state, gripper, refused)
 
     def close(self) -> None:
-        """Close environment and policy."""
         self._env.close()
         self._open.close()
 

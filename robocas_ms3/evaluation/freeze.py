@@ -111,16 +111,10 @@ def read_plan(path: Path) -> Plan:
     return plan.model_copy(update={name: list(map(located, getattr(plan, name))) for name in ("parts", "train")})
 
 
-def freeze(
-    plan: Plan, folder: Path, layouts: str | Path | None = "auto", overrides: Sequence[str] = ()
-) -> Iterator[tuple[int, int]]:
+def freeze(plan: Plan, folder: Path, overrides: Sequence[str] = ()) -> Iterator[tuple[int, int]]:
     """Write a protocol into a folder, which appears whole; yield the number of episodes that are chosen, and of all.
 
-    Args:
-        plan: what it is made from.
-        folder: of the protocol.
-        layouts: where layouts come from, see `RoboCASEnv`.
-        overrides: keys to set in all its configurations, see `load_task_config`.
+    ``overrides`` are keys to set in all its configurations, see `load_task_config`.
 
     Raises:
         EvaluationError: the rules are invalid, or two parts have the same name and different configurations.
@@ -137,7 +131,7 @@ def freeze(
                 _write_yaml(config.model_dump(mode="json"), make_folder(tmp / inside) / f"{name}.yaml")
         scenes: dict[str, dict[int, Layout]] = {}
         for part in plan.parts:
-            for seed, layout, env in _scenes(part, configs[part.file], str(rules.pack), layouts):
+            for seed, layout, env in _scenes(part, configs[part.file], str(rules.pack)):
                 scenes.setdefault(part.file, {})[seed] = layout
                 episodes.append(_episode(len(episodes), part, seed, layout, env))
                 yield len(episodes), total
@@ -167,12 +161,8 @@ def _write_yaml(values: dict[str, Any], path: Path) -> None:
     path.write_text(yaml.safe_dump(values, sort_keys=False, allow_unicode=True), encoding="utf-8")
 
 
-def _scenes(
-    part: Part, config: TaskConfig, pack: str, layouts: str | Path | None
-) -> Iterator[tuple[int, Layout, RoboCASEnv]]:
-    env = gym.make(
-        TASKS[config.task].env_id, config=config, pack=pack, layouts=layouts, obs_mode="none", render_backend="none"
-    )
+def _scenes(part: Part, config: TaskConfig, pack: str) -> Iterator[tuple[int, Layout, RoboCASEnv]]:
+    env = gym.make(TASKS[config.task].env_id, config=config, pack=pack, obs_mode="none", render_backend="none")
     base: Any = env.unwrapped
     try:
         seed, found = part.first_seed, 0

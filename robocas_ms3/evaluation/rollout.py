@@ -30,7 +30,7 @@ from robocas_ms3.scenes.language.embed import TextEmbedder
 from robocas_ms3.scenes.task_specs import TASKS
 
 NOT_FINITE = "the policy's action is not finite"
-_WELDS = "welds"  # of `stepping.Weld`, where there is one
+_WELDS = "welds"  # in an info, where objects are welded (`stepping.Weld`)
 
 
 @dataclass
@@ -38,7 +38,6 @@ class Rollout:
     """An episode that runs or has ended; see `Outcome`.
 
     Attributes:
-        start: the episode, and its env.
         at_end: by flag, whether it held after the last step.
         retrieval: (K, 3) in search, see `metrics.RetrievalOrder.read`.
         inference_seconds: clock time of the policy: of each batch the time per env.
@@ -103,15 +102,12 @@ class EpisodeBatch:
 
     Args:
         env: vector environment (`make_vec`, NumPy arrays, no automatic resets) of `stepping.PolicyStepping` envs.
-        spec: of the policy.
-        ends: when an episode ends.
         control_dt: simulated time of a control step, s.
         refill: whether an env can be reset while others run. In a GPU's batch all envs are reset together.
 
     Attributes:
         obs: last observation of the environment, arrays (N, ...).
         running: by env, the episode that it runs. An entry with an ``error`` ends at the next step.
-        action_size: number of values of an action.
     """
 
     def __init__(self, env: Any, spec: PolicySpec, ends: EndConditions, control_dt: float, *, refill: bool) -> None:
@@ -126,10 +122,7 @@ class EpisodeBatch:
         self._embed = TextEmbedder() if spec.language == "embedding" else None
 
     def start(self, pairs: list[tuple[int, EpisodeSpec]]) -> list[EpisodeSpec]:
-        """Reset envs to the first state of episodes, and return the episodes, with ``env`` set.
-
-        If envs can't be reset one by one, no other episode may run.
-        """
+        """Reset envs to the first state of episodes, and return the episodes, with ``env`` set."""
         envs = [env for env, _ in pairs]
         seeds = [start.seed for _, start in pairs]
         starts = [replace(start, env=env) for env, start in pairs]
@@ -148,7 +141,6 @@ class EpisodeBatch:
         return starts
 
     def observe(self, envs: list[int]) -> Observations:
-        """Return what the policy sees of some running envs."""
         obs, spec, index = self.obs, self._spec, np.array(envs)
         agent, cameras = obs["agent"], obs.get("sensor_data", {})
         starts = [self.running[env].start for env in envs]
@@ -164,10 +156,7 @@ class EpisodeBatch:
         )
 
     def step(self, actions: NDArray[np.float32]) -> Iterator[Rollout]:
-        """Step all envs once with actions (N, A), and yield the episodes that end.
-
-        Rows of envs without an episode have no effect on results.
-        """
+        """Step all envs once with actions (N, A), and yield the episodes that end."""
         for env in [env for env, played in self.running.items() if played.error]:
             yield self._end(env)
         if not self.running:

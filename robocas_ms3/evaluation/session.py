@@ -30,7 +30,8 @@ from robocas_ms3.scenes.task_specs import TASKS
 from robocas_ms3.tasks.vector import choose_backend, make_vec
 
 MAX_STARTS = 2
-"""How often an episode is started whose process dies."""
+"""How often an episode, or an environment, is started whose process dies."""
+_NO_EPISODE = -1
 _log = logging.getLogger(__name__)
 
 
@@ -86,7 +87,7 @@ class EvaluationSession:
     def run(self, on_start: Callable[[int], None] = lambda count: None) -> Iterator[Outcome]:
         """Start or continue a result: run the episodes that it lacks, write and yield each outcome as its episode ends.
 
-        ``on_start`` is called with the number of episodes to run. The session is closed at the end.
+        ``on_start`` is called with the number of episodes to run.
 
         Raises:
             OutputExistsError: the result was measured with something else.
@@ -104,13 +105,13 @@ class EvaluationSession:
                 yield outcome
 
     def max_steps(self, task: str) -> int:
-        """Return the maximum number of policy steps per episode of a task."""
+        """Return the maximum number of policy steps per episode."""
         steps = self.protocol.rules.steps(task, self.rate)
         assert steps is not None  # `load_protocol` checks it
         return steps
 
     def episode_spec(self, episode: Episode) -> EpisodeSpec:
-        """Return what a policy gets to know about an episode; its env is not known yet."""
+        """Return what a policy gets to know about an episode, before it has an env."""
         return EpisodeSpec(
             env=-1,
             episode=episode.episode,
@@ -129,7 +130,7 @@ class EvaluationSession:
         ``max_steps`` replaces the protocol's maximum number of policy steps per episode.
 
         Raises:
-            WorkerDied: a process died in which no episode ran.
+            WorkerDied: a process died twice in which no episode ran.
         """
         try:
             for config in dict.fromkeys(episode.config for episode in episodes):
@@ -224,18 +225,19 @@ class EvaluationSession:
         """Run episodes of one configuration."""
         left, deaths = {episode.episode: episode for episode in episodes}, Counter[int]()
         while left:
-            batch = self.open(episodes[0], min(self.settings.envs, len(left)), max_steps)
+            batch = None
             try:
+                batch = self.open(episodes[0], min(self.settings.envs, len(left)), max_steps)
                 for ended in rollout(batch, self.policy, [self.episode_spec(episode) for episode in left.values()]):
                     yield self._outcome(ended, left.pop(ended.start.episode))
             except WorkerDied as error:
                 self.close()
-                lost = list(batch.lost(error.envs, f"its process died: {error.found}"))
-                if not lost:
+                lost = [] if batch is None else list(batch.lost(error.envs, f"its process died: {error.found}"))
+                deaths.update([ended.start.episode for ended in lost] or [_NO_EPISODE])
+                if deaths[_NO_EPISODE] == MAX_STARTS:
                     raise
                 for ended in lost:
                     number = ended.start.episode
-                    deaths[number] += 1
                     if deaths[number] < MAX_STARTS:
                         _log.warning("episode %d: %s; it is started again", number, ended.error)
                     else:

@@ -10,6 +10,9 @@ from numpy.typing import ArrayLike
 from scipy.optimize import root_scalar
 from scipy.stats import beta, binom, norm
 
+_TAIL = (1 - 0.95) / 2  # error at each end of an interval
+_POWER = 0.8
+
 
 @dataclass(frozen=True)
 class Share:
@@ -22,7 +25,6 @@ class Share:
 
     @property
     def rate(self) -> float:
-        """Successes per episode."""
         return self.k / self.n
 
 
@@ -31,13 +33,9 @@ class Comparison:
     """Two runs, A and B, over the same scenes.
 
     Attributes:
-        both: scenes in which A and B succeeded.
-        only_a: scenes in which only A did.
-        only_b: scenes in which only B did.
-        neither: scenes in which both failed.
+        both, only_a, only_b, neither: numbers of scenes in which these succeeded.
         p_value: two-sided, of the hypothesis that A and B succeed equally often (`mcnemar`).
-        low: lower limit of the 95 % interval of A's rate less B's, -1..1 (`paired_interval`).
-        high: upper limit.
+        low, high: limits of the 95 % interval of A's rate less B's, -1..1 (`paired_interval`).
     """
 
     both: int
@@ -56,17 +54,14 @@ class Comparison:
 
     @property
     def n(self) -> int:
-        """Number of scenes."""
         return self.both + self.only_a + self.only_b + self.neither
 
     @property
     def successes_a(self) -> int:
-        """Number of scenes in which A succeeded."""
         return self.both + self.only_a
 
     @property
     def successes_b(self) -> int:
-        """Number of scenes in which B succeeded."""
         return self.both + self.only_b
 
     @property
@@ -75,15 +70,14 @@ class Comparison:
         return (self.only_a - self.only_b) / self.n
 
 
-def share(k: int, n: int, level: float = 0.95) -> Share:
-    """Return a rate with its exact interval, which holds the true rate in at least ``level`` of all evaluations.
+def share(k: int, n: int) -> Share:
+    """Return a rate with its exact interval, which holds the true rate in at least 95 % of all evaluations.
 
     Clopper and Pearson, Biometrika 26 (1934) 404-413, by quantiles of beta distributions. At k = 0 the lower limit
     is 0, at k = n the upper limit is 1; the other limit keeps half of the error.
     """
-    tail = (1 - level) / 2
-    low = float(beta.ppf(tail, k, n - k + 1)) if k else 0.0
-    high = float(beta.isf(tail, k + 1, n - k)) if k < n else 1.0
+    low = float(beta.ppf(_TAIL, k, n - k + 1)) if k else 0.0
+    high = float(beta.isf(_TAIL, k + 1, n - k)) if k < n else 1.0
     return Share(k, n, low, high)
 
 
@@ -96,7 +90,7 @@ def mcnemar(only_a: int, only_b: int) -> float:
     return min(1.0, 2 * float(binom.cdf(min(only_a, only_b), only_a + only_b, 0.5)))
 
 
-def paired_interval(only_a: int, only_b: int, n: int, level: float = 0.95) -> tuple[float, float]:
+def paired_interval(only_a: int, only_b: int, n: int) -> tuple[float, float]:
     """Return Tango's score interval of the difference of two rates over the same n scenes, A's less B's.
 
     The differences d that the score test of paired data does not reject (Tango, Statistics in Medicine 17 (1998)
@@ -108,9 +102,9 @@ def paired_interval(only_a: int, only_b: int, n: int, level: float = 0.95) -> tu
     if the runs disagree in no scene. With 6 to 50 scenes at 95 % it holds the true difference in 95 % of cases or more
     on average over the truths, in 94 % or more for 19 of 20 truths, and in 89 % at worst from 9 scenes on (83 % below);
     the worst are runs that disagree nearly everywhere. The score test is approximate: if the exact p-value is a little
-    above 1 - level, the interval can exclude 0. Claims go by the p-value.
+    above 0.05, the interval can exclude 0. Claims go by the p-value.
     """
-    z2 = float(norm.isf((1 - level) / 2)) ** 2
+    z2 = float(norm.isf(_TAIL)) ** 2
     middle = (only_a - only_b) / n
 
     def excess(d: float) -> float:
@@ -183,8 +177,8 @@ def mcnemar_power(n: int, difference: float, discordant: float, *, alpha: float 
     return float(binom.pmf(m, n, discordant) @ detected)
 
 
-def smallest_paired_difference(n: int, discordant: float, *, power: float = 0.8, alpha: float = 0.05) -> float | None:
-    """Return the smallest difference of rates that two runs over the same n scenes show with probability ``power``.
+def smallest_paired_difference(n: int, discordant: float, *, alpha: float = 0.05) -> float | None:
+    """Return the smallest difference of rates that two runs over the same n scenes show with a probability of 80 %.
 
     None if n is too small for any: six scenes that one run alone solves make the first p-value below 0.05.
 
@@ -192,32 +186,26 @@ def smallest_paired_difference(n: int, discordant: float, *, power: float = 0.8,
         n: number of scenes.
         discordant: the share of scenes in which the runs disagree, 0..1. With a difference greater than it, all scenes
             in which they disagree are the better run's.
-        power: probability, 0..1, above ``alpha``.
         alpha: see `mcnemar_power`.
     """
 
     def missing(difference: float) -> float:
-        return power - mcnemar_power(n, difference, max(difference, discordant), alpha=alpha)
+        return _POWER - mcnemar_power(n, difference, max(difference, discordant), alpha=alpha)
 
     return None if missing(1.0) > 0 else float(root_scalar(missing, bracket=(0.0, 1.0)).root)
 
 
-def too_few(comparison: Comparison, *, alpha: float = 0.05, power: float = 0.8) -> str | None:
-    """Return a warning if the runs are not told apart, with the difference that as many scenes would show.
+def too_few(comparison: Comparison, *, alpha: float = 0.05) -> str | None:
+    """Return a warning if the runs are not told apart at ``alpha``, with the difference that as many scenes would show.
 
     That difference assumes that the runs disagree in as many scenes as they did, so it is an estimate itself.
-
-    Args:
-        comparison: of the two runs.
-        alpha: they are told apart if the p-value is at most this; each of m comparisons may have alpha / m.
-        power: see `smallest_paired_difference`.
     """
     c = comparison
     if c.p_value <= alpha:
         return None
-    shown = smallest_paired_difference(c.n, (c.only_a + c.only_b) / c.n, power=power, alpha=alpha)
+    shown = smallest_paired_difference(c.n, (c.only_a + c.only_b) / c.n, alpha=alpha)
     difference = (
         "no difference, however large" if shown is None else f"differences of {np.ceil(100 * shown):.0f} points or more"
     )
     count = "1 episode shows" if c.n == 1 else f"{c.n} episodes show"
-    return f"not told apart: {count} {difference} ({100 * power:g} % power)"
+    return f"not told apart: {count} {difference} ({100 * _POWER:g} % power)"

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
-from counting_env import BREAKS, Dying
+from counting_env import BREAKS, CountingEnv, Dying, play
 
 from robocas_ms3.cli.main import run as cli
-from robocas_ms3.core.errors import DatasetError, EvaluationError, RobocasError, WorkerDied
+from robocas_ms3.core.errors import DatasetError, EvaluationError, OutputExistsError, RobocasError, WorkerDied
 from robocas_ms3.core.locks import locked_folder
 from robocas_ms3.evaluation import results, session
-from robocas_ms3.evaluation.policies.plain import StillPolicy
-from robocas_ms3.evaluation.policy import ExternalPolicy, PolicySpec
+from robocas_ms3.evaluation.policies import make_policy
+from robocas_ms3.evaluation.policy import EpisodeSpec, ExternalPolicy, Observations, PolicySpec
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
@@ -20,6 +22,86 @@ from robocas_ms3.evaluation.verify import problems
 
 SMOKE = load_protocol("smoke")
 AT_5_HZ = PolicySpec(rate_hz=5)
+
+
+class Obedient:
+    """Does as many as its instruction says, in chunks; keeps what it was told."""
+
+    spec = PolicySpec(state=True)
+
+    def __init__(self, chunk: int = 1) -> None:
+        self.chunk, self.asked = chunk, []
+
+    def reset(self, starts: list[EpisodeSpec]) -> None:
+        pass
+
+    def act(self, observations: Observations) -> np.ndarray:
+        assert observations.state is not None
+        for env, said, seed in zip(observations.envs, observations.instructions, observations.state[:, 0], strict=True):
+            assert said == f"count to {seed:.0f}", env  # the instruction of its own episode
+        self.asked.append(observations.envs.tolist())
+        actions = np.zeros((len(observations.envs), self.chunk, 7))
+        actions[..., 0] = 1
+        return actions[:, 0] if self.chunk == 1 else actions
+
+
+def starts(*seeds: int) -> list[EpisodeSpec]:
+    return [EpisodeSpec(-1, i, "pick", "", "", "", seed, f"count to {seed}") for i, seed in enumerate(seeds)]
+
+
+@pytest.mark.parametrize("count", [1, 2, 4])
+@pytest.mark.parametrize("refill", [True, False])
+def test_every_episode_is_played_once_with_its_own_instruction(count, refill):
+    env, policy = CountingEnv(count, None), Obedient()
+    played = play(env, policy, starts(3, 9, 2, 5, 4, 1), 7, refill=refill)
+    assert sorted(one.start.episode for one in played) == list(range(6))
+    for one in played:
+        seed = one.start.seed
+        assert one.steps == min(seed, 7)
+        assert one.seconds == pytest.approx(0.05 * one.steps)
+        assert one.flags["success"] == (seed if seed <= 7 else None)
+        assert one.at_end["success"] == (seed <= 7)
+        assert one.flags["fail"] is None
+    if not refill and count == 4:
+        assert [len(envs) for envs in env.resets] == [4, 4]  # four, then two, in one reset each
+        assert policy.asked[3] == [1, 3]  # those that are done are masked
+
+
+def test_chunks_are_played_to_their_end_before_the_policy_is_asked_again():
+    policy = Obedient(chunk=3)
+    played = play(CountingEnv(2, None), policy, starts(4, 7), 7)
+    assert {one.start.seed: one.steps for one in played} == {4: 4, 7: 7}
+    assert policy.asked == [[0, 1], [0, 1], [1]]
+
+
+@pytest.mark.parametrize(("chunk", "looks", "fits"), [(6, 3, True), (1, 3, True), (3, 6, False), (6, 4, False)])
+def test_chunks_begin_with_images(chunk, looks, fits):
+    """A policy without chunks takes care of that itself."""
+    policy = Obedient(chunk)
+    policy.spec = PolicySpec(state=True, look_every=looks)
+    if fits:
+        assert [one.steps for one in play(CountingEnv(1, None), policy, starts(4), 7)] == [4]
+    else:
+        with pytest.raises(EvaluationError, match=f"a multiple of {looks} steps"):
+            play(CountingEnv(1, None), policy, starts(4), 7)
+
+
+def test_actions_of_another_shape_are_refused_and_one_that_is_not_finite_ends_its_own_episode_alone():
+    policy = Obedient()
+    act = policy.act
+
+    def sick(observations: Observations) -> np.ndarray:
+        actions = act(observations)
+        actions[np.array(observations.instructions) == "count to 4"] = np.nan
+        return actions
+
+    policy.act = sick
+    played = sorted(play(CountingEnv(2, None), policy, starts(4, 5, 3), 7), key=lambda one: one.start.seed)
+    assert [one.error for one in played] == ["", "the policy's action is not finite", ""]
+    assert [one.flags["success"] for one in played] == [3, None, 5]
+    policy.act = lambda observations: np.zeros((2, 6))
+    with pytest.raises(EvaluationError, match=r"expected \(1, 7\) or \(1, chunk, 7\) numbers, found \(2, 6\)"):
+        play(CountingEnv(1, None), policy, starts(4), 7)
 
 
 def ones(count: int = 1, value: float = 1.0) -> np.ndarray:
@@ -31,48 +113,26 @@ def open_session(spec: PolicySpec = AT_5_HZ, **settings) -> EvaluationSession:
     return EvaluationSession(ExternalPolicy(spec), EvaluationSettings(**settings))
 
 
-@pytest.fixture
-def external():
-    opened = open_session()
-    yield opened
-    opened.close()
-
-
-def test_an_episode_ends_by_the_protocols_rules(made, external):
+def test_in_an_external_loop_an_episode_ends_by_the_protocols_rules_and_a_reset_drops_it(made):
+    external = open_session()
+    external.reset([0])
+    external.step(ones())
     seen = external.reset([1])
     assert seen.instructions == [SMOKE.episodes[1].instruction]
-    for _ in range(4):
-        assert external.outcomes == {}
-        seen = external.step(ones())
-        assert seen is not None and seen.envs.tolist() == [0]
-    assert external.step(ones()) is None
+    assert external.step(ones(2)).envs.tolist() == [0]  # a chunk is executed to its end
+    assert external.outcomes == {}
+    assert external.step(ones(4)) is None
     outcome = external.outcomes[0]
     assert (outcome.episode, outcome.success, outcome.steps, outcome.seconds) == (1, True, 5, 1.0)
     assert outcome.flags["reached_any"] == 2
     assert (outcome.config, outcome.seed, outcome.failure_stage) == ("pick_table_scattered", 110001, "")
     with pytest.raises(EvaluationError, match="no episode is running"):
         external.step(ones())
+    external.close()
 
 
-def test_an_episode_ends_when_its_task_has_no_more_steps(made, external):
-    assert [external.max_steps(task) for task in ("pick", "search")] == [200, 600]
-    external.reset([0])
-    assert external.step(ones(199, 0.0)) is not None
-    assert external.step(ones(1, 0.0)) is None
-    assert (external.outcomes[0].steps, external.outcomes[0].failure_stage) == (200, "reached_any")
-
-
-def test_a_reset_drops_the_running_episode(made, external):
-    external.reset([0])
-    external.step(ones())
-    external.reset([1])
-    assert external.outcomes == {}
-    assert external.step(ones(3)) is not None  # a chunk is executed to its end
-    assert external.step(ones(3)) is None
-    assert (external.outcomes[0].episode, external.outcomes[0].steps, external.outcomes[0].error) == (1, 5, "")
-
-
-def test_an_env_stays_open_as_long_as_its_configuration(made, external):
+def test_an_env_stays_open_as_long_as_its_configuration(made):
+    external = open_session()
     for number in (0, 1, 2, 0):
         external.reset([number])
     assert [env.config for env in made] == ["pick_table_scattered", "select_table_orderly", "pick_table_scattered"]
@@ -82,7 +142,8 @@ def test_an_env_stays_open_as_long_as_its_configuration(made, external):
     assert made[-1].closed
 
 
-def test_after_an_error_of_the_env_the_next_reset_opens_another(made, external):
+def test_after_an_error_of_the_env_the_next_reset_opens_another(made):
+    external = open_session()
     external.reset([0])
     with pytest.raises(EvaluationError, match=r"actions don't fit"):  # which is no error of the env
         external.step(np.zeros((1, 6)))
@@ -93,6 +154,7 @@ def test_after_an_error_of_the_env_the_next_reset_opens_another(made, external):
     assert external.step(ones(5)) is None
     assert external.outcomes[0].success
     assert [env.closed for env in made] == [True, False]
+    external.close()
 
 
 def test_each_env_of_a_batch_ends_by_itself(made):
@@ -115,6 +177,11 @@ def test_each_env_of_a_batch_ends_by_itself(made):
     for numbers, message in (([0, 4, 5], "several configurations"), ([0, 1], "wrong number"), ([0, 1, 8], "no such")):
         with pytest.raises(EvaluationError, match=message):
             batch.reset(numbers)
+    batch.close()
+
+
+def no_renderer() -> None:
+    raise DatasetError("no render device")
 
 
 @pytest.mark.parametrize(
@@ -122,24 +189,28 @@ def test_each_env_of_a_batch_ends_by_itself(made):
     [
         ({"protocol": "paper-v1"}, PolicySpec("joint_positions"), "convention is none of this protocol's"),
         ({"protocol": "paper-v1"}, PolicySpec(reference="tcp", rate_hz=10), "another rate .*10 Hz"),
+        ({}, PolicySpec(rate_hz=7), "divisor of 100"),
         ({"tasks": ("nothing",)}, AT_5_HZ, "no such task .expected pick, select, search, open_pick, found nothing"),
         ({"split": "seen"}, AT_5_HZ, "no such split .expected test, found seen"),
         ({"tasks": ("pick",), "shard": "90/100"}, AT_5_HZ, "no episodes in this shard"),
         ({"shard": "3/2"}, AT_5_HZ, "invalid shard"),
+        ({}, PolicySpec(cameras={"side_camera": (8, 8)}), "no such camera"),
+        ({}, PolicySpec(cameras={"base_camera": (8, 8)}), "no render device"),
+        ({"backend": "threads"}, AT_5_HZ, "no such backend"),
+        ({"weld": True}, AT_5_HZ, "the weld belongs to upstream's steps"),
+        (
+            {"protocol": "paper-v1", "weld": True, "backend": "gpu"},
+            PolicySpec(reference="tcp", rate_hz=5),
+            "nothing can be welded on a GPU",
+        ),
     ],
 )
-def test_settings_that_do_not_fit_the_protocol_are_refused_before_anything_is_written(settings, spec, message):
-    with pytest.raises(EvaluationError, match=message):
+def test_settings_that_do_not_fit_are_refused_before_anything_is_written(monkeypatch, settings, spec, message):
+    monkeypatch.setattr(session, "require_renderer", no_renderer)
+    choose = session.choose_backend
+    monkeypatch.setattr(session, "choose_backend", lambda name: name if name == "gpu" else choose(name))
+    with pytest.raises(RobocasError, match=message):
         open_session(spec, **settings)
-
-
-def test_a_policy_with_cameras_needs_a_renderer(monkeypatch):
-    def none() -> None:
-        raise DatasetError("no render device")
-
-    monkeypatch.setattr(session, "require_renderer", none)
-    with pytest.raises(DatasetError, match="no render device"):
-        open_session(PolicySpec(cameras={"base_camera": (8, 8)}))
 
 
 def test_episodes_are_chosen_by_task_count_and_shard():
@@ -152,11 +223,13 @@ def test_episodes_are_chosen_by_task_count_and_shard():
     assert chosen(load_protocol("objects-v1"), split="new", tasks=("pick",)) == [*range(50, 100)]
 
 
-def evaluate(folder, **settings) -> dict[int, dict]:
-    """Run pick and select with a policy that does nothing, 20 steps each."""
-    settings = {"tasks": ("pick", "select"), "protocol": "smoke", "backend": "processes", **settings}
-    opened = EvaluationSession(StillPolicy(), EvaluationSettings(policy="still", out=folder, **settings))
-    list(opened.run())
+def opened(folder, policy="random", **settings) -> EvaluationSession:
+    settings = {"tasks": ("pick", "select"), "backend": "processes", **settings}
+    return EvaluationSession(make_policy(policy), EvaluationSettings(policy=policy, out=folder, **settings))
+
+
+def evaluate(folder, policy="random", **settings) -> dict[int, dict]:
+    list(opened(folder, policy, **settings).run())
     return {number: one.without_clock() for number, one in results.read(folder).outcomes.items()}
 
 
@@ -171,7 +244,7 @@ def test_an_episode_whose_process_dies_runs_again_once_and_then_counts_as_failed
         return made[-1]
 
     monkeypatch.setattr(session, "make_vec", make_vec)
-    found = evaluate(out, protocol=str(short))
+    found = evaluate(out, "still", protocol=str(short))
     assert sorted(found) == [0, 1, 2, 3]
     assert [number for number, one in found.items() if one["error"]] == ([1] if times == 2 else [])
     assert found[1]["error"] == ("its process died: SIGSEGV" if times == 2 else "")
@@ -187,18 +260,27 @@ def test_an_episode_whose_process_dies_runs_again_once_and_then_counts_as_failed
     assert results.read(out).broken_off() == times - 1
 
 
-def test_a_process_that_dies_without_an_episode_ends_the_run(tmp_path, monkeypatch):
+@pytest.mark.parametrize("times", [1, 2])
+def test_envs_whose_process_dies_while_they_are_made_are_made_again_once(short, tmp_path, monkeypatch, times):
+    left = [times]
+
     def make_vec(env_id, count, **_):
-        raise WorkerDied("its process died", where="env 0", found="SIGSEGV")
+        left[0] -= 1
+        if left[0] >= 0:
+            raise WorkerDied("its process died", where="env 0", found="SIGSEGV")
+        return CountingEnv(count)
 
     monkeypatch.setattr(session, "make_vec", make_vec)
+    if times == 1:
+        assert len(evaluate(tmp_path / "out", "still", protocol=str(short))) == 4
+        return
     with pytest.raises(WorkerDied, match="env 0: its process died"):
-        evaluate(tmp_path / "out")
+        evaluate(tmp_path / "out", "still", protocol=str(short))
 
 
 def test_two_runs_into_one_folder_are_refused(tmp_path):
     with locked_folder(tmp_path / "out"), pytest.raises(RobocasError, match="out: another process is writing here"):
-        evaluate(tmp_path / "out")
+        evaluate(tmp_path / "out", "still")
 
 
 def test_an_interrupted_command_tells_how_to_continue_and_it_takes_one_thread(tmp_path, monkeypatch, capsys):
@@ -219,3 +301,76 @@ def test_an_interrupted_command_tells_how_to_continue_and_it_takes_one_thread(tm
         torch.set_num_threads(before)
     assert capsys.readouterr().err.splitlines()[-1] == "interrupted; the same command continues"
     assert threads == [1]
+
+
+@pytest.fixture(scope="module")
+def alone(short, tmp_path_factory):
+    """Outcomes of a random policy, one env at a time."""
+    return evaluate(tmp_path_factory.mktemp("alone"), protocol=str(short), envs=1)
+
+
+@pytest.mark.slow
+def test_outcomes_do_not_depend_on_the_number_of_envs_or_on_shards(alone, short, tmp_path):
+    assert sorted(alone) == [0, 1, 2, 3]
+    assert not any(one["success"] for one in alone.values())
+    assert len({one["measures"]["path_length"] for one in alone.values()}) == 4
+    parts = [evaluate(tmp_path / str(n), protocol=str(short), tasks=("select",), shard=f"{n}/2") for n in (0, 1)]
+    assert {**parts[0], **parts[1]} == {number: alone[number] for number in (2, 3)}
+    assert [sorted(part) for part in parts] == [[2], [3]]
+
+
+@pytest.mark.slow
+def test_a_run_that_was_cut_off_continues_with_other_envs_and_ends_the_same(alone, short, tmp_path):
+    begun: list[int] = []
+    playing = opened(tmp_path, protocol=str(short), envs=1).run(begun.append)
+    next(playing)
+    assert begun == [4]
+    playing.close()
+    path = tmp_path / "episodes.jsonl"
+    path.write_text(path.read_text() + path.read_text()[:100])  # and killed while it wrote
+    with pytest.raises(OutputExistsError, match="policy.name"):
+        evaluate(tmp_path, "still", protocol=str(short))
+    assert evaluate(tmp_path, protocol=str(short), envs=2, workers=1) == alone
+
+
+@pytest.mark.slow
+def test_an_external_loop_has_the_same_outcomes(alone, short):
+    policy = make_policy("random")
+    external = open_session(policy.spec, protocol=str(short))
+    for number in (0, 2):
+        seed = external.protocol.episodes[number].seed
+        policy.reset([EpisodeSpec(0, number, "", "", "", "", seed, "")])
+        seen = external.reset([number])
+        while seen is not None:
+            seen = external.step(policy.act(seen))
+        assert external.outcomes[0].without_clock() == alone[number]
+    external.close()
+
+
+@pytest.mark.slow
+def test_the_scripted_policy_succeeds(tmp_path):
+    outcome = evaluate(tmp_path, "scripted", protocol="smoke", tasks=("pick",), episodes=1)[0]
+    assert outcome["success"] and outcome["success_at_end"] and outcome["success_v0"]
+    flags = outcome["flags"]
+    assert flags["reached_target"] <= flags["target_lifted"] <= flags["target_in_basket"] <= flags["success"]
+    assert outcome["failure_stage"] == ""
+
+
+@pytest.mark.slow
+def test_the_policy_of_the_docs_sees_what_it_declares(short, tmp_path, monkeypatch, needs_renderer):
+    page = (Path(__file__).resolve().parents[2] / "docs" / "evaluation.md").read_text(encoding="utf-8")
+    program = page.split("```python\n")[1].split("```")[0]
+    program = program.replace("rate_hz=5,", "rate_hz=5, depth=True, state=True, language='text',")
+    program = program.replace(
+        "        return np.tile",
+        """\
+        assert observations.depths["gripper_camera"].shape[1:] == (48, 64, 1)
+        assert observations.state.shape[1] > 90 and observations.tcp_in_base.shape[1:] == (7,)
+        assert all(said.startswith("grasp the ") for said in observations.instructions)
+        return np.tile""",
+    )
+    (tmp_path / "docs_policy.py").write_text(program, encoding="utf-8")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    settings = {"protocol": str(short), "envs": 1, "episodes": 1, "tasks": ("select",)}
+    outcomes = evaluate(tmp_path / "out", "docs_policy:Descend", **settings)
+    assert [one["measures"]["path_length"] for one in outcomes.values()] == [pytest.approx(0.2, abs=0.02)]

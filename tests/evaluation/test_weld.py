@@ -12,18 +12,15 @@ import sapien
 import torch
 
 import robocas_ms3  # noqa: F401
-from robocas_ms3.cli.main import run as cli
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.metrics import read_sum
 from robocas_ms3.evaluation.policies import make_policy
 from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.protocol import load_protocol
-from robocas_ms3.evaluation.report import videos
-from robocas_ms3.evaluation.report.videos import film
 from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
-from robocas_ms3.evaluation.stepping import PolicyStepping, check_weld, control_mode
+from robocas_ms3.evaluation.stepping import PolicyStepping, control_mode
 from robocas_ms3.evaluation.verify import problems
 from robocas_ms3.robots.description import MOBILE_PANDA
 
@@ -138,15 +135,12 @@ def test_it_is_welded_once_a_grasp(pick):
     assert [float(count) for count in counts] == [1, 1, 1, 2]
 
 
-@pytest.mark.parametrize(("above", "welds"), [(0.025, 0), (0.035, 1)])
-def test_what_was_hardly_raised_is_not_welded(pick, above, welds):
+def test_what_was_hardly_raised_or_one_finger_touches_is_not_welded(pick, monkeypatch):
     env = welding(pick)
-    info = grasp(env, above)
+    info = grasp(env, above=0.025)
     assert bool(info["target_grasped"])
-    assert float(info["welds"]) == welds
-
-
-def test_what_one_finger_touches_is_not_welded(pick, monkeypatch):
+    assert float(info["welds"]) == 0
+    assert float(grasp(env, above=0.035)["welds"]) == 1
     env = welding(pick)
     base: Any = env.unwrapped
     forces = torch.zeros(1, 3, len(base.objects), 3)
@@ -181,18 +175,6 @@ def test_no_weld_outlives_a_reset(reconfiguration_freq):
     env.close()
 
 
-def test_it_is_refused_where_it_does_not_belong(tmp_path, capsys):
-    out = tmp_path / "out"
-    command = ["eval", "--policy", "random", "--weld", "--out", str(out), "--backend", "processes", "--protocol"]
-    assert cli([*command, "smoke"]) == 1
-    assert "--weld: the weld belongs to upstream's steps (expected stepping upstream, found timed)" in (
-        capsys.readouterr().err
-    )
-    assert not out.exists()
-    with pytest.raises(EvaluationError, match=r"nothing can be welded on a GPU \(found gpu\)\. Pass --backend"):
-        check_weld("upstream", "gpu")
-
-
 def play(folder, protocol, policy="random", **settings) -> dict[int, dict]:
     settings = {"tasks": ("pick",), "episodes": 2, "envs": 1, "backend": "processes", **settings}
     settings = EvaluationSettings(policy=policy, protocol=str(protocol), out=folder, **settings)
@@ -214,13 +196,10 @@ def test_where_nothing_is_lifted_it_changes_nothing(tmp_path):
 
 
 @pytest.mark.slow
-def test_an_evaluation_with_it_counts_it_says_so_and_is_filmed_alike(tmp_path, monkeypatch, needs_renderer):
+def test_an_evaluation_with_it_counts_it_and_says_so(tmp_path):
     protocol, folder = load_protocol("paper-v1"), tmp_path / "out"
     (outcome,) = play(folder, protocol.folder, "scripted-motions", episodes=1, weld=True).values()
     assert outcome["success"] and outcome["measures"]["welds"] == 1
     result = results.read(folder)
     assert result.run.weld
     assert problems(result, protocol) == ["missing: 399 of 400 episodes"]
-    monkeypatch.setattr(videos, "SIZE", (64, 48))
-    ((_, same),) = film(result, protocol, make_policy("scripted-motions"), [0])
-    assert same

@@ -65,11 +65,6 @@ FOLDERS: Registry[Callable[[Path], Policy]] = Registry("kind of policy folder", 
 def find_policy(name: str) -> Callable[[], Policy]:
     """Return what makes a policy; nothing is imported before it is called.
 
-    Args:
-        name: of a builtin policy, or of one that a package brings; ``replay:TRAJECTORY.h5``; ``module:Class`` of the
-            user's own, called without arguments; a folder of `robocas train`; or the address of a server
-            (`remote.address.read_address`).
-
     Raises:
         EvaluationError: no policy can have this name.
     """
@@ -96,7 +91,6 @@ def make_policy(name: str) -> Policy:
     Raises:
         EvaluationError: there is no such policy (`find_policy`), or it lacks something that `Policy` has.
         ExtensionError: that of a package can't be loaded, or several have it.
-        MissingExtraError: it is behind a server, and the ``remote`` extra is not installed.
     """
     with no_exit(f"policy {name}"):
         policy: Any = find_policy(name)()
@@ -123,13 +117,10 @@ def open_policy(name: str) -> Iterator[Policy]:
         try:
             yield policy
         finally:
-            close = getattr(policy, "close", None)
-            if close is not None:
-                close()
+            getattr(policy, "close", lambda: None)()
 
 
 def _make_own(name: str, module: str, attribute: str) -> Policy:
-    """Make a policy of the user's own, from an installed module or one in the folder that the command runs in."""
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # last: a file in the folder must not hide an installed module
     try:

@@ -17,7 +17,7 @@ class StillPolicy:
     spec = PolicySpec(reference="tcp", language="none")
 
     def reset(self, starts: list[EpisodeSpec]) -> None:
-        """Do nothing."""
+        pass
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
         """Return (E, 7) actions."""
@@ -34,7 +34,6 @@ class RandomPolicy:
         self._open: dict[int, bool] = {}
 
     def reset(self, starts: list[EpisodeSpec]) -> None:
-        """Seed the generators of some envs."""
         for start in starts:
             self._generators[start.env] = np.random.default_rng([start.seed, start.episode])
             self._open[start.env] = True

@@ -1,18 +1,102 @@
-"""Recorded episodes, repeated in the scenes of the same seeds."""
+"""Policies that follow a track of joint targets or TCP poses; `ReplayPolicy` follows recorded episodes."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.demos.recordings.entries import read_json, read_reset, was_taken_over
 from robocas_ms3.demos.recordings.environment import read_env
+from robocas_ms3.demos.recordings.motion import Motion, sample_states
 from robocas_ms3.demos.recordings.stored import open_episode, open_trajectory, read_actions
-from robocas_ms3.evaluation.policies.tracks import JointTrack, TrackPolicy
-from robocas_ms3.evaluation.policy import EpisodeSpec, PolicySpec
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
+from robocas_ms3.robots.description import RobotDescription
+from robocas_ms3.robots.table import RobotSpec
+
+Array = NDArray[np.floating]
+
+
+@dataclass
+class JointTrack:
+    """Joint targets (S, 8), of which the last one is held; without any the arm stays where it is."""
+
+    actions: Array
+    step: int = 0
+
+    def next(self, observations: Observations, row: int) -> Array:
+        """Return the next action (8,) of a row's env."""
+        if not len(self.actions):
+            self.actions = np.append(observations.qpos[row, RobotDescription.arm_slice], 1.0)[None]
+        action = self.actions[min(self.step, len(self.actions) - 1)]
+        self.step += 1
+        return action
+
+
+@dataclass
+class PoseTrack:
+    """Poses of the TCP, one per policy step: each action leads there from where the TCP is by then.
+
+    Attributes:
+        poses: (S, 4, 4) in the arm's base frame; without any the arm stays where it is.
+        open: (S,) bool, commands of the gripper.
+    """
+
+    poses: Array
+    open: NDArray[np.bool_]
+    step: int = 0
+
+    @classmethod
+    def of(cls, robot: RobotSpec, robot_states: Array, gripper: Array, stride: int) -> PoseTrack:
+        """Return the track of a recording.
+
+        Args:
+            robot: that was recorded.
+            robot_states: (S + 1, 37) after the reset and after each control step.
+            gripper: (S,) commands in [-1, 1].
+            stride: control steps per policy step.
+        """
+        if not len(gripper):
+            return cls(np.zeros((0, 4, 4)), np.zeros(0, dtype=bool))
+        motion = Motion.of(robot, robot_states, gripper, sample_states(len(gripper), stride))
+        return cls(motion.tcp_in_base[1:], motion.gripper_open[1:])
+
+    def next(self, observations: Observations, row: int) -> Array:
+        """Return the next action (7,) of a row's env, in RoboCAS' convention."""
+        place = min(self.step, len(self.poses) - 1)
+        self.step += 1
+        if place < 0:
+            return np.array([0, 0, 0, 0, 0, 0, 1.0])
+        tcp = observations.tcp_in_base[row].astype(np.float64)
+        turn = Rotation.from_quat(tcp[[4, 5, 6, 3]]).inv()
+        motion = turn.apply(self.poses[place, :3, 3] - tcp[:3])
+        angles = (turn * Rotation.from_matrix(self.poses[place, :3, :3])).as_euler("xyz")
+        return np.array([*motion, *angles, float(self.open[place])])
+
+
+class TrackPolicy(ABC):
+    """Follow a track in each episode."""
+
+    def __init__(self) -> None:
+        self._tracks: dict[int, JointTrack | PoseTrack] = {}  # by env
+
+    @abstractmethod
+    def track(self, start: EpisodeSpec) -> JointTrack | PoseTrack:
+        """Return the track of an episode."""
+
+    def reset(self, starts: list[EpisodeSpec]) -> None:
+        self._tracks |= {start.env: self.track(start) for start in starts}
+
+    def act(self, observations: Observations) -> Array:
+        """Return (E, A) actions."""
+        envs = observations.envs.tolist()
+        return np.stack([self._tracks[env].next(observations, row) for row, env in enumerate(envs)])
 
 
 class ReplayPolicy(TrackPolicy):
@@ -28,28 +112,22 @@ class ReplayPolicy(TrackPolicy):
 
     def __init__(self, trajectory: Path) -> None:
         super().__init__()
-        trajectory = trajectory.absolute()
+        self._trajectory = trajectory = trajectory.absolute()
         data = read_json(trajectory)
         env = read_env(data["env_info"], trajectory.with_suffix(".json"))
         if env.control_mode != "pd_joint_pos":
-            raise EvaluationError(
-                "can't be played here", where=trajectory, expected="pd_joint_pos", found=env.control_mode
-            )
+            what, found = "can't be played here", env.control_mode
+            raise EvaluationError(what, where=trajectory, expected="pd_joint_pos", found=found)
         if any(map(was_taken_over, data["episodes"])):
             what, fix = "episodes that begin where another policy was", "Use robocas replay, which begins there too."
             raise EvaluationError(what, where=trajectory, expected="episodes that begin with a reset", fix=fix)
-        self._trajectory = trajectory
         self._episodes = {
             read_reset(one, f"{trajectory}, traj_{one['episode_id']}")[0]: one["episode_id"] for one in data["episodes"]
         }
-        self.spec = PolicySpec(
-            convention="joint_positions",
-            rate_hz=env.kwargs.get("sim_config", {}).get("control_freq", 20),
-            language="none",
-        )
+        rate = env.kwargs.get("sim_config", {}).get("control_freq", 20)
+        self.spec = PolicySpec(convention="joint_positions", rate_hz=rate, language="none")
 
     def describe(self) -> dict[str, Any]:
-        """Return the entries of a result."""
         return {"trajectory": self._trajectory.name, "episodes": len(self._episodes)}
 
     def track(self, start: EpisodeSpec) -> JointTrack:
@@ -59,9 +137,7 @@ class ReplayPolicy(TrackPolicy):
         number = self._episodes[start.seed]
         with open_trajectory(self._trajectory) as file:
             actions = read_actions(open_episode(file, number))
-        if actions.shape[1] != 8:
-            where = f"{self._trajectory}, traj_{number}"
-            raise EvaluationError(
-                "can't be played here", where=where, expected="8 numbers an action", found=actions.shape[1]
-            )
+        if (found := actions.shape[1]) != 8:
+            where, expected = f"{self._trajectory}, traj_{number}", "8 numbers an action"
+            raise EvaluationError("can't be played here", where=where, expected=expected, found=found)
         return JointTrack(actions)

@@ -14,7 +14,7 @@ from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.recordings.motion import sample_stride
 from robocas_ms3.demos.settings import EpisodeSettings
-from robocas_ms3.evaluation.policies.tracks import JointTrack, PoseTrack, TrackPolicy
+from robocas_ms3.evaluation.policies.replay import JointTrack, PoseTrack, TrackPolicy
 from robocas_ms3.evaluation.policy import EpisodeSpec, PolicySpec
 from robocas_ms3.robots.table import find_robot
 from robocas_ms3.scenes.task_specs import TASKS
@@ -68,12 +68,11 @@ class ScriptedPolicy(TrackPolicy):
         return track
 
     def close(self) -> None:
-        """Close the environments that it plans in."""
         for generator in self._generators.values():
             generator.close()
 
     def _generator_of(self, start: EpisodeSpec) -> EpisodeGenerator:
-        """Return the generator of an episode's scenes; of several the one used longest ago is closed."""
+        """Return the generator of an episode's scenes; the one used longest ago is closed if there are too many."""
         for name in ("config_file", "layouts_file", "pack"):
             if not getattr(start, name):
                 what, fix = "unknown configuration or scene", "Start the server with --protocol FOLDER."

@@ -64,9 +64,9 @@ def spread(values: Sequence[float], most: float) -> str:
     )
 
 
-def axis(most: float, unit: str, parts: int = 4) -> str:
+def axis(most: float, unit: str) -> str:
     """Return the labels of a bar's width."""
-    ends = [most * part / parts for part in range(parts + 1)]
+    ends = [most * part / 4 for part in range(5)]
     labels = "".join(f"<span>{end:g}{f' {unit}' if end == most else ''}</span>" for end in ends)
     return f'<div class="axis">{labels}</div>'
 

@@ -8,11 +8,11 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
-import imageio.v2 as imageio
 import torch
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.files import make_folder, replacing
+from robocas_ms3.datasets.pictures.video import open_video
 from robocas_ms3.datasets.writing.render import require_renderer
 from robocas_ms3.evaluation.policy import Policy
 from robocas_ms3.evaluation.protocol import LoadedProtocol
@@ -50,11 +50,8 @@ def film(
         EvaluationError: the result is of another protocol.
         DatasetError: there is no render device.
     """
-    expected = result.run.protocol_hash
-    if expected != protocol.hash:
-        raise EvaluationError(
-            "the result is of another protocol", where=result.folder, expected=expected, found=protocol.hash
-        )
+    if (expected := result.run.protocol_hash) != (found := protocol.hash):
+        raise EvaluationError("it is of another protocol", where=result.folder, expected=expected, found=found)
     require_renderer()
     recorder = _VideoRecorder()
     settings = EvaluationSettings(
@@ -67,7 +64,8 @@ def film(
         for number in sorted(episodes, key=lambda one: protocol.episodes[one].config):
             before, path = result.outcomes[number], result.folder / VIDEOS / video_name(number)
             # As long as the first time, so that it is the same episode whatever ended it.
-            with replacing(path) as tmp, _writer(tmp, session.rate / recorder.period * _SPEED) as recorder.writer:
+            fps = session.rate / recorder.period * _SPEED
+            with replacing(path) as tmp, open_video(tmp, fps, quality=6) as recorder.writer:
                 (outcome,) = session.play([protocol.episodes[number]], before.steps)
             yield path, outcome.without_clock() == before.without_clock()
 
@@ -84,19 +82,16 @@ class _VideoRecorder:
         self.period = 1
 
     def wrap(self, env: Any) -> _VideoRecorder:
-        """Record this environment from now on."""
         self._env = env
         return self
 
     def reset(self, **kwargs: Any) -> Any:
-        """Reset, and add an image."""
         self._steps = 0
         result = self._env.reset(**kwargs)
         self._add_image()
         return result
 
     def step(self, actions: Any) -> Any:
-        """Execute one policy step."""
         result = self._env.step(actions)
         self._steps += 1
         if self._steps % self.period == 0:
@@ -104,20 +99,7 @@ class _VideoRecorder:
         return result
 
     def close(self) -> None:
-        """Close the environment."""
         self._env.close()
 
     def _add_image(self) -> None:
         self.writer.append_data(torch.as_tensor(self._env.render())[0].cpu().numpy())
-
-
-def _writer(path: Path, fps: float) -> Any:
-    return imageio.get_writer(
-        path,
-        fps=fps,
-        codec="libx264",
-        pixelformat="yuv420p",
-        quality=6,
-        macro_block_size=2,
-        ffmpeg_log_level="error",
-    )

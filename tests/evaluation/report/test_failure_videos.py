@@ -51,16 +51,16 @@ def test_a_result_chooses_no_code(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_a_failure_is_filmed_and_linked(tmp_path, needs_renderer, capsys):
-    rules = {"name": "tiny", "description": "Half a second.", "max_seconds": {"pick": 0.5}}
+    rules = {"name": "tiny", "description": "Two steps.", "max_steps": 2, "stepping": "upstream"}
     plan = {"rules": rules, "parts": [{"config": "pick_table_scattered", "count": 1, "first_seed": 110000}]}
     list(freeze(Plan.model_validate(plan), tmp_path / "tiny"))
     out, protocol = tmp_path / "result", str(tmp_path / "tiny")
-    assert run(EvaluationSettings((), "random", protocol, out, backend="processes")) == 0
+    assert run(EvaluationSettings((), "random", protocol, out, backend="processes", weld=True)) == 0
     assert videos(Videos(out, protocol=protocol)) == 0
     said = capsys.readouterr().out
     assert "episode_00000.mp4" in said and "differently" not in said
     frames = np.stack([np.asarray(frame) for frame in imageio.get_reader(out / "videos" / "episode_00000.mp4")])
-    assert frames.shape == (3, SIZE[1], SIZE[0], 3)  # at the reset, after 4 of 10 steps, after 8
+    assert frames.shape == (3, SIZE[1], SIZE[0], 3)  # at the reset, after each of 2 steps
     assert frames.std() > 10
     page = (out / "report.html").read_text()
     assert 'href="videos/episode_00000.mp4"' in page and "1 of 1 episode, protocol" in page
