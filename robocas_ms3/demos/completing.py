@@ -14,10 +14,8 @@ from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.planning.executor import OPEN
 from robocas_ms3.planning.protocol import Array, Trajectory
 from robocas_ms3.planning.skills.arm import BACK_OUT, Arm, moved_back, plan_back_out, raised
-from robocas_ms3.planning.skills.placing import carry_to_basket, release_into_basket
 from robocas_ms3.planning.skills.removing import hang_clear
-from robocas_ms3.planning.skills.stance import drive_to_basket
-from robocas_ms3.scenes.language.templates import subgoal
+from robocas_ms3.planning.skills.stance import bring_to_basket
 
 BRAKE_SECONDS = 0.2  # held where it was taken over, until it stands; a step of a dataset at 5 Hz
 LIFT = 0.10  # m that a held target is raised before it is carried, as after a grasp (`skills.grasping`)
@@ -28,7 +26,7 @@ def complete(arm: Arm, policy: Callable[[Arm], None]) -> None:
 
     A held target is carried on; on every other attempt it is let go, since it may be held in a way that leads nowhere.
     """
-    slot = int(arm.env.target_slot[0])
+    slot = arm.target
     arm.executor.move_gripper(arm.executor.gripper, arm.at, seconds=BRAKE_SECONDS)
     if arm.executor.gripper != OPEN and arm.holds(slot) and arm.path[0] % 2 == 0:
         _carry_on(arm, slot)
@@ -39,27 +37,23 @@ def complete(arm: Arm, policy: Callable[[Arm], None]) -> None:
 
 def _carry_on(arm: Arm, slot: int) -> None:
     """Bring a target that is held into the basket."""
-    words = arm.env.target_asset().asset.name, arm.env.task_config.support
     if not arm.executor.flag("target_lifted"):
-        arm.executor.label(**subgoal("move and grasp", *words))
+        arm.begin_subgoal("move and grasp")
         with arm.planning():
             lift = arm.plan_rise(arm.planner.tcp(arm.at), LIFT, stage="lift")
         arm.follow(lift)
-    if arm.env.task_config.target.approach == "top":
+    if arm.approach == "top":
         hang_clear(arm, slot)  # it may have been lifted just above its neighbours
     if not arm.holds(slot):
         raise PlanningFailed("lift", "slipped")
-    arm.executor.label(**subgoal("transfer object", *words))
-    drive_to_basket(arm, slot)
-    carry_to_basket(arm, slot)
-    release_into_basket(arm, slot)
+    bring_to_basket(arm, slot)
 
 
 def _get_free(arm: Arm) -> None:
     """Open the gripper, and leave what the arm touches: upwards, or back where something may be above."""
     if arm.executor.gripper != OPEN:
         arm.open_gripper()
-    if arm.env.task_config.target.approach == "top":
+    if arm.approach == "top":
         arm.rise_clear()
         return
     with arm.planning():

@@ -21,16 +21,13 @@ LIMIT_MARGIN = 0.02  # rad kept from every joint limit
 class ArmChain:
     """Seven joints that turn about z of their own links, and the TCP fixed to the last.
 
-    ``robots.kinematics.SerialChain`` serves controllers on a GPU, and gives only the pose of its tip. This class gives
-    the frames of all links, for collision checks, in NumPy without BLAS, so that plans repeat exactly.
+    `robots.kinematics.SerialChain` serves controllers on a GPU; this class gives the frames of all links, in NumPy
+    without BLAS, so that plans repeat exactly.
 
     Attributes:
-        robot: description of the robot that carries the arm.
         links: eight fixed transforms 4x4: from each link to the next one at 0 rad, the last to the TCP.
         hand_in_tcp: 4x4.
-        limits: (7, 2) lower and upper joint limits, rad.
-        lower: (7,) lower joint limits with a margin, rad.
-        upper: (7,) upper joint limits with a margin, rad.
+        limits: (7, 2) lower and upper joint limits, rad; ``lower`` and ``upper`` (7,) are these with a margin.
 
     Raises:
         RobotDescriptionError: the URDF of the arm is missing or malformed, or it does not describe that arm.

@@ -35,10 +35,7 @@ class FclWorld:
     Args:
         urdf: the arm alone, rooted at its base.
         srdf: pairs of its links that need no check.
-        robot: description of the robot that carries the arm.
-
-    Attributes:
-        chain: kinematic chain of the arm.
+        robot: that carries the arm.
 
     Raises:
         RobotDescriptionError: a file is missing or unusable, or a geometry is not supported.
@@ -220,8 +217,7 @@ class FclWorld:
     ) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
         """Return the pairs whose boxes overlap, for frames at rotations (8, M, 3, 3) and positions (8, M, 3).
 
-        Returns:
-            (n, 2) configuration and pair of parts; (m, 3) configuration, part and obstacle's piece.
+        They are (n, 2) configuration and pair of parts, and (m, 3) configuration, part and obstacle's piece.
         """
         bounds = self._closed_bounds + (self._open_bounds - self._closed_bounds) * (width / self._open_width)
         moving = self._moving if self._held else self._moving[:-1]

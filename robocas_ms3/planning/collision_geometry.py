@@ -29,11 +29,9 @@ class CollisionPart:
     """One convex collision geometry of a link.
 
     Attributes:
-        link: name of the link.
-        frame: frame that the part moves with: ``BASE``, 0 to 6 (links 1 to 7), or ``TCP``.
-        pose: (4, 4) pose of the part in that frame, with closed fingers.
-        slide: (3,) displacement of the part in that frame per metre of its finger joint; zero where no finger moves it.
-        geometry: FCL geometry.
+        frame: that the part moves with: ``BASE``, 0 to 6 (links 1 to 7), or ``TCP``.
+        pose: (4, 4) of the part in that frame, with closed fingers.
+        slide: (3,) displacement in that frame per metre of its finger joint; zero where no finger moves it.
         corners: (V, 3) points whose convex hull contains the part, in the part's frame, m.
     """
 
@@ -51,13 +49,9 @@ class CollisionPart:
 
 
 def read_collision_parts(urdf: Path | str, chain: ArmChain) -> list[CollisionPart]:
-    """Read the collision parts of all links from the arm's base link downwards.
+    """Read the collision parts of all links from the arm's base link downwards; raises `RobotDescriptionError`.
 
     A joint that is neither an arm joint nor a finger joint is taken at its zero position.
-
-    Raises:
-        RobotDescriptionError: the URDF is malformed, a mesh is missing or unreadable, a geometry has another type than
-            mesh, box, cylinder or sphere, or a finger joint is not prismatic.
     """
     robot, file = chain.robot, DescriptionFile(urdf)
     links = {file.attribute(link, "name"): link for link in file.root.iterfind("link")}

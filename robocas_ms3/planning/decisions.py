@@ -71,7 +71,6 @@ class StraightDecisions:
     done: Callable[[], int]
 
     def choose(self, candidates: Iterable[T], play: Callable[[T], float], effort: Effort = ONE_BY_ONE) -> T:
-        """Choose; see `Decisions`."""
         failure = PlanningFailed("decision", "no_candidate")
         for candidate in candidates:
             before = self.done()
@@ -96,7 +95,6 @@ class Seconds:
 
     @contextmanager
     def spent_on(self, part: str) -> Iterator[None]:
-        """Add the time spent inside to a part."""
         start = time.process_time()
         try:
             yield

@@ -18,13 +18,7 @@ OPEN, CLOSED = 1.0, -1.0
 
 @dataclass
 class Segment:
-    """A part of the demonstration with one sub-goal.
-
-    Attributes:
-        goal_type: one of the dataset's types, e.g. ``move and grasp``.
-        goal_description: the sub-goal in words.
-        first: index of its first action.
-    """
+    """A part of the demonstration with one sub-goal, from the action of index ``first`` on."""
 
     goal_type: str
     goal_description: str
@@ -36,14 +30,12 @@ class Executor:
     """Steps one environment (``pd_joint_pos`` or ``pd_joint_pos_base``, one env); keeps all actions since the reset.
 
     Attributes:
-        env: the environment, possibly wrapped by a recorder.
-        seed: the episode's seed.
+        env: may be wrapped by a recorder.
         actions: every action since the reset, (8,) each, or (11,) where the base is driven.
         segments: the sub-goals so far.
         info: of the last step or reset.
         gripper: last command of the gripper.
         base: (3,) last command of the base joints: x m, y m, yaw rad.
-        seconds: where the time went.
         facts: counters of the policy for the record, e.g. ``pushes``.
         rehearse: replays the actions so far open loop; raises ``EpisodeLost`` where the outcome differs.
     """
@@ -61,18 +53,15 @@ class Executor:
 
     @property
     def base_env(self) -> RoboCASEnv:
-        """The environment under its wrappers."""
         env = self.env.unwrapped
         assert isinstance(env, RoboCASEnv)
         return env
 
     @property
     def dt(self) -> float:
-        """Seconds a control step takes."""
         return self.base_env.control_timestep
 
     def reset(self) -> None:
-        """Start the episode from its seed, forgetting all actions."""
         with self.seconds.spent_on("reset"):
             _, self.info = self.env.reset(seed=self.seed)
         self.actions, self.segments, self.gripper, self.base = [], [], OPEN, np.zeros(3)
@@ -81,8 +70,7 @@ class Executor:
     def follow(self, trajectory: Trajectory, *, until: str | None = None) -> bool:
         """Send a trajectory's rows to the arm, holding the gripper's command.
 
-        With ``until`` it stops as soon as that flag of ``info`` is set, and returns whether it is; else it returns
-        True.
+        It stops as soon as the flag ``until`` of ``info`` is set; returns whether it is, or True without one.
         """
         for qpos in trajectory.qpos:
             if until and self.flag(until):
@@ -98,7 +86,6 @@ class Executor:
 
     @property
     def drives(self) -> bool:
-        """Whether actions command the base too."""
         return self.base_env.control_mode.endswith("_base")
 
     def drive(self, waypoints: Array, hold: Array) -> None:
@@ -122,7 +109,6 @@ class Executor:
             self.segments.append(Segment(goal_type, goal_description, len(self.actions)))
 
     def flag(self, name: str) -> bool:
-        """Return a bool of the last ``info``."""
         return bool(self.info[name][0])
 
     def _step(self, action: np.ndarray) -> None:

@@ -34,9 +34,7 @@ class Grasps:
     """Grasps that a robot could try; the second half are the first half with the wrist turned by 180 deg.
 
     Attributes:
-        tcp_in_world: (2K, 4, 4).
         widths: (2K,) opening the object needs there, m.
-        qualities: (2K,), more is better.
         index: (2K,) of each one among the annotated grasps.
     """
 
@@ -72,9 +70,8 @@ def grip_margins(tcp: Array, widths: Array, surface: Array) -> Array:
     beside the object while the gripper is open.
 
     Args:
-        tcp: (N, 4, 4) grasps, in the frame of the points.
+        tcp: (N, 4, 4) grasps, in the frame of ``surface`` (P, 3), points of the object 5 mm apart, m.
         widths: (N,) of the object there, m.
-        surface: (P, 3) of the object, m, 5 mm apart.
     """
     margin = np.clip((MAX_WIDTH - np.asarray(widths)) / 2 / ROOM_BESIDE, 0, 1)
     widest, deepest = np.abs(GRIP_SHIFTS).max(axis=0)
@@ -102,12 +99,9 @@ def score_grasps(
     steepness (1 straight down, 0 level; from the front the other way round), nearness in joint space, and the margin.
 
     Args:
-        tcp: (N, 4, 4) in any upright frame.
-        qualities: (N,), more is better.
-        margins: (N,) of `grip_margins`.
+        tcp: (N, 4, 4) in any upright frame, which ``object_center`` (3,) is in too.
+        qualities, margins: (N,), more is better.
         turns: (N,) rad, of the joint that turns most on the way there, which sets the time.
-        object_center: (3,) in the same frame.
-        approach: from where the gripper comes.
     """
     quality = qualities / max(float(np.abs(qualities).max()), 1e-9)
     distance = np.linalg.norm(tcp[:, :3, 3] - object_center, axis=1)
@@ -117,9 +111,6 @@ def score_grasps(
 
 
 def draw_order(rng: np.random.Generator, scores: Array) -> NDArray[np.int_]:
-    """Order grasps by score (N,), with some chance so that a retry tries others.
-
-    A grasp overtakes one whose score is 0.15 better about one time in four.
-    """
+    """Order grasps by score (N,), with some chance: one overtakes one that is 0.15 better about one time in four."""
     # Gumbel noise turns scores into draws without replacement, weighted by exp(score / TEMPERATURE).
     return np.argsort(-(scores + TEMPERATURE * rng.gumbel(size=len(scores))), kind="stable")

@@ -39,14 +39,10 @@ class Reachability:
         self._geometry = load(self.chain.robot.inverse_kinematics)(self.chain)
 
     def reachable(self, tcp_in_base: Array, near: Array) -> tuple[NDArray[np.bool_], Array]:
-        """Solve inverse kinematics for many poses at once.
-
-        Args:
-            tcp_in_base: (N, 4, 4).
-            near: (7,) preferred configuration; of a pose's solutions the nearest is kept.
+        """Find for each pose (N, 4, 4) the solution that is nearest to a configuration (7,).
 
         Returns:
-            (N,) whether a configuration inside the joint limits was found, and (N, 7) that one, NaN where none.
+            (N,) whether there is one inside the joint limits, and (N, 7) that one, NaN where none.
         """
         poses, near = np.asarray(tcp_in_base, dtype=np.float64).reshape(-1, 4, 4), np.asarray(near, dtype=np.float64)
         if len(poses) == 0:
@@ -101,8 +97,7 @@ def newton_step(chain: ArmChain, qpos: Array, goals: Array) -> tuple[Array, Arra
     the processor and on the number of threads.
 
     Args:
-        chain: the arm.
-        qpos: (M, 7) configurations, rad.
+        qpos: (M, 7) rad.
         goals: (M, 4, 4) TCP poses in the base frame.
 
     Returns:
@@ -136,8 +131,7 @@ def follow_line(chain: ArmChain, start: Array, tcp_in_base: Array, *, stage: str
         (n, 7) configurations whose TCP poses are at most 1 cm and 3 deg apart; the first is ``start``.
 
     Raises:
-        PlanningFailed: ``line_unreachable`` (a pose has no configuration near the previous one within the joint
-            limits) or ``line_joint_jump``.
+        PlanningFailed: ``line_unreachable``, or ``line_joint_jump``.
     """
     start = np.asarray(start, dtype=np.float64)
     goals = _line_poses(chain.tcp(start[None])[0], tcp_in_base)

@@ -104,7 +104,6 @@ class PandaArmMotionPlanningSolver:
 
     @property
     def arm_base_in_world(self) -> Array:
-        """4x4."""
         arm_base = from_wxyz(self.robot.links_map[self.description.arm_base_link].pose.raw_pose[0])
         if self._base_pose is None:
             return arm_base
@@ -140,7 +139,6 @@ class PandaArmMotionPlanningSolver:
         return self._move_gripper(t, gripper_state)
 
     def close_gripper(self, t: int = 6, gripper_state: float = CLOSED) -> Step:
-        """Close the gripper likewise."""
         return self._move_gripper(t, gripper_state)
 
     def add_box_collision(self, extents: Array, pose: sapien.Pose | Pose) -> None:
@@ -192,7 +190,6 @@ class PandaArmMotionPlanningSolver:
         return self._run(np.tile(self._arm_qpos, (t, 1)), np.zeros((t, 7)))
 
     def _run(self, qpos: Array, qvel: Array) -> Step:
-        """Send targets (T, 7) rad and (T, 7) rad/s."""
         arm = (qpos, qvel) if self.control_mode == "pd_joint_pos_vel" else (qpos,)
         gripper, step = np.full((len(qpos), 1), self.gripper_state), None
         for action in np.hstack([*arm, gripper]).astype(np.float32):

@@ -22,8 +22,6 @@ class BudgetSpent(Exception):
 
 
 class _Tree:
-    """Nodes of one tree, with room that grows."""
-
     def __init__(self, roots: list[Array]) -> None:
         self.qpos = np.empty((256, len(roots[0])))
         self.parent: list[int] = []
@@ -55,8 +53,7 @@ class PathSearch:
 
     Args:
         free_until: says how many of some configurations (M, n) are free before the first one that is not.
-        lower: (n,) joint limits, rad.
-        upper: (n,).
+        lower, upper: (n,) joint limits, rad.
         step: longest extension of a tree, rad (norm over the joints).
         spacing: distance of checks along an edge, rad (norm).
     """

@@ -32,12 +32,7 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class AttachedBody:
-    """An object held by the gripper, for collision checking.
-
-    Attributes:
-        vertices: (V, 3) points whose convex hull stands for the object, in the object's frame, m.
-        object_in_tcp: 4x4.
-    """
+    """An object in the gripper: the convex hull of vertices (V, 3) m in its frame, which is 4x4 in the TCP's."""
 
     vertices: Array
     object_in_tcp: Array
@@ -58,14 +53,7 @@ class Shape:
 
 @dataclass(frozen=True)
 class Obstacle:
-    """A rigid body that must not be touched.
-
-    Attributes:
-        name: for people.
-        shape: its form.
-        pose_in_base: 4x4 of its frame.
-        room: to keep to it, m.
-    """
+    """A rigid body that must not be touched, the pose of its frame (4x4), and how much room to keep to it, m."""
 
     name: str
     shape: Shape
@@ -138,9 +126,6 @@ class Planner(Protocol):
         """Move the TCP on a straight line (and shortest rotation) from where ``start`` (7,) has it to a pose (4x4).
 
         Args:
-            start: (7,).
-            tcp_in_base: 4x4 goal.
-            stage: name for errors.
             check_collisions: whether obstacles may not be touched (self-collisions always count).
             speed: fraction of the velocity and acceleration limits.
         """

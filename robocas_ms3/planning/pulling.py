@@ -35,10 +35,8 @@ def track(chain: ArmChain, starts: Array, goals: Array) -> Array:
     """Follow poses of a bar with the TCP, free to turn about the bar by up to ``MAX_SLIP``.
 
     Args:
-        chain: the arm.
         starts: (N, 7) configurations at (or near) the first pose.
-        goals: (T, 4, 4) TCP poses in the arm's base frame that hold the bar squarely, a centimetre or so apart; or
-            (T, N, 4, 4), each start's own.
+        goals: (T, 4, 4) or (T, N, 4, 4) TCP poses in the arm's base frame that hold the bar squarely, about 1 cm apart.
 
     Returns:
         (T, N, 7) rad; NaN from where a start leads no further: out of reach, a joint limit, or a jump.

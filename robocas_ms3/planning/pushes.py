@@ -27,13 +27,7 @@ YAWS = 4  # turns of the tool about the vertical, of half a turn
 
 @dataclass(frozen=True)
 class Push:
-    """A push to try, in the arm's base frame.
-
-    Attributes:
-        start: 4x4 of the TCP beside the object.
-        direction: (3,) unit, level.
-        length: m, the tool's way.
-    """
+    """A push to try: the TCP's start (4x4), its direction (3,), level and of length 1, and the length of its way, m."""
 
     start: Array
     direction: Array
@@ -62,7 +56,6 @@ def candidates(
     touches at the target's height, or at the nearest height above it at which there is room for it.
 
     Args:
-        rng: source of all randomness.
         points: (P, 3) surface of the object, upright frame, m.
         target: (3,) middle of the target.
         others: (Q, 3) surfaces of everything else.

@@ -235,11 +235,6 @@ BACKENDS: Registry[Callable[..., Planner]] = Registry(
 
 
 def make_planner(name: str, robot: RobotSpec, *, dt: float) -> Planner:
-    """Make the planner of a name for a robot's arm, with trajectories of time step ``dt`` (s).
-
-    Raises:
-        ExtensionError: there is no such planner, or another package's can't be loaded.
-        RobotDescriptionError: it can't load the robot's files.
-    """
+    """Make the planner of a name for a robot's arm, with trajectories of time step ``dt`` (s)."""
     backend, files = BACKENDS.find(name, where="planner"), robot.files()
     return backend(files.arm_urdf, files.arm_srdf, robot=robot.description, dt=dt)

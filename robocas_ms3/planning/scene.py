@@ -85,26 +85,26 @@ class PlanningScene:
 
     @property
     def arm_base_in_world(self) -> Array:
-        """4x4 of the arm's base in the world."""
         return from_wxyz(self.env.agent.arm_base_link.pose.raw_pose[0])
 
     @property
     def tcp_in_base(self) -> Array:
-        """4x4 of the TCP in the arm's base frame."""
         return inverse(self.arm_base_in_world) @ from_wxyz(self.env.agent.tcp.pose.raw_pose[0])
 
     @property
     def arm_qpos(self) -> Array:
-        """(7,) rad, where the arm is."""
         return self.env.agent.robot.get_qpos()[0, self.env.agent.description.arm_slice].cpu().numpy().astype(float)
 
     def object_in_base(self, slot: int) -> Array:
         """Return the pose (4x4) of an object in the arm's base frame."""
         return inverse(self.arm_base_in_world) @ from_wxyz(self.env.object_states[0, slot, :7])
 
+    def object_surface(self, slot: int) -> Array:
+        """Return samples (P, 3) of an object's surface."""
+        return transform(self.object_in_base(slot), self.env.object_assets[0][slot].surface_points(SPACING))
+
     @property
     def basket_in_base(self) -> Array:
-        """4x4 of the basket's frame in the arm's base frame."""
         return inverse(self.arm_base_in_world) @ from_wxyz(self.env.basket_pose[0])
 
     def obstacles(
@@ -139,10 +139,7 @@ class PlanningScene:
     ) -> Array:
         """Return samples (P, 3) of the collision surfaces of furniture, basket and present objects.
 
-        Args:
-            without: slot or slots of objects to leave out.
-            radius: m around ``around``, beyond which samples are left out.
-            around: (3,); default: the arm's base.
+        They are at most ``radius`` m from ``around`` (3,), by default the arm's base.
         """
         to_base = inverse(self.arm_base_in_world)
         center = np.zeros(3) if around is None else around

@@ -37,22 +37,18 @@ class JointPath:
 
     @property
     def dof(self) -> int:
-        """Number of joints."""
         return int(self._curve.c.shape[2])
 
     @property
     def path_interval(self) -> Array:
-        """First and last position."""
         return self._curve.x[[0, -1]]
 
     @property
     def waypoints(self) -> Array:
-        """Where the pieces join."""
         return self._curve.x
 
     @property
     def length(self) -> float:
-        """Length of the parameter, rad."""
         return float(self._curve.x[-1])
 
     def dense(self, spacing: float) -> Array:

@@ -25,10 +25,7 @@ def grasp_poses(count: int, seed: int) -> np.ndarray:
     return np.array(poses)
 
 
-def test_jacobian_is_the_derivative_and_agrees_with_pytorch_kinematics(reachability, panda_files):
-    import pytorch_kinematics as pk
-    import torch
-
+def test_jacobian_is_the_derivative(reachability):
     qpos = np.random.default_rng(0).uniform(-1, 1, (4, 7))
     pose, jacobian = reachability.chain.jacobian(qpos)
     for joint in range(7):
@@ -36,11 +33,6 @@ def test_jacobian_is_the_derivative_and_agrees_with_pytorch_kinematics(reachabil
         step[joint] = 1e-6
         moved, _ = reachability.chain.jacobian(qpos + step)
         np.testing.assert_allclose(twist(pose, moved) / 1e-6, jacobian[:, :, joint], atol=1e-5)
-    text = panda_files.arm_urdf.read_bytes()
-    chain = pk.build_serial_chain_from_urdf(text, "panda_hand_tcp", "panda_link0").to(dtype=torch.float64)
-    theirs, their_pose = chain.jacobian(torch.as_tensor(qpos), ret_eef_pose=True)
-    np.testing.assert_allclose(jacobian, theirs.numpy(), atol=1e-6)
-    np.testing.assert_allclose(pose, their_pose.numpy(), atol=1e-6)
 
 
 def anywhere(chain: ArmChain, count: int, seed: int) -> np.ndarray:

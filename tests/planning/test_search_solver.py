@@ -13,12 +13,11 @@ from robocas_ms3.planning.solvers import search
 @pytest.fixture
 def arm(monkeypatch):
     """An arm whose actions are words; nothing is free, and the only move is to push something."""
-    asset = SimpleNamespace(asset=SimpleNamespace(name="mug"))
-    env = SimpleNamespace(target_slot=[0], target_asset=lambda: asset, task_config=SimpleNamespace(support="table"))
     done: list[str] = []
-    executor = SimpleNamespace(actions=done, facts={}, label=lambda **words: None, rehearse=lambda: None)
+    executor = SimpleNamespace(actions=done, facts={}, rehearse=lambda: None)
     decisions = StraightDecisions(lambda: len(done))
-    arm = SimpleNamespace(env=env, executor=executor, choose=decisions.choose, planning=nullcontext)
+    arm = SimpleNamespace(target=0, executor=executor, choose=decisions.choose, planning=nullcontext)
+    arm.begin_subgoal = lambda goal_type: None
 
     class Heap:
         cleared = uncovered = False

@@ -30,9 +30,9 @@ class _Planner:
 @pytest.fixture
 def arm(reachability):
     robot = SimpleNamespace(pose=SimpleNamespace(raw_pose=np.array([[0.0, 0, 0, 1, 0, 0, 0]])))
-    config = SimpleNamespace(target=SimpleNamespace(approach="top"))
-    env = SimpleNamespace(agent=SimpleNamespace(robot=robot), task_config=config)
-    return SimpleNamespace(env=env, robot=MOBILE_PANDA, reachability=reachability, planner=_Planner(), at=REST)
+    env = SimpleNamespace(agent=SimpleNamespace(robot=robot))
+    tools = {"robot": MOBILE_PANDA, "reachability": reachability, "planner": _Planner()}
+    return SimpleNamespace(env=env, at=REST, approach="top", **tools)
 
 
 def grasps_in_world(arm) -> np.ndarray:

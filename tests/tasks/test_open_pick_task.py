@@ -150,8 +150,8 @@ def test_a_pull_opens_by_contact_and_leaves_the_handle(tmp_path):
         assert part.position(arm) == pytest.approx(0.95 * part.end, abs=0.01)
         assert bool(arm.env.furniture_opened()[0])
         # the gripper is open and off the handle
-        bar = part.in_base(arm, np.array([part.position(arm)]))[0] @ part.hold
-        assert (np.linalg.inv(bar) @ arm.scene.tcp_in_base)[2, 3] < -0.05
+        bar = part.in_world(arm, np.array([part.position(arm)]))[0] @ part.hold
+        assert (np.linalg.inv(bar) @ arm.scene.arm_base_in_world @ arm.scene.tcp_in_base)[2, 3] < -0.05
         arm.planner.set_scene(arm.scene.obstacles())
         assert arm.planner.collisions(arm.scene.arm_qpos) == []
         assert int(arm.env.evaluate()["disturbed"][0]) == 0

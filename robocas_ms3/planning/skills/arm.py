@@ -15,11 +15,13 @@ from robocas_ms3.planning.kinematics import Reachability
 from robocas_ms3.planning.protocol import Array, Planner, Trajectory
 from robocas_ms3.planning.scene import PlanningScene
 from robocas_ms3.robots.description import RobotDescription
+from robocas_ms3.scenes.grasping import Approach
+from robocas_ms3.scenes.language.templates import subgoal
 from robocas_ms3.tasks.base import RoboCASEnv
 
 T = TypeVar("T")
 Plan = TypeVar("Plan")
-OPEN_SECONDS, CLOSE_SECONDS = 0.50, 0.50  # a dataset at 5 Hz may give either command 0.2 s later
+GRIPPER_SECONDS = 0.5  # a dataset at 5 Hz may give its command 0.2 s later
 # m kept to furniture and basket where there is a way that does, as a robot may be off: on straight ways, while carrying
 ROOM, CARRYING_ROOM = 0.012, 0.024
 RISE, RISES = 0.04, 4  # m a step, steps
@@ -33,9 +35,7 @@ class Arm:
     """One attempt's tools. All poses are in the arm's base frame.
 
     Attributes:
-        planner: motion planner.
         reachability: batched inverse kinematics of the same arm.
-        executor: runs motions in the environment and remembers them.
         decisions: plays what `choose` is given.
         path: the attempt's number, and which candidate was taken at each decision since.
         rng: source of all randomness, made anew for each candidate: what was tried before must not matter.
@@ -55,14 +55,10 @@ class Arm:
         self.at = self.scene.arm_qpos
         self.hold_nothing()
         self._seed()
-        with self.planning():
-            self._prepare()
-
-    def _prepare(self) -> None:
-        """Work out before the first decision what is kept for as long as the process runs."""
-        self.scene.sample_surfaces()
-        for room in (CARRYING_ROOM, ROOM, 0.0):
-            self.planner.set_scene(self.scene.obstacles(room=room))
+        with self.planning():  # before the first decision: what is kept for as long as the process runs
+            self.scene.sample_surfaces()
+            for room in (CARRYING_ROOM, ROOM, 0.0):
+                self.planner.set_scene(self.scene.obstacles(room=room))
 
     def _seed(self) -> None:
         entropy = np.random.SeedSequence([self.executor.seed, *self.path])
@@ -92,8 +88,22 @@ class Arm:
 
     @property
     def robot(self) -> RobotDescription:
-        """What the environment's robot is."""
         return self.env.agent.description
+
+    @property
+    def target(self) -> int:
+        """Slot of the target."""
+        return int(self.env.target_slot[0])
+
+    @property
+    def approach(self) -> Approach:
+        """From where the target is grasped."""
+        return self.env.task_config.target.approach
+
+    def begin_subgoal(self, goal_type: str) -> None:
+        """Label the actions that follow, see ``Executor.label``."""
+        words = self.env.target_asset().asset.name, self.env.task_config.support
+        self.executor.label(**subgoal(goal_type, *words))
 
     def planning(self):
         """Count the time spent inside as planning."""
@@ -108,12 +118,10 @@ class Arm:
         return reached
 
     def open_gripper(self) -> None:
-        """Open the gripper, the arm standing still."""
-        self.executor.move_gripper(OPEN, self.at, seconds=OPEN_SECONDS)
+        self.executor.move_gripper(OPEN, self.at, seconds=GRIPPER_SECONDS)
 
     def close_gripper(self) -> None:
-        """Close the gripper, the arm standing still."""
-        self.executor.move_gripper(CLOSED, self.at, seconds=CLOSE_SECONDS)
+        self.executor.move_gripper(CLOSED, self.at, seconds=GRIPPER_SECONDS)
 
     def hold_nothing(self) -> None:
         """Tell the planner that the gripper is empty and open."""
@@ -135,7 +143,6 @@ class Arm:
         )
 
     def plan_home(self, start: Array) -> Trajectory:
-        """Plan to the rest configuration."""
         return self.planner.plan_to_qpos(start, [np.array(self.robot.arm_rest)], stage="home")
 
     def rise_clear(self, *, without: int | Collection[int] = ()) -> None:
@@ -192,7 +199,7 @@ def plan_back_out(arm: Arm, goals: list[Array]) -> Trajectory:
     try:
         return arm.first_line(arm.at, goals, stage="retreat")
     except PlanningFailed:
-        arm.planner.set_scene(arm.scene.obstacles(without=int(arm.env.target_slot[0])))
+        arm.planner.set_scene(arm.scene.obstacles(without=arm.target))
         return arm.first_line(arm.at, goals, stage="retreat")
 
 
@@ -207,7 +214,7 @@ def back_out(arm: Arm) -> None:
     with arm.planning():
         tcp = arm.planner.tcp(arm.at)
         arm.planner.set_scene(arm.scene.obstacles())
-        if arm.env.task_config.target.approach == "top" and tcp[2, 2] < POINTS_DOWN:
+        if arm.approach == "top" and tcp[2, 2] < POINTS_DOWN:
             motion = arm.plan_rise(arm.scene.tcp_in_base, BACK_OUT_RISE, stage="recover")
         else:
             motion = plan_back_out(arm, [moved_back(tcp, distance) for distance in BACK_OUT])

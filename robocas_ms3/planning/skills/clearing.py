@@ -9,7 +9,6 @@ from typing import Literal
 import numpy as np
 
 from robocas_ms3.core.errors import EpisodeLost, PlanningFailed
-from robocas_ms3.core.poses import transform
 from robocas_ms3.planning.executor import OPEN
 from robocas_ms3.planning.protocol import Array
 from robocas_ms3.planning.skills.arm import Arm
@@ -92,7 +91,7 @@ class Heap:
     def _in_the_way(self) -> list[int]:
         """Return slots of what hides or surrounds the target, the highest first, then of what blocks its grasps."""
         obstacles = np.flatnonzero(self.env.clutter().obstacles[0].cpu().numpy()).tolist()
-        obstacles.sort(key=lambda slot: -self._points(slot)[:, 2].max())
+        obstacles.sort(key=lambda slot: -self.arm.scene.object_surface(slot)[:, 2].max())
         order = dict.fromkeys(obstacles[:LOOKED_AT])
         order |= dict.fromkeys(slot for slot in blockers(self.arm, self.target)[:LOOKED_AT] if slot not in order)
         return [slot for slot in order if slot != self.target][:LOOKED_AT]
@@ -138,7 +137,4 @@ class Heap:
 
     def middle(self, slot: int) -> Array:
         """Return the middle (3,) of an object's surface."""
-        return self._points(slot).mean(axis=0)
-
-    def _points(self, slot: int) -> Array:
-        return transform(self.arm.scene.object_in_base(slot), self.env.object_assets[0][slot].surface_points())
+        return self.arm.scene.object_surface(slot).mean(axis=0)

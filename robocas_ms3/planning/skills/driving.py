@@ -34,19 +34,13 @@ DETOURS = (0.15, 0.30)  # m straight back first
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Obstacles of a drive, in the world.
-
-    Attributes:
-        obstacles: for the arm.
-        cloud: (P, 3) thinned samples of the same surfaces, for the body on the floor, m.
-    """
+    """What is around a drive, in the world: bodies for the arm, samples (P, 3) for the body on the floor, m."""
 
     obstacles: list[Obstacle]
     cloud: Array
 
 
 def surroundings(arm: Arm, *, without: int | tuple[()] = ()) -> Surroundings:
-    """Return everything around the robot, without one object."""
     cloud = arm.scene.obstacles_in_base(without=without, radius=np.inf)[::THINNED]
     obstacles = arm.scene.obstacles_in_world(without=without)
     return Surroundings(obstacles, transform(arm.scene.arm_base_in_world, cloud))
@@ -94,11 +88,7 @@ def best_route(
 ) -> list[Array]:
     """Return base poses that lead to the best of the first few goals (N, 3) where the body is free.
 
-    Args:
-        goals: the most promising first.
-        around: what is in the way.
-        judge: value of a base pose (3,), more is better; 0: useless.
-        enough: value at which no other goal is judged.
+    ``judge`` returns the value of a base pose (3,), 0: useless; at a value of ``enough`` no other goal is judged.
     """
     best: tuple[float, list[Array]] = (0.0, [])
     tried = 0

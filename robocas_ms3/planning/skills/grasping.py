@@ -6,7 +6,6 @@ From above: lift it. From the front: lift it a little, then withdraw straight ba
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import islice
 
 import numpy as np
@@ -18,7 +17,7 @@ from robocas_ms3.planning.grasp_choice import draw_order, filter_grasps, grip_ma
 from robocas_ms3.planning.protocol import Array, AttachedBody, Trajectory
 from robocas_ms3.planning.scene import SPACING
 from robocas_ms3.planning.skills.arm import ROOM, Arm, moved_back, raised
-from robocas_ms3.scenes.grasping import NEIGHBOURHOOD, PREGRASP_DISTANCE, Approach, gripper_is_clear
+from robocas_ms3.scenes.grasping import NEIGHBOURHOOD, PREGRASP_DISTANCE, gripper_is_clear
 
 GRASPS_CHECKED = 48  # grasps of which a check of collisions says whether to try them early
 CLEARED_AT_ONCE = 12
@@ -31,53 +30,45 @@ GRASPS_PLANNED = 12  # grasps that motions are planned for before an attempt giv
 FRONT_LIFTS = (0.04, 0.08, 0.14, 0.2)
 WITHDRAWALS = (0.25, 0.18, 0.12)  # m, straight back; the first one that can be reached
 
-_Way = tuple[Array, Trajectory, tuple[Trajectory, ...]]  # pre-grasp configuration, way in, way out
-
-
-@dataclass(frozen=True)
-class GraspPlan:
-    """Motions from where the arm is to a grasped object that is clear of its surroundings."""
-
-    way_in: Trajectory
-    retreat: tuple[Trajectory, ...]
+Out = tuple[Trajectory, ...]
 
 
 def grasp(arm: Arm, slot: int, *, lift_height: float = 0.10, other_than: int = 0) -> None:
     """Plan a grasp of an object, run it, and lift (from the front: lift and withdraw) the object.
 
     Args:
-        lift_height: when grasping from above, m (upstream: 0.10 when picking, 0.15 when searching).
+        lift_height: when grasping from above, m (RoboCAS-v0: 0.10 when picking, 0.15 when searching).
         other_than: how many kinds of grasps to leave out, the best first.
     """
     with arm.planning():
-        plan = plan_grasp(arm, slot, lift_height, arm.env.task_config.target.approach, other_than)
-    arm.follow(plan.way_in)
+        way_in, out = plan_grasp(arm, slot, lift_height, other_than)
+    arm.follow(way_in)
     arm.close_gripper()
     if not arm.holds(slot):
         raise PlanningFailed("grasp", "missed")
-    arm.follow(*plan.retreat)
+    arm.follow(*out)
     if not arm.holds(slot):
         raise PlanningFailed("lift", "slipped")
 
 
-def plan_grasp(arm: Arm, slot: int, lift_height: float, approach: Approach = "top", other_than: int = 0) -> GraspPlan:
-    """Plan the best grasp that has a way in and out."""
+def plan_grasp(arm: Arm, slot: int, lift_height: float, other_than: int = 0) -> tuple[Trajectory, Out]:
+    """Plan from where the arm is to the best grasp that has a way in and out, and out of the object's surroundings."""
     planner, failure = arm.planner, PlanningFailed("grasp_sampling", "no_feasible_grasp")
     everything, others = arm.scene.obstacles(), arm.scene.obstacles(without=slot)
     with_room = arm.scene.obstacles(room=ROOM)
-    ways: list[_Way] = []
+    ways: list[tuple[Array, Trajectory, Out]] = []  # pre-grasp configuration, way in, way out
 
-    def finished(reach: Trajectory, inward: Trajectory, out: tuple[Trajectory, ...]) -> GraspPlan:
+    def finished(reach: Trajectory, inward: Trajectory, out: Out) -> tuple[Trajectory, Out]:
         planner.set_scene(everything)
-        return GraspPlan(planner.join(arm.at, reach, inward), out)
+        return planner.join(arm.at, reach, inward), out
 
-    def searched() -> GraspPlan:
+    def searched() -> tuple[Trajectory, Out]:
         planner.set_scene(everything)
         reach = planner.plan_to_qpos(arm.at, [way[0] for way in ways], stage="reach")
         _, inward, out = min(ways, key=lambda way: float(np.abs(way[0] - reach.qpos[-1]).max()))
         return finished(reach, inward, out)
 
-    for tcp_in_base in candidates(arm, slot, approach, other_than):
+    for tcp_in_base in candidates(arm, slot, other_than):
         # in and out of the target's surroundings, where the target itself is no obstacle; it is one on the way there
         planner.set_scene(others)
         starts = planner.ik(moved_back(tcp_in_base, PREGRASP_DISTANCE), arm.at)[:ENTRIES]
@@ -90,7 +81,7 @@ def plan_grasp(arm: Arm, slot: int, lift_height: float, approach: Approach = "to
                 reach = None
             try:
                 planner.set_scene(others)
-                inward, out = _plan_way_in_and_out(arm, slot, start, tcp_in_base, lift_height, approach)
+                inward, out = _plan_way_in_and_out(arm, slot, start, tcp_in_base, lift_height)
             except PlanningFailed as error:
                 failure = error
                 continue
@@ -108,11 +99,11 @@ def plan_grasp(arm: Arm, slot: int, lift_height: float, approach: Approach = "to
     raise failure
 
 
-def candidates(arm: Arm, slot: int, approach: Approach = "top", other_than: int = 0) -> Iterator[Array]:
+def candidates(arm: Arm, slot: int, other_than: int) -> Iterator[Array]:
     """Yield grasps worth planning for, best first, as TCP poses 4x4; without the best few kinds (``other_than``)."""
     notes = arm.env.object_assets[0][slot].annotations
     base, object_in_base = arm.scene.arm_base_in_world, arm.scene.object_in_base(slot)
-    kept = filter_grasps(notes, base @ object_in_base, base, approach)
+    kept = filter_grasps(notes, base @ object_in_base, base, arm.approach)
     tcp_in_base = inverse(base) @ kept.tcp_in_world
     solved, qpos = arm.reachability.reachable(tcp_in_base, arm.at)
     solved_before, qpos_before = arm.reachability.reachable(moved_back(tcp_in_base, PREGRASP_DISTANCE), arm.at)
@@ -126,12 +117,12 @@ def candidates(arm: Arm, slot: int, approach: Approach = "top", other_than: int 
         grip_margins(notes.grasps_tcp_in_object[kept.index[reachable]], kept.widths[reachable], surface),
         np.abs(qpos[reachable] - arm.at).max(axis=1),
         object_in_base[:3, 3],
-        approach,
+        arm.approach,
     )
     ranks = draw_order(arm.rng, scores)
     near = arm.scene.obstacles_in_base(without=slot, radius=NEIGHBOURHOOD, around=object_in_base[:3, 3])
     clear = _clear(tcp_in_base, reachable[ranks], near)
-    if approach == "front":  # where it is narrow, first those whose arm is free as inverse kinematics found it
+    if arm.approach == "front":  # where it is narrow, first those whose arm is free as inverse kinematics found it
         looked_at = list(islice(clear, GRASPS_CHECKED))
         arm.planner.set_scene(arm.scene.obstacles(without=slot))
         ways = np.stack([qpos_before[looked_at], qpos[looked_at]], axis=1)
@@ -169,11 +160,11 @@ def _clear(tcp_in_base: Array, order: NDArray[np.int_], points_in_base: Array) -
 
 
 def _plan_way_in_and_out(
-    arm: Arm, slot: int, qpos: Array, tcp_in_base: Array, lift_height: float, approach: Approach
-) -> tuple[Trajectory, tuple[Trajectory, ...]]:
+    arm: Arm, slot: int, qpos: Array, tcp_in_base: Array, lift_height: float
+) -> tuple[Trajectory, Out]:
     """Plan straight from a pre-grasp configuration (7,) to a grasp, and out with the object."""
     inward = arm.planner.plan_straight(qpos, tcp_in_base, stage="approach")
-    if approach == "top":
+    if arm.approach == "top":
         return inward, (arm.first_line(inward.qpos[-1], _ways_up(tcp_in_base, lift_height), stage="lift"),)
     return inward, _plan_withdrawal(arm, slot, inward.qpos[-1], tcp_in_base)
 

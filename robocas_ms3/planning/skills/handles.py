@@ -57,7 +57,6 @@ class Part:
 
     @classmethod
     def of(cls, arm: Arm) -> Part:
-        """Return the part that the task wants opened."""
         model = arm.env.model
         opening, joint = model.config.opening, model.opened_joint
         assert opening is not None  # the task has one
@@ -70,7 +69,6 @@ class Part:
         return max(self.joint.limits, key=abs)
 
     def position(self, arm: Arm) -> float:
-        """Return the position of the joint, m or rad."""
         return arm.scene.joint_positions(self.furniture)[self.joint.name]
 
     def way(self, arm: Arm) -> Array:
@@ -91,12 +89,7 @@ class Part:
         frame = arm.env.model.furniture_poses[self.furniture]
         return np.array([frame @ joint_motion(self.joint, float(q)) for q in positions])
 
-    def in_base(self, arm: Arm, positions: Array) -> Array:
-        """Return the same poses in the arm's base frame."""
-        return inverse(arm.scene.arm_base_in_world) @ self.in_world(arm, positions)
-
     def obstacle(self, arm: Arm, pose_in_base: Array) -> Obstacle:
-        """Return the part as a body at a pose (4x4)."""
         part = arm.env.model.furniture[self.furniture].links[self.handle.link]
         return Obstacle(self.handle.link, shape_of(part), pose_in_base)
 
@@ -113,7 +106,6 @@ class Part:
         return pose
 
     def pressed(self, arm: Arm) -> bool:
-        """Whether both fingers press on the part."""
         env = arm.env
         furniture = env.fixtures.furniture[self.furniture]
         assert isinstance(furniture, Articulation)
@@ -122,14 +114,6 @@ class Part:
         forces = contact_forces(env.scene, [left, right], [link])
         closing = left.pose.to_transformation_matrix()[:, :3, 1]
         return bool(terms.finger_grasps(forces[:, 0], forces[:, 1], closing)[0, 0])
-
-
-@dataclass(frozen=True)
-class PullPlan:
-    """Motions from where the arm is to an opened part."""
-
-    way_in: Trajectory
-    pull: Trajectory
 
 
 def open_part(arm: Arm) -> None:
@@ -143,7 +127,6 @@ def open_part(arm: Arm) -> None:
 
 
 def is_opened(arm: Arm) -> bool:
-    """Return whether the task's door or drawer is open far enough now."""
     env = arm.env
     assert isinstance(env, RoboCASOpenPickEnv)
     return bool(env.furniture_opened()[0])
@@ -152,13 +135,13 @@ def is_opened(arm: Arm) -> bool:
 def pull(arm: Arm, part: Part) -> None:
     """Take hold of the handle, pull as far as the arm leads, let go and step back."""
     with arm.planning():
-        plan = plan_pull(arm, part)
+        way_in, opening = plan_pull(arm, part)
         before, least = part.position(arm), 0.5 * part.least(arm)
-    arm.follow(plan.way_in)
+    arm.follow(way_in)
     arm.close_gripper()
     if not part.pressed(arm):
         raise PlanningFailed("handle", "missed")
-    arm.follow(plan.pull)
+    arm.follow(opening)
     if abs(part.position(arm) - before) < least:
         raise PlanningFailed("pull", "slipped")
     arm.open_gripper()
@@ -175,15 +158,15 @@ def pull(arm: Arm, part: Part) -> None:
     arm.follow(back)
 
 
-def plan_pull(arm: Arm, part: Part) -> PullPlan:
-    """Plan the hold that leads furthest, with the bar deep between the fingers where it fits."""
+def plan_pull(arm: Arm, part: Part) -> tuple[Trajectory, Trajectory]:
+    """Plan to the hold that leads furthest, with the bar deep between the fingers where it fits, and the pull."""
     failure = PlanningFailed("pull", "no_plan")
     return first_plan((DEEPER, 0.0), lambda deeper: _plan_pull(arm, part, deeper), failure)
 
 
-def _plan_pull(arm: Arm, part: Part, deeper: float) -> PullPlan:
+def _plan_pull(arm: Arm, part: Part, deeper: float) -> tuple[Trajectory, Trajectory]:
     positions = part.way(arm)
-    frames = part.in_base(arm, positions)
+    frames = inverse(arm.scene.arm_base_in_world) @ part.in_world(arm, positions)
     paths, ends, turned = _paths(arm, part, frames, deeper)
     least = part.least(arm) / abs(positions[-1] - positions[0]) * len(positions)
     # the furthest first, in coarse steps; of those the squarest, and nearest to where the arm is
@@ -198,7 +181,7 @@ def _plan_pull(arm: Arm, part: Part, deeper: float) -> PullPlan:
     if not order:
         raise PlanningFailed("handle", "blocked")
 
-    def plan(index: int) -> PullPlan:
+    def plan(index: int) -> tuple[Trajectory, Trajectory]:
         path = paths[: ends[index], index]
         free = _free_length(arm, part, path, frames, others)
         if free < least:
@@ -207,8 +190,8 @@ def _plan_pull(arm: Arm, part: Part, deeper: float) -> PullPlan:
         arm.planner.set_scene(everything)
         away = arm.planner.plan_straight(path[0], moved_back(arm.planner.tcp(path[0]), STANDOFF), stage="approach")
         reach = arm.planner.plan_to_qpos(arm.at, [away.qpos[-1]], stage="reach")
-        way_in = arm.planner.join(arm.at, reach, _reversed(away, path[0]))
-        return PullPlan(way_in, _timed(path[:free], arm.robot, away.dt))
+        inward = Trajectory(np.concatenate([away.qpos[-2::-1], path[:1]]), away.dt)
+        return arm.planner.join(arm.at, reach, inward), _timed(path[:free], arm.robot, away.dt)
 
     return first_plan(order[:PULLS_PLANNED], plan, PlanningFailed("pull", "no_plan"))
 
@@ -298,16 +281,12 @@ def _free_length(arm: Arm, part: Part, path: Array, frames: Array, others: list[
     return length
 
 
-def _plan_retreat(arm: Arm, start: Array) -> Trajectory:
-    tcp = arm.planner.tcp(start)
-    return plan_step_back(arm, start, [moved_back(tcp, distance) for distance in RETREATS])
-
-
 def _retreatable(arm: Arm, path: Array, least: int) -> int:
     """Return the length of a pull (T, 7) after which the gripper can step back, at least ``least``."""
     for length in range(len(path), max(least, 1) - 1, -3):
+        tcp = arm.planner.tcp(path[length - 1])
         try:
-            _plan_retreat(arm, path[length - 1])
+            plan_step_back(arm, path[length - 1], [moved_back(tcp, distance) for distance in RETREATS])
             return length
         except PlanningFailed:
             continue
@@ -324,7 +303,3 @@ def _timed(path: Array, robot: RobotDescription, dt: float) -> Trajectory:
     if motion is None:
         raise PlanningFailed("pull", "timing_failed")
     return motion
-
-
-def _reversed(motion: Trajectory, start: Array) -> Trajectory:
-    return Trajectory(np.concatenate([motion.qpos[-2::-1], start[None]]), motion.dt)

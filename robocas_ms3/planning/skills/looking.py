@@ -80,7 +80,6 @@ def camera_in_base(arm: Arm) -> Array:
 
 
 def _shift(arm: Arm) -> Array:
-    """Return the random shift (4x4) of the camera in its own frame."""
     by = arm.env.task_config.randomisation.cameras
     if by is None:
         return np.eye(4)

@@ -26,13 +26,7 @@ SPREAD = 0.25  # of the inside's half size: how far from the middle the centre o
 
 @dataclass(frozen=True)
 class Inside:
-    """The inside of a container, a box.
-
-    Attributes:
-        container_in_base: 4x4 of the container's frame in the arm's base frame.
-        low: (3,) least corner in the container's frame, m.
-        high: (3,) greatest corner.
-    """
+    """The box inside a container, from ``low`` to ``high`` (3,) m in the container's frame, which is 4x4."""
 
     container_in_base: Array
     low: Array
@@ -129,7 +123,7 @@ def held_object(arm: Arm, slot: int) -> tuple[Array, Array]:
 
 
 def attach_held(arm: Arm, slot: int) -> None:
-    """Tell the planner what the gripper holds, as it holds it right now."""
+    """Tell the planner what the gripper holds right now."""
     object_in_tcp, vertices = held_object(arm, slot)
     arm.planner.attach(AttachedBody(vertices, object_in_tcp))
     arm.planner.finger_width = float(arm.env.agent.gripper_width[0])
@@ -173,14 +167,7 @@ def sample_drops(rng: np.random.Generator, count: int, inside: Inside, vertices:
     """Sample TCP poses (count, 4, 4) at which a held object hangs above a container, its lowest point clear of the rim.
 
     The approach axis is tilted from straight down, away from the arm, so that far containers are within reach; half of
-    the samples are steep, for near ones.
-
-    Args:
-        rng: source of all randomness.
-        count: how many poses.
-        inside: of the container.
-        vertices: (V, 3) the object's hull in the TCP frame, m.
-        center_of_mass: (3,) the object's, in the TCP frame, m.
+    the samples are steep, for near ones. The object's hull has vertices (V, 3) in the TCP frame, m.
     """
     middle, half = (inside.low + inside.high) / 2, (inside.high - inside.low) / 2
     local = np.column_stack(
@@ -208,7 +195,6 @@ def overhangs(tcp_in_base: Array, inside: Inside, vertices: Array, margin: float
 
     Args:
         tcp_in_base: (n, 4, 4) poses of the TCP.
-        inside: of the container.
         vertices: (V, 3) the object's hull in the TCP frame, m.
         margin: by which the opening is narrower at each side, m.
     """

@@ -9,11 +9,10 @@ import numpy as np
 import torch
 
 from robocas_ms3.core.errors import PlanningFailed
-from robocas_ms3.core.poses import inverse, transform
+from robocas_ms3.core.poses import inverse
 from robocas_ms3.planning.executor import CLOSED
 from robocas_ms3.planning.protocol import Array, Obstacle, Trajectory
 from robocas_ms3.planning.pushes import STAND_OFF, YAWS, Push, candidates
-from robocas_ms3.planning.scene import SPACING
 from robocas_ms3.planning.skills.arm import Arm, raised
 
 ABOVE = 0.08  # m above the start of the push, from where the tool comes straight down
@@ -72,15 +71,9 @@ def _plan_lift(arm: Arm, direction: Array) -> Trajectory:
 
 
 def _lifted(tcp_in_base: Array, direction: Array) -> Array:
-    """Return the TCP above and a little behind the end of a push."""
     back = raised(tcp_in_base, LIFT)
     back[:3, 3] -= STAND_OFF * direction
     return back
-
-
-def _fixed(arm: Arm) -> Array:
-    """Return surfaces (P, 3) of furniture and basket."""
-    return arm.scene.obstacles_in_base(without=range(len(arm.env.objects)))
 
 
 def _fixed_bodies(arm: Arm) -> list[Obstacle]:
@@ -96,38 +89,38 @@ def plan_push(arm: Arm, slot: int, target: int, turn_deg: float = 0.0) -> PushPl
     planner = arm.planner
     width, planner.finger_width = planner.finger_width, 0.0
     try:
-        begun = _begun(arm, slot, target, turn_deg)
+        starts = _starts(arm, slot, target, turn_deg)
         try:
-            return _plan_along(arm, begun, movable={slot})
+            return _plan_along(arm, starts, movable={slot})
         except PlanningFailed:
-            return _plan_along(arm, begun, movable=set(range(len(arm.env.objects))) - {target})
+            return _plan_along(arm, starts, movable=set(range(len(arm.env.objects))) - {target})
     finally:
         planner.finger_width = width
 
 
-def _begun(arm: Arm, slot: int, target: int, turn_deg: float) -> list[tuple[Push, Array, Trajectory]]:
+def _starts(arm: Arm, slot: int, target: int, turn_deg: float) -> list[tuple[Push, Array, Trajectory]]:
     """Return pushes with a free way down to the object: with a configuration (7,) above, and that way."""
     arm.planner.set_scene(arm.scene.obstacles())
-    failure, begun = PlanningFailed("push", "no_room"), []
+    failure, starts = PlanningFailed("push", "no_room"), []
     for push, qpos in reachable_pushes(arm, slot, target, arm.scene.obstacles_in_base(without=slot), turn_deg):
         try:
-            begun.append((push, qpos, arm.planner.plan_straight(qpos, push.start, stage="push")))
+            starts.append((push, qpos, arm.planner.plan_straight(qpos, push.start, stage="push")))
         except PlanningFailed as error:
             failure = error
-        if len(begun) == PUSHES_PLANNED:
+        if len(starts) == PUSHES_PLANNED:
             break
-    if not begun:
+    if not starts:
         raise failure
-    return begun
+    return starts
 
 
-def _plan_along(arm: Arm, begun: list[tuple[Push, Array, Trajectory]], movable: set[int]) -> PushPlan:
+def _plan_along(arm: Arm, starts: list[tuple[Push, Array, Trajectory]], movable: set[int]) -> PushPlan:
     """Plan on from where pushes begin, with some objects that may be moved on the way along."""
     planner, failure = arm.planner, PlanningFailed("push", "no_room")
     along_scene, fixed = arm.scene.obstacles(without=movable), _fixed_bodies(arm)
     ways: list[tuple[Array, Trajectory, Trajectory, Trajectory]] = []
     first = np.zeros(3)
-    for push, qpos, down in begun:
+    for push, qpos, down in starts:
         if ways and push.direction @ first < 1 - 1e-6:
             break
         try:
@@ -152,11 +145,9 @@ def reachable_pushes(
     arm: Arm, slot: int, target: int, others: Array, turn_deg: float = 0.0
 ) -> Iterator[tuple[Push, Array]]:
     """Yield pushes within reach and a configuration (7,) above each start: the paper's direction first."""
-    points, own = (
-        transform(arm.scene.object_in_base(s), arm.env.object_assets[0][s].surface_points(SPACING))
-        for s in (slot, target)
-    )
-    pushes = list(candidates(arm.rng, points, own.mean(axis=0), others, surface_in_base(arm), _fixed(arm), turn_deg))
+    points, middle = arm.scene.object_surface(slot), arm.scene.object_surface(target).mean(axis=0)
+    fixed = arm.scene.obstacles_in_base(without=range(len(arm.env.objects)))
+    pushes = list(candidates(arm.rng, points, middle, others, surface_in_base(arm), fixed, turn_deg))
     if not pushes:
         return
     starts, ends = np.stack([push.start for push in pushes]), np.stack([push.end for push in pushes])

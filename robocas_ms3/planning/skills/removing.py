@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.core.poses import transform
 from robocas_ms3.planning.protocol import Array, Trajectory
-from robocas_ms3.planning.scene import SPACING
 from robocas_ms3.planning.shapes import convex_hull
 from robocas_ms3.planning.skills.arm import Arm, first_plan, moved_back, plan_step_back, raised
 from robocas_ms3.planning.skills.grasping import grasp
@@ -78,8 +77,7 @@ def blockers(arm: Arm, slot: int) -> list[int]:
     grasps, in_the_way = _grasps_from_above(arm, slot), {}
     for other, used in enumerate(arm.env.present[0].tolist()):
         if used and other != slot:
-            points = transform(arm.scene.object_in_base(other), arm.env.object_assets[0][other].surface_points(SPACING))
-            in_the_way[other] = ~gripper_is_clear(grasps, points)
+            in_the_way[other] = ~gripper_is_clear(grasps, arm.scene.object_surface(other))
     count = np.sum(list(in_the_way.values()), axis=0)
     score = {other: float(np.sum(blocked / np.maximum(count, 1) ** 2)) for other, blocked in in_the_way.items()}
     return sorted((other for other in score if score[other] > 0), key=lambda other: -score[other])
@@ -160,8 +158,7 @@ def free_places(vertices: Array, others: Array, frame: Array, half: Array, margi
     Args:
         vertices: (V, 3) of the object where it is held, in the arm's base frame, m.
         others: (P, 3) surfaces of everything else.
-        frame: 4x4 of the surface's middle.
-        half: (2,) its half size, m.
+        frame, half: middle (4x4) and half size (2,) of the surface, m.
         margin: kept from its edge, m.
     """
     middle = (vertices.max(axis=0) + vertices.min(axis=0)) / 2

@@ -1,6 +1,6 @@
 """Where the mobile base stands: to reach an object, to pull at a handle, to let go above the basket.
 
-Every function does nothing unless the configuration lets policies drive.
+The base drives only where the configuration lets policies drive.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from robocas_ms3.planning.skills.driving import (
 )
 from robocas_ms3.planning.skills.grasping import grasp
 from robocas_ms3.planning.skills.handles import Part, open_part, pull_share
-from robocas_ms3.planning.skills.placing import attach_held, drop_poses
+from robocas_ms3.planning.skills.placing import attach_held, carry_to_basket, drop_poses, release_into_basket
 from robocas_ms3.scenes.grasping import HALF_TURN, NEIGHBOURHOOD, PREGRASP_DISTANCE, directions_ok, gripper_is_clear
 
 KINDS = 4  # of grasps that attempts take one after the other
@@ -124,6 +124,14 @@ def drive_to_handle(arm: Arm, *, elsewhere: bool = False) -> None:
     drive(arm, *route)
 
 
+def bring_to_basket(arm: Arm, slot: int) -> None:
+    """Carry a held object to the basket, let go of it above it, step back."""
+    arm.begin_subgoal("transfer object")
+    drive_to_basket(arm, slot)
+    carry_to_basket(arm, slot)
+    release_into_basket(arm, slot)
+
+
 def drive_to_basket(arm: Arm, slot: int) -> None:
     """Drive back to the start of the episode, an object in the gripper.
 
@@ -172,7 +180,7 @@ def clear_grasps(arm: Arm, slot: int) -> Array:
     object_in_world = base @ object_in_base
     notes = arm.env.object_assets[0][slot].annotations
     poses = object_in_world @ notes.grasps_tcp_in_object[:: max(1, len(notes.grasp_widths) // GRASPS_LOOKED_AT)]
-    tests = directions_ok(poses, np.ones(3), arm.env.task_config.target.approach)
+    tests = directions_ok(poses, np.ones(3), arm.approach)
     poses = poses[np.all([passed for name, passed in tests.items() if name != SIDE], axis=0)]
     near = arm.scene.obstacles_in_base(without=slot, radius=NEIGHBOURHOOD, around=object_in_base[:3, 3])
     return poses[gripper_is_clear(poses, transform(base, near))]
@@ -182,7 +190,6 @@ def reach_share(arm: Arm, base: Array, grasps: Array, others: list[Obstacle], *,
     """Return the share of grasps (with pre-grasps) that the arm reaches from a base pose (3,) without collisions.
 
     Args:
-        base: (3,).
         grasps: (G, 4, 4) from ``clear_grasps``; those that come from the far side count as out of reach.
         others: everything but the object, in the world.
         thorough: judge more grasps, by all configurations instead of the nearest; far slower.
@@ -213,4 +220,4 @@ def _poses_of_some(arm: Arm, frame: Array, grasps: Array, count: int) -> Array:
 def _from_here(arm: Arm, frame: Array, grasps: Array) -> Array:
     """Return the grasps (G, 4, 4) that come from the side of the arm's base (4x4, world)."""
     center = grasps[:, :3, 3].mean(axis=0) if len(grasps) else np.zeros(3)
-    return grasps[directions_ok(grasps, center - frame[:3, 3], arm.env.task_config.target.approach)[SIDE]]
+    return grasps[directions_ok(grasps, center - frame[:3, 3], arm.approach)[SIDE]]

@@ -6,14 +6,12 @@ from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.planning.skills.handles import is_opened
 from robocas_ms3.planning.skills.stance import open_from_reach
 from robocas_ms3.planning.solvers import pick
-from robocas_ms3.scenes.language.templates import subgoal
 
 
 def attempt(arm: Arm) -> None:
     """Try once, from wherever the episode stands; returns when the task has succeeded."""
     if not is_opened(arm):
-        words = arm.env.target_asset().asset.name, arm.env.task_config.support
-        arm.executor.label(**subgoal("operate the target", *words))
+        arm.begin_subgoal("operate the target")
         open_from_reach(arm)
         arm.executor.rehearse()
         arm.come_back_here()

@@ -14,7 +14,6 @@ from robocas_ms3.planning.skills.grasping import grasp
 from robocas_ms3.planning.skills.looking import FAR, NEAR, look_at, prepare_looks
 from robocas_ms3.planning.skills.placing import carry_to_basket, release_into_basket
 from robocas_ms3.planning.skills.removing import hang_clear
-from robocas_ms3.scenes.language.templates import subgoal
 
 LIFT_HEIGHT = 0.15  # m, upstream's
 AHEAD = 3  # moves that are compared
@@ -24,22 +23,19 @@ GRASPS = 3  # kinds of grasps of the target that are tried
 
 def attempt(arm: Arm) -> None:
     """Try once, from wherever the episode stands; returns when the task has succeeded."""
-    slot = int(arm.env.target_slot[0])
-    words = arm.env.target_asset().asset.name, arm.env.task_config.support
-    find, take = subgoal("find the object", *words), subgoal("move and grasp", *words)
-    heap = Heap(arm, slot)
+    slot, heap = arm.target, Heap(arm, arm.target)
     for fact in FACTS:
         arm.executor.facts.setdefault(fact, 0)
     with arm.planning():
         prepare_looks(arm)
-    arm.executor.label(**find)
+    arm.begin_subgoal("find the object")
     look_at(arm, heap.middle(slot), FAR)
     while True:
         if heap.cleared:
-            arm.executor.label(**take)
+            arm.begin_subgoal("move and grasp")
             if _grasp(arm, slot):
                 break
-            arm.executor.label(**find)
+            arm.begin_subgoal("find the object")
         done = len(arm.executor.actions)
         try:
             arm.choose(heap.moves(), heap.make, Effort(AHEAD, tries(heap.moves_made), ENOUGH))
@@ -47,7 +43,7 @@ def attempt(arm: Arm) -> None:
             if len(arm.executor.actions) > done:
                 raise
             # nothing can be moved: perhaps it can be grasped as things stand
-            arm.executor.label(**take)
+            arm.begin_subgoal("move and grasp")
             if not heap.visible or not _grasp(arm, slot):
                 raise
             break
@@ -55,7 +51,7 @@ def attempt(arm: Arm) -> None:
         if heap.uncovered and not heap.visible:
             look_at(arm, heap.middle(slot), NEAR)
     arm.executor.rehearse()
-    arm.executor.label(**subgoal("transfer object", *words))
+    arm.begin_subgoal("transfer object")
     carry_to_basket(arm, slot)
     heap.check_surface()
     release_into_basket(arm, slot)
