@@ -202,4 +202,4 @@ def _instruction(part: Part, env: RoboCASEnv, seed: int) -> str:
     if not others:
         raise EvaluationError("no other object whose name would be wrong", where=f"{part.file}, seed {seed}")
     rng = np.random.default_rng([seed, _WRONG])
-    return env.instruction_for(others[int(rng.integers(len(others)))]).text
+    return env.instruction(0, others[int(rng.integers(len(others)))]).text

@@ -56,7 +56,7 @@ def _build_room(scene: ManiSkillScene, model: SceneModel, level: VisualLevel, se
 
 
 def build_lights(scene: ManiSkillScene, config: TaskConfig, seeds: Sequence[int], *, shadow: bool) -> None:
-    """Light every sub-scene by its seed; the slanted light may cast shadows."""
+    """Light every sub-scene by its seed; with ``shadow``, or as configured, the slanted light casts shadows."""
     for i, seed in enumerate(seeds):
         lights = draw_lights(config, seed)
         scene.sub_scenes[i].ambient_light = [lights.ambient] * 3
@@ -64,7 +64,7 @@ def build_lights(scene: ManiSkillScene, config: TaskConfig, seeds: Sequence[int]
         scene.add_directional_light(
             lights.direction.tolist(),
             bright,
-            shadow=shadow,
+            shadow=shadow or config.lights.shadow,
             shadow_scale=5,
             shadow_near=_SHADOW_NEAR,
             shadow_map_size=2048,
@@ -83,8 +83,19 @@ def shift_cameras(cameras: Sequence[RenderCamera], config: TaskConfig, seeds: Se
             part.local_pose = part.local_pose * sapien.Pose(draw_camera_shift(by, number, seed))
 
 
+def build_objects(
+    scene: ManiSkillScene, config: TaskConfig, assets: Sequence[Sequence[LoadedObject]], level: VisualLevel
+) -> list[Actor]:
+    """Build the objects of all envs, a row of assets per env: an actor per slot, and the plane for unused slots."""
+    columns = zip(*assets, strict=True)
+    actors = [build_object_slot(scene, slot, column, level) for slot, column in enumerate(columns)]
+    if config.leaves_slots_empty:
+        build_parking(scene, len(actors))
+    return actors
+
+
 def build_object_slot(
-    scene: ManiSkillScene, slot: int, assets: list[LoadedObject], level: VisualLevel = "fast"
+    scene: ManiSkillScene, slot: int, assets: Sequence[LoadedObject], level: VisualLevel = "fast"
 ) -> Actor:
     """Build one slot of objects, env i's being ``assets[i]``, as one actor whose bodies are in the order of envs."""
     name, waiting = f"object_{slot}", sapien.Pose([slot * 0.5, 0, 20.0])

@@ -12,13 +12,12 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
-from mani_skill.utils.structs import Actor
 from mani_skill.utils.structs.types import SimConfig
 from numpy.typing import NDArray
 
 from robocas_ms3.assets.pack import LoadedObject, VisualLevel, load_pack
 from robocas_ms3.core.arrays import Array, as_tensor
-from robocas_ms3.core.errors import LayoutError, RobocasError
+from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.core.extensions import load
 from robocas_ms3.robots.agent import MobileManipulator
 from robocas_ms3.robots.table import DEFAULT, find_robot
@@ -33,8 +32,8 @@ from robocas_ms3.tasks import engine
 from robocas_ms3.tasks.bodies import Bodies, Contacts, link_poses
 from robocas_ms3.tasks.goals import Goal, InBasket
 from robocas_ms3.tasks.observations import over_the_shoulder, place_camera, privileged_observations
-from robocas_ms3.tasks.rewards import DENSE, TRANSFER, DenseReward, RewardTable
-from robocas_ms3.tasks.seeds import EpisodeSeeds
+from robocas_ms3.tasks.rewards import DENSE, TRANSFER, DenseReward, RewardTable, count_share
+from robocas_ms3.tasks.seeds import EpisodeSeeds, check_reset_options
 from robocas_ms3.tasks.starts import place
 from robocas_ms3.tasks.success import SuccessCheck
 
@@ -44,35 +43,27 @@ STAGES = ("reached_any", "picked_any", "reached_target", "target_grasped", "targ
 class RoboCASEnv(BaseEnv):
     """Base of all tasks: move the target to the ``GOAL``, which is the basket unless a task says otherwise.
 
-    A task is a subclass with a ``SPEC``, which overrides ``evaluate``, ``compute_dense_reward`` and
+    A task is a subclass with a ``SPEC``, which overrides ``evaluate``, ``reward_progress`` and
     ``privileged_observations`` where it adds something. N envs, K object slots. A single env is rebuilt at each reset.
     Several envs draw their objects once, and each reset draws a new layout and target.
 
     Args:
         config: name, path or content of a task configuration; default: the task's own.
-        pack: name or folder of the pack that objects come from.
-        furniture_pack: the same for room, furniture and basket.
+        pack: name or folder of the pack of the objects; ``furniture_pack``: of room, furniture and basket.
         visual_level: ``fast`` or ``full`` meshes to render.
-        layouts: folder of the layout cache; default: in the user's cache folder; None: no cache, every layout is
-            sampled again; a file of frozen layouts (`scenes.table`); or a function that returns the layout of an
-            objects seed and a seed.
-        seeds: least and greatest seed that unseeded resets draw from; default: any seed, with several envs 0 to 99,
-            those of frozen layouts.
+        layouts: where layouts come from; see `scenes.cache.layout_source`.
+        seeds: least and greatest seed that unseeded resets draw from; see `EpisodeSeeds`.
         robot_uids: name of the robot in `robots.table`.
-        num_envs: N; several need a GPU.
         kwargs: passed to ``BaseEnv``; ``reconfiguration_freq`` is 1 for one env, 0 for several, unless it is given.
 
     Raises:
         VectorEnvError: there are several envs and no GPU.
-        ExtensionError: there is no such robot, or it can't be loaded.
-        ConfigError: an argument is invalid.
+        ConfigError: an argument is invalid; ExtensionError: the robot is unknown, or can't be loaded.
 
     Attributes:
-        looks: whether images are rendered for observations; else they are black.
         present: (N, K) bool, which object slots are in use.
         target_slot: (N,) slot of the target; ``is_target`` (N, K) bool has the same as flags.
         start_poses: (N, K, 7) poses of the objects at the start of the episode; ``basket_at_start`` (N, 7).
-        cameras: their specifications, in the order of their randomisation.
     """
 
     SPEC: ClassVar[TaskSpec]
@@ -82,7 +73,7 @@ class RoboCASEnv(BaseEnv):
     SUPPORTED_REWARD_MODES = ("sparse", *DENSE, "none")  # the first is the default
 
     agent: MobileManipulator
-    looks = True
+    looks = True  # else images are black
 
     def __init__(
         self,
@@ -110,8 +101,6 @@ class RoboCASEnv(BaseEnv):
             kwargs["reconfiguration_freq"] = 1 if num_envs == 1 else 0
         cache, stay = layout_source(self.model, layouts), kwargs["reconfiguration_freq"] == 0
         self.seeds = EpisodeSeeds(num_envs, cache, seed_range=seeds, objects_stay=stay)
-        self._instructions: dict[int, Instruction] = {}  # by env, made when they are asked for
-        self.dense_reward = DenseReward(self, self.REWARDS)
         super().__init__(num_envs=num_envs, robot_uids=robot.uid, **kwargs)
 
     @property
@@ -120,8 +109,7 @@ class RoboCASEnv(BaseEnv):
 
     @property
     def _default_human_render_camera_configs(self) -> CameraConfig:
-        eye, target = self.overview()
-        pose = sapien_utils.look_at(eye.tolist(), target.tolist())
+        pose = sapien_utils.look_at(*(point.tolist() for point in self.overview()))
         return CameraConfig("render_camera", pose, 640, 480, np.pi / 3, 0.01, 20)
 
     def overview(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -136,12 +124,11 @@ class RoboCASEnv(BaseEnv):
     @property
     def scene_seeds(self) -> list[int]:
         """The seed of each env's looks, which stay until the scene is rebuilt."""
-        assert self._episode_seed is not None
-        return [int(seed) for seed in self._episode_seed]
+        return [int(seed) for seed in cast("NDArray[np.int64]", self._episode_seed)]
 
     def _reconfigure(self, options: dict | None = None) -> None:
-        assert self._episode_seed is not None
-        self.seeds.choose_objects(self._episode_seed, self.device, on_gpu=self._sim_device.is_cuda())
+        seeds = cast("NDArray[np.int64]", self._episode_seed)
+        self.seeds.choose_objects(seeds, self.device, on_gpu=self._sim_device.is_cuda())
         engine.keep_renderer(self.backend.render_device)
         super()._reconfigure(options)
 
@@ -156,7 +143,6 @@ class RoboCASEnv(BaseEnv):
             self.agent = self.scene = None  # pyright: ignore[reportAttributeAccessIssue]
 
     def close(self) -> None:
-        """Close the environment and free what it held."""
         self._resets = -1  # collects garbage
         self._engine_errors.close()
         super().close()
@@ -169,24 +155,19 @@ class RoboCASEnv(BaseEnv):
         self.fixtures = build.build_fixtures(self.scene, self.model, self._visual_level, self.scene_seeds)
         assets, ids = self.model.object_pack.objects, self.seeds.object_ids
         self.object_assets: list[list[LoadedObject]] = [[assets[i] for i in row] for row in ids]
-        self.objects: list[Actor] = [
-            build.build_object_slot(self.scene, slot, list(assets), self._visual_level)
-            for slot, assets in enumerate(zip(*self.object_assets, strict=True))
-        ]
+        self.objects = build.build_objects(self.scene, self.task_config, self.object_assets, self._visual_level)
         slots = len(self.objects)
-        if self.task_config.leaves_slots_empty:
-            build.build_parking(self.scene, slots)
         self.start_poses = torch.zeros(self.num_envs, slots, 7, device=self.device)
         self.present = torch.ones(self.num_envs, slots, dtype=torch.bool, device=self.device)
         self.target_slot = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
         self.is_target = torch.zeros_like(self.present)
         self.basket_at_start = torch.zeros(self.num_envs, 7, device=self.device)
+        self.dense_reward = DenseReward(self.REWARDS, self.num_envs, self.device)
         self.goal = self.GOAL(self)
         self.success_check = SuccessCheck(self, self.STAGES)
 
     def _load_lighting(self, options: dict) -> None:
-        shadow = self.task_config.lights.shadow or self.enable_shadow
-        build.build_lights(self.scene, self.task_config, self.scene_seeds, shadow=shadow)
+        build.build_lights(self.scene, self.task_config, self.scene_seeds, shadow=self.enable_shadow)
 
     def _after_reconfigure(self, options: dict) -> None:
         super()._after_reconfigure(options)
@@ -205,14 +186,7 @@ class RoboCASEnv(BaseEnv):
             LayoutError: there is no layout for a seed that was asked for, or for many that were drawn.
             RobocasError: ``options`` has ``reset_to_env_states``.
         """
-        options, envs = dict(options or {}), list(range(self.num_envs))
-        if "reset_to_env_states" in options:
-            fix = "Reset with the seed of the recorded episode, then call set_state_dict."
-            raise RobocasError("a state lacks objects, target and stages", where="reset_to_env_states", fix=fix)
-        if "env_idx" in options:
-            index = torch.as_tensor(options["env_idx"], device=self.device)
-            options["env_idx"] = index.nonzero()[:, 0] if index.dtype == torch.bool else index
-            envs = options["env_idx"].tolist() if self.num_envs > 1 else envs
+        options, envs = check_reset_options(options, self.num_envs, self.device)
         seed = self.seeds.start_reset(seed, envs)
         while True:
             try:
@@ -223,17 +197,17 @@ class RoboCASEnv(BaseEnv):
                 seed = None
 
     def _set_episode_rng(self, seed: Any, env_idx: torch.Tensor) -> None:
-        index = env_idx.cpu().numpy()
+        envs = env_idx.cpu().numpy()
         seeds: Any = None if seed is None else self.seeds.within_range(seed)
-        if seeds is None or self._batched_episode_rng is None or len(index) == self.num_envs:
+        if seeds is None or self._batched_episode_rng is None or len(envs) == self.num_envs:
             super()._set_episode_rng(seeds, env_idx)
         else:  # ManiSkill's would seed all envs
-            if len(seeds) == 1 and len(index) > 1:
-                seeds = np.concatenate([seeds, np.random.RandomState(seeds[0]).randint(2**31, size=len(index) - 1)])
-            self._episode_seed[index] = seeds
-            self._batched_episode_rng[index] = BatchedRNG.from_seeds(seeds, backend=self._batched_rng_backend)
-        drawn = None if seeds is None else self._episode_seed[index]
-        self.seeds.set_layout_seeds(index, drawn, self._batched_episode_rng)
+            if len(seeds) == 1 and len(envs) > 1:
+                seeds = np.concatenate([seeds, np.random.RandomState(seeds[0]).randint(2**31, size=len(envs) - 1)])
+            self._episode_seed[envs] = seeds
+            self._batched_episode_rng[envs] = BatchedRNG.from_seeds(seeds, backend=self._batched_rng_backend)
+        drawn = None if seeds is None else self._episode_seed[envs]
+        self.seeds.set_layout_seeds(envs, drawn, self._batched_episode_rng)
 
     def _clear_sim_state(self) -> None:
         if not self.gpu_sim_enabled:
@@ -245,15 +219,11 @@ class RoboCASEnv(BaseEnv):
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         self._engine_errors.check()
-        envs = env_idx.cpu().numpy()
-        place(self, self.seeds.find_starts(envs, self.device), env_idx)
+        place(self, self.seeds.find_starts(env_idx.cpu().numpy(), self.device), env_idx)
         self.success_check.reset(env_idx)
-        for env in envs.tolist():
-            self._instructions.pop(env, None)
         self.dense_reward.reset(env_idx)
 
     def layout(self, env: int = 0) -> Layout:
-        """Return the layout of an env's episode."""
         return self.seeds.layout(env)
 
     def get_state_dict(self) -> dict:
@@ -262,8 +232,8 @@ class RoboCASEnv(BaseEnv):
 
     def state_beside_bodies(self) -> dict:
         """Return targets of controllers, and the ``stages`` (N, stages) bool that were reached so far."""
-        stages = self.success_check.reached.T.clone()
-        return {"controller": self.agent.controller.targets(), "task": {"stages": stages}}
+        task = {"stages": self.success_check.reached.T.clone()}
+        return {"controller": self.agent.controller.targets(), "task": task}
 
     def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None) -> None:
         """Set the state. Without targets, the next action starts from where the robot is; without stages, they stay."""
@@ -291,15 +261,13 @@ class RoboCASEnv(BaseEnv):
         return pose
 
     def tcp_in_world(self) -> Array:
-        """(N, 7) pose of the TCP in the world, native (`arrays`)."""
+        """Return the pose (N, 7) of the TCP in the world, native (`arrays`)."""
         return link_poses(self.scene, [self.agent.tcp])[:, 0]
 
     def target_center(self, objects: Array) -> Array:
-        """(N, 3) m, the target's centre of mass in the world, from states (N, K, 13); native (`arrays`)."""
         return self.success_check.target_center(objects)
 
     def target_asset(self, env: int = 0) -> LoadedObject:
-        """The target's asset in one env."""
         return self.object_assets[env][int(self.target_slot[env])]
 
     def gripper_forces(self) -> torch.Tensor:
@@ -311,13 +279,10 @@ class RoboCASEnv(BaseEnv):
         return as_tensor(self.success_check.grasped(self.gripper_contacts.forces()))
 
     def step(self, action: Any) -> tuple[Any, torch.Tensor, torch.Tensor, torch.Tensor, dict]:
-        """Step; see ``BaseEnv``, whose step takes longer on a CPU where neither observation nor reward is wanted.
-
-        Raises:
-            SimulationError: on a GPU PhysX ran out of memory, and has dropped contacts.
-        """
+        """Step; see ``BaseEnv``. Raises SimulationError where PhysX ran out of memory on a GPU and dropped contacts."""
         self._engine_errors.check()
         plain = self._obs_mode == "none" and self._reward_mode == "none" and isinstance(action, np.ndarray)
+        # BaseEnv's step takes longer on a CPU where neither observation nor reward is wanted
         if not plain or self.gpu_sim_enabled or action.shape != self._orig_single_action_space.shape:
             return super().step(action)
         engine.step_without_observation(self, action)
@@ -325,35 +290,22 @@ class RoboCASEnv(BaseEnv):
         return {}, torch.zeros(1), info["success"] | info["fail"], torch.zeros(1, dtype=torch.bool), info
 
     def evaluate(self) -> dict[str, torch.Tensor]:
-        """Return stages, ``success`` and ``fail`` of each env, (N,) bool, and ``disturbed`` (N,) int.
-
-        Stages stay true until the reset; ``success`` and ``fail`` are of this moment (docs/tasks.md). ``disturbed``
-        counts other objects that moved by 3 cm or fell over (30 deg), relative to the door or drawer that they are on.
-        """
+        """Return stages, ``success`` and ``fail`` (N,) bool, and ``disturbed`` (N,) int; see docs/tasks.md."""
         return self.success_check.check()
 
     def target_measures(self) -> dict[str, torch.Tensor]:
-        """Return what has to hold at the same moment for success, besides the lift: (N,) bool each."""
         return self.success_check.measures()
 
-    def instruction(self, env: int = 0) -> Instruction:
-        """Return the instruction of an env."""
-        if env not in self._instructions:
-            self._instructions[env] = self.instruction_for(self.target_asset(env).asset.name, env)
-        return self._instructions[env]
-
-    def instruction_for(self, name: str, env: int = 0) -> Instruction:
-        """Return the instruction that an env would have if its target had this name."""
-        seed = int(self.seeds.layout_seeds[env])
+    def instruction(self, env: int = 0, target: str = "") -> Instruction:
+        """Return the instruction of an env; with ``target`` the one it would have if its target had that name."""
+        name, seed = target or self.target_asset(env).asset.name, int(self.seeds.layout_seeds[env])
         return episode_instruction(self.task_config, self.layout(env), seed, name, self.object_names(env))
 
     def object_names(self, env: int = 0) -> set[str]:
-        """Return the names of the objects in an env."""
         present = self.layout(env).present
         return {asset.asset.name for asset, used in zip(self.object_assets[env], present, strict=True) if used}
 
     def get_language_instruction(self) -> list[str]:
-        """Return the text of each env's instruction."""
         return [self.instruction(env).text for env in range(self.num_envs)]
 
     def _get_obs_extra(self, info: dict) -> dict[str, torch.Tensor]:
@@ -372,11 +324,6 @@ class RoboCASEnv(BaseEnv):
         return {camera: {kind: torch.zeros_like(of) for kind, of in kinds.items()} for camera, kinds in last.items()}
 
     def get_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
-        """Return the reward (N,) of the env's mode, and remember the action.
-
-        ``normalized_dense`` is 1 on success and only then, 0 on ``fail``; ``dense`` is this times ``REWARDS.total``;
-        ``progress`` is how much ``normalized_dense`` has changed since the last step.
-        """
         if self._reward_mode == "progress":
             reward = self.dense_reward.gain(self.compute_normalized_dense_reward(obs, action, info))
         else:
@@ -386,14 +333,17 @@ class RoboCASEnv(BaseEnv):
         return reward
 
     def compute_sparse_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
-        """Return 1 (N,) float32 where the task has succeeded at this moment, else 0."""
         return info["success"].float()
 
     def compute_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
         """Return the reward (N,) float32 in [0, ``REWARDS.total``]; add ``reward_terms`` to the last step's info."""
-        stage, found = self.dense_reward.of_goal()
-        return self.dense_reward.weigh(stage, found, action, info)
+        moment = self.success_check.moment
+        penalties = {"disturbed": count_share(moment.disturbed.sum(1)), **self.goal.penalties(moment)}
+        return self.dense_reward.weigh(self.reward_progress(), penalties, action, info)
+
+    def reward_progress(self) -> tuple[Array, dict[str, Array]]:
+        """Return how far the envs are; see `Goal.progress`."""
+        return self.goal.progress(self.success_check.moment, self.success_check.stages["target_lifted"], self.REWARDS)
 
     def compute_normalized_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
-        """Return the reward (N,) float32 in [0, 1]; see `compute_dense_reward`."""
         return self.compute_dense_reward(obs, action, info) / self.REWARDS.total

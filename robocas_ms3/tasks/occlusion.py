@@ -21,6 +21,7 @@ MAX_HIDDEN_SHARE = 0.2  # of a cleared target, the paper's
 MAX_OBSTACLES = 1  # around it, the same
 REACH = 2  # cells around the target's outline in which others count as neighbours: 1 cm
 LEAST_MOTION = 1e-4  # m, and of a quaternion's components: less changes nothing that counts in cells of 5 mm
+STAND_OFF = 0.02  # m between an obstacle and where its push begins
 
 _OUTSIDE = CELLS * CELLS  # number of the cell that takes what lies in none
 _NOTHING = -1e3  # height of an empty cell; finite, so that differences stay numbers
@@ -79,10 +80,8 @@ def seen_from(points: Tensor, eye: Tensor, depth: Tensor) -> Tensor:
     return (points[:, :, :2] - eye[:2, None]) * (depth[:, None, None] / below)[:, :, None]
 
 
-def moved_near(
-    poses: Tensor, before: Tensor, radii: Tensor, target: Tensor, eye: Tensor, *, least: float = LEAST_MOTION
-) -> Tensor:
-    """Whether anything that `clutter` looks at has moved, the targets included.
+def moved_near(poses: Tensor, before: Tensor, radii: Tensor, target: Tensor, eye: Tensor) -> Tensor:
+    """Return whether anything that `clutter` looks at has moved, the targets included.
 
     Args:
         poses: (N, K, 7) now.
@@ -90,7 +89,6 @@ def moved_near(
         radii: (N, K) of spheres about the objects' origins that hold them, m.
         target: (N,) slots of the targets.
         eye: (3,) the camera, world.
-        least: m, and of a quaternion's components, what counts as motion.
 
     Returns:
         (N,) bool.
@@ -105,7 +103,7 @@ def moved_near(
         # the target's outline, the cells around it, and one for where in its cell a point lies
         reach = size + size[env, target][:, None] + ((REACH + 1) * CELL / above[env, target])[:, None, None]
         near |= ((seen - seen[env, target][:, None]).abs() <= reach).all(dim=-1)
-    return (((poses - before).abs() > least).any(dim=-1) & near).any(dim=-1)
+    return (((poses - before).abs() > LEAST_MOTION).any(dim=-1) & near).any(dim=-1)
 
 
 def clutter(points: Tensor, present: Tensor, target: Tensor, eye: Tensor) -> Clutter:
@@ -172,14 +170,13 @@ def covering(points: Tensor, present: Tensor, eye: Tensor) -> Tensor:
     return torch.stack(shares, dim=2) * both
 
 
-def push_point(points: Tensor, obstacles: Tensor, target: Tensor, *, stand_off: float = 0.02) -> Tensor:
+def push_point(points: Tensor, obstacles: Tensor, target: Tensor) -> Tensor:
     """Where the paper's push of the highest obstacle begins: clear of it, on the target's side, level with its middle.
 
     Args:
         points: (N, K, 3, P) on the objects' surfaces, world.
         obstacles: (N, K) bool, see `Clutter`; where there are none, the target's own middle is given.
         target: (N,) slots of the targets.
-        stand_off: m between that point and the obstacle.
 
     Returns:
         (N, 3) world.
@@ -191,7 +188,7 @@ def push_point(points: Tensor, obstacles: Tensor, target: Tensor, *, stand_off: 
     away = (middle - goal)[:, :2]
     away = away / torch.linalg.vector_norm(away, dim=-1, keepdim=True).clamp(min=1e-6)
     behind = ((highest - middle[..., None])[:, :2] * away[..., None]).sum(dim=1).amin(dim=-1)  # (N,), negative
-    beside = torch.cat([middle[:, :2] + (behind - stand_off)[:, None] * away, middle[:, 2:]], dim=-1)
+    beside = torch.cat([middle[:, :2] + (behind - STAND_OFF)[:, None] * away, middle[:, 2:]], dim=-1)
     return torch.where(obstacles.any(dim=1)[:, None], beside, goal)
 
 

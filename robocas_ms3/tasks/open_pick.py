@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
 from mani_skill.utils.structs import Articulation
@@ -77,15 +75,15 @@ class RoboCASOpenPickEnv(RoboCASEnv):
         opened = self.success_check.reach("furniture_opened", native(self.furniture_opened()))
         return {**found, "furniture_opened": opened}
 
-    def compute_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
-        """Return the reward; see `RoboCASEnv`. The furniture must have been opened before the target may be grasped."""
-        stage, found = self.dense_reward.of_goal()
+    def reward_progress(self) -> tuple[Array, dict[str, Array]]:
+        """See `RoboCASEnv`; the furniture must have been opened before the target may be grasped."""
+        stage, found = super().reward_progress()
         shut = (stage == self.REWARDS.index("grasp")) & ~self.success_check.stages["furniture_opened"]
         if not known_all_false(shut):
             found["handle"] = rewards.closeness(self.tcp_in_world()[:, :3], self.handle_in_world())
             found["open"] = self._opened_share()
             stage = rewards.furthest(stage, [(shut, self.REWARDS.index("open"))])
-        return self.dense_reward.weigh(stage, found, action, info)
+        return stage, found
 
     def _opened_share(self) -> Array:
         return rewards.rise(native(self.opening_position()), 0.0, self.model.opened_position)

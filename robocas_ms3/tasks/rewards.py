@@ -15,7 +15,9 @@ import torch
 
 from robocas_ms3.core.arrays import Array, as_float, as_tensor, choose, clamp, length, native
 from robocas_ms3.tasks.occlusion import MAX_HIDDEN_SHARE, MAX_OBSTACLES
+from robocas_ms3.tasks.terms import BASKET_SHIFT
 
+_MANY_OBSTACLES = 5  # more than a cleared target may have: counts as the worst
 DENSE = ("normalized_dense", "dense", "progress")  # reward modes whose terms are computed
 
 
@@ -33,16 +35,14 @@ class RewardTable:
 
     @cached_property
     def weights(self) -> dict[str, float]:
-        """Of all terms."""
         return {name: weight for terms in self.stages.values() for name, weight in terms.items()}
 
     @cached_property
     def total(self) -> float:
-        """What a success is worth."""
+        """The reward of a success."""
         return sum(self.weights.values())
 
     def index(self, stage: str) -> int:
-        """The place of a stage in the row."""
         return list(self.stages).index(stage)
 
 
@@ -65,7 +65,7 @@ OPEN_PICK = RewardTable({"open": {"handle": 1.0, "open": 3.0}, **_TRANSFER}, TRA
 def weigh(
     table: RewardTable, stage: Array, terms: dict[str, Array], penalties: dict[str, Array]
 ) -> tuple[Array, dict[str, Array]]:
-    """The reward of envs from the stages that they are in.
+    """Return the reward of envs from the stages that they are in.
 
     Args:
         table: of the task.
@@ -105,16 +105,10 @@ def rise(value: Array, start: Array | float, by: float) -> Array:
     return clamp((value - start) / by, 0.0, 1.0)
 
 
-def uncovered(hidden_share: Array, obstacles: Array, *, many: int = 5) -> Array:
-    """(N,) in [0, 1]: 1 where a target is cleared, less the more of it is hidden and the more obstacles are there.
-
-    Args:
-        hidden_share: (N,) of the target, see `occlusion.Clutter`.
-        obstacles: (N,) how many there are.
-        many: as many more than a cleared target may have count as the worst.
-    """
+def uncovered(hidden_share: Array, obstacles: Array) -> Array:
+    """(N,) in [0, 1]: 1 where a target is cleared, less the more of it is hidden (N,) and the more obstacles (N,)."""
     hidden = clamp((hidden_share - MAX_HIDDEN_SHARE) / (1 - MAX_HIDDEN_SHARE), 0.0, 1.0)
-    around = clamp((as_float(obstacles) - MAX_OBSTACLES) / many, 0.0, 1.0)
+    around = clamp((as_float(obstacles) - MAX_OBSTACLES) / _MANY_OBSTACLES, 0.0, 1.0)
     return 1 - (hidden + around) / 2
 
 
@@ -123,40 +117,41 @@ def let_go(held: Array, touched: Array) -> Array:
     return 1 - (as_float(held) + as_float(held | touched)) / 2
 
 
-def calm(linear_velocity: Array, angular_velocity: Array, *, linear: float = 0.3, angular: float = 5.0) -> Array:
-    """(N,) in [0, 1]: 1 at rest, 0 at velocities (N, 3) of ``linear`` m/s or ``angular`` rad/s and more."""
-    return 1 - clamp(length(linear_velocity) / linear + length(angular_velocity) / angular, 0.0, 1.0)
+def calm(linear_velocity: Array, angular_velocity: Array) -> Array:
+    """(N,) in [0, 1]: 1 at rest, 0 at velocities (N, 3) of 0.3 m/s or 5 rad/s and more."""
+    return 1 - clamp(length(linear_velocity) / 0.3 + length(angular_velocity) / 5.0, 0.0, 1.0)
 
 
-def count_share(count: Array, *, many: int = 3) -> Array:
-    """(N,) in [0, 1]: a number of things (N,), 1 from ``many`` on."""
-    return clamp(as_float(count) / many, 0.0, 1.0)
+def count_share(count: Array) -> Array:
+    """(N,) in [0, 1]: a number of things (N,), 1 from 3 on."""
+    return clamp(as_float(count) / 3, 0.0, 1.0)
 
 
-def shift(position: Array, position_before: Array, *, limit: float = 0.1) -> Array:
-    """(N,) in [0, 1]: how far a body at (N, 3) was shifted, 1 from ``limit`` m on, as far as a basket may go."""
-    return clamp(length(position - position_before) / limit, 0.0, 1.0)
+def shift(position: Array, position_before: Array) -> Array:
+    """(N,) in [0, 1]: how far a body at (N, 3) was shifted, 1 from 0.1 m on, as far as a basket may go."""
+    return clamp(length(position - position_before) / BASKET_SHIFT, 0.0, 1.0)
 
 
-def action_rate(action: Array, before: Array, *, span: float = 2.0) -> Array:
-    """(N,) in [0, 1]: mean change of an action's components (N, A) since the last one, 1 from ``span`` on."""
-    return clamp(abs(action - before).mean(-1) / span, 0.0, 1.0)
+def action_rate(action: Array, before: Array) -> Array:
+    """(N,) in [0, 1]: mean change of an action's components (N, A) since the last one, 1 from 2 on."""
+    return clamp(abs(action - before).mean(-1) / 2.0, 0.0, 1.0)
 
 
 class DenseReward:
     """Weighs terms and penalties, and remembers the last action and reward.
 
     Args:
-        env: the `base.RoboCASEnv`.
-        table: weights of its terms.
+        table: weights of the terms.
+        num_envs: N.
+        device: of the results.
 
     Attributes:
         last_action: (N, A), NaN where there was none since the reset; None: none yet.
         last_level: (N,) last normalized reward of the mode ``progress``, NaN where there was none since the reset.
     """
 
-    def __init__(self, env: Any, table: RewardTable) -> None:
-        self._env, self._table = env, table
+    def __init__(self, table: RewardTable, num_envs: int, device: torch.device) -> None:
+        self._table, self._num_envs, self._device = table, num_envs, device
         self.last_action: torch.Tensor | None = None
         self.last_level: torch.Tensor | None = None
 
@@ -167,8 +162,7 @@ class DenseReward:
                 last[envs] = torch.nan
 
     def remember(self, action: Any) -> None:
-        """Remember the action of this step."""
-        self.last_action = torch.as_tensor(action, device=self._env.device).reshape(self._env.num_envs, -1).clone()
+        self.last_action = torch.as_tensor(action, device=self._device).reshape(self._num_envs, -1).clone()
 
     def gain(self, level: torch.Tensor) -> torch.Tensor:
         """Return how much a reward (N,) has risen since the last step; 0 in the first one."""
@@ -176,40 +170,29 @@ class DenseReward:
         self.last_level = level.clone()
         return (level - before).nan_to_num()
 
-    def of_goal(self) -> tuple[Array, dict[str, Array]]:
-        """Return stages (N,) and terms by name, (N,) in [0, 1] each, of the goal; native (`arrays`)."""
-        brought = self._env.success_check.stages["target_lifted"]
-        return self._env.goal.progress(self._env.success_check.moment, brought, self._table)
-
-    def weigh(self, stage: Array, found: dict[str, Array], action: Any, info: dict[str, Any]) -> torch.Tensor:
+    def weigh(
+        self, progress: tuple[Array, dict[str, Array]], penalties: dict[str, Array], action: Any, info: dict[str, Any]
+    ) -> torch.Tensor:
         """Return the reward (N,) in [0, total of the table], and add ``reward_terms`` to the info.
 
         Args:
-            stage: (N,) places in the table's stages, native (`arrays`).
-            found: terms by name, (N,) in [0, 1] each, native.
+            progress: stages and terms, see `Goal.progress`.
+            penalties: by name, (N,) in [0, 1] each, native (`arrays`); the action's rate is added.
             action: of this step.
             info: of this step, from `RoboCASEnv.evaluate`.
         """
-        penalties = self._penalties(action)
+        stage, found = progress
+        penalties = {**penalties, "action_rate": self._action_rate(action)}
+        penalties = {name: penalties[name] for name in self._table.penalties}
         stage = choose(native(info["success"]), 0 * stage + len(self._table.stages), stage)
         reward, counted = weigh(self._table, stage, found, penalties)
         counted.update(penalties)
         info["reward_terms"] = {name: as_tensor(term) for name, term in counted.items()}
         return as_tensor(reward * ~native(info["fail"]))
 
-    def _penalties(self, action: Any) -> dict[str, Array]:
-        """The table's penalties by name, (N,) in [0, 1] each, native."""
-        moment = self._env.success_check.moment
-        found = {
-            "disturbed": count_share(moment.disturbed.sum(1)),
-            **self._env.goal.penalties(moment),
-            "action_rate": self._action_rate(action),
-        }
-        return {name: found[name] for name in self._table.penalties}
-
     def _action_rate(self, action: Any) -> Array:
         before = self.last_action
         if action is None or before is None or before.shape[-1] != action.shape[-1]:
-            return native(torch.zeros(self._env.num_envs, device=self._env.device))
-        action = torch.as_tensor(action, device=self._env.device).reshape(self._env.num_envs, -1)
+            return native(torch.zeros(self._num_envs, device=self._device))
+        action = torch.as_tensor(action, device=self._device).reshape(self._num_envs, -1)
         return action_rate(native(action), native(torch.where(before.isnan(), action, before)))

@@ -150,9 +150,9 @@ class RoboCASSearchEnv(RoboCASEnv):
     def _moved(self, poses: torch.Tensor, before: torch.Tensor) -> bool:
         return bool(occlusion.moved_near(poses, before, self._radii, self.target_slot, self._eye).any())
 
-    def compute_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
-        """Return the reward; see `RoboCASEnv`. Before the target may be grasped, it has to be cleared or held once."""
-        stage, found = self.dense_reward.of_goal()
+    def reward_progress(self) -> tuple[Array, dict[str, Array]]:
+        """See `RoboCASEnv`; before the target may be grasped, it has to be cleared or held once."""
+        stage, found = super().reward_progress()
         stages = self.success_check.stages
         settled = stages["obstacles_cleared"] | stages["target_grasped"]
         covered = (stage == self.REWARDS.index("grasp")) & ~settled
@@ -160,7 +160,7 @@ class RoboCASSearchEnv(RoboCASEnv):
             found["push_point"] = rewards.closeness(self.tcp_in_world()[:, :3], native(self._push_point))
             found["clear"] = rewards.uncovered(native(self.hidden_share), native(self._obstacles.sum(dim=1)))
             stage = rewards.furthest(stage, [(covered, self.REWARDS.index("clear"))])
-        return self.dense_reward.weigh(stage, found, action, info)
+        return stage, found
 
     def privileged_observations(self) -> dict[str, torch.Tensor]:
         """Return those of `RoboCASEnv`, and ``hidden_share`` (N, 1), as last measured before the target was held."""

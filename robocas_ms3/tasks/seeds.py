@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from robocas_ms3.core.errors import ConfigError, LayoutError
+from robocas_ms3.core.errors import ConfigError, LayoutError, RobocasError
 from robocas_ms3.scenes.cache import LayoutCache
 from robocas_ms3.scenes.layout import Layout, LayoutSource, ObjectIds
 from robocas_ms3.scenes.table import FrozenLayouts, LayoutTable, Pair, State
@@ -33,6 +33,26 @@ def following_seeds(first: int, count: int, within: tuple[int, int] | None) -> l
         return [first + i for i in range(count)]
     low, high = within
     return [low + (first - low + i) % (high - low + 1) for i in range(count)]
+
+
+def check_reset_options(
+    options: dict[str, Any] | None, num_envs: int, device: torch.device
+) -> tuple[dict[str, Any], list[int]]:
+    """Return options of ``BaseEnv.reset``, ``env_idx`` as indices, and the numbers of the envs that are reset.
+
+    Raises:
+        RobocasError: ``reset_to_env_states`` was given.
+    """
+    options = dict(options or {})
+    if "reset_to_env_states" in options:
+        fix = "Reset with the seed of the recorded episode, then call set_state_dict."
+        raise RobocasError("a state lacks objects, target and stages", where="reset_to_env_states", fix=fix)
+    if "env_idx" in options:
+        index = torch.as_tensor(options["env_idx"], device=device)
+        options["env_idx"] = index.nonzero()[:, 0] if index.dtype == torch.bool else index
+        if num_envs > 1:
+            return options, options["env_idx"].tolist()
+    return options, list(range(num_envs))
 
 
 class EpisodeSeeds:
