@@ -75,7 +75,6 @@ class Annotations:
             raise AssetError("no such resting pose", where="display_pose", found=f"{self.display_pose} of {poses}")
 
     def save(self, path: Path) -> None:
-        """Write ``annotations.npz``."""
         arrays: dict[str, Any] = {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}
         np.savez_compressed(path, **arrays)
 

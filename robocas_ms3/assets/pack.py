@@ -77,7 +77,6 @@ class LoadedObject(Part):
 
     @cached_property
     def annotations(self) -> Annotations:
-        """Resting poses, footprints, grasps and surface points."""
         return Annotations.load(self.folder / ANNOTATIONS)
 
 

@@ -84,7 +84,6 @@ def add_body(scene: sapien.Scene, solid: Solid, pose: Array) -> physx.PhysxRigid
 
 
 def solid_of(asset: LoadedObject) -> Solid:
-    """Return an object of a pack as a body."""
     facts = asset.asset
     moments, center, axes = (np.array(v) for v in (facts.inertia, facts.center_of_mass, facts.inertia_wxyz))
     return Solid(asset.hulls, facts.mass, center, moments, axes, facts.friction)
@@ -169,7 +168,6 @@ def _box_shape(box: Box, material: physx.PhysxMaterial) -> physx.PhysxCollisionS
 
 
 def add_component(scene: sapien.Scene, component: physx.PhysxRigidBaseComponent, pose: sapien.Pose) -> None:
-    """Add a body at a pose."""
     entity = sapien.Entity()
     entity.add_component(component)
     entity.set_pose(pose)

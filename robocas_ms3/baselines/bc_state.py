@@ -226,7 +226,6 @@ class BcStateModel(nn.Module):
         return out[:, :-9].reshape(len(inputs), self.config.chunk, ROW), out[:, -9:]
 
     def forward(self, batch: Batch) -> dict[str, torch.Tensor]:
-        """Return the losses, see `chunk_losses`."""
         return chunk_losses(self, batch, *self.predict(batch["inputs"]))
 
     def act(self, inputs: torch.Tensor) -> torch.Tensor:
@@ -236,7 +235,6 @@ class BcStateModel(nn.Module):
 
 
 def make_policy(config: BcStateConfig, facts: dict[str, Any], model: BcStateModel) -> ChunkPolicy:
-    """Return the policy."""
     device, size = next(model.parameters()).device, len(facts["inputs"]["mean"])
 
     def predict(seen: Observations, row: int) -> NDArray[np.floating]:

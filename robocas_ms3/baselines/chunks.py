@@ -98,7 +98,6 @@ class Scale(torch.nn.Module):
         self.register_buffer("deviation", torch.tensor(deviation, dtype=torch.float32))
 
     def forward(self, values: torch.Tensor) -> torch.Tensor:
-        """Return normalised values."""
         return (values - self.mean) / self.deviation
 
     def back(self, values: torch.Tensor) -> torch.Tensor:
@@ -198,17 +197,14 @@ class ChunkPolicy:
         self._chunk_start: dict[int, Array] = {}  # by env, (3,) where the TCP was in the arm's base
 
     def describe(self) -> dict[str, Any]:
-        """Return what results record about the policy."""
         return self._about
 
     def reset(self, starts: list[EpisodeSpec]) -> None:
-        """Forget the chunks of these envs."""
         for start in starts:
             self._plans[start.env] = []
             self._chunk_start.pop(start.env, None)
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
-        """Return actions (E, 7)."""
         tcp = from_wxyz(observations.tcp_in_base)
         envs = observations.envs.tolist()
         for row, env in enumerate(envs):

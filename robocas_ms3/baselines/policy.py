@@ -66,15 +66,12 @@ class RunPolicy:
 
     @property
     def spec(self) -> PolicySpec:
-        """Observations and actions of the policy."""
         return self._policy.spec
 
     def describe(self) -> dict[str, Any]:
-        """Return what results record about the policy: baseline, data, steps and weights."""
         return {**self._about, **getattr(self._policy, "describe", dict)()}
 
     def reset(self, starts: list[EpisodeSpec]) -> None:
-        """Start episodes."""
         self._policy.reset(starts)
 
     def act(self, observations: Observations) -> Any:

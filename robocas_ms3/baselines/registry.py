@@ -30,7 +30,6 @@ class Builtin:
     about: str
 
     def __call__(self) -> Baseline:
-        """Return the baseline."""
         return import_module(f"robocas_ms3.baselines.{self.folder}").BASELINE
 
 

@@ -34,9 +34,9 @@ from robocas_ms3.demos.recordings.stored import (
 )
 from robocas_ms3.demos.recordings.writing import EpisodeRecorder
 from robocas_ms3.demos.settings import ReplaySettings
+from robocas_ms3.robots.description_file import chain
 from robocas_ms3.robots.ee_controller import RoboCASEEPoseController
 from robocas_ms3.robots.ee_deltas import to_ee_delta_action
-from robocas_ms3.robots.forward import chain
 from robocas_ms3.tasks.base import RoboCASEnv
 
 _JOINT_DELTA_SCALE = 0.1  # rad at |action| = 1 of pd_joint_delta_pos

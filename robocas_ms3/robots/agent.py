@@ -8,20 +8,31 @@ import numpy as np
 import sapien
 import torch
 from mani_skill.agents.base_agent import BaseAgent, Keyframe
-from mani_skill.agents.controllers import deepcopy_dict
+from mani_skill.agents.controllers import PDJointPosControllerConfig, deepcopy_dict
 from mani_skill.agents.registration import register_agent
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import common, sapien_utils
 from mani_skill.utils.structs import Actor, Link, Pose
 
 from robocas_ms3.robots.cameras import CameraSpec
-from robocas_ms3.robots.control_modes import Drive, Drives, control_modes
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.robots.drives import EvenDrives
-from robocas_ms3.robots.ee_controller import relative_pose
-from robocas_ms3.robots.joint_controllers import RobotController
+from robocas_ms3.robots.ee_controller import BODY_FRAME, RoboCASEEPoseControllerConfig, relative_pose
+from robocas_ms3.robots.ee_deltas import POSITION_SCALE, ROTATION_SCALE
+from robocas_ms3.robots.joint_controllers import (
+    BASE_SCALE,
+    JOINT_SCALE,
+    FingersControllerConfig,
+    HeldJointsControllerConfig,
+    JointDeltaControllerConfig,
+    RobotController,
+    SmoothJointPosControllerConfig,
+)
 from robocas_ms3.robots.quantities import QUANTITIES
 from robocas_ms3.robots.table import PANDA, STOCK_FINGERS, RobotSpec
+
+Drive = dict[str, Any]
+"""Stiffness, damping and force limit of joints, in ManiSkill's units."""
 
 
 class _GeneratedUrdf:
@@ -72,8 +83,48 @@ class MobileManipulator(BaseAgent):
 
     @property
     def _controller_configs(self) -> dict[str, dict[str, Any]]:
-        drives = Drives(self.arm_drive, self.gripper_drive, self.base_drive, self.base_max_speed)
-        return deepcopy_dict(control_modes(self.spec, drives, on_gpu=self.scene.gpu_sim_enabled))
+        """Controllers of each control mode: of the arm, the gripper, and the base, which is held or moved."""
+        # ManiSkill's replay tool asks for the exact class of its own controller
+        joint_deltas = JointDeltaControllerConfig if self.scene.gpu_sim_enabled else PDJointPosControllerConfig
+        robot, arm, base = self.description, self.arm_drive, self.base_drive
+        arm_joints, base_joints, fingers = list(robot.arm_joints), list(robot.base_joints), list(robot.finger_joints)
+        end_effector: dict[str, Any] = dict(
+            joint_names=arm_joints,
+            ee_link=robot.tcp_link,
+            urdf_path=str(self.spec.files().arm_urdf),
+            root_link_name=robot.arm_base_link,
+            **arm,
+        )
+        arms = dict(
+            pd_joint_pos=SmoothJointPosControllerConfig(arm_joints, None, None, **arm),
+            pd_joint_delta_pos=joint_deltas(arm_joints, -JOINT_SCALE, JOINT_SCALE, use_delta=True, **arm),
+            pd_ee_delta_pose=RoboCASEEPoseControllerConfig(
+                pos_lower=-POSITION_SCALE,
+                pos_upper=POSITION_SCALE,
+                rot_lower=-ROTATION_SCALE,
+                rot_upper=ROTATION_SCALE,
+                frame=BODY_FRAME,
+                use_target=True,
+                **end_effector,
+            ),
+            pd_ee_pose=RoboCASEEPoseControllerConfig(
+                pos_lower=-2.0, pos_upper=2.0, use_delta=False, normalize_action=False, **end_effector
+            ),
+        )
+        low, high = robot.finger_targets
+        mimic: dict[str, Any] = {fingers[1]: {"joint": fingers[0]}}
+        hand = FingersControllerConfig(fingers, lower=low, upper=high, mimic=mimic, **self.gripper_drive)
+        held = HeldJointsControllerConfig(base_joints, **base)
+        moving: dict[str, Any] = {**base, "max_speed": self.base_max_speed}
+        moved = SmoothJointPosControllerConfig(base_joints, None, None, **moving)
+        least, most = [-scale for scale in BASE_SCALE], list(BASE_SCALE)
+        moved_by = SmoothJointPosControllerConfig(
+            base_joints, least, most, use_delta=True, normalize_action=True, **moving
+        )
+        modes = {name: dict(arm=controller, gripper=hand, base=held) for name, controller in arms.items()}
+        for name, controller in arms.items():
+            modes[f"{name}_base"] = dict(arm=controller, gripper=hand, base=moved_by if "delta" in name else moved)
+        return deepcopy_dict(modes)
 
     @property
     def _sensor_configs(self) -> list[CameraConfig]:
@@ -123,13 +174,11 @@ class MobileManipulator(BaseAgent):
             self.robot.set_joint_drive_targets(targets, joints)
 
     def set_action(self, action: Any) -> None:
-        """Hand an action (N, action size) to the controllers."""
         if not self.scene.gpu_sim_enabled and torch.isnan(action).any():
             raise ValueError("Action cannot be NaN. Environment received:", action)
         self.controller.set_action(action)
 
     def before_simulation_step(self) -> None:
-        """Move on the drive targets that go from one to the next within a control step."""
         for controller in self._within_a_step:
             controller.before_simulation_step()
 
@@ -152,7 +201,6 @@ class MobileManipulator(BaseAgent):
 
     @property
     def controller(self) -> RobotController:
-        """The controller of the control mode."""
         return cast("RobotController", super().controller)
 
     def _still(self) -> None:

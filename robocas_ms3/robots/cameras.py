@@ -56,7 +56,6 @@ class CameraSpec:
     far: float = 10.0
 
     def __post_init__(self) -> None:
-        """Check the name."""
         if not re.fullmatch(CAMERA_NAME, self.name):
             raise ExtensionError("invalid camera name", expected="a name like side_camera", found=self.name)
 

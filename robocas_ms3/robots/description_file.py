@@ -1,8 +1,9 @@
-"""Read elements, joints, poses and numbers of URDF and SRDF files, with errors that name the file."""
+"""Read URDF and SRDF files, with errors that name the file; poses of links from a URDF, without a simulator."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import RobotDescriptionError
+from robocas_ms3.robots.table import RobotSpec
 
 Array = NDArray[np.float64]
 FIX = "Correct the file, or export it again."
@@ -66,11 +68,9 @@ class DescriptionFile:
             raise self.error("invalid robot description", "XML", error) from error
 
     def error(self, what: str, expected: object, found: object) -> RobotDescriptionError:
-        """Return an error about this file."""
         return RobotDescriptionError(what, where=self.path, expected=expected, found=found, fix=FIX)
 
     def attribute(self, element: Element, key: str) -> str:
-        """Return an attribute of an element."""
         if key not in element.attrib:
             found = " ".join(f'{name}="{value}"' for name, value in element.attrib.items()) or "no attributes"
             raise self.error(f"missing attribute of <{element.tag}>", key, found)
@@ -134,3 +134,49 @@ class DescriptionFile:
         if limit is None or "lower" not in limit.attrib or "upper" not in limit.attrib:
             return None
         return self.numbers(limit, "lower", 1)[0], self.numbers(limit, "upper", 1)[0]
+
+
+def link_poses(spec: RobotSpec, root_in_world: Array, qpos: Array) -> tuple[Array, Array]:
+    """Return poses of the TCP and of the arm's base in the world, (T, 4, 4) each.
+
+    Whatever makes dataset actions of recorded states goes this way: equal states give equal numbers to the last bit,
+    with and without a renderer, which the links' poses of a simulator do not.
+
+    Args:
+        spec: the robot.
+        root_in_world: (T, 4, 4) of its root.
+        qpos: (T, 12) m, rad.
+    """
+    urdf, robot = spec.files().urdf, spec.description
+    base = root_in_world @ chain(urdf, robot.root_link, robot.arm_base_link, qpos[:, robot.base_slice])
+    return base @ chain(urdf, robot.arm_base_link, robot.tcp_link, qpos[:, robot.arm_slice]), base
+
+
+def chain(urdf: Path, root: str, tip: str, positions: Array) -> Array:
+    """Return poses (T, 4, 4) of a link in another one.
+
+    Args:
+        urdf: the robot.
+        root, tip: links.
+        positions: (T, n) m or rad of the n moving joints between them, from the root on.
+    """
+    pose = np.tile(np.eye(4), (len(positions), 1, 1))
+    columns = iter(np.asarray(positions, np.float64).T)
+    for joint in read_joints(urdf, root, tip):
+        pose = pose @ joint.origin
+        if joint.kind == "fixed":
+            continue
+        along = next(columns)[:, None] * joint.axis
+        motion = np.tile(np.eye(4), (len(positions), 1, 1))
+        if joint.kind == "prismatic":
+            motion[:, :3, 3] = along
+        else:
+            motion[:, :3, :3] = Rotation.from_rotvec(along).as_matrix()
+        pose = pose @ motion
+    return pose
+
+
+@lru_cache(maxsize=8)
+def read_joints(urdf: Path, root: str, tip: str) -> tuple[Joint, ...]:
+    """Read the joints from one link of a URDF down to another, fixed ones included, in this order."""
+    return tuple(DescriptionFile(urdf).joints_between(root, tip))

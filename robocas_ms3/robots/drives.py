@@ -69,7 +69,6 @@ class DirectDrives(BatchedDrives):
             self._drive_to(targets[0].tolist())
 
     def _drive_to(self, targets: list[float]) -> None:
-        """`set_drive_targets` on a CPU."""
         for drive, target in zip(self._drives, targets, strict=True):
             drive.set_drive_target(target)
 
@@ -99,7 +98,6 @@ class EvenDrives(DirectDrives):
         self._step = 0
 
     def before_simulation_step(self) -> None:
-        """Move the drive targets on."""
         if self._step >= len(self._ahead):
             return
         targets = self._ahead[self._step]
@@ -111,6 +109,5 @@ class EvenDrives(DirectDrives):
             self._drive_to(targets)
 
     def reset(self) -> None:
-        """Start from the present configuration."""
         super().reset()
         self._ahead = []

@@ -148,7 +148,6 @@ class RoboCASEEPoseController(EvenDrives, _ArmChainController):
         return Pose(raw_pose=as_tensor(self._reference_pose()))
 
     def _reference_pose(self) -> Any:
-        """`reference_pose`, (N, 7) native."""
         now = _relative_pose(cast("Link", self.root_link), self.ee_link)
         if not self.config.use_target or self._target_pose is None:
             return now

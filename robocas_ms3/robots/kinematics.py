@@ -17,7 +17,7 @@ from torch import Tensor
 from robocas_ms3.core.arrays import Array, choose, clamp, join, known_all_false, matmul
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.core.rotations import left_matrix, positive
-from robocas_ms3.robots.forward import read_joints
+from robocas_ms3.robots.description_file import read_joints
 
 IK_ITERATIONS = 8
 IK_DAMPING, IK_LEAST_DAMPING = 0.1, 1e-6  # times the squared error, and added to it

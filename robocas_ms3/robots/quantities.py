@@ -48,7 +48,6 @@ class ArraySpec:
         return tuple(steps if length == "T" else length for length in self.shape)
 
     def has_dtype(self, array: np.ndarray) -> bool:
-        """Whether an array is of the declared type."""
         return array.dtype.kind == "U" if self.dtype == "str" else array.dtype == np.dtype(self.dtype)
 
     def cast(self, values: Any) -> np.ndarray:
@@ -78,7 +77,6 @@ class Quantity(ArraySpec):
 
     @property
     def width(self) -> int:
-        """Numbers per step."""
         return int(np.prod(self.shape_for(1)))
 
     @property

@@ -10,8 +10,8 @@ from motions import matrix, moved
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.robots.description import MOBILE_PANDA
+from robocas_ms3.robots.description_file import chain
 from robocas_ms3.robots.ee_deltas import to_ee_delta_action
-from robocas_ms3.robots.forward import chain
 from robocas_ms3.robots.urdf import robot_files
 
 MODES = {"pd_joint_pos": 8, "pd_joint_delta_pos": 8, "pd_ee_delta_pose": 7, "pd_ee_pose": 7}

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from robocas_ms3.core.errors import RobotDescriptionError
-from robocas_ms3.robots.description_file import DescriptionFile
-from robocas_ms3.robots.forward import read_joints
+from robocas_ms3.robots.description_file import DescriptionFile, read_joints
 
 ARM = """<robot name="arm">
   <link name="base"/><link name="upper"/><link name="lower"/><link name="pad"/>

@@ -13,7 +13,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.robots.description import MOBILE_PANDA
-from robocas_ms3.robots.forward import chain as urdf_pose
+from robocas_ms3.robots.description_file import chain as urdf_pose
 from robocas_ms3.robots.kinematics import SerialChain
 from robocas_ms3.robots.urdf import robot_files
 

@@ -62,7 +62,6 @@ class Agent(nn.Module):
 
 
 def make_agent(config: PpoConfig, facts: dict[str, Any]) -> Agent:
-    """Return the networks of policy and value."""
     return Agent(facts["observed"], facts["acted"], config.width)
 
 
@@ -87,7 +86,7 @@ class PpoPolicy:
         self._agent, self._size = agent, facts["observed"]
 
     def reset(self, starts: list[EpisodeSpec]) -> None:
-        """Do nothing: the policy keeps no state."""
+        pass
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
         """Return actions (E, 7).

@@ -56,12 +56,10 @@ class TopDown(gym.Wrapper):
         self.observation_space = batch_space(self.single_observation_space, base.num_envs)
 
     def reset(self, **kwargs: Any) -> tuple[torch.Tensor, dict[str, Any]]:
-        """Reset; see ``BaseEnv``."""
         obs, info = self.env.reset(**kwargs)
         return _observation(obs), info
 
     def step(self, action: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Take a step."""
         base: Any = self.unwrapped
         obs, *rest = self.env.step(expand_action(torch.as_tensor(action, device=base.device)))
         return (_observation(obs), *rest)  # pyright: ignore[reportReturnType]
@@ -117,12 +115,10 @@ class PpoEnvironments:
         )
 
     def close(self) -> None:
-        """Close the environments and their processes."""
         self.envs.close()
 
 
 def load_scenes(config: PpoConfig) -> TaskConfig:
-    """Load the scenes of a configuration."""
     if config.scenes is not None:
         return load_task_config(config.scenes)
     return load_task_config(load_task_config("pick_table_scattered").model_dump(mode="json") | ONE_FRUIT)

@@ -141,7 +141,6 @@ class _TrainingState:
             torch.cuda.set_rng_state(tensors["random.cuda"])
 
     def tensors(self) -> dict[str, torch.Tensor]:
-        """Return the tensors of a checkpoint."""
         random = {"cpu": torch.get_rng_state()}
         if self._agent.mean.is_cuda:
             random["cuda"] = torch.cuda.get_rng_state()
@@ -197,7 +196,6 @@ class RolloutCollector:
 
     @torch.no_grad()
     def collect(self) -> Rollout:
-        """Take the steps of one update."""
         agent, config = self._agent, self._config
         steps = []
         for _ in range(steps_per_env(config)):

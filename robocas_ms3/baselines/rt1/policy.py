@@ -44,7 +44,6 @@ class RT1Policy:
         return {"image_weights": name}
 
     def reset(self, starts: list[EpisodeSpec]) -> None:
-        """Forget the frames of these envs."""
         for start in starts:
             self._frames.pop(start.env, None)
             self._final.pop(start.env, None)
@@ -68,7 +67,6 @@ class RT1Policy:
         return action
 
     def _encode(self, observations: Observations, row: int) -> torch.Tensor:
-        """Return the image tokens (images, token_width) of an env."""
         assert observations.embeddings is not None
         views = [resize(observations.images[name][row], self._config.picture) for name in self._config.cameras]
         device = self._model.mean.device

@@ -162,7 +162,6 @@ class SmallSamples:
         return locate_objects(episode, arrays, poses, projections)
 
     def _check_calibration(self, camera: str, found: dict[str, Any], where: object) -> None:
-        """Check that a camera is mounted in all episodes as in the first."""
         first = self._calibration[camera]
         if self._config.lift and not same_calibration(first, found):
             key = "mount" if not same_calibration(first, found, ["mount"]) else "intrinsic"

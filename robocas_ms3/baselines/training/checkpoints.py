@@ -40,7 +40,6 @@ class Checkpoint:
         return {key.removeprefix(prefix): value for key, value in self.tensors.items() if key.startswith(prefix)}
 
     def load_model(self, model: torch.nn.Module, part: str = "") -> None:
-        """Load weights into a network."""
         own, tensors = model.state_dict(), self.part(part) if part else self.tensors
         missing, more = own.keys() - tensors.keys(), tensors.keys() - own.keys()
         shapes = [name for name in own if name in tensors and own[name].shape != tensors[name].shape]

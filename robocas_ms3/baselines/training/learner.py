@@ -86,7 +86,6 @@ class Learner:
         return means_of_sums(self._reduce(sums))
 
     def check_finite(self, step: int, **values: torch.Tensor | float) -> None:
-        """Raise a TrainingError if values of a step are NaN or infinite."""
         for name, value in values.items():
             if not math.isfinite(value):
                 raise self._run.error(f"the {name} is NaN or infinite", step)
@@ -112,7 +111,6 @@ class Learner:
             self._run.save(self.step, state, self.weights())
 
     def _restore(self, checkpoint: Checkpoint) -> None:
-        """Restore all but the optimiser."""
         checkpoint.load_model(self._bare, "model")
         if self._average is not None:
             checkpoint.load_model(self._average, "average")
@@ -131,7 +129,6 @@ class Learner:
         torch._foreach_lerp_(average, now, 1 - decay)  # pyright: ignore[reportPrivateImportUsage]
 
     def _reduce(self, sums: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """Return the sums over all processes."""
         if not sums:
             return {}
         reduced: Any = self._accelerator.reduce(torch.stack(list(sums.values())), "sum")

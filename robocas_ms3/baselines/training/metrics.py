@@ -62,7 +62,6 @@ class MetricsLog:
         return (step, split) in self._written
 
     def add(self, step: int, split: str, about: Mapping[str, float], metrics: Mapping[str, float]) -> None:
-        """Write a line."""
         row = {"step": step, "split": split, **about, **metrics}
         is_first = not self._columns
         if is_first:
@@ -76,7 +75,6 @@ class MetricsLog:
         self._tensorboard.add(step, {f"{split}/{key}": value for key, value in shown.items() if math.isfinite(value)})
 
     def close(self) -> None:
-        """Close the files."""
         self._tensorboard.close()
 
     def _remove_lines_after(self, step: int) -> None:
@@ -115,13 +113,11 @@ class TensorBoardWriter:
             self._write(step=first, session_log=log(status=log.START))
 
     def add(self, step: int, values: Mapping[str, float]) -> None:
-        """Write values by name."""
         summary = self._summaries.Summary
         scalars = [summary.Value(tag=name, simple_value=value) for name, value in values.items()]
         self._write(step=step, summary=summary(value=scalars))
 
     def close(self) -> None:
-        """Close the file."""
         with naming(self._path):
             self._records.close()
 

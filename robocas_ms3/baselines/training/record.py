@@ -84,7 +84,6 @@ def find_run(run: Path) -> Path:
 
 
 def read_run(folder: Path) -> RunRecord:
-    """Read the record of a run."""
     path = folder / RUN
     if not path.is_file():
         fix = "Name the --out of a `robocas train`."
@@ -99,7 +98,6 @@ def read_run(folder: Path) -> RunRecord:
 
 
 def package_versions() -> dict[str, str]:
-    """Return the versions of the packages that results depend on."""
     return {name: version(name) for name in _PACKAGES}
 
 

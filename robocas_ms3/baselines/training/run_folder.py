@@ -108,7 +108,6 @@ class RunFolder:
             checkpoints.save(self._output.path / CHECKPOINT, state, self.record.metadata, step)
 
     def error(self, message: str, step: int) -> TrainingError:
-        """Return an error about NaN or infinite values at a step."""
         return TrainingError(
             message,
             where=f"{self._output.path}, step {step}",

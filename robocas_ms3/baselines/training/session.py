@@ -265,7 +265,6 @@ def _read_validation(read: Callable[[Split, OnRead], Samples], progress: Progres
 
 
 def _make_model(baseline: Baseline, config: Any, record: RunRecord, initial: InitialWeights | None) -> torch.nn.Module:
-    """Return the network with random or initial weights."""
     torch.manual_seed(config.train.seed)
     model = baseline.model(config, record.facts)
     if initial is not None and initial.weights is not None:

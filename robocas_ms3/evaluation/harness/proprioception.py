@@ -13,7 +13,7 @@ from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.arrays import frame_columns
 from robocas_ms3.datasets.sources.arrays import episode_arrays
 from robocas_ms3.demos.recordings.motion import Motion, gripper_open
-from robocas_ms3.robots.forward import chain
+from robocas_ms3.robots.description_file import chain
 from robocas_ms3.robots.quantities import ARM_BASE, STATE, columns_of, features
 from robocas_ms3.robots.table import RobotSpec
 
