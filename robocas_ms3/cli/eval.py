@@ -87,7 +87,6 @@ def run(settings: EvaluationSettings) -> int:
 
 
 def list_protocols(cfg: Protocols) -> int:
-    """Run ``protocols``."""
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
 
@@ -101,7 +100,6 @@ def list_protocols(cfg: Protocols) -> int:
 
 
 def freeze(cfg: Freeze) -> int:
-    """Run ``freeze``."""
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.core.outputs import check_replaceable

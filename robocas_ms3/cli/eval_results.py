@@ -84,7 +84,6 @@ class Videos:
 
 
 def report(cfg: Report) -> int:
-    """Run ``report``."""
     from robocas_ms3.cli.terminal import say, say_lines
     from robocas_ms3.evaluation.report.tables import markdown
 
@@ -98,7 +97,6 @@ def report(cfg: Report) -> int:
 
 
 def merge(cfg: Merge) -> int:
-    """Run ``merge``."""
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.evaluation.results import merge as write
 
@@ -110,7 +108,6 @@ def merge(cfg: Merge) -> int:
 
 
 def compare(cfg: Compare) -> int:
-    """Run ``compare``."""
     from robocas_ms3.cli.terminal import say_lines
     from robocas_ms3.evaluation.report.comparison import comparison, comparison_of_splits
     from robocas_ms3.evaluation.results import parts_of, read
@@ -126,7 +123,6 @@ def compare(cfg: Compare) -> int:
 
 
 def verify(cfg: Verify) -> int:
-    """Run ``verify``."""
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.evaluation.verify import problems
 
@@ -142,11 +138,7 @@ def verify(cfg: Verify) -> int:
 
 
 def videos(cfg: Videos) -> int:
-    """Run ``videos``.
-
-    Raises:
-        EvaluationError: the policy of the result is not installed, and --policy does not confirm it.
-    """
+    """Run ``videos``."""
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.core.errors import EvaluationError
@@ -175,7 +167,6 @@ def videos(cfg: Videos) -> int:
 
 
 def write_pages(result: Result, out: Path, protocol: str | None) -> None:
-    """Write the report, and say where it is."""
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.core.errors import EvaluationError
     from robocas_ms3.evaluation.report import write_report
@@ -206,11 +197,7 @@ def _read(folders: tuple[Path, ...]) -> Result:
 
 
 def _protocol_of(result: Result, given: str | None) -> LoadedProtocol:
-    """Return the given protocol, or the shipped one that a result names: a result chooses no folder.
-
-    Raises:
-        EvaluationError: none is given, and none of that name is shipped.
-    """
+    """Return the given protocol, or the shipped one that a result names: a result chooses no folder."""
     from robocas_ms3.core.errors import EvaluationError
     from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
 

@@ -39,11 +39,7 @@ def steps_of(seed: int, after_steps: tuple[int, int]) -> int:
 
 
 def check_acting(settings: EpisodeSettings) -> str:
-    """Check that the policy can act, and return a hash of its weights, if it has some.
-
-    Raises:
-        RobocasError: there is no such policy, it does not fit the protocol, or uses cameras without a render device.
-    """
+    """Check that the policy can act, and return a hash of its weights, if it has some."""
     with open_policy(settings.after_policy) as policy:
         load_protocol(PROTOCOL).rules.check_policy(policy.spec)
         if policy.spec.cameras:

@@ -53,16 +53,11 @@ class Scene(StrictModel):
     change: dict[str, Any] = Field(default={}, description="keys that have other values, in the configuration's form")
 
     def changed(self, overrides: Sequence[str] = ()) -> TaskConfig:
-        """Return the resolved configuration: the file, with ``change`` and then ``overrides`` merged over it.
-
-        Raises:
-            ConfigError: there is no such file, or a key or value is wrong.
-        """
+        """Return the resolved configuration: the file, with ``change`` and then ``overrides`` merged over it."""
         return load_task_config(self.config, self.change, overrides)
 
     @property
     def file(self) -> str:
-        """Name of its configuration in the protocol."""
         return self.name or Path(self.config).stem
 
 
@@ -78,7 +73,6 @@ class Part(Scene):
 
     @property
     def file(self) -> str:
-        """Name of its configuration in the protocol."""
         return self.name or super().file + ("" if self.split == "test" else f"-{self.split}")
 
 
@@ -144,7 +138,6 @@ def freeze(plan: Plan, folder: Path, overrides: Sequence[str] = ()) -> Iterator[
 
 
 def _configs(parts: Sequence[Scene], overrides: Sequence[str]) -> dict[str, TaskConfig]:
-    """Return the configurations by name."""
     found: dict[str, TaskConfig] = {}
     for part in parts:
         config = part.changed(overrides)

@@ -44,7 +44,6 @@ class EpisodeMetrics:
         self._retrieval = RetrievalOrder(env) if isinstance(env, RoboCASSearchEnv) else None
 
     def reset(self, envs: Any) -> None:
-        """Start new episodes in some envs."""
         self._sums[envs] = 0
         self._near, self._in_v0 = _cleared(self._near, envs), _cleared(self._in_v0, envs)
         self._tcp[envs] = self._tcp_pos()[envs]
@@ -77,7 +76,6 @@ class EpisodeMetrics:
         return link_poses(self._env.scene, [self._env.agent.tcp])[:, 0, :3]  # a fourth of `tcp.pose`'s time
 
     def end_step(self) -> None:
-        """Count a policy step, after its last control step."""
         self._sums[:, _V0_STEPS] += self._in_v0
         if self._retrieval is not None:
             self._retrieval.end_step()
@@ -125,7 +123,6 @@ class RetrievalOrder:
         self._found: Tensor | None = None  # of `read`, until something changes
 
     def reset(self, envs: Any) -> None:
-        """Start new episodes in some envs, from their present heaps."""
         for some in torch.arange(len(self._steps), device=self._env.device)[envs].split(ENVS_AT_ONCE):
             self._reset(some)
 
@@ -152,7 +149,6 @@ class RetrievalOrder:
         self._moved_time = choose(now, time, self._moved_time)
 
     def end_step(self) -> None:
-        """Count a policy step."""
         self._steps += 1
 
     def read(self) -> Tensor:

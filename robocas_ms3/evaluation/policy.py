@@ -7,7 +7,8 @@ import re
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal, Protocol
+from functools import partial
+from typing import Annotated, Any, Literal, Protocol, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,10 +26,8 @@ ROBOT = {quantity.policy: quantity for quantity in QUANTITIES if quantity.policy
 """Quantities of the robot that policies observe, by their names there."""
 Language = Literal["none", "text", "embedding"]
 Reference = Literal["tcp", "target"]
-Side = Annotated[int, Field(ge=1, le=4096)]
-"""Of an image, pixels."""
-
-
+Pixels = Annotated[int, Field(ge=1, le=4096)]
+"""Width or height of an image."""
 Array = NDArray[np.float64]
 
 
@@ -49,33 +48,27 @@ class Convention:
     read: Callable[[Array], Motion] | None
 
 
-def _robocas(actions: Array) -> Motion:
-    return Motion(actions[:, :3], Rotation.from_euler("xyz", actions[:, 3:6]), actions[:, 6] > 0.5)
+def _motions(rotation: Callable[[Array], Rotation], open_above: float = 0.0) -> Callable[[Array], Motion]:
+    def read(actions: Array) -> Motion:
+        return Motion(actions[:, :3], rotation(actions[:, 3:-1]), actions[:, -1] > open_above)
+
+    return read
 
 
-def _euler(actions: Array) -> Motion:
-    return Motion(actions[:, :3], Rotation.from_euler("xyz", actions[:, 3:6]), actions[:, 6] > 0)
+def _quaternions(wxyz: Array) -> Rotation:
+    xyzw = wxyz[:, [1, 2, 3, 0]]
+    lengths = np.linalg.norm(xyzw, axis=1, keepdims=True)
+    return Rotation.from_quat(np.where(lengths > 1e-9, xyzw / np.maximum(lengths, 1e-9), [0.0, 0.0, 0.0, 1.0]))
 
 
-def _axis_angle(actions: Array) -> Motion:
-    return Motion(actions[:, :3], Rotation.from_rotvec(actions[:, 3:6]), actions[:, 6] > 0)
-
-
-def _quaternion(actions: Array) -> Motion:
-    quaternions = actions[:, [4, 5, 6, 3]]
-    lengths = np.linalg.norm(quaternions, axis=1, keepdims=True)
-    identity = np.array([0.0, 0.0, 0.0, 1.0])
-    quaternions = np.where(lengths > 1e-9, quaternions / np.maximum(lengths, 1e-9), identity)
-    return Motion(actions[:, :3], Rotation.from_quat(quaternions), actions[:, 7] > 0)
-
-
+_euler = partial(Rotation.from_euler, "xyz")
 # Translation in m, then rotation (Euler angles about fixed axes x, y, z in rad, a rotation vector in rad, or a
 # quaternion wxyz), both in the TCP's frame; the last number is the gripper's, open above 0, of the paper's above 0.5.
 CONVENTIONS: dict[str, Convention] = {
-    "robocas": Convention(7, _robocas),
-    "delta_euler": Convention(7, _euler),
-    "delta_axis_angle": Convention(7, _axis_angle),
-    "delta_quaternion": Convention(8, _quaternion),
+    "robocas": Convention(7, _motions(_euler, 0.5)),
+    "delta_euler": Convention(7, _motions(_euler)),
+    "delta_axis_angle": Convention(7, _motions(Rotation.from_rotvec)),
+    "delta_quaternion": Convention(8, _motions(_quaternions)),
     "joint_positions": Convention(8, None),  # seven joint targets, rad; gripper, -1 closed to 1 open
 }
 """By name."""
@@ -102,30 +95,24 @@ class PolicySpec:
     convention: str = "robocas"
     reference: Reference = "target"
     rate_hz: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
-    cameras: Mapping[str, tuple[Side, Side]] = field(default_factory=dict)
+    cameras: Mapping[str, tuple[Pixels, Pixels]] = field(default_factory=dict)
     depth: bool = False
     state: bool = False
     language: Language = "text"
     look_every: int = 1
 
     def __post_init__(self) -> None:
-        for name, value, known in (
-            ("convention", self.convention, sorted(CONVENTIONS)),
-            ("reference", self.reference, ["tcp", "target"]),
-            ("language", self.language, ["none", "text", "embedding"]),
+        wrong_cameras = [name for name in self.cameras if not re.fullmatch(CAMERA_NAME, name)]
+        for name, fits, expected in (
+            ("convention", self.convention in CONVENTIONS, f"one of {sorted(CONVENTIONS)}"),
+            ("reference", self.reference in get_args(Reference), f"one of {list(get_args(Reference))}"),
+            ("language", self.language in get_args(Language), f"one of {list(get_args(Language))}"),
+            ("cameras", not wrong_cameras, "names like side_camera"),
+            ("look_every", self.look_every >= 1, "1 or more"),
         ):
-            if value not in known:
-                raise EvaluationError(
-                    "a policy can't want that", where=name, expected=f"one of {known}", found=repr(value)
-                )
-        for camera in self.cameras:
-            if not re.fullmatch(CAMERA_NAME, camera):
-                expected = "names like side_camera"
-                raise EvaluationError("a policy can't want that", where="cameras", expected=expected, found=camera)
-        if self.look_every < 1:
-            raise EvaluationError(
-                "a policy can't want that", where="look_every", expected="1 or more", found=self.look_every
-            )
+            if not fits:
+                found = repr(wrong_cameras[0] if name == "cameras" else getattr(self, name))
+                raise EvaluationError("a policy can't want that", where=name, expected=expected, found=found)
 
 
 @dataclass(frozen=True)
@@ -136,12 +123,9 @@ class EpisodeSpec:
         env: number of the env that runs it, as in `Observations.envs`.
         episode: its number in the protocol's list.
         task: short name.
-        config_file: its configuration.
-        layouts_file: its scene's, among others.
-        pack: object pack.
+        config_file, layouts_file: of its configuration and its scene.
+        pack: name of the object pack, or its folder.
         seed: of its scene.
-        instruction: for the policy.
-        robot: name of the robot.
     """
 
     env: int
@@ -178,7 +162,6 @@ class Observations:
     state: NDArray[np.float32] | None
 
     def __getattr__(self, name: str) -> NDArray[np.float32]:
-        """Return a quantity of the robot."""
         if name not in ROBOT:
             raise AttributeError(name)
         return self.robot[name]
@@ -193,9 +176,7 @@ class Policy(Protocol):
     """A policy, which runs several episodes at a time."""
 
     @property
-    def spec(self) -> PolicySpec:
-        """What it declares."""
-        ...
+    def spec(self) -> PolicySpec: ...
 
     def reset(self, starts: list[EpisodeSpec]) -> None:
         """Start episodes in some envs, and forget what was kept of these envs."""
@@ -229,10 +210,9 @@ class ExternalPolicy:
         self.spec = spec
 
     def reset(self, starts: list[EpisodeSpec]) -> None:
-        """Do nothing."""
+        pass
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
-        """Raise an error."""
         raise EvaluationError("this policy has no actions", where="ExternalPolicy", fix="Call reset and step.")
 
 
@@ -243,11 +223,7 @@ def policy_spec_values(spec: PolicySpec) -> dict[str, Any]:
 
 
 def describe(policy: Policy) -> dict[str, Any]:
-    """Return what a result says of a policy: class, specification, and the entries of its optional ``describe()``.
-
-    Raises:
-        EvaluationError: the description is not a dict, or has a value that a result can't hold, such as NaN.
-    """
+    """Return what a result says of a policy: class, specification, and the entries of its optional ``describe()``."""
     where = f"policy {_class_of(policy)}, describe()"
     with policy_code(policy):
         spec, added = policy_spec_values(policy.spec), getattr(policy, "describe", dict)()

@@ -89,11 +89,7 @@ class Protocol(StrictModel):
         return min((steps for steps in ends if steps is not None), default=None)
 
     def check_policy(self, spec: PolicySpec) -> None:
-        """Check that a policy can be evaluated by this protocol.
-
-        Raises:
-            EvaluationError: its actions or its rate do not fit.
-        """
+        """Check that a policy can be evaluated by this protocol."""
         for what, found, allowed in (
             ("convention", spec.convention, self.conventions),
             ("reference", spec.reference, self.references),
@@ -106,11 +102,7 @@ class Protocol(StrictModel):
             raise EvaluationError("the policy acts at another rate", where=self.name, expected=expected, found=found)
 
     def rate(self, spec: PolicySpec) -> int:
-        """Return the number of actions per second.
-
-        Raises:
-            EvaluationError: physics at 100 Hz has no such rate.
-        """
+        """Return the number of actions per second."""
         rate = self.rate_hz or spec.rate_hz or DEFAULT_HZ
         if rate < 1 or rate != int(rate) or 100 % int(rate):
             raise EvaluationError("no such rate", where="rate_hz", expected="a divisor of 100", found=f"{rate:g}")
@@ -144,11 +136,7 @@ class LoadedProtocol:
 
     @cached_property
     def hash(self) -> str:
-        """Hex sha256 of its files, by their names.
-
-        Raises:
-            EvaluationError: a file can't be read or is too large.
-        """
+        """Hex sha256 of its files, by their names."""
         digest = hashlib.sha256()
         for path in files_of(self.folder):
             try:
@@ -185,11 +173,7 @@ class LoadedProtocol:
         return chosen
 
     def check_cameras(self, spec: PolicySpec, episodes: Sequence[Episode]) -> None:
-        """Check that episodes have the cameras that a policy uses.
-
-        Raises:
-            EvaluationError: a configuration lacks one.
-        """
+        """Check that episodes have the cameras that a policy uses."""
         robot = find_robot(self.rules.robot).description
         for config in dict.fromkeys(episode.config for episode in episodes):
             known = [camera.name for camera in load_task_config(self.config_file(config)).cameras_of(robot)]
@@ -200,22 +184,16 @@ class LoadedProtocol:
                     raise EvaluationError("no such camera", where=where, expected=expected, found=name, fix=fix)
 
     def check_one_configuration(self, episodes: Sequence[Episode], fix: str = "") -> None:
-        """Check that episodes can run in one batch.
-
-        Raises:
-            EvaluationError: their configurations differ.
-        """
+        """Check that episodes can run in one batch."""
         configs = list(dict.fromkeys(episode.config for episode in episodes))
         if len(configs) > 1:
             what, found = "episodes of several configurations in one batch", ", ".join(configs)
             raise EvaluationError(what, where=self.rules.name, expected="one", found=found, fix=fix)
 
     def config_file(self, config: str) -> Path:
-        """Return the file of a configuration."""
         return self.folder / CONFIGS / f"{config}.yaml"
 
     def layouts_file(self, config: str) -> Path:
-        """Return the file of the scenes of a configuration's episodes."""
         return self.folder / LAYOUTS / f"{config}.npy"
 
     def train_files(self) -> list[Path]:
@@ -230,7 +208,6 @@ def files_of(folder: Path) -> list[Path]:
 
 
 def shipped_protocols() -> dict[str, Path]:
-    """Return the folders of the bundled protocols by name."""
     return {path.parent.name: path.parent for path in sorted(protocols_dir().glob(f"*/{RULES}"))}
 
 

@@ -76,16 +76,11 @@ class RunRecord(BaseModel):
 
     @classmethod
     def of(cls, values: dict[str, Any], where: object) -> RunRecord:
-        """Return the record of these values, which can be written and read back; ``where`` is for errors.
-
-        Raises:
-            EvaluationError: a value is missing or wrong, or could not be read back, such as NaN.
-        """
+        """Return the record of these values, which can be written and read back; ``where`` is for errors."""
         text = json_text(values, where, error=EvaluationError)
         return parse_json(cls, text, EvaluationError, where=where, about="this evaluation can't be recorded")
 
     def entries(self) -> dict[str, Any]:
-        """Return its values in the form of the file."""
         return self.model_dump(exclude_unset=True)
 
     def identity(self) -> dict[str, Any]:
@@ -133,7 +128,6 @@ class Result:
         return len({(one.task, one.seed) for one in self.outcomes.values()}) < len(self.outcomes)
 
     def broken_off(self) -> int:
-        """Return the number of episodes that an error ended."""
         return sum(bool(one.error) for one in self.outcomes.values())
 
     def by(self, name: str) -> dict[str, list[Outcome]]:
@@ -228,7 +222,6 @@ def merge(folders: Sequence[Path], out: Path) -> Result:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of the packages that a score depends on."""
     return {name: version(name) for name in _PACKAGES}
 
 

@@ -192,7 +192,6 @@ class EpisodeBatch:
         return played
 
     def _record_flags(self) -> None:
-        """Record which flags hold for the first time."""
         new = np.array([self._info[name] for name in self._flags]) & ~self._held
         if not new.any():
             return

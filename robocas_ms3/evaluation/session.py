@@ -105,7 +105,6 @@ class EvaluationSession:
                 yield outcome
 
     def max_steps(self, task: str) -> int:
-        """Return the maximum number of policy steps per episode."""
         steps = self.protocol.rules.steps(task, self.rate)
         assert steps is not None  # `load_protocol` checks it
         return steps
@@ -197,7 +196,6 @@ class EvaluationSession:
 
     @property
     def observation(self) -> dict[str, Any]:
-        """Last observation of the environment, arrays (N, ...)."""
         assert self._batch is not None
         return self._batch.obs
 
@@ -222,7 +220,6 @@ class EvaluationSession:
             env.close()
 
     def _play(self, episodes: list[Episode], max_steps: int | None) -> Iterator[Outcome]:
-        """Run episodes of one configuration."""
         left, deaths = {episode.episode: episode for episode in episodes}, Counter[int]()
         while left:
             batch = None

@@ -59,11 +59,7 @@ class EvaluationSettings:
     """Width and height of the images of the env's ``render``, pixels; None: it renders none."""
 
     def check(self) -> None:
-        """Check the numbers.
-
-        Raises:
-            RobocasError: one is out of range.
-        """
+        """Check the numbers."""
         from robocas_ms3.core.strict import check_number  # with pydantic, which `robocas --help` does not wait for
 
         for name in ("envs", "episodes", "workers"):
@@ -74,17 +70,12 @@ class EvaluationSettings:
         self.parse_shard()
 
     def parse_shard(self) -> tuple[int, int]:
-        """Return number K and count N of the shard.
-
-        Raises:
-            EvaluationError: it is invalid.
-        """
+        """Return number K and count N of the shard."""
         number, _, count = self.shard.partition("/")
         if not (number.isdecimal() and count.isdecimal() and int(number) < int(count)):
             raise EvaluationError("invalid shard", where="--shard", expected="K/N with K < N", found=repr(self.shard))
         return int(number), int(count)
 
     def folder(self, protocol: str) -> Path:
-        """Return the folder of the result, by the name of the protocol."""
         name = re.sub(r"[^\w.-]+", "_", self.policy) + ("_weld" if self.weld else "")
         return self.out or (Path("eval") / protocol / name).absolute()

@@ -48,7 +48,6 @@ class Comparison:
 
     @classmethod
     def of(cls, both: int, only_a: int, only_b: int, neither: int) -> Comparison:
-        """Compare two runs by the counts of scenes."""
         limits = paired_interval(only_a, only_b, both + only_a + only_b + neither)
         return cls(both, only_a, only_b, neither, mcnemar(only_a, only_b), *limits)
 

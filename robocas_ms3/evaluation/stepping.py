@@ -59,7 +59,6 @@ class PolicyStepping(gym.Wrapper):
         self._image_period, self._steps = spec.look_every, np.zeros(count, dtype=np.int64)  # steps by env
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
-        """Reset; see ``BaseEnv``."""
         if self._weld:
             self._weld.reset()
         obs, info = self.env.reset(**kwargs)
@@ -196,7 +195,6 @@ class Weld:
             self._fix(env.objects[int(found[0])]._bodies[0])
 
     def open(self) -> None:
-        """Release the object."""
         if self._welded is None:
             return
         body, drive = self._welded
@@ -205,7 +203,6 @@ class Weld:
         self._welded = None
 
     def reset(self) -> None:
-        """Release the object, and count from 0; to be called before a reset, which may remove the objects."""
         self.open()
         self._count = 0
 
@@ -228,11 +225,7 @@ class Weld:
 
 
 def check_weld(stepping: str, backend: str) -> None:
-    """Check that objects can be welded with a protocol's steps, on a backend.
-
-    Raises:
-        EvaluationError: the protocol's steps are not upstream's, or envs run on a GPU.
-    """
+    """Check that objects can be welded with a protocol's steps, on a backend."""
     if stepping != "upstream":
         what, fix = "the weld belongs to upstream's steps", "Leave --weld out, or take paper-v1."
         raise EvaluationError(what, where="--weld", expected="stepping upstream", found=stepping, fix=fix)
@@ -242,7 +235,6 @@ def check_weld(stepping: str, backend: str) -> None:
 
 
 def control_mode(convention: str) -> str:
-    """Return the control mode into which actions of a convention are converted."""
     return "pd_joint_pos" if CONVENTIONS[convention].read is None else "pd_ee_delta_pose"
 
 

@@ -35,7 +35,6 @@ def problems(result: Result, protocol: LoadedProtocol) -> list[str]:
 
 
 def _problems(outcome: Outcome, episode: Episode, protocol: LoadedProtocol, run: RunRecord) -> Iterator[str]:
-    """Yield what is wrong with one outcome."""
     rules, flags, steps = protocol.rules, outcome.flags, count_of(outcome.steps, "step")
     for name in ("task", "config", "seed", "split", "p_vis"):
         if getattr(outcome, name) != getattr(episode, name):

@@ -72,11 +72,6 @@ class RoboCASEnvConfig(EnvConfig):
 
     @property
     def spec(self) -> PolicySpec:
-        """Specification of the policy.
-
-        Raises:
-            EvaluationError: no camera is named, or a value is unknown.
-        """
         size = (self.observation_width, self.observation_height)
         cameras = dict.fromkeys(_names(self.cameras, "env.cameras"), size)
         return PolicySpec(self.convention, cast(Reference, self.reference), self.fps, cameras, depth=self.depth)

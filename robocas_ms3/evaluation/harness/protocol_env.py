@@ -153,16 +153,13 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         return (shared[name],) * self.num_envs
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Return what `render` gives, or what `get_attr` gives."""
         return self.render() if name == "render" else self.get_attr(name)
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Close the environment and unlock the folder of the result."""
         self._session.close()
         self._lock.close()
 
     def _commands(self, actions: NDArray[np.float32]) -> list[float]:
-        """Gripper commands of actions (E, A), -1 closed to 1 open."""
         if self._convention.read is None:
             return actions[:, -1].tolist()
         opened = self._convention.read(np.nan_to_num(actions.astype(np.float64))).open
@@ -200,7 +197,6 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
 
 
 def _space(spec: PolicySpec) -> gym.spaces.Dict:
-    """Return the space of one env's observation."""
     depths = [(depth_key(name), (1, h, w)) for name, (w, h) in spec.cameras.items()] if spec.depth else []
     shapes = [*((name, (width,)) for name, width in WIDTHS.items()), *depths]
     numbers: dict[str, gym.Space[Any]] = {name: gym.spaces.Box(-np.inf, np.inf, shape) for name, shape in shapes}

@@ -94,7 +94,6 @@ class RoboCAS:
         return dict.fromkeys(names, "mean")
 
     def get_action_spec(self) -> dict[str, Any]:
-        """Return the meaning of actions."""
         from vla_eval.specs import DimSpec  # pyright: ignore[reportMissingImports]
 
         convention = self._spec.convention
@@ -109,7 +108,6 @@ class RoboCAS:
         }
 
     def get_observation_spec(self) -> dict[str, Any]:
-        """Return the meaning of observations."""
         from vla_eval.specs import IMAGE_RGB, LANGUAGE, DimSpec  # pyright: ignore[reportMissingImports]
 
         images = dict.fromkeys(["image", *self._spec.cameras] if self._spec.cameras else [], IMAGE_RGB)
@@ -120,11 +118,7 @@ class RoboCAS:
         raise NotImplementedError("RoboCAS' protocols need mode sync")
 
     async def start_episode(self, task: Mapping[str, Any], recorder: Any = None) -> None:
-        """Start the episode ``episode_idx`` of a task of `get_tasks`.
-
-        Raises:
-            EvaluationError: the protocol has fewer episodes.
-        """
+        """Start the episode ``episode_idx`` of a task of `get_tasks`."""
         episodes, number = self._of_config[task["name"]], task["episode_idx"]
         if number >= len(episodes):
             what, expected = "the protocol has no more episodes of this task", f"{len(episodes)} at most"
@@ -137,11 +131,7 @@ class RoboCAS:
         self._record()
 
     async def apply_action(self, action: Mapping[str, Any]) -> None:
-        """Execute an action, or all of a chunk.
-
-        Raises:
-            WireError: it does not fit the convention.
-        """
+        """Execute an action, or all of a chunk."""
         actions = actions_of({"actions": action.get("actions", action.get("action"))}, self._spec.convention)
         self._seen = self._session.step(actions[None])
         self._record()
@@ -160,19 +150,13 @@ class RoboCAS:
         }
 
     async def is_done(self) -> bool:
-        """Return whether the protocol's rules ended the episode."""
         return self._seen is None
 
     async def get_time(self) -> float:
-        """Return the clock time since the start of the episode, s."""
         return time.monotonic() - self._started
 
     async def get_result(self) -> dict[str, Any]:
-        """Return the outcome of the episode, whether flags ever held, and what it was measured with.
-
-        Raises:
-            EvaluationError: vla-eval ended it before the protocol does.
-        """
+        """Return the outcome of the episode, whether flags ever held, and what it was measured with."""
         outcome, episode = self._session.outcomes.get(0), self._episode
         if outcome is None or episode is None:
             what, fix = "the run ended an episode before the protocol does", "Leave max_steps out of the configuration."
@@ -186,7 +170,6 @@ class RoboCAS:
         }
 
     def cleanup(self) -> None:
-        """Close the environment."""
         self._session.close()
 
     def render(self) -> NDArray[np.uint8] | None:

@@ -63,11 +63,7 @@ FOLDERS: Registry[Callable[[Path], Policy]] = Registry("kind of policy folder", 
 
 
 def find_policy(name: str) -> Callable[[], Policy]:
-    """Return what makes a policy; nothing is imported before it is called.
-
-    Raises:
-        EvaluationError: no policy can have this name.
-    """
+    """Return what makes a policy; nothing is imported before it is called."""
     known, (kind, _, rest) = [*POLICIES.builtin, *POLICIES.entry_points], name.partition(":")
     if name in known:
         return lambda: _call(name, POLICIES[name])

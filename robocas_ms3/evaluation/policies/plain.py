@@ -20,7 +20,6 @@ class StillPolicy:
         pass
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
-        """Return (E, 7) actions."""
         return np.tile(np.array([0, 0, 0, 0, 0, 0, 1.0]), (len(observations.envs), 1))
 
 
@@ -39,7 +38,6 @@ class RandomPolicy:
             self._open[start.env] = True
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
-        """Return (E, 7) uniform motions."""
         return np.stack([self._draw(env) for env in observations.envs.tolist()])
 
     def _draw(self, env: int) -> NDArray[np.floating]:

@@ -88,7 +88,7 @@ class TrackPolicy(ABC):
 
     @abstractmethod
     def track(self, start: EpisodeSpec) -> JointTrack | PoseTrack:
-        """Return the track of an episode."""
+        pass
 
     def reset(self, starts: list[EpisodeSpec]) -> None:
         self._tracks |= {start.env: self.track(start) for start in starts}
@@ -131,7 +131,6 @@ class ReplayPolicy(TrackPolicy):
         return {"trajectory": self._trajectory.name, "episodes": len(self._episodes)}
 
     def track(self, start: EpisodeSpec) -> JointTrack:
-        """Return the recorded actions of the episode's seed."""
         if start.seed not in self._episodes:
             return JointTrack(np.zeros((0, 8)))
         number = self._episodes[start.seed]

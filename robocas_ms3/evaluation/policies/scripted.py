@@ -46,12 +46,7 @@ class ScriptedPolicy(TrackPolicy):
         self._generators: dict[EpisodeSettings, EpisodeGenerator] = {}  # the one used last is the last
 
     def track(self, start: EpisodeSpec) -> JointTrack | PoseTrack:
-        """Plan an episode, which takes seconds.
-
-        Raises:
-            EvaluationError: the episode does not name files of this machine, as of a client of a server.
-            ExtensionError: it names a task or a robot that this machine lacks.
-        """
+        """Plan an episode, which takes seconds."""
         actions, states = np.zeros((0, 8)), np.zeros((1, 37))
         generator = self._generator_of(start)
         with tempfile.TemporaryDirectory() as folder:

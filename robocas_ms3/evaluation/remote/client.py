@@ -102,12 +102,7 @@ class RemotePolicy:
         self._starts |= {start.env: start for start in starts}
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
-        """Return (E, H, A) chunks.
-
-        Raises:
-            PolicyFailed: some envs got no actions; the error has the chunks of the others.
-            EvaluationError: a connection can't be opened.
-        """
+        """Return (E, H, A) chunks."""
         envs: list[int] = observations.envs.tolist()
         starts = {env: self._starts.pop(env) for env in envs if env in self._starts}
         messages = [self._message(observations, row, starts.get(env)) for row, env in enumerate(envs)]

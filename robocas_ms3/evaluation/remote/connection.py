@@ -145,11 +145,7 @@ async def close_connection(connection: ClientConnection) -> None:
 
 
 def read_message(message: str | bytes) -> Any:
-    """Return the value of a server's message.
-
-    Raises:
-        EvaluationError: it is an error text, or invalid.
-    """
+    """Return the value of a server's message."""
     if isinstance(message, str):
         raise server_error(message)
     try:
@@ -165,7 +161,6 @@ def server_error(text: str) -> EvaluationError:
 
 
 async def _handshake(url: str, pings: bool) -> tuple[ClientConnection, str | bytes]:
-    """Connect, and return the connection and the first message."""
     connection = await connect(
         url,
         compression=None,

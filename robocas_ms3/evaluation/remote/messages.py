@@ -94,11 +94,7 @@ class Request(BaseModel):
 
 
 def read_request(message: Mapping[str, Any]) -> Request:
-    """Read the keys of a request; unknown keys are ignored.
-
-    Raises:
-        WireError: a value is of another type or size.
-    """
+    """Read the keys of a request; unknown keys are ignored."""
     try:
         return Request.model_validate(message)
     except ValidationError as problem:
@@ -106,11 +102,7 @@ def read_request(message: Mapping[str, Any]) -> Request:
 
 
 def read_metadata(message: Any, url: str) -> ServerMetadata:
-    """Read a server's metadata; keys of other packages are ignored.
-
-    Raises:
-        EvaluationError: a value is invalid.
-    """
+    """Read a server's metadata; keys of other packages are ignored."""
     try:
         return ServerMetadata.model_validate(message if isinstance(message, dict) else {})
     except ValidationError as problem:
@@ -154,11 +146,7 @@ def observation_message(
 
 
 def read_observations(messages: Sequence[Mapping[str, Any]], envs: Sequence[int], spec: PolicySpec) -> Observations:
-    """Return the observations of requests of one env each, whose numbers are ``envs``, as a policy gets them.
-
-    Raises:
-        WireError: an entry is missing, or has another shape or type.
-    """
+    """Return the observations of requests of one env each, whose numbers are ``envs``, as a policy gets them."""
 
     def stack(name: str, dtype: str, *shape: int | None) -> NDArray[Any]:
         arrays: list[Any] = [message.get(PREFIX + name) for message in messages]
@@ -217,11 +205,7 @@ def actions_of(answer: Any, convention: str) -> NDArray[np.float32]:
 
 
 def batch_of(message: Any, least: int, most: int) -> list[dict[str, Any]]:
-    """Return the maps of a batched request, or of the answer to it, ``least`` to ``most`` of them.
-
-    Raises:
-        WireError: it is no list of maps, or has another length.
-    """
+    """Return the maps of a batched request, or of the answer to it, ``least`` to ``most`` of them."""
     batch = message.get(BATCH) if isinstance(message, dict) else None
     if not isinstance(batch, list) or not all(isinstance(one, dict) for one in batch):
         raise WireError("invalid batch", where=BATCH, expected="a list of maps", found=type(batch).__name__)

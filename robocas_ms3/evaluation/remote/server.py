@@ -75,11 +75,7 @@ class ServedFiles:
 
     @classmethod
     def of(cls, protocols: Iterable[Path] = (), packs: Iterable[str] = ()) -> ServedFiles:
-        """Collect the files of shipped protocols and installed packs, and of other protocols and their packs.
-
-        Raises:
-            EvaluationError: two protocols have the same name.
-        """
+        """Collect the files of shipped protocols and installed packs, and of other protocols and their packs."""
         folders = {folder.name: folder for folder in protocols_dir().iterdir()}
         for folder in protocols:
             if folder.resolve() != folders.setdefault(folder.name, folder).resolve():
@@ -163,7 +159,6 @@ class PolicyServer:
         self._calls.put(None)
 
     def _serve(self, started: Future[tuple[str, Callable[[], object]]]) -> None:
-        """Run the network's event loop."""
         try:
             asyncio.run(self._listen(started))
         except Exception as error:
@@ -226,7 +221,6 @@ class PolicyServer:
             self._submit(partial(self._answers.release, envs))
 
     def _submit(self, work: Callable[[], Any]) -> Future[Any]:
-        """Have the thread of `run` call a function."""
         future: Future[Any] = Future()
         self._calls.put((future, work))
         return future
@@ -262,10 +256,6 @@ class _Answers:
         """Return the answer to a message.
 
         ``envs`` has the policy's env by the client's, of this connection; new ones are added.
-
-        Raises:
-            WireError: the request is invalid.
-            Exception: whatever the policy raises, without a batch.
         """
         if not isinstance(message, dict):
             raise WireError("no observation", expected="a map")
@@ -277,11 +267,9 @@ class _Answers:
         return {BATCH: [{ERROR: reasons[env]} if env in reasons else {ACTIONS: actions[row]} for row, env in rows]}
 
     def release(self, envs: dict[int, int]) -> None:
-        """Make the envs of a closed connection available."""
         self._used -= set(envs.values())
 
     def _read(self, messages: Sequence[dict[str, Any]], envs: dict[int, int]) -> tuple[Observations, list[EpisodeSpec]]:
-        """Return the observations of some messages, and the episodes that start."""
         numbers, starts = [], []
         for message in messages:
             request = read_request(message)

@@ -1,9 +1,10 @@
-"""A result as one HTML page that needs no other file."""
+"""A result as one HTML page that needs no other file. Its SVG has no text, so it may be stretched to any width."""
 
 from __future__ import annotations
 
 import json
 from collections import Counter
+from collections.abc import Iterable, Sequence
 from html import escape
 from importlib.resources import files
 from pathlib import Path
@@ -13,17 +14,15 @@ import numpy as np
 from robocas_ms3.core.words import count_of
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.protocol import LoadedProtocol
-from robocas_ms3.evaluation.report.html import axis, bar, facts, html_table, round_up, section, spread, table_section
-from robocas_ms3.evaluation.report.tables import WELDED, Table, failure_name, mean, stages_of, tables
+from robocas_ms3.evaluation.report.tables import WELDED, Cell, Fraction, Table, failure_name, mean, stages_of, tables
 from robocas_ms3.evaluation.report.tables import title as title_of
 from robocas_ms3.evaluation.results import Result
-from robocas_ms3.evaluation.statistics import share
+from robocas_ms3.evaluation.statistics import Share, share
 
 VIDEOS = "videos"
 
 
 def video_name(episode: int) -> str:
-    """Return the name of the file in ``videos``."""
     return f"episode_{episode:05d}.mp4"
 
 
@@ -33,8 +32,8 @@ def page(result: Result, folder: Path | None = None, protocol: LoadedProtocol | 
     style, script = ((here / name).read_text(encoding="utf-8") for name in ("style.css", "script.js"))
     title, parts = escape(title_of(result)), [_lead(result, protocol)]
     if result.outcomes:
-        success, *others = map(table_section, tables(result))
-        parts += [success, _funnels(result), *others, _seconds(result), table_section(_effort(result))]
+        success, *others = map(_table_section, tables(result))
+        parts += [success, _funnels(result), *others, _seconds(result), _table_section(_effort(result))]
     parts += [_record(result, protocol), _failed_episodes(result, folder)]
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
@@ -68,13 +67,13 @@ def _funnels(result: Result) -> str:
         for stage, name in stages_of(outcomes[0].task).items():
             if any(stage in outcome.flags for outcome in outcomes):
                 rate = result.rate(stage, outcomes)
-                shown = bar(rate, "good" if stage == "success" else "")
+                shown = _bar(rate, "good" if stage == "success" else "")
                 rows.append(
                     f'<div class="row"><span>{escape(name)}</span>{shown}<b>{100 * rate.rate:.0f} %</b></div>\n'
                 )
         cards.append(f"<figure><figcaption>{escape(config)}, n {len(outcomes)}</figcaption>{''.join(rows)}</figure>\n")
     note = "Share of the episodes that reached each stage, with its interval. An episode may skip a stage."
-    return section("Stages", note, f'<div class="cards">\n{"".join(cards)}</div>\n')
+    return _section("Stages", note, f'<div class="cards">\n{"".join(cards)}</div>\n')
 
 
 def _seconds(result: Result) -> str:
@@ -84,14 +83,14 @@ def _seconds(result: Result) -> str:
     }
     if not any(taken.values()):
         return ""
-    most = round_up(max(max(values, default=0.0) for values in taken.values()))
+    most = _round_up(max(max(values, default=0.0) for values in taken.values()))
     rows = []
     for config, values in taken.items():
         cells = [f"{value:.1f}" for value in np.quantile(values, (0, 0.25, 0.5, 0.75, 1))] if values else [""] * 5
-        rows.append([escape(config), str(len(values)), *cells, spread(values, most) if values else ""])
-    heads = ("configuration", "succeeded#", "least#", "25 %#", "median#", "75 %#", "most#", axis(most, "s"))
+        rows.append([escape(config), str(len(values)), *cells, _spread(values, most) if values else ""])
+    heads = ("configuration", "succeeded#", "least#", "25 %#", "median#", "75 %#", "most#", _axis(most, "s"))
     note = "Simulated seconds, over the episodes that succeeded. A tick is an episode, the box half of them."
-    return section("Seconds to success", note, html_table(heads, rows))
+    return _section("Seconds to success", note, _html_table(heads, rows))
 
 
 def _effort(result: Result) -> Table:
@@ -135,8 +134,8 @@ def _record(result: Result, protocol: LoadedProtocol | None) -> str:
     machines = {_plain(part.machine) for part in run.parts} or {_plain(run.machine or {})}
     pairs += [("machine", machine) for machine in sorted(machines)]
     rows = [[escape(part.folder), str(part.episodes)] for part in run.parts]
-    parts = html_table(("part", "episodes#"), rows) if rows else ""
-    return section("What it was measured with", "", facts(pairs) + parts)
+    parts = _html_table(("part", "episodes#"), rows) if rows else ""
+    return _section("What it was measured with", "", _facts(pairs) + parts)
 
 
 def _plain(value: object) -> str:
@@ -174,8 +173,8 @@ def _failed_episodes(result: Result, folder: Path | None) -> str:
         f'<span id="count">{len(failed)}</span> of {count_of(len(result.outcomes), "episode")}. '
         f"Ended by: the time limit, a failure such as a target on the floor, or an error. {videos}"
     )
-    table = html_table(heads, rows, "failed")
-    return section("Failed episodes", note, f'<form class="filters">{filters}</form>\n{table}')
+    table = _html_table(heads, rows, "failed")
+    return _section("Failed episodes", note, f'<form class="filters">{filters}</form>\n{table}')
 
 
 def _failed_row(outcome: Outcome, folder: Path | None) -> list[str]:
@@ -194,3 +193,89 @@ def _failed_row(outcome: Outcome, folder: Path | None) -> list[str]:
         f"{outcome.measures.get('disturbed_most', 0):.0f}",
         escape(outcome.error),
     ]
+
+
+def _section(title: str, note: str, content: str) -> str:
+    text = f"<p>{note}</p>\n" if note else ""
+    return f"<section>\n<h2>{title}</h2>\n{text}{content}</section>\n"
+
+
+def _table_section(table: Table) -> str:
+    """Return the section of a table, in which rates have bars."""
+    heads = []
+    for head in map(escape, table.heads):
+        heads += [f"{head[:-1]}#", "0 to 100 %"] if head.endswith("%") else [head]
+    rows = [
+        [html for cell, head in zip(row, table.heads, strict=True) for html in _cells(cell, head)] for row in table.rows
+    ]
+    return _section(table.title, escape(table.note, quote=False), _html_table(heads, rows))
+
+
+def _html_table(heads: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> str:
+    """Return a table of cells that are HTML; a head that ends in ``#`` is that of numbers, which are at the right."""
+    right = ["number" if head.endswith("#") else "" for head in heads]
+    head = "".join(_tag("th", name.rstrip("#"), how) for name, how in zip(heads, right, strict=True))
+    body = "".join(
+        "<tr>" + "".join(_tag("td", cell, how) for cell, how in zip(row, right, strict=True)) + "</tr>\n"
+        for row in rows
+    )
+    kinds = f' class="{kind}"' if kind else ""
+    return f'<div class="wide"><table{kinds}><thead><tr>{head}</tr></thead>\n<tbody>\n{body}</tbody></table></div>\n'
+
+
+def _bar(share: Share, kind: str = "") -> str:
+    """Return a bar of 0..100 % with its interval."""
+    low, high, here = 100 * share.low, 100 * share.high, 100 * share.rate
+    label = f"{share.k} of {share.n}: {here:.1f} %, {low:.1f} to {high:.1f}"
+    return (
+        f'<svg class="bar {kind}" viewBox="0 0 100 16" preserveAspectRatio="none" role="img" aria-label="{label}">'
+        f'<title>{label}</title><rect class="track" width="100" height="16"/>'
+        f'<rect class="fill" y="2" width="{here:.2f}" height="12"/>'
+        f'<path class="whisker" d="M{low:.2f} 8H{high:.2f}M{low:.2f} 4V12M{high:.2f} 4V12"/></svg>'
+    )
+
+
+def _spread(values: Sequence[float], most: float) -> str:
+    """Return where numbers are in 0..most: a tick each, a box from the lower to the upper quartile, and the median."""
+    low, middle, high = (100 * np.quantile(values, (0.25, 0.5, 0.75)) / most).tolist()
+    ticks = "".join(f"M{100 * value / most:.2f} 10V16" for value in values)
+    return (
+        '<svg class="bar" viewBox="0 0 100 16" preserveAspectRatio="none" role="img" aria-label="distribution">'
+        f'<rect class="track" width="100" height="16"/><rect class="box" x="{low:.2f}" y="2" '
+        f'width="{max(high - low, 0.3):.2f}" height="6"/><path class="tick" d="{ticks}"/>'
+        f'<path class="median" d="M{middle:.2f} 1V9"/></svg>'
+    )
+
+
+def _axis(most: float, unit: str) -> str:
+    ends = [most * part / 4 for part in range(5)]
+    labels = "".join(f"<span>{end:g}{f' {unit}' if end == most else ''}</span>" for end in ends)
+    return f'<div class="axis">{labels}</div>'
+
+
+def _facts(pairs: Iterable[tuple[str, object]]) -> str:
+    """Return a list of names and values, which are plain text."""
+    entries = "".join(f"<dt>{escape(name)}</dt><dd>{escape(str(value))}</dd>\n" for name, value in pairs)
+    return f"<dl>\n{entries}</dl>\n"
+
+
+def _round_up(value: float) -> float:
+    """Return 1, 2, 4 or 8 times a power of ten that is no smaller, for the end of an axis."""
+    power = 10.0 ** np.floor(np.log10(max(value, 1e-9)))
+    return float(next(power * step for step in (1, 2, 4, 8, 10) if power * step >= value * (1 - 1e-9)))
+
+
+def _cells(cell: Cell, head: str) -> list[str]:
+    """Return the HTML of a cell: a rate with a bar is two."""
+    if isinstance(cell, Share):
+        rate = f"{100 * cell.rate:.0f} %<small>{100 * cell.low:.0f} to {100 * cell.high:.0f}</small>"
+        return [rate, _bar(cell, "good")] if head.endswith("%") else [rate]
+    if isinstance(cell, Fraction):
+        return [f'<span class="heat" style="--share: {100 * cell.count / cell.n:.0f}%">{cell.count or ""}</span>']
+    if cell is None:
+        return ['<span class="faint">none</span>', *([""] if head.endswith("%") else [])]
+    return [escape(cell)]
+
+
+def _tag(tag: str, content: str, kind: str) -> str:
+    return f'<{tag} class="{kind}">{content}</{tag}>' if kind else f"<{tag}>{content}</{tag}>"

@@ -80,7 +80,6 @@ def tables(result: Result) -> Iterator[Table]:
 
 
 def markdown(result: Result) -> str:
-    """Return the tables of a result as Markdown."""
     run, broken = result.run, result.broken_off()
     versions = ", ".join(f"{name} {number}" for name, number in run.versions.items())
     lines = [
@@ -101,7 +100,6 @@ def markdown(result: Result) -> str:
 
 
 def title(result: Result) -> str:
-    """Return the title of a report, plain text."""
     weld = " with upstream's weld" if result.run.weld else ""
     return f"{result.run.policy.name} by {result.run.protocol}{weld}"
 
@@ -115,7 +113,6 @@ def stages_of(task: str) -> dict[str, str]:
 
 
 def failure_name(stage: str) -> str:
-    """Return the name of a first stage not reached."""
     return FAILURE_NAMES.get(stage, stage.replace("_", " "))
 
 
@@ -130,7 +127,6 @@ def first_splits(result: Result) -> list[Outcome]:
 
 
 def mean(values: Sequence[float]) -> float:
-    """Return the mean of at least one number."""
     return sum(values) / len(values)
 
 
