@@ -31,8 +31,6 @@ def main(settings: ConversionSettings) -> int:
         steps = count_of(sum(episode.steps for episode in done.episodes), "step")
         words += [steps, f"{megabytes:.0f} MB", f"{done.seconds / count:.1f} s an episode"]
     say(", ".join(words))
-    if count:
-        say(_describe_time(done, settings))
     if count and settings.video and settings.to == "robocas" and not done.previews:
         say("no videos of so many episodes: --all-videos makes them, and robocas video those of some")
     return 0
@@ -59,18 +57,3 @@ def _find_format(settings: ConversionSettings) -> Format:
             flag = f"--{field.name.replace('_', '-')}"
             raise DatasetError(f"not for {chosen.title}s", where=flag, fix="Leave it out.")
     return chosen
-
-
-def _describe_time(done: Conversion, settings: ConversionSettings) -> str:
-    """Return where the time of an episode went, in the process that wrote it."""
-    spent, count = done.timing, len(done.episodes)
-    beside = ""
-    if settings.to == "robocas":
-        waited = f", which waited {spent.wait / count:.1f}" if spent.wait / count >= 0.05 else ""
-        beside = f" (beside rendering{waited})"
-    processes = min(settings.jobs, count)
-    shared = f", {processes} at a time" if processes > 1 else ""
-    return (
-        f"load {spent.load / count:.1f}, render {spent.render / count:.1f}, encode {spent.encode / count:.1f}{beside},"
-        f" write {spent.write / count:.1f} s an episode{shared}"
-    )

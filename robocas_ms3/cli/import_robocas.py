@@ -89,7 +89,8 @@ def _table(found: Survey) -> None:
 
     rows: dict[tuple[str, str, str], list[int]] = defaultdict(list)
     for finding in found.findings:
-        place = finding.file.split("/", 1)[1] if finding.episode is not None and "/" in finding.file else finding.file
+        where = finding.violation.where
+        place = where.split("/", 1)[1] if finding.episode is not None and "/" in where else where
         numbers = rows[(finding.outcome, place, finding.problem)]
         if finding.episode is not None:
             numbers.append(finding.episode)

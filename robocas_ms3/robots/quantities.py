@@ -32,6 +32,7 @@ class ArraySpec:
         quaternion: rows are unit quaternions xyzw.
         embedding: rows are sentence embeddings; absent from datasets converted without.
         limits: least and greatest value; None: any.
+        optional: a dataset may lack it: one that was written before the entry was added, or of a format without it.
     """
 
     name: str
@@ -42,6 +43,7 @@ class ArraySpec:
     quaternion: bool = False
     embedding: bool = False
     limits: tuple[float, float] | None = None
+    optional: bool = False
 
     def shape_for(self, steps: int) -> tuple[int, ...]:
         """Shape in an episode of ``steps`` steps."""

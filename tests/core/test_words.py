@@ -4,11 +4,15 @@ import subprocess
 import sys
 
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.core.words import called, count_of, error_line, in_markdown, one_line, printable
+from robocas_ms3.core.words import called, count_of, error_line, format_ranges, in_markdown, one_line, printable
 
 
 def test_one_is_no_plural():
     assert [count_of(n, "episode") for n in (0, 1, 2)] == ["0 episodes", "1 episode", "2 episodes"]
+
+
+def test_numbers_in_short():
+    assert format_ranges([0, 1, 2, 5, 7, 8]) == "0-2, 5, 7-8"
 
 
 def test_an_object_is_called_by_its_name_and_by_an_id_that_says_more():

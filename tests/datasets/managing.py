@@ -2,10 +2,6 @@
 
 import json
 import shutil
-import signal
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 from synthetic import RayCaster, write_trajectory
@@ -80,8 +76,13 @@ def make(folder, name, seeds, **kwargs):
     return folder / name
 
 
-def die(moment, *words):
-    """Run `robocas` in a process of its own, which is killed at a moment."""
-    command = [sys.executable, str(Path(__file__).parents[1] / "support" / "dying_manage.py"), moment, *map(str, words)]
-    done = subprocess.run(command, check=False, capture_output=True, text=True)
-    assert done.returncode == -signal.SIGKILL, done.stderr
+def as_upstream(root, pose_name="cam_pos_wrt"):
+    """Leave what RoboCAS-v0 writes, with one name of the cameras' poses."""
+    for path in [root / "conversion.json", *root.glob("*/scene.json")]:
+        path.unlink()
+    for path in root.glob("episode_*"):
+        change(path, **dict.fromkeys(("agv_pose", "rel_agv_pose", "language_embedding", "step_goal_embs")))
+    for path in root.glob("*/*/cam_pos*"):
+        if not path.name.startswith(pose_name):
+            path.unlink()
+    return root

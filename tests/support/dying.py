@@ -1,21 +1,24 @@
-"""Convert a made-up trajectory and die by SIGKILL on the way: `python dying.py MOMENT TRAJECTORY OUT [previews]`."""
+"""Run `robocas` and die by SIGKILL on the way: `python dying.py MOMENT ROBOCAS_ARGUMENTS...`; images are made up."""
 
 import os
 import signal
 import sys
-from pathlib import Path
 
-from synthetic import RayCaster
+from synthetic import RayCaster, render_by
 
+from robocas_ms3.cli.main import run
 from robocas_ms3.core import files
+from robocas_ms3.datasets.manage import copying, importing
 from robocas_ms3.datasets.writing import convert, episode_folder
-from robocas_ms3.datasets.writing.settings import ConversionSettings
 
 PLACES = {  # moment -> (module, function, which call is the last)
     "picture": (episode_folder, "write_picture", 50),  # in the second episode
-    "arrays": (episode_folder, "write_cameras", 2),
+    "arrays": (episode_folder, "write_episode_files", 2),
+    "file": (copying.FilePlacer, "place", 70),  # in the second episode
     "rename": (files, "_move_in", 2),
-    "overview": (convert, "write_info", 1),
+    "convert overview": (convert, "write_info", 1),
+    "merge overview": (copying, "write_info", 1),
+    "import overview": (importing, "write_info", 1),
     "rmtree": (os, "rmdir", 3),  # --overwrite, with two folders of the old one gone
 }
 
@@ -33,16 +36,6 @@ def die_at(module, name, last):
 
 
 if __name__ == "__main__":
-    moment, trajectory, out, *previews = sys.argv[1:]
-    die_at(*PLACES[moment])
-    overwrite = moment == "rmtree"
-    convert.convert(
-        ConversionSettings(
-            Path(trajectory),
-            Path(out),
-            embeddings=False,
-            overwrite=overwrite,
-            video=bool(previews),
-            open_renderer=RayCaster,
-        )
-    )
+    die_at(*PLACES[sys.argv[1]])
+    convert.convert = render_by(RayCaster, convert.convert)
+    sys.exit(run(sys.argv[2:]))

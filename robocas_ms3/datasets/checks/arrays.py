@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.poses import from_xyzw
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.checks.violation import Violation
+from robocas_ms3.datasets.checks.violation import NO_FILE, Violation
 from robocas_ms3.datasets.sources.tolerant import SPECS, EpisodeArrays
 from robocas_ms3.demos.recordings.motion import planar_motion, relative_motion
 from robocas_ms3.scenes.language.templates import GOAL_TYPES
@@ -26,12 +26,10 @@ def check_file(stored: EpisodeArrays) -> Iterator[Violation]:
     """Check that the file and all of its arrays could be read."""
     for key, error in stored.unreadable.items():
         if isinstance(error, FileNotFoundError):
-            yield Violation(stored.file, "", "this file", "no file")
-        elif key and isinstance(error, (ValueError, MemoryError)):  # pickled, wrong shape, too large
-            yield Violation(stored.file, key, "an array without pickles", stored.reason(key))
+            yield Violation(stored.file, "", "this file", NO_FILE, "missing")
         else:
-            found = f"{key}: {stored.reason(key)}" if key else stored.reason()
-            yield Violation(stored.file, "", "a numpy archive without pickles", found)
+            expected = "an array without pickles" if key else "a numpy archive without pickles"
+            yield Violation(stored.file, key, expected, stored.reason(key))
 
 
 def check_keys(stored: EpisodeArrays) -> Iterator[Violation]:
@@ -41,10 +39,10 @@ def check_keys(stored: EpisodeArrays) -> Iterator[Violation]:
     embedded = any(spec.name in stored.arrays for spec in schema.EPISODE_INFO if spec.embedding)
     there = {*stored.arrays, *stored.unreadable, *stored.ignored}
     for spec in schema.EPISODE_INFO:
-        if spec.name not in there and (embedded or not spec.embedding):
-            yield Violation(stored.file, spec.name, "this key", "no such key")
+        if spec.name not in there and not spec.optional and (embedded or not spec.embedding):
+            yield Violation(stored.file, spec.name, "this key", "no such key", "missing")
     for key in sorted(there - set(SPECS)):
-        yield Violation(stored.file, key, "keys of the schema only", "an unknown key")
+        yield Violation(stored.file, key, "keys of the schema only", "an unknown key", "surplus")
 
 
 def check_shapes(stored: EpisodeArrays) -> Iterator[Violation]:
@@ -95,7 +93,8 @@ def check_pair(stored: EpisodeArrays, keys: tuple[str, str, str, str]) -> Iterat
     shift, turn = motion_errors(stored, keys)
     if (shift <= POSITION_TOLERANCE).all() and (turn <= ANGLE_TOLERANCE).all():
         return
-    if not wrong_rows(stored, keys, order=-1).any():
+    limits = POSITION_TOLERANCE, ANGLE_TOLERANCE
+    if all((e <= limit).all() for e, limit in zip(motion_errors(stored, keys, -1), limits, strict=True)):
         yield Violation(stored.file, f"{orientation}, {rel_orientation}", "quaternions xyzw", "quaternions wxyz")
         return
     for key, error, limit, unit in (
@@ -121,12 +120,6 @@ def motion_errors(stored: EpisodeArrays, keys: tuple[str, ...], order: int = 0) 
     motion = relative_motion(absolute)
     turn = Rotation.from_matrix(np.swapaxes(motion[:, :3, :3], 1, 2) @ relative[:, :3, :3]).magnitude()
     return np.linalg.norm(motion[:, :3, 3] - relative[:, :3, 3], axis=1), turn
-
-
-def wrong_rows(stored: EpisodeArrays, keys: tuple[str, ...], order: int = 0) -> NDArray[np.bool_]:
-    """Return in which rows (T,) the errors of `motion_errors` exceed the tolerances."""
-    shift, turn = motion_errors(stored, keys, order)
-    return ~((shift <= POSITION_TOLERANCE) & (turn <= ANGLE_TOLERANCE))
 
 
 def check_base_motion(stored: EpisodeArrays) -> Iterator[Violation]:

@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.actions import action_space
 from robocas_ms3.datasets.checks import arrays as laws
-from robocas_ms3.datasets.checks.info import check_info
-from robocas_ms3.datasets.checks.pictures import SURPLUS, Sizes, check_cameras, check_depth, check_images
+from robocas_ms3.datasets.checks.pictures import Sizes, check_cameras, check_depth, check_images
 from robocas_ms3.datasets.checks.scene import check_ledger, check_values, read_settings
 from robocas_ms3.datasets.checks.violation import Violation, read_object
 from robocas_ms3.datasets.pictures.stored import Pictures
-from robocas_ms3.datasets.sources.reader import no_dataset
-from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, read_arrays
+from robocas_ms3.datasets.sources.files import no_dataset
+from robocas_ms3.datasets.sources.records import DataInfoRecord
+from robocas_ms3.datasets.sources.tolerant import SPECS, EpisodeArrays, is_declared, read_arrays
 from robocas_ms3.datasets.writing.plan import MARKS
 
+INFO = schema.DATA_INFO_FILE
 _EMBEDDINGS = {spec.name for spec in schema.EPISODE_INFO if spec.embedding}
+_RANGE_TOLERANCE = 1e-4
+_Arrays = Mapping[str, NDArray]
 
 
 @dataclass(frozen=True)
@@ -42,7 +49,7 @@ class Report:
             "valid": not self.violations,
             "episodes": self.episodes,
             "steps": self.steps,
-            "violations": [asdict(violation) for violation in self.violations],
+            "violations": [violation.as_json() for violation in self.violations],
         }
 
 
@@ -87,16 +94,73 @@ def validate(root: str | Path, *, on_episode: Callable[[int, int], None] | None 
 
 def check_episode(folder: Path, stored: EpisodeArrays, pictures: Pictures, sizes: Sizes) -> list[Violation]:
     """Check the arrays, cameras and images of an episode; see `check_images`."""
-    wrong = list(laws.violations_of(stored, laws.FORM))
+    wrong, values = list(laws.violations_of(stored, laws.FORM)), []
     if not wrong:
-        wrong = list(laws.check_units(stored))
-        values = list(laws.violations_of(stored, laws.CONTENT))
-    else:
-        values = []
+        wrong, values = list(laws.check_units(stored)), list(laws.violations_of(stored, laws.CONTENT))
     wrong += check_cameras(folder, pictures)
     if "" in stored.unreadable:
         return wrong  # the number of images is unknown
     images = list(check_images(folder, pictures, stored.steps, sizes))
-    if pictures.depth and not wrong and all(image.found == SURPLUS for image in images):
+    if pictures.depth and not wrong and all(image.kind == "surplus" for image in images):
         images += check_depth(folder, stored, pictures)
     return [*wrong, *values, *images]
+
+
+def check_info(root: Path, episodes: Mapping[int, _Arrays]) -> Iterator[Violation]:
+    """Check ``data_info.json`` against the arrays of the episodes on disk."""
+    unfinished = " (not finished: convert again)" if (root / schema.CONVERSION_FILE).is_file() else ""
+    info, wrong = read_object(root, INFO, DataInfoRecord, absent=f"this file{unfinished}")
+    if wrong:
+        yield from wrong
+        return
+    train, val = info["train_eps"], info["val_eps"]
+    for key, numbers in (("train_eps", train), ("val_eps", val)):
+        if len(set(numbers)) != len(numbers):
+            yield Violation(INFO, key, "each episode once", "repeated numbers")
+    both, different = sorted(set(train) & set(val)), sorted({*train, *val} ^ set(episodes))
+    if both:
+        yield Violation(INFO, "train_eps, val_eps", "no episode in both", f"{both} in both")
+    if different:
+        yield Violation(INFO, "train_eps, val_eps", "the episodes on disk", f"{different} missing or not on disk")
+    for key in ("ep_length", "language_goal", "step_goals"):
+        wanted, found = {str(number) for number in episodes}, set(info[key])
+        if wanted != found:
+            yield Violation(INFO, key, "the episodes on disk", f"{len(wanted ^ found)} others or missing")
+    for number, arrays in sorted(episodes.items()):
+        declared = {key: array for key, array in arrays.items() if key in SPECS and is_declared(key, array)}
+        for key, array, kind in (("ep_length", "episode_length", int), ("language_goal", "language_goal", str)):
+            said = info[key].get(str(number))
+            if said is not None and array in declared and said != (expected := kind(declared[array])):
+                yield Violation(INFO, f"{key}.{number}", repr(expected), repr(said))
+        if str(number) in info["step_goals"] and {"step_lang_goals", "step_goal_type"} <= declared.keys():
+            yield from _check_goals(f"step_goals.{number}", info["step_goals"][str(number)], declared)
+    yield from _check_range(info["action_space"], episodes)
+
+
+def _check_goals(key: str, goals: list[dict[str, Any]], arrays: _Arrays) -> Iterator[Violation]:
+    texts, types = arrays["step_lang_goals"].tolist(), arrays["step_goal_type"].tolist()
+    next_step = 0
+    for goal in goals:
+        first, last = goal["goal_range"]
+        if first != next_step:
+            yield Violation(INFO, key, f"a range from {next_step}", f"[{first}, {last}]")
+            return
+        next_step = last + 1
+        stored = {*zip(types[first:next_step], texts[first:next_step], strict=False)}
+        if stored - {(goal["goal_type"], goal["goal_description"])}:
+            expected = f"the sub-goal that {schema.EPISODE_FILE} has at steps {first} to {last}"
+            yield Violation(INFO, key, expected, repr(goal["goal_description"]))
+    if next_step != len(texts):
+        yield Violation(INFO, key, f"ranges up to step {len(texts) - 1}", f"up to {next_step - 1}")
+
+
+def _check_range(space: Mapping[str, Any], episodes: Mapping[int, _Arrays]) -> Iterator[Violation]:
+    complete = [a for a in episodes.values() if all(np.ndim(a.get(key, 0)) == 2 for key in ("rel_pos", "rel_orn"))]
+    try:
+        expected = action_space([a["rel_pos"] for a in complete], [a["rel_orn"] for a in complete])
+    except ValueError:
+        return  # damaged arrays, which other checks name
+    for key, rows in expected.items():
+        worst = np.abs(np.subtract(space[key], rows)).max()
+        if worst > _RANGE_TOLERANCE:
+            yield Violation(INFO, f"action_space.{key}", "percentiles of the episodes", f"off by {worst:.3g}")

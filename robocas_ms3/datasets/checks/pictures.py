@@ -23,8 +23,8 @@ from robocas_ms3.datasets.sources.files import CAMERA_LIMIT
 from robocas_ms3.datasets.sources.tolerant import EpisodeArrays
 from robocas_ms3.robots.cameras import Parent
 
-SURPLUS = "a file beyond them"
-SOUND = "a sound picture"
+_SURPLUS = "a file beyond them"
+_SOUND = "a sound picture"
 _GEOMETRY_STEPS = 3  # whose depth is decoded
 _READERS = 4  # threads: reading and checksums run outside of Python's lock
 _HEADERS = {"rgb": (8, 3), "depth": (16, 1)}
@@ -48,7 +48,7 @@ def check_cameras(folder: Path, pictures: Pictures) -> Iterator[Violation]:
             try:
                 found = load_array(folder / camera / name, CAMERA_LIMIT)
             except FileNotFoundError:
-                yield Violation(file, "", "this file", NO_FILE)
+                yield Violation(file, "", "this file", NO_FILE, "missing")
                 continue
             except DAMAGED as error:
                 yield Violation(file, "", "a numpy array", one_line(error))
@@ -94,16 +94,16 @@ def check_images(
     with ThreadPoolExecutor(_READERS) as pool:
         headers = list(pool.map(partial(_read_headers, folder, pictures.image_format, steps, read), places))
     for (camera, kind), found in zip(places, headers, strict=True):
-        wanted = [name for name, header in found.items() if header != SURPLUS]
+        wanted = [name for name, header in found.items() if header != _SURPLUS]
         for name, header in found.items():
             file = f"{folder.name}/{camera}/{kind}/{name}"
             if header == NO_FILE:
-                yield Violation(file, "", "a picture of every step", NO_FILE)
-            elif header == SURPLUS:
+                yield Violation(file, "", "a picture of every step", NO_FILE, "missing")
+            elif header == _SURPLUS:
                 expected = f"{count_of(len(wanted), 'picture')} from {min(wanted, default='none')}"
-                yield Violation(file, "", expected, SURPLUS)
+                yield Violation(file, "", expected, _SURPLUS, "surplus")
             elif isinstance(header, str):
-                yield Violation(file, "", SOUND, header)
+                yield Violation(file, "", _SOUND, header)
             elif header is not None:
                 size = sizes.setdefault(camera, (header.width, header.height))
                 expected = PictureHeader(*(pictures.size or size), *_HEADERS[kind])
@@ -124,7 +124,7 @@ def _read_headers(
             found[name] = read(first.with_name(name)) if name in there else NO_FILE
         except (OSError, ValueError) as error:
             found[name] = getattr(error, "strerror", None) or one_line(error)
-    return {**found, **dict.fromkeys(sorted(there - set(wanted)), SURPLUS)}
+    return {**found, **dict.fromkeys(sorted(there - set(wanted)), _SURPLUS)}
 
 
 def check_depth(folder: Path, stored: EpisodeArrays, pictures: Pictures) -> Iterator[Violation]:
@@ -150,7 +150,7 @@ def check_depth(folder: Path, stored: EpisodeArrays, pictures: Pictures) -> Iter
             file = f"{folder.name}/{path.relative_to(folder)}"
             image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)  # `check_images` has checked file and size
             if image is None:
-                yield Violation(file, "", SOUND, "damage")
+                yield Violation(file, "", _SOUND, "damage")
                 return
             if not image.any():
                 yield Violation(file, "", "depth", "only zeros")

@@ -52,7 +52,7 @@ def read_settings(root: Path) -> tuple[dict[str, Any], Pictures, list[Violation]
     version is used.
     """
     absent = "this file (robocas import-robocas writes one)"
-    content, wrong = read_object(root, FILE, expected="settings of a dataset", absent=absent)
+    content, wrong = read_object(root, FILE, absent=absent)
     if wrong:
         return {}, STANDARD, wrong
     version = content.get("schema_version", 1)

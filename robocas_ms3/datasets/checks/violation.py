@@ -6,12 +6,12 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import BaseModel, ValidationError
 
 from robocas_ms3.core.documents import load_json
-from robocas_ms3.core.strict import Mistake, mistakes
+from robocas_ms3.core.strict import mistakes
 from robocas_ms3.core.words import one_line
 
 NO_FILE = "no file"
@@ -27,26 +27,30 @@ class Violation:
         key: in that file; empty: the file itself.
         expected: by the schema.
         found: instead.
+        kind: what a program may have to tell apart: a file or key that is missing, or one too many.
     """
 
     file: str
     key: str
     expected: str
     found: str
+    kind: Literal["", "missing", "surplus"] = ""
+
+    @property
+    def where(self) -> str:
+        """File and key."""
+        return ", ".join(part for part in (self.file, self.key) if part)
 
     def __str__(self) -> str:
-        where = ", ".join(part for part in (self.file, self.key) if part) or "dataset"
-        return f"{where}: expected {self.expected}, found {self.found}"
+        return f"{self.where or 'dataset'}: expected {self.expected}, found {self.found}"
+
+    def as_json(self) -> dict[str, str]:
+        """Return its entry in the report of ``--json``."""
+        return {"file": self.file, "key": self.key, "expected": self.expected, "found": self.found}
 
 
 def read_object(
-    root: Path,
-    name: str,
-    model: type[BaseModel] | None = None,
-    *,
-    expected: str = "JSON",
-    absent: str = "this file",
-    missing: str = NO_FILE,
+    root: Path, name: str, model: type[BaseModel] | None = None, *, absent: str = "this file"
 ) -> tuple[dict[str, Any], list[Violation]]:
     """Return the object in a JSON file of a dataset, empty if it can't be read, and what is wrong with it.
 
@@ -54,39 +58,36 @@ def read_object(
         root: folder of the dataset.
         name: path of the file in it.
         model: declared form of the content; None: any object.
-        expected: expectation that a damaged file breaks.
-        absent, missing: expected and found if there is no such file.
+        absent: what is expected if there is no such file.
     """
     try:
         content = load_json(root / name)
     except FileNotFoundError:
-        return {}, [Violation(name, "", absent, missing)]
+        return {}, [Violation(name, "", absent, NO_FILE, "missing")]
     except (OSError, ValueError) as error:
-        return {}, [Violation(name, "", expected, one_line(error))]
+        return {}, [Violation(name, "", "JSON", one_line(error))]
     if not isinstance(content, dict):
         return {}, [Violation(name, "", "an object", type(content).__name__)]
     return content, check_form(model, content, name) if model else []
 
 
 def check_form(model: type[BaseModel], content: Mapping[str, Any], file: str) -> list[Violation]:
-    """Compare the content of a JSON file with its declared form."""
+    """Compare the content of a JSON file with its declared form; of each list only the first faulty item is named."""
     try:
         model.model_validate(content)
     except ValidationError as error:
-        found: dict[str, Violation] = {}  # only the first faulty item of each list
+        found: dict[str, Violation] = {}
         for mistake in mistakes(error, words=_WORDS):
-            key = ".".join(word for word in mistake.key.split(".") if not word.isdecimal())
-            found.setdefault(key, _violation(file, mistake))
+            expected, value = mistake.expected or mistake.what.removeprefix(f"{mistake.key}: "), shorten(mistake.value)
+            if mistake.kind in ("too_short", "too_long"):
+                limit = mistake.context.get("min_length", mistake.context.get("max_length"))
+                expected, value = f"{limit} values", f"{mistake.context['actual_length']}"
+            elif mistake.kind == "missing":
+                value = "no such key"
+            place = ".".join(word for word in mistake.key.split(".") if not word.isdecimal())
+            found.setdefault(place, Violation(file, mistake.key, expected, value))
         return list(found.values())
     return []
-
-
-def _violation(file: str, mistake: Mistake) -> Violation:
-    if mistake.kind in ("too_short", "too_long"):
-        limit = mistake.context.get("min_length", mistake.context.get("max_length"))
-        return Violation(file, mistake.key, f"{limit} values", f"{mistake.context['actual_length']}")
-    found = "no such key" if mistake.kind == "missing" else shorten(mistake.value)
-    return Violation(file, mistake.key, mistake.expected or mistake.what.removeprefix(f"{mistake.key}: "), found)
 
 
 def shorten(value: Any) -> str:

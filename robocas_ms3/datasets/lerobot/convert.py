@@ -87,7 +87,6 @@ def convert_lerobot(
             _check_episodes(output, plan)  # everything that may fail comes before the output is touched
             settings.check_device()
             written: list[WrittenEpisode] = []
-            joining = 0.0
             if output.recorded is None or not (out / INFO_FILE).is_file():
                 output.start(plan)
                 for name in (_JOINED, *_FOLDERS):  # left half joined by a conversion that was killed
@@ -102,12 +101,10 @@ def convert_lerobot(
                     raise incomplete
                 if incomplete:
                     _log.warning("%s", incomplete)
-                staged = time.perf_counter()
                 plan = _join(out, plan, incomplete)
-                joining = time.perf_counter() - staged
             for name in (_PARTS, _JOINED):
                 shutil.rmtree(out / name, ignore_errors=True)
-    return Conversion(written, len(plan["episodes"]) - len(written), time.perf_counter() - start, joining)
+    return Conversion(written, len(plan["episodes"]) - len(written), time.perf_counter() - start)
 
 
 def _plan(given: ConversionInput, codec: str, variant: Variant) -> dict[str, Any]:

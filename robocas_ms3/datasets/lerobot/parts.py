@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import time
-from contextlib import ExitStack, closing
+from collections.abc import Generator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,7 +17,6 @@ from pydantic import BaseModel, ConfigDict
 
 from robocas_ms3.core.documents import JSON_LIMIT, read_text
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.files import replacing_folder
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.arrays import frame_columns
 from robocas_ms3.datasets.lerobot.depth import to_levels
@@ -37,8 +36,7 @@ from robocas_ms3.datasets.lerobot.video import Encoder, coding_of
 from robocas_ms3.datasets.pictures.stored import Box
 from robocas_ms3.datasets.schema import episode_folder
 from robocas_ms3.datasets.sources.protocol import Frame, Kind
-from robocas_ms3.datasets.writing.inputs import ConversionInput, complete_arrays
-from robocas_ms3.datasets.writing.settings import Timing, WrittenEpisode
+from robocas_ms3.datasets.writing.workers import EpisodeWriter, GivenEpisode
 from robocas_ms3.demos.recordings.subgoals import subgoal_runs
 
 FRAMES_FILE, EPISODE_FILE = "frames.parquet", "episode.json"
@@ -78,8 +76,8 @@ def _sizes(folder: Path) -> dict[str, int]:
 
 
 @dataclass(frozen=True)
-class PartWriter:
-    """Writes the parts of a LeRobot dataset; can be sent to another process.
+class PartWriter(EpisodeWriter):
+    """Writes the parts of a LeRobot dataset.
 
     Attributes:
         parts: folder of the parts.
@@ -91,35 +89,32 @@ class PartWriter:
     codec: str
     variant: Variant
 
-    def write(self, number: int, given: ConversionInput, source: int) -> WrittenEpisode:
-        """Write episode ``source`` of the input as part ``number``."""
-        start, timing, fps = time.perf_counter(), Timing(), schema.whole_rate(given.source.rate_hz)
-        with replacing_folder(self.parts / episode_folder(number), sync=True) as folder:
-            with timing.measure("load"):
-                episode = given.source.episode(source)
-                arrays = complete_arrays(episode)
-            with _Videos(folder, self, fps, timing) as videos, closing(given.frames(episode)) as frames:
-                for frame in timing.each(given.stage, frames):
-                    videos.add(frame)
-            begin_write, steps, scene = time.perf_counter(), int(arrays["episode_length"]), episode.scene
-            if len(videos.boxes) != steps:
-                what = "images and arrays differ in length"
-                raise DatasetError(what, where=source, expected=steps, found=len(videos.boxes))
-            pq.write_table(self._table(arrays, videos.boxes, scene, fps), folder / FRAMES_FILE)
-            record = EpisodeRecord(
-                instruction=str(arrays["language_goal"]),
-                scene=scene,
-                cameras={name: CameraRecord.of(name, episode.camera(name)) for name in given.pictures.cameras},
-                depth=given.pictures.depth,
-                depth_clipped=videos.clipped,
-                levels={key: levels.counts.tolist() for key, levels in videos.levels.items()},
-                sizes=_sizes(folder),
-            )
-            (folder / EPISODE_FILE).write_text(record.model_dump_json(), encoding="utf-8")
-            size = sum(file.stat().st_size for file in folder.iterdir())
-        timing.write += time.perf_counter() - begin_write  # with the renaming of the folder
-        timing.total += time.perf_counter() - start
-        return WrittenEpisode(number, steps, size, timing)
+    def folder(self, number: int) -> Path:
+        """Return the folder of a part."""
+        return self.parts / episode_folder(number)
+
+    def write_files(self, folder: Path, wanted: GivenEpisode, frames: Generator[Frame, None, None]) -> None:
+        """Write a part into a folder."""
+        episode, arrays, pictures = wanted.episode, wanted.arrays, wanted.given.pictures
+        fps, steps = schema.whole_rate(wanted.given.source.rate_hz), int(arrays["episode_length"])
+        with _Videos(folder, self, fps) as videos:
+            for frame in frames:
+                videos.add(frame)
+        if len(videos.boxes) != steps:
+            what = "images and arrays differ in length"
+            raise DatasetError(what, where=episode.where, expected=steps, found=len(videos.boxes))
+        scene = episode.scene
+        pq.write_table(self._table(arrays, videos.boxes, scene, fps), folder / FRAMES_FILE)
+        record = EpisodeRecord(
+            instruction=str(arrays["language_goal"]),
+            scene=scene,
+            cameras={name: CameraRecord.of(name, episode.camera(name)) for name in pictures.cameras},
+            depth=pictures.depth,
+            depth_clipped=videos.clipped,
+            levels={key: levels.counts.tolist() for key, levels in videos.levels.items()},
+            sizes=_sizes(folder),
+        )
+        (folder / EPISODE_FILE).write_text(record.model_dump_json(), encoding="utf-8")
 
     def _table(
         self, arrays: dict[str, NDArray], boxes: list[dict[str, Box]], scene: dict[str, Any], fps: int
@@ -146,8 +141,8 @@ class _Videos:
         boxes: of each frame.
     """
 
-    def __init__(self, folder: Path, writer: PartWriter, fps: int, timing: Timing) -> None:
-        self._folder, self._writer, self._fps, self._timing = folder, writer, fps, timing
+    def __init__(self, folder: Path, writer: PartWriter, fps: int) -> None:
+        self._folder, self._writer, self._fps = folder, writer, fps
         self._encoders: dict[str, Encoder] = {}
         self._stack = ExitStack()
         self.levels: dict[str, Levels] = {}
@@ -158,20 +153,18 @@ class _Videos:
         return self
 
     def __exit__(self, *error: Any) -> None:
-        with self._timing.measure("encode"):
-            self._stack.__exit__(*error)
+        self._stack.__exit__(*error)
 
     def add(self, frame: Frame) -> None:
-        with self._timing.measure("encode"):
-            for camera, image in frame.rgb.items():
-                self._encode("rgb", camera, image)
-                self.levels.setdefault(schema.image_key(camera), Levels.rgb()).add(image)
-            for camera, image in frame.depth.items():
-                if self._writer.variant.native_depth:
-                    self.clipped = self.clipped or bool(image.max() > schema.MAX_DEPTH_MM)
-                    image = to_levels(image)  # noqa: PLW2901
-                    self.levels.setdefault(schema.depth_key(camera), Levels.depth()).add(image)
-                self._encode("depth", camera, image)
+        for camera, image in frame.rgb.items():
+            self._encode("rgb", camera, image)
+            self.levels.setdefault(schema.image_key(camera), Levels.rgb()).add(image)
+        for camera, image in frame.depth.items():
+            if self._writer.variant.native_depth:
+                self.clipped = self.clipped or bool(image.max() > schema.MAX_DEPTH_MM)
+                image = to_levels(image)  # noqa: PLW2901
+                self.levels.setdefault(schema.depth_key(camera), Levels.depth()).add(image)
+            self._encode("depth", camera, image)
         self.boxes.append(frame.boxes)
 
     def _encode(self, kind: Kind, camera: str, image: NDArray) -> None:

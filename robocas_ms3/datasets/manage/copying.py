@@ -17,19 +17,18 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import replacing_folder
 from robocas_ms3.core.outputs import OutputFolder
 from robocas_ms3.core.strict import parse
-from robocas_ms3.core.words import count_of
+from robocas_ms3.core.words import count_of, format_ranges
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks import arrays as laws
-from robocas_ms3.datasets.checks.pictures import SURPLUS, check_cameras, check_images
+from robocas_ms3.datasets.checks.pictures import check_cameras, check_images
 from robocas_ms3.datasets.checks.scene import read_settings
 from robocas_ms3.datasets.checks.violation import Violation, read_object
 from robocas_ms3.datasets.pictures.headers import PictureHeader, has_both_ends, read_header
-from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.records import ConversionRecord
-from robocas_ms3.datasets.sources.tolerant import SPECS, arrays_fingerprint, read_arrays
+from robocas_ms3.datasets.sources.tolerant import arrays_fingerprint, read_arrays
 from robocas_ms3.datasets.writing.info import write_info
-from robocas_ms3.datasets.writing.plan import DATASET, SETTINGS
+from robocas_ms3.datasets.writing.plan import DATASET, SETTINGS, header
 
 KEEP_RULE = "every episode keeps the side it had in the dataset it is from"
 _NO_LINKS = {errno.EXDEV, errno.EPERM, errno.EACCES, errno.EMLINK, errno.EOPNOTSUPP, errno.ENOSYS}
@@ -78,7 +77,7 @@ def open_finished(root: Path, name: str = "") -> FinishedDataset:
         raise DatasetError("this dataset is not finished", where=path, found="no file", fix=fix)
     listed = [number for side in dataset.sides for number in side]
     if sorted(listed) != dataset.numbers:
-        found = f"{list_first(sorted(set(listed) ^ set(dataset.numbers)))} missing, twice, or not on disk"
+        found = f"{format_ranges(set(listed) ^ set(dataset.numbers)) or 'some'} missing, twice, or not on disk"
         fix = "Finish it with robocas convert, or accept what is there with robocas split --in-place."
         raise DatasetError("not the episodes on disk", where=root / schema.DATA_INFO_FILE, found=found, fix=fix)
     where = root / schema.CONVERSION_FILE
@@ -86,18 +85,12 @@ def open_finished(root: Path, name: str = "") -> FinishedDataset:
     ledger = {int(number): entry for number, entry in dataset.settings.get("episodes", {}).items()}
     unlisted = [number for number in dataset.numbers if number not in ledger]
     if unlisted:
-        raise DatasetError("these episodes are not listed", where=where, found=list_first(unlisted))
+        raise DatasetError("these episodes are not listed", where=where, found=format_ranges(unlisted))
     for number in dataset.numbers:
         episode = dataset.episode(number)
         found = episode.scene.get("schema_version", 1)
         schema.check_version(found, episode.folder / schema.SCENE_FILE, "an episode")
     return FinishedDataset(dataset, name or root.resolve().name, ledger)
-
-
-def list_first(values: Iterable[object], most: int = 8) -> str:
-    """Return the first of several values, for messages."""
-    values = [str(value) for value in values]
-    return ", ".join(values[:most]) + (f" and {len(values) - most} more" if len(values) > most else "")
 
 
 @dataclass(frozen=True)
@@ -193,14 +186,12 @@ def _record(members: Sequence[CopiedEpisode], split_rule: str) -> dict[str, Any]
         before = {"from": entry["from"]} if "from" in entry else {}  # of an episode that was copied before
         episodes[str(number)] = {**entry, "from": {"dataset": member.source.name, "episode": member.number, **before}}
     settings = members[0].source.dataset.settings
-    return {
-        "format": "robocas",
-        "schema_version": schema.SCHEMA_VERSION,
-        "made_with": {"robocas_ms3": robocas_ms3.__version__},
-        **{key: settings[key] for key in SETTINGS},
-        "split": split_rule,
-        "episodes": episodes,
-    }
+    return {**copied_header({key: settings[key] for key in SETTINGS}, split_rule), "episodes": episodes}
+
+
+def copied_header(settings: Mapping[str, Any], split_rule: str) -> dict[str, Any]:
+    """Return ``conversion.json`` of a dataset made of others, without the episodes."""
+    return {**header(settings, split_rule), "made_with": {"robocas_ms3": robocas_ms3.__version__}}
 
 
 @contextmanager
@@ -231,29 +222,28 @@ def _check_episodes(root: Path, numbers: Iterable[int]) -> None:
     """Check that episodes have all arrays, cameras and images; arrays that an imported episode lacks may be missing."""
     _, pictures, _ = read_settings(root)
     for folder in (root / schema.episode_folder(number) for number in numbers):
-        for wrong in _violations(folder, pictures):
-            raise damaged_episode(root, wrong)
-
-
-def _violations(folder: Path, pictures: Pictures) -> Iterator[Violation]:
-    stored = read_arrays(folder / schema.EPISODE_FILE)
-    source = read_object(folder, schema.SCENE_FILE)[0].get("source")
-    missing = source.get("missing") if isinstance(source, dict) else None
-    lacking = missing if isinstance(missing, list) else []
-    yield from (wrong for wrong in laws.check_keys(stored) if wrong.key in SPECS and wrong.key not in lacking)
-    yield from laws.violations_of(stored, (laws.check_file, laws.check_shapes, laws.check_finite))
-    yield from check_cameras(folder, pictures)
-    images = check_images(folder, pictures, stored.steps, {}, check_ends)
-    yield from (wrong for wrong in images if wrong.found != SURPLUS)
+        stored = read_arrays(folder / schema.EPISODE_FILE)
+        source = read_object(folder, schema.SCENE_FILE)[0].get("source")
+        missing = source.get("missing") if isinstance(source, dict) else None
+        lacking = missing if isinstance(missing, list) else []
+        images = check_images(folder, pictures, stored.steps, {}, _check_ends)
+        for wrong in (
+            *(wrong for wrong in laws.check_keys(stored) if wrong.key not in lacking),
+            *laws.violations_of(stored, (laws.check_file, laws.check_shapes, laws.check_finite)),
+            *check_cameras(folder, pictures),
+            *images,
+        ):
+            if wrong.kind != "surplus":
+                raise damaged_episode(root, wrong)
 
 
 def damaged_episode(root: Path, wrong: Violation) -> DatasetError:
     """Return an error for a violation in an episode of a dataset."""
-    where, fix = f"{root / wrong.file}{f', {wrong.key}' if wrong.key else ''}", f"robocas validate {root} lists all."
+    where, fix = root / wrong.where, f"robocas validate {root} lists all."
     return DatasetError("this episode is damaged", where=where, expected=wrong.expected, found=wrong.found, fix=fix)
 
 
-def check_ends(path: Path) -> PictureHeader | None:
+def _check_ends(path: Path) -> PictureHeader | None:
     """Check both ends of an image; if one is not as it should be, the image is read whole."""
     return None if has_both_ends(path) else read_header(path) and None
 

@@ -9,22 +9,29 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-import robocas_ms3
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.files import json_text, replacing_folder, write_json
+from robocas_ms3.core.files import replacing_folder, write_json
 from robocas_ms3.core.strict import parse
 from robocas_ms3.core.words import count_of
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.manage.copying import CopyOptions, FilePlacer, check_apart, dataset_output, schema_version
-from robocas_ms3.datasets.manage.repairs import EMBEDDINGS, about_z
-from robocas_ms3.datasets.manage.survey import ImportedEpisode, Survey, read_episode, read_info
+from robocas_ms3.datasets.manage.copying import (
+    CopyOptions,
+    FilePlacer,
+    check_apart,
+    copied_header,
+    dataset_output,
+    schema_version,
+)
+from robocas_ms3.datasets.manage.repairs import EMBEDDINGS, ImportedEpisode
+from robocas_ms3.datasets.manage.survey import Survey, read_episode, read_info
 from robocas_ms3.datasets.sources.arrays import with_embeddings
 from robocas_ms3.datasets.sources.protocol import CameraModel
 from robocas_ms3.datasets.sources.reader import Dataset, Episode
 from robocas_ms3.datasets.sources.records import SCENE_KEYS, EpisodesRecord
 from robocas_ms3.datasets.sources.tolerant import SPECS, EpisodeArrays
-from robocas_ms3.datasets.writing.episode_folder import write_cameras
+from robocas_ms3.datasets.writing.episode_folder import write_episode_files
 from robocas_ms3.datasets.writing.info import write_info
 from robocas_ms3.datasets.writing.plan import dataset_settings
 
@@ -65,13 +72,13 @@ def import_robocas(
         if options.on_start:
             options.on_start(len(missing))
         for number in missing:
-            read = read_episode(dataset, number, info, surveyed.rate_hz, surveyed.turn_eef)
-            if not read.usable:
+            episode = read_episode(dataset, number, info, surveyed.rate_hz, surveyed.turn_eef)
+            if not episode.usable:
                 where = surveyed.root / schema.episode_folder(number)
                 raise DatasetError("this episode changed meanwhile", where=where)
-            read = replace(read, stored=_embedded(read, embedded, embed), pictures=surveyed.pictures)
+            episode.stored = _embedded(episode, embedded, embed)
             with replacing_folder(out / schema.episode_folder(number)) as folder:
-                _write(folder, dataset.episode(number), read, surveyed, placer)
+                _write(folder, dataset.episode(number), episode, surveyed, placer)
             if options.on_episode:
                 options.on_episode(number)
         write_json(out / REPORT_FILE, surveyed.as_json())
@@ -90,65 +97,58 @@ def _record(dataset: Dataset, surveyed: Survey, embedded: bool) -> dict[str, Any
         str(n): {**unknown, **before.get(str(n), {}), "from": {"dataset": name, "episode": n}} for n in surveyed.taken
     }
     return {
-        "format": "robocas",
-        "schema_version": schema.SCHEMA_VERSION,
-        "made_with": {"robocas_ms3": robocas_ms3.__version__},
-        **dataset_settings(surveyed.rate_hz, surveyed.pictures, embedded),
-        "split": SPLIT_RULE,
+        **copied_header(dataset_settings(surveyed.rate_hz, surveyed.pictures, embedded), SPLIT_RULE),
         "source": {"format": f"robocas v{schema_version(dataset)}", "dataset": name},
         "episodes": episodes,
     }
 
 
-def _embedded(read: ImportedEpisode, wanted: bool, embed: Embed | None) -> EpisodeArrays:
-    """Return the arrays of an episode with embeddings, or without."""
-    stored = read.stored
+def _embedded(episode: ImportedEpisode, wanted: bool, embed: Embed | None) -> EpisodeArrays:
+    stored = episode.stored
     if not wanted:
         return replace(stored, arrays={key: array for key, array in stored.arrays.items() if key not in EMBEDDINGS})
-    if read.embedded:
+    if episode.embedded:
         return stored
     assert embed is not None
     derived = {"language_embedding": "language_goal", "step_goal_embs": "step_lang_goals"}
     return replace(stored, arrays=with_embeddings(stored.arrays, embed), derived={**stored.derived, **derived})
 
 
-def _write(folder: Path, episode: Episode, read: ImportedEpisode, surveyed: Survey, placer: FilePlacer) -> None:
-    assert read.pictures is not None
-    pictures, stored = read.pictures, read.stored
+def _write(folder: Path, source: Episode, episode: ImportedEpisode, surveyed: Survey, placer: FilePlacer) -> None:
+    pictures, stored = surveyed.pictures, episode.stored
+    assert pictures is not None
     cameras: dict[str, CameraModel] = {}
     for camera in pictures.cameras:
-        model = episode.camera(camera)
+        model = source.camera(camera)
         pose = np.asarray(model.camera_in_parent, dtype=np.float64)
-        if model.parent == "ee" and read.turn_deg:
-            pose = about_z(-read.turn_deg) @ pose
+        if model.parent == "ee" and episode.turn_deg:
+            back = Rotation.from_euler("z", -episode.turn_deg, degrees=True).as_matrix()
+            pose = np.vstack([back @ pose[:3], pose[3]])
         cameras[camera] = CameraModel(np.asarray(model.intrinsic, dtype=np.float64), pose, model.parent)
         for kind in pictures.kinds:
             (folder / camera / kind).mkdir(parents=True)
             for step in range(stored.steps):
                 target = schema.image_path(folder, camera, kind, step, pictures.image_format)
-                placer.place(episode.image_path(camera, kind, step), target)
-    write_cameras(folder, cameras)
-    arrays: dict[str, Any] = {key: stored.arrays[key] for key in SPECS if key in stored.arrays}
-    np.savez(folder / schema.EPISODE_FILE, **arrays)
-    text = json_text(_scene(episode, read, surveyed), episode.folder, indent=1, error=DatasetError)
-    (folder / schema.SCENE_FILE).write_text(text + "\n", encoding="utf-8")
+                placer.place(source.image_path(camera, kind, step), target)
+    arrays = {key: stored.arrays[key] for key in SPECS if key in stored.arrays}
+    write_episode_files(folder, arrays, cameras, _scene(source, episode, surveyed))
 
 
-def _scene(episode: Episode, read: ImportedEpisode, surveyed: Survey) -> dict[str, Any]:
+def _scene(source: Episode, episode: ImportedEpisode, surveyed: Survey) -> dict[str, Any]:
     """Return the content of ``scene.json``; most is unknown, unless the episode has such a file."""
-    assert episode.dataset is not None
-    before = episode.scene if episode.scene.get("schema_version") == schema.SCHEMA_VERSION else {}
+    assert source.dataset is not None
+    before = source.scene if source.scene.get("schema_version") == schema.SCHEMA_VERSION else {}
     wanted = (spec.name for spec in schema.EPISODE_INFO if not spec.embedding)
-    repaired = (found for found in read.findings if found.outcome == "mended")
-    source = {
+    repaired = (found for found in episode.findings if found.outcome == "mended")
+    made = {
         "recording": None,
         **(before.get("source") or {}),
-        "format": f"robocas v{schema_version(episode.dataset)}",
+        "format": f"robocas v{schema_version(source.dataset)}",
         "dataset": surveyed.root.resolve().name,
-        "episode": read.number,
-        "derived": read.stored.derived,
-        "missing": [key for key in wanted if key not in read.stored.arrays],
-        "mended": [f"{found.file.split('/', 1)[1]}: {found.problem}" for found in repaired],
+        "episode": episode.number,
+        "derived": episode.stored.derived,
+        "missing": [key for key in wanted if key not in episode.stored.arrays],
+        "mended": [f"{found.violation.where.split('/', 1)[1]}: {found.problem}" for found in repaired],
     }
-    known = {"schema_version": schema.SCHEMA_VERSION, "rate_hz": float(surveyed.rate_hz), "source": source}
+    known = {"schema_version": schema.SCHEMA_VERSION, "rate_hz": float(surveyed.rate_hz), "source": made}
     return {key: known.get(key, before.get(key)) for key in SCENE_KEYS}

@@ -15,7 +15,6 @@ from robocas_ms3.datasets.manage.copying import (
     CopyResult,
     FinishedDataset,
     copy_episodes,
-    list_first,
     open_finished,
 )
 from robocas_ms3.datasets.writing.plan import SETTINGS
@@ -58,8 +57,8 @@ def merge(
             if first is not member:
                 duplicates.append((first, member))
     if duplicates and not skip_duplicates:
-        pairs = (f"{a.source.name} {a.number} = {b.source.name} {b.number}" for a, b in duplicates)
-        where, found = ", ".join(map(str, roots)), f"{len(duplicates)}: {list_first(pairs, 4)}"
+        pairs = [f"{a.source.name} {a.number} = {b.source.name} {b.number}" for a, b in duplicates]
+        where, found = ", ".join(map(str, roots)), f"{len(duplicates)}: {', '.join(pairs[:4])}"
         fix = "Pass --skip-duplicates to take each once."
         raise DatasetError("the same recording twice", where=where, found=found, fix=fix)
     (written,) = copy_episodes({out: list(members.values())}, KEEP_RULE, options or CopyOptions())
@@ -69,11 +68,12 @@ def merge(
 def distinct_names(roots: Sequence[Path]) -> list[str]:
     """Return the shortest ends of paths that differ."""
     parts = [root.resolve().parts for root in roots]
-    for length in range(1, max(map(len, parts), default=1) + 1):
+    names: list[str] = []
+    for length in range(1, max(map(len, parts)) + 1):
         names = [str(Path(*path[-length:])) for path in parts]
         if len(set(names)) == len(names):
-            return names
-    return [str(Path(*path)) for path in parts]
+            break
+    return names
 
 
 def _check_settings(sources: Sequence[FinishedDataset]) -> None:

@@ -13,15 +13,14 @@ import numpy as np
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.words import count_of
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.checks.pictures import SOUND, SURPLUS, Sizes, check_camera_file, check_images
+from robocas_ms3.datasets.checks.pictures import Sizes, check_camera_file, check_images
 from robocas_ms3.datasets.checks.violation import NO_FILE, Violation
 from robocas_ms3.datasets.manage.repairs import (
     EMBEDDINGS,
     Finding,
-    Outcome,
+    ImportedEpisode,
     eef_turn,
-    finding,
-    key_findings,
+    note_keys,
     repair_arrays,
     turn_eef_frame,
 )
@@ -32,40 +31,6 @@ from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, arrays_fingerpr
 from robocas_ms3.robots.cameras import EE_CAMERA
 
 _FULL_SIZE = (640, 480)
-_SHOWN_IMAGES = 3  # findings per folder of images
-
-
-@dataclass(frozen=True)
-class ImportedEpisode:
-    """An episode with its repaired arrays.
-
-    Attributes:
-        number: of the episode.
-        stored: its arrays.
-        findings: what is or was wrong.
-        turn_deg: angle about z by which its EEF frame was turned.
-        pictures: its images; None if they were not checked.
-    """
-
-    number: int
-    stored: EpisodeArrays
-    findings: tuple[Finding, ...]
-    turn_deg: int = 0
-    pictures: Pictures | None = None
-
-    @property
-    def usable(self) -> bool:
-        """Whether it can be imported."""
-        return all(found.outcome != "left out" for found in self.findings)
-
-    @property
-    def embedded(self) -> bool:
-        """Whether all embeddings are there."""
-        return set(EMBEDDINGS) <= self.stored.arrays.keys()
-
-    def extended(self, findings: Sequence[Finding], **changes: Any) -> ImportedEpisode:
-        """Return it with further findings and other values."""
-        return replace(self, findings=(*self.findings, *findings), **changes)
 
 
 @dataclass
@@ -108,7 +73,7 @@ class Survey:
             "left_out": self.left_out,
             "pictures": asdict(self.pictures) if self.pictures else None,
             "embeddings": self.embeddings,
-            "findings": [asdict(found) for found in self.findings],
+            "findings": [found.as_json() for found in self.findings],
         }
 
 
@@ -135,44 +100,62 @@ def survey(
     if rate_hz <= 0:
         raise DatasetError("no such rate", where="rate", expected="> 0 Hz", found=rate_hz)
     info, findings = read_info(dataset)
-    usable: dict[int, ImportedEpisode] = {}
+    if not dataset.settings:
+        wrong = Violation(schema.CONVERSION_FILE, "", "this file", NO_FILE)
+        findings.append(Finding(None, wrong, "mended", f"made of the episodes, {rate_hz:g} steps a second"))
+    usable: list[ImportedEpisode] = []
     fingerprints: dict[int, str] = {}
     for done, number in enumerate(dataset.numbers, start=1):
-        read = read_episode(dataset, number, info, rate_hz, turn_eef)
-        if read.usable:
-            read = _check_images(read, dataset.episode(number))
-        findings += read.findings
-        if read.usable:
-            fingerprints[number] = arrays_fingerprint(read.stored.arrays)
-            usable[number] = replace(read, stored=replace(read.stored, arrays=_few(read.stored)))
+        episode = read_episode(dataset, number, info, rate_hz, turn_eef)
+        if episode.usable:
+            _check_images(episode, dataset.episode(number))
+        if episode.usable:
+            fingerprints[number] = arrays_fingerprint(episode.stored.arrays)
+            embeddings = {key: episode.stored.arrays[key][:0] for key in EMBEDDINGS if key in episode.stored.arrays}
+            arrays = {"ee_pos": episode.stored.arrays["ee_pos"], **embeddings}  # the others take memory
+            episode.stored = replace(episode.stored, arrays=arrays)
+            usable.append(episode)
+        else:
+            findings += episode.findings
         if on_episode:
             on_episode(done, len(dataset.numbers))
-    most = Counter(read.pictures for read in usable.values()).most_common(1)[0][0] if usable else None
+    most = Counter(episode.pictures for episode in usable).most_common(1)[0][0] if usable else None
     first: dict[str, int] = {}
-    taken: dict[int, int] = {}
-    for number, read in usable.items():
-        if read.pictures != most:
-            text = f"pictures of {_describe(read.pictures)}; most are of {_describe(most)}"
-        elif first.setdefault(fingerprints[number], number) != number:
-            text = f"the same as episode {first[fingerprints[number]]}"
-        else:
-            taken[number] = read.stored.steps
-            continue
-        findings.append(Finding(number, schema.episode_folder(number), text, "left out"))
-    lacking = [number for number in taken if not usable[number].embedded]
+    for episode in usable:
+        name = schema.episode_folder(episode.number)
+        if episode.pictures != most:
+            wrong = Violation(name, "", f"{_describe(most)}, as most", _describe(episode.pictures))
+            episode.note(wrong, "left out")
+        elif (other := first.setdefault(fingerprints[episode.number], episode.number)) != episode.number:
+            episode.note(Violation(name, "", "each episode once", f"the arrays of episode {other}"), "left out")
+        findings += episode.findings
+    taken = {episode.number: episode for episode in usable if episode.usable}
+    lacking = [number for number, episode in taken.items() if not episode.embedded]
     if lacking and len(lacking) < len(taken):
-        text = f"missing in {count_of(len(lacking), 'episode')}: those of the others are not taken"
-        findings.append(Finding(None, f"{schema.EPISODE_FILE}, embeddings", text, "mended"))
-    findings += _missing_files(dataset, list(taken), rate_hz)
-    findings.sort(key=lambda found: -1 if found.episode is None else found.episode)
-    embeddings = bool(taken) and not lacking
-    return Survey(root, rate_hz, turn_eef, len(dataset.numbers), taken, most, embeddings, findings)
+        found = f"{count_of(len(lacking), 'episode')} without"
+        wrong = Violation(schema.EPISODE_FILE, "embeddings", "in all episodes or none", found)
+        findings.append(Finding(None, wrong, "mended", "not taken"))
+    findings = sorted(_merged(findings, list(taken)), key=lambda f: -1 if f.episode is None else f.episode)
+    lengths = {number: episode.stored.steps for number, episode in taken.items()}
+    embedded = bool(taken) and not lacking
+    return Survey(root, rate_hz, turn_eef, len(dataset.numbers), lengths, most, embedded, findings)
 
 
-def _few(stored: EpisodeArrays) -> dict[str, Any]:
-    """Return what a survey keeps of the arrays of each episode: length, and which embeddings there are."""
-    kept = {key: stored.arrays[key][:0] for key in EMBEDDINGS if key in stored.arrays}
-    return {"ee_pos": stored.arrays["ee_pos"], **kept}
+def _merged(findings: Sequence[Finding], taken: Sequence[int]) -> Iterator[Finding]:
+    """Yield findings; those that all of several episodes share once, as of the dataset."""
+    shared = Counter(_in_dataset(found) for found in findings if found.episode in taken)
+    for found in findings:
+        count = shared.get(_in_dataset(found), 0) if found.episode in taken else 0
+        if count < len(taken) or count < 2:
+            yield found
+        elif found.episode == taken[0]:
+            yield _in_dataset(found)
+
+
+def _in_dataset(found: Finding) -> Finding:
+    folder = "" if found.episode is None else f"{schema.episode_folder(found.episode)}/"
+    file = found.violation.file.removeprefix(folder)
+    return replace(found, episode=None, violation=replace(found.violation, file=file))
 
 
 def read_episode(
@@ -186,88 +169,78 @@ def read_episode(
         info: ``data_info.json``.
         rate_hz, turn_eef: see `survey`.
     """
-    episode, said = dataset.episode(number), said_of(info, number)
-    name, path = episode.folder.name, episode.folder / schema.EPISODE_FILE
+    source, said = dataset.episode(number), said_of(info, number)
+    path = source.folder / schema.EPISODE_FILE
+    episode = ImportedEpisode(number, EpisodeArrays(path, {}))
     try:
         loaded = load_arrays(path)
     except DatasetError as error:
-        damaged = Finding(number, f"{name}/{schema.EPISODE_FILE}", _reason(error), "left out")
-        return ImportedEpisode(number, EpisodeArrays(path, {}), (damaged,))
-    stored = completed(loaded, said, rate_hz)
-    read = ImportedEpisode(number, stored, tuple(key_findings(loaded, stored)))
-    if read.usable:
-        stored, found = repair_arrays(stored)
-        for key, value in (("ep_length", stored.steps), ("language_goal", str(stored.arrays["language_goal"]))):
+        episode.note(_unreadable(f"{source.folder.name}/{path.name}", "a numpy archive", error), "left out")
+        return episode
+    episode.stored = completed(loaded, said, rate_hz)
+    note_keys(episode, loaded)
+    repair_arrays(episode)
+    if episode.usable:
+        arrays, file = episode.stored.arrays, episode.stored.file
+        for key, value in (("ep_length", episode.stored.steps), ("language_goal", str(arrays["language_goal"]))):
             if said.get(key, value) != value:
-                text = f"{schema.DATA_INFO_FILE} says {said[key]!r}, this {value!r}"
-                found.append(finding(stored, key, "mended", text))
-        read = read.extended(found, stored=stored)
-    if read.usable:
-        cameras = [Finding(number, f"{name}/{file}", text, "left out") for file, text in _check_cameras(episode)]
-        read = read.extended(cameras)
-    if read.usable and turn_eef and EE_CAMERA in episode.cameras and not episode.scene.get("env_info"):
-        turn = eef_turn(episode.camera_in_parent(EE_CAMERA))
+                wrong = Violation(file, key, f"{said[key]!r} ({schema.DATA_INFO_FILE})", repr(value))
+                episode.note(wrong, "mended", "the array counts")
+        _check_files(episode, source)
+    if episode.usable and turn_eef and EE_CAMERA in source.cameras and not source.scene.get("env_info"):
+        turn = eef_turn(source.camera_in_parent(EE_CAMERA))
         if turn:
-            text = f"EEF frame turned by {turn} degrees about z, to be ManiSkill's TCP"
-            found = finding(read.stored, "ee_orn, rel_pos, rel_orn", "mended", text)
-            read = read.extended([found], stored=turn_eef_frame(read.stored, turn), turn_deg=turn)
-    return read
+            turn_eef_frame(episode, turn)
+    return episode
 
 
-def _reason(error: DatasetError) -> str:
-    return f"{error.what}{f': {error.found}' if error.found else ''}"
+def _unreadable(file: str, expected: str, error: DatasetError) -> Violation:
+    return Violation(file, "", expected, f"{error.what}{f': {error.found}' if error.found else ''}")
 
 
-def _check_cameras(episode: Episode) -> Iterator[tuple[str, str]]:
-    """Yield file and fault of cameras that can't be used."""
-    if not episode.cameras:
-        yield "", "no cameras"
-    for camera in episode.cameras:
+def _check_files(episode: ImportedEpisode, source: Episode) -> None:
+    """Note cameras that can't be used, and files of today's schema that are missing."""
+    name = source.folder.name
+    if not source.cameras:
+        episode.note(Violation(name, "", "cameras", "none"), "left out")
+    for camera in source.cameras:
         try:
-            intrinsic, pose = episode.intrinsic(camera), episode.camera_in_parent(camera)
+            model = source.camera(camera)
         except DatasetError as error:
-            yield camera, _reason(error)
+            episode.note(_unreadable(f"{name}/{camera}", "intrinsics and a pose", error), "left out")
             continue
-        for wrong in check_camera_file(f"{camera}/{schema.INTRINSIC_FILE}", intrinsic.astype(np.float64), pose=False):
-            yield wrong.file, f"not {wrong.expected}: {wrong.found}"
-        for wrong in check_camera_file(camera, pose.astype(np.float64), pose=True):
-            yield wrong.file, f"its pose is not {wrong.expected}"
+        intrinsic = f"{name}/{camera}/{schema.INTRINSIC_FILE}"
+        for wrong in (
+            *check_camera_file(intrinsic, model.intrinsic.astype(np.float64), pose=False),
+            *check_camera_file(f"{name}/{camera}", model.camera_in_parent.astype(np.float64), pose=True),
+        ):
+            episode.note(wrong, "left out")
+        files = schema.pose_files(model.parent)
+        for file, other in zip(files, files[::-1], strict=True):
+            if not (source.folder / camera / file).is_file():
+                wrong = Violation(f"{name}/{camera}/{file}", "", "this file", NO_FILE)
+                episode.note(wrong, "mended", f"a copy of {other}")
+    if not (source.folder / schema.SCENE_FILE).is_file():
+        wrong = Violation(f"{name}/{schema.SCENE_FILE}", "", "this file", NO_FILE)
+        episode.note(wrong, "noted", "seed, target, layout and configuration are not known")
 
 
-def _check_images(read: ImportedEpisode, episode: Episode) -> ImportedEpisode:
-    """Check the images of an episode; a few findings per folder are listed."""
-    name, number, steps = episode.folder.name, read.number, read.stored.steps
-    pictures = Pictures(episode.cameras, None, episode.has_depth, episode.image_format)
+def _check_images(episode: ImportedEpisode, source: Episode) -> None:
+    """Check the images of an episode; each folder is one finding."""
+    pictures = Pictures(source.cameras, None, source.has_depth, source.image_format)
     sizes: Sizes = {}
-    by_folder: dict[str, list[Violation]] = {}
-    for wrong in check_images(episode.folder, pictures, steps, sizes):
-        by_folder.setdefault(wrong.file.rpartition("/")[0], []).append(wrong)
-    findings: list[Finding] = []
-    for folder, found in by_folder.items():
-        wrong = [violation for violation in found if violation.found != SURPLUS]
-        findings += [Finding(number, v.file, _image_fault(v), "left out") for v in wrong[:_SHOWN_IMAGES]]
-        if len(wrong) > _SHOWN_IMAGES:
-            text = f"{len(wrong) - _SHOWN_IMAGES} more are missing or damaged"
-            findings.append(Finding(number, folder, text, "left out"))
-        if len(found) > len(wrong):
-            text = f"{count_of(len(found) - len(wrong), 'file')} beyond the {count_of(steps, 'step')}: not taken"
-            findings.append(Finding(number, folder, text, "noted"))
+    folders: dict[tuple[str, bool], list[Violation]] = {}
+    for wrong in check_images(source.folder, pictures, episode.stored.steps, sizes):
+        folders.setdefault((wrong.file.rpartition("/")[0], wrong.kind == "surplus"), []).append(wrong)
+    for found in folders.values():
+        more = f"and {count_of(len(found) - 1, 'other')}" if len(found) > 1 else ""
+        episode.note(found[0], "noted" if found[0].kind == "surplus" else "left out", more)
     different = set(sizes.values())
     size = None if len(different) != 1 or _FULL_SIZE in different else different.pop()
     try:
-        return read.extended(findings, pictures=replace(pictures, size=size))
+        episode.pictures = replace(pictures, size=size)
     except DatasetError as error:  # too small
-        return read.extended([*findings, Finding(number, name, _reason(error), "left out")], pictures=pictures)
-
-
-def _image_fault(wrong: Violation) -> str:
-    if wrong.expected == SOUND:
-        return wrong.found
-    if wrong.found == NO_FILE:
-        return "missing"
-    pairs = zip(wrong.found.split(", "), wrong.expected.split(", "), strict=True)  # size, channels and bits
-    found, expected = zip(*((a, b) for a, b in pairs if a != b), strict=True)
-    return f"{', '.join(found)}, not {', '.join(expected)}"
+        episode.note(Violation(source.folder.name, "", f"pictures {error.expected}", str(error.found)), "left out")
 
 
 def _describe(pictures: Pictures | None) -> str:
@@ -277,47 +250,26 @@ def _describe(pictures: Pictures | None) -> str:
     return f"{', '.join(pictures.cameras)}, {size} {pictures.image_format}, {depth} depth"
 
 
-def _missing_files(dataset: Dataset, taken: Sequence[int], rate_hz: float) -> Iterator[Finding]:
-    """Yield files of today's schema that are missing, once if they are missing in all episodes that are taken."""
-    if not dataset.settings:
-        made = f"no file: made of the episodes, {rate_hz:g} steps a second"
-        yield Finding(None, schema.CONVERSION_FILE, made, "mended")
-    lacking: dict[tuple[str, str, Outcome], list[int]] = {}
-    for number in taken:
-        episode = dataset.episode(number)
-        files: list[tuple[str, str, Outcome]] = [
-            (schema.SCENE_FILE, "no file: seed, target, layout and configuration are not known", "noted")
-        ]
-        for camera in episode.cameras:
-            names = schema.pose_files(episode.camera_parent(camera))
-            for name, other in zip(names, names[::-1], strict=True):
-                files.append((f"{camera}/{name}", f"no file: a copy of {other}", "mended"))
-        for key in files:
-            if not (episode.folder / key[0]).is_file():
-                lacking.setdefault(key, []).append(number)
-    for (file, problem, outcome), numbers in lacking.items():
-        if len(numbers) == len(taken):
-            yield Finding(None, file, problem, outcome)
-        else:
-            yield from (Finding(n, f"{schema.episode_folder(n)}/{file}", problem, outcome) for n in numbers)
-
-
 def read_info(dataset: Dataset) -> tuple[dict[str, Any], list[Finding]]:
     """Return the usable content of ``data_info.json``, and what is wrong with it."""
     file = schema.DATA_INFO_FILE
     try:
         info = dataset.info
     except DatasetError as error:
-        return {}, [Finding(None, file, f"damaged: {error.found}", "mended")]
+        return {}, [Finding(None, Violation(file, "", "JSON", str(error.found)), "mended", "made of the episodes")]
     if not info:
-        return {}, [Finding(None, file, "no file: made of the episodes, with a split of its own", "mended")]
+        repair = "made of the episodes, with a split of its own"
+        return {}, [Finding(None, Violation(file, "", "this file", NO_FILE), "mended", repair)]
     there, train, val = set(dataset.numbers), _numbers(info.get("train_eps")), _numbers(info.get("val_eps"))
     listed = Counter([*train, *val])
-    lists = f"{file}, train_eps, val_eps"
+    wrong = [
+        *((n, "the episodes on disk", "an episode without a folder", "removed") for n in sorted(set(listed) - there)),
+        *((n, "each episode once", "an episode twice", "it trains") for n in sorted(listed) if listed[n] > 1),
+        *((n, "the episodes on disk", "an episode that is not listed", "added") for n in sorted(there - set(listed))),
+    ]
     findings = [
-        *(Finding(n, file, "listed, but there is no such folder", "mended") for n in sorted(set(listed) - there)),
-        *(Finding(n, lists, "listed twice: it trains", "mended") for n in sorted(listed) if listed[n] > 1),
-        *(Finding(n, lists, "not listed: added", "mended") for n in sorted(there - set(listed))),
+        Finding(n, Violation(file, "train_eps, val_eps", expected, found), "mended", repair)
+        for n, expected, found, repair in wrong
     ]
     sides = {"train_eps": [n for n in train if n in there], "val_eps": [n for n in val if n in there - set(train)]}
     return {**info, **sides}, findings

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -93,15 +92,13 @@ class Pictures:
         return schema.IMAGE_KINDS if self.depth else ("rgb",)
 
 
-def write_picture(path: Path, picture: NDArray) -> float:
-    """Encode (H, W, 3) RGB or (H, W) depth by the file's suffix; gives the seconds that took."""
-    begun = time.perf_counter()
+def write_picture(path: Path, picture: NDArray) -> None:
+    """Encode (H, W, 3) RGB or (H, W) depth by the file's suffix."""
     try:
         data = encode_png(picture) if path.suffix == ".png" else _encode(picture, path.suffix)
     except (ValueError, cv2.error) as error:
         raise DatasetError("can't encode this picture", where=path, found=one_line(error)) from error
     path.write_bytes(data)  # unlike cv2.imwrite this says when the disk is full
-    return time.perf_counter() - begun
 
 
 def _encode(picture: NDArray[np.uint8], suffix: str) -> bytes:

@@ -1,9 +1,9 @@
-"""Videos and contact sheets of a dataset, for people to look at; drawn of its pictures."""
+"""Videos and contact sheets of a dataset, for people to look at: of stored images, and of those that are written."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from contextlib import closing
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -13,22 +13,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.files import replacing
-from robocas_ms3.datasets.pictures.drawing import (
-    Pictures,
-    Story,
-    draw_frame,
-    draw_row,
-    row_steps,
-)
+from robocas_ms3.core.files import make_folder, replacing
+from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.pictures.drawing import EpisodeDrawing, Images
 from robocas_ms3.datasets.pictures.png import encode_png
 from robocas_ms3.datasets.sources.protocol import EpisodeSource, Kind, shots
 
-PANEL = (426, 320)
-"""Width and height of one camera's picture in a video."""
+PANEL, PREVIEW_PANEL = (426, 320), (320, 240)
+"""Width and height of one camera's image in a video, and in a preview."""
 SHEET = 10
 """Episodes on a contact sheet."""
+FEW = 20
+"""Up to so many episodes have previews by default."""
 _NEAR_MM, _FAR_MM = 30, 5000  # colours of depth
+# Of a preview x264's default preset takes three times as long, and its threads get in the renderer's way.
+_PREVIEW_OPTIONS = ("-preset", "veryfast", "-threads", "1")
 
 
 def open_video(path: Path, fps: float, *options: str, quality: float = 8) -> Any:
@@ -36,7 +35,7 @@ def open_video(path: Path, fps: float, *options: str, quality: float = 8) -> Any
 
     Args:
         path: of the video.
-        fps: frames a second.
+        fps: frames per second.
         options: FFmpeg's, for the output.
         quality: 0 to 10.
     """
@@ -53,12 +52,7 @@ def open_video(path: Path, fps: float, *options: str, quality: float = 8) -> Any
 
 
 def write_video(
-    dataset: EpisodeSource,
-    number: int,
-    path: Path | str,
-    *,
-    speed: float = 1.0,
-    kind: Kind = "rgb",
+    dataset: EpisodeSource, number: int, path: Path | str, *, speed: float = 1.0, kind: Kind = "rgb"
 ) -> Path:
     """Write an episode as MP4 (H.264, yuv420p): the cameras side by side, instruction and sub-goal below.
 
@@ -76,14 +70,14 @@ def write_video(
         raise DatasetError("no such speed", where="speed", expected="> 0", found=speed)
     path = Path(path)
     episode = dataset.episode(number)
-    story = Story.of(number, episode.arrays)
+    drawing = EpisodeDrawing(number, episode.arrays, dataset.rate_hz)
     with (
         replacing(path) as tmp,
         open_video(tmp, dataset.rate_hz * speed) as video,
         closing(shots(episode, episode.cameras, kind)) as run,
     ):
-        for step, pictures in enumerate(run):
-            video.append_data(draw_frame(story, step, _coloured(pictures, kind), PANEL))
+        for step, images in enumerate(run):
+            video.append_data(drawing.frame(step, _coloured(images, kind), PANEL))
     return path
 
 
@@ -99,27 +93,80 @@ def contact_sheet(
         kind: ``rgb``, or ``depth`` in colours.
     """
     numbers = dataset.numbers[:SHEET] if episodes is None else list(episodes)
-    return write_sheet([sheet_row(dataset, number, kind) for number in numbers], out)
+    return _write_sheet([_row(dataset, number, kind) for number in numbers], out)
 
 
-def sheet_row(dataset: EpisodeSource, number: int, kind: Kind = "rgb") -> NDArray[np.uint8]:
-    """Return an episode's part of a contact sheet, (H, W, 3) RGB."""
+class Preview:
+    """Video and row of the contact sheet of an episode that is being written; the video appears whole, at the end.
+
+    Args:
+        root: the dataset.
+        drawing: of the episode.
+        row: whether it is on the contact sheet.
+
+    Attributes:
+        row: (H, W, 3) RGB, after the last frame.
+    """
+
+    def __init__(self, root: Path, drawing: EpisodeDrawing, *, row: bool) -> None:
+        self.row: NDArray[np.uint8] | None = None
+        self._path = make_folder(root / schema.PREVIEW_FOLDER) / f"{schema.episode_folder(drawing.number)}.mp4"
+        self._drawing, self._wanted = drawing, drawing.row_steps if row else []
+        self._shown: dict[int, Images] = {}
+        self._stack = ExitStack()
+        self._video: Any = None
+
+    def __enter__(self) -> Preview:
+        """Open the video."""
+        with ExitStack() as stack:
+            tmp = stack.enter_context(replacing(self._path))
+            self._video = stack.enter_context(open_video(tmp, self._drawing.rate_hz, *_PREVIEW_OPTIONS, quality=6))
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        """Finish it."""
+        self._stack.__exit__(*error)
+
+    def add(self, step: int, rgb: Images) -> None:
+        """Take the images of the next step."""
+        self._video.append_data(self._drawing.frame(step, rgb, PREVIEW_PANEL))
+        if step in self._wanted:
+            self._shown[step] = rgb
+            if step == self._wanted[-1]:
+                self.row, self._shown = self._drawing.row(self._shown), {}
+
+
+def on_sheet(numbers: Iterable[int]) -> tuple[int, ...]:
+    """Return the episodes of a dataset that are on its contact sheet."""
+    return tuple(sorted(numbers)[:SHEET])
+
+
+def finish_previews(dataset: EpisodeSource, rows: dict[int, NDArray[np.uint8]]) -> None:
+    """Write the contact sheet of a dataset, from rows of new episodes and stored images of the others, if it is new."""
+    path = dataset.root / schema.PREVIEW_FOLDER / "contact_sheet.png"
+    if rows or not path.is_file():
+        numbers = on_sheet(dataset.numbers)
+        _write_sheet([rows[number] if number in rows else _row(dataset, number) for number in numbers], path)
+
+
+def _row(dataset: EpisodeSource, number: int, kind: Kind = "rgb") -> NDArray[np.uint8]:
     episode, shown = dataset.episode(number), {}
-    picture = episode.rgb if kind == "rgb" else episode.depth
-    for step in row_steps(episode.steps):
-        shown[step] = _coloured({camera: picture(camera, step) for camera in episode.cameras}, kind)
-    return draw_row(Story.of(number, episode.arrays), shown, dataset.rate_hz)
+    drawing = EpisodeDrawing(number, episode.arrays, dataset.rate_hz)
+    image = episode.rgb if kind == "rgb" else episode.depth
+    for step in drawing.row_steps:
+        shown[step] = _coloured({camera: image(camera, step) for camera in episode.cameras}, kind)
+    return drawing.row(shown)
 
 
-def write_sheet(rows: Sequence[NDArray[np.uint8]], path: Path | str) -> Path:
-    """Write a contact sheet as PNG."""
+def _write_sheet(rows: Sequence[NDArray[np.uint8]], path: Path | str) -> Path:
     with replacing(path) as tmp:
         tmp.write_bytes(encode_png(np.concatenate(rows)))
     return Path(path)
 
 
 def colour_depth(depth: NDArray[np.uint16]) -> NDArray[np.uint8]:
-    """Depth as colours, (H, W, 3) RGB, on a logarithmic scale: near is red, far is blue, nothing is black."""
+    """Return depth as colours, (H, W, 3) RGB, on a logarithmic scale: near is red, far is blue, nothing is black."""
     near, far = np.log(_NEAR_MM), np.log(_FAR_MM)
     share = np.clip((far - np.log(np.maximum(depth, 1))) / (far - near), 0, 1)
     colours = cv2.applyColorMap((share * 255).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1].copy()
@@ -127,6 +174,5 @@ def colour_depth(depth: NDArray[np.uint16]) -> NDArray[np.uint8]:
     return colours.astype(np.uint8)
 
 
-def _coloured(pictures: Mapping[str, NDArray], kind: Kind) -> Pictures:
-    """Depth as colours, RGB as it is."""
-    return {camera: picture if kind == "rgb" else colour_depth(picture) for camera, picture in pictures.items()}
+def _coloured(images: Mapping[str, NDArray], kind: Kind) -> Images:
+    return {camera: image if kind == "rgb" else colour_depth(image) for camera, image in images.items()}

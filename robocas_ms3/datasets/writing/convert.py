@@ -18,7 +18,7 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import write_json
 from robocas_ms3.core.outputs import OutputFolder, sweep
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.pictures.preview import FEW, finish_previews, on_sheet
+from robocas_ms3.datasets.pictures.video import FEW, finish_previews, on_sheet
 from robocas_ms3.datasets.sources.protocol import EpisodeSource
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.episode_folder import FolderWriter, find_damaged
@@ -71,47 +71,46 @@ def convert(
         source = stack.enter_context(closing(open_trajectory(settings)))
         pictures = source.pictures
         stored = dataset_settings(source.rate_hz, pictures, settings.embeddings)
-        recorded_settings = {**stored, "made_with": versions()}
-        output = stack.enter_context(OutputFolder(out, DATASET, recorded_settings, overwrite=settings.overwrite))
+        recorded = {**stored, "made_with": versions()}
+        output = stack.enter_context(OutputFolder(out, DATASET, recorded, overwrite=settings.overwrite))
         # Everything that may fail comes before the output is touched.
         entries = ConversionInput(source, pictures, settings.include_failed).entries()
-        plan = plan_episodes(output, entries, stored, append=settings.append)
+        content, tasks = plan_episodes(output, entries, stored, append=settings.append)
         settings.check_device()
         embed = partial(_look_up, embed_texts(source, entries)) if settings.embeddings else None
-        output.start(plan.content)
+        output.start(content)
         sweep(out / schema.PREVIEW_FOLDER)
         before = _split_before(out)
-        for folder in (out / schema.episode_folder(number) for number, _ in plan.tasks):
+        for folder in (out / schema.episode_folder(number) for number, _ in tasks):
             if folder.is_dir() and (path := find_damaged(folder, pictures)):
                 _log.warning("%s: cut off, or gone, since it was written; its episode is written again", path)
                 shutil.rmtree(folder)
-        missing = [task for task in plan.tasks if not (out / schema.episode_folder(task[0])).is_dir()]
+        missing = [task for task in tasks if not (out / schema.episode_folder(task[0])).is_dir()]
         if on_start:
             on_start(len(missing))
         sheet = None
-        if settings.video and (settings.all_videos or len(plan.tasks) <= FEW):
-            sheet = on_sheet(map(int, plan.content["episodes"]))
-        continued = len(missing) < len(plan.tasks)
-        job = WriteJob(settings, FolderWriter(out, embed, sheet), missing, continued, _FIX)
+        if settings.video and (settings.all_videos or len(tasks) <= FEW):
+            sheet = on_sheet(map(int, content["episodes"]))
+        job = WriteJob(settings, FolderWriter(out, embed, sheet), missing, len(missing) < len(tasks), _FIX)
         try:
             written, incomplete = write_episodes(job, output, on_episode)
         finally:
             for folder in (out, out / schema.PREVIEW_FOLDER):
                 sweep(folder)  # left by workers that died; others wrote it again
         if incomplete:
-            write_json(out / schema.CONVERSION_FILE, without_unwritten(out, plan, incomplete.reasons))
+            write_json(out / schema.CONVERSION_FILE, without_unwritten(out, content, incomplete.reasons))
         add_failures(settings.source.parent, out, source.file.env_info)
-        write_info(out, planned_sides(plan.content, before))
+        write_info(out, planned_sides(content, before))
         if sheet is not None:
-            finish_previews(out, {episode.number: episode.row for episode in written if episode.row is not None})
+            rows = {episode.number: episode.row for episode in written if episode.row is not None}
+            finish_previews(Dataset(out), rows)
         if incomplete and not settings.leave_out:
             raise incomplete
         if incomplete:
             _log.warning("%s", incomplete)
-        if left := missing_episodes(out, plan.content):
+        if left := missing_episodes(out, content):
             _log.warning("%s: %s are still missing: convert that with --append", out, " and ".join(left))
-    kept = len(plan.tasks) - len(missing)
-    return Conversion(written, kept, time.perf_counter() - start, previews=sheet is not None)
+    return Conversion(written, len(tasks) - len(missing), time.perf_counter() - start, previews=sheet is not None)
 
 
 def _split_before(out: Path) -> tuple[list[int], list[int]]:

@@ -1,12 +1,11 @@
-"""Writes the folder of an episode: images while they are rendered, the rest at the end; the folder appears whole."""
+"""Writes the folder of an episode: images while they are rendered, the rest at the end."""
 
 from __future__ import annotations
 
-import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,26 +15,25 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.documents import DAMAGED, DocumentError, load_array, load_json
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.files import json_text, replacing_folder
+from robocas_ms3.core.files import json_text
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.pictures.drawing import Story
+from robocas_ms3.datasets.pictures.drawing import EpisodeDrawing
 from robocas_ms3.datasets.pictures.headers import has_both_ends
-from robocas_ms3.datasets.pictures.preview import Preview
 from robocas_ms3.datasets.pictures.stored import Pictures, write_picture
+from robocas_ms3.datasets.pictures.video import Preview
 from robocas_ms3.datasets.sources.arrays import with_embeddings
 from robocas_ms3.datasets.sources.files import CAMERA_LIMIT
 from robocas_ms3.datasets.sources.protocol import CameraModel, Frame
 from robocas_ms3.datasets.sources.tolerant import read_arrays
-from robocas_ms3.datasets.writing.inputs import ConversionInput, complete_arrays
-from robocas_ms3.datasets.writing.settings import Timing, WrittenEpisode
+from robocas_ms3.datasets.writing.workers import EpisodeWriter, GivenEpisode
 
 ENCODERS = 2  # threads; ISA-L and OpenCV work outside Python's lock
 _MAX_WAITING = 24  # images, which bounds memory
 
 
 @dataclass(frozen=True)
-class FolderWriter:
-    """Writes episodes of a RoboCAS folder; can be sent to another process.
+class FolderWriter(EpisodeWriter):
+    """Writes episodes of a RoboCAS folder.
 
     Attributes:
         out: the dataset.
@@ -47,84 +45,70 @@ class FolderWriter:
     embed: Callable[[list[str]], NDArray[np.float32]] | None = None
     sheet: tuple[int, ...] | None = None
 
-    def write(self, number: int, given: ConversionInput, source: int) -> WrittenEpisode:
-        """Write episode ``source`` of the input as episode ``number`` of the dataset."""
-        start, timing, pictures = time.perf_counter(), Timing(), given.pictures
-        with replacing_folder(self.out / schema.episode_folder(number), sync=True) as folder:
-            for camera in pictures.cameras:
+    def folder(self, number: int) -> Path:
+        """Return the folder of an episode."""
+        return self.out / schema.episode_folder(number)
+
+    def write_files(
+        self, folder: Path, wanted: GivenEpisode, frames: Generator[Frame, None, None]
+    ) -> NDArray[np.uint8] | None:
+        """Write an episode into a folder; return its row of the contact sheet, if there is one."""
+        episode, pictures, arrays, preview = wanted.episode, wanted.given.pictures, wanted.arrays, None
+        for camera in pictures.cameras:
+            for kind in pictures.kinds:
+                (folder / camera / kind).mkdir(parents=True)
+        with ExitStack() as stack:
+            if self.sheet is not None:
+                drawing = EpisodeDrawing(wanted.number, arrays, wanted.given.source.rate_hz)
+                preview = stack.enter_context(Preview(self.out, drawing, row=wanted.number in self.sheet))
+            encode = stack.enter_context(_encoder())
+            in_order = stack.enter_context(_encoder(1))  # frames of a video
+            for step, frame in enumerate(frames):
                 for kind in pictures.kinds:
-                    (folder / camera / kind).mkdir(parents=True)
-            with timing.measure("load"):
-                episode = given.source.episode(source)
-                arrays: dict[str, Any] = complete_arrays(episode)
-            with (
-                ExitStack() as previews,
-                _Encoders(folder, pictures, timing) as encoders,
-                closing(given.frames(episode)) as frames,
-            ):
-                if self.sheet is not None:  # finished after the encoders
-                    story, row = Story.of(number, arrays), number in self.sheet
-                    preview = Preview(self.out, given.source.rate_hz, story, row=row)
-                    encoders.preview = previews.enter_context(preview)
-                for step, frame in enumerate(timing.each(given.stage, frames)):
-                    encoders.add(step, frame)
-            begin_write = time.perf_counter()
-            write_cameras(folder, {name: episode.camera(name) for name in pictures.cameras})
-            arrays = with_embeddings(arrays, self.embed) if self.embed else arrays
-            np.savez(folder / schema.EPISODE_FILE, **arrays)
-            text = json_text(episode.scene, f"episode {source}", indent=1, error=DatasetError)
-            (folder / schema.SCENE_FILE).write_text(text + "\n", encoding="utf-8")
-            size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-        timing.write += time.perf_counter() - begin_write  # with the renaming of the folder
-        timing.total += time.perf_counter() - start
-        return WrittenEpisode(number, len(arrays["ee_pos"]), size, timing, encoders.preview and encoders.preview.row)
+                    images = frame.rgb if kind == "rgb" else frame.depth
+                    for camera in pictures.cameras:
+                        path = schema.image_path(folder, camera, kind, step, pictures.image_format)
+                        encode(write_picture, path, images[camera])
+                if preview:
+                    in_order(preview.add, step, frame.rgb)
+        cameras = {name: episode.camera(name) for name in pictures.cameras}
+        arrays = with_embeddings(arrays, self.embed) if self.embed else arrays
+        write_episode_files(folder, arrays, cameras, episode.scene)
+        return preview and preview.row
 
 
-def write_cameras(folder: Path, cameras: Mapping[str, CameraModel]) -> None:
-    """Write intrinsics and poses into an episode's folder."""
+def write_episode_files(
+    folder: Path, arrays: dict[str, NDArray], cameras: Mapping[str, CameraModel], scene: Mapping[str, Any]
+) -> None:
+    """Write all of an episode but its images."""
     for camera, model in cameras.items():
-        (folder / camera).mkdir(exist_ok=True)
         np.save(folder / camera / schema.INTRINSIC_FILE, model.intrinsic)
         for name in schema.pose_files(model.parent):
             np.save(folder / camera / name, model.camera_in_parent)
+    np.savez(folder / schema.EPISODE_FILE, **arrays)  # pyright: ignore[reportArgumentType]
+    text = json_text(dict(scene), folder, indent=1, error=DatasetError)
+    (folder / schema.SCENE_FILE).write_text(text + "\n", encoding="utf-8")
 
 
-class _Encoders:
-    """Encodes images on other threads while the next state renders."""
+@contextmanager
+def _encoder(threads: int = ENCODERS) -> Generator[Callable[..., None], None, None]:
+    """Give a function that calls others in threads, while the next state renders; it waits if too many are waiting."""
+    waiting: deque[Future[Any]] = deque()
 
-    def __init__(self, folder: Path, pictures: Pictures, timing: Timing) -> None:
-        self._folder, self._pictures, self._timing = folder, pictures, timing
-        self._waiting: deque[Future[float]] = deque()
-        self._pool = ThreadPoolExecutor(ENCODERS, thread_name_prefix="pictures")
-        self._in_order = ThreadPoolExecutor(1, thread_name_prefix="preview")  # a video's frames are
-        self.preview: Preview | None = None
+    def collect(limit: int) -> None:
+        while len(waiting) > limit:
+            waiting.popleft().result()
 
-    def __enter__(self) -> _Encoders:
-        return self
+    def submit(*call: Any) -> None:
+        waiting.append(pool.submit(*call))
+        collect(_MAX_WAITING)
 
-    def __exit__(self, kind: object, *_: object) -> None:
-        try:
-            if kind is None:
-                self._collect(0)
-        finally:
-            for pool in (self._pool, self._in_order):
-                pool.shutdown(cancel_futures=True)
-
-    def add(self, step: int, frame: Frame) -> None:
-        """Take a frame; waits if too many images are waiting."""
-        for kind in self._pictures.kinds:
-            images = frame.rgb if kind == "rgb" else frame.depth
-            for camera in self._pictures.cameras:
-                path = schema.image_path(self._folder, camera, kind, step, self._pictures.image_format)
-                self._waiting.append(self._pool.submit(write_picture, path, images[camera]))
-        if self.preview:
-            self._waiting.append(self._in_order.submit(self.preview.add, step, frame.rgb))
-        self._collect(_MAX_WAITING)
-
-    def _collect(self, limit: int) -> None:
-        with self._timing.measure("wait"):
-            while len(self._waiting) > limit:
-                self._timing.encode += self._waiting.popleft().result()
+    pool = ThreadPoolExecutor(threads)
+    try:
+        yield submit
+        collect(0)
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def find_damaged(folder: Path, pictures: Pictures) -> Path | None:

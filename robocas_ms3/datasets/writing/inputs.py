@@ -23,7 +23,9 @@ from robocas_ms3.datasets.sources.tolerant import arrays_fingerprint
 from robocas_ms3.datasets.writing.rendering import RenderedSource, open_env
 from robocas_ms3.datasets.writing.settings import ConversionSettings
 
-NEEDED = frozenset(s.name for s in schema.EPISODE_INFO if not s.embedding) - {"base_rel_pos", "base_rel_orn"}
+NEEDED = frozenset(spec.name for spec in schema.EPISODE_INFO if not (spec.embedding or spec.optional)) - {
+    *schema.RELATIVE_PAIRS[1][2:]  # which follow from the base poses
+}
 """Arrays that an episode must have to be converted."""
 _log = logging.getLogger(__name__)
 
@@ -43,11 +45,6 @@ class ConversionInput:
     pictures: Pictures
     include_failed: bool = False
     sizes: Mapping[str, tuple[int, int]] = field(default_factory=dict)
-
-    @property
-    def stage(self) -> str:
-        """The field of `settings.Timing` for the time of images."""
-        return "load" if self.sizes else "render"
 
     def entries(self) -> list[dict[str, Any]]:
         """Return the recording of each episode to convert, in order, and ``source``, its number in the source.

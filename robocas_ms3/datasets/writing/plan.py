@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -41,19 +40,6 @@ def with_versions(record: dict[str, Any]) -> dict[str, Any]:
 DATASET = FolderKind("robocas convert", (schema.CONVERSION_FILE,), "rate_hz", marks=MARKS, upgrade=with_versions)
 
 
-@dataclass(frozen=True)
-class EpisodePlan:
-    """The episodes that a dataset will have.
-
-    Attributes:
-        content: of ``conversion.json``.
-        tasks: (number in the dataset, number in the source) of each episode of this source, written or not.
-    """
-
-    content: dict[str, Any]
-    tasks: list[tuple[int, int]]
-
-
 def dataset_settings(rate_hz: float, pictures: Pictures, embeddings: bool) -> dict[str, Any]:
     """Return the settings of ``conversion.json``."""
     settings = SettingsRecord(
@@ -73,7 +59,9 @@ def header(settings: Mapping[str, Any], split_rule: str = SPLIT_RULE) -> dict[st
     return {**version, **settings, "split": split_rule}
 
 
-def plan_episodes(output: OutputFolder, entries: Entries, settings: dict[str, Any], *, append: bool) -> EpisodePlan:
+def plan_episodes(
+    output: OutputFolder, entries: Entries, settings: dict[str, Any], *, append: bool
+) -> tuple[dict[str, Any], list[tuple[int, int]]]:
     """Number the episodes of a source: as recorded, new ones after those of the dataset.
 
     Args:
@@ -81,69 +69,57 @@ def plan_episodes(output: OutputFolder, entries: Entries, settings: dict[str, An
         entries: recordings to convert.
         settings: of the dataset.
         append: whether recordings may be new to a dataset that exists.
+
+    Returns:
+        ``conversion.json``, and (number in the dataset, number in the source) of each episode, written or not.
     """
-    path, recorded = output.path / schema.CONVERSION_FILE, output.recorded
-    if recorded is None:
+    path, content = output.path / schema.CONVERSION_FILE, output.recorded
+    if content is None:
         if append:
             raise DatasetError("no dataset to append to", where=path, fix="Convert without --append first.")
-        return _extended(header(settings), {}, entries, first=0)
-    schema.check_version(recorded.get("schema_version", 1), path)
-    parse(ConversionRecord, recorded, DatasetError, where=path)
-    content, known, new = _divided({**recorded, "episodes": recorded.get("episodes", {})}, entries)
-    if new and not append:
-        found, fix = f"{len(new)} of {len(entries)} are new", "Pass --append to add them, --overwrite to start again."
-        raise OutputExistsError("a dataset of other recordings", where=path, found=found, fix=fix)
-    first = max(map(int, [*content["episodes"], *content.get(LEFT_OUT, {})]), default=-1) + 1
-    plan = _extended(content, content["episodes"], new, first)
-    return EpisodePlan(plan.content, [*known, *plan.tasks])
-
-
-def _divided(
-    before: Mapping[str, Any], entries: Entries
-) -> tuple[dict[str, Any], list[tuple[int, int]], list[dict[str, Any]]]:
-    """Return ``conversion.json``, tasks of planned episodes, and new entries; episodes left out are planned again."""
-    episodes, left_out = dict(before["episodes"]), dict(before.get(LEFT_OUT, {}))
+        content = header(settings)
+    else:
+        schema.check_version(content.get("schema_version", 1), path)
+        parse(ConversionRecord, content, DatasetError, where=path)
+    episodes, left_out = dict(content.get("episodes", {})), dict(content.get(LEFT_OUT, {}))
     planned = {entry["recording"]: number for number, entry in episodes.items() if entry.get("recording")}
     unread = {number: entry for number, entry in episodes.items() if not entry.get("recording")}
     again = {_place(entry): number for number, entry in {**unread, **left_out}.items()}
-    known, new = [], []
+    first_new = max(map(int, [*episodes, *left_out]), default=-1) + 1
+    tasks, new = [], 0
     for entry in entries:
         number = planned.get(entry["recording"]) or again.get(_place(entry))
         if number is None:
-            new.append(entry)
-            continue
-        known.append((int(number), entry["source"]))
-        if number in unread or left_out.pop(number, None):
-            episodes[number] = _without_source(entry)
-    in_order = {number: episodes[number] for number in sorted(episodes, key=int)}
-    content = {key: value for key, value in before.items() if key != LEFT_OUT} | {"episodes": in_order}
-    return {**content, **({LEFT_OUT: left_out} if left_out else {})}, known, new
+            number, new = str(first_new + new), new + 1
+        if number not in episodes or number in unread:
+            left_out.pop(number, None)
+            episodes[number] = {key: value for key, value in entry.items() if key != "source"}
+        tasks.append((int(number), entry["source"]))
+    if new and output.recorded is not None and not append:
+        found, fix = f"{new} of {len(entries)} are new", "Pass --append to add them, --overwrite to start again."
+        raise OutputExistsError("a dataset of other recordings", where=path, found=found, fix=fix)
+    return json.loads(json.dumps(_content(content, episodes, left_out))), tasks
 
 
-def _extended(head: Mapping[str, Any], episodes: Mapping[str, Any], entries: Entries, first: int) -> EpisodePlan:
-    tasks = [(number, entry["source"]) for number, entry in enumerate(entries, start=first)]
-    added = {str(number): _without_source(entry) for number, entry in enumerate(entries, start=first)}
-    return EpisodePlan(json.loads(json.dumps({**head, "episodes": {**episodes, **added}})), tasks)
+def without_unwritten(out: Path, content: Mapping[str, Any], reasons: Mapping[str, str]) -> dict[str, Any]:
+    """Return ``conversion.json`` without the episodes that could not be written; reasons by name of their folder."""
+    episodes, left_out = dict(content["episodes"]), dict(content.get(LEFT_OUT, {}))
+    for folder, why in reasons.items():
+        if not (out / folder).is_dir():
+            number = str(schema.episode_number(folder))
+            left_out[number] = {**episodes.pop(number), "why": why}
+    return _content(content, episodes, left_out)
 
 
-def _without_source(entry: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in entry.items() if key != "source"}
+def _content(content: Mapping[str, Any], episodes: Mapping[str, Any], left_out: Mapping[str, Any]) -> dict[str, Any]:
+    lists = {"episodes": episodes, **({LEFT_OUT: left_out} if left_out else {})}
+    in_order = {key: {number: entries[number] for number in sorted(entries, key=int)} for key, entries in lists.items()}
+    return {key: value for key, value in content.items() if key not in ("episodes", LEFT_OUT)} | in_order
 
 
 def _place(entry: Mapping[str, Any]) -> str:
     """Return what distinguishes recordings that may have been unreadable."""
     return json.dumps([entry.get(key) for key in ("trajectory", "trajectory_episode", "seed")])
-
-
-def without_unwritten(out: Path, plan: EpisodePlan, reasons: Mapping[str, str]) -> dict[str, Any]:
-    """Return ``conversion.json`` without the episodes that could not be written; reasons by name of their folder."""
-    episodes, left_out = dict(plan.content["episodes"]), dict(plan.content.get(LEFT_OUT, {}))
-    for number, _ in plan.tasks:
-        folder = schema.episode_folder(number)
-        if not (out / folder).is_dir():
-            left_out[str(number)] = {**episodes.pop(str(number)), "why": reasons[folder]}
-    in_order = {number: left_out[number] for number in sorted(left_out, key=int)}
-    return {**plan.content, "episodes": episodes, LEFT_OUT: in_order}
 
 
 def planned_sides(content: Mapping[str, Any], before: tuple[list[int], list[int]]) -> tuple[list[int], list[int]]:

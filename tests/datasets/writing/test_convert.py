@@ -1,10 +1,6 @@
 import json
 import os
 import shutil
-import signal
-import subprocess
-import sys
-from pathlib import Path
 
 import cv2
 import h5py
@@ -268,29 +264,6 @@ def test_with_other_versions_it_does_not_go_on(trajectory, tmp_path):
     (out / "conversion.json").write_text(json.dumps(about))
     assert run(trajectory, out).kept == 2
     assert len(run(more, out, append=True).episodes) == 1
-
-
-@pytest.mark.parametrize("moment", ["picture", "arrays", "rename", "overview", "rmtree"])
-def test_killed_and_resumed_is_as_if_never_killed(trajectory, tmp_path, moment):
-    """kill -9 in a process of its own, at five places."""
-    run(trajectory, tmp_path / "whole")
-    out = tmp_path / "out"
-    if moment == "rmtree":
-        shutil.copytree(tmp_path / "whole", out)
-    command = [
-        sys.executable,
-        str(Path(__file__).parents[2] / "support" / "dying.py"),
-        moment,
-        str(trajectory),
-        str(out),
-    ]
-    done = subprocess.run(command, check=False, capture_output=True, text=True)
-    assert done.returncode == -signal.SIGKILL, done.stderr
-    run(trajectory, out)
-    assert files_of(out) == files_of(tmp_path / "whole")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "whole"]
-    with pytest.raises(DatasetError, match="no successful"):
-        run(write_trajectory(tmp_path / "failed.h5", failed=(0, 1, 2)), out)
 
 
 def test_what_would_be_numbered_alike_is_refused(trajectory, tmp_path, monkeypatch):

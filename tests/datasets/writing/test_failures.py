@@ -3,6 +3,7 @@ import json
 from managing import edit
 from synthetic import RayCaster, write_trajectory
 
+from robocas_ms3.core.ledger import Ledger
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.manage.merging import merge
 from robocas_ms3.datasets.sources.provenance import environment_of
@@ -10,7 +11,7 @@ from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.datasets.writing.info import add_failures
 from robocas_ms3.datasets.writing.settings import ConversionSettings
-from robocas_ms3.demos.ledger import Failure, Ledger
+from robocas_ms3.demos.ledger import Failure
 
 SLIPPED = Failure(3, 0, "grasp", "slipped", 2.5)
 LOST = Failure(4, -1, "episode", "gave_up", 0.0)
@@ -20,7 +21,7 @@ OTHER = Failure(9, 1, "reach", "unreachable", 1.0)
 def run_of(folder, failures, seeds=(3, 5), **kwargs):
     """A trajectory and what went wrong with it."""
     folder.mkdir()
-    Ledger(folder / "failures.jsonl").append(failures)
+    Ledger(folder / "failures.jsonl", Failure).append(failures)
     return write_trajectory(folder / "trajectory.h5", seeds=seeds, **kwargs)
 
 

@@ -11,7 +11,7 @@ import torch
 from synthetic import RayCaster, write_trajectory
 
 from robocas_ms3.core.errors import DatasetError, MissingExtraError
-from robocas_ms3.datasets.writing.settings import ConversionSettings, Timing, WrittenEpisode
+from robocas_ms3.datasets.writing.settings import ConversionSettings, WrittenEpisode
 from robocas_ms3.datasets.writing.workers import WriteJob, write_episodes
 
 
@@ -25,7 +25,7 @@ class Writer:
         if number in self.errors:
             raise self.errors[number]
         about = os.getpid(), torch.get_num_threads(), os.environ.get("LP_NUM_THREADS")
-        return WrittenEpisode(number, source, 0, Timing(), about)
+        return WrittenEpisode(number, source, 0, about)
 
 
 class Deadly(Writer):

@@ -1,0 +1,61 @@
+"""Commands that write datasets, killed at any moment: the same command again makes what an undisturbed one makes."""
+
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from managing import as_upstream, files_of, make
+from synthetic import RayCaster, render_by
+
+from robocas_ms3.cli.main import run
+from robocas_ms3.datasets.writing import convert as conversion
+
+DYING = Path(__file__).parents[1] / "support" / "dying.py"
+CONVERT = ("convert", "F.h5", "--no-embeddings")
+MERGE = ("merge", "a", "b")
+IMPORT = ("import-robocas", "upstream")
+
+
+@pytest.fixture(scope="module")
+def inputs(trajectory, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("inputs")
+    for suffix in (".h5", ".json"):
+        shutil.copy(trajectory.with_suffix(suffix), folder)
+    for name, seeds in (("a", (10, 11)), ("b", (20, 21)), ("upstream", (30, 31))):
+        make(folder, name, seeds)
+    as_upstream(folder / "upstream")
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def made_up_images(monkeypatch):
+    monkeypatch.setattr(conversion, "convert", render_by(RayCaster, conversion.convert))
+
+
+@pytest.mark.parametrize(
+    ("words", "moment"),
+    [
+        (CONVERT, "picture"),  # of the second episode; the preview of the first is whole
+        *(((*CONVERT, "--no-video"), moment) for moment in ("arrays", "rename", "convert overview", "rmtree")),
+        *((MERGE, moment) for moment in ("file", "rename", "merge overview")),
+        *((IMPORT, moment) for moment in ("file", "import overview")),
+    ],
+    ids=lambda value: value if isinstance(value, str) else value[0],
+)
+def test_the_same_command_again_makes_the_same(inputs, tmp_path, monkeypatch, words, moment):
+    monkeypatch.chdir(inputs)
+    whole, out = tmp_path / "whole", tmp_path / "out"
+    assert run([*words, "--out", str(whole)]) == 0
+    overwrite = ["--overwrite"] if moment == "rmtree" else []
+    if overwrite:
+        shutil.copytree(whole, out)
+    command = [sys.executable, str(DYING), moment, *words, "--out", str(out), *overwrite]
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    assert overwrite or not (out / "data_info.json").exists()
+    assert run([*words, "--out", str(out)]) == 0
+    assert files_of(out) == files_of(whole)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "whole"]
