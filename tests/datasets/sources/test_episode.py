@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.poses import from_xyzw, inverse, wxyz_to_xyzw, xyzw_to_wxyz
+from robocas_ms3.core.poses import from_xyzw
 from robocas_ms3.datasets.schema import EPISODE_INFO
 from robocas_ms3.datasets.sources.arrays import episode_arrays, with_embeddings
 from robocas_ms3.demos.recordings.motion import (
@@ -56,19 +56,6 @@ def test_the_stored_arrays_compose_to_the_stored_poses(tcp, base):
         absolute = from_xyzw(arrays[position], arrays[orientation])
         relative = from_xyzw(arrays[rel_position], arrays[rel_orientation])
         np.testing.assert_allclose(compose(absolute[0], relative), absolute, atol=1e-4)  # float32
-
-
-@given(st.lists(st.floats(-1, 1), min_size=4, max_size=4))
-def test_quaternion_orders_round_trip(quaternion):
-    q = np.array(quaternion)
-    np.testing.assert_array_equal(wxyz_to_xyzw(xyzw_to_wxyz(q)), q)
-    assert wxyz_to_xyzw(q)[3] == q[0]
-
-
-@settings(max_examples=30, deadline=None)
-@given(pose_sequences())
-def test_inverse(poses):
-    np.testing.assert_allclose(inverse(poses) @ poses, np.broadcast_to(np.eye(4), poses.shape), atol=1e-12)
 
 
 def test_orientations_never_flip_their_sign():
@@ -198,12 +185,3 @@ def test_gripper_status_is_the_command_that_led_there():
     status = gripper_open(MOBILE_PANDA, commands, samples, initial_width=0.08)
     assert status.tolist() == [True, True, False, False, True, True]
     assert not gripper_open(MOBILE_PANDA, commands, samples, initial_width=0.0)[0]
-
-
-def test_the_bases_yaw_does_not_jump():
-    """A base that stands at -180 deg, give or take a hair."""
-    qpos = np.zeros((4, 12))
-    qpos[:, 2] = -np.pi + np.array([0, 1e-6, -1e-6, -0.1])
-    root = np.tile(np.eye(4), (4, 1, 1))
-    yaw = planar_base(root, qpos)[:, 2]
-    np.testing.assert_allclose(yaw, qpos[:, 2], atol=1e-9)

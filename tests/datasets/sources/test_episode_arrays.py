@@ -1,4 +1,4 @@
-"""Arrays as a record: damage is noted in it, and mends make another one."""
+"""Arrays as a record: damage is noted in it, and repairs make another one."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from managing import arrays_of, change
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks import arrays as laws
-from robocas_ms3.datasets.manage.repairs import repair_arrays
+from robocas_ms3.datasets.manage.repairs import ImportedEpisode, repair_arrays
 from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, load_arrays, motion_arrays, read_arrays
 
 FILE = "episode_0000001/episode_info.npz"
@@ -71,22 +71,25 @@ def test_what_is_absent_breaks_no_law_but_one(tmp_path):
     assert absent == [spec.name for spec in schema.EPISODE_INFO if not spec.embedding]
 
 
-def test_mends_leave_what_they_are_given(made):
+def test_repairs_leave_what_they_are_given(made):
     episode = made / "episode_0000001"
     arrays = arrays_of(episode)
     arrays |= {key: np.roll(arrays[key], 1, axis=0) for key in ("rel_pos", "rel_orn")}
     arrays |= {"rel_agv_pose": arrays["rel_agv_pose"] + 1, "language_embedding": np.ones(384, "f4")}
     before = {key: array.copy() for key, array in arrays.items()}
     stored = EpisodeArrays(episode / "episode_info.npz", arrays)
-    mended, findings = repair_arrays(stored)
-    assert [(finding.file.split(", ", 1)[1], finding.outcome) for finding in findings] == [
+    repaired = ImportedEpisode(1, stored)
+    repair_arrays(repaired)
+    assert [(finding.violation.key, finding.outcome) for finding in repaired.findings] == [
         ("language_embedding", "noted"),
-        ("rel_pos, rel_orn", "mended"),
+        ("rel_pos", "mended"),
+        ("rel_orn", "mended"),
         ("rel_agv_pose", "mended"),
     ]
-    assert {finding.episode for finding in findings} == {1}
     assert list(stored.arrays) == list(before)
     for key, array in before.items():
         np.testing.assert_array_equal(stored.arrays[key], array)
-    assert repair_arrays(mended) == (mended, [])
-    assert "language_embedding" not in mended.arrays
+    again = ImportedEpisode(1, repaired.stored)
+    repair_arrays(again)
+    assert again.findings == []
+    assert "language_embedding" not in again.stored.arrays
