@@ -87,7 +87,7 @@ def _one(trajectory: Path, ours: Path, size: tuple[int, int] | None) -> dict[str
             kept = size if source is trajectory else None
             convert_lerobot(ConversionSettings(source, root, size=kept, lerobot_version=version))
         report[name] |= _compare(Dataset(ours), LeRobotDataset(root))
-        report[name]["violations"] = len(check_lerobot(root, decode=True))
+        report[name]["violations"] = len(check_lerobot(root, decode=True).violations)
     theirs, back = Path(f"{base}_upstream"), Path(f"{base}_imported")
     _as_upstream(ours, theirs)
     with _timed(report, "import"):

@@ -85,7 +85,7 @@ _BUILTIN = (
         _is_lerobot,
         f"{_PACKAGE}.lerobot.reader:open_lerobot",
         f"{_PACKAGE}.lerobot.convert:convert_lerobot",
-        f"{_PACKAGE}.lerobot.check:report_lerobot",
+        f"{_PACKAGE}.lerobot.check:check_lerobot",
         ("codec", "lerobot_version", "leave_out"),
     ),
     Format(

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from pathlib import Path, PurePosixPath
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from robocas_ms3.core.documents import DocumentError
 from robocas_ms3.core.errors import DatasetError
@@ -12,26 +16,20 @@ from robocas_ms3.datasets.checks.dataset import Report
 from robocas_ms3.datasets.checks.scene import check_values
 from robocas_ms3.datasets.checks.violation import Violation, read_object
 from robocas_ms3.datasets.lerobot import schema
-from robocas_ms3.datasets.lerobot.check_content import check_statistics, check_videos
-from robocas_ms3.datasets.lerobot.check_frames import check_data
+from robocas_ms3.datasets.lerobot.check_frames import TOLERANCE, Fault, Ranges, check_data
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
-from robocas_ms3.datasets.lerobot.records import (
-    MAX_EPISODES,
-    MAX_FRAMES,
-    ConversionRecord,
-    EpisodeLine,
-    InfoRecord,
-    TaskLine,
-    episode_columns,
-    read_lines,
-    unknown_numbers,
-)
-from robocas_ms3.datasets.lerobot.tables import faults, open_table
+from robocas_ms3.datasets.lerobot.records import MAX_EPISODES, MAX_FRAMES, InfoRecord, StatsLine, read_lines
+from robocas_ms3.datasets.lerobot.stats import QUANTILES
+from robocas_ms3.datasets.lerobot.video import packet_times, read_frames
+
+_MILLISECONDS = 0.6e-3  # Matroska rounds to them
+_STATISTICS = ("min", "max", "mean", "std", "count")
+_MOST = {"total_episodes": MAX_EPISODES, "total_tasks": MAX_EPISODES, "total_frames": MAX_FRAMES}
 
 
 def check_lerobot(
     root: str | Path, *, decode: bool = False, on_episode: Callable[[int, int], None] | None = None
-) -> list[Violation]:
+) -> Report:
     """Check a dataset; datasets made elsewhere are checked as far as they have what ours have.
 
     Args:
@@ -40,9 +38,6 @@ def check_lerobot(
             shows by the checksums that datasets made here have.
         on_episode: called with the number of episodes done and of all.
 
-    Returns:
-        Violations; empty for a valid dataset.
-
     Raises:
         MissingExtraError: the ``lerobot`` extra is not installed.
     """
@@ -50,152 +45,193 @@ def check_lerobot(
     root = Path(root)
     info, wrong = read_object(root, schema.INFO_FILE, InfoRecord, absent="JSON")
     features = {} if wrong else info["features"]
-    if set(schema.OUR_KEYS) <= set(features):
-        for own in schema.FEATURES:
-            if (shape := features[own.key]["shape"]) != [own.width]:
-                wrong.append(Violation(schema.INFO_FILE, f"features.{own.key}.shape", str([own.width]), str(shape)))
+    for own in schema.FEATURES if set(schema.OUR_KEYS) <= set(features) else ():
+        if (shape := features[own.key]["shape"]) != [own.width]:
+            wrong.append(Violation(schema.INFO_FILE, f"features.{own.key}.shape", str([own.width]), str(shape)))
     if wrong:
-        return wrong
+        return Report(0, 0, wrong)
     try:
         dataset = LeRobotDataset(root)
-        totals = list(_check_counts(dataset))
-        wrong = list(_check_rows(dataset))
-        if wrong:
-            return [*totals, *wrong]
-        totals += _check_totals(dataset)
+        wrong = list(_check_totals(dataset))
         texts = {"task_index": dataset.tasks}
         if schema.SUBTASK_INDEX.key in features:
             texts[schema.SUBTASK_INDEX.key] = dataset.subtasks
     except DatasetError as error:
-        return [Violation("meta", "", "readable tables", one_line(error))]
+        return Report(0, 0, [Violation("meta", "", "readable tables", one_line(error))])
     data, ranges = check_data(dataset, texts, on_episode or (lambda *_: None))
     videos = [key for key, feature in features.items() if feature["dtype"] == "video"]
-    return [
-        *totals,
+    violations = [
+        *wrong,
         *data,
-        *(wrong for key in videos for wrong in check_videos(dataset, key, decode)),
-        *check_statistics(dataset, ranges),
-        *_check_conversion(dataset),
-        *_check_scenes(dataset),
+        *(wrong for key in videos for wrong in _check_videos(dataset, key, decode)),
+        *_check_statistics(dataset, ranges),
+        *_check_our_files(dataset),
         *_check_checksums(root),
     ]
-
-
-def _check_counts(dataset: LeRobotDataset) -> Iterator[Violation]:
-    """Compare numbers of rows with ``info.json``; readers and later checks then expect those of the tables."""
-    root = dataset.root
-    if dataset.layout.one_file_per_episode:
-        counts = {
-            "total_episodes": len(read_lines(root / schema.EPISODES_LINES, EpisodeLine, MAX_EPISODES)),
-            "total_tasks": len(read_lines(root / schema.TASKS_LINES, TaskLine, MAX_EPISODES)),
-        }
-    else:
-        episodes = sorted((root / "meta/episodes").glob("*/*.parquet"))
-        counts = {"total_episodes": sum(map(_rows, episodes)), "total_tasks": _rows(root / schema.TASKS_FILE)}
-    for key, count in counts.items():
-        yield from _check_total(dataset, key, count, MAX_EPISODES)
-
-
-def _rows(path: Path) -> int:
-    with open_table(path) as file:
-        return file.metadata.num_rows
-
-
-def _check_total(dataset: LeRobotDataset, key: str, found: int, greatest: int) -> Iterator[Violation]:
-    if dataset.info[key] != found:
-        yield Violation(schema.INFO_FILE, key, str(found), str(dataset.info[key]))
-        dataset.info[key] = min(found, greatest)
-
-
-def _check_rows(dataset: LeRobotDataset) -> Iterator[Violation]:
-    """Check the columns of ``meta/episodes``, on which the other checks rely."""
-    numbers: list[int] = []
-    for path, table in dataset.tables_of_episodes():
-        name = str(path.relative_to(dataset.root))
-        wrong = list(faults(table, episode_columns(table.column_names, dataset.info["features"])))
-        yield from (Violation(name, *fault) for fault in wrong)
-        numbers += table.column("episode_index").to_pylist() if not wrong else []
-    if len(set(numbers)) < len(numbers):
-        yield Violation("meta/episodes", "episode_index", "each episode once", "some twice")
+    return Report(len(dataset.rows), dataset.info["total_frames"], violations)
 
 
 def _check_totals(dataset: LeRobotDataset) -> Iterator[Violation]:
-    frames = sum(sum(table.column("length").to_pylist()) for _, table in dataset.tables_of_episodes())
-    yield from _check_total(dataset, "total_frames", frames, MAX_FRAMES)
-    if len(set(dataset.tasks)) != len(dataset.tasks):
-        tasks = schema.TASKS_LINES if dataset.layout.one_file_per_episode else schema.TASKS_FILE
-        yield Violation(tasks, "", "each text once", "some twice")
+    """Check ``info.json`` and the rows of episodes; from here on the totals are those of the tables."""
+    declared = {key: dataset.info[key] for key in _MOST}
+    dataset.info.update(_MOST)  # which limit what is read
+    rows, tasks = dataset.rows, dataset.tasks
     start = 0
-    for index, row in enumerate(dataset.rows):
+    for index, row in enumerate(rows):
         end = start + row["length"]
         for key, value in (("episode_index", index), ("dataset_from_index", start), ("dataset_to_index", end)):
             if row[key] != value:
                 yield Violation("meta/episodes", f"episode {index}, {key}", str(value), str(row[key]))
         start = end
+    for key, found in (("total_episodes", len(rows)), ("total_tasks", len(tasks)), ("total_frames", start)):
+        dataset.info[key] = found
+        if declared[key] != found:
+            yield Violation(schema.INFO_FILE, key, str(found), str(declared[key]))
+    if len(set(tasks)) != len(tasks):
+        name = schema.TASKS_LINES if dataset.layout.one_file_per_episode else schema.TASKS_FILE
+        yield Violation(name, "", "each text once", "some twice")
+
+
+def _check_videos(dataset: LeRobotDataset, key: str, decode: bool) -> Iterator[Violation]:
+    """Check the videos of a feature, and the depth videos of the camera that LeRobot does not read."""
+    root, layout, fps = dataset.root, dataset.layout, dataset.info["fps"]
+    size, extra = dataset.info["features"][key]["shape"][:2], f"depth/{schema.camera_of(key)}"
+    has_extra = any(f"{extra}/file_index" in row for row in dataset.rows)
+    for prefix in (f"videos/{key}", extra) if has_extra else (f"videos/{key}",):
+        by_file: dict[Path, list[dict[str, Any]]] = defaultdict(list)
+        for row in dataset.rows:
+            by_file[layout.path_of(root, prefix, row)].append(row)
+        for path, inside in by_file.items():
+            yield from _check_times(inside, prefix, fps)
+            frames, name = sum(row["length"] for row in inside), str(path.relative_to(root))
+            yield from (Violation(name, *fault) for fault in _video_faults(path, frames, fps, size, decode))
+        folder = layout.path(root, prefix, 0, 0).parent  # chunk-000, or below it
+        chunks = folder.parent.parent.glob(f"*/{folder.name}") if layout.one_file_per_episode else [folder.parent]
+        for path in sorted(path for chunk in chunks for path in chunk.rglob("*") if path.is_file()):
+            if path not in by_file:
+                yield Violation(str(path.relative_to(root)), "", "files of episodes only", "of none")
+
+
+def _check_times(rows: list[dict[str, Any]], prefix: str, fps: int) -> Iterator[Violation]:
+    """Check that the episodes of a file follow each other."""
+    first = 0
+    for row in rows:
+        span = (first / fps, (first + row["length"]) / fps)
+        found = (row[f"{prefix}/from_timestamp"], row[f"{prefix}/to_timestamp"])
+        if max(abs(a - b) for a, b in zip(span, found, strict=True)) > TOLERANCE:
+            where = f"episode {row['episode_index']}, {prefix}"
+            yield Violation("meta/episodes", where, f"{span[0]} to {span[1]} s", f"{found[0]} to {found[1]} s")
+        first += row["length"]
+
+
+def _video_faults(path: Path, frames: int, fps: int, size: list[int], decode: bool) -> Iterator[Fault]:
+    try:
+        times, about = packet_times(path, frames)
+        if decode and len(times) == frames:
+            for _ in read_frames(path, 0, frames, fps):
+                pass
+    except DatasetError as error:
+        yield "", "a readable video", str(error)
+        return
+    if (found := [about["video.height"], about["video.width"]]) != size:
+        yield "size", str(size), str(found)
+    if len(times) != frames:
+        yield "frames", str(frames), str(len(times))
+        return
+    tolerance = _MILLISECONDS if path.suffix == ".mkv" else TOLERANCE
+    late = [index for index, time in enumerate(times) if abs(float(time) - index / fps) > tolerance]
+    if late:
+        yield f"time of frame {late[0]}", f"{late[0] / fps} s", f"{float(times[late[0]])} s"
+
+
+def _check_statistics(dataset: LeRobotDataset, ranges: Ranges) -> Iterator[Violation]:
+    """Check that there are statistics of every feature, with the ranges of the data."""
+    if dataset.layout.one_file_per_episode:
+        yield from _check_lines(dataset)
+        if not (dataset.root / schema.STATS_FILE).exists():  # of an older format, and optional
+            return
+    stats, wrong = read_object(dataset.root, schema.STATS_FILE, absent="JSON")
+    yield from wrong
+    for key, feature in dataset.info["features"].items() if not wrong else ():
+        if feature["dtype"] not in ("string", "language"):
+            for name, expected, found in _statistics_faults(stats.get(key), feature, ranges.get(key)):
+                yield Violation(schema.STATS_FILE, f"{key}, {name}" if name else key, expected, found)
+
+
+def _statistics_faults(found: Any, feature: Mapping[str, Any], seen: Any) -> Iterator[Fault]:
+    """Yield name, expected and found of wrong statistics of a feature; ``seen`` is its entry in the ranges."""
+    try:
+        values = {name: np.asarray(found[name], np.float64) for name in (*_STATISTICS, *QUANTILES)}
+    except (LookupError, TypeError, ValueError) as error:
+        yield "", f"numbers for {', '.join((*_STATISTICS, *QUANTILES))}", f"{type(error).__name__}: {one_line(error)}"
+        return
+    shape = (feature["shape"][2], 1, 1) if feature["dtype"] == "video" else tuple(feature["shape"])
+    count = values.pop("count")
+    for name, array in values.items():
+        if array.shape != shape:
+            yield name, f"shape {shape}", str(array.shape)
+            return
+    low, high = values["min"], values["max"]
+    slack = 1e-3 * (1 + np.abs(low) + np.abs(high))  # of others' histograms and float32
+    for name, array in values.items():
+        least, most = (0, high - low + slack) if name == "std" else (low - slack, high + slack)
+        if not ((least <= array) & (array <= most)).all():  # NaN too
+            yield name, "between min and max", str(array.tolist())[:80]
+            return
+    if seen:
+        same = np.allclose(low, seen[0], atol=1e-6) and np.allclose(high, seen[1], atol=1e-6)
+        if not same or count.tolist() != [seen[2]]:
+            expected = f"min {seen[0].tolist()}, max {seen[1].tolist()}, count {seen[2]}"
+            yield "", expected, f"min {low.tolist()}, max {high.tolist()}, count {count.tolist()}"
+
+
+def _check_lines(dataset: LeRobotDataset) -> Iterator[Violation]:
+    """Check that each episode has statistics of every feature."""
+    features = {key for key, feature in dataset.info["features"].items() if feature["dtype"] not in ("string", "image")}
+    try:
+        lines = read_lines(dataset.root / schema.STATS_LINES, StatsLine, len(dataset.rows))
+    except DatasetError as error:
+        yield Violation(schema.STATS_LINES, "", "readable lines", one_line(error))
+        return
+    if sorted(line.episode_index for line in lines) != sorted(dataset.row_of):
+        yield Violation(schema.STATS_LINES, "episode_index", "each episode once", "others")
+    for line in lines:
+        missing = sorted(key for key in features if not set(line.stats.get(key, {})) >= set(_STATISTICS))
+        if missing:
+            where = f"episode {line.episode_index}, {missing[0]}"
+            yield Violation(schema.STATS_LINES, where, ", ".join(_STATISTICS), "some are missing")
+
+
+def _check_our_files(dataset: LeRobotDataset) -> Iterator[Violation]:
+    """Check how the dataset was made, and scenes and cameras of the episodes, where the dataset says so."""
+    name = schema.CONVERSION_FILE
+    try:
+        _ = dataset.split("train"), dataset.split("val")
+        name = schema.SCENES_FILE
+        if dataset.described and dataset.described.keys() != dataset.row_of.keys():
+            found = sorted(dataset.described.keys() ^ dataset.row_of.keys())[:5]
+            yield Violation(name, "episode_index", "the episodes of the dataset", f"{found} more or missing")
+        for number in sorted(dataset.described.keys() & dataset.row_of.keys()):
+            episode = dataset.episode(number)
+            yield from check_values(episode.scene, f"{name}, episode {number}")
+            for camera in dataset.cameras:
+                episode.intrinsic(camera)
+    except DatasetError as error:
+        yield Violation(name, "", "valid content", one_line(error))
 
 
 def _check_checksums(root: Path) -> Iterator[Violation]:
+    if not (root / schema.CHECKSUMS_FILE).is_file():
+        return
     sums, wrong = read_object(root, schema.CHECKSUMS_FILE)
-    if (root / schema.CHECKSUMS_FILE).is_file():
-        yield from wrong
-    for name, expected in sums.items():
-        inside = PurePosixPath(name).parts[0] in schema.CONTENT and ".." not in Path(name).parts
-        if not isinstance(expected, str):
-            yield Violation(schema.CHECKSUMS_FILE, name, "a SHA-256", type(expected).__name__)
-        elif not inside:
-            yield Violation(schema.CHECKSUMS_FILE, name, f"a file in {', '.join(schema.CONTENT)}", "another path")
-        elif not (root / name).exists():
-            yield Violation(name, "", "a file", "none")
-        else:
-            try:
-                found = schema.checksum(root / name)
-            except (OSError, DocumentError) as error:
-                found = one_line(error)
-            if found != expected:
-                yield Violation(name, "", f"the bytes that were written, SHA-256 {expected}", found)
-
-
-def _check_conversion(dataset: LeRobotDataset) -> Iterator[Violation]:
-    """Check how the dataset says it was made, if it does."""
-    if not (dataset.root / schema.CONVERSION_FILE).exists():
-        return
-    made, wrong = read_object(dataset.root, schema.CONVERSION_FILE, ConversionRecord)
     yield from wrong
-    sides = {key: made.get(key, []) for key in ("train_eps", "val_eps")} if not wrong else {}
-    for key, unknown in unknown_numbers(sides, dataset.row_of).items():
-        yield Violation(schema.CONVERSION_FILE, key, "numbers of episodes", str(unknown[:5]))
-
-
-def _check_scenes(dataset: LeRobotDataset) -> Iterator[Violation]:
-    """Check scenes and cameras of the episodes, if the dataset has them."""
-    try:
-        described = dataset.described
-    except DatasetError as error:
-        yield Violation(schema.SCENES_FILE, "", "a readable table", one_line(error))
-        return
-    if described and described.keys() != dataset.row_of.keys():
-        found = sorted(described.keys() ^ dataset.row_of.keys())[:5]
-        yield Violation(schema.SCENES_FILE, "episode_index", "the episodes of the dataset", f"{found} more or missing")
-    for number in sorted(described.keys() & dataset.row_of.keys()):
-        episode = dataset.episode(number)
+    for name, expected in sums.items():
+        if name.partition("/")[0] not in schema.CONTENT or ".." in Path(name).parts:
+            yield Violation(schema.CHECKSUMS_FILE, name, f"a file in {', '.join(schema.CONTENT)}", "another path")
+            continue
         try:
-            yield from check_values(episode.scene, f"{schema.SCENES_FILE}, episode {number}")
-            for camera in dataset.cameras:
-                episode.intrinsic(camera)
-        except DatasetError as error:
-            yield Violation(schema.SCENES_FILE, "", "scene and cameras", one_line(error))
-
-
-def report_lerobot(root: Path, *, on_episode: Callable[[int, int], None] | None = None) -> Report:
-    """Check a dataset; return the violations and the numbers of episodes and steps."""
-    checked = 0
-
-    def count(done: int, total: int) -> None:
-        nonlocal checked
-        checked = done
-        if on_episode:
-            on_episode(done, total)
-
-    violations = check_lerobot(root, on_episode=count)
-    steps = read_object(root, schema.INFO_FILE)[0].get("total_frames")
-    return Report(checked, steps if isinstance(steps, int) else 0, violations)
+            found = schema.checksum(root / name)
+        except (OSError, DocumentError) as error:
+            found = one_line(error)
+        if found != expected:
+            yield Violation(name, "", f"the bytes that were written, SHA-256 {expected}", found)

@@ -17,13 +17,12 @@ from robocas_ms3.core.words import count_of, one_line
 from robocas_ms3.datasets.checks import arrays as laws
 from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.lerobot import schema
-from robocas_ms3.datasets.lerobot.arrays import robocas_arrays
+from robocas_ms3.datasets.lerobot.arrays import frame_columns, robocas_arrays
 from robocas_ms3.datasets.lerobot.language import EVENTS, PERSISTENT, Row, box_in, read_rows_of
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
-from robocas_ms3.datasets.lerobot.records import frame_columns
+from robocas_ms3.datasets.lerobot.records import frame_columns as declared_columns
 from robocas_ms3.datasets.lerobot.tables import faults, numbers, open_table, read_rows
 from robocas_ms3.datasets.sources.tolerant import EpisodeArrays
-from robocas_ms3.robots.quantities import ARM_BASE, STATE, columns_of
 
 TOLERANCE = 1e-4
 """Of times, s: what LeRobot tolerates."""
@@ -43,29 +42,21 @@ def check_data(
     dataset: LeRobotDataset, texts: Texts, on_episode: Callable[[int, int], None]
 ) -> tuple[list[Violation], Ranges]:
     """Return the violations in all frames, and the ranges of their numbers."""
-    root, layout, features = dataset.root, dataset.layout, dataset.info["features"]
-    wanted = sorted(key for key, feature in features.items() if feature["dtype"] != "video")
+    root, features = dataset.root, dataset.info["features"]
     by_file: dict[Path, list[dict[str, Any]]] = defaultdict(list)
     for row in dataset.rows:
-        by_file[layout.path_of(root, "data", row)].append(row)
+        by_file[dataset.layout.path_of(root, "data", row)].append(row)
     violations: list[Violation] = []
     ranges: Ranges = {}
     done = 0
-    for path, inside in by_file.items():
-        name, count = str(path.relative_to(root)), sum(row["length"] for row in inside)
+    for path, rows in by_file.items():
+        name = str(path.relative_to(root))
         try:
-            with open_table(path) as file:
-                names, found = sorted(file.schema_arrow.names), file.metadata.num_rows
-            if names != wanted:
-                violations.append(Violation(name, "columns", ", ".join(wanted), ", ".join(names)))
-            if found != count:
-                violations.append(Violation(name, "rows", str(count), str(found)))
-            if names != wanted or found != count:
-                continue
-            for row in inside:  # one at a time: memory does not grow with the file
+            wrong = list(_file_faults(path, rows, features))
+            violations += [Violation(name, *fault) for fault in wrong]
+            for row in [] if wrong else rows:  # one at a time: memory does not grow with the file
                 table, where = read_rows(path, row["episode_index"]), f"episode {row['episode_index']}"
-                wrong = list(faults(table, frame_columns(features)))
-                if wrong:
+                if wrong := list(faults(table, declared_columns(features))):
                     violations += [Violation(name, *fault) for fault in wrong]
                     break
                 numeric = [key for key, feature in features.items() if feature["dtype"] not in schema.NOT_NUMERIC]
@@ -82,6 +73,17 @@ def check_data(
     others = sorted(path for path in (root / "data").rglob("*") if path.is_file() and path not in by_file)
     violations += [Violation(str(path.relative_to(root)), "", "files of episodes only", "of none") for path in others]
     return violations, ranges
+
+
+def _file_faults(path: Path, rows: list[dict[str, Any]], features: Mapping[str, Any]) -> Iterator[Fault]:
+    wanted = sorted(key for key, feature in features.items() if feature["dtype"] != "video")
+    count = sum(row["length"] for row in rows)
+    with open_table(path) as file:
+        names, found = sorted(file.schema_arrow.names), file.metadata.num_rows
+    if names != wanted:
+        yield "columns", ", ".join(wanted), ", ".join(names)
+    if found != count:
+        yield "rows", str(count), str(found)
 
 
 def _widen(ranges: Ranges, columns: Columns, features: Mapping[str, Any]) -> None:
@@ -113,14 +115,17 @@ def _check_episode(
         texts: that the index columns number.
     """
     length = row["length"]
-    if len(table) != length or length == 0:
-        yield "", count_of(length, "frame") if length else "frames", str(len(table) or "none")
+    if len(table) != length:
+        yield "", count_of(length, "frame"), str(len(table))
         return
     wrong = [(key, *fault) for key, found in columns.items() if (fault := _number_fault(found, info["features"][key]))]
     yield from wrong
     steps = np.arange(length)
-    start, index = row["dataset_from_index"], row["episode_index"]
-    expected = {"frame_index": steps, "index": start + steps, "episode_index": np.full(length, index)}
+    expected = {
+        "frame_index": steps,
+        "index": row["dataset_from_index"] + steps,
+        "episode_index": np.full(length, row["episode_index"]),
+    }
     for key, values in expected.items():
         if not np.array_equal(columns[key][:, 0], values):
             yield key, f"{values[0]} to {values[-1]}", "others"
@@ -164,18 +169,17 @@ def _check_content(columns: Columns, types: list[Any], instruction: str) -> Iter
     """Check the values by the rules for RoboCAS folders, and that each action leads to the next state."""
     arrays: dict[str, NDArray] = {"step_goal_type": np.array([str(kind) for kind in types], np.str_)}
     if set(schema.OUR_KEYS) <= set(columns):
-        state, command, status = columns[STATE], columns["action"], columns["observation.gripper_open"]
-        joints = state[:, columns_of(STATE)["robot_joints"]]
-        if not np.array_equal(command[:, 6], np.append(status[1:], status[-1:])):
-            yield "action", "the gripper's command of the next step", "another"
-        if not np.array_equal(columns["action.joint"][:, :7], np.concatenate([joints[1:], joints[-1:]])):
-            yield "action.joint", "the next step's joints", "others"
-        turns = state[:, columns_of(STATE)["ee_orn"]], columns[ARM_BASE][:, columns_of(ARM_BASE)["base_orn"]]
-        if np.linalg.norm(turns, axis=-1).min() < 0.5:
-            yield f"{STATE}, {ARM_BASE}", "unit quaternions", "others"
+        try:
+            arrays = robocas_arrays(dict(columns), instruction, [], arrays["step_goal_type"].tolist())
+        except ValueError as error:  # a quaternion of length 0
+            yield "observation.state, observation.arm_base", "unit quaternions", one_line(error)
             return
-        whole = robocas_arrays(dict(columns), instruction, [], arrays["step_goal_type"].tolist())
-        arrays = {**whole, "rel_orn": Rotation.from_euler("xyz", command[:, 3:6]).as_quat()}
+        again, command = frame_columns(arrays), columns["action"]
+        if not np.array_equal(command[:, -1], again["action"][:, -1]):
+            yield "action", "the gripper's command of the next step", "another"
+        if not np.array_equal(columns["action.joint"], again["action.joint"]):
+            yield "action.joint", "the next step's joints and gripper", "others"
+        arrays["rel_orn"] = Rotation.from_euler("xyz", command[:, 3:6]).as_quat()
     for wrong in laws.violations_of(EpisodeArrays(Path(), arrays), (laws.check_units, *laws.CONTENT)):
         key = schema.SUBGOAL_TYPE.key if wrong.key == "step_goal_type" else wrong.key
         yield key, wrong.expected, wrong.found

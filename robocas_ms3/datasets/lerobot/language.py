@@ -24,6 +24,7 @@ from pydantic import BaseModel, ValidationError
 
 from robocas_ms3.core.errors import DatasetError, RobocasError
 from robocas_ms3.core.strict import validate_json
+from robocas_ms3.core.words import one_line
 from robocas_ms3.datasets.checks.scene import valid_values
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.pictures.stored import Box
@@ -155,27 +156,18 @@ def box_in(answer: str | None) -> Box | None:
 
 
 def read_rows_of(table: pa.Table, key: str, where: object) -> list[list[Row]]:
-    """Return the rows of a language column, those of each frame."""
-    fields = {*("role", "content", "style", "camera"), *(("timestamp",) if key == PERSISTENT else ())}
-    kind = table.schema.field(key).type if key in table.column_names else pa.null()
-    is_list = pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
-    value = kind.value_type if is_list else pa.null()
-    names = {value.field(i).name for i in range(value.num_fields)} if pa.types.is_struct(value) else set()
-    if pa.types.is_null(value) and is_list:  # what Arrow makes of lists that are all empty
-        return [[] for _ in range(len(table))]
-    if not fields <= names:
-        expected = f"lists of {', '.join(sorted(fields))}"
-        raise DatasetError("no language column", where=f"{where}, {key}", expected=expected, found=kind)
-    found = [frame or [] for frame in table.column(key).to_pylist()]
-    for row in (row for frame in found for row in frame):
-        if not _is_row(row, timed=key == PERSISTENT):
-            raise DatasetError("damaged language row", where=f"{where}, {key}", found=str(row)[:120])
+    """Return the rows of a language column, those of each frame.
+
+    Raises:
+        DatasetError: there is no such column, or it is of another type.
+    """
+    kind = PERSISTENT_TYPE if key == PERSISTENT else EVENTS_TYPE
+    try:
+        frames = table.column(key).cast(kind).to_pylist()
+    except (LookupError, ValueError, pa.ArrowException) as error:
+        what = "no language column"
+        raise DatasetError(what, where=f"{where}, {key}", expected=str(kind), found=one_line(error)) from error
+    found = [frame or [] for frame in frames]
+    if not all(row is not None and np.isfinite(row.get("timestamp", 0)) for rows in found for row in rows):
+        raise DatasetError("damaged language row", where=f"{where}, {key}")
     return found
-
-
-def _is_row(row: Any, *, timed: bool) -> bool:
-    """Return whether texts are texts and the timestamp, of persistent rows, is a finite number."""
-    if not isinstance(row, dict) or not isinstance(row["role"], str):
-        return False
-    texts = all(isinstance(row[key], str | None) for key in ("content", "style", "camera"))
-    return texts and (not timed or (isinstance(row["timestamp"], float | int) and bool(np.isfinite(row["timestamp"]))))

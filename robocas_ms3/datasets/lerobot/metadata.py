@@ -1,4 +1,4 @@
-"""Read the folder ``meta`` of a LeRobot dataset of format v3.0 or v2.1."""
+"""Reads the folder ``meta`` of a LeRobot dataset of format v3.0 or v2.1."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ from robocas_ms3.datasets.lerobot.records import (
 from robocas_ms3.datasets.lerobot.tables import (
     OBJECTS_LIMIT,
     check_columns,
+    in_order,
     open_table,
     read_columns,
     read_objects,
@@ -36,10 +37,17 @@ from robocas_ms3.datasets.sources.files import read_json
 
 
 class Metadata:
-    """The ``meta`` folder of a dataset; each file is read at its first use."""
+    """The ``meta`` folder of a dataset; each file is read at its first use.
+
+    Raises:
+        DatasetError: no LeRobot dataset there, or one of another version.
+        MissingExtraError: pyarrow or av is missing.
+    """
 
     def __init__(self, root: Path) -> None:
+        schema.require_extra()
         self.root = root
+        _ = self.info
 
     @cached_property
     def info(self) -> dict[str, Any]:
@@ -65,7 +73,6 @@ class Metadata:
 
     @property
     def layout(self) -> Layout:
-        """Paths of the files of this format version."""
         return LAYOUTS[self.info["codebase_version"]]
 
     @cached_property
@@ -90,7 +97,6 @@ class Metadata:
 
     @property
     def has_language(self) -> bool:
-        """Whether the data have language columns."""
         return schema.LANGUAGE_COLUMNS[0] in self.info["features"]
 
     @property
@@ -102,31 +108,27 @@ class Metadata:
     @cached_property
     def rows(self) -> list[dict[str, Any]]:
         """The rows of ``meta/episodes``, without statistics."""
-        found: list[dict[str, Any]] = []
-        for path, table in self.tables_of_episodes():
-            check_columns(table, episode_columns(table.column_names, self.info["features"]), path)
-            found += table.to_pylist()
-        numbers = [row["episode_index"] for row in found]
-        if len(set(numbers)) < len(numbers):
-            raise DatasetError("two rows of one episode", where=self.root / "meta/episodes")
-        frames = sum(row["length"] for row in found)
-        if frames > self.info["total_frames"]:
-            what, expected = "episodes are longer than the dataset", f"{self.info['total_frames']} frames at most"
-            raise DatasetError(what, where=self.root / "meta/episodes", expected=expected, found=frames)
+        where, found = self.root / "meta/episodes", [row for table in self._tables() for row in table.to_pylist()]
+        if len({row["episode_index"] for row in found}) < len(found):
+            raise DatasetError("two rows of one episode", where=where)
+        frames, most = sum(row["length"] for row in found), self.info["total_frames"]
+        if frames > most:
+            expected = f"{most} frames at most"
+            raise DatasetError("episodes are longer than the dataset", where=where, expected=expected, found=frames)
         return found
 
-    def tables_of_episodes(self) -> Iterator[tuple[Path, pa.Table]]:
-        """Yield path and table of the files of ``meta/episodes``, without statistics."""
-        left = self.info["total_episodes"]
+    def _tables(self) -> Iterator[pa.Table]:
+        left, features = self.info["total_episodes"], self.info["features"]
         if self.layout.one_file_per_episode:
-            yield self.root / schema.EPISODES_LINES, self._table_of_lines(left)
+            yield self._table_of_lines(left)
             return
         for path in sorted((self.root / "meta/episodes").glob("*/*.parquet")):
             with open_table(path, most_rows=left) as file:
                 names = [name for name in file.schema_arrow.names if not name.startswith("stats/")]
                 table = read_columns(file, path, names, limit=OBJECTS_LIMIT)
+            check_columns(table, episode_columns(table.column_names, features), path)
             left -= len(table)
-            yield path, table
+            yield table
 
     def _table_of_lines(self, most: int) -> pa.Table:
         """Return ``meta/episodes.jsonl`` as the table that format v3.0 has in its place."""
@@ -139,26 +141,27 @@ class Metadata:
             chunk, file = divmod(line.episode_index, CHUNK_FILES)
             row = {"episode_index": line.episode_index, "tasks": line.tasks, "length": line.length}
             row |= {"dataset_from_index": start, "dataset_to_index": start + line.length}
-            row |= {"data/chunk_index": chunk, "data/file_index": file}
-            for prefix in prefixes:
+            for prefix in ("data", *prefixes):
                 row |= {f"{prefix}/chunk_index": chunk, f"{prefix}/file_index": file}
                 row |= {f"{prefix}/from_timestamp": 0.0, f"{prefix}/to_timestamp": line.length / fps}
             rows.append(row)
             start += line.length
-        empty = {key: [] for key in episode_columns((), features)}
-        return pa.Table.from_pylist(rows) if rows else pa.table(empty)
+        return pa.Table.from_pylist(rows)
+
+    @cached_property
+    def row_of(self) -> dict[int, dict[str, Any]]:
+        """Number -> row of ``meta/episodes``."""
+        return {row["episode_index"]: row for row in self.rows}
 
     @cached_property
     def tasks(self) -> list[str]:
         """Instructions, by ``task_index``."""
-        if self.layout.one_file_per_episode:
-            path = self.root / schema.TASKS_LINES
-            lines = sorted(read_lines(path, TaskLine, self.info["total_tasks"]), key=lambda line: line.task_index)
-            if [line.task_index for line in lines] != list(range(len(lines))):
-                expected = f"0 to {len(lines) - 1}, each once"
-                raise DatasetError("wrong numbers of texts", where=f"{path}, task_index", expected=expected)
-            return [line.task for line in lines]
-        return read_texts(self.root / schema.TASKS_FILE, "task_index", self.info["total_tasks"])
+        most = self.info["total_tasks"]
+        if not self.layout.one_file_per_episode:
+            return read_texts(self.root / schema.TASKS_FILE, "task_index", most)
+        path = self.root / schema.TASKS_LINES
+        lines = read_lines(path, TaskLine, most)
+        return in_order([line.task_index for line in lines], [line.task for line in lines], f"{path}, task_index")
 
     @cached_property
     def subtasks(self) -> list[str]:

@@ -22,18 +22,8 @@ from robocas_ms3.datasets.lerobot.arrays import robocas_arrays
 from robocas_ms3.datasets.lerobot.depth import to_depth
 from robocas_ms3.datasets.lerobot.language import EVENTS, PERSISTENT, boxes_of, goals_of, read_rows_of
 from robocas_ms3.datasets.lerobot.metadata import Metadata
-from robocas_ms3.datasets.lerobot.records import (
-    CameraRecord,
-    CamerasRecord,
-    frame_columns,
-    unknown_numbers,
-)
-from robocas_ms3.datasets.lerobot.tables import (
-    check_columns,
-    is_numeric,
-    numbers,
-    read_rows,
-)
+from robocas_ms3.datasets.lerobot.records import CameraRecord, CamerasRecord, frame_columns
+from robocas_ms3.datasets.lerobot.tables import check_columns, is_numeric, numbers, read_rows
 from robocas_ms3.datasets.lerobot.video import read_frames
 from robocas_ms3.datasets.pictures.stored import Box
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
@@ -51,40 +41,29 @@ class LeRobotDataset(Metadata, EpisodeSource):
         MissingExtraError: pyarrow or av is missing.
     """
 
-    def __init__(self, root: Path) -> None:
-        schema.require_extra()
-        super().__init__(root)
-        _ = self.info
-
     @property
     def rate_hz(self) -> float:
-        """Steps a second."""
         return float(self.info["fps"])
 
     @cached_property
-    def row_of(self) -> dict[int, dict[str, Any]]:
-        """Number -> row of ``meta/episodes``."""
-        return {row["episode_index"]: row for row in self.rows}
-
-    @cached_property
     def numbers(self) -> list[int]:
-        """Numbers of the episodes."""
-        return [row["episode_index"] for row in self.rows]
+        return list(self.row_of)
 
     @cached_property
     def lengths(self) -> dict[int, int]:
-        """Number -> T."""
-        return {row["episode_index"]: int(row["length"]) for row in self.rows}
+        return {number: int(row["length"]) for number, row in self.row_of.items()}
 
     def split(self, side: Side) -> list[int]:
         """Return the numbers of one side; all episodes of a dataset made elsewhere train."""
         if side == "all" or (side == "train" and "train_eps" not in self.settings):
             return self.numbers
-        sides = {f"{side}_eps": self.settings.get(f"{side}_eps", [])}
-        for key, unknown in unknown_numbers(sides, self.row_of).items():
+        key = f"{side}_eps"
+        listed = self.settings.get(key, [])
+        unknown = [number for number in listed if number not in self.row_of]
+        if unknown:
             where = f"{self.root / schema.CONVERSION_FILE}, {key}"
             raise DatasetError("episodes that are not there", where=where, found=unknown[:5])
-        return list(sides[f"{side}_eps"])
+        return list(listed)
 
     def entry(self, number: int) -> dict[str, Any]:
         """Return the entry of an episode in ``conversion.json``."""
@@ -92,7 +71,6 @@ class LeRobotDataset(Metadata, EpisodeSource):
         return entries[number] if number < len(entries) else {}
 
     def episode(self, number: int) -> LeRobotEpisode:
-        """Open an episode."""
         if number not in self.row_of:
             raise DatasetError("no such episode", where=self.root, expected=f"0 to {len(self.rows) - 1}", found=number)
         return LeRobotEpisode(self, number)
@@ -107,7 +85,6 @@ class LeRobotEpisode(SourceEpisode):
 
     @property
     def where(self) -> str:
-        """Dataset and number, for messages."""
         return f"{self.dataset.root}, episode {self.number}"
 
     @property
@@ -117,7 +94,6 @@ class LeRobotEpisode(SourceEpisode):
 
     @property
     def steps(self) -> int:
-        """T."""
         return int(self.row["length"])
 
     @property
@@ -127,12 +103,10 @@ class LeRobotEpisode(SourceEpisode):
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """Names of the cameras."""
         return self.dataset.cameras
 
     @property
     def has_depth(self) -> bool:
-        """Whether depth is there."""
         return self.dataset.has_depth
 
     @cached_property
@@ -205,7 +179,6 @@ class LeRobotEpisode(SourceEpisode):
 
     @cached_property
     def scene(self) -> dict[str, Any]:
-        """``scene.json``; empty where there is none."""
         return self._described("scene", "{}")
 
     @cached_property
@@ -219,15 +192,12 @@ class LeRobotEpisode(SourceEpisode):
         return self._cameras[name]
 
     def intrinsic(self, camera: str) -> NDArray[np.float64]:
-        """(4,) fx, fy, cx, cy in pixels."""
         return np.array(self._camera(camera).intrinsic)
 
     def camera_in_parent(self, camera: str) -> NDArray[np.float64]:
-        """(4, 4) OpenCV camera frame in its parent."""
         return np.array(self._camera(camera).camera_in_parent)
 
     def camera_parent(self, camera: str) -> Parent:
-        """Return the frame that the pose of a camera is in."""
         return self._camera(camera).parent or standard_parent(camera)
 
     def video(self, camera: str, kind: Kind) -> tuple[Path, int]:
@@ -242,7 +212,6 @@ class LeRobotEpisode(SourceEpisode):
     def frames(
         self, camera: str, kind: Kind = "rgb", first: int = 0, count: int | None = None
     ) -> Generator[NDArray, None, None]:
-        """Pictures one after the other, for which their video is opened once."""
         path, start = self.video(camera, kind)
         count = self.steps - first if count is None else count
         pictures = read_frames(path, start + first, count, self.dataset.info["fps"])
@@ -250,12 +219,10 @@ class LeRobotEpisode(SourceEpisode):
         return pictures if feature is None else _depths(pictures, feature["info"])
 
     def rgb(self, camera: str, step: int) -> NDArray[np.uint8]:
-        """(H, W, 3) RGB."""
         (picture,) = self.frames(camera, "rgb", step, 1)
         return picture
 
     def depth(self, camera: str, step: int) -> NDArray[np.uint16]:
-        """(H, W) mm, 0 = nothing."""
         (picture,) = self.frames(camera, "depth", step, 1)
         return picture
 

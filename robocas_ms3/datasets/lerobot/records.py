@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -197,9 +197,3 @@ def frame_columns(features: Mapping[str, Any]) -> dict[str, Column]:
         if dtype not in ("image", "video", "language"):
             columns[key] = Column(TEXT if dtype == "string" else NUMBERS if dtype.startswith("float") else INTEGERS)
     return columns | {key: Column(INTEGER, greatest=MAX_FRAMES) for key in schema.INDICES if key != "timestamp"}
-
-
-def unknown_numbers(sides: Mapping[str, Sequence[int]], known: Iterable[int]) -> dict[str, list[int]]:
-    """Return, by side of a split, the episode numbers that are not known."""
-    there = set(known)
-    return {side: unknown for side, numbers in sides.items() if (unknown := [n for n in numbers if n not in there])}

@@ -161,18 +161,15 @@ def is_numeric(kind: pa.DataType) -> bool:
 
 
 def _is_kind(found: pa.DataType, kind: str) -> bool:
-    lists = pa.types.is_list, pa.types.is_fixed_size_list, pa.types.is_large_list
     if kind in (INTEGERS, NUMBERS, TEXTS):
         depth = 0
-        while any(is_list(found) for is_list in lists):
+        while pa.types.is_list(found) or pa.types.is_fixed_size_list(found) or pa.types.is_large_list(found):
             found, depth = found.value_type, depth + 1
         if kind == TEXTS:
             return depth == 1 and _is_kind(found, TEXT)
         return pa.types.is_boolean(found) or _is_kind(found, NUMBER if kind == NUMBERS else INTEGER)
-    if pa.types.is_dictionary(found):
-        found = found.value_type
-        return kind == TEXT and (pa.types.is_string(found) or pa.types.is_large_string(found))
     if kind == TEXT:
+        found = found.value_type if pa.types.is_dictionary(found) else found
         return pa.types.is_string(found) or pa.types.is_large_string(found)
     return pa.types.is_integer(found) or (kind == NUMBER and pa.types.is_floating(found))
 
@@ -237,12 +234,19 @@ def _footer(path: Path, _changed_ns: int) -> tuple[pq.FileMetaData, list[str], l
 def read_texts(path: Path, name: str, most_rows: float = np.inf) -> list[str]:
     """Read a table of texts, in the order of their numbers."""
     table = read_objects(path, {name: Column(INTEGER), TEXT_INDEX: Column(TEXT)}, most_rows=most_rows)
-    places, texts = table.column(name).to_numpy(), table.column(TEXT_INDEX).to_pylist()
-    order = np.argsort(places, kind="stable")
-    if not np.array_equal(places[order], np.arange(len(places))):
+    return in_order(table.column(name).to_pylist(), table.column(TEXT_INDEX).to_pylist(), f"{path}, {name}")
+
+
+def in_order(places: list[int], texts: list[str], where: str) -> list[str]:
+    """Return texts in the order of their numbers.
+
+    Raises:
+        DatasetError: the numbers are not 0, 1, ..., each once.
+    """
+    if sorted(places) != list(range(len(places))):
         expected = f"0 to {len(places) - 1}, each once"
-        raise DatasetError("wrong numbers of texts", where=f"{path}, {name}", expected=expected, fix=SEE_VALIDATE)
-    return [texts[place] for place in order.tolist()]
+        raise DatasetError("wrong numbers of texts", where=where, expected=expected, fix=SEE_VALIDATE)
+    return [text for _, text in sorted(zip(places, texts, strict=True))]
 
 
 def write_texts(path: Path, name: str, texts: Sequence[str]) -> None:

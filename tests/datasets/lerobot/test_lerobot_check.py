@@ -8,6 +8,7 @@ pytest.importorskip("av", reason="needs the extra 'lerobot'")
 pa = pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
 pq = pytest.importorskip("pyarrow.parquet", reason="needs the extra 'lerobot'")
 
+from robocas_ms3.datasets.checks.dataset import Report
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check import check_lerobot
 from robocas_ms3.datasets.lerobot.tables import as_column, numbers, write_texts
@@ -15,7 +16,7 @@ from robocas_ms3.datasets.lerobot.video import CODINGS, Encoder
 
 
 def found(root, **options):
-    return [str(violation) for violation in check_lerobot(root, **options)]
+    return [str(violation) for violation in check_lerobot(root, **options).violations]
 
 
 def change(root, key, edit, file=DATA):
@@ -34,9 +35,9 @@ def change(root, key, edit, file=DATA):
 
 def test_a_valid_dataset(valid):
     seen = []
-    assert check_lerobot(valid, on_episode=lambda done, all: seen.append((done, all))) == []
+    assert check_lerobot(valid, on_episode=lambda done, all: seen.append((done, all))) == Report(2, 14, [])
     assert seen == [(1, 2), (2, 2)]
-    assert check_lerobot(valid, decode=True) == []
+    assert check_lerobot(valid, decode=True).violations == []
 
 
 @pytest.mark.parametrize(
@@ -98,7 +99,7 @@ def test_overview_that_contradicts(spoiled):
     edit_json(spoiled, "meta/stats.json", lambda stats: stats["observation.images.base_camera"].update(mean=[1, 2, 3]))
     texts = found(spoiled)
     assert any("meta/info.json, total_frames: expected 14, found 15" in text for text in texts)
-    assert any("meta/stats.json, action: expected q50, found nothing" in text for text in texts)
+    assert any("meta/stats.json, action: expected numbers" in text and "q50" in text for text in texts)
     assert any("observation.images.base_camera, mean: expected shape (3, 1, 1)" in text for text in texts)
 
 

@@ -170,12 +170,12 @@ def test_files_roll_over_at_their_limits(trajectory, tmp_path, monkeypatch):
     depth = "videos/observation.images.base_camera_depth"
     assert [row[f"{depth}/from_timestamp"] for row in dataset.rows] == [0, 1.4, 0]
     assert [row["meta/episodes/file_index"] for row in dataset.rows] == [0, 0, 0]
-    assert check_lerobot(out) == []
+    assert check_lerobot(out).violations == []
     by_size = tmp_path / "by_size"
     monkeypatch.setattr(limits, FileLimits(video_mb=1e-6))
     convert(trajectory, by_size, include_failed=True)
     assert [row[f"{depth}/file_index"] for row in LeRobotDataset(by_size).rows] == [0, 1, 2]
-    assert check_lerobot(by_size) == []
+    assert check_lerobot(by_size).violations == []
 
 
 def test_fewer_pictures_and_another_rate(trajectory, tmp_path):
@@ -186,7 +186,7 @@ def test_fewer_pictures_and_another_rate(trajectory, tmp_path):
     assert sorted(path.name for path in (out / "videos").iterdir()) == ["observation.images.static_camera"]
     assert dataset.episode(0).rgb("static_camera", 5).shape == (60, 80, 3)
     assert dataset.episode(0).columns["timestamp"][3, 0] == pytest.approx(0.3)
-    assert check_lerobot(out) == []
+    assert check_lerobot(out).violations == []
 
 
 def fails(match, source, out, kind=RobocasError, **kwargs):
@@ -237,7 +237,7 @@ def test_failed_episodes_of_a_folder_stay_out(made, tmp_path):
     dataset = LeRobotDataset(tmp_path / "out")
     assert [entry["source"] for entry in dataset.settings["episodes"]] == [1]
     assert dataset.numbers == [0]
-    assert check_lerobot(tmp_path / "out") == []
+    assert check_lerobot(tmp_path / "out").violations == []
 
 
 @pytest.mark.parametrize("source", [None, {"recording": None}])

@@ -108,7 +108,7 @@ def test_a_killed_and_resumed_conversion_gives_the_same_bytes(trajectory, lerobo
     done = subprocess.run(command, check=False, capture_output=True, text=True)
     assert done.returncode == -signal.SIGKILL, done.stderr
     if (out / schema.INFO_FILE).exists():
-        assert check_lerobot(out) == []
+        assert check_lerobot(out).violations == []
     convert(trajectory, out)
     assert files_of(out) == files_of(lerobot)
     assert {path.name for path in out.iterdir()} == {"meta", "data", "videos", ".annotate_staging"}

@@ -53,7 +53,7 @@ def test_the_versions_of_the_command_line_are_those_of_the_table():
 
 def test_each_version_passes_the_check_and_restores_the_episodes(datasets, version, made, tmp_path):
     root = datasets / version
-    assert check_lerobot(root, decode=True) == []
+    assert check_lerobot(root, decode=True).violations == []
     dataset, source = open_source(root), Dataset(made)
     for ours, theirs in ((0, 0), (2, 1)):  # the source has no failed episode
         episode, wanted = dataset.episode(ours), source.episode(theirs)
@@ -79,12 +79,12 @@ def test_the_same_input_gives_the_same_bytes(datasets, version, trajectory, tmp_
 
 def test_each_version_from_a_folder_and_from_another_version(datasets, version, made, tmp_path):
     convert_lerobot(ConversionSettings(made, tmp_path / "folder", lerobot_version=version))
-    assert check_lerobot(tmp_path / "folder") == []
+    assert check_lerobot(tmp_path / "folder").violations == []
     for other in VARIANTS:
         convert_lerobot(
             ConversionSettings(datasets / other, tmp_path / other, include_failed=True, lerobot_version=version)
         )
-        assert check_lerobot(tmp_path / other) == []
+        assert check_lerobot(tmp_path / other).violations == []
         ours, theirs = LeRobotDataset(tmp_path / other).episode(2), LeRobotDataset(datasets / other).episode(2)
         assert ours.goals == theirs.goals
     again = LeRobotDataset(tmp_path / "0.6").episode(2)
@@ -186,7 +186,7 @@ def spoiled(datasets, tmp_path):
 )
 def test_damaged_lines(spoiled, name, text, file):
     (spoiled / name).write_text(text + "\n")
-    assert file in {violation.file for violation in check_lerobot(spoiled)}
+    assert file in {violation.file for violation in check_lerobot(spoiled).violations}
     if file == "meta":
         with pytest.raises(DatasetError):
             _ = LeRobotDataset(spoiled).rows, LeRobotDataset(spoiled).tasks
@@ -196,7 +196,7 @@ def test_videos_of_version_2_1_that_are_wrong(spoiled):
     folder = spoiled / "videos/chunk-000/observation.images.base_camera"
     shutil.copy(folder / "episode_000000.mp4", folder / "episode_000003.mp4")
     (folder / "episode_000001.mp4").unlink()
-    found = {violation.file: violation.expected for violation in check_lerobot(spoiled)}
+    found = {violation.file: violation.expected for violation in check_lerobot(spoiled).violations}
     assert found[str((folder / "episode_000003.mp4").relative_to(spoiled))] == "files of episodes only"
     assert (folder / "episode_000001.mp4").relative_to(spoiled).as_posix() in found
 
