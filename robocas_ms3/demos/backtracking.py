@@ -88,7 +88,7 @@ class _Decision:
 
 
 class Resimulation:
-    """Makes decisions by running attempts again."""
+    """Makes decisions by running attempts again from the reset; methods as `branches.ForkedBranches`."""
 
     def __init__(self, result: EpisodeResult) -> None:
         self._result = result
@@ -96,7 +96,6 @@ class Resimulation:
         self._depth = 0
 
     def run(self, attempt: Callable[[], None]) -> bool:
-        """Run an attempt; see `branches.ForkedBranches`."""
         self._decisions = []
         while True:
             self._depth = 0
@@ -117,7 +116,6 @@ class Resimulation:
             self._decisions[-1].advance()
 
     def choose(self, candidates: Iterable[T], play: Callable[[T], float], effort: Effort = ONE_BY_ONE) -> T:
-        """Choose; see `Decisions`."""
         items = list(candidates)
         if self._depth == len(self._decisions):
             self._decisions.append(_Decision(turns(range(len(items)), effort, self._result)))

@@ -49,25 +49,19 @@ class ChildGone(ChildCrash):
 
 @dataclass(frozen=True)
 class Child:
-    """A forked process: its id, and the pipe to it."""
+    """A forked process."""
 
     pid: int
     pipe: Connection
 
     def send(self, message: Any) -> None:
-        """Send a message; raises ``ChildGone`` if the child has ended."""
         try:
             self.pipe.send(message)
         except OSError as error:
             raise ChildGone("crashed") from error
 
     def receive(self, limit: float) -> Any:
-        """Return the child's next message, within ``limit`` seconds.
-
-        Raises:
-            ChildGone: the child has ended.
-            ChildCrash: no message in time.
-        """
+        """Return the child's next message; raises ``ChildCrash`` where there is none within ``limit`` seconds."""
         try:
             if not self.pipe.poll(limit):
                 raise ChildCrash("timed_out")
@@ -83,11 +77,7 @@ class Child:
 
 
 def fork() -> Child | Connection:
-    """Fork this process; return the child, or in the child the pipe to this process.
-
-    Raises:
-        RobocasError: the system allows no more processes, memory or open files.
-    """
+    """Fork this process; return the child, or in the child the pipe to this process."""
     for stream in (sys.stdout, sys.stderr):
         if stream is not None:  # as in a service
             stream.flush()
@@ -128,7 +118,6 @@ def why_not_fork(*, renders: bool) -> str:
 
 @cache
 def say_once(reason: str) -> None:
-    """Warn the user that undoing takes longer here."""
     _log.warning("can't fork (%s): what fails is undone by simulating everything again", reason)
 
 

@@ -38,8 +38,7 @@ from robocas_ms3.tasks.base import RoboCASEnv
 class EpisodeGenerator:
     """Makes episodes of one task in one process: holds the environment, the planner and the policy.
 
-    Next to other processes it needs one thread of torch (``torch.set_num_threads``): threads of small operations wait
-    for each other 25 times longer than they work.
+    Next to other processes it needs one thread of torch (``torch.set_num_threads``).
 
     Args:
         settings: the same for all episodes.
@@ -95,8 +94,8 @@ class EpisodeGenerator:
         attempts = _Attempts(self, recorder, executor, result, takeover)
         executor.rehearse = attempts.rehearse
         try:
-            if takeover is not None:
-                takeover.check()
+            if takeover is not None and takeover.refused:
+                raise EpisodeLost("takeover", takeover.refused)
             if self.settings.keep_recoveries:
                 attempts.make_in_one_motion()
             else:
@@ -109,7 +108,6 @@ class EpisodeGenerator:
         return result
 
     def close(self) -> None:
-        """Close the environments."""
         self.env.close()
         for world in self.worlds:
             world.close()
@@ -117,8 +115,6 @@ class EpisodeGenerator:
 
 @dataclass
 class _Attempts:
-    """The attempts at one seed."""
-
     generator: EpisodeGenerator
     recorder: EpisodeRecorder
     executor: Executor
@@ -188,18 +184,16 @@ class _Attempts:
 
     @property
     def _noisy(self) -> bool:
-        """Whether noise counts still."""
         return self.result.noisy_failures < self.generator.settings.noisy_failures
 
     def rehearse(self, *, finished: bool = False) -> None:
-        """Try what was done so far; see `Trials`."""
         if self.generator.trials is not None:
             gripper = np.array([action[7] for action in self.executor.actions])
             with self.executor.seconds.spent_on("trial"):
                 self.generator.trials.follow(self.recorder.states, gripper, finished=finished, noisy=self._noisy)
 
     def _finish(self, recoveries: list[dict[str, Any]]) -> None:
-        """Write what a policy says it has done, if it is a demonstration."""
+        """Write what a policy has done, if it is a demonstration."""
         if len(self.executor.actions) > self.generator.horizon:
             raise EpisodeLost("horizon", "too_long")
         if not self.executor.flag("success"):
@@ -209,7 +203,6 @@ class _Attempts:
         self.recorder.finish(self._describe(recoveries))
 
     def _describe(self, recoveries: list[dict[str, Any]]) -> dict[str, Any]:
-        """Return what the record says of the episode, besides ManiSkill's own."""
         executor, settings, tried = self.executor, self.generator.settings, self.generator.trials is not None
         env, taken = executor.base_env, self.takeover
         target = env.target_asset().asset
@@ -226,7 +219,7 @@ class _Attempts:
             "target": {"slot": int(env.target_slot[0]), "asset_id": target.id, "name": target.name},
             "objects": [asset.asset.id for asset in env.object_assets[0]],
             "subgoals": [
-                SubGoal(part.goal_type, part.goal_description, part.first, after - 1).as_json()
+                SubGoal.of(part.goal_type, part.goal_description, part.first, after - 1).model_dump()
                 for part, after in zip(executor.segments, bounds[1:], strict=True)
             ],
             "replay_rate": settings.replay_rate if tried else None,

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 from numpy.typing import NDArray
 from pydantic import Field
 
-from robocas_ms3.core.errors import EpisodeLost, PlanningFailed
+from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.demos.recordings.entries import GREATEST_SEED
 from robocas_ms3.planning.decisions import Seconds
 
@@ -27,7 +27,6 @@ class Failure:
     """A failed attempt.
 
     Attributes:
-        seed: of the episode.
         attempt: counted from 0; -1 marks the seed as given up.
         stage: of the policy that failed.
         reason: why, in words that can be counted.
@@ -42,7 +41,6 @@ class Failure:
 
     @property
     def gave_up(self) -> bool:
-        """Whether this line says that the seed has no episode."""
         return self.attempt < 0
 
 
@@ -51,9 +49,7 @@ class EpisodeResult:
     """Result of a seed; forked processes send theirs back.
 
     Attributes:
-        seed: of the episode.
-        success: whether an episode was recorded.
-        steps: its length in control steps.
+        steps: length in control steps.
         attempts: attempts used.
         seconds: where the time went.
         failures: every attempt that failed.
@@ -72,7 +68,6 @@ class EpisodeResult:
 
     @property
     def noisy_failures(self) -> int:
-        """Number of attempts that failed for noise alone."""
         return sum(failure.reason.startswith(NOISY) for failure in self.failures)
 
     @property
@@ -81,7 +76,6 @@ class EpisodeResult:
         return len(self.failures) >= self.max_attempts
 
     def failed(self, error: PlanningFailed) -> None:
-        """Note a failed attempt."""
         now = time.perf_counter()
         seconds = round(now - self.begun, 3)
         self.failures.append(Failure(self.seed, len(self.failures), error.stage, error.reason, seconds))
@@ -98,7 +92,6 @@ class Takeover:
     """State in which a policy left a scene.
 
     Attributes:
-        seed: of the scene.
         policy: its name.
         policy_steps: for which it acted.
         state: as ``set_state_dict`` takes it, each array (1, D) float32 or bool; without targets of controllers.
@@ -112,11 +105,6 @@ class Takeover:
     state: dict[str, dict[str, NDArray[Any]]]
     gripper: float
     refused: str = ""
-
-    def check(self) -> None:
-        """Raise ``EpisodeLost`` if nothing can be taken over."""
-        if self.refused:
-            raise EpisodeLost("takeover", self.refused)
 
 
 def failed_attempts(seed: int, recorded: Iterable[str], noted: Mapping[int, Failure]) -> list[Failure]:

@@ -75,23 +75,19 @@ class OpenLoop:
 
     @property
     def env(self) -> RoboCASEnv:
-        """The environment under its wrappers."""
         env = self._env.unwrapped
         assert isinstance(env, RoboCASEnv)
         return env
 
     def reset(self, seed: int, options: dict[str, Any] | None = None) -> None:
-        """Build the scene of a seed, with further options of its reset."""
         self._env.reset(seed=seed, options=dict(options or {}))
         self.success, self.clipped, self._gripper = False, 0, 1.0
 
     @property
     def layout(self) -> Layout:
-        """Of the scene that was built last."""
         return self.env.layout()
 
     def tcp_in_base(self) -> NDArray[np.float32]:
-        """Return the TCP (3,) in the arm's base frame, m."""
         return self.env.agent.tcp_in_arm_base.p[0].numpy().copy()
 
     def begin_at(self, state: dict[str, Any], gripper: float) -> None:
@@ -129,7 +125,6 @@ class OpenLoop:
         return Playback(self.success, np.stack(places).astype(np.float64), self.clipped)
 
     def close(self) -> None:
-        """Close the environment."""
         self._env.close()
 
 
@@ -150,7 +145,6 @@ class Trials:
         self._seed, self._played = 0, 0
 
     def reset(self, seed: int, takeover: Takeover | None = None) -> None:
-        """Build the episode's scene in each world, as it was taken over, if it was."""
         for world in self._worlds:
             world.reset(seed)
             if takeover is not None:
@@ -169,8 +163,8 @@ class Trials:
             noisy: play it with noise too; without, those environments stay behind.
 
         Raises:
-            EpisodeLost: ``clipped``, an action goes beyond the range of ``pd_ee_delta_pose``; ``parted``, the target is
-                elsewhere than recorded; ``no_success``; with noise ``NOISY`` and the same.
+            EpisodeLost: ``clipped``, ``parted`` (the target is elsewhere than recorded) or ``no_success``; with noise
+                ``NOISY`` and the same.
         """
         samples = sample_states(len(gripper), self._stride)
         if not finished:

@@ -50,8 +50,6 @@ class Recorded:
 
     Attributes:
         where: name of the episode for messages.
-        seed, options: of ``env.reset``.
-        control_mode: of the actions.
         actions: (S, A).
         states: S + 1, each as ``set_state_dict`` takes it.
         taken_over: whether it begins at the first state instead of that of the reset.
@@ -67,7 +65,6 @@ class Recorded:
 
     @classmethod
     def read(cls, trajectory: Path, episode: dict[str, Any]) -> Recorded:
-        """Read the episode of an entry of the JSON."""
         where = f"{trajectory}, traj_{episode['episode_id']}"
         seed, options = read_reset(episode, where)
         mode = episode.get("control_mode")
@@ -106,7 +103,6 @@ class Replay:
 
     Attributes:
         episode_id: in the source file.
-        seed: of the episode.
         success: at the last step.
         state_error: greatest distance of any object or the TCP's joints from the recorded final state, m or rad; None
             when the actions were converted.

@@ -3,35 +3,153 @@
 import io
 import json
 import shutil
+import warnings
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import made_up_results
 import numpy as np
 import pytest
-from fuzzing import VALUES, flipped, twist_file
+from fuzzing import SCALARS, VALUES, flipped, twisted
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from synthetic import RayCaster, write_trajectory
 
+from robocas_ms3.assets.annotations import Annotations
+from robocas_ms3.assets.hulls import read_hulls
 from robocas_ms3.assets.pack import load_pack
+from robocas_ms3.baselines.training.record import BUNDLED, read_run
 from robocas_ms3.cli.layouts import Info, info
-from robocas_ms3.core.errors import RobocasError
+from robocas_ms3.core import documents
+from robocas_ms3.core.documents import DocumentError, open_arrays
+from robocas_ms3.core.errors import AssetError, DatasetError, RobocasError, TrainingError
+from robocas_ms3.core.ledger import Ledger
+from robocas_ms3.core.outputs import OutputFolder
 from robocas_ms3.core.paths import builtin_packs_dir
 from robocas_ms3.core.poses import planar
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.lerobot.check import check_lerobot
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
+from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.sources.provenance import recorded_scene, recording_entry
 from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.datasets.sources.trajectory import TrajectorySource
 from robocas_ms3.datasets.writing.convert import convert
+from robocas_ms3.datasets.writing.plan import DATASET, dataset_settings, plan_episodes
 from robocas_ms3.datasets.writing.settings import ConversionSettings
+from robocas_ms3.demos.generate import OUTPUT
+from robocas_ms3.demos.ledger import Failure, count_by_stage
+from robocas_ms3.demos.recordings.reading import TrajectoryFile
+from robocas_ms3.demos.replay import Recorded
+from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
 from robocas_ms3.evaluation.report.comparison import comparison
 from robocas_ms3.evaluation.report.page import page
 from robocas_ms3.evaluation.report.tables import markdown
+from robocas_ms3.plans.folder import PLAN, check_plan_record, plan_record, read_plan
+from robocas_ms3.plans.load import load_plan, shipped_plans
+from robocas_ms3.plans.status import read_status
+from robocas_ms3.plans.units import OUTCOME, OUTCOMES, Outcome, Unit
+from robocas_ms3.robots.cameras import STANDARD_NAMES
 from robocas_ms3.scenes.cache import ABOUT, LayoutCache
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.table import FrozenLayouts, LayoutTable, write_frozen, write_table
+
+PACK = builtin_packs_dir() / "builtin"
+OBJECT = min(PACK.glob("*/annotations.npz")).parent
+NAMES = ["one", "three", "two"]
+LAYOUT = Layout(
+    ("two", "one", "two"),
+    np.stack([planar(0.1 * i, 0.2, 0.6, i) for i in range(3)]),
+    planar(0.7, 0.15, 0, 1.5),
+    planar(1.3, 0.9, 0.6, 0),
+    target=1,
+)
+RUN = {"settings": asdict(EpisodeSettings("pick")), "first_seed": 0, "versions": {"a": "1"}}
+FAILURE = {"seed": 1, "attempt": 0, "stage": "a", "reason": "b", "seconds": 1.0}
+ENTRY = {"trajectory": "F.h5", "trajectory_episode": 0, "seed": 3, "success": True, "recording": "ab", "source": 0}
+CONVERSION = dataset_settings(5, Pictures(STANDARD_NAMES), False)
+
+
+# What is whole at first: functions that write it into a folder
+
+
+def write_robocas(root):
+    trajectory = write_trajectory(root.with_suffix(".h5"), seeds=(3, 4))
+    made = {"size": (64, 48), "video": False, "open_renderer": RayCaster, "embeddings": False}
+    convert(ConversionSettings(trajectory, root, **made))
+
+
+def write_lerobot(root):
+    trajectory = write_trajectory(root.with_suffix(".h5"), seeds=(3, 4))
+    convert_lerobot(ConversionSettings(trajectory, root, size=(64, 48), video=False, open_renderer=RayCaster))
+
+
+def write_recording(root):
+    root.mkdir()
+    write_trajectory(root / "trajectory.h5", seeds=(3, 4))
+
+
+def write_pack(root):
+    root.mkdir()
+    manifest = json.loads((PACK / "manifest.json").read_text())
+    (root / "manifest.json").write_text(json.dumps({**manifest, "assets": manifest["assets"][:2]}))
+    for name in ("hulls.obj", "annotations.npz"):
+        shutil.copy(OBJECT / name, root)
+    (root / "hulls.obj").write_bytes((root / "hulls.obj").read_bytes()[:4000])
+
+
+def write_protocol(root):
+    shutil.copytree(Path(next(iter(shipped_protocols().values()))), root)
+
+
+def write_result(root):
+    made_up_results.write(root, [made_up_results.outcome(i, came_to=7 - i) for i in range(3)])
+
+
+def the_plan():
+    return load_plan(next(iter(shipped_plans())))
+
+
+def write_plan(root):
+    plan, complete = the_plan(), Unit(0, 0)
+    for unit in (complete, Unit(0, 1)):
+        for seed in unit.seeds(plan):
+            with unit.files(plan, root, seed).temporary() as files:
+                files.write(Outcome(seed, True, 10, ["a: b"], ["c: d"], 1.0, 1.0, 5, 1e9))
+    complete.complete(plan, root)
+    (root / PLAN).write_text(json.dumps(plan_record(plan)))
+    shutil.copy(complete.folder(plan, root) / OUTCOMES, root)  # where the table below finds them
+    shutil.copy(Unit(0, 1).files(plan, root, Unit(0, 1).seeds(plan)[0]).folder / OUTCOME, root)
+
+
+def write_generation(root):
+    root.mkdir()
+    (root / "run.json").write_text(json.dumps(RUN))
+    (root / "failures.jsonl").write_text(json.dumps(FAILURE))
+
+
+def write_conversion(root):
+    root.mkdir()
+    whole = {"schema_version": 2, "made_with": {}, **CONVERSION, "episodes": {"0": ENTRY}}
+    (root / "conversion.json").write_text(json.dumps(whole))
+    (root / "episode_0000000").write_text("an episode")
+
+
+def write_training(root):
+    shutil.copytree(BUNDLED / "small", root)
+
+
+def write_layouts(root):
+    root.mkdir()
+    write_table(root / "table.npy", NAMES, dict.fromkeys([(0, 0), (0, 1)], LAYOUT))
+    write_frozen(root / "frozen.npy", NAMES, {0: LAYOUT})
+
+
+# Readers of such folders
 
 
 def read_dataset(root):
@@ -45,94 +163,191 @@ def read_dataset(root):
         assert episode.layout is not None
 
 
-def attempt(read, path, seed):
-    """Gives whether it was refused."""
+def read_recording(root):
+    """Everything that a conversion, statistics, the viewer and a replay read."""
+    path = root / "trajectory.h5"
+    with TrajectoryFile(path) as file:
+        for index in range(len(file.episodes)):
+            recording = file.recording(index)
+            motion = recording.motion(np.arange(0, recording.control_steps + 1, 4))
+            assert np.isfinite(motion.actions).all()
+            assert np.isfinite(Recorded.read(path, file.episodes[index]).actions).all()
+            assert recording_entry(file, index)
+            assert recorded_scene(file, index)
+    source = TrajectorySource(path)
+    for number in source.numbers:
+        episode = source.episode(number)
+        assert episode.arrays
+        _ = episode.goals, episode.scene, episode.layout, source.entry(number)
+
+
+def read_annotations(root):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        notes = Annotations.load(root / "annotations.npz")
+    assert np.isfinite(notes.grasps_tcp_in_object).all()
+    assert -1 <= notes.display_pose < len(notes.resting_poses)
+
+
+def read_hull_file(root):
+    for hull in read_hulls(root / "hulls.obj"):
+        assert np.isfinite(hull.vertices).all()
+        assert 0 <= hull.faces.min() <= hull.faces.max() < len(hull.vertices)
+
+
+def read_result(root):
+    found = results.read(root)
+    assert markdown(found)
+    assert page(found)
+    assert comparison([found, found])
+    results.parts_of([root])
+
+
+def read_plan_folder(root):
+    plan, started = the_plan(), Unit(0, 1)
+    shutil.copy(root / OUTCOMES, Unit(0, 0).folder(plan, root))
+    shutil.copy(root / OUTCOME, started.files(plan, root, started.seeds(plan)[0]).folder)
+    assert read_status(root)
+    check_plan_record(root, read_plan(root))
+
+
+def read_generation(root):
+    OutputFolder(root, OUTPUT, RUN).read()
+    count_by_stage(Ledger(root / "failures.jsonl", Failure).read())
+
+
+def read_conversion(root):
+    output = OutputFolder(root, DATASET, CONVERSION)
+    output.read()
+    plan_episodes(output, [ENTRY], CONVERSION, append=False)
+
+
+def read_table(root):
+    table = LayoutTable(root / "table.npy", NAMES)
+    found = [table.layout(pair) for pair in ((0, 0), (0, 1))]
+    assert table.object_ids(0) is None or set(table.object_ids(0)) <= set(NAMES)
+    for layout in filter(None, found):
+        layout.check(NAMES)
+
+
+def read_frozen(root):
+    layout = FrozenLayouts(root / "frozen.npy", NAMES)(0, 0)
+    if layout is not None:
+        layout.check(NAMES)
+
+
+ROBOCAS_FILES = ("data_info.json", "conversion.json", "episode_0000000/scene.json")
+TABLE = [  # writer, file, reader, how many kinds of damage, how many of them are refused at least
+    *((write_robocas, name, read, 16, 0) for read in (validate, read_dataset) for name in ROBOCAS_FILES),
+    (write_robocas, "episode_0000000/episode_info.npz", read_dataset, 16, 0),
+    *((write_lerobot, f"meta/{name}.json", check_lerobot, 10, 0) for name in ("info", "stats", "robocas/conversion")),
+    (write_recording, "trajectory.h5", read_recording, 80, 20),
+    (write_recording, "trajectory.json", read_recording, 120, 30),
+    (write_pack, "manifest.json", load_pack, 150, 120),
+    (write_pack, "hulls.obj", read_hull_file, 40, 10),
+    (write_pack, "annotations.npz", read_annotations, 40, 20),
+    *((write_protocol, name, load_protocol, 30, 0) for name in ("protocol.yaml", "episodes.jsonl")),
+    (write_result, results.RUN, read_result, 40, 5),
+    (write_result, results.OUTCOMES, read_result, 40, 0),
+    (write_plan, PLAN, read_plan_folder, 25, 5),
+    *((write_plan, name, read_plan_folder, 20, 0) for name in (OUTCOMES, OUTCOME)),
+    (write_generation, "run.json", read_generation, 60, 10),
+    (write_generation, "failures.jsonl", read_generation, 60, 0),
+    (write_conversion, "conversion.json", read_conversion, 60, 10),
+    (write_training, "run.json", read_run, 40, 10),
+    (write_layouts, "table.npy", read_table, 50, 25),
+    (write_layouts, "frozen.npy", read_frozen, 50, 25),
+]
+
+
+def damaged(name, whole, seed):
+    """Another value somewhere in JSON, or in the first line of many; else other bytes."""
+    if seed % 2 and name.endswith((".json", ".jsonl")):
+        first, *others = whole.splitlines() if name.endswith("l") else [whole]
+        return b"\n".join([json.dumps(twisted(json.loads(first), seed)).encode(), *others])
+    return flipped(whole, seed)
+
+
+def is_refused(read, path, case):
     try:
         read(path)
-    except RobocasError as error:
-        assert "\n" not in str(error), f"seed {seed}"
+    except (RobocasError, DocumentError) as error:
+        assert "\n" not in str(error), case
         return True
     except Exception as error:
-        raise AssertionError(f"seed {seed}") from error
+        raise AssertionError(case) from error
     return False
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    """A small dataset of each kind."""
-    folder = tmp_path_factory.mktemp("made")
-    trajectory = write_trajectory(folder / "trajectory.h5", seeds=(3, 4))
-    settings = {"size": (64, 48), "video": False, "open_renderer": RayCaster}
-    convert(ConversionSettings(trajectory, folder / "robocas", embeddings=False, **settings))
-    convert_lerobot(ConversionSettings(trajectory, folder / "lerobot", **settings))
-    return folder
+def folder_of(tmp_path_factory):
+    """Writer -> a folder that it wrote."""
+    kept = {}
+
+    def of(write):
+        if write not in kept:
+            kept[write] = tmp_path_factory.mktemp("whole") / write.__name__
+            write(kept[write])
+        return kept[write]
+
+    return of
 
 
-@pytest.mark.parametrize("name", ["data_info.json", "conversion.json", "episode_0000000/scene.json"])
-@pytest.mark.parametrize("read", [validate, read_dataset])
-def test_json_of_a_dataset(made, tmp_path, name, read):
-    root = tmp_path / "dataset"
-    shutil.copytree(made / "robocas", root)
-    whole = json.loads((root / name).read_text())
-    for seed in range(25):
-        twist_file(root / name, whole, seed)
-        attempt(read, root, seed)
+@pytest.mark.parametrize(("write", "name", "read", "count", "least"), TABLE)
+def test_it_is_read_or_refused(folder_of, tmp_path, write, name, read, count, least):
+    root = shutil.copytree(folder_of(write), tmp_path / "copy")
+    if read is not load_pack:
+        assert not is_refused(read, root, "whole")
+    whole, refused = (root / name).read_bytes(), 0
+    for seed in range(count):
+        (root / name).write_bytes(damaged(name, whole, seed))
+        refused += is_refused(read, root, seed)
+    assert refused >= least
 
 
-@pytest.mark.parametrize("name", ["episode_info.npz", "base_camera/intrinsic.npy", "base_camera/rgb/0001.png"])
-def test_bytes_of_an_episode(made, tmp_path, name):
-    root = tmp_path / "dataset"
-    shutil.copytree(made / "robocas", root)
-    path = root / "episode_0000000" / name
-    whole, found = path.read_bytes(), 0
-    for seed in range(16):
-        path.write_bytes(flipped(whole, seed))
-        attempt(read_dataset, root, seed)
-        found += bool(validate(root).violations)
-    assert found > 8
-
-
-@pytest.mark.parametrize("name", ["meta/info.json", "meta/stats.json", "meta/robocas/conversion.json"])
-def test_json_of_a_lerobot_dataset(made, tmp_path, name):
-    root = tmp_path / "dataset"
-    shutil.copytree(made / "lerobot", root)
-    whole = json.loads((root / name).read_text())
-    for seed in range(20):
-        twist_file(root / name, whole, seed)
-        attempt(check_lerobot, root, seed)
-
-
-def test_manifest_of_a_pack(tmp_path):
-    whole = json.loads((builtin_packs_dir() / "builtin" / "manifest.json").read_text())
-    whole["assets"] = whole["assets"][:2]
-    refused = 0
-    for seed in range(150):
-        folder = tmp_path / str(seed)
-        folder.mkdir()
-        twist_file(folder / "manifest.json", whole, seed)
-        refused += attempt(load_pack, folder, seed)
-    assert refused > 100
-
-
-def test_files_of_a_protocol(tmp_path):
-    root = tmp_path / "protocol"
-    shutil.copytree(Path(next(iter(shipped_protocols().values()))), root)
-    for path in sorted(file for file in root.iterdir() if file.is_file()):
-        whole = path.read_bytes()
-        for seed in range(30):
+def test_damage_of_images_and_arrays_is_found(folder_of, tmp_path):
+    root = shutil.copytree(folder_of(write_robocas), tmp_path / "copy")
+    for name in ("episode_info.npz", "base_camera/intrinsic.npy", "base_camera/rgb/0001.png"):
+        path = root / "episode_0000000" / name
+        whole, found = path.read_bytes(), 0
+        for seed in range(12):
             path.write_bytes(flipped(whole, seed))
-            attempt(load_protocol, root, seed)
+            found += bool(validate(root).violations)
+        assert found > 6
         path.write_bytes(whole)
 
 
-NAMES = ["one", "three", "two"]
-LAYOUT = Layout(
-    ("two", "one", "two"),
-    np.stack([planar(0.1 * i, 0.2, 0.6, i) for i in range(3)]),
-    planar(0.7, 0.15, 0, 1.5),
-    planar(1.3, 0.9, 0.6, 0),
-    target=1,
-)
+def test_deep_json_is_refused(folder_of, tmp_path):
+    """A file of brackets takes no reader down."""
+    for write, name, read in (
+        (write_robocas, "data_info.json", read_dataset),
+        (write_lerobot, "meta/info.json", check_lerobot),
+        (write_result, results.RUN, read_result),
+    ):
+        root = shutil.copytree(folder_of(write), tmp_path / write.__name__)
+        (root / name).write_text("[" * 100_000)
+        is_refused(read, root, name)
+
+
+ARRAYS = (np.zeros(0), np.array("x"), np.full((2, 4, 4), np.nan), np.array(2**63, np.uint64), np.array([True]), None)
+
+
+def with_other_arrays(whole):
+    """The file with another array in place of each, or without it."""
+    arrays = dict(np.load(io.BytesIO(whole)))
+    for name in arrays:
+        for value in ARRAYS:
+            made = io.BytesIO()
+            rest = {key: array for key, array in arrays.items() if key != name}
+            np.savez(made, **rest if value is None else {**rest, name: value})
+            yield name, made.getvalue()
+
+
+def test_annotations_of_other_arrays(folder_of, tmp_path):
+    root = shutil.copytree(folder_of(write_pack), tmp_path / "copy")
+    for name, content in with_other_arrays((root / "annotations.npz").read_bytes()):
+        (root / "annotations.npz").write_bytes(content)
+        is_refused(read_annotations, root, name)
 
 
 @pytest.fixture
@@ -147,101 +362,85 @@ def cache(tmp_path, monkeypatch):
     return cache
 
 
-def same(one, other):
-    return one.object_ids == other.object_ids and np.array_equal(one.object_poses, other.object_poses)
-
-
 def test_a_damaged_layout_of_a_cache_is_made_again(cache):
-    whole_layout = cache.get(0, 0)
+    made = cache.get(0, 0)
     path = cache.path(0, 0)
     whole = path.read_bytes()
-    for seed in range(40):
-        path.write_bytes(flipped(whole, seed))
-        assert same(cache.get(0, 0), whole_layout), f"seed {seed}"
-    arrays = dict(np.load(io.BytesIO(whole)))
-    rng = np.random.default_rng(0)
-    for name in arrays:  # a whole file of other arrays
-        for value in (np.zeros(0), np.array("x"), rng.random((3, 4, 4)), np.array(9), np.array([True]), None):
-            others = {**arrays, name: value} if value is not None else {k: a for k, a in arrays.items() if k != name}
-            np.savez(path, **others)
-            if not same(cache.get(0, 0), whole_layout):
-                raise AssertionError(f"{name} {value}")
+    for case, content in [*((seed, flipped(whole, seed)) for seed in range(40)), *with_other_arrays(whole)]:
+        path.write_bytes(content)
+        again = cache.get(0, 0)
+        assert again.object_ids == made.object_ids, case
+        assert np.array_equal(again.object_poses, made.object_poses), case
 
 
 def test_caches_with_damaged_notes_are_listed(cache, capsys):
     cache.get(0, 0)
     path = cache.folder / ABOUT
     whole = json.loads(path.read_text())
-    for seed in range(60):
-        twist_file(path, whole, seed)
-        assert info(Info(folder=cache.folder.parent)) == 0, f"seed {seed}"
-    for value in VALUES:
-        path.write_text(json.dumps(value))
-        assert info(Info(folder=cache.folder.parent)) == 0, value
-        assert "damaged" in capsys.readouterr().out
+    for content in [*(twisted(whole, seed) for seed in range(60)), *VALUES]:
+        path.write_text(json.dumps(content))
+        assert info(Info(folder=cache.folder.parent)) == 0, content
+    assert "damaged" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("kind", ["table", "frozen"])
-def test_files_of_many_layouts(tmp_path, kind):
-    path, pairs = tmp_path / "layouts.npy", [(0, 0)] if kind == "frozen" else [(0, 0), (0, 1)]
-    if kind == "table":
-        write_table(path, NAMES, dict.fromkeys(pairs, LAYOUT))
-    else:
-        write_frozen(path, NAMES, {0: LAYOUT})
+@dataclass(frozen=True)
+class Try:
+    seed: int
+    seconds: float = 0.0
+    words: dict[str, int | None] = field(default_factory=dict)
+    more: object = None
 
-    def read(path):
-        if kind == "table":
-            table = LayoutTable(path, NAMES)
-            found = [table.layout(pair) for pair in pairs]
-            assert table.object_ids(0) is None or set(table.object_ids(0)) <= set(NAMES)
+
+JSON = st.recursive(
+    st.sampled_from(SCALARS),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner),
+    max_leaves=4,
+)
+LINE = st.fixed_dictionaries({"seed": JSON}, optional={"more": JSON, "seconds": JSON})
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(lines=st.lists(st.binary(max_size=20) | JSON | LINE, max_size=5))
+def test_ledgers(tmp_path_factory, lines):
+    ledger: Ledger[Try] = Ledger(tmp_path_factory.mktemp("ledger") / "tries.jsonl", Try)
+    texts = [line if isinstance(line, bytes) else json.dumps(line).encode() for line in lines]
+    ledger.path.write_bytes(b"\n".join(texts))
+    for line in ledger.lines():
+        if line.record is None:
+            assert "\n" not in str(ledger.refusal(line, DatasetError, "no try"))
         else:
-            found = [FrozenLayouts(path, NAMES)(*pair) for pair in pairs]
-        for layout in found:
-            if layout is not None:
-                layout.check(NAMES)
-
-    whole = path.read_bytes()
-    refused = 0
-    for seed in range(50):
-        path.write_bytes(flipped(whole, seed))
-        refused += attempt(read, path, seed)
-    assert refused > 25
+            json.dumps([line.record.seconds, line.record.more], allow_nan=False)
+    ledger.append([Try(1)])
+    assert ledger.read()[-1] == Try(1)
 
 
-@pytest.mark.parametrize("name", [results.RUN, results.OUTCOMES])
-def test_files_of_a_result(tmp_path, name):
-    root = tmp_path / "result"
-    made_up_results.write(root, [made_up_results.outcome(i, came_to=7 - i) for i in range(3)])
-
-    def read(folder):
-        found = results.read(folder)
-        assert markdown(found)
-        assert page(found)
-        assert comparison([found, found])
-        results.parts_of([folder])
-
-    read(root)
-    whole = (root / name).read_bytes()
-    first, *others = whole.splitlines() if name == results.OUTCOMES else [whole]
-    for seed in range(20):
-        (root / name).write_bytes(flipped(whole, seed))
-        attempt(read, root, seed)
-        text = twist_file(root / name, json.loads(first), seed)
-        (root / name).write_bytes(b"\n".join([text.encode(), *others, b""]))
-        attempt(read, root, seed)
+def test_arrays_that_unpack_to_more_than_there_may_be(tmp_path, monkeypatch):
+    monkeypatch.setattr(documents, "ARRAYS_LIMIT", 2**20)
+    path = tmp_path / "annotations.npz"
+    np.savez_compressed(path, zeros=np.zeros(2**20))
+    assert path.stat().st_size < 2**14
+    for read, error in ((open_arrays, DocumentError), (Annotations.load, AssetError)):
+        with pytest.raises(error):
+            read(path)
 
 
-def test_deep_json_is_refused(made, tmp_path):
-    """A file of brackets takes no reader down."""
-    deep = "[" * 100_000
-    root = tmp_path / "result"
-    made_up_results.write(root, [made_up_results.outcome(0)])
-    (root / results.RUN).write_text(deep)
-    assert attempt(results.read, root, 0)
-    for kind, name, read in (
-        ("robocas", "data_info.json", read_dataset),
-        ("lerobot", "meta/info.json", lambda root: check_lerobot(root) and None),
-    ):
-        shutil.copytree(made / kind, tmp_path / kind)
-        (tmp_path / kind / name).write_text(deep)
-        attempt(read, tmp_path / kind, 0)
+def test_facts_and_checkpoints_of_a_training(folder_of, tmp_path):
+    torch = pytest.importorskip("torch", reason="needs torch")
+    from safetensors.torch import save_file
+
+    from robocas_ms3.baselines.policy import RunPolicy
+    from robocas_ms3.baselines.training import checkpoints
+
+    root = shutil.copytree(folder_of(write_training), tmp_path / "copy")
+    whole = json.loads((root / "run.json").read_text())
+    facts = whole["facts"]
+    for changes in ({"chunk": {**facts["chunk"], "mean": "x"}}, {"heights": []}, {"pictures": {"base_camera": [1]}}):
+        (root / "run.json").write_text(json.dumps({**whole, "facts": {**facts, **changes}}))
+        with pytest.raises(TrainingError):
+            RunPolicy(root, "cpu")
+    small = root / "small.safetensors"
+    for metadata in ({"step": ""}, {"step": "-1"}, {"step": "nan"}, {"step": "1e308"}, {"step": "9" * 5000}, {}):
+        save_file({"a": torch.zeros(1)}, small, metadata)
+        with pytest.raises(TrainingError) as error:
+            checkpoints.load(small, {})
+        assert len(str(error.value)) < 500

@@ -6,7 +6,6 @@ import copy
 import json
 import random
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 NUMBERS = [-1, 0, 2**62, 2**63, 10**400, -1.5, 1e308, -1e308, 5e-324, float("nan"), float("inf")]
@@ -47,22 +46,3 @@ def twisted(whole: Any, seed: int) -> Any:
     else:
         parent[last] = copy.deepcopy(rng.choice(VALUES))
     return data
-
-
-def twist_file(path: Path, whole: Any, seed: int) -> str:
-    """Write a twisted file of JSON; gives its text."""
-    text = json.dumps(twisted(whole, seed))
-    path.write_text(text)
-    return text
-
-
-def changed(whole: Any, most: int) -> Iterator[tuple[tuple, Any, Any]]:
-    """Yield place, value and JSON of a document with another of `VALUES` in that place; the same ones each time."""
-    pairs = [(place, value) for place in _places(whole) for value in VALUES]
-    for (*way, last), value in random.Random(0).sample(pairs, min(most, len(pairs))):
-        data = copy.deepcopy(whole)
-        parent = data
-        for key in way:
-            parent = parent[key]
-        parent[last] = value
-        yield (*way, last), value, data

@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, NonNegativeInt, 
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.demos.recordings.entries import one_seed
-from robocas_ms3.demos.recordings.subgoals import SubGoalRecord
+from robocas_ms3.demos.recordings.subgoals import SubGoal
 from robocas_ms3.robots.cameras import CAMERA_NAME
 
 
@@ -139,7 +139,7 @@ class DataInfoRecord(_Part):
     )
     ep_length: dict[EpisodeNumber, int] = Field(description="{number: T}")
     language_goal: dict[EpisodeNumber, str] = Field(description="{number: instruction}")
-    step_goals: dict[EpisodeNumber, list[SubGoalRecord]] = Field(
+    step_goals: dict[EpisodeNumber, list[SubGoal]] = Field(
         description="{number: [{goal_type, goal_range: [first, last] step, inclusive, goal_description}]}"
     )
     action_space: _ActionSpace = Field(

@@ -57,7 +57,7 @@ def info_of(root: Path, before: tuple[Iterable[int], Iterable[int]] = ((), ())) 
         lengths[str(number)] = int(arrays["episode_length"])
         instructions[str(number)] = str(arrays["language_goal"])
         runs = subgoal_runs(arrays["step_goal_type"].tolist(), arrays["step_lang_goals"].tolist())
-        goals[str(number)] = [goal.as_json() for goal in runs]
+        goals[str(number)] = [goal.model_dump() for goal in runs]
         positions.append(arrays["rel_pos"])
         orientations.append(arrays["rel_orn"])
     train, val = split_by_seed(seeds, before)

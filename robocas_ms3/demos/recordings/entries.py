@@ -18,7 +18,7 @@ from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.strict import parse
 from robocas_ms3.core.words import one_line
-from robocas_ms3.demos.recordings.subgoals import SubGoal, SubGoalsRecord
+from robocas_ms3.demos.recordings.subgoals import SubGoal, SubGoals
 
 GREATEST_SEED = 2**32 - 1  # numpy's older generators, which ManiSkill uses, take no greater one
 _ENTRY = "the JSON's entry"
@@ -63,7 +63,7 @@ class BeginRecord(_Record):
     reset_kwargs: ResetRecord | None = None
 
 
-class TaskRecord(SubGoalsRecord):
+class TaskRecord(SubGoals):
     """``robocas`` of an episode: what ManiSkill's format has no place for."""
 
     instruction: str
@@ -107,11 +107,8 @@ class Entry:
 
     Attributes:
         episode_id: number in the trajectory file.
-        seed: of the environment.
         reset_options: further options of ``env.reset``.
-        control_mode: of the actions.
         control_steps: S.
-        instruction: of the task.
         subgoals: ranges over the actions 0..S-1.
         taken_over: whether it begins where another policy was, instead of at the reset.
     """
@@ -129,7 +126,7 @@ class Entry:
 def read_entry(episode: Mapping[str, Any], where: object) -> Entry:
     """Return what a trajectory's JSON says of an episode."""
     found = parse(EpisodeRecord, episode, DatasetError, where=where, about=_ENTRY)
-    goals = found.robocas.goals
+    goals = found.robocas.subgoals
     steps = found.elapsed_steps
     if steps is None and not goals:
         raise DatasetError("the JSON's entry does not say how long the episode is", where=where)
@@ -158,7 +155,6 @@ def read_reset(episode: Mapping[str, Any], where: object) -> tuple[int, dict[str
 
 
 def read_reset_options(options: Any, where: object) -> dict[str, Any]:
-    """Return options of ``env.reset`` in a file."""
     return _options(parse(ResetRecord, {"options": options or None}, DatasetError, where=where))
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveInt, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from robocas_ms3.assets.pack import pack_folders
 from robocas_ms3.core.errors import DatasetError, ExtensionError, RobocasError
@@ -32,7 +32,7 @@ _Settings = dict[str, Any]
 
 
 class _Kwargs(StrictModel):
-    """Arguments of ``gym.make`` that a file may have; those that aren't the scene's are the reader's to choose."""
+    """Arguments of ``gym.make`` that are read of a file: those of the scene, and its actions' control mode."""
 
     model_config = ConfigDict(strict=True)
 
@@ -44,25 +44,14 @@ class _Kwargs(StrictModel):
     sim_config: _Settings = {}
     sensor_configs: _Settings = {}
     control_mode: _Name | None = None
-    obs_mode: str | None = None
-    reward_mode: _Name | None = None
-    num_envs: PositiveInt = 1
-    seeds: list[int] | None = None
-    reconfiguration_freq: int | None = None
-    max_episode_steps: PositiveInt | None = None
-    enable_shadow: bool = False
-    enhanced_determinism: bool = False
-    parallel_in_single_scene: bool = False
-    render_mode: _Name | None = None
-    sim_backend: str | None = None
-    render_backend: str | None = None
-    shader_dir: str | None = None
-    human_render_camera_configs: _Settings = {}
-    viewer_camera_configs: _Settings = {}
-    layouts: Any = None
 
 
-_SCENE = ("config", "pack", "furniture_pack", "visual_level", "robot_uids", "sim_config", "sensor_configs")
+# Arguments that a recording may hold, and that its reader chooses
+_READERS = {
+    *("obs_mode", "reward_mode", "render_mode", "num_envs", "seeds", "reconfiguration_freq", "max_episode_steps"),
+    *("enable_shadow", "enhanced_determinism", "parallel_in_single_scene", "sim_backend", "render_backend"),
+    *("shader_dir", "human_render_camera_configs", "viewer_camera_configs", "layouts"),
+}
 
 
 class _Info(BaseModel):
@@ -79,7 +68,7 @@ class RecordedEnv:
     Attributes:
         env_id: gymnasium's, of a registered task.
         control_mode: of the actions, if the file names it.
-        kwargs: for ``gym.make``, those of the scene (``_SCENE``); layouts follow from the seed.
+        kwargs: for ``gym.make``, those of the scene; layouts follow from the seed.
     """
 
     env_id: str
@@ -94,7 +83,6 @@ class RecordedEnv:
         return replace(self, kwargs={**self.kwargs, "pack": named})
 
     def robot(self, where: object = "robot_uids") -> RobotSpec:
-        """Return its robot."""
         try:
             return find_robot(self.kwargs.get("robot_uids"), where=where)
         except ExtensionError as error:
@@ -135,8 +123,9 @@ class RecordedEnv:
 
 def read_env(info: Any, where: object, *, pack: str | Path | None = None) -> RecordedEnv:
     """Read ``env_info`` of a file, ``{"env_id": ..., "env_kwargs": {...}}``; ``pack`` replaces the named one."""
-    if pack is not None and isinstance(info, Mapping) and isinstance(info.get("env_kwargs"), Mapping):
-        info = {**info, "env_kwargs": {**info["env_kwargs"], "pack": "builtin"}}
+    if isinstance(info, Mapping) and isinstance(info.get("env_kwargs"), Mapping):
+        kwargs = {name: value for name, value in info["env_kwargs"].items() if name not in _READERS}
+        info = {**info, "env_kwargs": kwargs if pack is None else {**kwargs, "pack": "builtin"}}
     try:
         found = _Info.model_validate(info)
     except ValidationError as error:
@@ -146,15 +135,13 @@ def read_env(info: Any, where: object, *, pack: str | Path | None = None) -> Rec
         raise DatasetError(
             "a file can't choose this", where=f"{where}, env_id", expected="id of a task", found=found.env_id
         )
-    kwargs = found.env_kwargs.model_dump(exclude_unset=True)
+    kwargs = found.env_kwargs.model_dump(exclude_unset=True, exclude={"control_mode"})
     for name in ("sim_config", "sensor_configs"):
         _check_settings(kwargs.get(name, {}), f"{where}, env_kwargs.{name}", _DEEP)
-    kept = {name: value for name, value in kwargs.items() if name in _SCENE}
-    return RecordedEnv(env_id, found.env_kwargs.control_mode, kept).with_pack(pack)
+    return RecordedEnv(env_id, found.env_kwargs.control_mode, kwargs).with_pack(pack)
 
 
 def recorded_id(env_id: str) -> str:
-    """Return a registered id as files have it."""
     return f"{_PREFIX}{env_id}"
 
 
@@ -171,7 +158,6 @@ def _refusal(error: ValidationError, where: object) -> DatasetError:
 
 
 def _check_settings(settings: Any, where: str, deep: int) -> None:
-    """Check that settings are numbers and names in few levels."""
     if isinstance(settings, dict) and deep:
         for key, value in settings.items():
             _check_settings(value, f"{where}.{key}", deep - 1)

@@ -59,7 +59,6 @@ def gripper_open(
     half open counts as open.
 
     Args:
-        robot: with that gripper.
         commands: (S,) gripper actions in [-1, 1].
         samples: (T,) from ``sample_states``.
         initial_width: of the gripper at reset, m, which is its target until the first action.
@@ -120,7 +119,6 @@ def planar_motion(agv_pose: NDArray) -> Array:
 
 
 def _wrap(angle: Array) -> Array:
-    """Return angles in [-pi, pi)."""
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
@@ -129,11 +127,8 @@ class Motion:
     """Motion of the robot at the T states of an episode that a dataset keeps.
 
     Attributes:
-        qpos: (T, 12) base x, y, yaw, 7 arm joints, 2 fingers, m and rad.
-        qvel: (T, 12) the same order.
-        root_in_world: (T, 4, 4).
-        tcp_in_world: (T, 4, 4), by forward kinematics.
-        arm_base_in_world: (T, 4, 4), the same.
+        qpos: (T, 12) base x, y, yaw, 7 arm joints, 2 fingers, m and rad; ``qvel`` likewise.
+        root_in_world: (T, 4, 4); ``tcp_in_world`` and ``arm_base_in_world`` follow by forward kinematics.
         gripper_open: (T,) bool, commands, see `gripper_open`.
     """
 
@@ -155,7 +150,6 @@ class Motion:
         """Compute the motion in datasets from recorded states, for all of them to the same bit.
 
         Args:
-            robot: of the states.
             robot_states: (S + 1, 37) after the reset and after each control step.
             gripper: (S,) commands in [-1, 1].
             samples: (T,) indices of states, from `sample_states`, or some of them in a row.
@@ -169,7 +163,6 @@ class Motion:
     def of_joints(
         cls, robot: RobotSpec, root_in_world: Array, qpos: Array, qvel: Array, opened: NDArray[np.bool_]
     ) -> Motion:
-        """Compute the motion of a robot from the attributes of these names."""
         return cls(qpos, qvel, root_in_world, *link_poses(robot, root_in_world, qpos), opened)
 
     @cached_property
@@ -189,7 +182,7 @@ class Motion:
 
     @cached_property
     def agv_pose(self) -> Array:
-        """(T, 3) mobile base in the world, see `planar_base`."""
+        """(T, 3), see `planar_base`."""
         return planar_base(self.root_in_world, self.qpos)
 
     @property

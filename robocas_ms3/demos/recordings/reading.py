@@ -33,7 +33,6 @@ class Recording(Entry):
     Attributes:
         actions: (S, A).
         states: ``{"actors": {name: (S+1, 13)}, "articulations": {name: (S+1, 13 + 2 joints)}}``.
-        robot: whose it is.
     """
 
     actions: NDArray[np.float32]
@@ -54,17 +53,13 @@ class TrajectoryFile:
     """An open trajectory file; use it in a ``with`` statement. ``pack`` (name or folder) replaces the named one.
 
     Attributes:
-        path: the HDF5 file.
         env_info: ``env_id``, ``env_kwargs``, ... of the JSON.
         env: the environment it was recorded in.
-        robot: that was recorded.
-        control_freq: Hz.
         versions: of the packages that it was made with.
         episodes: the JSON's entries.
     """
 
     def __init__(self, path: str | Path, *, pack: str | Path | None = None) -> None:
-        """Open both files and check that they belong together."""
         self.path = Path(path)
         metadata_path = self.path.with_suffix(".json")
         if self.path.is_dir():
@@ -102,15 +97,12 @@ class TrajectoryFile:
             )
 
     def __enter__(self) -> TrajectoryFile:
-        """Give itself: the file is open already."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close the file."""
         self.close()
 
     def close(self) -> None:
-        """Close the file."""
         self._file.close()
 
     def reopened(self) -> TrajectoryFile:

@@ -60,7 +60,7 @@ def reserved(path: Path, size: int) -> Iterator[h5py.File]:
 
 @contextmanager
 def readable(where: object, what: str = "this episode is damaged") -> Iterator[None]:
-    """Read of an HDF5 file."""
+    """Turn whatever h5py raises while a file is read into a ``DatasetError``."""
     try:
         yield
     except (OSError, KeyError, RuntimeError, AttributeError, ValueError, TypeError, MemoryError) as error:
@@ -68,7 +68,6 @@ def readable(where: object, what: str = "this episode is damaged") -> Iterator[N
 
 
 def open_trajectory(path: Path) -> h5py.File:
-    """Open an HDF5 trajectory for reading."""
     try:
         check_regular(path)
         return h5py.File(path, "r")
@@ -84,7 +83,7 @@ def open_trajectory(path: Path) -> h5py.File:
 
 
 def open_episode(file: h5py.File, number: int) -> h5py.Group:
-    """Find an episode of an open trajectory, and see that no link in it leads elsewhere."""
+    """Return an episode of an open trajectory; raise ``DatasetError`` where a link in it leads elsewhere."""
     name = f"traj_{number}"
     where = f"{file.filename}, {name}"
     astray: list[bytes] = []
@@ -105,7 +104,6 @@ def open_episode(file: h5py.File, number: int) -> h5py.Group:
 
 
 def copy_episode(source: h5py.File, number: int, target: h5py.File, new_number: int) -> None:
-    """Copy an episode to another trajectory."""
     group = open_episode(source, number)
     with readable(f"{source.filename}, traj_{number}"):
         group.visititems(lambda _, item: _check_own(item) if isinstance(item, h5py.Dataset) else None)
@@ -188,15 +186,10 @@ def _found(node: Any, deep: int) -> Any:
 
 
 def _read(found: Any) -> Any:
-    if (size := _size(found)) > _LIMIT:  # a few compressed bytes can say they are terabytes
+    size = sum(math.prod(array.shape) * array.dtype.itemsize for _, array in named_arrays(found))
+    if size > _LIMIT:  # a few compressed bytes can say they are terabytes
         raise ValueError(f"{size >> 20} MB of numbers, more than {_LIMIT >> 20}")
     return _values(found)
-
-
-def _size(found: Any) -> int:
-    if isinstance(found, dict):
-        return sum(map(_size, found.values()))
-    return math.prod(found.shape) * found.dtype.itemsize
 
 
 def _values(found: Any) -> Any:
@@ -220,7 +213,7 @@ def _leads_out(where: str, found: str) -> DatasetError:
 def merge(shards: list[Path], out: Path) -> None:
     """Merge trajectory files into one, episodes numbered in the order given; unknown keys of the JSON are kept.
 
-    The file is synced to disk before it gets its name, so a power cut leaves no half file.
+    It is synced to disk before it gets its name.
     """
     merged: dict[str, Any] = {}
     episodes: list[dict[str, Any]] = []

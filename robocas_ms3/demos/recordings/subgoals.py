@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import groupby
 from typing import Annotated, Any
 
@@ -15,63 +14,45 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.strict import parse
 
 
-@dataclass(frozen=True)
-class SubGoal:
-    """A part of an episode.
-
-    Attributes:
-        goal_type: one of ``GOAL_TYPES``.
-        goal_description: its text.
-        first, last: range of steps, inclusive.
-    """
-
-    goal_type: str
-    goal_description: str
-    first: int
-    last: int
-
-    def as_json(self) -> dict[str, Any]:
-        """Its form in trajectory files and in ``data_info.json``."""
-        return {
-            "goal_type": self.goal_type,
-            "goal_range": [self.first, self.last],
-            "goal_description": self.goal_description,
-        }
-
-
-class SubGoalRecord(BaseModel):
-    """A sub-goal in JSON; see `SubGoal.as_json`."""
+class SubGoal(BaseModel):
+    """A part of an episode, as trajectory files and ``data_info.json`` have it: ``goal_range`` includes both ends."""
 
     model_config = ConfigDict(strict=True, extra="allow", frozen=True)
 
     goal_type: str
-    goal_description: str
     goal_range: Annotated[list[NonNegativeInt], Field(min_length=2, max_length=2)]
+    goal_description: str
+
+    @classmethod
+    def of(cls, goal_type: str, goal_description: str, first: int, last: int) -> SubGoal:
+        return cls(goal_type=goal_type, goal_range=[first, last], goal_description=goal_description)
+
+    @property
+    def first(self) -> int:
+        return self.goal_range[0]
+
+    @property
+    def last(self) -> int:
+        return self.goal_range[1]
 
     @model_validator(mode="after")
-    def _is_range(self) -> SubGoalRecord:
-        first, last = self.goal_range
-        if first > last:
+    def _is_range(self) -> SubGoal:
+        if self.first > self.last:
             raise ValueError(f"goal_range: expected [first, last], found {self.goal_range}")
         return self
 
 
-class SubGoalsRecord(BaseModel):
+class SubGoals(BaseModel):
     """What has sub-goals in JSON."""
 
     model_config = ConfigDict(strict=True, extra="allow", frozen=True)
 
-    subgoals: list[SubGoalRecord]
-
-    @property
-    def goals(self) -> list[SubGoal]:
-        """The sub-goals."""
-        return [SubGoal(goal.goal_type, goal.goal_description, *goal.goal_range) for goal in self.subgoals]
+    subgoals: list[SubGoal]
 
 
 def read_subgoals(entries: Any, where: object) -> list[SubGoal]:
-    """Read sub-goals from their JSON, a list of `SubGoal.as_json`."""
-    return parse(SubGoalsRecord, {"subgoals": entries}, DatasetError, where=where, about="damaged sub-goals").goals
+    """Read sub-goals from a list of JSON."""
+    return parse(SubGoals, {"subgoals": entries}, DatasetError, where=where, about="damaged sub-goals").subgoals
 
 
 def sample_subgoals(subgoals: Sequence[SubGoal], samples: NDArray[np.int64]) -> list[SubGoal]:
@@ -83,7 +64,7 @@ def sample_subgoals(subgoals: Sequence[SubGoal], samples: NDArray[np.int64]) -> 
     actions = int(samples[-1])
     expected_first = 0
     for goal in subgoals:
-        if goal.first != expected_first or goal.last < goal.first:
+        if goal.first != expected_first:
             break
         expected_first = goal.last + 1
     if expected_first != actions:
@@ -91,14 +72,14 @@ def sample_subgoals(subgoals: Sequence[SubGoal], samples: NDArray[np.int64]) -> 
             "sub-goals do not cover the actions one after the other",
             where="subgoals",
             expected=f"ranges from 0 to {actions - 1}",
-            found=[[goal.first, goal.last] for goal in subgoals],
+            found=[goal.goal_range for goal in subgoals],
         )
     owner = np.searchsorted([goal.first for goal in subgoals], np.minimum(samples, actions - 1), side="right") - 1
     result = []
     for index, goal in enumerate(subgoals):
         steps = np.flatnonzero(owner == index)
         if len(steps):
-            result.append(SubGoal(goal.goal_type, goal.goal_description, int(steps[0]), int(steps[-1])))
+            result.append(SubGoal.of(goal.goal_type, goal.goal_description, int(steps[0]), int(steps[-1])))
     return result
 
 
@@ -107,5 +88,5 @@ def subgoal_runs(types: Sequence[str], texts: Sequence[str]) -> list[SubGoal]:
     goals: list[SubGoal] = []
     for (kind, text), steps in groupby(range(len(types)), key=lambda step: (types[step], texts[step])):
         inside = list(steps)
-        goals.append(SubGoal(kind, text, inside[0], inside[-1]))
+        goals.append(SubGoal.of(kind, text, inside[0], inside[-1]))
     return goals

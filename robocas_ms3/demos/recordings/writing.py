@@ -43,7 +43,6 @@ class EpisodeRecorder(gym.Wrapper):
         versions()  # here, where it is kept, and not in each branch
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Reset the environment and begin anew."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._reset_kwargs = copy.deepcopy({"options": options} if seed is None else {"options": options, "seed": seed})
         self._steps = _Steps()
@@ -57,7 +56,6 @@ class EpisodeRecorder(gym.Wrapper):
         self._keep(self._base_env.get_obs())
 
     def step(self, action: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Step the environment and keep what came of it."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._steps.actions.append(np.array(action, np.float32).reshape(-1))
         self._steps.flags.append((bool(terminated), bool(truncated), bool(info["success"]), bool(info["fail"])))
@@ -146,7 +144,6 @@ def _of_one_env(data: Any) -> Any:
 
 
 def _stacked(steps: list[Any]) -> Any:
-    """Stack equal nested dicts of arrays along a new first axis."""
     if isinstance(steps[0], dict):
         return {key: _stacked([step[key] for step in steps]) for key in steps[0]}
     return np.stack(steps)

@@ -72,7 +72,7 @@ def arrays_of(tcp, base, *, qpos=None, subgoals=None, embed=None):
     qpos = np.zeros((count, 12)) if qpos is None else qpos
     root = np.broadcast_to(np.eye(4), (count, 4, 4))
     motion = Motion(qpos, np.zeros((count, 12)), root, tcp, base, np.ones(count, bool))
-    subgoals = subgoals or [SubGoal("move and grasp", "grasp it", 0, count - 1)]
+    subgoals = subgoals or [SubGoal.of("move and grasp", "grasp it", 0, count - 1)]
     arrays = episode_arrays(motion, "do it", subgoals)
     return with_embeddings(arrays, embed) if embed else arrays
 
@@ -93,7 +93,7 @@ def test_relative_motion_is_in_the_frame_of_the_hand():
 def test_arrays_have_the_declared_types_and_shapes():
     poses = np.broadcast_to(np.eye(4), (5, 4, 4))
     qpos = np.arange(60.0).reshape(5, 12)
-    goals = [SubGoal("move and grasp", "grasp it", 0, 1), SubGoal("transfer object", "drop it", 2, 4)]
+    goals = [SubGoal.of("move and grasp", "grasp it", 0, 1), SubGoal.of("transfer object", "drop it", 2, 4)]
     arrays = arrays_of(poses, poses, qpos=qpos, subgoals=goals, embed=lambda texts: np.ones((len(texts), 384)))
     assert list(arrays) == [spec.name for spec in EPISODE_INFO]
     for spec in EPISODE_INFO:
@@ -140,7 +140,7 @@ def test_strides():
 
 
 def test_a_step_belongs_to_the_action_that_leaves_it():
-    goals = [SubGoal("move and grasp", "a", 0, 4), SubGoal("transfer object", "b", 5, 9)]
+    goals = [SubGoal.of("move and grasp", "a", 0, 4), SubGoal.of("transfer object", "b", 5, 9)]
     # States 0, 4 precede actions 0, 4 of the first goal; 8 and the end belong to the second.
     assert [(g.goal_type, g.first, g.last) for g in sample_subgoals(goals, sample_states(10, 4))] == [
         ("move and grasp", 0, 1),
@@ -150,9 +150,9 @@ def test_a_step_belongs_to_the_action_that_leaves_it():
 
 def test_a_sub_goal_between_two_samples_is_left_out():
     goals = [
-        SubGoal("move and grasp", "a", 0, 4),
-        SubGoal("lift object", "b", 5, 7),
-        SubGoal("transfer object", "c", 8, 9),
+        SubGoal.of("move and grasp", "a", 0, 4),
+        SubGoal.of("lift object", "b", 5, 7),
+        SubGoal.of("transfer object", "c", 8, 9),
     ]
     sampled = sample_subgoals(goals, sample_states(10, 4))
     assert [(g.goal_description, g.first, g.last) for g in sampled] == [("a", 0, 1), ("c", 2, 3)]
@@ -163,7 +163,7 @@ def test_a_sub_goal_between_two_samples_is_left_out():
 def test_sampled_sub_goals_cover_all_steps(lengths, stride):
     firsts = np.concatenate([[0], np.cumsum(lengths)])
     goals = [
-        SubGoal("move and grasp", str(i), int(a), int(b) - 1)
+        SubGoal.of("move and grasp", str(i), int(a), int(b) - 1)
         for i, (a, b) in enumerate(zip(firsts[:-1], firsts[1:], strict=True))
     ]
     samples = sample_states(sum(lengths), stride)
@@ -173,7 +173,7 @@ def test_sampled_sub_goals_cover_all_steps(lengths, stride):
 
 @pytest.mark.parametrize("ranges", [[(0, 4), (6, 9)], [(1, 9)], [(0, 8)], [(0, 12)], [(0, 5), (4, 9)], []])
 def test_sub_goals_with_gaps_are_refused(ranges):
-    goals = [SubGoal("move and grasp", "a", first, last) for first, last in ranges]
+    goals = [SubGoal.of("move and grasp", "a", first, last) for first, last in ranges]
     with pytest.raises(DatasetError, match="ranges from 0 to 9"):
         sample_subgoals(goals, sample_states(10, 4))
 
