@@ -10,7 +10,7 @@ from robocas_ms3.core.errors import EvaluationError, ExtensionError
 from robocas_ms3.evaluation.policies import make_policy, open_policy
 from robocas_ms3.evaluation.policies.plain import StillPolicy
 from robocas_ms3.evaluation.policies.scripted import OFFSETS, offset
-from robocas_ms3.evaluation.policy import EpisodeSpec, PolicySpec, describe, policy_spec_values
+from robocas_ms3.evaluation.policy import CONVENTIONS, EpisodeSpec, PolicySpec, describe, policy_spec_values
 
 GOOD = """
 import numpy as np
@@ -123,3 +123,32 @@ def test_offsets_follow_from_the_seed():
     assert np.ptp(lengths) > 0.9 * (OFFSETS[1] - OFFSETS[0])
     assert set(zip(*np.sign(drawn).T, strict=True)) == {(1, 1), (1, -1), (-1, 1), (-1, -1)}
     assert np.array_equal(offset(7), drawn[7])
+
+
+QUARTER = np.pi / 2
+SAID = {  # 1, 2, 3 cm, then a quarter turn about z; gripper open, then shut
+    "robocas": ([0.01, 0.02, 0.03, 0, 0, QUARTER], 1.0, 0.5),
+    "delta_euler": ([0.01, 0.02, 0.03, 0, 0, QUARTER], 0.1, -0.1),
+    "delta_axis_angle": ([0.01, 0.02, 0.03, 0, 0, QUARTER], 1.0, 0.0),
+    "delta_quaternion": ([0.01, 0.02, 0.03, 2.0, 0, 0, 2.0], 0.2, -1.0),  # of any length
+}
+
+
+@pytest.mark.parametrize("name", SAID)
+def test_a_motion_is_read(name):
+    numbers, opened, shut = SAID[name]
+    convention = CONVENTIONS[name]
+    assert len(numbers) + 1 == convention.size
+    assert convention.read is not None
+    motion = convention.read(np.array([[*numbers, opened], [*numbers, shut]]))
+    np.testing.assert_allclose(motion.translation, [[0.01, 0.02, 0.03]] * 2)
+    np.testing.assert_allclose(motion.rotation.apply([1.0, 0, 0]), [[0, 1.0, 0]] * 2, atol=1e-12)
+    assert motion.open.tolist() == [True, False]
+
+
+def test_euler_angles_are_about_fixed_axes_x_first_and_a_quaternion_of_zeros_is_no_turn():
+    euler, quaternion = (CONVENTIONS[name].read for name in ("robocas", "delta_quaternion"))
+    assert euler is not None and quaternion is not None
+    turn = euler(np.array([[0, 0, 0, QUARTER, 0, QUARTER, 1.0]])).rotation
+    np.testing.assert_allclose(turn.apply([[0, 1.0, 0]]), [[0, 0, 1.0]], atol=1e-12)  # up by x, then z leaves it
+    assert quaternion(np.zeros((1, 8))).rotation.magnitude() == pytest.approx(0)

@@ -20,19 +20,15 @@ def start(folder, run=RUN_OF, new=(), **options):
         return list(done)
 
 
-def test_what_is_appended_is_read(tmp_path):
+def test_what_is_appended_is_read_and_a_line_that_was_cut_is_written_over(tmp_path):
     start(tmp_path / "a", new=[outcome(3), outcome(1)])
     assert read(tmp_path / "a").outcomes == {1: outcome(1), 3: outcome(3)}
     assert read(tmp_path / "a").run == RunRecord.of(RUN_OF, "")
-
-
-def test_a_line_that_was_cut_is_dropped_and_written_over(tmp_path):
-    write(tmp_path / "a", [outcome(0), outcome(1)])
     path = tmp_path / "a" / OUTCOMES
     path.write_bytes(path.read_bytes()[:-20])
-    assert list(read(tmp_path / "a").outcomes) == [0]
-    assert start(tmp_path / "a", new=[outcome(2)]) == [0]
-    assert list(read(tmp_path / "a").outcomes) == [0, 2]
+    assert list(read(tmp_path / "a").outcomes) == [3]
+    assert start(tmp_path / "a", new=[outcome(2)]) == [3]
+    assert list(read(tmp_path / "a").outcomes) == [2, 3]
 
 
 def test_a_damaged_line_is_an_error_with_its_number(tmp_path):
@@ -73,12 +69,24 @@ def test_a_result_from_before_there_was_a_weld_is_one_without_it(tmp_path):
         start(tmp_path / "a", {**RUN_OF, "weld": True})
 
 
-def test_parts_are_read_as_one_whatever_the_clock_and_the_machine(tmp_path):
-    write(tmp_path / "a", [outcome(2), outcome(0)])
-    write(tmp_path / "b", [outcome(1), outcome(2, inference_ms=9.0)], machine={"processor": "arm64"})
-    both = read(tmp_path / "a", tmp_path / "b")
-    assert both.outcomes == {0: outcome(0), 1: outcome(1), 2: outcome(2)}
-    assert [part.episodes for part in both.run.parts] == [2, 2]
+def test_parts_are_merged_whatever_the_clock_and_the_machine(tmp_path):
+    """A whole number stays one."""
+    counts = {"path_length": 1.0, "fallen": 3, "disturbed_most": 0}
+    write(tmp_path / "a", [outcome(0, measures=counts, seconds=40, p_vis=1, inference_ms=2, flag_seconds={"fail": 5})])
+    write(
+        tmp_path / "b",
+        [outcome(1), outcome(0, measures=counts, seconds=40, p_vis=1, flag_seconds={"fail": 5})],
+        machine={"processor": "arm64"},
+    )
+    both = merge([tmp_path / "a", tmp_path / "b"], tmp_path / "c")
+    assert list(both.outcomes) == [0, 1]
+    assert [part.episodes for part in both.run.parts] == [1, 2]
+    first, second, merged = ((tmp_path / name / OUTCOMES).read_text() for name in "abc")
+    assert merged == first + second.splitlines(keepends=True)[0]
+    assert '"fallen": 3,' in merged
+    assert start(tmp_path / "c") == [0, 1]
+    with pytest.raises(OutputExistsError):
+        merge([tmp_path / "a", tmp_path / "b"], tmp_path / "c")
 
 
 def test_parts_that_disagree_are_refused(tmp_path):
@@ -119,20 +127,6 @@ def test_what_was_played_twice_is_two_results(tmp_path):
         write(tmp_path / name, [outcome(number) for number in numbers])
     folders = [tmp_path / name for name in "abc"]
     assert parts_of(folders) == [folders[:2], folders[2:]]
-
-
-def test_merged_parts_say_what_they_said(tmp_path):
-    """A whole number stays one."""
-    counts = {"path_length": 1.0, "fallen": 3, "disturbed_most": 0}
-    write(tmp_path / "a", [outcome(0, measures=counts, seconds=40, p_vis=1, inference_ms=2, flag_seconds={"fail": 5})])
-    write(tmp_path / "b", [outcome(1)])
-    merge([tmp_path / "a", tmp_path / "b"], tmp_path / "c")
-    lines = [(tmp_path / name / OUTCOMES).read_text() for name in "abc"]
-    assert lines[2] == lines[0] + lines[1]
-    assert '"fallen": 3,' in lines[2]
-    assert start(tmp_path / "c") == [0, 1]
-    with pytest.raises(OutputExistsError):
-        merge([tmp_path / "a", tmp_path / "b"], tmp_path / "c")
 
 
 @pytest.mark.parametrize(

@@ -65,8 +65,5 @@ def test_every_step_of_two_envs_is_what_a_dataset_holds():
     turns = np.stack([one["agent_pos"] for one in read[0]])
     assert np.ptp(turns[:, 17]) > 2 * np.pi  # it went round
     assert (np.sum(turns[1:, 3:7] * turns[:-1, 3:7], axis=1) >= 0).all()
-
-
-def test_all_state_columns_of_a_dataset_are_there():
-    columns = {one.key: one.width for one in FEATURES if one.key.startswith("observation.")}
-    assert {KEYS[name]: width for name, width in WIDTHS.items()} == columns
+    widths = {one.key: one.width for one in FEATURES if one.key.startswith("observation.")}
+    assert {KEYS[name]: width for name, width in WIDTHS.items()} == widths  # all state columns of a dataset

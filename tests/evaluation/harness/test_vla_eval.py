@@ -70,10 +70,18 @@ def test_a_task_is_a_configuration_and_its_episodes_are_the_protocols(benchmark,
     assert [env.seeds for env in made] == [[110000, 110001]] * 4
 
 
-def test_what_a_result_says(benchmark):
+def test_what_is_observed_and_what_a_result_says(benchmark):
     recorder = Recorder()
     task = {**benchmark.get_tasks()[0], "episode_idx": 0}
-    metrics = asyncio.run(play(benchmark, task, recorder=recorder))["metrics"]
+    played = asyncio.run(play(benchmark, task, recorder=recorder))
+    seen, metrics = played["seen"], played["metrics"]
+    assert [one["images"]["base_camera"].max() for one in seen] == [0, 1, 2, 3, 4]
+    assert seen[0]["images"]["base_camera"].shape == (4, 6, 3)
+    state = seen[0]["state"]
+    assert state.dtype == np.float32
+    np.testing.assert_allclose(state[7:14], [13, 14, 15, 16, 17, 18, 19])  # arm joints 3 to 9
+    assert state[14] == 41  # the fingers, 20 and 21
+    np.testing.assert_allclose(state[15:], [0, 0, 0], atol=1e-5)  # base in the world, not its joints 10, 11, 12
     assert metrics["success"] is metrics["success_at_end"] is metrics["reached_any"] is True
     assert metrics["success_v0"] is metrics["fail"] is False
     assert (metrics["failure_stage"], metrics["seconds"], metrics["path_length"]) == ("", 1.0, 5.0)
@@ -87,30 +95,15 @@ def test_what_a_result_says(benchmark):
     assert [frame is None or int(frame.max()) for frame in recorder.frames] == [0, 1, 2, 3, 4, True]
 
 
-def test_what_is_seen(benchmark):
-    seen = asyncio.run(play(benchmark, {**benchmark.get_tasks()[0], "episode_idx": 0}))["seen"]
-    assert [one["images"]["base_camera"].max() for one in seen] == [0, 1, 2, 3, 4]
-    assert seen[0]["images"]["base_camera"].shape == (4, 6, 3)
-    state = seen[0]["state"]
-    np.testing.assert_allclose(state[7:14], [13, 14, 15, 16, 17, 18, 19])  # arm joints 3 to 9
-    assert state[14] == 41  # the fingers, 20 and 21
-    np.testing.assert_allclose(state[15:], [0, 0, 0], atol=1e-5)  # base in the world, not its joints 10, 11, 12
-    assert seen[0]["state"].dtype == np.float32
-
-
-def test_an_episode_that_the_run_cuts_short_is_no_result(benchmark):
+def test_episodes_cut_short_or_that_the_protocol_lacks_and_mode_live_are_refused(benchmark):
     task = {**benchmark.get_tasks()[0], "episode_idx": 0}
     with pytest.raises(EvaluationError, match="Leave max_steps out"):
         asyncio.run(play(benchmark, task, max_steps=4))
     assert asyncio.run(play(benchmark, task, max_steps=5))["metrics"]["success"]
-
-
-def test_more_episodes_than_the_protocol_has_and_mode_live_are_refused(benchmark):
+    with pytest.raises(EvaluationError, match="expected episodes_per_task: 2 at most, found 3"):
+        asyncio.run(play(benchmark, {**task, "episode_idx": 2}))
     with pytest.raises(NotImplementedError, match="mode sync"):
         benchmark.get_hold_action(None)
-    task = {**benchmark.get_tasks()[0], "episode_idx": 2}
-    with pytest.raises(EvaluationError, match="expected episodes_per_task: 2 at most, found 3"):
-        asyncio.run(play(benchmark, task))
 
 
 @pytest.mark.parametrize("actions", [None, np.zeros(6), [float("nan")] * 7, [1e9] * 7])
@@ -123,16 +116,7 @@ def test_an_action_that_is_none_fails_its_episode_alone(benchmark, actions, monk
     assert asyncio.run(play(benchmark, task))["metrics"]["steps"] == 5
 
 
-@pytest.mark.parametrize(
-    ("params", "words"),
-    [
-        ({"protocol": "smok"}, "smoke"),
-        ({"convention": "euler"}, "convention"),
-        ({"cameras": {"wrist": [4, 4]}}, "cameras"),
-        ({"rate_hz": 7}, "divisor of 100"),
-        ({"protocol": "paper-v1", "convention": "joint_positions"}, "none of this protocol's"),
-    ],
-)
-def test_parameters_that_are_none(params, words):
-    with pytest.raises(EvaluationError, match=words):
+@pytest.mark.parametrize("params", [{"protocol": "smok"}, {"convention": "euler"}, {"cameras": {"wrist": [4, 4]}}])
+def test_parameters_that_do_not_exist_are_refused(params):
+    with pytest.raises(EvaluationError):
         RoboCAS(**params)
