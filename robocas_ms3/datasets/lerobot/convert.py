@@ -35,7 +35,7 @@ from robocas_ms3.datasets.writing.inputs import ConversionInput, open_input
 from robocas_ms3.datasets.writing.plan import LEFT_OUT, with_versions
 from robocas_ms3.datasets.writing.settings import Conversion, ConversionSettings, WrittenEpisode
 from robocas_ms3.datasets.writing.workers import WriteJob, write_episodes
-from robocas_ms3.demos.recordings.entries import versions
+from robocas_ms3.demos.recordings.entries import one_seed, versions
 
 FILE_LIMITS = FileLimits()
 _PARTS, _JOINED = ".parts", ".joined"  # the finished episodes; the dataset that is being made of them
@@ -80,20 +80,20 @@ def convert_lerobot(
     check_video_size(settings.pictures.size)
     start, variant, out = time.perf_counter(), find_variant(settings.lerobot_version), settings.out
     settings = replace(settings, boxes=variant.language)
+    written: list[WrittenEpisode] = []
     with closing(open_input(settings)) as given:
         plan = _plan(given, settings.codec, variant)
         recorded_settings = {key: plan[key] for key in ("settings", "made_with")}
         with OutputFolder(out, _OUTPUT, recorded_settings, overwrite=settings.overwrite) as output:
             _check_episodes(output, plan)  # everything that may fail comes before the output is touched
             settings.check_device()
-            written: list[WrittenEpisode] = []
             if output.recorded is None or not (out / INFO_FILE).is_file():
                 output.start(plan)
                 for name in (_JOINED, *_FOLDERS):  # left half joined by a conversion that was killed
                     if os.path.lexists(out / name):
                         remove(out / name)
                 sweep(out / _PARTS)
-                job = _missing_parts(settings, variant, len(plan["episodes"]), plan)
+                job = _missing_parts(settings, variant, plan["episodes"])
                 if on_start:
                     on_start(len(job.tasks))
                 written, incomplete = write_episodes(job, output, on_episode)
@@ -101,7 +101,8 @@ def convert_lerobot(
                     raise incomplete
                 if incomplete:
                     _log.warning("%s", incomplete)
-                plan = _join(out, plan, incomplete)
+                    plan = _without_missing(plan, out / _PARTS, incomplete)
+                _join(out, plan)
             for name in (_PARTS, _JOINED):
                 shutil.rmtree(out / name, ignore_errors=True)
     return Conversion(written, len(plan["episodes"]) - len(written), time.perf_counter() - start)
@@ -112,7 +113,7 @@ def _plan(given: ConversionInput, codec: str, variant: Variant) -> dict[str, Any
     entries, pictures = given.entries(), given.pictures
     place = {entry["source"]: i for i, entry in enumerate(entries)}
     before_train, before_val = ([place[n] for n in side if n in place] for side in given.source.settled_split())
-    seeds = {i: i if e["seed"] is None else _seed(e["seed"]) for i, e in enumerate(entries)}
+    seeds = {i: i if entry["seed"] is None else one_seed(entry["seed"]) for i, entry in enumerate(entries)}
     train, val = split_by_seed(seeds, (before_train, before_val))
     plan = {
         "format": "lerobot",
@@ -130,10 +131,6 @@ def _plan(given: ConversionInput, codec: str, variant: Variant) -> dict[str, Any
         "episodes": entries,
     }
     return json.loads(json.dumps(plan))
-
-
-def _seed(seed: Any) -> int:
-    return int(seed[0] if isinstance(seed, list) else seed)
 
 
 def _check_episodes(output: OutputFolder, plan: Mapping[str, Any]) -> None:
@@ -158,39 +155,42 @@ def _is_same(before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
     return all(before.get(key) == now[key] for key in keys)
 
 
-def _missing_parts(settings: ConversionSettings, variant: Variant, count: int, plan: Mapping[str, Any]) -> WriteJob:
+def _missing_parts(settings: ConversionSettings, variant: Variant, episodes: list[dict[str, Any]]) -> WriteJob:
     """Return the parts that are missing; damaged ones are removed."""
     from robocas_ms3.datasets.lerobot.parts import Part, PartWriter
 
-    parts = settings.out / _PARTS
-    folders = [parts / episode_folder(index) for index in range(count)]
-    for folder in folders:
+    writer = PartWriter(settings.out / _PARTS, settings.codec, variant)
+    missing = []
+    for number, entry in enumerate(episodes):
+        folder = writer.folder(number)
         if folder.is_dir() and not Part(folder).is_whole:
             _log.warning("%s: damaged since it was written; it is written again", folder)
             shutil.rmtree(folder)
-    missing = [(i, plan["episodes"][i]["source"]) for i, folder in enumerate(folders) if not folder.is_dir()]
-    return WriteJob(settings, PartWriter(parts, settings.codec, variant), missing, len(missing) < count, _FIX)
+        if not folder.is_dir():
+            missing.append((number, entry["source"]))
+    return WriteJob(settings, writer, missing, len(missing) < len(episodes), _FIX)
 
 
-def _join(out: Path, plan: dict[str, Any], incomplete: IncompleteError | None) -> dict[str, Any]:
-    """Make the dataset of the parts that are there; return the plan of those."""
+def _without_missing(plan: dict[str, Any], parts: Path, incomplete: IncompleteError) -> dict[str, Any]:
+    """Return the plan of the parts that are there; the other episodes are in ``left_out``, with the reason."""
+    episodes = list(enumerate(plan["episodes"]))
+    there = [number for number, _ in episodes if (parts / episode_folder(number)).is_dir()]
+    place = {number: new for new, number in enumerate(there)}
+    sides = {side: [place[number] for number in plan[side] if number in place] for side in ("train_eps", "val_eps")}
+    reasons = incomplete.reasons
+    left_out = [{**entry, "why": reasons.get(episode_folder(n))} for n, entry in episodes if n not in place]
+    return {**plan, **sides, "episodes": [entry for n, entry in episodes if n in place], LEFT_OUT: left_out}
+
+
+def _join(out: Path, plan: Mapping[str, Any]) -> None:
+    """Make the dataset of all parts that are there."""
     from robocas_ms3.datasets.lerobot.writer import join_parts
 
-    folders = {index: out / _PARTS / episode_folder(index) for index in range(len(plan["episodes"]))}
-    if incomplete:
-        why = {index: incomplete.reasons.get(folder.name) for index, folder in folders.items()}
-        folders = {index: folder for index, folder in folders.items() if folder.is_dir()}
-        place = {index: new for new, index in enumerate(folders)}
-        sides = {side: [place[i] for i in plan[side] if i in place] for side in ("train_eps", "val_eps")}
-        episodes = list(enumerate(plan["episodes"]))
-        left_out = [{**entry, "why": why[i]} for i, entry in episodes if i not in place]
-        plan = {**plan, **sides, "episodes": [entry for i, entry in episodes if i in place], LEFT_OUT: left_out}
     joined = make_folder(out / _JOINED)
     with naming(joined):
-        join_parts(list(folders.values()), plan, joined, FILE_LIMITS)
+        join_parts(sorted((out / _PARTS).glob("episode_*")), plan, joined, FILE_LIMITS)
         flush_to_disk(joined)  # before the parts go
     for name in _FOLDERS:
         if (joined / name).is_dir():
             os.replace(joined / name, out / name)
     joined.rmdir()
-    return plan

@@ -49,13 +49,7 @@ EVENTS_TYPE = pa.list_(pa.struct([*_TEXTS, _CAMERA, _TOOL_CALLS]))
 
 
 def persistent_rows(goals: Sequence[SubGoal], instructions: Iterable[str], fps: int) -> list[Row]:
-    """Return the persistent rows of an episode, in LeRobot's order.
-
-    Args:
-        goals: sub-goals over the frames.
-        instructions: texts that mean the same; repeated ones are left out.
-        fps: frames per second.
-    """
+    """Return the persistent rows of an episode, in LeRobot's order; repeated instructions are left out."""
     rows = [_row("user", text, "task_aug", timestamp=0.0) for text in dict.fromkeys(instructions)]
     starts = [(goal, float(np.float32(goal.first / fps))) for goal in goals]
     rows += [_row("assistant", goal.goal_description, "subtask", timestamp=start) for goal, start in starts]
@@ -63,12 +57,7 @@ def persistent_rows(goals: Sequence[SubGoal], instructions: Iterable[str], fps: 
 
 
 def event_rows(boxes: Mapping[str, Box], target: str) -> list[Row]:
-    """Return the event rows of a frame, in LeRobot's order: a question and its answer per camera that sees the target.
-
-    Args:
-        boxes: of the target, by camera.
-        target: name of the object, "sugar box".
-    """
+    """Return the event rows of a frame, in LeRobot's order: question and answer per camera that sees the target."""
     question = f"Where {'are' if is_plural(target) else 'is'} the {target}?"
     rows = []
     for camera, box in boxes.items():
@@ -89,15 +78,8 @@ def _row(role: str, content: str, style: str, *, timestamp: float | None = None,
 def paraphrases(scene: Mapping[str, Any], text: str) -> list[str]:
     """Return the instruction and its paraphrases in plain names: one per template of the split ``train``.
 
-    Templates of the split ``held_out`` are for evaluation and are never used.
-
-    Args:
-        scene: content of ``scene.json``; where it does not say what the instruction was made of, there are no
-            paraphrases.
-        text: the instruction.
-
-    Returns:
-        Texts, the instruction first; empty where there is no paraphrase.
+    Templates of the split ``held_out`` are for evaluation and are never used. Where ``scene.json`` does not say what
+    the instruction was made of, the list is empty.
     """
     known, _ = valid_values(scene)
     task, target, recorded = known.get("task"), known.get("target") or {}, known.get("recorded") or {}
@@ -116,13 +98,7 @@ def paraphrases(scene: Mapping[str, Any], text: str) -> list[str]:
 
 
 def goals_of(rows: Sequence[Row], count: int, fps: int) -> list[str]:
-    """Return the text of the sub-goal of each frame; empty before the first.
-
-    Args:
-        rows: persistent rows of the episode.
-        count: number of frames.
-        fps: frames per second.
-    """
+    """Return the text of the sub-goal of each frame, from persistent rows; empty before the first."""
     starts = sorted((row["timestamp"], row["content"] or "") for row in rows if row["style"] == "subtask")
     times = (np.arange(count) + 0.5) / fps
     places = np.searchsorted([time for time, _ in starts], times, side="right") - 1

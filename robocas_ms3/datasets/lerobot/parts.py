@@ -19,7 +19,6 @@ from robocas_ms3.core.documents import JSON_LIMIT, read_text
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.arrays import frame_columns
-from robocas_ms3.datasets.lerobot.depth import to_levels
 from robocas_ms3.datasets.lerobot.language import (
     EVENTS,
     EVENTS_TYPE,
@@ -32,7 +31,7 @@ from robocas_ms3.datasets.lerobot.records import CameraRecord
 from robocas_ms3.datasets.lerobot.stats import Levels
 from robocas_ms3.datasets.lerobot.tables import as_column
 from robocas_ms3.datasets.lerobot.variants import Variant
-from robocas_ms3.datasets.lerobot.video import Encoder, coding_of
+from robocas_ms3.datasets.lerobot.video import Encoder, coding_of, to_levels
 from robocas_ms3.datasets.pictures.stored import Box
 from robocas_ms3.datasets.schema import episode_folder
 from robocas_ms3.datasets.sources.protocol import Frame, Kind

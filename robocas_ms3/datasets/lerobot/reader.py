@@ -19,12 +19,11 @@ from robocas_ms3.core.strict import parse
 from robocas_ms3.core.words import one_line
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.arrays import robocas_arrays
-from robocas_ms3.datasets.lerobot.depth import to_depth
 from robocas_ms3.datasets.lerobot.language import EVENTS, PERSISTENT, boxes_of, goals_of, read_rows_of
 from robocas_ms3.datasets.lerobot.metadata import Metadata
 from robocas_ms3.datasets.lerobot.records import CameraRecord, CamerasRecord, frame_columns
 from robocas_ms3.datasets.lerobot.tables import check_columns, is_numeric, numbers, read_rows
-from robocas_ms3.datasets.lerobot.video import read_frames
+from robocas_ms3.datasets.lerobot.video import read_frames, to_depth
 from robocas_ms3.datasets.pictures.stored import Box
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 from robocas_ms3.datasets.sources.protocol import EpisodeSource, Kind, Side, SourceEpisode

@@ -15,7 +15,7 @@ from typing import Any
 from robocas_ms3.core.documents import check_regular
 from robocas_ms3.core.errors import DatasetError, MissingExtraError
 from robocas_ms3.datasets.lerobot.variants import Variant
-from robocas_ms3.robots.quantities import STATE, Quantity, columns_of
+from robocas_ms3.robots.quantities import STATE, columns_of
 from robocas_ms3.robots.quantities import features as quantities_of_features
 from robocas_ms3.robots.table import DEFAULT
 
@@ -54,63 +54,41 @@ class FileLimits:
 
 @dataclass(frozen=True)
 class Feature:
-    """One column of the data.
-
-    Attributes:
-        key: its name.
-        names: of its numbers; a single one makes a column of numbers, not of lists.
-        meaning: for people.
-        dtype: of LeRobot.
-    """
+    """One column of the data; without names, or with a single one, of numbers, not of lists."""
 
     key: str
-    names: tuple[str, ...]
-    meaning: str
+    names: tuple[str, ...] = ()
     dtype: str = "float32"
 
     @property
     def width(self) -> int:
-        """Number of numbers."""
-        return len(self.names)
+        return len(self.names) or 1
 
     def as_json(self) -> dict[str, Any]:
-        """Return its entry in ``info.json``."""
-        return {"dtype": self.dtype, "shape": [self.width], "names": list(self.names)}
+        return {"dtype": self.dtype, "shape": [self.width], "names": list(self.names) or None}
 
 
 _JOINTS = tuple(f"joint_{number}" for number in range(1, 8))
-
-
-def _observation(key: str, quantities: Sequence[Quantity]) -> Feature:
-    names = tuple(name for quantity in quantities for name in quantity.names)
-    return Feature(key, names, ", ".join(f"{one.name} ({one.width}, {one.unit or 'bool'})" for one in quantities))
-
-
 FEATURES: tuple[Feature, ...] = (
-    *(_observation(key, quantities) for key, quantities in quantities_of_features().items()),
-    Feature(
-        "action",
-        ("dx", "dy", "dz", "roll", "pitch", "yaw", "gripper_open"),
-        "rel_pos (3, m); rel_orn as Euler angles xyz about fixed axes (3, rad); gripper commanded until the next step,"
-        " gripper_status[t + 1], the last one repeated, 1 = open",
+    *(
+        Feature(key, tuple(name for quantity in quantities for name in quantity.names))
+        for key, quantities in quantities_of_features().items()
     ),
-    Feature(
-        "action.joint",
-        (*_JOINTS, "gripper_open"),
-        "robot_joints at the next step (7, rad), the last one repeated; gripper as in action",
-    ),
-    Feature("action.base", ("dx", "dy", "dyaw"), "rel_agv_pose (m, m, rad)"),
+    # rel_pos; rel_orn as Euler angles xyz about fixed axes; the gripper's command of the next step, 1 = open
+    Feature("action", ("dx", "dy", "dz", "roll", "pitch", "yaw", "gripper_open")),
+    Feature("action.joint", (*_JOINTS, "gripper_open")),  # joints at the next step, the last repeated
+    Feature("action.base", ("dx", "dy", "dyaw")),  # rel_agv_pose
 )
-"""Numeric features. The keys in their meanings are those of ``episode_info.npz``."""
+"""Numeric features, see docs/lerobot.md."""
 
 OUR_KEYS = tuple(feature.key for feature in FEATURES)
 """A dataset with these keys was written here."""
 
-SUBGOAL_TYPE = Feature("subgoal_type", ("type",), "type of the sub-goal pursued at this step", "string")
-SUBTASK_INDEX = Feature("subtask_index", ("index",), "row of meta/subtasks.parquet: text of that sub-goal", "int64")
-REWARD = Feature("next.reward", ("reward",), "1 in the last frame of a successful episode, else 0")
-SUCCESS = Feature("next.success", ("success",), "whether it is the last frame of a successful episode", "bool")
-DONE = Feature("next.done", ("done",), "whether it is the last frame of the episode", "bool")
+SUBGOAL_TYPE = Feature("subgoal_type", dtype="string")
+SUBTASK_INDEX = Feature("subtask_index", dtype="int64")  # row of meta/subtasks.parquet: text of the sub-goal
+REWARD = Feature("next.reward")
+SUCCESS = Feature("next.success", dtype="bool")
+DONE = Feature("next.done", dtype="bool")
 OUTCOME = (REWARD, SUCCESS, DONE)
 LANGUAGE_COLUMNS = ("language_persistent", "language_events")
 INDICES = ("timestamp", "frame_index", "episode_index", "index", "task_index")
@@ -123,22 +101,18 @@ MAX_DEPTH_MM = 4095
 
 
 def image_key(camera: str) -> str:
-    """Return the name of a camera's feature."""
     return f"observation.images.{camera}"
 
 
 def depth_key(camera: str) -> str:
-    """Return the name of a camera's native depth feature."""
     return f"{image_key(camera)}_depth"
 
 
 def camera_of(key: str) -> str:
-    """Return the camera of a feature."""
     return key.removeprefix("observation.images.")
 
 
 def is_depth(feature: dict[str, Any]) -> bool:
-    """Return whether a feature of ``info.json`` is a depth video."""
     info = feature.get("info") or {}
     return info.get("is_depth_map") is True or info.get("video.is_depth_map") is True
 
@@ -152,24 +126,14 @@ def robot_type(scene: dict[str, Any]) -> str:
 
 
 def features_json(variant: Variant, videos: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """Return ``features`` of ``info.json``.
-
-    Args:
-        variant: what is written.
-        videos: key of the feature -> description from `video.packet_times`.
-    """
+    """Return ``features`` of ``info.json``; ``videos``: key -> description from `video.packet_times`."""
     features = {feature.key: feature.as_json() for feature in FEATURES}
     for key, video in videos.items():
         shape = [video["video.height"], video["video.width"], video["video.channels"]]
         features[key] = {"dtype": "video", "shape": shape, "names": ["height", "width", "channels"], "info": video}
-    for feature in single_features(variant):
-        features[feature.key] = {**feature.as_json(), "names": None}
-    if variant.language:
-        features |= {key: {"dtype": "language", "shape": [1], "names": None} for key in LANGUAGE_COLUMNS}
-    for key in INDICES:
-        dtype = "float32" if key == "timestamp" else "int64"
-        features[key] = {"dtype": dtype, "shape": [1], "names": None}
-    return features
+    language = [Feature(key, dtype="language") for key in LANGUAGE_COLUMNS] if variant.language else []
+    indices = [Feature(key, dtype="float32" if key == "timestamp" else "int64") for key in INDICES]
+    return features | {feature.key: feature.as_json() for feature in (*single_features(variant), *language, *indices)}
 
 
 def single_features(variant: Variant) -> tuple[Feature, ...]:
@@ -193,11 +157,7 @@ def modality_json(cameras: Sequence[str]) -> dict[str, Any]:
 
 
 def whole_rate(rate_hz: float) -> int:
-    """Return the frames per second of LeRobot.
-
-    Raises:
-        DatasetError: the rate is not a whole number.
-    """
+    """Return the frames per second of LeRobot, or raise DatasetError if the rate is not a whole number."""
     if rate_hz < 1 or abs(rate_hz - round(rate_hz)) > 1e-9:
         what, expected = "LeRobot takes a whole number of frames a second", "1, 2, 4, 5, ..."
         raise DatasetError(what, where="rate", expected=expected, found=rate_hz)
@@ -205,22 +165,14 @@ def whole_rate(rate_hz: float) -> int:
 
 
 def check_video_size(size: tuple[int, int] | None) -> None:
-    """Check width and height in pixels; None is the size of the cameras.
-
-    Raises:
-        DatasetError: one is odd, which the codecs can't encode.
-    """
+    """Raise DatasetError for an odd width or height, which the codecs can't encode; None is the cameras' size."""
     if size is not None and (size[0] % 2 or size[1] % 2):
         expected, found = "even width and height", f"{size[0]} x {size[1]}"
         raise DatasetError("videos need even sizes", where="size", expected=expected, found=found)
 
 
 def require_extra() -> None:
-    """Check that pyarrow and PyAV are installed.
-
-    Raises:
-        MissingExtraError: one is not.
-    """
+    """Raise MissingExtraError unless pyarrow and PyAV are installed."""
     missing = [name for name in ("pyarrow", "av") if importlib.util.find_spec(name) is None]
     if missing:
         fix = 'In the clone: pip install -e ".[lerobot]"'
@@ -240,8 +192,3 @@ def checksum(path: Path) -> str:
         while block := file.read(2**20):
             digest.update(block)
     return digest.hexdigest()
-
-
-def content_files(root: Path) -> list[Path]:
-    """Return the files of data, videos and depth, sorted."""
-    return sorted(path for name in CONTENT for path in (root / name).rglob("*") if path.is_file())

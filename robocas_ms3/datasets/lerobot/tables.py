@@ -66,12 +66,8 @@ def faults(table: pa.Table, columns: Mapping[str, Column]) -> Iterator[tuple[str
 def open_table(path: Path, *, most_rows: float = np.inf) -> Iterator[pq.ParquetFile]:
     """Open a Parquet file; texts are read as dictionaries, so that a repeated one takes no memory.
 
-    Args:
-        path: of the file.
-        most_rows: more are refused.
-
     Raises:
-        DatasetError: the file is missing, damaged or too long, or two columns have the same name. Errors of Arrow
+        DatasetError: the file is missing, damaged or has more rows, or two columns have the same name. Errors of Arrow
             inside of the ``with`` statement are of the same kind.
     """
     try:
@@ -105,16 +101,10 @@ def read_columns(
     groups: Sequence[int] | None = None,
     limit: int = _ARRAYS_LIMIT,
 ) -> pa.Table:
-    """Read columns of a file from `open_table`, those that are there.
-
-    Args:
-        file, path: the file.
-        columns: to read; None: all.
-        groups: row groups to read; None: all.
-        limit: bytes that the values may have.
+    """Read columns of a file from `open_table`, those that are there; by default all, of all row groups.
 
     Raises:
-        DatasetError: the columns are too large.
+        DatasetError: the values have more bytes than ``limit``.
     """
     footer = file.metadata
     groups = range(footer.num_row_groups) if groups is None else groups
@@ -145,11 +135,7 @@ def read_objects(path: Path, columns: Mapping[str, Column], *, most_rows: float 
 
 
 def check_columns(table: pa.Table, columns: Mapping[str, Column], path: Path) -> None:
-    """Refuse a table in which a column is missing or holds other values than declared.
-
-    Raises:
-        DatasetError: for the first such column.
-    """
+    """Raise DatasetError for the first column that is missing or holds other values than declared."""
     for key, expected, found in faults(table, columns):
         what = "wrong column of a table"
         raise DatasetError(what, where=f"{path}, {key}", expected=expected, found=found, fix=SEE_VALIDATE)
@@ -189,18 +175,14 @@ def _text_bytes(values: pa.ChunkedArray | pa.Array) -> int:
 
 
 def numbers(values: pa.ChunkedArray | pa.Array) -> NDArray:
-    """Return a column as an array: (T, D) of lists of D numbers, (T, 1) of numbers.
-
-    Raises:
-        DatasetError: the column holds something else, or lists of different lengths.
-    """
+    """Return a column as an array: (T, D) of lists of D numbers, (T, 1) of numbers; else raise DatasetError."""
     whole = values.combine_chunks() if isinstance(values, pa.ChunkedArray) else values
     if not is_numeric(whole.type):
         raise DatasetError("no column of numbers", expected=NUMBERS, found=whole.type)
     if not len(whole):
         return np.zeros((0, 1))
     flat = whole
-    while not (pa.types.is_primitive(flat.type)):
+    while not pa.types.is_primitive(flat.type):
         flat = flat.flatten()
     if len(flat) % len(whole):
         raise DatasetError("no column of numbers", expected="lists of one length", found=f"{len(flat)} numbers in all")

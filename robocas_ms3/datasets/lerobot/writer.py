@@ -19,14 +19,13 @@ from numpy.typing import NDArray
 from robocas_ms3.core.files import write_json
 from robocas_ms3.core.words import count_of
 from robocas_ms3.datasets.lerobot import schema
-from robocas_ms3.datasets.lerobot.depth import DEPTH_INFO
 from robocas_ms3.datasets.lerobot.language import EVENTS, EVENTS_TYPE, PERSISTENT, PERSISTENT_TYPE, Row
 from robocas_ms3.datasets.lerobot.parts import FRAMES_FILE, SUBGOAL, EpisodeRecord, Part, video_name
 from robocas_ms3.datasets.lerobot.schema import FileLimits
 from robocas_ms3.datasets.lerobot.stats import Levels, Stats, vector_stats
 from robocas_ms3.datasets.lerobot.tables import as_column, numbers, write_texts
 from robocas_ms3.datasets.lerobot.variants import CHUNK_FILES, Variant, find_variant
-from robocas_ms3.datasets.lerobot.video import Joiner, packet_times
+from robocas_ms3.datasets.lerobot.video import DEPTH_INFO, Joiner, packet_times
 from robocas_ms3.datasets.sources.protocol import Kind
 
 _GROUP = 64  # episodes per row group of the tables about episodes
@@ -34,14 +33,7 @@ _log = logging.getLogger(__name__)
 
 
 def join_parts(folders: Sequence[Path], plan: Mapping[str, Any], root: Path, limits: FileLimits) -> None:
-    """Write a dataset from all parts of a plan, one part in memory at a time.
-
-    Args:
-        folders: of the parts.
-        plan: content of ``conversion.json``.
-        root: an empty folder.
-        limits: of the sizes of files.
-    """
+    """Write a dataset into an empty folder from all parts of a plan, the content of ``conversion.json``."""
     writer = LeRobotWriter(root, plan, limits, Part(folders[0]).record)
     with writer:
         for folder, entry in zip(folders, plan["episodes"], strict=True):
@@ -50,12 +42,7 @@ def join_parts(folders: Sequence[Path], plan: Mapping[str, Any], root: Path, lim
 
 
 class LeRobotWriter:
-    """Writes episodes, and at the end what ``meta`` says of all of them.
-
-    Args:
-        root, plan, limits: see `join_parts`.
-        first: the first episode, which has the cameras and the robot of all.
-    """
+    """Writes episodes, and at the end what ``meta`` says of all; cameras and robot are those of the first."""
 
     def __init__(self, root: Path, plan: Mapping[str, Any], limits: FileLimits, first: EpisodeRecord) -> None:
         self._root, self._plan, self._limits, self._first = root, plan, limits, first
@@ -184,10 +171,7 @@ class LeRobotWriter:
     def _stage_rows(self, index: int, persistent: list[Row], events: list[list[Row]], times: list[float]) -> None:
         """Write language rows where ``lerobot-annotate`` looks for rows to keep; it removes all others.
 
-        Args:
-            index: of the episode.
-            persistent, events: rows of the episode, and of each frame.
-            times: of the frames, s, float32 as in the table: LeRobot compares them exactly.
+        Times are s, float32 as in the table: LeRobot compares them exactly.
         """
         folder = self._root / schema.STAGING / f"episode_{index:06d}"
         timed = ({**row, "timestamp": time} for rows, time in zip(events, times, strict=True) for row in rows)
@@ -212,7 +196,8 @@ class LeRobotWriter:
         write_json(root / schema.STATS_FILE, stats | {key: found.stats() for key, found in self._levels.items()})
         write_json(root / schema.INFO_FILE, self._info())
         write_json(root / schema.CONVERSION_FILE, self._plan)
-        sums = {str(path.relative_to(root)): schema.checksum(path) for path in schema.content_files(root)}
+        files = sorted(path for name in schema.CONTENT for path in (root / name).rglob("*") if path.is_file())
+        sums = {str(path.relative_to(root)): schema.checksum(path) for path in files}
         write_json(root / schema.CHECKSUMS_FILE, sums)
 
     def _info(self) -> dict[str, Any]:
@@ -250,14 +235,7 @@ class LeRobotWriter:
 
 @dataclass(frozen=True)
 class _Stream:
-    """The videos of a camera.
-
-    Attributes:
-        kind: of images.
-        prefix: of the columns of ``meta/episodes``.
-        part_name: of the video of a part.
-        joiner: writes them.
-    """
+    """The videos of a camera; ``prefix`` is that of the columns of ``meta/episodes``."""
 
     kind: Kind
     prefix: str

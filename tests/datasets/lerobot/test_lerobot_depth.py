@@ -7,9 +7,8 @@ pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
-from robocas_ms3.datasets.lerobot.depth import DEPTH_INFO, to_depth, to_levels
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
-from robocas_ms3.datasets.lerobot.video import CODINGS, Encoder, read_frames
+from robocas_ms3.datasets.lerobot.video import CODINGS, DEPTH_INFO, Encoder, read_frames, to_depth, to_levels
 from robocas_ms3.datasets.writing.settings import ConversionSettings
 
 
