@@ -67,8 +67,6 @@ def robot_files(finger_extension: float = c.finger_extension) -> RobotFiles:
     Raises:
         RobocasError: mani_skill's Panda is not where it should be, or the cache can't be written to.
     """
-    if finger_extension < 0:
-        raise RobocasError("negative finger extension", expected=">= 0 m", found=finger_extension)
     source = _panda_folder()
     folder = cache_dir() / "robots" / _fingerprint(source, finger_extension)
     files = RobotFiles(

@@ -1,6 +1,5 @@
 """The description agrees with the robot that is built from it, and with itself."""
 
-import xml.etree.ElementTree as ET
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +10,6 @@ from robocas_ms3.core.errors import ExtensionError, RobocasError
 from robocas_ms3.robots.cameras import CameraSpec
 from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.table import DEFAULT, PANDA, ROBOTS, find_robot
-from robocas_ms3.robots.urdf import robot_files
 
 
 def test_positions_are_where_the_slices_say():
@@ -21,13 +19,6 @@ def test_positions_are_where_the_slices_say():
     assert joints[MOBILE_PANDA.finger_slice].tolist() == list(MOBILE_PANDA.finger_joints)
     limits = MOBILE_PANDA.base_limits + MOBILE_PANDA.arm_limits + MOBILE_PANDA.finger_limits
     assert len(limits) == len(joints) == 12
-
-
-def test_its_links_are_the_robots():
-    links = {link.get("name") for link in ET.parse(robot_files().urdf).getroot().iterfind("link")}
-    own = MOBILE_PANDA
-    assert {own.base_link, own.arm_base_link, own.hand_link, own.tcp_link, *own.arm_links, *own.finger_links} <= links
-    assert own.base_link != own.arm_base_link
 
 
 def test_grasps_are_annotated_for_a_gripper_as_wide():

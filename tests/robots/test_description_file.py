@@ -80,10 +80,3 @@ def test_a_malformed_file_is_an_error(write, old, new):
     assert str(caught.value.expected)
     assert str(caught.value.found)
     assert caught.value.fix
-
-
-def test_read_joints_returns_a_tuple_of_the_same_joints(write):
-    path = write(ARM)
-    joints = read_joints(path, "base", "lower")
-    assert isinstance(joints, tuple)
-    assert read_joints(path, "base", "lower") == joints

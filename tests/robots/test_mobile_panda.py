@@ -44,12 +44,6 @@ def test_observation_of_the_robot(make_env):
     assert rotation == pytest.approx(expected[:3, :3], abs=1e-5)
 
 
-def test_keyframes_are_the_references():
-    rest, evaluation = (RoboCASMobilePanda.keyframes[name].qpos for name in ("rest", "evaluation"))
-    assert rest == pytest.approx([0, 0, 0, 0, -1.02, 0, -2.51, 0, 1.35, 0.78, 0.04, 0.04])
-    assert evaluation[3:10] == pytest.approx([-0.0276, 0.1581, 0, -1.8899, -0.0688, 2.7705, 0.7514])
-
-
 def test_stock_fingers_are_a_second_robot(make_env):
     _, agent = make_env(robot=RoboCASMobilePandaStockFingers.uid)
     distance = agent.tcp.pose.p - agent.robot.links_map["panda_hand"].pose.p

@@ -11,7 +11,6 @@ import pytest
 from robot_checks import link_poses, numbers
 
 import robocas_ms3.robots
-from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.planning.collision import FclWorld
 from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.urdf import robot_files
@@ -33,30 +32,12 @@ def output(process: subprocess.Popen) -> str:
     return out.strip()
 
 
-def test_active_joints_have_the_reference_order_and_limits():
-    joints = [j for j in ET.parse(robot_files().urdf).getroot().iterfind("joint") if j.get("type") != "fixed"]
-    limits = {j.get("name"): (float(j.find("limit").get("lower")), float(j.find("limit").get("upper"))) for j in joints}
-    assert set(limits) == set(MOBILE_PANDA.joints)
-    assert [j.get("name") for j in joints][:3] == list(MOBILE_PANDA.base_joints)
-    expected = MOBILE_PANDA.base_limits + MOBILE_PANDA.arm_limits + MOBILE_PANDA.finger_limits
-    for name, limit in zip(MOBILE_PANDA.joints, expected, strict=True):
-        assert limits[name] == pytest.approx(limit, abs=1e-9), name
-    assert MOBILE_PANDA.base_limits[2] == pytest.approx((-3.14159265, 1.57079633))
-    assert {j.get("name"): j.get("type") for j in joints}["base_yaw_joint"] == "revolute"
-
-
 def test_heights_above_the_floor():
     poses = link_poses(robot_files().urdf, REST)
     assert poses["base_link"][2, 3] == pytest.approx(0.26)
     assert poses["panda_link0"][:3, 3] == pytest.approx([0, 0, 0.49])
     # The evaluation start holds the TCP 0.29 m above the 0.61 m table, which is why the base link stands 0.26 m high.
     assert link_poses(robot_files().urdf, EVALUATION)["panda_hand_tcp"][2, 3] - 0.61 == pytest.approx(0.287, abs=2e-3)
-
-
-def test_base_joints_move_x_then_y_then_turn():
-    poses = link_poses(robot_files().urdf, dict(base_x_joint=0.3, base_y_joint=-0.2, base_yaw_joint=np.pi / 2))
-    assert poses["base_link"][:3, 3] == pytest.approx([0.3, -0.2, 0.26])
-    assert poses["base_link"][:3, 0] == pytest.approx([0, 1, 0], abs=1e-9)
 
 
 @pytest.mark.parametrize(("extension", "distance"), [(0.03, 0.1334), (0.0, 0.1034)])
@@ -147,19 +128,6 @@ def test_two_processes_at_once(tmp_path):
     assert first == second
     assert Path(first).is_file()
     assert len(list((tmp_path / "robots").iterdir())) == 1
-
-
-def test_unusable_cache_is_a_one_line_error(tmp_path, monkeypatch):
-    (tmp_path / "file").write_text("")
-    monkeypatch.setenv("ROBOCAS_CACHE", str(tmp_path / "file"))
-    with pytest.raises(RobocasError, match="can't make this folder") as error:
-        robot_files()
-    assert "\n" not in str(error.value)
-
-
-def test_negative_extension_is_an_error():
-    with pytest.raises(RobocasError, match=r"expected >= 0 m, found -0.01"):
-        robot_files(-0.01)
 
 
 def test_imports_write_nothing_and_the_urdf_needs_no_sapien(tmp_path):
