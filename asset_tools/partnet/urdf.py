@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -84,12 +84,6 @@ class Mobility:
     links: list[MovingLink]
     joints: frozenset[str]
     repairs: tuple[str, ...] = ()
-
-    def visuals(self) -> Iterator[Visual]:
-        """Yield all shapes."""
-        yield from self.body
-        for link in self.links:
-            yield from link.visuals
 
 
 @dataclass(frozen=True)

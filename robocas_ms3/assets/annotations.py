@@ -80,11 +80,7 @@ class Annotations:
 
     @classmethod
     def load(cls, path: Path) -> Annotations:
-        """Read ``annotations.npz``.
-
-        Raises:
-            AssetError: it is damaged, or an array is missing or has the wrong type or shape.
-        """
+        """Read ``annotations.npz``."""
         try:
             with open_arrays(path) as file:
                 arrays = {f.name: file[f.name] for f in fields(cls)}

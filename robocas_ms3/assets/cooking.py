@@ -65,13 +65,7 @@ class CookingFault:
 
 
 def cooking_faults(folder: Path) -> list[CookingFault]:
-    """Cook all hulls in a pack's folder for CPU and GPU; return those that shrink or can't be built.
-
-    Boxes are not cooked, in simulation neither. Cooking for a GPU needs no GPU, but a process of its own.
-
-    Raises:
-        AssetError: a file of hulls can't be read, or the process died.
-    """
+    """Cook all hulls in a pack's folder, but boxes, for CPU and GPU; return those that shrink or can't be built."""
     named: list[tuple[str, int, Array]] = []
     for path in sorted(folder.rglob(HULLS)):
         name = path.parent.relative_to(folder).as_posix()

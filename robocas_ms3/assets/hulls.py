@@ -39,11 +39,7 @@ class Box:
 
 
 def read_hulls(path: Path) -> list[Hull]:
-    """Read ``hulls.obj``: an ``o`` group per hull, triangles only.
-
-    Raises:
-        AssetError: the file is damaged, or holds no hull.
-    """
+    """Read ``hulls.obj``: an ``o`` group per hull, triangles only."""
     vertices: list[list[float]] = []
     groups: list[list[list[int]]] = []
     try:
@@ -85,11 +81,7 @@ def write_hulls(path: Path, hulls: Sequence[Array]) -> None:
 
 
 def convex_faces(points: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Return vertices (V, 3) and outward triangles (F, 3) of the convex hull of points (P, 3).
-
-    Raises:
-        AssetError: the points lie in a plane.
-    """
+    """Return vertices (V, 3) and outward triangles (F, 3) of the convex hull of points (P, 3)."""
     try:
         hull = ConvexHull(points)
     except (QhullError, ValueError) as error:

@@ -25,12 +25,7 @@ def joint_motion(joint: Joint, position: float) -> Array:
 
 
 def link_poses(links: Sequence[Link], positions: Mapping[str, float]) -> dict[str, Array]:
-    """Return poses 4x4 of the links in the furniture's frame; identities where all joints are at 0.
-
-    Args:
-        links: parents first.
-        positions: of the joints by name, m or rad; those not named are at 0.
-    """
+    """Return poses 4x4 of links, parents first, in the furniture's frame; joints that are not named are at 0."""
     poses: dict[str, Array] = {}
     for link in links:
         above = poses[link.parent] if link.parent else np.eye(4)

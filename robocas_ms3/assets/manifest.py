@@ -69,11 +69,7 @@ Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
 def check_asset_name(name: str, where: object) -> None:
-    """Check that a name can be that of an asset, a link or a finish, which are folders and files of a pack.
-
-    Raises:
-        AssetError: it can't.
-    """
+    """Check that a name can be that of an asset, a link or a finish, which are folders and files of a pack."""
     if re.fullmatch("[a-z0-9_]+", name) is None or len(name) > LONGEST:
         expected = f"1 to {LONGEST} small letters, digits and underscores"
         raise AssetError("this name can't be used in a pack", where=where, expected=expected, found=repr(name)[:80])

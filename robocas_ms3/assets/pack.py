@@ -98,11 +98,7 @@ class LoadedFurniture(Part):
         return np.concatenate([self.surface_points(), *links])
 
     def finish(self, part: str, name: str) -> Path:
-        """Return the textured mesh (GLB) of a part in one of its finishes.
-
-        Raises:
-            AssetError: there is no such part or finish.
-        """
+        """Return the textured mesh (GLB) of a part in one of its finishes."""
         found = self.asset.finishes.get(part, ())
         if name not in found:
             what = f"{self.asset.id}: no such finish of {part!r}"
@@ -161,11 +157,7 @@ def load_pack(name_or_path: str | Path) -> Pack:
 
 
 def verify(pack: Pack) -> None:
-    """Check that the files of all assets are those the manifest lists. A file is read once per process and change.
-
-    Raises:
-        AssetError: naming the file, and whether it is missing, cut short, changed or not listed.
-    """
+    """Check that the files of all assets are those the manifest lists. A file is read once per process and change."""
     for asset in pack.manifest.assets:
         folder = pack.root / asset.id
         for name in _files(str(folder)):
@@ -187,12 +179,7 @@ def verify(pack: Pack) -> None:
 
 
 def sha256(path: Path) -> str:
-    """Return the hash of a file, from memory if its size and time of change are those of the last call.
-
-    Raises:
-        DocumentError: the file is not regular or is too large.
-        OSError: the file cannot be read.
-    """
+    """Return the hash of a file, from memory if its size and time of change are those of the last call."""
     check_regular(path, _FILE_LIMIT)
     status = path.stat()
     key = (str(path), status.st_size, status.st_mtime_ns)

@@ -63,11 +63,7 @@ def new_scene(time_step: float = TIME_STEP) -> sapien.Scene:
 
 
 def add_body(scene: sapien.Scene, solid: Solid, pose: Array) -> physx.PhysxRigidDynamicComponent:
-    """Add a free body at a pose (4, 4) of its frame in the world.
-
-    Raises:
-        AssetError: the engine makes no shape of a hull.
-    """
+    """Add a free body at a pose (4, 4) of its frame in the world."""
     material = physx.PhysxMaterial(solid.friction, solid.friction, 0.0)
     free = physx.PhysxRigidDynamicComponent()
     try:
@@ -114,32 +110,20 @@ def places(count: int) -> Array:
 
 
 def shape_of(vertices: Array, material: physx.PhysxMaterial) -> physx.PhysxCollisionShape:
-    """Return the shape of a convex hull of points (V, 3); a box, which is exact and fast, if they are its corners.
-
-    Raises:
-        RuntimeError: the engine makes no hull of them.
-    """
+    """Return the shape of a convex hull of points (V, 3); a box, which is exact and fast, if they are its corners."""
     box = box_of(vertices)
     return cook(vertices, material) if box is None else _box_shape(box, material)
 
 
 def cook(vertices: Array, material: physx.PhysxMaterial) -> physx.PhysxCollisionShapeConvexMesh:
-    """Return the engine's convex mesh of points (V, 3); it may leave some out (`cooking`).
-
-    Raises:
-        RuntimeError: the engine makes no hull of them.
-    """
+    """Return the engine's convex mesh of points (V, 3); it may leave some out (`cooking`)."""
     return physx.PhysxCollisionShapeConvexMesh(
         vertices=np.asarray(vertices, np.float32), scale=[1, 1, 1], material=material
     )
 
 
 def shapes_of(part: Part, material: physx.PhysxMaterial) -> list[physx.PhysxCollisionShape]:
-    """Return the shapes of all hulls of an asset; bodies made of one file share the engine's meshes.
-
-    Raises:
-        AssetError: the engine makes no shape of a hull.
-    """
+    """Return the shapes of all hulls of an asset; bodies made of one file share the engine's meshes."""
     boxes = [box_of(hull) for hull in part.hulls]
     # a file of boxes is not cooked: the engine rejects slender ones on a GPU
     loaded = [] if all(boxes) else _load(part.hulls_path, material)

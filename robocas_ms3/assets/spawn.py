@@ -67,11 +67,7 @@ def spawn_articulation(
     pose: sapien.Pose,
     level: VisualLevel = "fast",
 ) -> Articulation:
-    """Build furniture with moving parts, its body fixed in the world, its joints at 0. Arguments as in `spawn`.
-
-    Raises:
-        AssetError: the physics engine refused a hull.
-    """
+    """Build furniture with moving parts, its body fixed in the world, its joints at 0. Arguments as in `spawn`."""
     builder: Any = scene.create_articulation_builder()
     facts = asset.asset
     root = builder.create_link_builder()

@@ -60,15 +60,7 @@ def next_keys(poses: Array, opened: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def decode(rows: NDArray[np.floating], tcp: NDArray[np.floating]) -> tuple[Array, NDArray[np.float64]]:
-    """Return the poses of chunks in the arm's base, and gripper commands.
-
-    Args:
-        rows: (..., 10).
-        tcp: (4, 4) or (..., 4, 4) present pose of the TCP in the arm's base.
-
-    Returns:
-        (..., 4, 4) and (...,) commands, 1 = open, as predicted.
-    """
+    """Return poses (..., 4, 4) in the arm's base, and commands, of rows (..., 10) seen from a TCP's pose there."""
     rows = np.asarray(rows, np.float64)
     first = rows[..., 3:6] / np.maximum(np.linalg.norm(rows[..., 3:6], axis=-1, keepdims=True), 1e-9)
     second = rows[..., 6:9] - (first * rows[..., 6:9]).sum(-1, keepdims=True) * first

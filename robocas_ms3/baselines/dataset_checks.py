@@ -38,11 +38,7 @@ class DatasetNeeds:
 
 
 def check_dataset(source: EpisodeSource, numbers: Sequence[int], needs: DatasetNeeds) -> None:
-    """Check cameras, embeddings, rate, the frame of the actions, and that the base stands in some episodes.
-
-    Raises:
-        DatasetError: one does not suit the baseline.
-    """
+    """Check cameras, embeddings, rate, the frame of the actions, and that the base stands in some episodes."""
     if any(camera not in source.cameras for camera in needs.cameras):
         raise DatasetError(
             f"the dataset lacks a camera of {needs.baseline}",
@@ -75,15 +71,7 @@ def check_dataset(source: EpisodeSource, numbers: Sequence[int], needs: DatasetN
 
 
 def check_base_stands(motion: NDArray[np.floating], where: object) -> None:
-    """Check that the base stands throughout an episode: actions of 7 numbers leave its motion out.
-
-    Args:
-        motion: (T, 3) its ``rel_agv_pose``: x and y in m and yaw in rad, from step to step.
-        where: for messages.
-
-    Raises:
-        DatasetError: it drives, in one step or slowly.
-    """
+    """Check that a base stands, of motions (T, 3) in m, m and rad per step: actions of 7 numbers leave it out."""
     path = np.cumsum(motion, axis=0, dtype=np.float64)
     furthest = float(np.abs(np.concatenate([motion, path])).max(initial=0))
     if not furthest <= _MAX_BASE_MOTION:  # NaN is refused too

@@ -48,12 +48,7 @@ BASELINES: Registry[Callable[[], Baseline]] = Registry(
 
 
 def find_baseline(name: str, *, where: object = "") -> Baseline:
-    """Return the baseline of a name.
-
-    Raises:
-        TrainingError: there is none.
-        MissingExtraError: the ``train`` extra is not installed.
-    """
+    """Return the baseline of a name."""
     if name not in BASELINES:
         from robocas_ms3.core.strict import nearest  # imports pydantic, which `robocas --help` does not need
 
@@ -66,11 +61,7 @@ def find_baseline(name: str, *, where: object = "") -> Baseline:
 
 
 def need_extra(*modules: str) -> None:
-    """Check that modules of the ``train`` extra are installed.
-
-    Raises:
-        MissingExtraError: one is missing.
-    """
+    """Check that modules of the ``train`` extra are installed."""
     for module in modules:
         try:
             import_module(module)

@@ -160,11 +160,7 @@ class MobileManipulator(BaseAgent):
         self.base_link: Link = links[robot.base_link]
 
     def reset(self, init_qpos: Any = None) -> None:
-        """Stop the robot and, given a configuration, put it there, drive targets included.
-
-        Args:
-            init_qpos: (12,) or (N, 12) for the environments being reset; None leaves the robot where it is.
-        """
+        """Stop the robot and, given a configuration (12,) or (N, 12), put it there, drive targets included."""
         super().reset(init_qpos)
         self._still()
         if init_qpos is not None:
@@ -237,16 +233,7 @@ class MobileManipulator(BaseAgent):
         return self.robot.get_qpos()[:, self.description.finger_slice].sum(dim=1)
 
     def is_grasping(self, object: Actor, min_force: float = 0.5, max_angle: float = 85) -> torch.Tensor:
-        """Say whether both fingers press on an object.
-
-        Args:
-            object: the actor.
-            min_force: N, for each finger.
-            max_angle: degrees between a finger's opening direction and the contact force on it.
-
-        Returns:
-            (N,) bool.
-        """
+        """Return whether (N,) both fingers press on an object, by N and degrees from the way they open."""
         grasping = None
         for link, side in ((self.finger1_link, 1.0), (self.finger2_link, -1.0)):
             force = self.scene.get_pairwise_contact_forces(link, object)

@@ -153,13 +153,7 @@ def link_poses(spec: RobotSpec, root_in_world: Array, qpos: Array) -> tuple[Arra
 
 
 def chain(urdf: Path, root: str, tip: str, positions: Array) -> Array:
-    """Return poses (T, 4, 4) of a link in another one.
-
-    Args:
-        urdf: the robot.
-        root, tip: links.
-        positions: (T, n) m or rad of the n moving joints between them, from the root on.
-    """
+    """Return poses (T, 4, 4) of a link in another one, at positions (T, n) of the moving joints between."""
     pose = np.tile(np.eye(4), (len(positions), 1, 1))
     columns = iter(np.asarray(positions, np.float64).T)
     for joint in read_joints(urdf, root, tip):

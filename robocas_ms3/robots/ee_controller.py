@@ -76,15 +76,7 @@ class _ArmChainController(PDEEPoseController):
         self._lower, self._upper = limits[:, 0], limits[:, 1]
 
     def _solve(self, target: Any, qpos: Any) -> tuple[Any, Any]:
-        """Solve inverse kinematics within the joint limits.
-
-        Args:
-            target: (N, 7) poses of the end effector in the arm's base frame, native.
-            qpos: (N, joints) where the arm is, rad, native.
-
-        Returns:
-            (N, joints) float32 positions, and (N,) whether they reach the poses, native.
-        """
+        """Return arm positions (N, joints) near ``qpos`` for targets (N, 7), and whether (N,) they reach them."""
         target = as_double(target)
         qpos, solved = self._chain.inverse(target[:, :3], target[:, 3:], as_double(qpos), self._lower, self._upper)
         return as_float(qpos), solved
@@ -106,12 +98,7 @@ class RoboCASEEPoseController(EvenDrives, _ArmChainController):
         return self._middle + self._half * join([position, rotation])
 
     def _wanted_pose(self, reference: Any, action: Any) -> Any:
-        """(N, 7) the target in the arm's base frame, native.
-
-        Args:
-            reference: (N, 7) the pose that deltas refer to; None where actions are poses.
-            action: (N, 6) scaled: m and rad.
-        """
+        """Return targets (N, 7) in the arm's base frame of actions (N, 6), m and rad, relative to a pose or not."""
         if reference is not None:
             return join([*ee_delta_target(reference[:, :3], reference[:, 3:], action)])
         return join([action[:, :3], rotations.from_euler(action[:, 3:6])])

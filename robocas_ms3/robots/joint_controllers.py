@@ -164,12 +164,7 @@ class RobotController(CombinedController):
         return found
 
     def set_targets(self, state: State | None = None, env_idx: torch.Tensor | None = None) -> None:
-        """Let the next actions start from targets, and without these from where the joints are.
-
-        Args:
-            state: of `targets`, a row for each env that is set.
-            env_idx: of these envs; default: all.
-        """
+        """Let the next actions of envs start from targets (`targets`), and without these from where the joints are."""
         envs = slice(None) if env_idx is None else env_idx
         for name, controller in self.controllers.items():
             part, given = cast("Any", controller), (state or {}).get(name, {})

@@ -67,14 +67,7 @@ class SerialChain:
         self._angles, self._shift, self._weights, self._constant, self._quotient, self._identity = constants
 
     def forward(self, qpos: Array) -> tuple[Array, Array]:
-        """Return the pose of the tip in the root's frame.
-
-        Args:
-            qpos: (N, n) rad.
-
-        Returns:
-            Positions (N, 3), m, and unit quaternions wxyz (N, 4), of either sign.
-        """
+        """Return positions (N, 3), m, and quaternions wxyz (N, 4), of either sign, of the tip at (N, n) rad."""
         frames = self._frames(qpos)
         return frames[-1, 0, :, :3, 3], frames[-1, 1, :, :, 0]
 

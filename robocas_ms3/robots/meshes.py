@@ -19,16 +19,7 @@ Box = tuple[Sequence[float], Sequence[float], Sequence[float]]
 
 
 def decimate_glb(source: Path, target: Path, triangles: int) -> int:
-    """Write a decimated copy of a GLB, each submesh keeping its material.
-
-    Args:
-        source: the GLB to read.
-        target: the GLB to write.
-        triangles: wanted number of triangles of the whole file; each submesh gets its share.
-
-    Returns:
-        Triangles written.
-    """
+    """Write a copy of a GLB with about so many triangles, each submesh with its material; return their number."""
     scene = trimesh.load(source, force="scene")
     assert isinstance(scene, trimesh.Scene)
     total = sum(len(g.faces) for g in scene.geometry.values())

@@ -263,15 +263,7 @@ def _write(root: Element, path: Path) -> None:
 
 
 def made_once(folder: Path, make: Callable[[Path], None]) -> None:
-    """Make a folder unless it is there and complete; of several processes one makes it, and the others wait.
-
-    Args:
-        folder: its name says all that the files are made from.
-        make: writes them into an empty folder.
-
-    Raises:
-        OSError: it can't be written; nothing is left of it.
-    """
+    """Make a folder, named by all that it is made from, unless it is complete; other processes wait."""
     if _is_complete(folder):
         return
     make_folder(folder.parent)

@@ -89,11 +89,7 @@ class PpoPolicy:
         pass
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
-        """Return actions (E, 7).
-
-        Raises:
-            EvaluationError: the scenes hold another number of objects than those of the training.
-        """
+        """Return actions (E, 7)."""
         assert observations.state is not None
         width = observations.robot[GRIPPER_WIDTH]
         obs = join_observation(observations.qpos, observations.tcp_in_base, width, observations.state)

@@ -228,13 +228,7 @@ def steps_per_env(config: PpoConfig) -> int:
 
 
 def advantages(deltas: torch.Tensor, truncated: torch.Tensor, decay: float) -> torch.Tensor:
-    """Return generalised advantages (T, N) (Schulman et al. 2016).
-
-    Args:
-        deltas: (T, N) temporal differences.
-        truncated: (T, N) whether the episode ended after the step.
-        decay: discount times lambda.
-    """
+    """Return generalised advantages (T, N) of temporal differences; decay: gamma lambda (Schulman et al. 2016)."""
     found, last = torch.zeros_like(deltas), torch.zeros_like(deltas[0])
     for t in reversed(range(len(deltas))):
         last = found[t] = deltas[t] + decay * ~truncated[t] * last

@@ -94,11 +94,7 @@ class ImageEncoder(nn.Module):
         return self.learner(self.features(images, language).flatten(2).transpose(1, 2))
 
     def load_efficientnet(self, path: Path) -> None:
-        """Load EfficientNet's weights from a file; others in it, such as a classifier's, are ignored.
-
-        Args:
-            path: of a safetensors file, or one of ``torch.save``.
-        """
+        """Load EfficientNet's weights from a file, which may hold more, such as a classifier's."""
         tensors = {name.removeprefix("efficientnet."): value for name, value in _read_weights(path).items()}
         own = self.net.state_dict()
         counters = {name: value for name, value in own.items() if name.endswith("num_batches_tracked")}

@@ -90,11 +90,7 @@ def _sort_header(content: bytes) -> bytes:
 
 
 def load(path: Path, expected: Mapping[str, str]) -> Checkpoint:
-    """Read the tensors of a file.
-
-    Raises:
-        TrainingError: the file is missing or damaged, or its metadata differ.
-    """
+    """Read the tensors of a file, whose metadata must be as expected."""
     if not path.is_file():
         fix = "`robocas train` into this folder continues a training that ended before it wrote one."
         raise TrainingError("no such file", where=path, fix=fix)

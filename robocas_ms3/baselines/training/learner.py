@@ -70,11 +70,7 @@ class Learner:
 
     @torch.no_grad()
     def evaluate(self, batches: Iterable[tuple[int, Batch]]) -> dict[str, float]:
-        """Return the means of the metrics of the averaged weights; random states stay as they are.
-
-        Args:
-            batches: of this process, with the number of samples in each.
-        """
+        """Return the means of the metrics of the averaged weights over this process's batches, with their sizes."""
         model = self._acting_model().eval()
         device = self._accelerator.device
         sums: dict[str, torch.Tensor] = {}

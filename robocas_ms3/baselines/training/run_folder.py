@@ -83,11 +83,7 @@ class RunFolder:
         return broadcast_object_list([self._log is not None and self._log.has(step, split)])[0]
 
     def log(self, step: int, split: str, metrics: Mapping[str, float], *, epoch: float, learning_rate: float) -> None:
-        """Log metrics.
-
-        Raises:
-            RobocasError: somebody removed the folder.
-        """
+        """Log metrics."""
         if self._log is None:
             return
         self._output.check_exists()
@@ -95,11 +91,7 @@ class RunFolder:
         self._log.add(step, split, {"epoch": epoch, "seconds": seconds, "learning_rate": learning_rate}, metrics)
 
     def save(self, step: int, state: Tensors, weights: Tensors) -> None:
-        """Write the weights of the policy, then the checkpoint: the weights of the last step are never missing.
-
-        Raises:
-            RobocasError: somebody removed the folder.
-        """
+        """Write the weights of the policy, then the checkpoint: the weights of the last step are never missing."""
         if not self.accelerator.is_main_process:
             return
         self._output.check_exists()
@@ -129,15 +121,7 @@ def _hardware_changes(record: RunRecord, accelerator: Accelerator) -> str:
 
 
 def make_accelerator(device: str, precision: Precision) -> Accelerator:
-    """Return accelerate's accelerator for a device.
-
-    Args:
-        device: ``auto`` (a GPU if there is one), ``cpu`` or ``cuda``.
-        precision: see `TrainSettings`.
-
-    Raises:
-        TrainingError: there is no GPU.
-    """
+    """Return accelerate's accelerator for a device: ``auto`` (a GPU if there is one), ``cpu`` or ``cuda``."""
     if device == "cuda" and not torch.cuda.is_available():
         raise TrainingError("there is no GPU that torch can use", where="--device", found="cuda", fix="--device cpu")
     cpu = device == "cpu" or not torch.cuda.is_available()

@@ -154,12 +154,7 @@ def merge_configs(defaults: Mapping[str, Any], changes: Mapping[str, Any]) -> di
 def load_initial_weights(
     baseline: Baseline, start: Path | None, recorded: RunRecord | None, out: Path
 ) -> InitialWeights | None:
-    """Load the weights of the run to start from, if one is named.
-
-    Raises:
-        TrainingError: the weights are missing, or of another baseline or version; or a run that continues has no
-            checkpoint yet, and the run that it started from is not named.
-    """
+    """Load the weights of the run to start from, if one is named."""
     from robocas_ms3.baselines.training import checkpoints
 
     has_checkpoint = recorded is not None and (out / CHECKPOINT).is_file()
@@ -176,11 +171,7 @@ def load_initial_weights(
 
 
 def combine_facts(own: dict[str, Any], initial: InitialWeights | None, data: Path | None) -> dict[str, Any]:
-    """Return the facts of a run; on a dataset, with initial weights, the other run's, whose scales fit the weights.
-
-    Raises:
-        TrainingError: the inputs of the other run differ.
-    """
+    """Return the facts of a run; on a dataset, with initial weights, the other run's, whose scales fit the weights."""
     if initial is None:
         return own
     others = initial.record.facts
