@@ -75,21 +75,23 @@ class Checker:
                 _origin(joint),
                 np.array([float(v) for v in axis.attrib["xyz"].split()]) if axis is not None else np.zeros(3),
             )
+        self.parts: list[tuple[str, np.ndarray]] = []  # link, and vertices of a convex part in its frame
         self.surfaces: dict[str, list[np.ndarray]] = {}
         self._hulls: dict[str, list[np.ndarray]] = {}
         for link in root.iterfind("link"):
+            name = link.attrib["name"]
             for collision in link.iterfind("collision"):
-                pose, shape = _origin(collision), collision.find("geometry")
+                shape = collision.find("geometry")
                 box = shape.find("box")
                 if box is not None:
                     mesh = trimesh.creation.box([float(v) for v in box.attrib["size"].split()])
                 else:
-                    mesh = trimesh.load(urdf.parent / shape.find("mesh").attrib["filename"], force="mesh").convex_hull
-                mesh.apply_transform(pose)
+                    mesh = trimesh.load(urdf.parent / f"{shape.find('mesh').attrib['filename']}.convex.stl")
+                mesh.apply_transform(_origin(collision))
                 sampled, _ = trimesh.sample.sample_surface(mesh, samples, seed=0)
-                points = np.concatenate([mesh.vertices, sampled])
-                self.surfaces.setdefault(link.attrib["name"], []).append(points)
-                self._hulls.setdefault(link.attrib["name"], []).append(ConvexHull(mesh.vertices).equations)
+                self.parts.append((name, np.asarray(mesh.vertices)))
+                self.surfaces.setdefault(name, []).append(np.concatenate([mesh.vertices, sampled]))
+                self._hulls.setdefault(name, []).append(ConvexHull(mesh.vertices).equations)
 
     def poses(self, link: str, qpos: np.ndarray, finger: float = 0.04) -> np.ndarray:
         """Poses (T, 4, 4) of a link at configurations (T, 7)."""

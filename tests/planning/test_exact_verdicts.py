@@ -7,13 +7,12 @@ program decides.
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-import trimesh
 from planning_scenes import REST, Checker, corners
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull
@@ -73,20 +72,7 @@ class ExactArm:
     def __init__(self, urdf: Path, srdf: Path, checker: Checker) -> None:
         self.checker = checker
         root = ElementTree.parse(urdf).getroot()
-        self.parts: list[tuple[str, Polytope]] = []
-        for link in root.iterfind("link"):
-            for collision in link.iterfind("collision"):
-                pose, box = np.eye(4), collision.find("geometry/box")
-                if (origin := collision.find("origin")) is not None:
-                    pose[:3, 3] = [float(value) for value in origin.attrib["xyz"].split()]
-                    angles = [float(value) for value in origin.attrib["rpy"].split()]
-                    pose[:3, :3] = Rotation.from_euler("xyz", angles).as_matrix()
-                if box is not None:
-                    points = corners(*(float(value) / 2 for value in box.attrib["size"].split()))
-                else:
-                    mesh = collision.find("geometry/mesh").attrib["filename"]
-                    points = np.asarray(trimesh.load(urdf.parent / f"{mesh}.convex.stl").vertices)
-                self.parts.append((link.attrib["name"], Polytope.of(points).at(pose)))
+        self.parts = [(name, Polytope.of(vertices)) for name, vertices in checker.parts]
         adjacent = {(j.find("parent").attrib["link"], j.find("child").attrib["link"]) for j in root.iterfind("joint")}
         disabled = {
             (pair.attrib["link1"], pair.attrib["link2"])
@@ -126,18 +112,19 @@ class Scene:
     """Bodies or occupied voxels (P, 3), a held object, and configurations (7,) with their finger widths, m."""
 
     configurations: list[tuple[np.ndarray, float]]
-    obstacles: list[Obstacle] = field(default_factory=list)
-    voxels: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    obstacles: list[Obstacle] | np.ndarray
     held: AttachedBody | None = None
 
     def decide(self, arm: ExactArm, qpos: np.ndarray, width: float) -> tuple[set[str], set[str]]:
         """Return the names in contact, and the undecided ones, by linear programs."""
-        placed = [
-            (body.name, Polytope.of(inflated(body.shape.hulls[0], MARGIN + body.room)[0]).at(body.pose_in_base))
-            for body in self.obstacles
-        ]
-        cube = Polytope.of(corners(*[VOXEL / 2] * 3))
-        placed += [("cloud", cube.at(pose_at(centre))) for centre in self.voxels]
+        if isinstance(self.obstacles, np.ndarray):
+            cube = Polytope.of(corners(*[VOXEL / 2] * 3))
+            placed = [("cloud", cube.at(pose_at(centre))) for centre in self.obstacles]
+        else:
+            placed = [
+                (body.name, Polytope.of(inflated(body.shape.hulls[0], MARGIN + body.room)[0]).at(body.pose_in_base))
+                for body in self.obstacles
+            ]
         verdicts = arm.contacts(arm.at(qpos, width, self.held), placed)
         contacts = {name for name, found in verdicts.items() if True in found}
         return contacts, {name for name, found in verdicts.items() if UNDECIDED in found} - contacts
@@ -172,20 +159,20 @@ def hulls(world: FclWorld, rng: np.random.Generator, seed: int) -> Scene:
         pose = pose_at(rng.uniform((0.2, -0.25, 0.1), (0.6, 0.25, 0.6)), rng.uniform(-1, 1, 4))
         obstacles.append(Obstacle(f"obstacle {i}", Shape((points,)), pose, float(rng.choice((0.0, 0.01)))))
     held = held_object(rng) if seed % 2 else None
-    return Scene(configurations(world, rng, wide=4), obstacles, held=held)
+    return Scene(configurations(world, rng, wide=4), obstacles, held)
 
 
 def arm_alone(world: FclWorld, rng: np.random.Generator, seed: int) -> Scene:
     samples = rng.uniform(world.chain.lower, world.chain.upper, (200, 7))
     free = world.free(samples)  # as many configurations with a contact as without one
     chosen = [*samples[~free][:10], *samples[free][:10]]
-    return Scene([(qpos, (0.0, 0.08)[i % 2]) for i, qpos in enumerate(chosen)])
+    return Scene([(qpos, (0.0, 0.08)[i % 2]) for i, qpos in enumerate(chosen)], [])
 
 
 def cloud(world: FclWorld, rng: np.random.Generator, seed: int) -> Scene:
     points = rng.uniform((0.3, -0.3, 0.1), (0.7, 0.3, 0.6), (150, 3))
     voxels = np.unique(np.floor(points / VOXEL), axis=0) * VOXEL + VOXEL / 2
-    return Scene(configurations(world, rng, wide=1000), voxels=voxels, held=held_object(rng) if seed % 2 else None)
+    return Scene(configurations(world, rng, wide=1000), voxels, held_object(rng) if seed % 2 else None)
 
 
 @pytest.fixture(scope="module")
@@ -198,7 +185,7 @@ def arm(panda_files, checker) -> ExactArm:
 def test_verdicts_of_fcl_are_exact(panda_files, arm, draw, seed):
     world = FclWorld(panda_files.arm_urdf, panda_files.arm_srdf, MOBILE_PANDA)
     scene = draw(world, np.random.default_rng([seed, 1]), seed)
-    world.set_scene(scene.voxels if len(scene.voxels) else scene.obstacles)
+    world.set_scene(scene.obstacles)
     world.attach(scene.held)
     count = 0
     for qpos, width in scene.configurations:

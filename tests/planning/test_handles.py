@@ -14,7 +14,7 @@ from robocas_ms3.assets.manifest import Handle, Joint
 from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.planning.protocol import AttachedBody, Obstacle, Shape
 from robocas_ms3.planning.pulling import MAX_SLIP, reached, track
-from robocas_ms3.planning.skills.driving import Surroundings, body_is_free, free_route
+from robocas_ms3.planning.skills.driving import Surroundings, free_route
 from robocas_ms3.planning.skills.handles import Part
 from robocas_ms3.robots.description import MOBILE_PANDA
 
@@ -67,15 +67,6 @@ def test_pull_ends_at_the_limit_of_the_reach(reachability):
     assert count > 3
     assert np.isnan(path[count:]).all()
     assert np.isfinite(path[:count]).all()
-
-
-def test_the_body_is_free_where_no_point_is_inside_it():
-    frame = np.eye(4)
-    frame[:3, 3] = 1.0, 2.0, 0.49  # the arm's base, 0.49 m above the floor
-    beside = np.array([[1.3, 2.0, 0.2], [1.0, 2.24, 0.2], [1.2, 2.0, 0.31], [1.14, 2.0, 0.65], [1.0, 2.0, -5.0]])
-    assert body_is_free(MOBILE_PANDA, frame, beside)
-    for hit in ([1.27, 2.0, 0.2], [1.0, 1.78, 0.2], [1.14, 2.0, 0.4], [1.08, 2.0, 0.6]):
-        assert not body_is_free(MOBILE_PANDA, frame, np.array([hit]))
 
 
 def test_drive_keeps_the_held_object_free_of_collisions(planner):

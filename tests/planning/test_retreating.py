@@ -58,28 +58,25 @@ class Way(Arm):
         self.followed += motions
 
 
-def test_above_a_table_it_rises_through_what_it_touches():
-    arm = Way(top_down(0.6, 0.1, 0.05), "top", blocking=(None, TARGET))
+@pytest.mark.parametrize(
+    ("tcp", "approach", "blocking", "moved", "checked", "left_out"),
+    [
+        # above a table it rises through what it touches
+        (top_down(0.6, 0.1, 0.05), "top", (None, TARGET), (0, 0, 0.1), False, None),
+        # where it reached in level it steps straight back on a free way; from the top too, with a handle in the fingers
+        (LEVEL, "front", (), (-0.25, 0, 0), True, None),
+        (LEVEL, "top", (), (-0.25, 0, 0), True, None),
+        (LEVEL, "front", (None,), (-0.25, 0, 0), True, TARGET),  # from the target that it stands against too
+    ],
+)
+def test_the_way_out_of_a_failure(tcp, approach, blocking, moved, checked, left_out):
+    arm = Way(tcp, approach, blocking)
     back_out(arm)
-    ((goal, checked, _),) = arm.lines
-    assert goal[:3, 3] == pytest.approx([0.6, 0.1, 0.15])
-    assert not checked
+    ((goal, *how),) = arm.lines
+    assert goal[:3, 3] == pytest.approx(tcp[:3, 3] + moved)
+    assert how[0] == checked
+    assert not checked or how[1] == left_out
     assert arm.opened and len(arm.followed) == 1
-
-
-@pytest.mark.parametrize("approach", ["front", "top"])  # top: with a handle between the fingers
-def test_where_it_reached_in_level_it_steps_straight_back_on_a_free_way(approach):
-    arm = Way(LEVEL, approach)
-    back_out(arm)
-    ((goal, checked, left_out),) = arm.lines
-    assert goal[:3, 3] == pytest.approx([0.6 - 0.25, 0.1, 0.4])
-    assert checked and left_out is None
-
-
-def test_from_the_target_that_it_stands_against_it_steps_back_too():
-    arm = Way(LEVEL, "front", blocking=(None,))
-    back_out(arm)
-    assert [(checked, left_out) for _, checked, left_out in arm.lines] == [(True, TARGET)]
 
 
 @pytest.mark.parametrize("tcp", [LEVEL, top_down(0.6, 0.1, 0.05)])
