@@ -12,7 +12,6 @@ __all__ = ["RoboCASDataset", "SampleOptions"]
 
 
 def __getattr__(name: str) -> Any:
-    """Import torch only where it is asked for."""
     if name in __all__:
         from robocas_ms3.datasets.training import torch_dataset
 

@@ -107,7 +107,6 @@ def camera_names(episode: Path) -> tuple[str, ...]:
 
 
 def episode_folder(number: int) -> str:
-    """Name of an episode's folder."""
     return f"episode_{number:07d}"
 
 

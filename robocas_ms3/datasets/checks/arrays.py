@@ -149,7 +149,6 @@ CONTENT: tuple[Check, ...] = (check_motion, check_base_motion, check_values)
 
 
 def violations_of(stored: EpisodeArrays, checks: tuple[Check, ...]) -> Iterator[Violation]:
-    """Run several checks."""
     return (violation for check in checks for violation in check(stored))
 
 

@@ -15,11 +15,11 @@ from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.actions import action_space
 from robocas_ms3.datasets.checks import arrays as laws
 from robocas_ms3.datasets.checks.pictures import Sizes, check_cameras, check_depth, check_images
-from robocas_ms3.datasets.checks.scene import check_ledger, check_values, read_settings
+from robocas_ms3.datasets.checks.scene import check_ledger, read_settings
 from robocas_ms3.datasets.checks.violation import Violation, read_object
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.files import no_dataset
-from robocas_ms3.datasets.sources.records import DataInfoRecord
+from robocas_ms3.datasets.sources.records import DataInfoRecord, SceneRecord
 from robocas_ms3.datasets.sources.tolerant import SPECS, EpisodeArrays, is_declared, read_arrays
 from robocas_ms3.datasets.writing.plan import MARKS
 
@@ -44,7 +44,6 @@ class Report:
     violations: list[Violation]
 
     def as_json(self) -> dict[str, Any]:
-        """Return the report of ``--json``."""
         return {
             "valid": not self.violations,
             "episodes": self.episodes,
@@ -76,8 +75,7 @@ def validate(root: str | Path, *, on_episode: Callable[[int, int], None] | None 
     embedded: set[bool] = set()
     for done, (number, folder) in enumerate(numbers.items(), start=1):
         stored = read_arrays(folder / schema.EPISODE_FILE)
-        scene, wrong = read_object(root, f"{folder.name}/{schema.SCENE_FILE}")
-        wrong = wrong or check_values(scene, f"{folder.name}/{schema.SCENE_FILE}")
+        scene, wrong = read_object(root, f"{folder.name}/{schema.SCENE_FILE}", SceneRecord)
         violations += [*wrong, *check_episode(folder, stored, pictures, sizes)]
         embedded |= {"language_embedding" in stored.arrays} if stored.arrays else set()
         small = {key: array for key, array in stored.arrays.items() if key not in _EMBEDDINGS}

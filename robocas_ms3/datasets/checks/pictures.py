@@ -114,7 +114,6 @@ def check_images(
 def _read_headers(
     folder: Path, image_format: schema.ImageFormat, steps: int, read: ReadHeader, place: tuple[str, str]
 ) -> dict[str, PictureHeader | str | None]:
-    """Return by file name the header of an image, or what is wrong with it."""
     first = schema.image_path(folder, *place, 0, image_format)
     there = {path.name for path in first.parent.iterdir()} if first.parent.is_dir() else set()
     wanted = [f"{step:04d}{first.suffix}" for step in range(min(steps, schema.MAX_STEPS))]

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.core.words import one_line
 from robocas_ms3.datasets.actions import episode_actions
-from robocas_ms3.datasets.sources.reader import Dataset, Episode
+from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.datasets.sources.records import EnvInfo, Layout, SceneRecord, read_scene
 from robocas_ms3.demos.open_loop import OpenLoop
-from robocas_ms3.demos.recordings.entries import one_seed, read_reset_options, was_taken_over
+from robocas_ms3.demos.recordings.entries import one_seed, read_reset_options
 from robocas_ms3.demos.recordings.environment import read_env
 
 _SAME_PLACE = 1e-3  # m
@@ -69,7 +70,6 @@ class ReplayReport:
         return result
 
     def as_json(self) -> dict[str, Any]:
-        """Return the report of ``--json``."""
         return {"by_task": self.by_task(), "episodes": [asdict(episode) for episode in self.episodes]}
 
 
@@ -89,11 +89,17 @@ def replay_dataset(
     Raises:
         DatasetError: there is no dataset, or actions can't be replayed at its rate.
     """
-    dataset = Dataset(Path(root))
-    replays = []
+    dataset, replays = Dataset(Path(root)), []
     with closing(_Player(dataset.rate_hz, pack)) as player:
         for number in dataset.numbers:
-            replays.append(player.play(number, dataset.episode(number)))
+            episode = dataset.episode(number)
+            task = ""
+            try:
+                scene = read_scene(episode.scene, episode.where)
+                task = scene.task or ""
+                replays.append(player.play(number, task, scene, episode.arrays))
+            except (RobocasError, ValueError, TypeError, KeyError, IndexError, AttributeError, OSError) as error:
+                replays.append(EpisodeReplay(number, task, None, skipped=one_line(error)))
             on_episode(replays[-1], len(dataset.numbers))
     return ReplayReport(replays)
 
@@ -103,37 +109,24 @@ class _Player:
 
     def __init__(self, rate_hz: float, pack: str | Path | None) -> None:
         self._rate_hz, self._pack = rate_hz, pack
-        self._key, self._open_loop = "", None
+        self._env_info: EnvInfo | None = None
+        self._open_loop: OpenLoop | None = None
 
-    def play(self, number: int, episode: Episode) -> EpisodeReplay:
-        task = ""
-        try:
-            scene = episode.scene
-            task = str(scene.get("task") or "")
-            seed, reason = one_seed(scene.get("seed")), _not_playable(episode)
-            if seed is None or reason:
-                return EpisodeReplay(number, task, None, skipped=reason)
-            arrays = episode.arrays
-            open_loop = self._environment(scene["env_info"])
-            open_loop.reset(seed, read_reset_options(scene.get("reset_options"), "reset_options"))
-            other = _other_scene(scene, open_loop)
-            if other:
-                return EpisodeReplay(number, task, None, skipped=f"its seed builds another scene now: {other}")
-            played = open_loop.play(episode_actions(arrays)[:-1])
-            error = np.linalg.norm(played.tcp_in_base - arrays["ee_pos"], axis=1)
-        except (RobocasError, ValueError, TypeError, KeyError, IndexError, AttributeError, OSError) as error:
-            return EpisodeReplay(number, task, None, skipped=one_line(error))
-        return EpisodeReplay(
-            number, task, played.success, float(error.mean()), float(error.max()), clipped=played.clipped
-        )
-
-    def _environment(self, env_info: dict[str, Any]) -> OpenLoop:
-        key = json.dumps(env_info, sort_keys=True)
-        if self._open_loop is None or key != self._key:
+    def play(self, number: int, task: str, scene: SceneRecord, arrays: Mapping[str, NDArray]) -> EpisodeReplay:
+        seed, reason = one_seed(scene.seed), _not_playable(scene, arrays)
+        if seed is None or reason:
+            return EpisodeReplay(number, task, None, skipped=reason)
+        if self._open_loop is None or scene.env_info != self._env_info:
             self.close()
-            env = read_env(env_info, "scene.json, env_info", pack=self._pack)
-            self._key, self._open_loop = key, OpenLoop(env, self._rate_hz)
-        return self._open_loop
+            env = read_env(scene.env_info and scene.env_info.model_dump(), "scene.json, env_info", pack=self._pack)
+            self._env_info, self._open_loop = scene.env_info, OpenLoop(env, self._rate_hz)
+        self._open_loop.reset(seed, read_reset_options(scene.reset_options, "reset_options"))
+        other = _other_scene(scene.layout or Layout(), self._open_loop)
+        if other:
+            return EpisodeReplay(number, task, None, skipped=f"its seed builds another scene now: {other}")
+        played = self._open_loop.play(episode_actions(arrays)[:-1])
+        error = np.linalg.norm(played.tcp_in_base - arrays["ee_pos"], axis=1)
+        return EpisodeReplay(number, task, played.success, float(error.mean()), float(error.max()), played.clipped)
 
     def close(self) -> None:
         if self._open_loop is not None:
@@ -141,37 +134,35 @@ class _Player:
             self._open_loop = None
 
 
-def _other_scene(scene: dict[str, Any], open_loop: OpenLoop) -> str:
-    """Return what differs between a rebuilt and the recorded scene; empty: nothing."""
-    recorded, built = scene.get("layout") or {}, open_loop.layout
-    if "object_ids" in recorded and list(recorded["object_ids"]) != list(built.object_ids):
+def _other_scene(recorded: Layout, open_loop: OpenLoop) -> str:
+    built = open_loop.layout
+    if recorded.object_ids and recorded.object_ids != list(built.object_ids):
         return "other objects"
-    for key, what, poses in (
-        ("poses", "objects", built.object_poses),
-        ("robot_pose", "the robot", built.robot_pose),
-        ("basket_pose", "the basket", built.basket_pose),
+    for what, there, poses in (
+        ("objects", recorded.poses, built.object_poses),
+        ("the robot", recorded.robot_pose, built.robot_pose),
+        ("the basket", recorded.basket_pose, built.basket_pose),
     ):
-        if recorded.get(key) and poses is not None:
-            places = np.reshape([pose[:3] for pose in np.atleast_2d(recorded[key])], (-1, 3)).astype(np.float64)
-            apart = np.linalg.norm(places - np.reshape(poses, (-1, 4, 4))[:, :3, 3], axis=1).max()
+        if there and poses is not None:
+            places = np.reshape(there, (-1, 7))[:, :3] - np.reshape(poses, (-1, 4, 4))[:, :3, 3]
+            apart = np.linalg.norm(places, axis=1).max()
             if apart > _SAME_PLACE:
                 return f"{what} up to {apart * 1000:.0f} mm away"
     return ""
 
 
-def _not_playable(episode: Episode) -> str:
-    scene = episode.scene
-    if not scene.get("env_info") or one_seed(scene.get("seed")) is None:
+def _not_playable(scene: SceneRecord, arrays: Mapping[str, NDArray]) -> str:
+    if not scene.env_info or one_seed(scene.seed) is None:
         return "its scene.json does not say how to build the scene"
-    if scene.get("success") is False:
+    if scene.success is False:
         return "it was recorded without success"
-    if was_taken_over(scene):
+    if scene.recorded and scene.recorded.takeover is not None:
         return "it begins where another policy was, to which its seed does not lead"
-    if len(episode.arrays["ee_pos"]) < 2:
+    if len(arrays["ee_pos"]) < 2:
         return "it has no actions"
-    if not all(np.isfinite(episode.arrays[key]).all() for key in ("rel_pos", "rel_orn", "ee_pos", "base_pos")):
+    if not all(np.isfinite(arrays[key]).all() for key in ("rel_pos", "rel_orn", "ee_pos", "base_pos")):
         return "its arrays hold NaN or infinity"  # which the simulation would keep
-    base = episode.arrays["base_pos"]
+    base = arrays["base_pos"]
     if np.linalg.norm(base - base[0], axis=1).max() > _BASE_STILL:
         return "its base drives, which 7-D actions leave out"
     return ""

@@ -11,32 +11,20 @@ from robocas_ms3.core.words import one_line
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.violation import Violation, check_form, read_object, shorten
 from robocas_ms3.datasets.pictures.stored import Pictures
-from robocas_ms3.datasets.sources.records import SCENE_KEYS, ConversionRecord, SceneRecord
+from robocas_ms3.datasets.sources.records import ConversionRecord, SceneRecord, with_unknown
 from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, arrays_fingerprint
 from robocas_ms3.demos.recordings.entries import one_seed
 from robocas_ms3.robots.cameras import STANDARD_NAMES
 
 FILE = schema.CONVERSION_FILE
 STANDARD = Pictures(STANDARD_NAMES)
-_UNKNOWN = {**dict.fromkeys(SCENE_KEYS), "schema_version": schema.SCHEMA_VERSION, "rate_hz": 1.0, "source": {}}
-
-
-def check_values(scene: Mapping[str, Any], file: str = schema.SCENE_FILE) -> list[Violation]:
-    """Check the content of ``scene.json``: keys, types, and the number of places of the layout."""
-    wrong = check_form(SceneRecord, scene, file)
-    layout = {} if wrong else scene["layout"] or {}
-    count = len(layout.get("object_ids", ()))
-    for key in ("poses", "present"):
-        if len(layout.get(key, ())) not in (0, count):
-            wrong.append(Violation(file, f"layout.{key}", f"{count}, as many as object_ids", str(len(layout[key]))))
-    return wrong
 
 
 def valid_values(scene: Any, file: str = schema.SCENE_FILE) -> tuple[dict[str, Any], str]:
     """Return the usable part of a ``scene.json``, and what is wrong with the rest; missing keys are allowed."""
     if not isinstance(scene, Mapping):
         return {}, "" if scene is None else f"{file}: expected an object, found {shorten(scene)}"
-    wrong = check_values({**_UNKNOWN, **scene}, file)
+    wrong = check_form(SceneRecord, with_unknown(scene), file)
     return _usable(scene, wrong), "; ".join(map(str, wrong))
 
 

@@ -38,14 +38,12 @@ class Violation:
 
     @property
     def where(self) -> str:
-        """File and key."""
         return ", ".join(part for part in (self.file, self.key) if part)
 
     def __str__(self) -> str:
         return f"{self.where or 'dataset'}: expected {self.expected}, found {self.found}"
 
     def as_json(self) -> dict[str, str]:
-        """Return its entry in the report of ``--json``."""
         return {"file": self.file, "key": self.key, "expected": self.expected, "found": self.found}
 
 

@@ -50,7 +50,6 @@ class FinishedDataset:
 
     @property
     def root(self) -> Path:
-        """Folder of the dataset."""
         return self.dataset.root
 
     def identity(self, number: int) -> str:
@@ -179,7 +178,6 @@ def _copy(out: Path, members: Sequence[CopiedEpisode], record: Mapping[str, Any]
 
 
 def _record(members: Sequence[CopiedEpisode], split_rule: str) -> dict[str, Any]:
-    """Return the content of ``conversion.json``."""
     episodes = {}
     for number, member in enumerate(members):
         entry = member.source.ledger[member.number]
@@ -238,7 +236,6 @@ def _check_episodes(root: Path, numbers: Iterable[int]) -> None:
 
 
 def damaged_episode(root: Path, wrong: Violation) -> DatasetError:
-    """Return an error for a violation in an episode of a dataset."""
     where, fix = root / wrong.where, f"robocas validate {root} lists all."
     return DatasetError("this episode is damaged", where=where, expected=wrong.expected, found=wrong.found, fix=fix)
 
@@ -262,7 +259,6 @@ class FilePlacer:
     copied: int = 0
 
     def place(self, source: Path, target: Path) -> None:
-        """Link or copy one file."""
         if self.link and not source.is_symlink():
             try:
                 os.link(source, target)

@@ -87,7 +87,6 @@ def import_robocas(
 
 
 def _record(dataset: Dataset, surveyed: Survey, embedded: bool) -> dict[str, Any]:
-    """Return the content of ``conversion.json``."""
     assert surveyed.pictures is not None
     unknown = dict.fromkeys(("trajectory", "trajectory_episode", "seed", "success", "target", "recording"))
     parse(EpisodesRecord, dataset.settings, DatasetError, where=dataset.root / schema.CONVERSION_FILE)

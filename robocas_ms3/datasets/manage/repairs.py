@@ -51,7 +51,6 @@ class Finding:
         return f"{wrong}: {self.repair}" if self.repair else wrong
 
     def as_json(self) -> dict[str, Any]:
-        """Return its entry in ``import_report.json``."""
         where = self.violation.where
         return {"episode": self.episode, "file": where, "problem": self.problem, "outcome": self.outcome}
 
@@ -76,20 +75,16 @@ class ImportedEpisode:
 
     @property
     def usable(self) -> bool:
-        """Whether it can be imported."""
         return all(found.outcome != "left out" for found in self.findings)
 
     @property
     def embedded(self) -> bool:
-        """Whether all embeddings are there."""
         return set(EMBEDDINGS) <= self.stored.arrays.keys()
 
     def note(self, violation: Violation, outcome: Outcome, repair: str = "") -> None:
-        """Add a finding."""
         self.findings.append(Finding(self.number, violation, outcome, repair))
 
     def put(self, arrays: Mapping[str, NDArray]) -> None:
-        """Replace arrays."""
         self.stored = _with(self.stored, arrays)
 
 
@@ -203,7 +198,6 @@ def eef_turn(camera_in_ee: NDArray) -> int:
 
 
 def turn_eef_frame(episode: ImportedEpisode, degrees: int) -> None:
-    """Turn the EEF frame about its own z."""
     arrays = episode.stored.arrays
     turns = Rotation.from_quat(arrays["ee_orn"]) * Rotation.from_euler("z", degrees, degrees=True)
     arrays = {**arrays, "ee_orn": SPECS["ee_orn"].cast(continuous_xyzw(turns.as_matrix()))}

@@ -53,7 +53,6 @@ class Share:
 
     @property
     def rule(self) -> str:
-        """Description for ``conversion.json``."""
         return f"{self.by}s in the order of sha256({self.by}), the first {self.val:g} of the episodes validate"
 
 

@@ -59,11 +59,9 @@ class Survey:
 
     @property
     def left_out(self) -> list[int]:
-        """Numbers of the episodes that can't be imported."""
         return sorted({f.episode for f in self.findings if f.outcome == "left out" and f.episode is not None})
 
     def as_json(self) -> dict[str, Any]:
-        """Return the report."""
         return {
             "dataset": self.root.resolve().name,
             "rate_hz": self.rate_hz,

@@ -91,12 +91,10 @@ def _font(size: int) -> Any:
 
 
 def _text(draw: ImageDraw.ImageDraw, at: tuple[int, int], text: str, size: int, ink, width: int) -> None:
-    """Write one line, smaller where it is too long."""
     while size > 10 and draw.textlength(text, _font(size)) > width:
         size -= 1
     draw.text(at, text, ink, _font(size))
 
 
 def _label(draw: ImageDraw.ImageDraw, at: tuple[int, int], text: str, size: int) -> None:
-    """Write on an image: light with a dark rim."""
     draw.text(at, text, _INK, _font(size), stroke_width=2, stroke_fill=(0, 0, 0))

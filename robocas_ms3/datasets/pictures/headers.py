@@ -37,7 +37,6 @@ class PictureHeader:
 
 
 def read_header(path: Path) -> PictureHeader:
-    """Read a picture's header."""
     data = read_picture_bytes(path)
     return _read_png(data) if path.suffix == ".png" else _decode(data, _FORMATS[path.suffix])
 

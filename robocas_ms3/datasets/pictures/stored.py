@@ -46,7 +46,6 @@ class Pictures:
     boxes: bool = False
 
     def __post_init__(self) -> None:
-        """Put cameras in order, and check them."""
         wrong = [name for name in self.cameras if not re.fullmatch(CAMERA_NAME, name)]
         if wrong:
             raise DatasetError("no such camera", where="cameras", expected="names like side_camera", found=wrong)
@@ -88,7 +87,6 @@ class Pictures:
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """``rgb``, and ``depth`` where it is stored."""
         return schema.IMAGE_KINDS if self.depth else ("rgb",)
 
 

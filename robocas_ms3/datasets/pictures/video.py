@@ -117,7 +117,6 @@ class Preview:
         self._video: Any = None
 
     def __enter__(self) -> Preview:
-        """Open the video."""
         with ExitStack() as stack:
             tmp = stack.enter_context(replacing(self._path))
             self._video = stack.enter_context(open_video(tmp, self._drawing.rate_hz, *_PREVIEW_OPTIONS, quality=6))
@@ -125,11 +124,9 @@ class Preview:
         return self
 
     def __exit__(self, *error: Any) -> None:
-        """Finish it."""
         self._stack.__exit__(*error)
 
     def add(self, step: int, rgb: Images) -> None:
-        """Take the images of the next step."""
         self._video.append_data(self._drawing.frame(step, rgb, PREVIEW_PANEL))
         if step in self._wanted:
             self._shown[step] = rgb

@@ -80,7 +80,6 @@ def scene_record(
 
 
 def succeeded(episode: dict[str, Any]) -> bool:
-    """Whether a trajectory's entry ended in success."""
     found = episode.get("success", False)
     return found is True or (isinstance(found, list) and bool(found) and all(one is True for one in found))
 

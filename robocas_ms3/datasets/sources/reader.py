@@ -44,7 +44,6 @@ class Episode(SourceEpisode):
 
     @cached_property
     def arrays(self) -> dict[str, NDArray]:
-        """``episode_info.npz``, by the schema's keys and of its types; what is missing is made where it can be."""
         path = self.folder / schema.EPISODE_FILE
         loaded = load_arrays(path)
         if any(spec.name not in loaded.arrays for spec in schema.EPISODE_INFO if not spec.embedding):
@@ -55,7 +54,6 @@ class Episode(SourceEpisode):
         return dict(loaded.arrays)
 
     def read(self, keys: Sequence[str]) -> dict[str, NDArray]:
-        """Some of the arrays."""
         found = read_arrays(self.folder / schema.EPISODE_FILE, keys)
         if found.unreadable or all(key in found.arrays and is_declared(key, found.arrays[key]) for key in keys):
             return found.needed(keys)
@@ -63,45 +61,37 @@ class Episode(SourceEpisode):
 
     @property
     def goals(self) -> list[SubGoal]:
-        """Sub-goals, as ``data_info.json`` has them; empty where it has none."""
         where = f"{self.folder.parent / schema.DATA_INFO_FILE}, step_goals.{schema.episode_number(self.folder.name)}"
         return read_subgoals(self._said().get("step_goals", []), where)
 
     def _said(self) -> dict[str, Any]:
-        """What ``data_info.json`` says of this episode."""
         if self.dataset is None:
             return {}
         return said_of(self.dataset.info, schema.episode_number(self.folder.name))
 
     @property
     def where(self) -> Path:
-        """Its folder."""
         return self.folder
 
     @property
     def steps(self) -> int:
-        """T."""
         return int(self.read(["episode_length"])["episode_length"])
 
     @property
     def instruction(self) -> str:
-        """What the robot was told: by ``data_info.json``, else by the arrays."""
         said = self._said().get("language_goal")
         return said if isinstance(said, str) else str(self.read(["language_goal"])["language_goal"])
 
     @cached_property
     def scene(self) -> dict[str, Any]:
-        """``scene.json``; empty where there is none."""
         return read_json(self.folder / schema.SCENE_FILE)
 
     @cached_property
     def cameras(self) -> tuple[str, ...]:
-        """Names of the cameras that are there."""
         return schema.camera_names(self.folder)
 
     @cached_property
     def has_depth(self) -> bool:
-        """Whether depth is there."""
         return any((self.folder / camera / "depth").is_dir() for camera in self.cameras)
 
     @cached_property
@@ -114,24 +104,19 @@ class Episode(SourceEpisode):
         return "png"
 
     def image_path(self, camera: str, kind: str, step: int) -> Path:
-        """Path of a picture; ``kind`` is ``rgb`` or ``depth``."""
         return schema.image_path(self.folder, camera, kind, step, self.image_format)
 
     def rgb(self, camera: str, step: int) -> NDArray[np.uint8]:
-        """(H, W, 3) RGB."""
         return read_picture(self.image_path(camera, "rgb", step))
 
     def depth(self, camera: str, step: int) -> NDArray[np.uint16]:
-        """(H, W) mm, 0 = nothing."""
         return read_picture(self.image_path(camera, "depth", step))
 
     def intrinsic(self, camera: str) -> NDArray[np.float64]:
-        """(4,) fx, fy, cx, cy in pixels; a 3x3 camera matrix is read as such."""
         array = read_array(self.folder / camera / schema.INTRINSIC_FILE)
         return np.array([array[0, 0], array[1, 1], array[0, 2], array[1, 2]]) if array.shape == (3, 3) else array
 
     def camera_in_parent(self, camera: str) -> NDArray[np.float64]:
-        """(4, 4) OpenCV camera frame in its parent, under either name."""
         names = schema.pose_files(self.camera_parent(camera))
         for name in names:
             if (self.folder / camera / name).is_file():
@@ -139,7 +124,6 @@ class Episode(SourceEpisode):
         raise DatasetError("no pose of this camera", where=self.folder / camera, expected=" or ".join(names))
 
     def camera_parent(self, camera: str) -> Parent:
-        """Return the frame that the pose of a camera is in."""
         return schema.camera_parent(self.folder / camera)
 
 
@@ -162,7 +146,6 @@ class Dataset(EpisodeSource):
 
     @cached_property
     def numbers(self) -> list[int]:
-        """Numbers of the episodes on disk."""
         return sorted(self._found())
 
     @cached_property
@@ -171,12 +154,10 @@ class Dataset(EpisodeSource):
 
     @cached_property
     def settings(self) -> dict[str, Any]:
-        """``conversion.json``; empty where there is none."""
         return read_json(self.root / schema.CONVERSION_FILE)
 
     @cached_property
     def info(self) -> dict[str, Any]:
-        """``data_info.json``; empty where there is none."""
         return read_json(self.root / schema.DATA_INFO_FILE)
 
     @cached_property
@@ -194,7 +175,6 @@ class Dataset(EpisodeSource):
 
     @cached_property
     def rate_hz(self) -> float:
-        """Steps a second: from ``conversion.json``, 5 where there is none."""
         said = self.settings.get("rate_hz", DEFAULT_RATE)
         if isinstance(said, int | float) and 0 < said < np.inf:
             return float(said)
@@ -202,7 +182,6 @@ class Dataset(EpisodeSource):
 
     @cached_property
     def cameras(self) -> tuple[str, ...]:
-        """Names of the cameras: by ``conversion.json``, else those of the first episode."""
         said = self.settings.get("cameras", self._first.cameras)
         if isinstance(said, list | tuple) and all(re.fullmatch(CAMERA_NAME, str(name)) for name in said):
             return tuple(said)
@@ -210,12 +189,10 @@ class Dataset(EpisodeSource):
 
     @property
     def has_depth(self) -> bool:
-        """Whether depth is there."""
         return bool(self.settings.get("depth", self._first.has_depth))
 
     @property
     def has_embeddings(self) -> bool:
-        """Whether embeddings are there, as far as ``conversion.json`` says."""
         return bool(self.settings.get("embeddings", True))
 
     @property
@@ -229,7 +206,6 @@ class Dataset(EpisodeSource):
 
     @cached_property
     def lengths(self) -> dict[int, int]:
-        """Number -> T, by ``data_info.json``."""
         where = self.root / schema.DATA_INFO_FILE
         if not self.info:
             if self.settings:
@@ -251,7 +227,6 @@ class Dataset(EpisodeSource):
             ) from error
 
     def split(self, side: Side) -> list[int]:
-        """Numbers of the episodes of one side, by ``data_info.json``."""
         numbers = sorted(self.lengths) if side == "all" else self.sides[side == "val"]
         unknown = [number for number in numbers if number not in self.lengths]
         if unknown:
@@ -259,17 +234,14 @@ class Dataset(EpisodeSource):
         return numbers
 
     def entry(self, number: int) -> dict[str, Any]:
-        """What ``conversion.json`` says of an episode."""
         entries = self.settings.get("episodes")
         found = entries.get(str(number)) if isinstance(entries, dict) else None
         return found if isinstance(found, dict) else {}
 
     def action_space(self) -> dict[str, Any]:
-        """As ``data_info.json`` has it."""
         return self.info.get("action_space", {})
 
     def episode(self, number: int) -> Episode:
-        """Open an episode."""
         if number not in self._known:
             known = f"{self.numbers[0]} to {self.numbers[-1]}"
             raise DatasetError("no such episode", where=self.root, expected=known, found=number)

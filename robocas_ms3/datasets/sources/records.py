@@ -2,10 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, NonNegativeInt, PlainValidator, StringConstraints
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    NonNegativeInt,
+    PlainValidator,
+    StringConstraints,
+    ValidationError,
+    model_validator,
+)
 
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.strict import refusal
 from robocas_ms3.datasets import schema
 from robocas_ms3.demos.recordings.entries import one_seed
 from robocas_ms3.demos.recordings.subgoals import SubGoal
@@ -29,18 +42,29 @@ class _Part(BaseModel):
     model_config = ConfigDict(strict=True, extra="allow")  # further keys are their writer's
 
 
-class _EnvInfo(_Part):
+class EnvInfo(_Part):
+    """``env_info``."""
+
     env_id: str
     env_kwargs: dict[str, Any]
 
 
-class _Layout(_Part):
+class Layout(_Part):
+    """``layout``: poses [x, y, z, qw, qx, qy, qz] in the world."""
+
     object_ids: list[str] = []
     poses: list[Pose] = []
     present: list[bool] = []
     robot_pose: Pose | None = None
     basket_pose: Pose | None = None
     relation: str | None = None
+
+    @model_validator(mode="after")
+    def _check_lengths(self) -> Layout:
+        for values in (self.poses, self.present):
+            if len(values) not in (0, len(self.object_ids)):
+                raise ValueError("as many poses and values of present as object_ids")
+        return self
 
 
 class _Object(_Part):
@@ -49,7 +73,9 @@ class _Object(_Part):
     name: str
 
 
-class _Target(_Part):
+class Target(_Part):
+    """``target``."""
+
     slot: NonNegativeInt
     asset_id: str
     name: str
@@ -67,13 +93,16 @@ class _Recovery(_Part):
     reason: str
 
 
-class _Recorded(_Part):
+class Recorded(_Part):
+    """``recorded``."""
+
     instruction_template: str | None = None
     relation: str | None = None
     support: str | None = None
     facts: dict[str, Any] | None = None
     attempts: NonNegativeInt | None = None
     recoveries: list[_Recovery] | None = None
+    takeover: Any = None
     seconds: dict[str, Any] | None = None
 
 
@@ -155,16 +184,16 @@ class SceneRecord(_Part):
         description=f"{schema.SCHEMA_VERSION}"
     )
     task: str | None = Field(description="pick, select, search or open_pick")
-    env_info: _EnvInfo | None = Field(description="{env_id, env_kwargs}: what makes the environment")
+    env_info: EnvInfo | None = Field(description="{env_id, env_kwargs}: what makes the environment")
     seed: Annotated[Any, PlainValidator(_seed)] = Field(description="of `env.reset`")
     reset_options: dict[str, Any] | None = Field(description="further options of `env.reset`")
     config: dict[str, Any] | None = Field(description="the whole configuration")
-    layout: _Layout | None = Field(
+    layout: Layout | None = Field(
         description="{object_ids, poses [x, y, z, qw, qx, qy, qz] in the world, present, robot_pose, basket_pose,"
         " relation}"
     )
     objects: list[_Object] | None = Field(description="[{slot, id, name}] those that take part")
-    target: _Target | None = Field(description="{slot, asset_id, name}")
+    target: Target | None = Field(description="{slot, asset_id, name}")
     success: bool | None = Field(description="whether the recording ended in success")
     control_mode: str | None = Field(description="of the recorded actions")
     control_freq: Rate | None = Field(description="of the recorded actions, Hz")
@@ -172,10 +201,29 @@ class SceneRecord(_Part):
     source: _Source = Field(
         description="{trajectory, episode_id, recording: SHA-256 of seed, control mode, instruction and actions}"
     )
-    recorded: _Recorded | None = Field(
+    recorded: Recorded | None = Field(
         description="what the generator said of the episode: template, relation, facts, attempts, seconds"
     )
     versions: dict[str, Any] | None = Field(description="{package: version} the episode was generated with")
 
 
 SCENE_KEYS = tuple(SceneRecord.model_fields)
+_UNKNOWN = {**dict.fromkeys(SCENE_KEYS), "schema_version": schema.SCHEMA_VERSION, "rate_hz": 1.0, "source": {}}
+
+
+def with_unknown(scene: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content of ``scene.json`` with the keys that an older or foreign file lacks."""
+    return {**_UNKNOWN, **scene}
+
+
+def read_scene(scene: Mapping[str, Any], where: object) -> SceneRecord:
+    """Return the content of ``scene.json`` as a record; keys may be missing.
+
+    Raises:
+        DatasetError: it is damaged.
+    """
+    try:
+        return SceneRecord.model_validate(with_unknown(scene))
+    except ValidationError as problem:
+        about, fix = "this description of a scene is damaged", "robocas validate says what is wrong."
+        raise refusal(problem, SceneRecord, DatasetError, where=where, about=about, fix=fix) from problem

@@ -44,12 +44,10 @@ class EpisodeArrays:
 
     @property
     def file(self) -> str:
-        """Path in the dataset."""
         return f"{self.path.parent.name}/{self.path.name}"
 
     @property
     def steps(self) -> int:
-        """T: as ``ee_pos`` has, else as most arrays have; 0 where none has any."""
         lengths = {key: len(array) for key, array in self.arrays.items() if array.ndim}
         most = Counter(lengths.values()).most_common(1)
         return lengths.get("ee_pos", most[0][0] if most else 0)

@@ -77,29 +77,24 @@ class TrajectorySource(EpisodeSource):
         self.numbers, self.file = list(range(len(self.index))), file
 
     def info(self, number: int) -> RecordingInfo:
-        """Return what the JSON says of an episode."""
         info = self._infos[number]
         if isinstance(info, DatasetError):
             raise info
         return info
 
     def steps(self, number: int) -> int:
-        """T of an episode."""
         return len(sample_states(self.info(number).entry.control_steps, self.stride))
 
     @cached_property
     def lengths(self) -> dict[int, int]:
-        """Number -> T, by the JSON."""
         return {number: self.steps(number) for number in self.numbers}
 
     def split(self, side: Side) -> list[int]:
-        """Numbers of the episodes of one side, by the rule of ``robocas convert``."""
         if side == "all":
             return self.numbers
         return split_by_seed({number: self.info(number).entry.seed for number in self.numbers})[side == "val"]
 
     def entry(self, number: int) -> Mapping[str, Any]:
-        """Which recording it is."""
         with self.file.reopened() as file:
             return recording_entry(file, self.index[number])
 
@@ -109,7 +104,6 @@ class TrajectorySource(EpisodeSource):
             return file.recording(self.index[number], bodies=bodies)
 
     def episode(self, number: int) -> RecordedEpisode:
-        """Open an episode."""
         if not 0 <= number < len(self.index):
             raise DatasetError("no such episode", where=self.root, expected=f"0 to {len(self.index) - 1}", found=number)
         return RecordedEpisode(self, number)
@@ -129,35 +123,29 @@ class RecordedEpisode(SourceEpisode):
 
     @property
     def where(self) -> str:
-        """File and recording."""
         return f"{self._source.root}, traj_{self._entry.episode_id}"
 
     @property
     def steps(self) -> int:
-        """T."""
         return self._source.steps(self._number)
 
     @property
     def instruction(self) -> str:
-        """What the robot was told."""
         return self._entry.instruction
 
     @cached_property
     def arrays(self) -> dict[str, NDArray]:
-        """All but the embeddings."""
         recording = self.recording(bodies=False)
         samples = sample_states(recording.control_steps, self._source.stride)
         return episode_arrays(recording.motion(samples), recording.instruction, self.goals)
 
     @property
     def goals(self) -> list[SubGoal]:
-        """Sub-goals over the sampled steps."""
         samples = sample_states(self._entry.control_steps, self._source.stride)
         return sample_subgoals(self._entry.subgoals, samples)
 
     @property
     def scene(self) -> dict[str, Any]:
-        """What the JSON says of how it was made, and what its objects are called, if their pack is here."""
         info = self._source.info(self._number)
         kwargs = info.scene["env_info"]["env_kwargs"]
         config, names = kwargs.get("config"), _names(str(kwargs.get("pack", "builtin")))
@@ -171,7 +159,6 @@ class RecordedEpisode(SourceEpisode):
 
     @cached_property
     def layout(self) -> dict[str, Any]:
-        """Objects at the first state; those that take no part wait below the floor."""
         ids = list(self._source.info(self._number).objects or ())
         actors = self.recording().states.get("actors", {})
         poses = [actors[f"object_{slot}"][0, :7] if f"object_{slot}" in actors else None for slot in range(len(ids))]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.words import error_line
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.checks.scene import valid_values
 from robocas_ms3.datasets.sources.protocol import SourceEpisode
 from robocas_ms3.datasets.sources.provenance import task_of
+from robocas_ms3.datasets.sources.records import Layout, Recorded, SceneRecord, read_scene
 
 Array = NDArray[np.float64]
 UNKNOWN = "unknown"
@@ -22,7 +22,7 @@ UNKNOWN = "unknown"
 
 @dataclass(frozen=True)
 class Surface:
-    """What a layout's objects stand on.
+    """The surface that objects stand on.
 
     Attributes:
         label: furniture and name of the surface.
@@ -37,25 +37,21 @@ class Surface:
     region: list[list[float]] | None
 
     def place(self, xy: Array) -> Array:
-        """(N, 2) in the world -> in the furniture's frame."""
+        """Return positions (N, 2) in the world in the frame of the furniture."""
         cosine, sine = np.cos(self.yaw), np.sin(self.yaw)
         return (xy - [self.x, self.y]) @ np.array([[cosine, -sine], [sine, cosine]])
 
 
 @dataclass(frozen=True)
 class Facts:
-    """What an episode was about; empty where nothing says so.
+    """What an episode was about; empty where it is not known.
 
     Attributes:
-        task, config: names.
         success: whether the recording succeeded; None: not known.
-        instruction, template, relation: what was said.
-        object_ids: of those that took part.
+        object_ids: of the objects that took part.
         names: of objects, by id.
         positions: (N, 2) of those in the world at the beginning, m.
-        target_id: asset.
         target_index: of the target in ``positions``.
-        surface: see there.
     """
 
     instruction: str
@@ -73,64 +69,53 @@ class Facts:
 
 
 def facts_of(episode: SourceEpisode) -> Facts:
-    """Facts of an episode, as far as its scene tells them."""
+    """Return the facts of an episode, as far as its ``scene.json`` has them."""
     instruction = str(episode.read(["language_goal"])["language_goal"])
-    scene = episode.scene
-    if not scene:
+    if not episode.scene:
         return Facts(instruction)
-    _, wrong = valid_values(scene)
-    if wrong:
-        where, fix = f"{episode.where}/{schema.SCENE_FILE}", "robocas validate says what is wrong."
-        raise DatasetError("this description of a scene is damaged", where=where, found=wrong[:200], fix=fix)
+    where, fix = f"{episode.where}/{schema.SCENE_FILE}", "robocas validate says what is wrong."
+    scene = read_scene(episode.scene, where)
+    recorded, target = scene.recorded or Recorded(), scene.target
     try:
-        layout, said, target = episode.layout, scene.get("recorded") or {}, scene.get("target") or {}
-        ids = layout.get("object_ids", [])
-        poses = np.array(layout.get("poses", []), dtype=np.float64).reshape(-1, 7)
-        slots = [slot for slot, there in enumerate(layout.get("present", [True] * len(ids))) if there]
-        names = {target["asset_id"]: target["name"]} if {"asset_id", "name"} <= set(target) else {}
-        names |= {entry["id"]: entry["name"] for entry in scene.get("objects") or []}
+        layout = Layout.model_validate(episode.layout)
+        slots = [n for n in range(len(layout.object_ids)) if not layout.present or layout.present[n]]
+        poses = np.array(layout.poses, dtype=np.float64).reshape(-1, 7)
+        names = {target.asset_id: target.name} if target else {}
         return Facts(
             instruction,
-            task=scene.get("task") or UNKNOWN,
-            config=_config_name(scene.get("env_info") or {}, scene.get("task")),
-            success=scene.get("success"),
-            template=said.get("instruction_template") or "",
-            relation=said.get("relation") or "",
-            object_ids=[ids[slot] for slot in slots],
-            names=names,
+            task=scene.task or UNKNOWN,
+            config=_config_name(scene),
+            success=scene.success,
+            template=recorded.instruction_template or "",
+            relation=recorded.relation or "",
+            object_ids=[layout.object_ids[slot] for slot in slots],
+            names=names | {entry.id: entry.name for entry in scene.objects or []},
             positions=poses[slots, :2] if len(poses) else np.zeros((0, 2)),
-            target_id=target.get("asset_id") or "",
-            target_index=_place(slots, target.get("slot")) if len(poses) else None,
-            surface=_surface(scene.get("config") or {}),
+            target_id=target.asset_id if target else "",
+            target_index=slots.index(target.slot) if target and len(poses) and target.slot in slots else None,
+            surface=_surface(scene.config or {}),
         )
     except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
         raise DatasetError(
-            "this description of a scene is damaged",
-            where=f"{episode.where}/{schema.SCENE_FILE}",
-            found=f"{type(error).__name__}: {error}",
-            fix="robocas validate says what is wrong.",
+            "this description of a scene is damaged", where=where, found=error_line(error, 200), fix=fix
         ) from error
 
 
-def _place(slots: list[int], slot: int | None) -> int | None:
-    return slots.index(slot) if slot in slots else None
-
-
-def _config_name(env_info: Mapping[str, Any], task: str | None) -> str:
-    config = (env_info.get("env_kwargs") or {}).get("config")
+def _config_name(scene: SceneRecord) -> str:
+    env_id, kwargs = (scene.env_info.env_id, scene.env_info.env_kwargs) if scene.env_info else (None, {})
+    config = kwargs.get("config")
     if isinstance(config, str):
         return Path(config).stem
-    name = task or task_of(str(env_info.get("env_id"))) or UNKNOWN
+    name = scene.task or task_of(env_id) or UNKNOWN
     return f"{name} (own configuration)" if config else name
 
 
-def _surface(config: Mapping[str, Any]) -> Surface | None:
+def _surface(config: dict[str, Any]) -> Surface | None:
     surface = config.get("surface")
     if not surface:
         return None
     pose = config["furniture"][surface["furniture"]]["pose"]
     region = [list(surface[key]) for key in ("min_xy", "max_xy")] if surface.get("min_xy") else None
     x, y, _ = pose["position"]
-    return Surface(
-        f"{surface['furniture']}, {surface['name']}", x, y, float(np.deg2rad(pose.get("yaw_deg", 0.0))), region
-    )
+    yaw = float(np.deg2rad(pose.get("yaw_deg", 0.0)))
+    return Surface(f"{surface['furniture']}, {surface['name']}", x, y, yaw, region)

@@ -12,9 +12,7 @@ from robocas_ms3.core.errors import MissingExtraError
 from robocas_ms3.core.files import make_folder, replacing, write_json
 from robocas_ms3.core.words import called, count_of, printable
 from robocas_ms3.datasets.actions import ACTION_NAMES
-from robocas_ms3.datasets.statistics.collect import Stats
-from robocas_ms3.datasets.statistics.described import counted, histogram
-from robocas_ms3.datasets.statistics.layout_map import LayoutMap
+from robocas_ms3.datasets.statistics.collect import LayoutMap, Stats, counted, histogram
 
 DPI = 110
 BLUE, ORANGE, GREY = "#2f6fa8", "#e08a2e", "#9aa3ab"
@@ -23,13 +21,17 @@ _TEXT = 84  # letters of a label
 
 
 def write_stats(stats: Stats, out: Path) -> list[Path]:
-    """Write ``stats.json`` and a PNG of each kind into a folder; gives their paths."""
-    figure_of = _matplotlib()  # before anything is written
+    """Write ``stats.json`` and a PNG of each kind into a folder; return their paths."""
+    try:
+        import matplotlib  # noqa: F401  (before anything is written)
+    except ImportError as error:
+        fix = 'In the clone: pip install -e ".[plots]"'
+        raise MissingExtraError("statistics are drawn with matplotlib, which is not installed", fix=fix) from error
     make_folder(out)
     paths = [out / "stats.json"]
     write_json(paths[0], stats.as_json())
     for name, draw in PICTURES.items():
-        figure = draw(stats, figure_of)
+        figure = draw(stats)
         if figure is None:
             (out / f"{name}.png").unlink(missing_ok=True)  # of an earlier run
             continue
@@ -39,31 +41,15 @@ def write_stats(stats: Stats, out: Path) -> list[Path]:
     return paths
 
 
-FigureOf = Callable[[float, float], Any]
+def _figure(width: float, height: float) -> Any:
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
 
-
-def _matplotlib() -> FigureOf:
-    try:
-        from matplotlib import rc_context
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MissingExtraError(
-            "statistics are drawn with matplotlib, which is not installed",
-            fix='In the clone: pip install -e ".[plots]"',
-        ) from error
-
-    def figure_of(width: float, height: float) -> Any:
-        with rc_context({"font.size": 9, "axes.titlesize": 10}):
-            figure = Figure(figsize=(width, height), layout="constrained")
-        FigureCanvasAgg(figure)
-        return figure
-
-    return figure_of
+    with rc_context({"font.size": 9, "axes.titlesize": 10}):
+        return Figure(figsize=(width, height), layout="constrained")
 
 
 def _axes(figure: Any, rows: int, columns: int, count: int) -> list[Any]:
-    """Some axes in a grid, bare of what says nothing."""
     grid = np.atleast_1d(figure.subplots(rows, columns, squeeze=False)).ravel()
     for axes in grid[count:]:
         axes.remove()
@@ -88,10 +74,10 @@ def _whole_numbers(axis: Any) -> None:
     axis.get_major_locator().set_params(integer=True)
 
 
-def draw_lengths(stats: Stats, figure_of: FigureOf) -> Any:
+def draw_lengths(stats: Stats) -> Any:
     """Histogram of episode lengths, a panel a task."""
     rows, columns = _shape(len(stats.lengths), 2)
-    figure = figure_of(4.6 * columns + 0.4, 2.7 * rows + 0.3)
+    figure = _figure(4.6 * columns + 0.4, 2.7 * rows + 0.3)
     panels = _axes(figure, rows, columns, len(stats.lengths))
     for axes, (task, lengths) in zip(panels, sorted(stats.lengths.items()), strict=True):
         low, high = min(lengths), max(lengths)
@@ -107,13 +93,13 @@ def draw_lengths(stats: Stats, figure_of: FigureOf) -> Any:
     return figure
 
 
-def draw_objects(stats: Stats, figure_of: FigureOf) -> Any:
+def draw_objects(stats: Stats) -> Any:
     """Bars: in how many episodes each object took part, and of how many it was the target."""
     if not stats.objects and not stats.targets:
         return None
     everything = counted(stats.objects | stats.targets)
     ids = list(everything)[:MAX_ROWS]
-    figure = figure_of(7, 1.2 + 0.2 * len(ids))
+    figure = _figure(7, 1.2 + 0.2 * len(ids))
     axes = _axes(figure, 1, 1, 1)[0]
     rows = np.arange(len(ids))
     names = [_label(called(i, stats.names.get(i, ""))) for i in ids]
@@ -130,12 +116,12 @@ def draw_objects(stats: Stats, figure_of: FigureOf) -> Any:
     return figure
 
 
-def draw_layouts(stats: Stats, figure_of: FigureOf) -> Any:
+def draw_layouts(stats: Stats) -> Any:
     """Heat maps of where objects stood, with the targets, one of each configuration; x goes up, y to the left."""
     if not stats.layouts:
         return None
     rows, columns = _shape(len(stats.layouts), 3)
-    figure = figure_of(4.2 * columns, 2.6 * rows + 0.3)
+    figure = _figure(4.2 * columns, 2.6 * rows + 0.3)
     panels = _axes(figure, rows, columns, len(stats.layouts))
     for axes, (name, layout) in zip(panels, sorted(stats.layouts.items()), strict=True):
         _draw_layout(figure, axes, name, layout)
@@ -173,7 +159,7 @@ def _draw_layout(figure: Any, axes: Any, name: str, layout: LayoutMap) -> None:
     _whole_numbers(bar.ax.yaxis)
 
 
-def draw_instructions(stats: Stats, figure_of: FigureOf) -> Any:
+def draw_instructions(stats: Stats) -> Any:
     """Bars of instructions, and of templates and relations where they are known."""
     tables = {
         f"Instructions, {len(stats.instructions)} different": stats.instructions,
@@ -182,7 +168,7 @@ def draw_instructions(stats: Stats, figure_of: FigureOf) -> Any:
     }
     tables = {title: list(counted(table).items())[: MAX_ROWS // 2] for title, table in tables.items() if table}
     heights = [0.8 + 0.2 * len(rows) for rows in tables.values()]
-    figure = figure_of(10, sum(heights))
+    figure = _figure(10, sum(heights))
     panels = np.atleast_1d(figure.subplots(len(tables), 1, height_ratios=heights))
     for axes, (title, rows) in zip(panels, tables.items(), strict=True):
         axes.spines[["top", "right"]].set_visible(False)
@@ -196,11 +182,11 @@ def draw_instructions(stats: Stats, figure_of: FigureOf) -> Any:
     return figure
 
 
-def draw_actions(stats: Stats, figure_of: FigureOf) -> Any:
+def draw_actions(stats: Stats) -> Any:
     """Histograms of the seven numbers of the action; dashed: 1st and 99th percentile."""
     if not len(stats.actions):
         return None
-    figure = figure_of(11, 5.2)
+    figure = _figure(11, 5.2)
     units = ("m", "m", "m", "rad", "rad", "rad", "")
     for axes, name, column, unit in zip(_axes(figure, 2, 4, 7), ACTION_NAMES, stats.actions.T, units, strict=True):
         bins = histogram(column)
@@ -221,12 +207,12 @@ def draw_actions(stats: Stats, figure_of: FigureOf) -> Any:
     return figure
 
 
-def draw_subgoals(stats: Stats, figure_of: FigureOf) -> Any:
+def draw_subgoals(stats: Stats) -> Any:
     """Box plots of how long the sub-goals of each type took."""
     if not stats.subgoals:
         return None
     kinds = sorted(stats.subgoals, key=lambda kind: -len(stats.subgoals[kind]))
-    figure = figure_of(7.5, 1.2 + 0.55 * len(kinds))
+    figure = _figure(7.5, 1.2 + 0.55 * len(kinds))
     axes = _axes(figure, 1, 1, 1)[0]
     seconds = [np.array(stats.subgoals[kind]) / stats.rate_hz for kind in kinds]
     boxes = axes.boxplot(
@@ -251,7 +237,7 @@ def draw_subgoals(stats: Stats, figure_of: FigureOf) -> Any:
     return figure
 
 
-PICTURES: dict[str, Callable[[Stats, FigureOf], Any]] = {
+PICTURES: dict[str, Callable[[Stats], Any]] = {
     "lengths": draw_lengths,
     "objects": draw_objects,
     "layouts": draw_layouts,
@@ -259,4 +245,4 @@ PICTURES: dict[str, Callable[[Stats, FigureOf], Any]] = {
     "actions": draw_actions,
     "subgoals": draw_subgoals,
 }
-"""Name of the PNG -> what draws it, or gives None where there is nothing to draw."""
+"""Name of the PNG -> function that draws it, or returns None where there is nothing to draw."""

@@ -16,7 +16,6 @@ from robocas_ms3.scenes.language.templates import GOAL_TYPES
 
 
 def check_holds(source: EpisodeSource, cameras: Sequence[str], *, depth: bool, embedding: bool) -> None:
-    """Check that a source holds what samples are to be made of."""
     pictures = source.cameras
     wrong = [camera for camera in cameras if camera not in pictures]
     if wrong and not pictures:

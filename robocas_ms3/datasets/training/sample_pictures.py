@@ -59,7 +59,6 @@ class PictureStack:
         return torch.from_numpy(stack)
 
     def _run(self, episode: SourceEpisode, camera: str, kind: Kind, first: int, count: int) -> list[NDArray]:
-        """One camera's pictures of steps one after the other, scaled."""
         shots = []
         with closing(episode.frames(camera, kind, first, count)) as pictures:
             for step, picture in enumerate(pictures, start=first):

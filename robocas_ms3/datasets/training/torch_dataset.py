@@ -222,5 +222,4 @@ class RoboCASDataset(torch.utils.data.Dataset):
         return made
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave the cache behind."""
         return {**self.__dict__, "_cache": OrderedDict()}

@@ -126,7 +126,6 @@ def _split_before(out: Path) -> tuple[list[int], list[int]]:
 
 
 def embed_texts(source: EpisodeSource, entries: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return the embedding (384,) of every distinct text, so that no worker has to load the model."""
     from robocas_ms3.scenes.language.embed import TextEmbedder
 
     embedder = TextEmbedder()

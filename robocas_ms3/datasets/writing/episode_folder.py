@@ -46,13 +46,11 @@ class FolderWriter(EpisodeWriter):
     sheet: tuple[int, ...] | None = None
 
     def folder(self, number: int) -> Path:
-        """Return the folder of an episode."""
         return self.out / schema.episode_folder(number)
 
     def write_files(
         self, folder: Path, wanted: GivenEpisode, frames: Generator[Frame, None, None]
     ) -> NDArray[np.uint8] | None:
-        """Write an episode into a folder; return its row of the contact sheet, if there is one."""
         episode, pictures, arrays, preview = wanted.episode, wanted.given.pictures, wanted.arrays, None
         for camera in pictures.cameras:
             for kind in pictures.kinds:

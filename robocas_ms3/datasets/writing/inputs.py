@@ -88,7 +88,6 @@ class ConversionInput:
         }
 
     def frames(self, episode: SourceEpisode) -> Generator[Frame, None, None]:
-        """Yield the images of every step; close the generator unless it is read to the end."""
         with closing(episode.images(self.pictures)) as frames:
             for step, frame in enumerate(frames):
                 for camera, size in self.sizes.items():
@@ -104,7 +103,6 @@ class ConversionInput:
                 yield frame
 
     def close(self) -> None:
-        """Close the source."""
         self.source.close()
 
 
@@ -137,7 +135,6 @@ def open_input(settings: ConversionSettings) -> ConversionInput:
 
 
 def open_trajectory(settings: ConversionSettings) -> RenderedSource:
-    """Open a trajectory file, which is rendered."""
     return RenderedSource(
         settings.source,
         rate_hz=settings.rate_hz,
@@ -148,7 +145,6 @@ def open_trajectory(settings: ConversionSettings) -> RenderedSource:
 
 
 def complete_arrays(episode: SourceEpisode) -> dict[str, NDArray]:
-    """Return all arrays of an episode."""
     fix = "robocas validate says what is wrong."
     try:
         arrays = episode.arrays

@@ -41,7 +41,6 @@ DATASET = FolderKind("robocas convert", (schema.CONVERSION_FILE,), "rate_hz", ma
 
 
 def dataset_settings(rate_hz: float, pictures: Pictures, embeddings: bool) -> dict[str, Any]:
-    """Return the settings of ``conversion.json``."""
     settings = SettingsRecord(
         rate_hz=float(rate_hz),
         cameras=list(pictures.cameras),
@@ -54,7 +53,6 @@ def dataset_settings(rate_hz: float, pictures: Pictures, embeddings: bool) -> di
 
 
 def header(settings: Mapping[str, Any], split_rule: str = SPLIT_RULE) -> dict[str, Any]:
-    """Return ``conversion.json`` without the episodes."""
     version = {"format": "robocas", "schema_version": schema.SCHEMA_VERSION, "made_with": versions()}
     return {**version, **settings, "split": split_rule}
 

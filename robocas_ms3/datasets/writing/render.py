@@ -51,11 +51,9 @@ class EnvRenderer:
         self._base: Any = self.env.unwrapped
 
     def close(self) -> None:
-        """Free the renderer."""
         self.env.close()
 
     def load(self, recording: Recording) -> None:
-        """Rebuild the scene of a recording."""
         self.env.reset(seed=recording.seed, options=dict(recording.reset_options))
         for name in set(self._base._sensors) - set(self._pictures.cameras):
             del self._base._sensors[name]  # they are made anew at each reset; what is there is rendered
@@ -87,12 +85,10 @@ class EnvRenderer:
             yield "", recording.instruction, instruction
 
     def frames(self, recording: Recording, samples: NDArray[np.int64]) -> Iterator[Frame]:
-        """Render some of the states of the loaded recording, in order."""
         for index in samples:
             yield self._frame(recording.state(int(index)))
 
     def _frame(self, state: dict[str, dict[str, NDArray[np.float32]]]) -> Frame:
-        """Render one state, without a step of physics."""
         tensors = {kind: {k: torch.from_numpy(v) for k, v in arrays.items()} for kind, arrays in state.items()}
         self._base.set_state_dict(tensors)
         textures = self._base._get_obs_sensor_data(apply_texture_transforms=False)
@@ -111,7 +107,6 @@ class EnvRenderer:
         return {name: box for name, mask in masks.items() if (box := box_of(mask)) is not None}
 
     def cameras(self) -> dict[str, CameraModel]:
-        """Return the camera models at the state rendered last."""
         agent = self._base.agent
         parents = {"ee": agent.tcp.pose, "arm_base": agent.arm_base_link.pose}
         models = {}
@@ -130,7 +125,6 @@ class EnvRenderer:
         return models
 
     def scene(self) -> dict[str, Any]:
-        """Return ``task``, ``config``, ``layout`` and ``objects`` of ``scene.json``."""
         env = self._base
         layout = env.layout()
         return {

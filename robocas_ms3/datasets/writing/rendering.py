@@ -29,7 +29,6 @@ OpenRenderer = Callable[[RecordedEnv, str, Pictures], "EnvRenderer"]
 
 
 def open_env(env: RecordedEnv, control_mode: str, pictures: Pictures) -> EnvRenderer:
-    """Open the environment that recorded an episode."""
     from robocas_ms3.datasets.writing.render import EnvRenderer
 
     return EnvRenderer(env, control_mode, pictures)
@@ -81,11 +80,9 @@ class RenderedSource(TrajectorySource):
         super().__init__(path, rate_hz=self.rate_hz, include_failed=True, pack=self._pack)
 
     def settled_split(self) -> tuple[list[int], list[int]]:
-        """Return two empty lists: a trajectory file has no split."""
         return [], []
 
     def entry(self, number: int) -> dict[str, Any]:
-        """Return the recording of an episode, without fingerprint if it can't be read."""
         with self.file.reopened() as file:
             try:
                 return recording_entry(file, number)
@@ -93,12 +90,10 @@ class RenderedSource(TrajectorySource):
                 return unread_entry(file, number)
 
     def texts(self, number: int) -> list[str]:
-        """Return the instruction of an episode and the texts of its sub-goals."""
         entry = self.info(number).entry
         return [entry.instruction, *(goal.goal_description for goal in entry.subgoals)]
 
     def episode(self, number: int) -> RenderedEpisode:
-        """Build the scene of a recording. The episode is valid until the next one is opened."""
         recording = self.recording(number)
         samples = sample_states(recording.control_steps, self.stride)
         if len(samples) > schema.MAX_STEPS:
@@ -112,7 +107,6 @@ class RenderedSource(TrajectorySource):
         return RenderedEpisode(self, number, recording, self._renderer)
 
     def close(self) -> None:
-        """Close the environment."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
@@ -127,17 +121,14 @@ class RenderedEpisode(RecordedEpisode):
         self._recording, self._renderer = recording, renderer
 
     def recording(self, *, bodies: bool = True) -> Recording:
-        """Return all control steps."""
         return self._recording
 
     def images(self, pictures: Pictures) -> Generator[Frame, None, None]:
-        """Render every step; ``pictures`` are those that the source was opened with."""
         samples = sample_states(self._recording.control_steps, self._source.stride)
         yield from self._renderer.frames(self._recording, samples)
 
     @property
     def scene(self) -> dict[str, Any]:
-        """Content of ``scene.json``."""
         source, rendered = self._source, self._renderer.scene()
         return scene_record(source.file, self._number, self._recording, rendered, source.rate_hz)
 
@@ -146,13 +137,10 @@ class RenderedEpisode(RecordedEpisode):
         return self._renderer.cameras()
 
     def intrinsic(self, camera: str) -> NDArray[np.float64]:
-        """Return fx, fy, cx, cy in pixels (4,)."""
         return self._models[camera].intrinsic
 
     def camera_in_parent(self, camera: str) -> NDArray[np.float64]:
-        """Return the OpenCV camera frame in its parent (4, 4)."""
         return self._models[camera].camera_in_parent
 
     def camera_parent(self, camera: str) -> Parent:
-        """Return the frame that the pose of a camera is in."""
         return self._models[camera].parent

@@ -115,7 +115,6 @@ class ConversionSettings:
 
     @property
     def is_trajectory(self) -> bool:
-        """Whether the images of the source have to be rendered."""
         from robocas_ms3.datasets.formats import format_of
 
         found = format_of(self.source)
@@ -123,7 +122,6 @@ class ConversionSettings:
 
     @property
     def needs_device(self) -> bool:
-        """Whether a render device is needed."""
         return self.open_renderer is None and self.is_trajectory
 
     def check_device(self) -> None:
