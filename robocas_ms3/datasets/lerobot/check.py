@@ -13,14 +13,13 @@ from robocas_ms3.core.documents import DocumentError
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.words import one_line
 from robocas_ms3.datasets.checks.dataset import Report
-from robocas_ms3.datasets.checks.violation import Violation, check_form, read_object
+from robocas_ms3.datasets.checks.violation import Violation, read_object
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check_frames import TOLERANCE, Fault, Ranges, check_data
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.records import MAX_EPISODES, MAX_FRAMES, InfoRecord, StatsLine, read_lines
 from robocas_ms3.datasets.lerobot.stats import QUANTILES
 from robocas_ms3.datasets.lerobot.video import packet_times, read_frames
-from robocas_ms3.datasets.sources.records import SceneRecord
 
 _MILLISECONDS = 0.6e-3  # Matroska rounds to them
 _STATISTICS = ("min", "max", "mean", "std", "count")
@@ -213,7 +212,7 @@ def _check_our_files(dataset: LeRobotDataset) -> Iterator[Violation]:
             yield Violation(name, "episode_index", "the episodes of the dataset", f"{found} more or missing")
         for number in sorted(dataset.described.keys() & dataset.row_of.keys()):
             episode = dataset.episode(number)
-            yield from check_values(episode.scene, f"{name}, episode {number}")
+            yield from check_form(SceneRecord, episode.scene, f"{name}, episode {number}")
             for camera in dataset.cameras:
                 episode.intrinsic(camera)
     except DatasetError as error:

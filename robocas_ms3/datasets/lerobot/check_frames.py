@@ -64,7 +64,10 @@ def check_data(
                 wrong = list(_check_episode(table, columns, row, dataset.info, texts))
                 if dataset.has_language:
                     wrong += check_language(table, name, dataset.info)
-                violations += [Violation(name, f"{where}, {key}" if key else where, *rest) for key, *rest in wrong]
+                violations += [
+                    Violation(name, f"{where}, {key}" if key else where, expected, found)
+                    for key, expected, found in wrong
+                ]
                 _widen(ranges, columns, features)
                 done += 1
                 on_episode(done, len(dataset.rows))
