@@ -90,11 +90,9 @@ class PageContent:
             }
 
     def rgb(self, number: int, camera: str, step: int) -> EncodedImage:
-        """Return an image, as it is stored if it is stored encoded."""
         return encode_jpeg(self._image(number, camera, "rgb", step))
 
     def depth(self, number: int, camera: str, step: int) -> NDArray[np.uint16]:
-        """Return (H, W) depth in mm; 0: no measurement."""
         return self._image(number, camera, "depth", step)
 
     def _row(self, number: int, steps: int, split: str) -> tuple[Row, Any]:
@@ -141,7 +139,6 @@ class PageContent:
         return {**dict.fromkeys(train, "train"), **dict.fromkeys(val, "val")}
 
     def _failures(self, scene: Mapping[str, Any]) -> Sequence[Failure]:
-        """Return the failures of the seed of a scene in its environment."""
         return self.failures.of_seed(one_seed(scene.get("seed")), scene.get("env_info"))
 
     def _show(self, number: int, scene: Mapping[str, Any]) -> dict[str, Any]:
@@ -149,7 +146,6 @@ class PageContent:
         return show_arrays(self.source.episode(number).arrays, scene)
 
     def _image(self, number: int, camera: str, kind: Kind, step: int) -> NDArray:
-        """Return a decoded image."""
         with readable(f"{self.root.name}, episode {number}"), self._reading:
             episode = self.source.episode(number)
             return episode.rgb(camera, step) if kind == "rgb" else episode.depth(camera, step)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, TypeVar
@@ -11,8 +10,6 @@ from robocas_ms3.core.documents import DAMAGED
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.words import error_line
 from robocas_ms3.datasets.checks.scene import valid_values
-from robocas_ms3.datasets.checks.violation import check_form
-from robocas_ms3.datasets.sources.records import RateRecord
 
 T = TypeVar("T")
 _WRONG = (*DAMAGED, ArithmeticError, AttributeError, AssertionError, LookupError, RecursionError, TypeError)
@@ -72,25 +69,7 @@ def read_scene(read: Callable[[], Any], name: str) -> tuple[dict[str, Any], str]
     return found, f"{name}: {failed}" if failed else wrong
 
 
-def rate_of(settings: Mapping[str, Any], name: str, default: float) -> tuple[float, str]:
-    """Return the steps per second of the settings, and a note; the default if they are damaged."""
-    wrong = check_form(RateRecord, settings, "")
-    if not wrong:
-        return float(settings["rate_hz"]), ""
-    note = f"`rate_hz` of `{name}`: expected {wrong[0].expected}, found {wrong[0].found}; {default:g} Hz is assumed."
-    return default, note if "rate_hz" in settings else ""
-
-
 def split_of(info: Mapping[str, Any]) -> dict[int, str]:
     """Return the side of each episode that a dataset lists, "train" or "val"."""
     sides = {side: info.get(f"{side}_eps") for side in ("train", "val")}
     return {n: side for side, listed in sides.items() if isinstance(listed, list) for n in listed if type(n) is int}
-
-
-def without_nan(value: Any) -> Any:
-    """Return JSON values with None for NaN and infinite numbers."""
-    if isinstance(value, dict):
-        return {key: without_nan(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [without_nan(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

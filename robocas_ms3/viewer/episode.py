@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import from_xyzw
 from robocas_ms3.core.words import called
 from robocas_ms3.demos.recordings.subgoals import subgoal_runs
@@ -44,13 +43,9 @@ def show_arrays(
             None: where they were at the start, according to the scene.
 
     Raises:
-        DatasetError: an array is missing.
+        LookupError: an array is missing.
         ValueError: arrays have different lengths.
     """
-    missing = sorted(set(_NEEDED) - set(a))
-    if missing:
-        found = f"without {', '.join(missing)}"
-        raise DatasetError("this episode can't be read", found=found, fix="robocas validate says what is wrong.")
     lengths = {len(a[key]) for key in _NEEDED}
     if len(lengths) > 1:
         raise ValueError(f"arrays of different lengths: {sorted(lengths)}")

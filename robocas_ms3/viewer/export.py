@@ -26,10 +26,8 @@ def export(
 ) -> tuple[int, dict[int, str]]:
     """Write ``index.html`` and all it needs; an existing folder is replaced, so the caller checks that it may be.
 
-    Damaged values are left out; the table of the page says so.
-
     Returns:
-        The number of episodes, and what is wrong with the damaged ones.
+        The number of episodes, and what is wrong with the damaged ones, which the table of the page says too.
 
     Raises:
         DatasetError: an episode that was asked for does not exist.

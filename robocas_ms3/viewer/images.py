@@ -38,18 +38,15 @@ def depth_image(depth: NDArray[np.uint16], width: int | None = None) -> EncodedI
 
 
 def shrink_image(image: EncodedImage, width: int) -> EncodedImage:
-    """Return an image as JPEG, at most this wide."""
     return encode_jpeg(_shrink(decode(image), width))
 
 
 def thumbnail(image: EncodedImage) -> EncodedImage:
-    """Return a small JPEG."""
     small = cv2.resize(decode(image, cv2.IMREAD_REDUCED_COLOR_4), THUMBNAIL, interpolation=cv2.INTER_AREA)
     return encode_jpeg(np.asarray(small, np.uint8))
 
 
 def decode(image: EncodedImage, flags: int = cv2.IMREAD_COLOR) -> NDArray[np.uint8]:
-    """Return (H, W, 3) RGB."""
     pixels = cv2.imdecode(np.frombuffer(image.data, np.uint8), flags) if image.data else None
     if pixels is None:
         raise DatasetError("this picture is damaged", fix="robocas validate lists all that is wrong.")
@@ -57,7 +54,6 @@ def decode(image: EncodedImage, flags: int = cv2.IMREAD_COLOR) -> NDArray[np.uin
 
 
 def encode_jpeg(image: NDArray[np.uint8]) -> EncodedImage:
-    """Return (H, W, 3) RGB as JPEG."""
     _, data = cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
     return EncodedImage("image/jpeg", data.tobytes())
 

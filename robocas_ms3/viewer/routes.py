@@ -19,7 +19,7 @@ import re
 import secrets
 import threading
 from dataclasses import dataclass
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 from importlib.resources import files
 from typing import Any
 
@@ -27,7 +27,6 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.words import printable
 from robocas_ms3.viewer import images
 from robocas_ms3.viewer.content import CAMERA_NAME, PageContent
-from robocas_ms3.viewer.damage import without_nan
 from robocas_ms3.viewer.images import EncodedImage
 
 _SCRIPT = "text/javascript; charset=utf-8"
@@ -48,7 +47,7 @@ _CONTROL = re.compile(  # of `words.printable`, but for surrogates, of which JSO
 
 @dataclass(frozen=True)
 class Response:
-    """What to send: status, media type, content, and for how many seconds a browser may cache it."""
+    """What to send; ``max_age``: for how many seconds a browser may cache it."""
 
     status: int
     media_type: str
@@ -117,17 +116,12 @@ def script(name: str, content: Any) -> bytes:
 
     It is ASCII, and the page shows control characters as escapes: ``\u202e`` becomes ``\\u202e``.
     """
-    write = partial(json.dumps, ensure_ascii=True, separators=(",", ":"), allow_nan=False, default=str)
-    try:
-        text = write(content)
-    except ValueError:
-        text = write(without_nan(content))
+    text = json.dumps(content, ensure_ascii=True, separators=(",", ":"), default=str)
     shown = _CONTROL.sub(r"\1\\\\\2", text)
     return f'robocas.put("{name}",{shown});\n'.encode()
 
 
 def page_file(name: str) -> bytes:
-    """Return a file of the page."""
     return files("robocas_ms3.viewer").joinpath("page", name).read_bytes()
 
 

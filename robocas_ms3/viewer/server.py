@@ -21,13 +21,9 @@ _POLICY = "default-src 'self'; base-uri 'none'; form-action 'none'; frame-ancest
 
 
 class Viewer(ThreadingHTTPServer):
-    """The server; use it in a ``with`` statement, and ``serve_forever``.
+    """The server; use it in a ``with`` statement, and ``serve_forever``. Port 0 takes a free one.
 
     All its threads end with it: the interpreter would crash if it ended one inside OpenCV.
-
-    Args:
-        source: what to show.
-        port: of 127.0.0.1; 0 takes a free one.
 
     Raises:
         RobocasError: the port is taken.
@@ -48,7 +44,6 @@ class Viewer(ThreadingHTTPServer):
 
     @property
     def url(self) -> str:
-        """Address of the page."""
         return f"http://{HOST}:{self.server_port}/"
 
     def warm_up(self) -> None:
@@ -63,7 +58,6 @@ class Viewer(ThreadingHTTPServer):
         super().process_request(request, client_address)
 
     def shutdown_request(self, request: Any) -> None:
-        """Forget the connection."""
         self._connections.discard(request)
         super().shutdown_request(request)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,12 +16,13 @@ from robocas_ms3.core.words import called
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.formats import format_of
 from robocas_ms3.datasets.pictures.headers import read_picture_bytes
+from robocas_ms3.datasets.sources.protocol import Kind
 from robocas_ms3.datasets.sources.provenance import task_of, unread_entry
 from robocas_ms3.datasets.sources.reader import DEFAULT_RATE, Dataset
 from robocas_ms3.datasets.sources.trajectory import TrajectorySource
 from robocas_ms3.demos.recordings.reading import Recording, TrajectoryFile
 from robocas_ms3.viewer.content import PageContent
-from robocas_ms3.viewer.damage import attempt, rate_of, read_object, readable, split_of
+from robocas_ms3.viewer.damage import attempt, read_object, readable, split_of
 from robocas_ms3.viewer.episode import ARM, ROLL_PITCH_YAW, XYZ, Plot, facts_of, plot, show_arrays
 from robocas_ms3.viewer.images import EncodedImage, check_inside
 
@@ -30,6 +32,8 @@ _NO_IMAGES = (
 )
 _STILL = 0.002  # m: an object that moves less is drawn as one point
 _PARKED = 5.0  # m from the arm: objects there take no part
+_AT_ONCE = 8  # images decoded together: a video opens and seeks slowly, and the next step is asked for next
+_CACHE_BYTES = 128e6  # of decoded images
 
 
 def open_source(path: Path | str) -> PageContent:
@@ -55,31 +59,25 @@ def open_source(path: Path | str) -> PageContent:
     if found.name == "trajectory":
         return TrajectoryContent(path)
     if found.name == "lerobot":
-        from robocas_ms3.viewer.lerobot import LeRobotContent  # needs the extra `lerobot`
-
         return LeRobotContent(path)
     return PageContent(found.part("reader")(path), found.title)
 
 
 class FolderContent(PageContent):
-    """A RoboCAS folder, of this package or of RoboCAS-v0; images are sent as they are stored.
-
-    Raises:
-        DatasetError: there are no episodes.
-    """
+    """A RoboCAS folder, of this package or of RoboCAS-v0; images are sent as they are stored."""
 
     def __init__(self, root: Path) -> None:
         self.dataset = dataset = Dataset(root)
         # damaged values of the overviews are left out from here on
         dataset.settings, wrong_settings = read_object(lambda: dataset.settings, schema.CONVERSION_FILE)
         dataset.info, wrong_info = read_object(lambda: dataset.info, schema.DATA_INFO_FILE)
-        dataset.rate_hz, wrong_rate = rate_of(dataset.settings, schema.CONVERSION_FILE, DEFAULT_RATE)
+        dataset.rate_hz, wrong = attempt(lambda: dataset.rate_hz, DEFAULT_RATE)
+        assumed = f"`rate_hz` of `{schema.CONVERSION_FILE}`: {wrong}; {DEFAULT_RATE:g} Hz is assumed."
         dataset.cameras, _ = attempt(lambda: dataset.cameras, dataset.episode(dataset.numbers[0]).cameras)
-        notes = wrong_settings, wrong_rate, wrong_info
+        notes = wrong_settings, assumed if wrong else "", wrong_info
         super().__init__(dataset, "RoboCAS folder", notes=notes, split=split_of(dataset.info))
 
     def rgb(self, number: int, camera: str, step: int) -> EncodedImage:
-        """Return the file of an image, not decoded."""
         path = check_inside(self.dataset.episode(number).image_path(camera, "rgb", step), self.root)
         try:
             return EncodedImage(MEDIA_TYPES[path.suffix], read_picture_bytes(path))
@@ -88,18 +86,13 @@ class FolderContent(PageContent):
             raise DatasetError("can't read this picture", where=path, found=found) from error
 
     def depth(self, number: int, camera: str, step: int) -> NDArray[np.uint16]:
-        """Return (H, W) depth in mm; 0: no measurement."""
         episode = self.dataset.episode(number)
         check_inside(episode.image_path(camera, "depth", step), self.root)
         return episode.depth(camera, step)
 
 
 class TrajectoryContent(PageContent):
-    """A trajectory file at its control frequency: no images, but recorded actions and the motion of the objects.
-
-    Raises:
-        DatasetError: a file is missing, damaged, or they do not match.
-    """
+    """A trajectory file at its control frequency: no images, but recorded actions and the motion of the objects."""
 
     scene_name = entry_name = "its entry of the JSON"
 
@@ -122,6 +115,68 @@ class TrajectoryContent(PageContent):
         objects = _object_paths(recording, scene, self.recordings.info(number).objects, base)
         shown = show_arrays(arrays, scene, actions=_action_plots(recording), moving=objects)
         return {**shown, "facts": facts_of({**scene, "source": None})}  # which is this file
+
+
+class LeRobotContent(PageContent):
+    """A LeRobot dataset; images are decoded from its videos, damaged additions of ours are left out with a note."""
+
+    def __init__(self, root: Path) -> None:
+        from robocas_ms3.datasets.lerobot import schema as lerobot  # needs the extra `lerobot`
+        from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
+
+        with readable(root):
+            self.dataset = dataset = LeRobotDataset(root)
+            _ = dataset.is_ours, dataset.lengths, dataset.rate_hz, dataset.cameras, dataset.has_depth
+        self.entry_name, self._indices = lerobot.CONVERSION_FILE, {*lerobot.INDICES, lerobot.SUBTASK_INDEX.key}
+        dataset.settings, wrong_settings = read_object(lambda: dataset.settings, lerobot.CONVERSION_FILE)
+        dataset.described, wrong_scenes = read_object(lambda: dataset.described, lerobot.SCENES_FILE)
+        notes = wrong_scenes, wrong_settings
+        super().__init__(dataset, "LeRobot dataset", notes=notes, split=split_of(dataset.settings))
+        self._decoded: OrderedDict[tuple[int, str, Kind, int], NDArray] = OrderedDict()  # the last used is last
+
+    def _show(self, number: int, scene: Mapping[str, Any]) -> dict[str, Any]:
+        """Show ours like a RoboCAS folder, others by a plot per numeric column."""
+        if self.dataset.is_ours:
+            return super()._show(number, scene)
+        episode = self.dataset.episode(number)
+        features = self.dataset.info["features"]
+        plots = [
+            plot(name, "", _names(features.get(name, {}), values.shape[1]), values)
+            for name, values in episode.columns.items()
+            if name not in self._indices and values.dtype != bool
+        ]
+        return {
+            "instruction": episode.instruction,
+            "steps": episode.steps,
+            "subgoals": [],
+            "plots": plots,
+            "trace": None,
+            "facts": {"Robot": self.dataset.info.get("robot_type")},
+        }
+
+    def _image(self, number: int, camera: str, kind: Kind, step: int) -> NDArray:
+        episode = self.dataset.episode(number)
+        if not 0 <= step < episode.steps:
+            raise DatasetError("no such step", where=f"{self.root}, episode {number}", found=step)
+        first = step - step % _AT_ONCE
+        key = number, camera, kind, first
+        with self._reading:
+            if key not in self._decoded:
+                check_inside(episode.video(camera, kind)[0], self.root)
+                frames = episode.frames(camera, kind, first, min(_AT_ONCE, episode.steps - first))
+                self._decoded[key] = np.stack(list(frames))
+            self._decoded.move_to_end(key)
+            while len(self._decoded) > 1 and sum(images.nbytes for images in self._decoded.values()) > _CACHE_BYTES:
+                self._decoded.popitem(last=False)
+            return self._decoded[key][step - first]
+
+
+def _names(feature: dict[str, Any], width: int) -> list[str]:
+    """Return the names of a feature's numbers; datasets have a list, a dictionary of lists, or nothing."""
+    names = feature.get("names")
+    if isinstance(names, dict):
+        names = [str(word) for part in names.values() for word in (part if isinstance(part, list) else [part])]
+    return [str(name) for name in names] if names and len(names) == width else [str(i) for i in range(width)]
 
 
 def _action_plots(recording: Recording) -> list[Plot]:

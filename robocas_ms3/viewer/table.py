@@ -19,13 +19,7 @@ class Row:
 
     Attributes:
         n: episode; None: a seed without an episode.
-        steps: number of steps.
-        instruction: of the episode.
-        task: its name.
         object: name of the target.
-        seed: of the scene.
-        success: whether the episode succeeded; None: unknown.
-        split: ``train``, ``val`` or empty.
         stages: where attempts failed.
         attempts: how many there were.
         damage: what of the episode is damaged and therefore not shown.

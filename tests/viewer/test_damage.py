@@ -192,17 +192,15 @@ def test_a_static_page_of_a_damaged_dataset(spoilt, tmp_path, capsys):
     assert [bool(row["damage"]) for row in index["episodes"]] == [True, True, True, False]
 
 
-def test_control_characters_and_nan_in_data():
-    """Control characters reach the page as escapes, NaN and infinity, which JSON does not have, as null."""
+def test_control_characters_reach_the_page_as_escapes():
     texts = ["\x1b[31m\x9b\x7f", "\u202eevil\u2069\u2028", "\\u202e", "\\\u202e\u202e", "é 😀 \u0645", "two\nlines"]
-    data = script("index", {"name": texts, "numbers": [1.5, float("nan"), (float("inf"), "NaN")]})
+    data = script("index", {"name": texts})
     assert data.isascii()
     read = json.loads(data[len(b'robocas.put("index",') : -len(b");\n")])
     assert read["name"] == [
         *("\\u001b[31m\\u009b\\u007f", "\\u202eevil\\u2069\\u2028"),
         *("\\u202e", "\\\\u202e\\u202e", "é 😀 \u0645", "two\nlines"),
     ]
-    assert read["numbers"] == [1.5, None, [None, "NaN"]]
 
 
 LINE = '{"seed": 4, "attempt": 0, "stage": "grasp", "reason": "slipped", "seconds": 2}'

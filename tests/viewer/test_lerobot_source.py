@@ -48,7 +48,7 @@ def test_pictures_are_those_of_that_step(lerobot, folder):
 def test_the_memory_of_decoded_images_is_bounded(lerobot, monkeypatch):
     decoded, frames = [], LeRobotEpisode.frames
     monkeypatch.setattr(LeRobotEpisode, "frames", lambda self, *key: decoded.append(self.number) or frames(self, *key))
-    monkeypatch.setattr("robocas_ms3.viewer.lerobot._CACHE_BYTES", 2 * 7 * 64 * 48 * 3)  # two episodes of a camera
+    monkeypatch.setattr("robocas_ms3.viewer.source._CACHE_BYTES", 2 * 7 * 64 * 48 * 3)  # two episodes of a camera
     source = open_source(lerobot)
     for number in (0, 1, 0, 2, 0, 1):
         source.rgb(number, "base_camera", 3)
