@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.baselines.rt1.config import RT1Config
 from robocas_ms3.baselines.rt1.model import RT1Model
-from robocas_ms3.datasets.training.sample_pictures import resize
+from robocas_ms3.datasets.training.torch_dataset import resize
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 
 

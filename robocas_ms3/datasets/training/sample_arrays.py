@@ -12,34 +12,26 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.words import one_line
 from robocas_ms3.datasets.actions import ACTION_ARRAYS, episode_actions
 from robocas_ms3.datasets.sources.protocol import EpisodeSource
+from robocas_ms3.datasets.training.options import SampleOptions
 from robocas_ms3.scenes.language.templates import GOAL_TYPES
 
 
-def check_holds(source: EpisodeSource, cameras: Sequence[str], *, depth: bool, embedding: bool) -> None:
-    pictures = source.cameras
-    wrong = [camera for camera in cameras if camera not in pictures]
-    if wrong and not pictures:
-        raise DatasetError(
-            "there are no pictures here",
-            where=source.root,
-            expected="cameras=()",
-            found=f"cameras={cameras}",
-            fix="Pass cameras=(), or make pictures with robocas convert.",
-        )
-    if wrong or len(set(cameras)) < len(cameras):
-        expected = f"some of {', '.join(pictures)}, each once"
-        raise DatasetError("no such camera", where=source.root, expected=expected, found=", ".join(cameras))
-    if depth and not (source.has_depth and cameras):
+def check_holds(source: EpisodeSource, options: SampleOptions) -> None:
+    """Raise DatasetError if a source does not hold what samples are made of."""
+    there, cameras = source.cameras, tuple(options.cameras)
+    if set(cameras) - set(there) or len(set(cameras)) < len(cameras):
+        fix = "" if there else "Pass cameras=(), or make images with robocas convert."
+        expected, found = f"some of {', '.join(there) or 'none'}, each once", ", ".join(cameras)
+        raise DatasetError("no such cameras", where=source.root, expected=expected, found=found, fix=fix)
+    if options.depth and not (source.has_depth and cameras):
         found = "no cameras" if source.has_depth else "no depth"
         raise DatasetError("there is no depth here", where=source.root, found=found, fix="Pass depth=False.")
-    if embedding and not source.has_embeddings:
-        raise DatasetError(
-            "there are no embeddings here",
-            where=source.root,
-            fix="Pass embedding=False, or convert the trajectory with embeddings.",
-        )
+    if options.embedding and not source.has_embeddings:
+        fix = "Pass embedding=False, or convert the trajectory with embeddings."
+        raise DatasetError("there are no embeddings here", where=source.root, fix=fix)
 
 
+_SEE_VALIDATE = "robocas validate says more."
 _TYPE_INDEX: dict[str, int] = {kind: index for index, kind in enumerate(GOAL_TYPES)}
 
 
@@ -49,28 +41,32 @@ def type_index(goal_type: str) -> int:
 
 
 def checked_actions(arrays: Mapping[str, NDArray], where: str) -> NDArray[np.float32]:
-    """Actions (T, 7) of an episode, see `episode_actions`."""
-    for key in ACTION_ARRAYS:
-        if not np.isfinite(arrays[key]).all():
-            raise DatasetError("not a number", where=f"{where}, {key}", fix="robocas validate says more.")
+    """Return the actions (T, 7) of an episode, see `episode_actions`."""
+    _check_finite(arrays, where)
     try:
         return episode_actions(arrays)
     except ValueError as error:
         raise DatasetError(
-            "these arrays make no actions", where=where, found=one_line(error), fix="robocas validate says more."
+            "these arrays make no actions", where=where, found=one_line(error), fix=_SEE_VALIDATE
         ) from error
+
+
+def _check_finite(arrays: Mapping[str, NDArray], where: str) -> None:
+    for key, array in arrays.items():
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise DatasetError("not a number", where=f"{where}, {key}", fix=_SEE_VALIDATE)
 
 
 def read_episode(
     source: EpisodeSource, number: int, state: Sequence[str], *, embedding: bool, subgoals: bool
 ) -> dict[str, Any]:
-    """Read what an episode's samples are made of, all but the pictures.
+    """Read what the samples of an episode are made of, except images.
 
     Args:
         source: it is in.
         number: of it.
         state: arrays of the schema that make up the state.
-        embedding: whether the texts' embeddings are wanted.
+        embedding: whether the embeddings of the texts are wanted.
         subgoals: whether sub-goals are.
 
     Returns:
@@ -78,24 +74,18 @@ def read_episode(
         the embeddings where they are wanted.
 
     Raises:
-        DatasetError: the file is missing or damaged, an array of another length, or holds what is no number.
+        DatasetError: the file is missing or damaged, an array of another length, or NaN or infinite.
     """
     keys = (*ACTION_ARRAYS, *state, "language_goal")
     keys += ("step_lang_goals", "step_goal_type") * subgoals
     keys += ("language_embedding",) * embedding + ("step_goal_embs",) * (embedding and subgoals)
     arrays = source.episode(number).read(keys)
-    length = source.lengths[number]
-    where = f"{source.root}, episode {number}"
+    length, where = source.lengths[number], f"{source.root}, episode {number}"
     for key, array in arrays.items():
         if key not in {"language_goal", "language_embedding"} and len(array) != length:
-            raise DatasetError(
-                "another length than the overview says",
-                where=f"{where}, {key}",
-                expected=length,
-                found=len(array),
-            )
-        if array.dtype.kind == "f" and not np.isfinite(array).all():
-            raise DatasetError("not a number", where=f"{where}, {key}", fix="robocas validate says more.")
+            what = "another length than the overview says"
+            raise DatasetError(what, where=f"{where}, {key}", expected=length, found=len(array))
+    _check_finite(arrays, where)
     made: dict[str, Any] = {
         "action": checked_actions(arrays, where),
         "first_command": float(arrays["gripper_status"][0]),

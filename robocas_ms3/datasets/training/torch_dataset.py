@@ -7,20 +7,23 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch.utils.data import get_worker_info
 
 from robocas_ms3.core.errors import DatasetError, EmptySplitError
 from robocas_ms3.core.words import count_of
 from robocas_ms3.datasets.actions import ActionScale
 from robocas_ms3.datasets.formats import open_source
+from robocas_ms3.datasets.sources.protocol import Kind, SourceEpisode
 from robocas_ms3.datasets.training.options import SampleOptions
 from robocas_ms3.datasets.training.sample_arrays import check_holds, read_episode, type_index
-from robocas_ms3.datasets.training.sample_pictures import PictureStack
 
 
 class RoboCASDataset(torch.utils.data.Dataset):
@@ -51,6 +54,12 @@ class RoboCASDataset(torch.utils.data.Dataset):
         options: what the samples hold.
         transform: called with each sample; has to be picklable where workers are spawned.
 
+    Attributes:
+        rate_hz: steps per second.
+        episodes: numbers of the split's episodes, sorted.
+        stages: (N,) int8 sub-goal type of each sample's step, index in ``GOAL_TYPES``; -1 = unknown.
+        scale: how actions are normalised; None: they are not.
+
     Raises:
         DatasetError: nothing there, an empty split, a wrong option, something asked for that the dataset does not hold.
     """
@@ -64,38 +73,23 @@ class RoboCASDataset(torch.utils.data.Dataset):
     ) -> None:
         self.options = options = options or SampleOptions()
         self.transform = transform
-        cameras = tuple(options.cameras)
         self.source = open_source(path, rate_hz=options.rate_hz, include_failed=options.include_failed)
         self.rate_hz = self.source.rate_hz
-        """Steps a second."""
-        check_holds(self.source, cameras, depth=options.depth, embedding=options.embedding)
-        self._pictures = PictureStack(cameras, options.size, options.float_images)
+        check_holds(self.source, options)
         self.episodes: list[int] = self.source.split(options.split)
-        """Numbers of the split's episodes, sorted."""
         if not self.episodes:
-            raise EmptySplitError(
-                "this split holds no episodes",
-                where=path,
-                expected=f"some in {options.split}",
-                found=f"{len(self.source.lengths)} in all",
-                fix='Add seeds, or pass split="all".',
-            )
+            expected, found = f"some in {options.split}", f"{len(self.source.lengths)} in all"
+            what, fix = "this split holds no episodes", 'Add seeds, or pass split="all".'
+            raise EmptySplitError(what, where=path, expected=expected, found=found, fix=fix)
         self._steps = {number: options.samples(self.source.lengths[number]) for number in self.episodes}
         self._offsets = np.cumsum([0, *map(len, self._steps.values())])
         if not len(self):
             longest = max(self.source.lengths[number] for number in self.episodes)
             needed = options.observation_horizon + options.action_horizon if options.padding == "drop" else 2
-            raise DatasetError(
-                "no episode is long enough",
-                where=path,
-                expected=count_of(needed, "step"),
-                found=longest,
-                fix="Pad them.",
-            )
+            what, expected = "no episode is long enough", count_of(needed, "step")
+            raise DatasetError(what, where=path, expected=expected, found=longest, fix="Pad them.")
         self.stages = np.concatenate([self._stages_of(number, within) for number, within in self._steps.items()])
-        """(N,) int8 sub-goal type of each sample's step, index in ``GOAL_TYPES``; -1 = unknown."""
         self.scale: ActionScale | None = None
-        """How actions are normalised; None: they are not."""
         if options.normalize:
             space = self.source.action_space() if options.action_space is None else options.action_space
             self.scale = ActionScale.of(space, path)
@@ -158,68 +152,112 @@ class RoboCASDataset(torch.utils.data.Dataset):
         return torch.from_numpy(1.0 / (len(counts) * counts[stages]))
 
     def __getitem__(self, index: int) -> Any:
-        """One sample.
+        """Return a sample.
 
         Raises:
             IndexError: there is no such sample.
             DatasetError: a file is missing or damaged.
         """
         number, step = self.locate(int(index))
-        episode = self._episode(number)
-        observed, acted = self.options.observed(step), self.options.acted(step)
-        last = len(episode["action"]) - 2  # that an action leaves
+        arrays, options = self._arrays(number), self.options
+        observed, acted = options.observed(step), options.acted(step)
+        last = len(arrays["action"]) - 2  # that an action leaves
         sample: dict[str, Any] = {"episode": number, "step": step}
         sample["observation_mask"] = torch.from_numpy(observed >= 0)
         sample["action_mask"] = torch.from_numpy((acted >= 0) & (acted <= last))
-        sample["action"] = self._actions(episode, acted, last)
+        sample["action"] = self._actions(arrays, acted, last)
         for key in ("state", "subgoal_type", "subgoal_embedding"):
-            if key in episode:
-                sample[key] = self._rows(episode[key], observed, nothing=-1 if key == "subgoal_type" else 0)
-        sample["instruction"] = episode["instruction"]
-        if self.options.embedding:
-            sample["language_embedding"] = torch.from_numpy(episode["language_embedding"].copy())
-        if self.options.subgoals:
-            sample["subgoal"] = episode["texts"][step]
-        if self.options.cameras:
-            zero = self.options.padding == "zero"
-            sample["rgb"] = self._pictures.read(episode["pictures"], observed, "rgb", zero=zero)
-            if self.options.depth:
-                sample["depth"] = self._pictures.read(episode["pictures"], observed, "depth", zero=zero)
+            if key in arrays:
+                rows = arrays[key][np.maximum(observed, 0)]
+                if options.padding == "zero":
+                    rows[observed < 0] = -1 if key == "subgoal_type" else 0
+                sample[key] = torch.from_numpy(rows)
+        sample["instruction"] = arrays["instruction"]
+        if options.embedding:
+            sample["language_embedding"] = torch.from_numpy(arrays["language_embedding"].copy())
+        if options.subgoals:
+            sample["subgoal"] = arrays["texts"][step]
+        for kind in ("rgb", "depth")[: 1 + options.depth] if options.cameras else ():
+            sample[kind] = read_images(self.source.episode(number), options, observed, kind)
         return sample if self.transform is None else self.transform(sample)
 
-    def _actions(self, episode: Mapping[str, Any], acted: NDArray[np.int64], last: int) -> torch.Tensor:
+    def _actions(self, arrays: Mapping[str, Any], acted: NDArray[np.int64], last: int) -> torch.Tensor:
         rows = np.clip(acted, 0, last)
-        actions = episode["action"][rows]
+        actions = arrays["action"][rows]
         outside = acted != rows
         if self.options.padding == "hold":
             actions[outside, :6] = 0
-            actions[acted < 0, 6] = episode["first_command"]  # that of the last one goes on after the end
+            actions[acted < 0, 6] = arrays["first_command"]  # that of the last one goes on after the end
         if self.scale is not None:
             actions = self.scale.encode(actions)
         if self.options.padding == "zero":
             actions[outside] = 0
         return torch.from_numpy(actions)
 
-    def _rows(self, array: NDArray, observed: NDArray[np.int64], nothing: int) -> torch.Tensor:
-        rows = array[np.maximum(observed, 0)]
-        if self.options.padding == "zero":
-            rows[observed < 0] = nothing
-        return torch.from_numpy(rows)
-
-    def _episode(self, number: int) -> dict[str, Any]:
-        if number in self._cache:
-            self._cache.move_to_end(number)
-            return self._cache[number]
-        wanted = self.options
-        made = read_episode(
-            self.source, number, tuple(wanted.state), embedding=wanted.embedding, subgoals=wanted.subgoals
-        )
-        if self.options.cameras:
-            made["pictures"] = self.source.episode(number)
-        self._cache[number] = made
+    def _arrays(self, number: int) -> dict[str, Any]:
+        if number not in self._cache:
+            options = self.options
+            self._cache[number] = read_episode(
+                self.source, number, tuple(options.state), embedding=options.embedding, subgoals=options.subgoals
+            )
+        self._cache.move_to_end(number)
         if len(self._cache) > max(1, self.options.cached_episodes):
             self._cache.popitem(last=False)
-        return made
+        return self._cache[number]
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_cache": OrderedDict()}
+
+
+def read_images(
+    episode: SourceEpisode, options: SampleOptions, observed: NDArray[np.int64], kind: Kind
+) -> torch.Tensor:
+    """Read the images of steps (H,) one after the other, below 0 before the episode: (H, C, 3, h, w) or (H, C, h, w).
+
+    Raises:
+        DatasetError: a file is missing or damaged, or sizes differ.
+    """
+    if get_worker_info() is not None and cv2.getNumThreads() > 1:
+        cv2.setNumThreads(0)  # a pool of OpenCV does not survive a fork
+    steps = np.maximum(observed, 0)
+    first, count = int(steps[0]), int(steps[-1] - steps[0]) + 1
+    shots = {camera: _read_camera(episode, camera, kind, (first, count), options.size) for camera in options.cameras}
+    shapes = {image.shape for images in shots.values() for image in images}
+    if len(shapes) > 1:
+        raise DatasetError("images differ in size", where=episode.where, found=sorted(shapes), fix="Pass a size.")
+    stack = np.stack([np.stack(images) for images in shots.values()], axis=1)[steps - first]
+    if kind == "depth":
+        stack = stack.astype(np.float32) / 1000
+    else:
+        stack = np.ascontiguousarray(stack.transpose(0, 1, 4, 2, 3))
+        stack = stack.astype(np.float32) / 255 if options.float_images else stack
+    if options.padding == "zero":
+        stack[observed < 0] = 0
+    return torch.from_numpy(stack)
+
+
+def _read_camera(
+    episode: SourceEpisode, camera: str, kind: Kind, run: tuple[int, int], size: tuple[int, int] | None
+) -> list[NDArray]:
+    images = []
+    with closing(episode.frames(camera, kind, *run)) as frames:
+        for step, image in enumerate(frames, start=run[0]):
+            if (image.ndim, image.dtype) != ((3, np.uint8) if kind == "rgb" else (2, np.uint16)):
+                raise DatasetError(
+                    "not an image of this kind",
+                    where=f"{episode.where}/{camera}/{kind}, step {step}",
+                    expected="(H, W, 3) uint8" if kind == "rgb" else "(H, W) uint16",
+                    found=f"{image.shape} {image.dtype}",
+                )
+            images.append(resize(image, size))
+    return images
+
+
+def resize(image: NDArray, size: tuple[int, int] | None) -> NDArray:
+    """Scale to width and height: RGB by areas, depth by the nearest pixel, which mixes no distances."""
+    if size is None or image.shape[1::-1] == tuple(size):
+        return image
+    smaller = size[0] <= image.shape[1] and size[1] <= image.shape[0]
+    if image.ndim == 2:
+        return cv2.resize(image, size, interpolation=cv2.INTER_NEAREST_EXACT)
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
