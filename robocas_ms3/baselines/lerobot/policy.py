@@ -65,7 +65,7 @@ class LeRobotPolicy:
         before: LeRobot's preprocessor: one observation to a normalised batch of one.
         after: its postprocessor: an action (1, 7) back in m, rad and the gripper's opening.
         inputs: shape by key, as in the checkpoint's configuration; images are (3, H, W).
-        rate_hz: actions per second, the dataset's frames.
+        rate_hz: actions per second.
         about: what results record about the policy.
 
     Raises:
@@ -82,8 +82,7 @@ class LeRobotPolicy:
         about: Mapping[str, Any] | None = None,
     ) -> None:
         self._model, self._before, self._after, self._about = model, before, after, dict(about or {})
-        self._inputs = dict(inputs)
-        cameras = {}
+        self._inputs, cameras = dict(inputs), {}
         for key, shape in self._inputs.items():
             if re.fullmatch(f"{_IMAGES}{CAMERA_NAME}", key) and len(shape) == 3:
                 cameras[key.removeprefix(_IMAGES)] = (shape[2], shape[1])
@@ -101,7 +100,6 @@ class LeRobotPolicy:
         self._draws: dict[int, np.random.Generator] = {}
 
     def describe(self) -> dict[str, Any]:
-        """Return what results record about the policy."""
         return self._about
 
     def reset(self, starts: list[EpisodeSpec]) -> None:
@@ -112,8 +110,7 @@ class LeRobotPolicy:
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
         """Return actions (E, 7), of each env by itself, so that they do not depend on the other envs."""
-        actions = [self._act(env, observations, row) for row, env in enumerate(observations.envs.tolist())]
-        return np.stack(actions)
+        return np.stack([self._act(env, observations, row) for row, env in enumerate(observations.envs.tolist())])
 
     def _act(self, env: int, observations: Observations, row: int) -> NDArray[np.float32]:
         torch.manual_seed(int(self._draws[env].integers(2**63)))  # diffusion draws noise

@@ -13,7 +13,8 @@ import argparse
 import os
 import shutil
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -36,19 +37,17 @@ from robocas_ms3.core.errors import DatasetError, RobocasError
 from robocas_ms3.core.files import replacing_folder, write_json
 from robocas_ms3.core.outputs import check_replaceable
 from robocas_ms3.core.words import printable
-from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
-from robocas_ms3.datasets.lerobot.records import episode_columns, frame_columns
-from robocas_ms3.datasets.lerobot.schema import FEATURES, INDICES, INFO_FILE, STAGING, STATS_FILE, is_depth
-from robocas_ms3.datasets.lerobot.tables import Column, check_columns, numbers, open_table, read_columns
+from robocas_ms3.datasets.lerobot.reader import LeRobotDataset, LeRobotEpisode
+from robocas_ms3.datasets.lerobot.schema import INDICES, INFO_FILE, STAGING, STATS_FILE, image_key, is_depth
+from robocas_ms3.datasets.lerobot.stats import vector_stats
+from robocas_ms3.datasets.lerobot.tables import as_column
 from robocas_ms3.datasets.lerobot.variants import V3
 from robocas_ms3.datasets.sources.files import read_json
-from robocas_ms3.robots.quantities import GRIPPER_WIDTH, STATE, columns_of
+from robocas_ms3.robots.quantities import GRIPPER_WIDTH, STATE
 
 Embed = Callable[[Sequence[str]], NDArray[np.float32]]
-_WIDTHS = {feature.key: feature.width for feature in FEATURES}
 _NOT_COPIED = ("data", "episodes", "robocas", "depth", ".parts", STAGING)
 """Folders that are written here, or that the policies do not need."""
-_QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 
 
 def prepare(source: Path, out: Path, embed: Embed | None) -> None:
@@ -64,108 +63,70 @@ def prepare(source: Path, out: Path, embed: Embed | None) -> None:
         OutputExistsError: there is something at ``out``.
     """
     check_replaceable(out)
-    info = _info(source)
-    depths = [key for key, feature in info["features"].items() if is_depth(feature)]  # policies would take it for RGB
+    dataset = _open(source)
+    features = dataset.info["features"]
+    depths = [key for key, feature in features.items() if is_depth(feature)]  # policies would take it for RGB
     with replacing_folder(out) as part:
         ignored = shutil.ignore_patterns(*_NOT_COPIED, *depths)
         shutil.copytree(source, part, ignore=ignored, copy_function=_link, dirs_exist_ok=True)
-        vectors = None if embed is None else scale_embeddings(embed(LeRobotDataset(source).tasks))
-        parts: dict[str, list[NDArray]] = {}
-        for path in sorted((source / "data").rglob("*.parquet")):
-            columns, indices = _columns(path, info["features"], vectors)
-            for key, values in columns.items():
-                parts.setdefault(key, []).append(values)
-            lists = {
-                key: pa.FixedSizeListArray.from_arrays(pa.array(values.reshape(-1)), values.shape[1])
-                for key, values in columns.items()
-            }
-            _write(pa.table({**lists, **indices}), part / path.relative_to(source))
+        vectors: dict[str, NDArray[np.float32]] = {}
+        if embed is not None:
+            vectors = dict(zip(dataset.tasks, scale_embeddings(embed(dataset.tasks)), strict=True))
+        by_file: dict[Path, list[int]] = defaultdict(list)
+        for number, row in dataset.row_of.items():
+            by_file[dataset.layout.path_of(source, "data", row)].append(number)
+        parts: dict[str, list[NDArray]] = defaultdict(list)
+        for path, numbers in by_file.items():
+            tables = []
+            for episode in map(dataset.episode, numbers):
+                columns = _columns(episode, vectors)
+                for key, values in columns.items():
+                    parts[key].append(values)
+                indices = {key: episode.table.column(key) for key in INDICES}
+                tables.append(pa.table({**{key: as_column(values) for key, values in columns.items()}, **indices}))
+            _write(pa.concat_tables(tables), part / path.relative_to(source))
         for path in sorted((source / "meta" / "episodes").rglob("*.parquet")):
-            _table(path, episode_columns((), info["features"]))  # bounded and checked, with texts as dictionaries
             table = pq.read_table(path)  # LeRobot reads no statistics of episodes, and these are of other columns
             left_out = ("stats/", *(f"videos/{key}/" for key in depths))
             names = [name for name in table.column_names if not name.startswith(left_out)]
             _write(table.select(names), part / path.relative_to(source))
-        _write_meta(source, part, info, {key: np.concatenate(values) for key, values in parts.items()})
+        _write_meta(dataset, part, {key: np.concatenate(values) for key, values in parts.items()})
 
 
-def _info(source: Path) -> dict[str, Any]:
+def _open(source: Path) -> LeRobotDataset:
+    what, fix = "no LeRobot dataset of ours", "Make one: robocas convert F.h5 --to lerobot --out DIR"
     try:
         dataset = LeRobotDataset(source)
-        info = dataset.info
-        if dataset.layout is not V3:
-            version = info["codebase_version"]
-            raise DatasetError("another format", where=source, expected=V3.codebase_version, found=version)
-        widths = {key: info["features"][key]["shape"] for key in _WIDTHS}
-    except (DatasetError, KeyError) as error:
-        fix = "Make one: robocas convert F.h5 --to lerobot --out DIR"
-        raise DatasetError("no LeRobot dataset of ours", where=source, found=error, fix=fix) from error
-    if widths != {key: [width] for key, width in _WIDTHS.items()}:
-        raise DatasetError("another LeRobot dataset's columns", where=source, expected=_WIDTHS, found=widths)
-    if not any(key.startswith("observation.images.") for key in info["features"]):
-        raise DatasetError("no images", where=source, expected="at least one camera")
-    return info
+    except DatasetError as error:
+        raise DatasetError(what, where=source, found=error, fix=fix) from error
+    if dataset.layout is not V3 or not dataset.is_ours or not dataset.cameras:
+        expected, version = f"{V3.codebase_version}, our columns, a camera", dataset.info["codebase_version"]
+        raise DatasetError(what, where=source, expected=expected, found=version, fix=fix)
+    return dataset
 
 
-def _columns(
-    path: Path, features: Mapping[str, Any], vectors: NDArray | None
-) -> tuple[dict[str, NDArray], dict[str, pa.ChunkedArray]]:
-    """Return the numbers (N, D) of a file by key, and the columns that stay as they are."""
-    table = _table(path, frame_columns(features))
-    read = {key: _numbers(table, key) for key in (STATE, ACTION, "action.base")}
-    for key, values in read.items():
-        if not np.isfinite(values).all():
-            row = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
-            raise DatasetError("NaN or infinite value", where=f"{path}: {key}, row {row}", found=values[row].tolist())
-    ends = np.flatnonzero(np.diff(table["episode_index"].to_numpy())) + 1
-    for motion in np.split(read["action.base"], ends):
-        check_base_stands(motion, path)
-    parts = (read[STATE][:, columns_of(STATE)[key]] for key in ("ee_pos", "ee_orn", "robot_joints", GRIPPER_WIDTH))
-    columns = {STATE: state_of(*parts), ACTION: read[ACTION]}
-    if vectors is not None:
-        places = table["task_index"].to_numpy()
-        if len(places) and places.max() >= len(vectors):
-            expected, where = f"0 to {len(vectors) - 1}", f"{path}, task_index"
-            raise DatasetError("no such instruction", where=where, expected=expected, found=places.max())
-        columns[EMBEDDING] = vectors[places]
-    return columns, {key: table[key] for key in INDICES}
+def _columns(episode: LeRobotEpisode, vectors: dict[str, NDArray[np.float32]]) -> dict[str, NDArray]:
+    """Return the numbers (T, D) of an episode by key."""
+    arrays, steps = episode.arrays, episode.steps
+    check_base_stands(arrays["rel_agv_pose"], episode.where)
+    parts = (arrays[key].reshape(steps, -1) for key in ("ee_pos", "ee_orn", "robot_joints", GRIPPER_WIDTH))
+    columns: dict[str, NDArray] = {STATE: state_of(*parts), ACTION: episode.columns[ACTION].astype(np.float32)}
+    if vectors:
+        columns[EMBEDDING] = np.tile(vectors[episode.instruction], (steps, 1))
+    return columns
 
 
-def _table(path: Path, columns: Mapping[str, Column]) -> pa.Table:
-    with open_table(path) as file:
-        table = read_columns(file, path, columns)
-        check_columns(table, columns, path)
-    return table
-
-
-def _numbers(table: pa.Table, key: str) -> NDArray[np.float32]:
-    values = numbers(table[key]).astype(np.float32)
-    if values.shape[1] != _WIDTHS[key]:
-        raise DatasetError("another width of a column", where=key, expected=_WIDTHS[key], found=values.shape[1])
-    return values
-
-
-def _write_meta(source: Path, part: Path, info: dict[str, Any], columns: dict[str, NDArray]) -> None:
-    names = {STATE: list(STATE_NAMES), EMBEDDING: [f"e{number}" for number in range(DIMENSIONS)]}
+def _write_meta(dataset: LeRobotDataset, part: Path, columns: dict[str, NDArray]) -> None:
+    info, names = dataset.info, {STATE: list(STATE_NAMES), EMBEDDING: [f"e{number}" for number in range(DIMENSIONS)]}
     names[ACTION] = info["features"][ACTION]["names"]
-    features = {
+    features: dict[str, Any] = {
         key: {"dtype": "float32", "shape": [values.shape[1]], "names": names[key]} for key, values in columns.items()
     }
-    features |= {
-        key: feature
-        for key, feature in info["features"].items()
-        if (key.startswith("observation.images.") and not is_depth(feature)) or key in INDICES
-    }
-    stats = {key: values for key, values in read_json(source / STATS_FILE).items() if key in features}
-    stats |= {key: _stats(values.astype(np.float64)) for key, values in columns.items()}
+    features |= {key: info["features"][key] for key in (*map(image_key, dataset.cameras), *INDICES)}
+    stats = {key: values for key, values in read_json(dataset.root / STATS_FILE).items() if key in features}
+    stats |= {key: vector_stats(values) for key, values in columns.items()}
     write_json(part / INFO_FILE, {**info, "features": features})
     write_json(part / STATS_FILE, stats)
-
-
-def _stats(values: NDArray[np.float64]) -> dict[str, list]:
-    found = {name: getattr(values, name)(axis=0).tolist() for name in ("min", "max", "mean", "std")}
-    rows = dict(zip(_QUANTILES, np.quantile(values, list(_QUANTILES.values()), axis=0).tolist(), strict=True))
-    return {**found, "count": [len(values)], **rows}
 
 
 def _write(table: pa.Table, path: Path) -> None:

@@ -104,7 +104,7 @@ def test_videos_are_the_same_files(source, out):
 
 def test_another_format_is_refused(source, tmp_path):
     convert_lerobot(ConversionSettings(source, tmp_path / "old", lerobot_version="2.1"))
-    with pytest.raises(DatasetError, match="no LeRobot dataset of ours .*expected v3.0, found v2.1"):
+    with pytest.raises(DatasetError, match="no LeRobot dataset of ours"):
         prepare(tmp_path / "old", tmp_path / "out", None)
     assert not (tmp_path / "out").exists()
 
