@@ -1,7 +1,11 @@
-"""A recording chooses no files: whatever of HDF5 names another one is refused, wherever an episode is opened."""
+"""HDF5 files of trajectories: a disk that fills up, merged files, and files that name other files."""
 
 # pyright: reportAttributeAccessIssue=false, reportIndexIssue=false, reportArgumentType=false
+import errno
 import json
+import os
+import resource
+from contextlib import contextmanager
 
 import h5py
 import numpy as np
@@ -9,15 +13,91 @@ import pytest
 from synthetic import STEPS, write_trajectory
 
 from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.files import replacing
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
-from robocas_ms3.demos.recordings.stored import merge
+from robocas_ms3.demos.recordings.stored import damage_of, merge, reserved, write_whole
 from robocas_ms3.demos.replay import Recorded
 from robocas_ms3.evaluation.policies.replay import ReplayPolicy
 from robocas_ms3.evaluation.policy import EpisodeSpec
 
+DATA = np.arange(50_000, dtype=np.float64)
 CUBE = "traj_0/env_states/actors/object_1"
 SECRET = np.full((STEPS + 1, 13), 7, np.float32)
 SECRET[:, 3:7] = [1, 0, 0, 0]
+
+
+@contextmanager
+def files_of_at_most(size):
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def fill(file):
+    file.create_group("a", track_order=True).create_dataset("b", data=DATA)
+
+
+@pytest.mark.parametrize("size", [1, 10_000_000, None])
+def test_what_was_reserved_and_not_needed_is_given_back(tmp_path, monkeypatch, size):
+    def none(*_):
+        raise OSError(errno.EOPNOTSUPP, "Operation not supported")
+
+    if size is None:  # a file system that reserves nothing
+        monkeypatch.setattr("os.posix_fallocate", none)
+    with reserved(tmp_path / "x.h5", size or 10) as file:
+        fill(file)
+    with h5py.File(tmp_path / "x.h5") as file:
+        np.testing.assert_array_equal(file["a/b"], DATA)
+    assert os.path.getsize(tmp_path / "x.h5") < DATA.nbytes + 10_000
+
+
+def test_no_room_is_an_error_before_anything_is_lost(tmp_path):
+    """No crash when HDF5 frees the file, and nothing is left."""
+    with files_of_at_most(100_000):
+        with pytest.raises(OSError, match="x.h5") as error, replacing(tmp_path / "x.h5") as tmp:
+            write_whole(tmp, fill)
+        assert error.value.errno == errno.EFBIG
+        with pytest.raises(OSError, match="y.h5"), replacing(tmp_path / "y.h5") as tmp, reserved(tmp, 500_000):
+            raise AssertionError("it was opened")
+    assert list(tmp_path.iterdir()) == []
+
+
+def cut_off(path):
+    os.truncate(path, path.stat().st_size - 1)
+
+
+def without_json(path):
+    path.with_suffix(".json").unlink()
+
+
+def without_an_action(path):
+    with h5py.File(path, "r+") as file:
+        actions = file["traj_1/actions"][:-1]
+        del file["traj_1/actions"]
+        file["traj_1/actions"] = actions
+
+
+def without_an_episode(path):
+    with h5py.File(path, "r+") as file:
+        del file["traj_1"]
+
+
+def with_another_number(path):
+    text = path.with_suffix(".json").read_text()
+    path.with_suffix(".json").write_text(text.replace('"episode_id": 0', '"episode_id": 5'))
+
+
+@pytest.mark.parametrize("damage", [cut_off, without_json, without_an_action, without_an_episode, with_another_number])
+def test_damage_of_a_merged_file_is_found(tmp_path, damage):
+    path = tmp_path / "merged.h5"
+    merge([write_trajectory(tmp_path / f"{seed}.h5", seeds=(seed,)) for seed in (7, 3)], path)
+    assert damage_of(path, [7, 3]) == ""
+    assert "other episodes" in damage_of(path, [3, 7])
+    damage(path)
+    assert damage_of(path, [7, 3])
 
 
 @pytest.fixture

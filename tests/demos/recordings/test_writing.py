@@ -52,8 +52,7 @@ def play(env: gym.Env, mode: str) -> None:
     ("obs_mode", "mode"), [("none", "pd_joint_pos"), ("state", "pd_ee_delta_pose"), ("state_dict", "pd_joint_pos")]
 )
 def test_files_are_those_of_maniskills_recorder(tmp_path, obs_mode, mode):
-    env = gym.make("RoboCASPick-v1", obs_mode=obs_mode, control_mode=mode, render_backend="none")
-    compare(env, mode, tmp_path)
+    compare(gym.make("RoboCASPick-v1", obs_mode=obs_mode, control_mode=mode, render_backend="none"), mode, tmp_path)
 
 
 def test_pictures_are_those_of_maniskills_recorder(tmp_path, needs_renderer):
@@ -91,39 +90,29 @@ def compare(env: gym.Env, mode: str, folder) -> None:
     assert ours == theirs
 
 
-def test_there_is_no_file_before_the_end(tmp_path):
+def test_there_is_no_file_before_the_end_and_a_fork_writes_its_own(tmp_path):
     env = gym.make("RoboCASPick-v1", obs_mode="none", control_mode="pd_joint_pos", render_backend="none")
     recorder = EpisodeRecorder(env, tmp_path / "made_later", "episode")
     files = len(os.listdir("/proc/self/fd"))
-    play(recorder, "pd_joint_pos")
-    assert not (tmp_path / "made_later").exists()
-    assert len(os.listdir("/proc/self/fd")) == files
-    play(recorder, "pd_joint_pos")  # and again, from the reset on
-    recorder.finish({})
-    assert sorted(path.name for path in (tmp_path / "made_later").iterdir()) == ["episode.h5", "episode.json"]
-    with h5py.File(tmp_path / "made_later" / "episode.h5") as file:
-        assert file["traj_0/actions"].shape == (STEPS, 8)
-        assert file["traj_0/env_states/actors/object_0"].shape == (STEPS + 1, 13)
-    env.close()
-
-
-def test_a_forked_process_goes_on_recording_and_writes_its_own_file(tmp_path):
-    env = gym.make("RoboCASPick-v1", obs_mode="none", control_mode="pd_joint_pos", render_backend="none")
-    recorder = EpisodeRecorder(env, tmp_path, "episode")
-    play(recorder, "pd_joint_pos")
+    for _ in range(2):  # and again, from the reset on
+        play(recorder, "pd_joint_pos")
+        assert not (tmp_path / "made_later").exists()
+        assert len(os.listdir("/proc/self/fd")) == files
     child = os.fork()
     if child == 0:
         code = 1
         try:
-            env_of_child = EpisodeRecorder(env, tmp_path, "child")
-            env_of_child._steps = recorder._steps
-            env_of_child.step(np.array([*MOBILE_PANDA.arm_rest, -1], np.float32))
-            env_of_child.finish({})
+            recorder.step(np.array([*MOBILE_PANDA.arm_rest, -1], np.float32))
+            recorder.finish({})
+            os.rename(tmp_path / "made_later", tmp_path / "of_the_child")
             code = 0
         finally:
             os._exit(code)
     assert os.waitpid(child, 0)[1] == 0
     recorder.finish({})
-    with h5py.File(tmp_path / "child.h5") as longer, h5py.File(tmp_path / "episode.h5") as shorter:
-        assert len(longer["traj_0/actions"]) == len(shorter["traj_0/actions"]) + 1
+    for folder, steps in (("made_later", STEPS), ("of_the_child", STEPS + 1)):
+        assert sorted(path.name for path in (tmp_path / folder).iterdir()) == ["episode.h5", "episode.json"]
+        with h5py.File(tmp_path / folder / "episode.h5") as file:
+            assert file["traj_0/actions"].shape == (steps, 8)
+            assert file["traj_0/env_states/actors/object_0"].shape == (steps + 1, 13)
     env.close()
