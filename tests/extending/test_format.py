@@ -102,25 +102,9 @@ def test_a_format_that_there_is_not(stranger, tmp_path, capsys):
     assert "--append: not for toy datasets" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("what", ["missing_module:FORMAT", "json:dumps"])
-def test_a_broken_package_is_said_and_left_out(stranger, what, caplog):
-    (stranger / "toy_format-1.0.dist-info" / "entry_points.txt").write_text(f"[robocas_ms3.formats]\ntoy = {what}\n")
-    assert set(formats.FORMATS) == {"trajectory", "robocas", "lerobot"}
-    assert f"toy = {what}: " in caplog.text
-
-
 def test_a_format_that_fails_at_a_path_holds_it_not(both, monkeypatch):
     """One that looks for files in what is no folder, say."""
     toy = formats.FORMATS["toy"]
     monkeypatch.setitem(formats.FORMATS._loaded, "toy", replace(toy, holds=lambda path: any(path.iterdir())))
     trajectory = both[0].with_name("F.h5")
     assert format_of(trajectory).name == "trajectory"
-
-
-def test_lengths_are_read_once(both):
-    source = open_source(both[0])
-    read = source.read
-    asked = []
-    source.read = lambda *names: (asked.append(names), read(*names))[1]
-    assert [source.lengths[number] for number in source.numbers] == [7, 7, 7]
-    assert len(asked) == 3
