@@ -8,7 +8,7 @@ from branch_notes import Notes
 from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.demos.backtracking import DeadEnd, Resimulation, turns
 from robocas_ms3.demos.branches import ForkedBranches
-from robocas_ms3.planning.decisions import ONE_BY_ONE, Effort, StraightDecisions
+from robocas_ms3.planning.decisions import Effort, StraightDecisions
 
 RUNNERS = [ForkedBranches, Resimulation]
 
@@ -23,7 +23,7 @@ class World:
         self.done += letter
 
 
-def search(decide, good, **how):
+def search(decide, good):
     """Run an attempt that `decide`s; the outcome and the failures."""
     found = []
     for make in RUNNERS:
@@ -32,7 +32,7 @@ def search(decide, good, **how):
 
         def attempt(world=world, runner=runner, notes=notes):
             world.done = ""
-            decide(world, runner, **how)
+            decide(world, runner)
             if world.done not in good:
                 raise PlanningFailed("end", world.done)
             notes.outcome = world.done
@@ -43,43 +43,30 @@ def search(decide, good, **how):
     return found[0]
 
 
-def two_letters(world, runner, score=lambda letters: 0.0, effort=ONE_BY_ONE):
-    for _ in range(2):
-        runner.choose("abc", lambda letter: (world.act(letter), score(world.done))[1], effort)
+A_FEW, ALL = {"a": 1.0, "b": 3.0, "c": 2.0}, {"a": 1.0, "b": 2.0, "c": 3.0}  # scores of the last letter
 
 
-def test_the_first_way_that_ends_well_is_taken_and_what_failed_leaves_no_trace():
-    ended, outcome, failures = search(two_letters, {"bc"})
-    assert (ended, outcome) == (True, "bc")
-    assert failures == ["end: aa", "end: ab", "end: ac", "end: ba", "end: bb"]
+@pytest.mark.parametrize(
+    ("good", "effort", "scores", "outcome", "failures"),
+    [
+        ("bc", Effort(), None, "bc", "aa ab ac ba bb"),  # what failed leaves no trace
+        ("", Effort(), None, "", "aa ab ac ba bb bc ca cb cc"),
+        ("ba", Effort(tries=2), None, "ba", "aa ab"),  # a decision gives up after some tries
+        ("cb bc", Effort(ahead=3), A_FEW, "bc", "bb"),  # from the best of those compared first
+        ("cc", Effort(ahead=2, tries=9), ALL, "cc", "bb ba bc ab aa ac cb ca"),  # then others are compared
+    ],
+)
+def test_ways_are_tried_in_order_until_one_ends_well(good, effort, scores, outcome, failures):
+    def decide(world, runner):
+        def play(letter):
+            world.act(letter)
+            return scores[letter] if scores else 0.0
 
+        for _ in range(2):
+            runner.choose("abc", play, effort)
 
-def test_no_way_ends_well():
-    ended, outcome, failures = search(two_letters, set())
-    assert (ended, outcome) == (False, "")
-    assert len(failures) == 9
-
-
-def test_a_decision_gives_up_after_some_tries():
-    ended, outcome, failures = search(two_letters, {"ba"}, effort=Effort(tries=2))
-    assert (ended, outcome, failures) == (True, "ba", ["end: aa", "end: ab"])
-
-
-def test_the_best_of_those_compared_is_gone_on_from_first():
-    score = {"a": 1.0, "b": 3.0, "c": 2.0}
-    ended, outcome, failures = search(
-        two_letters, {"cb", "bc"}, score=lambda letters: score[letters[-1]], effort=Effort(ahead=3)
-    )
-    assert (ended, outcome, failures) == (True, "bc", ["end: bb"])
-
-
-def test_others_are_compared_when_the_first_few_lead_nowhere():
-    score = {"a": 1.0, "b": 2.0, "c": 3.0}
-    ended, outcome, failures = search(
-        two_letters, {"cc"}, score=lambda letters: score[letters[-1]], effort=Effort(ahead=2, tries=9)
-    )
-    assert (ended, outcome) == (True, "cc")
-    assert failures == ["end: bb", "end: ba", "end: bc", "end: ab", "end: aa", "end: ac", "end: cb", "end: ca"]
+    found = search(decide, set(good.split()))
+    assert found == (bool(outcome), outcome, [f"end: {end}" for end in failures.split()])
 
 
 def test_enough_ends_the_comparison():

@@ -1,7 +1,8 @@
-"""The examples run as they stand, each in a process of its own."""
+"""The examples, and the first programs of pages of the docs, run as they stand, each in a process of its own."""
 
 import csv
 import os
+import re
 import subprocess
 import sys
 from functools import cache
@@ -11,7 +12,8 @@ import cv2
 import pytest
 from forkserver import ForkServer
 
-EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+ROOT = Path(__file__).resolve().parents[2]
+EXAMPLES = ROOT / "examples"
 pytestmark = pytest.mark.slow
 
 
@@ -20,8 +22,9 @@ def server() -> ForkServer:
     return ForkServer()
 
 
-def run(name: str, *words: object, cwd: Path) -> list[str]:
-    done = server().run(EXAMPLES / name, *words, cwd=cwd)
+def run(path: str | Path, *words: object, cwd: Path) -> list[str]:
+    """What an example, or another program, prints."""
+    done = server().run(EXAMPLES / path, *words, cwd=cwd)
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines()
 
@@ -92,3 +95,30 @@ def test_missing_arguments_are_a_line(tmp_path):
     command = [sys.executable, str(EXAMPLES / "03_read_dataset.py"), "F.h5"]
     done = subprocess.run(command, cwd=tmp_path, env=os.environ, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (1, "python examples/03_read_dataset.py TRAJECTORY.h5 OUT\n")
+
+
+def program_of(page: str, cwd: Path, number: int = 0) -> Path:
+    """Write a Python program of a page to a file."""
+    text = (ROOT / "docs" / page).read_text(encoding="utf-8")
+    program = re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE)[number]
+    (cwd / "program.py").write_text(program.replace("learn(100_000)", "learn(300)"), encoding="utf-8")
+    return cwd / "program.py"
+
+
+def test_the_program_about_batches(tmp_path):
+    about, *ends = run(program_of("batched.md", tmp_path), cwd=tmp_path)
+    assert about.startswith("torch.Size([4, 142]) grasp the ")
+    assert ends == ["4 ended, 0.0 succeeded"] * 2
+
+
+def test_the_program_about_motion_planning(needs_renderer, tmp_path):
+    assert run(program_of("motion_planning.md", tmp_path), cwd=tmp_path)[-1].startswith("success True after ")
+
+
+def test_the_programs_about_reinforcement_learning(tmp_path):
+    rewards = [float(line.split()[0]) for line in run(program_of("rl.md", tmp_path), cwd=tmp_path)]
+    assert len(rewards) == 5
+    assert rewards == sorted(rewards)
+    assert 0 < rewards[0] < rewards[-1] < 0.4
+    pytest.importorskip("stable_baselines3")
+    run(program_of("rl.md", tmp_path, 1), cwd=tmp_path)
