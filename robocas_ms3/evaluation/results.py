@@ -21,10 +21,10 @@ from pydantic import BaseModel, ConfigDict
 
 from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.core.files import json_text, replacing_folder, write_json
+from robocas_ms3.core.files import replacing_folder, write_json
 from robocas_ms3.core.ledger import Ledger
 from robocas_ms3.core.outputs import FolderKind, OutputFolder, check_replaceable, setting_changes
-from robocas_ms3.core.strict import parse, parse_json
+from robocas_ms3.core.strict import parse
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.statistics import Share, share
 
@@ -77,8 +77,7 @@ class RunRecord(BaseModel):
     @classmethod
     def of(cls, values: dict[str, Any], where: object) -> RunRecord:
         """Return the record of these values, which can be written and read back; ``where`` is for errors."""
-        text = json_text(values, where, error=EvaluationError)
-        return parse_json(cls, text, EvaluationError, where=where, about="this evaluation can't be recorded")
+        return parse(cls, values, EvaluationError, where=where, about="this evaluation can't be recorded")
 
     def entries(self) -> dict[str, Any]:
         return self.model_dump(exclude_unset=True)

@@ -57,12 +57,9 @@ def test_steps_are_drawn_from_the_seed_both_ends_included():
     assert drawn == [steps_of(seed, (5, 8)) for seed in range(60)]
 
 
-def test_a_policy_that_speaks_otherwise_than_the_protocol_is_refused():
+def test_weights_of_what_acts_have_a_hash_and_other_actions_than_the_protocols_are_refused():
     with pytest.raises(EvaluationError, match="joint_positions"):
         check_acting(settings("scripted", (5, 60)))
-
-
-def test_weights_of_what_acts_have_a_hash():
     assert check_acting(settings("random", (5, 60))) == ""
     assert check_acting(settings("small", (5, 60))) == hash_weights(BUNDLED / "small")
 
@@ -88,6 +85,9 @@ def test_there_is_nothing_to_take_over_where_the_policy_succeeded(player, genera
     result = generator.generate(4, tmp_path, "one", takeover)
     assert not result.success
     assert [(failure.stage, failure.reason) for failure in result.failures] == [("takeover", "succeeded")]
+    died = Takeover(7, "random", 0, {}, 1.0, "SIGSEGV")
+    (failure,) = generator.generate(7, tmp_path, "one", died).failures
+    assert (failure.stage, failure.reason) == ("takeover", "SIGSEGV")
     assert not list(tmp_path.iterdir())
 
 
@@ -123,30 +123,29 @@ def test_the_record_begins_where_the_policy_was(player, generator, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("player", [("scripted-motions", (31, 31))], indirect=True)
-def test_a_target_in_the_hand_is_carried_on(player, generator, tmp_path):
-    takeover = player.run(2)
-    assert generator.generate(2, tmp_path, "one", takeover).success
-    (episode,) = read_json(tmp_path / "one.h5")["episodes"]
-    assert [part["goal_type"] for part in episode["robocas"]["subgoals"]] == ["transfer object"]
-    with h5py.File(tmp_path / "one.h5") as file:
-        told = file["traj_0/actions"][:, 7]
-    assert np.flatnonzero(np.diff(told)).size == 1  # it opens once, above the basket
-    assert told[0] == -1
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("player", [("scripted-beside", (31, 31))], indirect=True)
-def test_who_has_closed_the_gripper_beside_is_shown_how_to_go_on(player, generator, tmp_path):
-    """In the same scene as above, in which the target is in the hand by then."""
+@pytest.mark.parametrize(
+    ("player", "subgoals", "commands"),
+    [
+        (
+            ("scripted-motions", (31, 31)),
+            ["transfer object"],
+            1,
+        ),  # the target is in the hand: it opens above the basket
+        # in the same scene beside the target: it opens, closes where the target is, and opens above the basket
+        (("scripted-beside", (31, 31)), ["move and grasp", "transfer object"], 3),
+    ],
+    indirect=["player"],
+)
+def test_it_goes_on_with_what_the_gripper_holds(player, generator, tmp_path, subgoals, commands):
     takeover = player.run(2)
     assert takeover.gripper == -1.0
     assert generator.generate(2, tmp_path, "one", takeover).success
     (episode,) = read_json(tmp_path / "one.h5")["episodes"]
-    assert [part["goal_type"] for part in episode["robocas"]["subgoals"]] == ["move and grasp", "transfer object"]
+    assert [part["goal_type"] for part in episode["robocas"]["subgoals"]] == subgoals
     with h5py.File(tmp_path / "one.h5") as file:
-        told = file["traj_0/actions"][:, 7]
-    assert np.flatnonzero(np.diff(told)).size == 3  # it opens, closes where the target is, and opens above the basket
+        gripper = file["traj_0/actions"][:, 7]
+    assert np.flatnonzero(np.diff(gripper)).size == commands
+    assert gripper[0] == -1
 
 
 @pytest.mark.slow
@@ -161,12 +160,6 @@ def test_it_is_converted_from_where_the_policy_was(player, generator, tmp_path, 
     tcp = player._base.agent.tcp_in_arm_base.p[0].numpy()  # where the policy stopped
     first = Dataset(tmp_path / "dataset").episode(0).arrays["ee_pos"][0]
     np.testing.assert_allclose(first, tcp, atol=1e-5)
-
-
-def test_a_process_that_dies_leaves_nothing(generator, tmp_path):
-    takeover = Takeover(7, "random", 0, {}, 1.0, "SIGSEGV")
-    (failure,) = generator.generate(7, tmp_path, "one", takeover).failures
-    assert (failure.stage, failure.reason) == ("takeover", "SIGSEGV")
 
 
 def actions_of(path) -> str:
