@@ -10,18 +10,17 @@ import os
 import tempfile
 import time
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import tyro
 
+from robocas_ms3.plans import worker
 from robocas_ms3.plans.executors import LocalExecutor
+from robocas_ms3.plans.folder import PlanFolder, SeedFiles, Unit
 from robocas_ms3.plans.plan import PartConfig, Plan
 from robocas_ms3.plans.run import run_shard
-from robocas_ms3.plans.units import SeedFiles, Unit
-from robocas_ms3.plans.worker import UnitWorker
 
 
 @dataclass
@@ -38,22 +37,17 @@ class Benchmark:
 
 @dataclass
 class Wait:
-    """A stage that takes its time, and none of the processor's."""
+    """A stage that takes its time, and none of the processor's: `plan.limits.render_seconds`."""
 
-    seconds: float
+    plan: Plan
 
     def run(self, files: SeedFiles) -> dict[str, Any]:
         """Do nothing for a while."""
-        time.sleep(self.seconds)
+        time.sleep(self.plan.limits.render_seconds)
         return {"success": True, "steps": 1}
 
     def close(self) -> None:
         """Nothing is held."""
-
-
-def wait(seconds: float, plan: Plan) -> Wait:
-    """The stage of a plan."""
-    return Wait(seconds)
 
 
 def main(cfg: Benchmark) -> None:
@@ -63,17 +57,18 @@ def main(cfg: Benchmark) -> None:
             "parts": [PartConfig(task="pick", config="pick_table_scattered", episodes=cfg.units, name="waits")],
             "stages": ["demonstrations"],
             "block": 1,
+            "limits": {"render_seconds": cfg.seconds},
         },
         strict=False,
     )
-    record = partial(wait, cfg.seconds)
-    with tempfile.TemporaryDirectory() as folder:
-        out, begun = Path(folder) / "out", time.time()
+    worker.Recorder = Wait  # pyright: ignore[reportAttributeAccessIssue]
+    with tempfile.TemporaryDirectory() as tmp:
+        folder, begun = PlanFolder(plan, Path(tmp) / "out"), time.time()
         cpu = time.process_time()
-        run_shard(LocalExecutor(plan, out, cfg.workers, open_worker=partial(UnitWorker, record=record)), (0, 1))
+        run_shard(LocalExecutor(folder, cfg.workers), (0, 1))
         cpu = time.process_time() - cpu
         units = [Unit(0, block) for block in range(cfg.units)]
-        at = np.sort([one.at for unit in units for one in unit.outcomes(plan, out) or ()])
+        at = np.sort([one.at for unit in units for one in folder.outcomes(unit) or ()])
     # from when every worker has begun until the first has nothing left to do
     first, last = 2 * cfg.workers, cfg.units - cfg.workers
     rate = (last - first) / (at[last] - at[first])

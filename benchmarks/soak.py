@@ -22,10 +22,9 @@ import psutil
 import tyro
 import yaml
 
-from robocas_ms3.plans.folder import read_plan
+from robocas_ms3.plans.folder import Outcome, read_plan
 from robocas_ms3.plans.progress import Progress
 from robocas_ms3.plans.status import read_status
-from robocas_ms3.plans.units import Outcome
 
 LOOK = 5.0  # s between two looks at memory
 
@@ -109,11 +108,10 @@ def watch(process: subprocess.Popen[bytes], until: float) -> dict[int, Memory]:
 
 def report(cfg: Benchmark, out: Path, wall: float, ctrl_c: float, memory: dict[int, Memory]) -> dict[str, Any]:
     """The figures."""
-    plan = read_plan(out)
-    progress = Progress(plan, out)
+    progress = Progress(read_plan(out))
     found: dict[str, list[Outcome]] = defaultdict(list)
     for unit, outcomes in [*progress.done.items(), *progress.partial.items()]:
-        found[plan.name_of(unit.part).split("-")[0]] += outcomes
+        found[progress.plan.name_of(unit.part).split("-")[0]] += outcomes
     good = {task: [one for one in made if one.success] for task, made in found.items()}
     cpu = {
         task: sum(one.record_seconds + one.render_seconds for one in made) / max(1, len(good[task]))

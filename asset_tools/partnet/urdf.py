@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from asset_tools.partnet.annotation import LARGEST, JointNote
 from asset_tools.reading.files import read_file
 from robocas_ms3.core.errors import AssetError
-from robocas_ms3.core.names import check_name
+from robocas_ms3.core.strict import check_name
 
 Array = np.ndarray
 

@@ -124,7 +124,6 @@ class Build:
 
 
 def import_scans(command: ImportScans) -> int:
-    """Run ``import-scans``."""
     with mesh_tools():
         from asset_tools.import_scans import ImportSettings, scan_jobs
     out, masses = _target(command.pack), _masses(command.masses)
@@ -137,7 +136,6 @@ def import_scans(command: ImportScans) -> int:
 
 
 def import_graspnet(command: ImportGraspNet) -> int:
-    """Run ``import-graspnet``."""
     with mesh_tools():
         from asset_tools.graspnet.importer import graspnet_jobs
     out = _target(command.pack)
@@ -147,7 +145,6 @@ def import_graspnet(command: ImportGraspNet) -> int:
 
 
 def import_ycb(command: ImportYCB) -> int:
-    """Run ``import-ycb``."""
     with mesh_tools():
         from asset_tools.import_ycb import ycb_jobs
     out = _target(command.pack)
@@ -157,7 +154,6 @@ def import_ycb(command: ImportYCB) -> int:
 
 
 def import_partnet(command: ImportPartNet) -> int:
-    """Run ``import-partnet``."""
     from robocas_ms3.core.errors import AssetError
 
     with mesh_tools():
@@ -174,7 +170,6 @@ def import_partnet(command: ImportPartNet) -> int:
 
 
 def build(command: Build) -> int:
-    """Run ``build``."""
     from robocas_ms3.core.errors import AssetError
     from robocas_ms3.core.paths import builtin_packs_dir
 

@@ -72,7 +72,6 @@ class Sheet:
 
 
 def list_packs(command: ListPacks) -> int:
-    """Run ``list``; a pack that can't be read is listed with the reason."""
     from rich.table import Column, Table
     from rich.text import Text
 
@@ -92,7 +91,6 @@ def list_packs(command: ListPacks) -> int:
 
 
 def info(command: Info) -> int:
-    """Run ``info``."""
     from rich.table import Column, Table
 
     from robocas_ms3.assets.pack import load_pack
@@ -164,7 +162,6 @@ def verify(command: Verify) -> int:
 
 
 def sheet(command: Sheet) -> int:
-    """Run ``sheet``."""
     with mesh_tools():
         from asset_tools.sheet import contact_sheet
     from robocas_ms3.assets.pack import load_pack

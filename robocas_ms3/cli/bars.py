@@ -59,7 +59,6 @@ class Display:
         self.bars.update(self.bars.task_ids[-1], about=about)
 
     def note(self, text: str) -> None:
-        """Write a line above the bars."""
         if self.bars is None:
             tell(text)
         else:
@@ -178,7 +177,6 @@ def bar(description: str, *, transient: bool = False) -> Iterator[Bar]:
 
 @contextmanager
 def working(text: str) -> Iterator[None]:
-    """Show a spinner on a terminal, for work of unknown length."""
     terminal = terminal_of_stderr()
     with terminal.status(text) if terminal else nullcontext():
         yield

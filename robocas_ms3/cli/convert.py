@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
 @resumable
 def main(settings: ConversionSettings) -> int:
-    """Run the command."""
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.terminal import say
 

@@ -23,7 +23,6 @@ class Doctor:
 
 
 def main(cfg: Doctor) -> int:
-    """Run the command."""
     from robocas_ms3.cli.bars import working
     from robocas_ms3.cli.terminal import say_lines
     from robocas_ms3.doctor.checks import examine

@@ -141,8 +141,8 @@ def videos(cfg: Videos) -> int:
     """Run ``videos``."""
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.terminal import say
+    from robocas_ms3.core.checks import check_number
     from robocas_ms3.core.errors import EvaluationError
-    from robocas_ms3.core.strict import check_number
     from robocas_ms3.evaluation.policies import POLICIES, open_policy
 
     check_number("count", cfg.count, 1)

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
 @resumable
 def main(settings: GenerateSettings) -> int:
-    """Run the command."""
     settings = settings.resolve()  # an invalid configuration is an error before the imports below, which take seconds
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.terminal import say

@@ -44,7 +44,6 @@ class ImportRobocas:
 
 
 def main(cfg: ImportRobocas) -> int:
-    """Survey, report, import; gives the exit code."""
     import json
 
     from robocas_ms3.cli.bars import bar

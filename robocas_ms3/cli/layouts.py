@@ -65,11 +65,10 @@ class Info:
 
 
 def build(command: Build) -> int:
-    """Run ``build``."""
     from robocas_ms3.assets.pack import load_pack
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.terminal import say
-    from robocas_ms3.core.strict import check_number
+    from robocas_ms3.core.checks import check_number
     from robocas_ms3.scenes.config import load_task_config
 
     if command.jobs is not None:
@@ -150,7 +149,6 @@ def try_all(cache: LayoutCache, engine: Engine, **packs: str) -> int:
 
 
 def info(command: Info) -> int:
-    """Run ``info``."""
     from rich.markup import escape
     from rich.table import Table
 

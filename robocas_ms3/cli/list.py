@@ -21,7 +21,6 @@ class List:
 
 
 def main(cfg: List) -> int:
-    """Run the command."""
     from robocas_ms3.cli.terminal import say_lines
 
     found = collect()

@@ -150,7 +150,6 @@ def parse(words: Sequence[str]) -> tuple[Callable[[Any], int], Any]:
 
 
 def module_of(name: str) -> ModuleType:
-    """Import the module of a command."""
     return importlib.import_module(f"robocas_ms3.cli.{name.replace('-', '_')}")
 
 

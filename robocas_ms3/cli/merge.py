@@ -28,7 +28,6 @@ class Merge:
 
 
 def main(cfg: Merge) -> int:
-    """Merge, with a progress bar; gives the exit code."""
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.core.words import count_of

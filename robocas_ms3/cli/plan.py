@@ -78,25 +78,24 @@ class List:
 
 @resumable
 def run(command: Run) -> int:
-    """Run ``run``."""
     from robocas_ms3.cli.bars import Display, show_plan
     from robocas_ms3.cli.terminal import say
+    from robocas_ms3.core.checks import check_number, parse_shard
     from robocas_ms3.core.errors import PlanError
-    from robocas_ms3.core.strict import check_number
     from robocas_ms3.plans.executors import open_executor
+    from robocas_ms3.plans.folder import PlanFolder
     from robocas_ms3.plans.load import load_plan
-    from robocas_ms3.plans.progress import parse_shard
     from robocas_ms3.plans.run import Callbacks, run_plan, run_shard
 
     jobs = command.jobs if command.jobs is not None else os.cpu_count() or 1
     check_number("jobs", jobs, 1)
-    shard = parse_shard(command.shard) if command.shard is not None else None
+    shard = parse_shard(command.shard, PlanError) if command.shard is not None else None
     if shard and (command.overwrite or command.executor != "local"):
         found = "--overwrite" if command.overwrite else f"--executor {command.executor}"
         raise PlanError("a shard continues in its folder, on this machine", where="--shard", found=found)
     options = dict(_option(word) for word in command.executor_option)
     plan = load_plan(command.plan)
-    executor = open_executor(command.executor, plan, command.out, jobs, options)
+    executor = open_executor(command.executor, PlanFolder(plan, command.out), jobs, options)
     if command.executor == "local" and plan.makes_datasets:
         from robocas_ms3.datasets.writing.render import require_renderer
 
@@ -121,7 +120,6 @@ def run(command: Run) -> int:
 
 
 def join(command: Join) -> int:
-    """Run ``join``."""
     from robocas_ms3.cli.terminal import tell
     from robocas_ms3.plans.run import join_plan
 
@@ -131,7 +129,6 @@ def join(command: Join) -> int:
 
 
 def list_plans(cfg: List) -> int:
-    """Run ``list``."""
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.plans.load import load_plan, shipped_plans
 
@@ -142,7 +139,6 @@ def list_plans(cfg: List) -> int:
 
 
 def show_status(command: Status) -> int:
-    """Run ``status``."""
     from rich.markup import escape
     from rich.table import Table
 

@@ -7,7 +7,6 @@ from robocas_ms3.demos.settings import ReplaySettings
 
 
 def main(settings: ReplaySettings) -> int:
-    """Run the command."""
     import numpy as np
 
     from robocas_ms3.cli.bars import bar

@@ -36,10 +36,9 @@ class ServePolicy:
 
 
 def main(cfg: ServePolicy) -> int:
-    """Run the command; gives the exit code."""
     from robocas_ms3.cli.terminal import say
+    from robocas_ms3.core.checks import check_number
     from robocas_ms3.core.errors import EvaluationError
-    from robocas_ms3.core.strict import check_number
     from robocas_ms3.evaluation.policies import open_policy
     from robocas_ms3.evaluation.protocol import load_protocol
     from robocas_ms3.evaluation.remote.messages import LARGEST_BATCH

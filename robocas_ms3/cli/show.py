@@ -38,11 +38,9 @@ class Show:
 
 
 def main(cfg: Show) -> int:
-    """Run the command."""
     from robocas_ms3.assets.pack import load_pack
+    from robocas_ms3.core.checks import GREATEST_SEED, check_number
     from robocas_ms3.core.errors import RobocasError
-    from robocas_ms3.core.strict import check_number
-    from robocas_ms3.demos.recordings.entries import GREATEST_SEED
     from robocas_ms3.scenes.config import load_task_config
 
     check_number("seed", cfg.seed, 0, GREATEST_SEED)

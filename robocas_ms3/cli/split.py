@@ -46,7 +46,6 @@ class Split:
 
 
 def main(cfg: Split) -> int:
-    """Split, with a progress bar; gives the exit code."""
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.core.words import count_of

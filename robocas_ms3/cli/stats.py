@@ -30,7 +30,6 @@ class Stats:
 
 
 def main(cfg: Stats) -> int:
-    """Count and draw; gives the exit code."""
     import json
 
     from robocas_ms3.cli.bars import bar

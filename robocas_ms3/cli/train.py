@@ -116,7 +116,6 @@ DEFAULT = "small"
 
 @resumable
 def train(baseline: str, cfg: Training) -> int:
-    """Train a baseline, with a progress bar."""
     from robocas_ms3.baselines.training.record import find_run
     from robocas_ms3.baselines.training.session import Progress, RunOptions, train_run
     from robocas_ms3.cli.bars import bar

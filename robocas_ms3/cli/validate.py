@@ -45,7 +45,6 @@ class Validate:
 
 
 def main(cfg: Validate) -> int:
-    """Validate; gives the exit code."""
     from robocas_ms3.datasets.checks.dataset import validate
     from robocas_ms3.datasets.formats import format_of
 

@@ -31,7 +31,6 @@ class Video:
 
 
 def main(cfg: Video) -> int:
-    """Write them; gives the exit code."""
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.datasets.formats import open_source

@@ -38,7 +38,6 @@ class View:
 
 
 def main(cfg: View) -> int:
-    """Serve until Ctrl-C, or write; gives the exit code."""
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.viewer.source import open_source
 

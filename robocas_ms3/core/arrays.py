@@ -34,12 +34,10 @@ def choose(condition: Array, yes: Array, no: Array) -> Array:
 
 
 def as_float(values: Array) -> Array:
-    """Return flags or numbers as float32."""
     return values.float() if isinstance(values, Tensor) else np.asarray(values, np.float32)
 
 
 def as_double(values: Array) -> Array:
-    """Return numbers as float64."""
     return values.double() if isinstance(values, Tensor) else np.asarray(values, np.float64)
 
 
@@ -51,14 +49,12 @@ def clamp(values: Array, low: Array | float, high: Array | float) -> Array:
 
 
 def greater(one: Array, other: Array) -> Array:
-    """Return the greater of each two numbers."""
     if isinstance(one, Tensor):
         return torch.maximum(one, other)  # pyright: ignore[reportArgumentType]
     return np.maximum(one, other)
 
 
 def join(arrays: list[Array], axis: int = -1) -> Array:
-    """Join arrays along an axis."""
     if isinstance(arrays[0], Tensor):
         return torch.cat(arrays, dim=axis)  # pyright: ignore[reportArgumentType]
     return np.concatenate(arrays, axis=axis)

@@ -48,13 +48,9 @@ DAMAGED = (
 
 
 class DocumentError(ValueError):
-    """A file that is too large, nested too deeply, or not of its language; in one line.
+    """A file that is too large, nested too deeply, or not of its language; in one line."""
 
-    Attributes:
-        filename: of the file, as errors of the system have it; empty where a text was read.
-    """
-
-    filename: str = ""
+    filename: str = ""  # as errors of the system have it; empty where a text was read
 
 
 @contextmanager
@@ -67,12 +63,7 @@ def _reading(path: Path) -> Iterator[None]:
 
 
 def load_json(path: Path) -> Any:
-    """Read a JSON file.
-
-    Raises:
-        DocumentError: the file is not regular or not JSON, is too large or deep, or has a number out of range.
-        OSError: the file cannot be read.
-    """
+    """Read a JSON file of bounded size and depth, whose numbers are finite and of 64 bits."""
     with _reading(path):
         return json_values(read_text(path, JSON_LIMIT))
 
@@ -123,13 +114,7 @@ def _scalar_fault(value: Any) -> str:
 
 
 def load_yaml(path: Path) -> Any:
-    """Read a YAML file; a key given twice in a mapping is an error, infinity and NaN are not.
-
-    Raises:
-        DocumentError: the file is not regular or not YAML, is too large or deep, has a number out of range, or its
-            aliases stand for too many values.
-        OSError: the file cannot be read.
-    """
+    """Read a YAML file of bounded size, depth and aliases; a key given twice in a mapping is an error."""
     with _reading(path):
         text = read_text(path, YAML_LIMIT)
         try:
@@ -139,11 +124,7 @@ def load_yaml(path: Path) -> Any:
 
 
 def open_arrays(path: Path) -> Any:
-    """Open an ``.npz`` file; returns NumPy's reader, for a ``with`` statement. Pickled objects are never loaded.
-
-    Raises:
-        ValueError: or another error of `DAMAGED`: the file is not an archive, or its arrays are too large.
-    """
+    """Open an ``.npz`` file without pickled objects; return NumPy's reader, a context manager. Raises `DAMAGED`."""
     import numpy as np  # not for every command
     from numpy.lib.npyio import NpzFile
 
@@ -158,11 +139,7 @@ def open_arrays(path: Path) -> Any:
 
 
 def load_array(path: Path, limit: int = ARRAYS_LIMIT) -> Any:
-    """Read an ``.npy`` file of at most ``limit`` bytes. Pickled objects are never loaded.
-
-    Raises:
-        ValueError: or another error of `DAMAGED`: the file is too large, or does not hold one array.
-    """
+    """Read an ``.npy`` file of at most ``limit`` bytes without pickled objects. Raises `DAMAGED`."""
     import numpy as np  # not for every command
 
     check_regular(path, limit)
@@ -174,12 +151,7 @@ def load_array(path: Path, limit: int = ARRAYS_LIMIT) -> Any:
 
 
 def check_regular(path: Path, limit: int | None = None) -> None:
-    """Refuse a pipe, a device or a socket, on which a read may never end; a folder is left to ``open``.
-
-    Raises:
-        DocumentError: the path leads to one of these, or the file has more than ``limit`` bytes.
-        OSError: the path cannot be read.
-    """
+    """Refuse a file of more than ``limit`` bytes, and a pipe, a device or a socket, on which a read may never end."""
     status = path.stat()
     if not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)):
         raise DocumentError("not a regular file")
@@ -188,12 +160,6 @@ def check_regular(path: Path, limit: int | None = None) -> None:
 
 
 def read_bytes(path: Path, limit: int) -> bytes:
-    """Read a file of at most ``limit`` bytes.
-
-    Raises:
-        DocumentError: the file is not regular or is larger.
-        OSError: the file cannot be read.
-    """
     with _reading(path):
         check_regular(path, limit)
         with path.open("rb") as file:
@@ -204,7 +170,7 @@ def read_bytes(path: Path, limit: int) -> bytes:
 
 
 def read_text(path: Path, limit: int) -> str:
-    """Read a text in UTF-8 of at most ``limit`` bytes; raises as `read_bytes`, and DocumentError if it is not UTF-8."""
+    """Read a text in UTF-8 of at most ``limit`` bytes."""
     with _reading(path):
         try:
             return read_bytes(path, limit).decode("utf-8")
@@ -225,7 +191,6 @@ class _Loader(yaml.SafeLoader):
         self._sizes: dict[str, int] = {}  # anchor -> values below it
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        """Compose a value and what is in it."""
         event: Any = self.peek_event()
         self._nodes += self._sizes.get(event.anchor, 0) if isinstance(event, yaml.AliasEvent) else 1
         if self._nodes > YAML_NODES:
@@ -251,7 +216,6 @@ class _Loader(yaml.SafeLoader):
         return node
 
     def construct_yaml_int(self, node: Any) -> int:
-        """Return an integer of at most 64 bits."""
         number = INTEGER_LIMIT if len(node.value) > _INTEGER_LENGTH else super().construct_yaml_int(node)
         if abs(number) >= INTEGER_LIMIT:
             raise DocumentError(f"integer {node.value[:24]} has more than 64 bits")

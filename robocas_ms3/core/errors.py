@@ -134,7 +134,6 @@ class PlanningFailed(RobocasError):
         super().__init__(f"{stage}: {reason}")
 
     def __reduce__(self):
-        """Let the error cross a process boundary."""
         return type(self), (self.stage, self.reason)
 
 

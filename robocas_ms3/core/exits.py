@@ -48,7 +48,6 @@ class _CommandInterrupt:
         self._handler(number, frame)
 
     def waits(self) -> bool:
-        """Return whether the command waits for the first SIGINT, undeferred."""
         return self.installed and signal.getsignal(signal.SIGINT) == self.handle
 
     def arm(self) -> None:
@@ -119,11 +118,7 @@ def end_process(code: int) -> NoReturn:
 
 
 def die_with_parent(parent: int) -> None:
-    """Have the system kill this process as soon as the thread that started it ends; on Linux alone.
-
-    Args:
-        parent: process id of the parent, which may have ended before this call.
-    """
+    """Have Linux kill this process as soon as the thread that started it ends, of the process with id ``parent``."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != parent:
@@ -132,13 +127,10 @@ def die_with_parent(parent: int) -> None:
 
 @contextmanager
 def no_exit(source: str) -> Iterator[None]:
-    """Turn a ``SystemExit``, or a ``KeyboardInterrupt`` without a signal, of foreign code into an error.
+    """Turn a SystemExit, or a KeyboardInterrupt without a signal, of foreign code into ExtensionError.
 
     Args:
         source: whose code is called, such as ``policy mine:Policy``.
-
-    Raises:
-        ExtensionError: the code called ``sys.exit``, or raised ``KeyboardInterrupt``.
     """
     try:
         yield

@@ -28,7 +28,6 @@ ABANDONED = 86400.0
 """Age in s, since the last change, of files that a killed run left."""
 _SHOWN_KEYS = 8  # of the way to a wrong value, in a message
 _NAME_BYTES = 96  # of stem and of suffix that a temporary name repeats: file systems allow 255 in all
-_TRIES = 5  # to rename a folder onto one that others replace
 
 
 @contextmanager
@@ -75,12 +74,7 @@ def replacing(path: Path | str, *, sync: bool = False) -> Iterator[Path]:
 
 
 def open_for_append(path: Path) -> BufferedRandom:
-    """Open a file for reading and appending; create it if missing, follow no symbolic link.
-
-    Raises:
-        RobocasError: the path is a symbolic link, or not a regular file.
-        OSError: the file can't be opened.
-    """
+    """Open a file for reading and appending, or create it; raise RobocasError for a symbolic link or a pipe."""
     flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     found = "a pipe or device"
     try:
@@ -97,7 +91,6 @@ def open_for_append(path: Path) -> BufferedRandom:
 
 
 def _sync(path: Path) -> None:
-    """Wait until a file, or a folder's list of its files, is on the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -157,20 +150,14 @@ def remove(path: Path) -> None:
 
 
 def _move_in(tmp: Path, path: Path) -> None:
-    """Rename a folder onto another, which other runs may replace at the same time."""
-    for tries_left in reversed(range(_TRIES)):
-        old = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".old", dir=path.parent))
-        try:
-            if path.exists():
-                with suppress(FileNotFoundError):
-                    os.replace(path, old / "old")
-            os.replace(tmp, path)
-            return
-        except OSError as error:
-            if not tries_left or error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
-                raise
-        finally:
-            shutil.rmtree(old, ignore_errors=True)
+    """Rename a folder onto another."""
+    old = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".old", dir=path.parent))
+    try:
+        if path.exists():
+            os.replace(path, old / "old")
+        os.replace(tmp, path)
+    finally:
+        shutil.rmtree(old, ignore_errors=True)
 
 
 def _restore_and_sweep(path: Path) -> None:

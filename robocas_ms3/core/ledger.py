@@ -27,19 +27,12 @@ _LIMIT = 2**30  # bytes of a file: a million lines have 300 MB
 
 @dataclass(frozen=True)
 class Line(Generic[Record]):
-    """A line of the file.
+    """A line of the file."""
 
-    Attributes:
-        number: from 1 on.
-        record: its content; None: it is damaged.
-        problem: pydantic's, of a damaged one.
-        cut_off: whether a kill may have cut it off: it is the last one, and has no end.
-    """
-
-    number: int
-    record: Record | None
+    number: int  # from 1 on
+    record: Record | None  # None: it is damaged
     problem: ValidationError | None = None
-    cut_off: bool = False
+    cut_off: bool = False  # perhaps by a kill: it is the last one, and has no end
 
 
 _form_of = lru_cache(TypeAdapter)
@@ -90,7 +83,6 @@ class Ledger(Generic[Record]):
                 os.fsync(file.fileno())
 
     def rewrite(self, records: Iterable[Record]) -> None:
-        """Replace the file, whole or not at all."""
         with replacing(self.path) as tmp:
             tmp.write_bytes(_text(records, self.path))
 

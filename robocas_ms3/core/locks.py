@@ -28,9 +28,6 @@ def locked_folder(path: Path | str) -> Iterator[None]:
     """Hold a lock on a folder, which may not exist yet; see `lock_file`.
 
     Parent folders that were made for the lock are removed if the folder does not exist in the end.
-
-    Raises:
-        RobocasError: another process holds the lock, or the folder is not writable.
     """
     path = Path(path)
     new = [folder for folder in path.parents if not folder.exists()]

@@ -63,6 +63,8 @@ class OutputFolder:
         kind: of the command.
         settings: what has to match to continue: JSON values, by keys of the record. None: see `check_settings`.
         overwrite: whether to start again.
+        shared: whether other processes of the same run write there too: then the folder is not locked, a record that
+            is there stays, and so do leftovers.
 
     Attributes:
         path: of the folder.
@@ -74,17 +76,24 @@ class OutputFolder:
     """
 
     def __init__(
-        self, path: Path | str, kind: FolderKind, settings: Mapping[str, Any] | None = None, *, overwrite: bool = False
+        self,
+        path: Path | str,
+        kind: FolderKind,
+        settings: Mapping[str, Any] | None = None,
+        *,
+        overwrite: bool = False,
+        shared: bool = False,
     ) -> None:
         self.path = Path(path)
         self.recorded: dict[str, Any] | None = None
-        self._kind, self._settings, self._overwrite = kind, settings, overwrite
+        self._kind, self._settings, self._overwrite, self._shared = kind, settings, overwrite, shared
         self._started = False
         self._stack = ExitStack()
 
     def __enter__(self) -> OutputFolder:
         with ExitStack() as stack:
-            stack.enter_context(locked_folder(self.path))
+            if not self._shared:
+                stack.enter_context(locked_folder(self.path))
             self.read()
             self._stack = stack.pop_all()
         return self
@@ -101,7 +110,7 @@ class OutputFolder:
                 except RobocasError as removed:
                     raise removed from error
             with suppress(OSError):  # a mount point or a link stays
-                if not self._has_results():
+                if not (self._shared or self._has_results()):
                     empty_folder(self.path)
                     self.path.rmdir()
 
@@ -113,10 +122,12 @@ class OutputFolder:
 
     def check_settings(self, settings: Mapping[str, Any]) -> None:
         """Raise OutputExistsError if recorded settings differ; not those of a folder that is to be overwritten."""
-        if self.recorded is None:
-            return
+        if self.recorded is not None:
+            self._compare(self.recorded, settings)
+
+    def _compare(self, record: dict[str, Any], settings: Mapping[str, Any]) -> None:
         now = json.loads(json_text(settings, self.path))
-        before = self._kind.upgrade(self.recorded)
+        before = self._kind.upgrade(record)
         changes = [change for key, value in now.items() for change in setting_changes(before.get(key), value, key)]
         if changes:
             more = len(changes) - _SHOWN_CHANGES
@@ -129,8 +140,11 @@ class OutputFolder:
         if self._overwrite and not self._started and self.path.is_dir():
             self._hide_content()
         self._started = True
+        if self._shared and self._record_path().is_file():
+            return
         make_folder(self.path)
-        sweep(self.path)
+        if not self._shared:
+            sweep(self.path)
         write_json(self._record_path(), record, sync=True)
 
     def _hide_content(self) -> None:
@@ -146,8 +160,18 @@ class OutputFolder:
     def check_exists(self) -> None:
         """Raise RobocasError if somebody removed the folder: writers make missing folders, and would go on there."""
         if not self._record_path().is_file():
-            what, fix = "the output folder was removed or emptied during the run", "Start again."
-            raise RobocasError(what, where=self.path, expected=self._record_path().name, fix=fix)
+            raise self._removed()
+
+    def _removed(self) -> RobocasError:
+        what, fix = "the output folder was removed or emptied during the run", "Start again."
+        return RobocasError(what, where=self.path, expected=self._record_path().name, fix=fix)
+
+    def check_record(self) -> None:
+        """Raise RobocasError if the record was removed, or has other settings: another run started here."""
+        record = self._load_record()
+        if record is None:
+            raise self._removed()
+        self._compare(record, self._settings or {})
 
     def _record_path(self) -> Path:
         """Return the path of the record, or of the one that will be written."""
@@ -155,14 +179,9 @@ class OutputFolder:
         return next((path for path in paths if path.is_file()), paths[0])
 
     def _load_matching(self) -> dict[str, Any] | None:
-        """Return the record, or None if there is nothing to continue."""
         if is_empty(self.path):
             return None
-        record = None
-        with suppress(OSError, ValueError):
-            record = load_json(self._record_path())
-        if not isinstance(record, dict) or self._kind.key not in record:
-            record = None
+        record = self._load_record()
         if record is not None and record.get(_OVERWRITTEN) is True:  # killed while it moved the content
             self._overwrite = True
         if record is None:
@@ -173,7 +192,13 @@ class OutputFolder:
             if not self._overwrite and self._has_results():
                 what, fix = "there are no recorded settings to continue with", "Pass --overwrite to start again."
                 raise OutputExistsError(what, where=self._record_path(), fix=fix)
-        return None if self._overwrite or not self._has_results() else record
+        return None if self._overwrite or not (self._shared or self._has_results()) else record
+
+    def _load_record(self) -> dict[str, Any] | None:
+        with suppress(OSError, ValueError):
+            record = load_json(self._record_path())
+            if isinstance(record, dict) and self._kind.key in record:
+                return record
 
     def _has_results(self) -> bool:
         records = {self.path / record for record in self._kind.records}
@@ -181,7 +206,6 @@ class OutputFolder:
 
 
 def _content(folder: Path) -> Iterator[Path]:
-    """Yield the files in a folder and below it that are not hidden."""
     for entry in folder.iterdir() if folder.is_dir() else ():
         if _is_hidden(entry):
             continue

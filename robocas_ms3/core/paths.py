@@ -1,4 +1,7 @@
-"""Folders of bundled data, of the user's data and of the cache."""
+"""Folders of bundled data, of the user's data and of the cache.
+
+Without a home folder, and without the variable that chooses a folder, asking for it raises RobocasError.
+"""
 
 from __future__ import annotations
 
@@ -21,10 +24,7 @@ _log = logging.getLogger(__name__)
 
 
 def data_dir() -> Path:
-    """Return the folder of the user's asset packs: ``$ROBOCAS_DATA``, by default the user's data folder.
-
-    Raises RobocasError if the variable is not set and the user has no home folder.
-    """
+    """Return the folder of the user's asset packs: ``$ROBOCAS_DATA``, by default the user's data folder."""
     return Path(os.environ.get(DATA) or _of_user(platformdirs.user_data_path))
 
 
@@ -32,7 +32,6 @@ def cache_dir() -> Path:
     """Return the cache folder: ``$ROBOCAS_CACHE``, by default the user's cache folder.
 
     If the variable is not set and the user's folder is not writable, it is a private one among the temporary files.
-    Raises RobocasError if the variable is not set and the user has no home folder.
     """
     chosen = os.environ.get(CACHE)
     return Path(chosen) if chosen else _cache_of_user(_of_user(platformdirs.user_cache_path))
@@ -49,11 +48,7 @@ def _of_user(find: Callable[[str], Path]) -> Path:
 
 
 def ensure_home() -> None:
-    """Set ``HOME`` to an absolute path, which libraries need: the user's home folder, or one in the cache.
-
-    Raises:
-        RobocasError: the user has no home folder, and the variables do not choose both cache and data.
-    """
+    """Set ``HOME`` to an absolute path, which libraries need: the user's home folder, or one in the cache."""
     home = os.environ.get("HOME", "")
     if not os.path.isabs(home):
         with suppress(KeyError):  # a user id without an entry, as in many containers
@@ -107,15 +102,12 @@ def task_configs_dir() -> Path:
 
 
 def builtin_packs_dir() -> Path:
-    """Return the folder of bundled asset packs."""
     return PACKAGE_DIR / "data" / "packs"
 
 
 def protocols_dir() -> Path:
-    """Return the folder of bundled evaluation protocols."""
     return PACKAGE_DIR / "data" / "protocols"
 
 
 def plans_dir() -> Path:
-    """Return the folder of bundled plans."""
     return PACKAGE_DIR / "data" / "plans"

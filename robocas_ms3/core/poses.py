@@ -67,12 +67,10 @@ def transform(pose: Array, points: Array) -> Array:
 
 
 def wxyz_to_xyzw(quaternions: Array) -> Array:
-    """Reorder quaternions (..., 4)."""
     return np.roll(quaternions, -1, axis=-1)
 
 
 def xyzw_to_wxyz(quaternions: Array) -> Array:
-    """Reorder quaternions (..., 4)."""
     return np.roll(quaternions, 1, axis=-1)
 
 

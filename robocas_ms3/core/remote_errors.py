@@ -27,11 +27,9 @@ class RemoteError:
 
     @classmethod
     def of(cls, error: BaseException, where: str) -> RemoteError:
-        """Return an error in this form; one that can't be pickled becomes a `RuntimeError`.
+        """Return an error in this form; one that can't be pickled becomes a RuntimeError.
 
-        Args:
-            error: the error.
-            where: name of this process; an error from another process keeps the name of that one.
+        ``where`` names this process; an error from another process keeps the name of that one.
         """
         if isinstance(error, SystemExit):  # would end the receiving process without a message
             error = exit_error(error, where).with_traceback(error.__traceback__)
@@ -48,7 +46,6 @@ class RemoteError:
         return self.error
 
     def reraise(self) -> NoReturn:
-        """Raise the error in this process."""
         raise self.with_traceback()
 
 

@@ -6,13 +6,12 @@ A message names the key, what was expected and what was found; of a mistyped key
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, TypeAdapter, ValidationError, model_validator
 
 from robocas_ms3.core.documents import DocumentError, json_values
 from robocas_ms3.core.errors import RobocasError
@@ -22,6 +21,9 @@ _Model = TypeVar("_Model", bound=BaseModel)
 _Error = TypeVar("_Error", bound=RobocasError)
 GREATEST_NUMBER = 1e12
 """No number of a declared form is larger: products of numbers like 1e308 are infinite."""
+LONGEST_NAME = 200
+"""Bytes; file systems allow 255, of which temporary files add some."""
+_NAME = f"1 to {LONGEST_NAME} printable characters without / and \\, no leading dot"
 # where pydantic's message alone does not say what was expected
 _EXPECTED = {
     "extra_forbidden": "no such key",
@@ -62,26 +64,16 @@ def _too_large(value: Any) -> float | None:
 
 @dataclass(frozen=True)
 class Mistake:
-    """An invalid value, in one line each.
+    """An invalid value, in one line each."""
 
-    Attributes:
-        key: where, as the file has it; empty: at the top.
-        kind: pydantic's type of the error.
-        what: is wrong.
-        expected, found: in a file; empty where ``what`` says it all.
-        fix: the nearest known words, where there are some.
-        value: what was found.
-        context: pydantic's limits and the like.
-    """
-
-    key: str
-    kind: str
+    key: str  # as the file has it; empty: at the top
+    kind: str  # pydantic's type of the error
     what: str
-    expected: str
+    expected: str  # empty, as `found`, where `what` says it all
     found: str
-    fix: str
+    fix: str  # the nearest known words, where there are some
     value: Any
-    context: Mapping[str, Any]
+    context: Mapping[str, Any]  # pydantic's limits and the like
 
 
 def parse(model: type[_Model], data: Any, error: type[RobocasError], *, where: object, about: str = "") -> _Model:
@@ -171,11 +163,24 @@ def mistakes(
     return sorted(made, key=lambda mistake: mistake.kind != "extra_forbidden")  # it may be why another is missing
 
 
-def check_number(name: str, value: float, least: float, greatest: int | None = None) -> None:
-    """Raise RobocasError if a number is out of range."""
-    if not least <= value < math.inf or (greatest is not None and value > greatest):
-        expected = f"at least {least}" if greatest is None else f"{least} to {greatest}"
-        raise RobocasError("this number is out of range", where=name, expected=expected, found=value)
+def check_name(name: str, error: type[RobocasError], *, where: object, fix: str = "") -> str:
+    """Return a name that can be that of one file or folder; raise ``error`` if it can't be used in a path."""
+    try:
+        return _check_name(name)
+    except ValueError as problem:
+        what, found = "this name can't be used for a file", f"{name!r:.80}"
+        raise error(what, where=where, expected=_NAME, found=found, fix=fix) from problem
+
+
+def _check_name(name: str) -> str:
+    fits = 0 < len(name.encode()) <= LONGEST_NAME
+    if not (fits and name.isprintable()) or name.startswith(".") or {*name} & {"/", "\\"}:
+        raise ValueError(f"not a name for a file: expected {_NAME}")
+    return name
+
+
+FileName = Annotated[str, AfterValidator(_check_name)]
+"""A field of a declared form that becomes a part of a path."""
 
 
 def _mistake(key: str, same: list[Any], schema: dict[str, Any], words: Mapping[str, str]) -> Mistake:

@@ -19,6 +19,7 @@ from robocas_ms3.core.errors import RobocasError
 _UNPRINTABLE = r"[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]"
 _CONTROL = re.compile(_UNPRINTABLE)
 _CONTROL_IN_LINES = re.compile(rf"(?![\n\t]){_UNPRINTABLE}")
+_RANGES = 6  # of numbers in a message
 _MARKDOWN = re.compile(
     r"[`*\[\]<>|&~$]"
     r"|\\(?=[!-/:-@\[-`{-~]|$)"  # a backslash is markup only before punctuation
@@ -28,8 +29,8 @@ _MARKDOWN = re.compile(
 )
 
 
-def format_ranges(numbers: Iterable[int], most: int = 6) -> str:
-    """Format numbers as ``0-3, 7``, with at most so many ranges."""
+def format_ranges(numbers: Iterable[int]) -> str:
+    """Format numbers as ``0-3, 7``, with at most six ranges."""
     runs: list[list[int]] = []
     for number in sorted(set(numbers)):
         if runs and number == runs[-1][1] + 1:
@@ -37,8 +38,8 @@ def format_ranges(numbers: Iterable[int], most: int = 6) -> str:
         else:
             runs.append([number, number])
     texts = [str(a) if a == b else f"{a}-{b}" for a, b in runs]
-    more = f" and {sum(b - a + 1 for a, b in runs[most:])} more" if len(runs) > most else ""
-    return ", ".join(texts[:most]) + more
+    more = f" and {sum(b - a + 1 for a, b in runs[_RANGES:])} more" if len(runs) > _RANGES else ""
+    return ", ".join(texts[:_RANGES]) + more
 
 
 def printable(text: str, *, lines: bool = False) -> str:
@@ -81,7 +82,6 @@ class _LogLines(logging.Formatter):
         return printable(super().formatMessage(record), lines=not record.name.startswith("robocas_ms3"))
 
     def formatException(self, ei: Any) -> str:  # noqa: N802
-        """Return a traceback."""
         return printable(super().formatException(ei), lines=True)
 
 

@@ -4,23 +4,28 @@ from __future__ import annotations
 
 import math
 import os
+import pickle
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import CancelledError
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing import Pipe
-from multiprocessing.connection import wait
+from multiprocessing.connection import Connection, wait
 from typing import Any, Generic, Protocol, TypeVar
 
 import cloudpickle
 import psutil
+from tqdm import tqdm
 
 from robocas_ms3.core.errors import RobocasError, WorkerCrashed, WorkerStartError
+from robocas_ms3.core.exits import die_with_parent, end_process, exit_error
 from robocas_ms3.core.remote_errors import RemoteError
+from robocas_ms3.core.words import escape_log_lines, escape_tracebacks
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -33,7 +38,7 @@ _POLL_SECONDS = 1.0  # between two checks of limits
 _JOB_KILL_SECONDS = 2.0  # until this process is ended too, where a batch system ends all processes of a job
 # Not `multiprocessing`, whose spawn runs the user's main module again: it needs `if __name__ == "__main__"` there, and
 # fails in a program from standard input.
-_PROGRAM = "import sys; sys.path[:] = {path!r}; from robocas_ms3.core.worker_main import main; main({fd}, {parent})"
+_PROGRAM = "import sys; sys.path[:] = {path!r}; from robocas_ms3.core.worker_process import main; main({fd}, {parent})"
 
 
 @dataclass(frozen=True)
@@ -59,9 +64,7 @@ class ProcessDied(WorkerCrashed):
 class Worker(Protocol[Task_contra, Result_co]):
     """Keeps what tasks need, and runs one task after the other."""
 
-    def run(self, task: Task_contra, /) -> Result_co:
-        """Run a task."""
-        ...
+    def run(self, task: Task_contra, /) -> Result_co: ...
 
     def close(self) -> None:
         """Free what it holds: after a task that raised an error, and when a pool without processes is closed."""
@@ -86,7 +89,6 @@ class WorkerProcess(Generic[Task, Result]):
         self._checked = 0.0  # time of the last check of the memory limit
 
     def run(self, task: Task) -> Result:
-        """Run a task; raises WorkerStartError, ProcessDied, CancelledError, or the error of the task."""
         if self._process is None or self._process.poll() is not None:
             try:
                 self._start()
@@ -193,3 +195,66 @@ def _kill_tree(process: subprocess.Popen[bytes]) -> None:
             forked.kill()
     process.kill()
     process.wait()
+
+
+def main(descriptor: int, parent: int) -> None:
+    """Run tasks in this process until the pool closes the connection.
+
+    Args:
+        descriptor: file descriptor of the connection.
+        parent: process id of the pool's process.
+    """
+    for number in (signal.SIGINT, signal.SIGTERM):  # a terminal or a batch system sends them to all processes
+        signal.signal(number, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    die_with_parent(parent)
+    os.set_inheritable(descriptor, False)
+    escape_log_lines()
+    escape_tracebacks()
+    tqdm.set_lock(threading.RLock())  # its own is a semaphore of the system, which a killed process leaves behind
+    with suppress(EOFError, OSError):
+        _serve(Connection(descriptor))
+    end_process(0)
+
+
+def _serve(connection: Connection) -> None:
+    """Make the worker, then run tasks; answer each message with a result or a `RemoteError`."""
+    make_worker: Any = None
+    worker: Any = None
+
+    def start(pickled: bytes) -> None:
+        nonlocal make_worker, worker
+        make_worker = pickle.loads(pickled)
+        worker = make_worker()
+
+    def run(task: Any) -> Any:
+        nonlocal worker
+        if worker is None:
+            worker = make_worker()
+        try:
+            return worker.run(task)
+        except BaseException:
+            failed, worker = worker, None
+            failed.close()
+            raise
+
+    connection.send(None)
+    _answer(connection, start)
+    while True:
+        _answer(connection, run)
+
+
+def _answer(connection: Connection, function: Callable[[Any], Any]) -> None:
+    message = connection.recv_bytes()
+    try:
+        answer = function(pickle.loads(message))
+    except KeyboardInterrupt as error:  # of the code: the process ignores Ctrl-C
+        answer = RemoteError.of(exit_error(error, "a worker"), "a worker")
+    except BaseException as error:  # noqa: BLE001  (it is raised again in the pool's process)
+        answer = RemoteError.of(error, "a worker")
+    try:
+        connection.send(answer)
+    except OSError:
+        raise
+    except Exception as error:  # the result can't be pickled
+        connection.send(RemoteError.of(error, "a worker"))

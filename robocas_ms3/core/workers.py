@@ -220,7 +220,6 @@ class WorkerPool(Generic[Task, Result]):
                 self._jobs.put(None)
 
     def close(self) -> None:
-        """End the processes, whatever they do."""
         self.stop()
         if self._owner == os.getpid():
             for thread in self._threads:

@@ -14,8 +14,8 @@ from typing import Annotated, Any
 from numpy.typing import NDArray
 from pydantic import Field
 
+from robocas_ms3.core.checks import GREATEST_SEED
 from robocas_ms3.core.errors import PlanningFailed
-from robocas_ms3.demos.recordings.entries import GREATEST_SEED
 from robocas_ms3.planning.decisions import Seconds
 
 FAILURES_FILE = "failures.jsonl"

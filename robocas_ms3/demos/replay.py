@@ -17,11 +17,11 @@ from mani_skill.trajectory.utils import dict_to_list_of_dicts
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from robocas_ms3.core.checks import check_number
 from robocas_ms3.core.errors import DatasetError, RobocasError
 from robocas_ms3.core.files import make_folder
 from robocas_ms3.core.outputs import check_replaceable
 from robocas_ms3.core.poses import from_wxyz, inverse
-from robocas_ms3.core.strict import check_number
 from robocas_ms3.demos.recordings.entries import read_json, read_reset, was_taken_over
 from robocas_ms3.demos.recordings.environment import RecordedEnv, read_env
 from robocas_ms3.demos.recordings.stored import (

@@ -8,9 +8,8 @@ from typing import Annotated, Any
 
 import tyro
 
+from robocas_ms3.core.checks import GREATEST_SEED, check_number
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.core.strict import check_number
-from robocas_ms3.demos.recordings.entries import GREATEST_SEED
 from robocas_ms3.robots.table import DEFAULT as DEFAULT_ROBOT
 from robocas_ms3.robots.table import find_robot
 from robocas_ms3.scenes.task_specs import SIM_FREQ, STANDARD_FREQ, TASKS

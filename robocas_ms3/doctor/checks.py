@@ -88,7 +88,6 @@ def examine() -> list[Finding]:
 
 
 def check_python() -> list[Finding]:
-    """Check that the package supports this version of Python."""
     try:
         supported = SpecifierSet(metadata.metadata(DISTRIBUTION)["Requires-Python"])
     except metadata.PackageNotFoundError:
@@ -99,7 +98,6 @@ def check_python() -> list[Finding]:
 
 
 def check_packages() -> list[Finding]:
-    """Check the installed version of each required package."""
     wanted = {_key(item.name): item for item in requirements(DISTRIBUTION)}
     if not wanted:
         return [Finding(DISTRIBUTION, "fail", "not installed", "Run bash scripts/setup.sh, or pip install -e .")]
@@ -155,7 +153,6 @@ def check_writable(name: str, folder: Path, variable: str, *, required: bool) ->
 
 
 def check_disk(folder: Path) -> Finding:
-    """Check the free space of the disk of a folder."""
     free = shutil.disk_usage(folder).free / GIGABYTE
     found = f"{free:.1f} GB free in {folder}"
     if free < LEAST_DISK:

@@ -79,7 +79,6 @@ def planner() -> str:
 
 
 def packs() -> str:
-    """Load and verify every asset pack."""
     from robocas_ms3.assets.pack import load_pack, pack_folders
     from robocas_ms3.core.words import count_of
 

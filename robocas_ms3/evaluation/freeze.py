@@ -17,8 +17,7 @@ from robocas_ms3.assets.pack import MANIFEST, load_pack, sha256
 from robocas_ms3.core.documents import DocumentError, load_yaml
 from robocas_ms3.core.errors import EvaluationError, LayoutError
 from robocas_ms3.core.files import make_folder, replacing, replacing_folder
-from robocas_ms3.core.names import LONGEST
-from robocas_ms3.core.strict import StrictModel, parse
+from robocas_ms3.core.strict import LONGEST_NAME, StrictModel, parse
 from robocas_ms3.evaluation.protocol import (
     CONFIG_NAME,
     CONFIGS,
@@ -61,7 +60,7 @@ class Scene(StrictModel):
         return self.name or Path(self.config).stem
 
 
-class ProtocolPart(Scene):
+class Part(Scene):
     """Episodes of one configuration."""
 
     count: int = Field(ge=1, description="how many episodes")
@@ -76,16 +75,16 @@ class ProtocolPart(Scene):
         return self.name or super().file + ("" if self.split == "test" else f"-{self.split}")
 
 
-class ProtocolPlan(StrictModel):
+class Plan(StrictModel):
     """What a protocol is made from."""
 
     rules: dict[str, object] = Field(description="of `Protocol`, but for the pack's hash")
-    parts: list[ProtocolPart]
+    parts: list[Part]
     train: list[Scene] = Field(default=[], description="configurations to train on")
     lists: dict[str, Any] = Field(default={}, description="for YAML's anchors: lists that changes refer to")
 
 
-def read_plan(path: Path) -> ProtocolPlan:
+def read_plan(path: Path) -> Plan:
     """Read a plan. Files that it names are in its folder, or where the command runs.
 
     Raises:
@@ -95,7 +94,7 @@ def read_plan(path: Path) -> ProtocolPlan:
         data = load_yaml(path)
     except (OSError, DocumentError) as error:
         raise EvaluationError(NO_PLAN, where=path, found=error) from error
-    plan = parse(ProtocolPlan, data, EvaluationError, where=path, about=NO_PLAN)
+    plan = parse(Plan, data, EvaluationError, where=path, about=NO_PLAN)
 
     def located(scene: Scene) -> Scene:
         file = path.parent / scene.config
@@ -105,7 +104,7 @@ def read_plan(path: Path) -> ProtocolPlan:
     return plan.model_copy(update={name: list(map(located, getattr(plan, name))) for name in ("parts", "train")})
 
 
-def freeze(plan: ProtocolPlan, folder: Path, overrides: Sequence[str] = ()) -> Iterator[tuple[int, int]]:
+def freeze(plan: Plan, folder: Path, overrides: Sequence[str] = ()) -> Iterator[tuple[int, int]]:
     """Write a protocol into a folder, which appears whole; yield the number of episodes that are chosen, and of all.
 
     ``overrides`` are keys to set in all its configurations, see `load_task_config`.
@@ -141,9 +140,9 @@ def _configs(parts: Sequence[Scene], overrides: Sequence[str]) -> dict[str, Task
     found: dict[str, TaskConfig] = {}
     for part in parts:
         config = part.changed(overrides)
-        if not re.fullmatch(CONFIG_NAME, part.file) or len(part.file) > LONGEST:
+        if not re.fullmatch(CONFIG_NAME, part.file) or len(part.file) > LONGEST_NAME:
             what, fix = "invalid name of a configuration", "Give it a `name`, and a plain `split`."
-            expected = f"letters, digits, _ and -, at most {LONGEST}"
+            expected = f"letters, digits, _ and -, at most {LONGEST_NAME}"
             raise EvaluationError(what, where=part.config, expected=expected, found=repr(part.file)[:80], fix=fix)
         if found.setdefault(part.file, config) != config:
             raise EvaluationError("two configurations of one name", where=part.file, fix="Give one of them a `name`.")
@@ -154,7 +153,7 @@ def _write_yaml(values: dict[str, Any], path: Path) -> None:
     path.write_text(yaml.safe_dump(values, sort_keys=False, allow_unicode=True), encoding="utf-8")
 
 
-def _scenes(part: ProtocolPart, config: TaskConfig, pack: str) -> Iterator[tuple[int, Layout, RoboCASEnv]]:
+def _scenes(part: Part, config: TaskConfig, pack: str) -> Iterator[tuple[int, Layout, RoboCASEnv]]:
     env = gym.make(TASKS[config.task].env_id, config=config, pack=pack, obs_mode="none", render_backend="none")
     base: Any = env.unwrapped
     try:
@@ -172,7 +171,7 @@ def _scenes(part: ProtocolPart, config: TaskConfig, pack: str) -> Iterator[tuple
         env.close()
 
 
-def _episode(number: int, part: ProtocolPart, seed: int, layout: Layout, env: RoboCASEnv) -> Episode:
+def _episode(number: int, part: Part, seed: int, layout: Layout, env: RoboCASEnv) -> Episode:
     p_vis = float(layout.visible_shares[layout.target])
     return Episode(
         episode=number,
@@ -186,7 +185,7 @@ def _episode(number: int, part: ProtocolPart, seed: int, layout: Layout, env: Ro
     )
 
 
-def _instruction(part: ProtocolPart, env: RoboCASEnv, seed: int) -> str:
+def _instruction(part: Part, env: RoboCASEnv, seed: int) -> str:
     if part.words == "empty":
         return ""
     if part.words == "asked":

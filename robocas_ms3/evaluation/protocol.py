@@ -23,12 +23,11 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from robocas_ms3.core.checks import GREATEST_SEED, parse_shard
 from robocas_ms3.core.documents import ARRAYS_LIMIT, JSON_LIMIT, DocumentError, load_yaml, read_bytes, read_text
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.core.names import LONGEST, FileName
 from robocas_ms3.core.paths import protocols_dir
-from robocas_ms3.core.strict import StrictModel, nearest, parse, parse_json
-from robocas_ms3.demos.recordings.entries import GREATEST_SEED
+from robocas_ms3.core.strict import LONGEST_NAME, FileName, StrictModel, nearest, parse, parse_json
 from robocas_ms3.evaluation.policy import CONVENTIONS, PolicySpec
 from robocas_ms3.evaluation.settings import EvaluationSettings
 from robocas_ms3.robots.table import DEFAULT as DEFAULT_ROBOT
@@ -114,7 +113,7 @@ class Episode(StrictModel):
 
     episode: Annotated[int, Field(ge=0, le=10**7)] = Field(description="its number, from 0 on")
     task: str
-    config: Annotated[str, Field(pattern=CONFIG_NAME, max_length=LONGEST)] = Field(
+    config: Annotated[str, Field(pattern=CONFIG_NAME, max_length=LONGEST_NAME)] = Field(
         description="name of a file in configs/"
     )
     seed: Annotated[int, Field(ge=0, le=GREATEST_SEED)]
@@ -160,7 +159,7 @@ class LoadedProtocol:
                     other = "Name a protocol that has it, or make one: robocas eval freeze."
                     expected, fix = ", ".join(known), nearest(name, known) or other
                     raise EvaluationError(f"the protocol has no such {kind}", expected=expected, found=name, fix=fix)
-        (index, count), of_config, chosen = settings.parse_shard(), Counter[str](), []
+        (index, count), of_config, chosen = parse_shard(settings.shard, EvaluationError), Counter[str](), []
         for episode in self.episodes:
             if (settings.tasks and episode.task not in settings.tasks) or settings.split not in ("", episode.split):
                 continue

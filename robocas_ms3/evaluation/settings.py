@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from robocas_ms3.core.checks import check_number, parse_shard
 from robocas_ms3.core.errors import EvaluationError
 
 _NO_HINT = tyro.conf.arg(help_behavior_hint="")  # the help text says what the default is
@@ -60,21 +61,12 @@ class EvaluationSettings:
 
     def check(self) -> None:
         """Check the numbers."""
-        from robocas_ms3.core.strict import check_number  # with pydantic, which `robocas --help` does not wait for
-
         for name in ("envs", "episodes", "workers"):
             if (number := getattr(self, name)) is not None:
                 check_number(name, number, 1)
         check_number("step_seconds", self.step_seconds, 1)
         check_number("memory_gb", self.memory_gb, 0.1)
-        self.parse_shard()
-
-    def parse_shard(self) -> tuple[int, int]:
-        """Return number K and count N of the shard."""
-        number, _, count = self.shard.partition("/")
-        if not (number.isdecimal() and count.isdecimal() and int(number) < int(count)):
-            raise EvaluationError("invalid shard", where="--shard", expected="K/N with K < N", found=repr(self.shard))
-        return int(number), int(count)
+        parse_shard(self.shard, EvaluationError)
 
     def folder(self, protocol: str) -> Path:
         name = re.sub(r"[^\w.-]+", "_", self.policy) + ("_weld" if self.weld else "")

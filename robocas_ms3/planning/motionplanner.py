@@ -20,9 +20,9 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.structs import Pose
 from mani_skill.utils.structs.pose import to_sapien_pose
 
+from robocas_ms3.core.checks import check_number
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.core.poses import from_wxyz, inverse
-from robocas_ms3.core.strict import check_number
 from robocas_ms3.planning.protocol import Array, Obstacle, Shape, Trajectory
 from robocas_ms3.planning.rrt_connect import DEFAULT, make_planner
 from robocas_ms3.planning.scene import seen_from

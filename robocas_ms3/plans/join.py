@@ -27,12 +27,21 @@ from robocas_ms3.datasets.writing.info import write_info
 from robocas_ms3.datasets.writing.plan import dataset_settings, header
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
 from robocas_ms3.demos.recordings.stored import damage_of, merge
-from robocas_ms3.plans.folder import REPORT, UNITS
+from robocas_ms3.plans.folder import (
+    DATASETS,
+    DEMOS,
+    LAYOUTS,
+    REPORT,
+    STATISTICS,
+    UNITS,
+    Outcome,
+    PlanFolder,
+    SeedFiles,
+    Unit,
+)
 from robocas_ms3.plans.plan import Plan
-from robocas_ms3.plans.units import Outcome, SeedFiles, Unit
 from robocas_ms3.scenes.table import join_frozen
 
-LAYOUTS, DEMOS, DATASETS, STATISTICS = "layouts", "demos", "datasets", "statistics"
 TRAJECTORY = "trajectory.h5"
 Chosen = Mapping[int, Sequence[tuple[Unit, Outcome]]]
 """Part -> its episodes, in the order of their seeds."""
@@ -41,14 +50,13 @@ Say = Callable[[str], None]
 _log = logging.getLogger(__name__)
 
 
-def join(plan: Plan, out: Path, chosen: Chosen, *, jobs: int = 1, say: Say = lambda text: None) -> dict[str, Any]:
+def join(folder: PlanFolder, chosen: Chosen, *, jobs: int = 1, say: Say = lambda text: None) -> dict[str, Any]:
     """Join all episodes, and return the content of ``report.json``; another call after a kill makes the same.
 
     Files of units are deleted once the joined files are on the disk and complete.
 
     Args:
-        plan: the plan.
-        out: its folder.
+        folder: of the plan.
         chosen: the episodes.
         jobs: processes that make the LeRobot dataset, at most one per core.
         say: called with each stage.
@@ -56,16 +64,15 @@ def join(plan: Plan, out: Path, chosen: Chosen, *, jobs: int = 1, say: Say = lam
     Raises:
         PlanError: a joined file is damaged, and the files of units are gone; or the disk does not keep it.
     """
+    plan, out = folder.plan, folder.path
     report = _report(plan, chosen)
-    files = {
-        part: [unit.files(plan, out, outcome.seed) for unit, outcome in episodes] for part, episodes in chosen.items()
-    }
+    files = {part: [folder.files(unit, outcome.seed) for unit, outcome in found] for part, found in chosen.items()}
     finished = False
     with suppress(OSError, ValueError):
         finished = load_json(out / REPORT) == report
     # folders of seeds that are joined, not needed, or left by a killed process
     if not finished or any(path.is_dir() for path in (out / UNITS).glob("*/*/*")):
-        _join_files(plan, out, files, say)
+        _join_files(folder, files, say)
     if not finished:
         if plan.makes_datasets and "lerobot" in plan.formats:
             say("making the LeRobot dataset")
@@ -81,17 +88,8 @@ def join(plan: Plan, out: Path, chosen: Chosen, *, jobs: int = 1, say: Say = lam
     return report
 
 
-def damaged_episodes(plan: Plan, out: Path, chosen: Chosen) -> dict[Unit, list[int]]:
-    """Return seeds whose files have lost their size, as a disk with errors may do; none once files were moved."""
-    found: dict[Unit, list[int]] = {}
-    if not any((out / name).exists() for name in (DATASETS, DEMOS, REPORT)):
-        for unit, outcome in (episode for episodes in chosen.values() for episode in episodes):
-            if unit.files(plan, out, outcome.seed).size() != outcome.size:
-                found.setdefault(unit, []).append(outcome.seed)
-    return found
-
-
-def _join_files(plan: Plan, out: Path, files: EpisodeFiles, say: Say) -> None:
+def _join_files(folder: PlanFolder, files: EpisodeFiles, say: Say) -> None:
+    plan, out = folder.plan, folder.path
     seeds = {part: [each.seed for each in episodes] for part, episodes in files.items()}
     for part, episodes in files.items() if plan.makes_layouts else ():
         path, layouts = out / LAYOUTS / f"{plan.name_of(part)}.npy", [each.layout for each in episodes]
@@ -159,7 +157,6 @@ def _dataset_sources(plan: Plan, root: Path, files: EpisodeFiles) -> Iterator[Pa
 
 
 def _join_dataset(plan: Plan, root: Path, files: EpisodeFiles) -> None:
-    """Move the rendered episodes into one dataset, numbered part by part."""
     entries: dict[str, Any] = {}
     for part, episodes in files.items():
         trajectory = {"trajectory": f"{DEMOS}/{plan.name_of(part)}/{TRAJECTORY}"}  # that of the unit is deleted

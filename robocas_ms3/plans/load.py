@@ -6,19 +6,21 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from robocas_ms3.assets.pack import MANIFEST, pack_folders, sha256
+from robocas_ms3.core.checks import GREATEST_SEED
 from robocas_ms3.core.documents import DocumentError, load_yaml
-from robocas_ms3.core.errors import MissingExtraError, PlanError, RobocasError
+from robocas_ms3.core.errors import MissingExtraError, PlanError
 from robocas_ms3.core.paths import plans_dir
 from robocas_ms3.core.strict import parse
 from robocas_ms3.core.words import error_line, nearest
-from robocas_ms3.demos.recordings.entries import GREATEST_SEED
 from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.plans.plan import PartConfig, Plan
-from robocas_ms3.scenes.config import load_config_of, shipped_configs
+from robocas_ms3.robots.table import find_robot
+from robocas_ms3.scenes.config import TaskConfig, load_config_of, shipped_configs
 from robocas_ms3.scenes.task_specs import TASKS
 
 _FURNITURE_PACK = "builtin"
@@ -50,20 +52,18 @@ def load_plan(plan: str | Path) -> Plan:
     except (OSError, DocumentError) as error:
         raise PlanError("this plan can't be read", where=path, found=error) from error
     loaded = parse(Plan, data, PlanError, where=path, about="not a valid plan")
-    try:
-        loaded.pictures.chosen()
-    except RobocasError as error:
-        raise PlanError("not a valid plan: pictures", where=path, found=error) from error
     completed = [_completed(part, number, path) for number, part in enumerate(loaded.parts)]
     parts = [part for part, _ in completed]
     names = [part.name or "" for part in parts]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise PlanError("parts of one name", where=path, found=", ".join(twice), fix="Give them a name each.")
     _check_seeds(parts, [scene for _, scene in completed], loaded.block, path)
+    cameras = _cameras(loaded, [config for _, (_, config, _) in completed], path)
+    pictures = loaded.pictures.model_copy(update={"cameras": cameras})
     packs = sorted({_FURNITURE_PACK, *(part.pack for part in parts)})
     found = {pack: digest for pack in packs if (digest := _digest(pack))}
     check_packs(loaded, found)
-    return loaded.model_copy(update={"parts": parts, "packs": found})
+    return loaded.model_copy(update={"parts": parts, "packs": found, "pictures": pictures})
 
 
 def most_seeds(episodes: int, block: int) -> int:
@@ -160,6 +160,21 @@ def _completed(part: PartConfig, number: int, path: Path) -> tuple[PartConfig, A
         "name": part.name or re.sub(r"[^\w-]+", "-", f"{number:02d}-{stem}")[:60],
     }
     return part.model_copy(update=completed), (part.task, loaded, pack)
+
+
+def _cameras(plan: Plan, configs: Sequence[TaskConfig], path: Path) -> list[str]:
+    """Return the cameras of the dataset: the chosen ones, or all that the parts' configurations declare."""
+    robot, where = find_robot(plan.recording.robot).description, f"{path}, pictures.cameras"
+    declared = [[camera.name for camera in config.cameras_of(robot)] for config in configs]
+    common = [name for name in declared[0] if all(name in names for names in declared)]
+    if plan.pictures.cameras is None:
+        if any(len(names) > len(common) for names in declared):
+            what, fix = "the parts have different cameras", f"Choose some of {', '.join(common)}."
+            raise PlanError(what, where=where, found=sorted({*chain(*declared)} - {*common}), fix=fix)
+        return common
+    if wrong := sorted({*plan.pictures.cameras} - {*common}):
+        raise PlanError("no such camera", where=where, expected=f"some of {', '.join(common)}", found=wrong)
+    return plan.pictures.cameras
 
 
 def _digest(pack: str) -> str:

@@ -6,10 +6,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
+from robocas_ms3.core.checks import GREATEST_SEED
 from robocas_ms3.core.strict import StrictModel
 from robocas_ms3.datasets.lerobot.variants import NEWEST, Version
 from robocas_ms3.datasets.pictures.stored import Pictures
-from robocas_ms3.demos.recordings.entries import GREATEST_SEED
 from robocas_ms3.robots.cameras import STANDARD_NAMES
 
 Side = Literal["train", "val"]
@@ -55,7 +55,7 @@ class PicturesConfig(StrictModel):
     size: tuple[Annotated[int, Field(ge=16, le=8192)], Annotated[int, Field(ge=16, le=8192)]] = (640, 480)
     depth: bool = True
     image_format: Literal["png", "jpg", "webp"] = "png"
-    cameras: list[str] | None = None
+    cameras: list[str] | None = Field(default=None, description="default: all that the configurations declare")
 
     def chosen(self) -> Pictures:
         """Return the settings as dataset writers take them."""
@@ -117,17 +117,14 @@ class Plan(StrictModel):
 
     @property
     def makes_layouts(self) -> bool:
-        """Whether layouts are kept."""
         return "layouts" in self.stages
 
     @property
     def makes_demonstrations(self) -> bool:
-        """Whether episodes are recorded."""
         return "demonstrations" in self.stages
 
     @property
     def makes_datasets(self) -> bool:
-        """Whether episodes are rendered."""
         return "datasets" in self.stages
 
     def name_of(self, part: int) -> str:

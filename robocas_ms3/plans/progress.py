@@ -2,26 +2,14 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Iterator
-from pathlib import Path
 
 from robocas_ms3.core.errors import PlanError
-from robocas_ms3.plans.folder import UNITS
-from robocas_ms3.plans.plan import Plan
-from robocas_ms3.plans.units import Outcome, Unit, started_blocks
+from robocas_ms3.plans.folder import DATASETS, DEMOS, REPORT, UNITS, Outcome, PlanFolder, Unit
 
 Shard = tuple[int, int]
 """K, N: the work units whose block is K modulo N."""
-
-
-def parse_shard(text: str) -> Shard:
-    """Parse ``K/N``; raise PlanError if it has another form, or K is not less than N."""
-    found = re.fullmatch(r"(\d{1,9})/(\d{1,9})", text)
-    if not found or int(found[1]) >= int(found[2]):
-        raise PlanError("invalid shard", where="--shard", expected="K/N with K < N, such as 0/4", found=repr(text))
-    return int(found[1]), int(found[2])
 
 
 class Progress:
@@ -35,27 +23,26 @@ class Progress:
         partial: outcomes of each unit that was started and is not complete.
     """
 
-    def __init__(self, plan: Plan, out: Path) -> None:
-        self.plan, self._out = plan, out
+    def __init__(self, folder: PlanFolder) -> None:
+        self.folder, self.plan = folder, folder.plan
         self.done: dict[Unit, list[Outcome]] = {}
         self.partial: dict[Unit, list[Outcome]] = {}
         # per part, of its first units that are done without a gap: number of units, of seeds, of successes
-        self._first = [(0, 0, 0)] * len(plan.parts)
+        self._first = [(0, 0, 0)] * len(self.plan.parts)
         self._failing: PlanError | None = None
         self.read()
 
     def read(self) -> None:
         """Read the outcomes of units that are not complete."""
-        for part in range(len(self.plan.parts)):
-            for block in started_blocks(self.plan, self._out, part):
-                self.add(Unit(part, block))
+        for unit in self.folder.started_units():
+            self.add(unit)
 
     def add(self, unit: Unit) -> bool:
         """Read the outcomes of a unit; return whether it is complete."""
         if unit not in self.done:
-            outcomes = unit.outcomes(self.plan, self._out)
+            outcomes = self.folder.outcomes(unit)
             if outcomes is None:
-                self.partial[unit] = unit.partial_outcomes(self.plan, self._out)
+                self.partial[unit] = self.folder.partial_outcomes(unit)
                 return False
             self.done[unit] = outcomes
             self.partial.pop(unit, None)
@@ -71,20 +58,30 @@ class Progress:
                 every = (outcome for unit, done in self.done.items() if unit.part == part for outcome in done)
                 reasons = Counter(outcome.failures[-1] for outcome in every if outcome.failures)
                 found = f"{seeds - successes} of {seeds}, most of them: {reasons.most_common(1)[0][0]}"
-                where, fix = self._out / UNITS / self.plan.name_of(part), "A smaller objects.count may help."
+                where, fix = self.folder.path / UNITS / self.plan.name_of(part), "A smaller objects.count may help."
                 self._failing = PlanError("almost all seeds fail", where=where, found=found, fix=fix)
         self._first[part] = block, seeds, successes
 
     def check_failures(self) -> None:
-        """Raise PlanError if almost all seeds of a part fail."""
         if self._failing:
             raise self._failing
 
-    def forget(self, unit: Unit, seeds: list[int]) -> None:
-        """Delete some seeds, which are then done again."""
-        unit.forget(self.plan, self._out, seeds)
-        del self.done[unit]
-        self._first[unit.part] = 0, 0, 0
+    def forget_damaged(self) -> dict[Unit, list[int]]:
+        """Delete chosen episodes whose files have lost their size, as a disk with errors may do; return their seeds.
+
+        None once files were moved.
+        """
+        damaged: dict[Unit, list[int]] = {}
+        if any((self.folder.path / name).exists() for name in (DATASETS, DEMOS, REPORT)):
+            return damaged
+        for unit, outcome in (episode for episodes in self.chosen().values() for episode in episodes):
+            if self.folder.files(unit, outcome.seed).size() != outcome.size:
+                damaged.setdefault(unit, []).append(outcome.seed)
+        for unit, seeds in damaged.items():
+            self.folder.forget(unit, seeds)
+            del self.done[unit]
+            self._first[unit.part] = 0, 0, 0
+        return damaged
 
     def missing(self, shard: Shard = (0, 1)) -> Iterator[Unit]:
         """Yield the units of a shard that are needed and not done, in the order of the plan."""

@@ -14,17 +14,14 @@ from typing import Any
 
 from robocas_ms3.core.errors import PlanError
 from robocas_ms3.core.exits import deferred_interrupts
-from robocas_ms3.core.files import make_folder, write_json
-from robocas_ms3.core.locks import locked_folder
-from robocas_ms3.core.outputs import OutputFolder, is_empty
+from robocas_ms3.core.outputs import OutputFolder
 from robocas_ms3.core.words import count_of
 from robocas_ms3.plans.executors import Executor
-from robocas_ms3.plans.folder import KIND, PLAN, check_plan_record, plan_record, read_plan, settings_of
-from robocas_ms3.plans.join import damaged_episodes, join
+from robocas_ms3.plans.folder import Unit, read_plan
+from robocas_ms3.plans.join import join
 from robocas_ms3.plans.load import check_plan
 from robocas_ms3.plans.progress import Progress, Shard
 from robocas_ms3.plans.status import Status, status_of
-from robocas_ms3.plans.units import Unit
 
 _ROUNDS = 3  # how often episodes are made again that a disk has damaged
 _TRIES = 3  # jobs that may end at the same seed of a unit
@@ -67,25 +64,24 @@ def run_plan(
         PlanError: almost all seeds of a part fail.
         RobocasError: another run writes into the folder; or an error that every seed would meet.
     """
-    plan, out = executor.plan, executor.out
-    check_plan(plan)
-    record = plan_record(plan)
-    with OutputFolder(out, KIND, settings_of(record), overwrite=overwrite) as output:
-        output.start(record)
+    folder = executor.folder
+    check_plan(folder.plan)
+    with folder.open(overwrite=overwrite) as output:
+        output.start(folder.record())
         with executor:
-            progress = Progress(plan, out)
+            progress = Progress(folder)
             for _ in range(_ROUNDS):
-                _do_units(executor, progress, callbacks)
-                damaged = _forget_damaged(progress, out)
+                _do_units(executor, progress, output, callbacks)
+                damaged = progress.forget_damaged()
                 if not damaged:
                     break
                 callbacks.stage(f"{count_of(sum(map(len, damaged.values())), 'episode')} again: damaged files")
             else:
                 unit, seeds = min(damaged.items())
                 found, fix = f"seed {seeds[0]}, made {_ROUNDS} times", "Check the disk; then run the command again."
-                what, where = "files don't keep the sizes that they were written with", unit.folder(plan, out)
+                what, where = "files don't keep the sizes that they were written with", folder.unit_folder(unit)
                 raise PlanError(what, where=where, found=found, fix=fix)
-        return join(plan, out, progress.chosen(), jobs=executor.jobs, say=callbacks.stage)
+        return join(folder, progress.chosen(), jobs=executor.jobs, say=callbacks.stage)
 
 
 def run_shard(
@@ -97,17 +93,14 @@ def run_shard(
 
     Returns whether no unit of the plan is missing: `join_plan` can join it. Raises as `run_plan` does.
     """
-    plan, out = executor.plan, executor.out
-    check_plan(plan)
-    if not (out / PLAN).exists():
-        if not is_empty(out):
-            raise PlanError("not the folder of a plan", where=out, expected=PLAN, fix="Choose another --out.")
-        write_json(make_folder(out) / PLAN, plan_record(plan), sync=True)
-    check_plan_record(out, plan)
-    progress = Progress(plan, out)
-    if next(progress.missing(shard), None):
-        with executor:
-            _do_units(executor, progress, callbacks, shard)
+    folder = executor.folder
+    check_plan(folder.plan)
+    with folder.open(shared=True) as output:
+        output.start(folder.record())
+        progress = Progress(folder)
+        if next(progress.missing(shard), None):
+            with executor:
+                _do_units(executor, progress, output, callbacks, shard)
     progress.read()
     return next(progress.missing(), None) is None
 
@@ -116,32 +109,25 @@ def join_plan(out: Path, *, jobs: int = 1, say: Callable[[str], None] = lambda t
     """Join the episodes of a plan whose work units are done; return the content of ``report.json``.
 
     Raises:
-        PlanError: units are missing, files are damaged, or this machine has other versions.
+        PlanError: units are missing, or files are damaged.
+        OutputExistsError: this machine has other versions.
         RobocasError: another run writes into ``out``.
     """
-    plan = read_plan(out)
-    check_plan_record(out, plan)
-    with locked_folder(out):
-        progress = Progress(plan, out)
-        _forget_damaged(progress, out)
-        missing = [f"{unit.folder(plan, out).relative_to(out)}" for unit in progress.missing()]
+    folder = read_plan(out)
+    with folder.open():
+        progress = Progress(folder)
+        progress.forget_damaged()
+        missing = [f"{folder.unit_folder(unit).relative_to(out)}" for unit in progress.missing()]
         if missing:
             found, fix = f"{count_of(len(missing), 'unit')}, {missing[0]} first", "robocas plan run does them."
             raise PlanError("work units are missing", where=out, found=found, fix=fix)
-        return join(plan, out, progress.chosen(), jobs=jobs, say=say)
+        return join(folder, progress.chosen(), jobs=jobs, say=say)
 
 
-def _forget_damaged(progress: Progress, out: Path) -> dict[Unit, list[int]]:
-    """Delete chosen episodes whose files have lost their size; return their seeds."""
-    damaged = damaged_episodes(progress.plan, out, progress.chosen())
-    for unit, seeds in damaged.items():
-        progress.forget(unit, seeds)
-    return damaged
-
-
-def _do_units(executor: Executor, progress: Progress, callbacks: Callbacks, shard: Shard = (0, 1)) -> None:
+def _do_units(
+    executor: Executor, progress: Progress, output: OutputFolder, callbacks: Callbacks, shard: Shard = (0, 1)
+) -> None:
     """Do the units that are needed; which ones these are is seen as seeds fail."""
-    plan, out = executor.plan, executor.out
     running: dict[Any, Sequence[Unit]] = {}
     killed: Counter[tuple[Unit, int]] = Counter()  # jobs that ended at a unit with so many seeds done
     shown = -math.inf
@@ -155,7 +141,7 @@ def _do_units(executor: Executor, progress: Progress, callbacks: Callbacks, shar
             groups = [units[first : first + size] for first in range(0, len(units), size)]
             running |= zip(executor.submit(groups), groups, strict=False)
         if time.monotonic() > shown:
-            OutputFolder(out, KIND).check_exists()
+            output.check_exists()
             progress.read()
             progress.check_failures()
             status = status_of(progress)
@@ -171,7 +157,7 @@ def _do_units(executor: Executor, progress: Progress, callbacks: Callbacks, shar
                     continue
                 killed[place := (unit, len(progress.partial[unit]))] += 1
                 if killed[place] >= _TRIES:
-                    where, fix = unit.folder(plan, out), f"See {executor.log_of(job)}; is memory short?"
+                    where, fix = executor.folder.unit_folder(unit), f"See {executor.log_of(job)}; is memory short?"
                     found = f"{killed[place]} in a row"
                     raise PlanError("the jobs of this unit die", where=where, found=found, fix=fix)
                 break  # the job was at this unit

@@ -8,9 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from robocas_ms3.plans.folder import REPORT, read_plan
+from robocas_ms3.plans.folder import REPORT, Outcome, read_plan
 from robocas_ms3.plans.progress import Progress
-from robocas_ms3.plans.units import Outcome
 
 _RECENT = 600.0  # s before the last episode that the rate is measured over
 
@@ -60,7 +59,7 @@ class Status:
 
 def read_status(out: Path) -> Status:
     """Read the status of the plan in a folder; raise PlanError if there is none."""
-    return status_of(Progress(read_plan(out), out), finished=(out / REPORT).is_file())
+    return status_of(Progress(read_plan(out)), finished=(out / REPORT).is_file())
 
 
 def status_of(progress: Progress, *, finished: bool = False) -> Status:

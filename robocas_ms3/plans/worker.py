@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import CancelledError
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from robocas_ms3.core.errors import (
@@ -22,50 +21,27 @@ from robocas_ms3.core.errors import (
 from robocas_ms3.core.files import remove
 from robocas_ms3.core.outputs import sweep
 from robocas_ms3.core.words import error_line
-from robocas_ms3.core.workers import Limits, Worker, WorkerPool
-from robocas_ms3.plans.folder import check_plan_record
-from robocas_ms3.plans.plan import Plan
-from robocas_ms3.plans.units import Outcome, SeedFiles, Unit
+from robocas_ms3.core.workers import Limits, WorkerPool
+from robocas_ms3.plans.folder import Outcome, PlanFolder, SeedFiles, Unit
+from robocas_ms3.plans.stages import Recorder, Renderer
 
 TRIES = 2
 """How often a seed is tried whose process dies, before it is left out."""
 _OF_A_SEED = (LayoutError, PlanningFailed, SimulationError, DatasetError)  # other errors of ours affect all seeds
-OpenStage = Callable[[Plan], Worker[SeedFiles, dict[str, Any]]]
-
-
-def open_recorder(plan: Plan) -> Worker[SeedFiles, dict[str, Any]]:
-    """Return what records episodes, in its process."""
-    from robocas_ms3.plans.record import Recorder
-
-    return Recorder(plan)
-
-
-def open_renderer(plan: Plan) -> Worker[SeedFiles, dict[str, Any]]:
-    """Return what renders recorded episodes, in its process."""
-    from robocas_ms3.plans.render import Renderer
-
-    return Renderer(plan)
 
 
 class UnitWorker:
     """Does one work unit after the other, by two processes that are kept from unit to unit.
 
     One process records an episode, the other one renders it: a process with a renderer can't fork, as planning does.
-
-    Args:
-        plan: the plan of the units.
-        out: the output folder of the plan.
-        record, render: open what does each stage, in its process.
     """
 
-    def __init__(
-        self, plan: Plan, out: Path, record: OpenStage = open_recorder, render: OpenStage = open_renderer
-    ) -> None:
-        self._plan, self._out = plan, out
-        memory_gb = plan.limits.memory_gb
-        limits = Limits(plan.limits.record_seconds, memory_gb), Limits(plan.limits.render_seconds, memory_gb)
-        self._record = WorkerPool(partial(record, plan), 1, limits=limits[0], retries=0)
-        self._render = WorkerPool(partial(render, plan), 1, limits=limits[1], retries=0)
+    def __init__(self, folder: PlanFolder) -> None:
+        self._folder, self._plan, self._output = folder, folder.plan, folder.open(shared=True)
+        chosen = self._plan.limits
+        limits = Limits(chosen.record_seconds, chosen.memory_gb), Limits(chosen.render_seconds, chosen.memory_gb)
+        self._record = WorkerPool(partial(Recorder, self._plan), 1, limits=limits[0], retries=0)
+        self._render = WorkerPool(partial(Renderer, self._plan), 1, limits=limits[1], retries=0)
 
     def do(self, unit: Unit) -> None:
         """Do the seeds of a unit that are not done.
@@ -79,21 +55,21 @@ class UnitWorker:
 
     def seeds(self, unit: Unit) -> Iterator[SeedFiles]:
         """Do the seeds of a unit that are not done; yield the files of each, which are complete."""
-        if unit.outcomes(self._plan, self._out) is not None:
+        if self._folder.outcomes(unit) is not None:
             return
         for seed in unit.seeds(self._plan):
-            files = unit.files(self._plan, self._out, seed)
+            files = self._folder.files(unit, seed)
             if files.outcome() is None:
-                check_plan_record(self._out, self._plan)
+                self._output.check_record()
                 with files.temporary() as tmp:
                     outcome = self._outcome(tmp)
                     if not outcome.success:
                         for path in tmp.folder.iterdir():
                             remove(path)
                     tmp.write(outcome)
-                    check_plan_record(self._out, self._plan)  # --overwrite may have started another plan
+                    self._output.check_record()  # --overwrite may have started another plan
                 yield files
-        unit.complete(self._plan, self._out)
+        self._folder.complete(unit)
 
     def _outcome(self, files: SeedFiles) -> Outcome:
         deaths = list[str]()
@@ -128,7 +104,6 @@ class UnitWorker:
         self._render.stop()
 
     def close(self) -> None:
-        """End the processes."""
         self.stop()
         self._record.close()
         self._render.close()

@@ -15,56 +15,45 @@ from robocas_ms3.core.ledger import Ledger
 from robocas_ms3.core.paths import builtin_packs_dir
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
-from robocas_ms3.plans.folder import PLAN, read_plan
-from robocas_ms3.plans.units import OUTCOME, Outcome, SeedFiles
+from robocas_ms3.plans.folder import OUTCOME, PLAN, Outcome, SeedFiles, read_plan
+
+
+def copy_pack(root):
+    shutil.copytree(next(path.parent for path in builtin_packs_dir().glob("*/manifest.json")), root)
+
+
+def copy_protocol(root):
+    shutil.copytree(Path(shipped_protocols()["ms3-v1"]), root)
+
+
+def write_result(root):
+    made_up_results.write(root, [made_up_results.outcome(0)])
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_packs(tmp_path, kind):
-    root = shutil.copytree(next(path.parent for path in builtin_packs_dir().glob("*/manifest.json")), tmp_path / "pack")
-    path = replace_file(next(root.glob("*/visual_fast.glb")), kind)
-    with pytest.raises(AssetError) as error:
-        load_pack(root)
-    assert error.value.where == path
-    replace_file(root / "manifest.json", kind)
-    with pytest.raises(AssetError):
-        load_pack(root)
-    with pytest.raises(AssetError) as error:
-        read_hulls(replace_file(tmp_path / "hulls.obj", kind))
-    assert error.value.where == tmp_path / "hulls.obj"
+@pytest.mark.parametrize(
+    ("make", "name", "read", "error"),
+    [
+        (copy_pack, "plate/visual_fast.glb", load_pack, AssetError),
+        (copy_pack, "manifest.json", load_pack, AssetError),
+        (Path.mkdir, "hulls.obj", lambda root: read_hulls(root / "hulls.obj"), AssetError),
+        (copy_protocol, "configs/other.yaml", load_protocol, ConfigError),
+        (copy_protocol, "episodes.jsonl", load_protocol, EvaluationError),
+        (write_result, results.RUN, results.read, EvaluationError),
+        (write_result, results.OUTCOMES, results.read, EvaluationError),
+        (Path.mkdir, PLAN, read_plan, PlanError),
+        (Path.mkdir, "ledger.jsonl", lambda root: Ledger(root / "ledger.jsonl", Outcome).lines(), DocumentError),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_it_is_an_error(tmp_path, kind, make, name, read, error):
+    make(tmp_path / "made")
+    replace_file(tmp_path / "made" / name, kind)
+    with pytest.raises(error):
+        read(tmp_path / "made")
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_protocols(tmp_path, kind):
-    source = Path(shipped_protocols()["ms3-v1"])
-    root = shutil.copytree(source, tmp_path / "protocol")
-    assert load_protocol(root).hash == load_protocol(source).hash
-    path = replace_file(root / "configs" / "other.yaml", kind)
-    with pytest.raises(ConfigError) as error:
-        load_protocol(root)
-    assert error.value.where == path
-    path = replace_file(root / "episodes.jsonl", kind)
-    with pytest.raises(EvaluationError) as error:
-        load_protocol(root)
-    assert error.value.where == path
-
-
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("name", [results.RUN, results.OUTCOMES])
-def test_results(tmp_path, name, kind):
-    folder = tmp_path / "result"
-    made_up_results.write(folder, [made_up_results.outcome(0)])
-    replace_file(folder / name, kind)
-    with pytest.raises(EvaluationError):
-        results.read(folder)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_files_of_plans(tmp_path, kind):
+def test_an_outcome_of_a_plan_is_as_if_it_were_missing(tmp_path, kind):
     replace_file(tmp_path / OUTCOME, kind)
     assert SeedFiles(0, 1, tmp_path).outcome() is None
-    with pytest.raises(DocumentError):
-        Ledger(replace_file(tmp_path / "ledger.jsonl", kind), Outcome).lines()
-    replace_file(tmp_path / PLAN, kind)
-    with pytest.raises(PlanError):
-        read_plan(tmp_path)

@@ -3,8 +3,7 @@
 import pytest
 
 from robocas_ms3.core.errors import AssetError
-from robocas_ms3.core.names import FileName, check_name
-from robocas_ms3.core.strict import StrictModel, parse
+from robocas_ms3.core.strict import FileName, StrictModel, check_name, parse
 
 
 class Form(StrictModel):

@@ -47,10 +47,9 @@ from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
 from robocas_ms3.evaluation.report.comparison import comparison
 from robocas_ms3.evaluation.report.page import page
 from robocas_ms3.evaluation.report.tables import markdown
-from robocas_ms3.plans.folder import PLAN, check_plan_record, plan_record, read_plan
+from robocas_ms3.plans.folder import OUTCOME, OUTCOMES, PLAN, Outcome, PlanFolder, Unit, read_plan
 from robocas_ms3.plans.load import load_plan, shipped_plans
 from robocas_ms3.plans.status import read_status
-from robocas_ms3.plans.units import OUTCOME, OUTCOMES, Outcome, Unit
 from robocas_ms3.robots.cameras import STANDARD_NAMES
 from robocas_ms3.scenes.cache import ABOUT, LayoutCache
 from robocas_ms3.scenes.config import load_task_config
@@ -110,20 +109,28 @@ def write_result(root):
     made_up_results.write(root, [made_up_results.outcome(i, came_to=7 - i) for i in range(3)])
 
 
-def the_plan():
-    return load_plan(next(iter(shipped_plans())))
+COMPLETE, STARTED = Unit(0, 0), Unit(0, 1)
+
+
+def plan_folder(root):
+    return PlanFolder(load_plan(next(iter(shipped_plans()))), root)
+
+
+def first_seed(folder):
+    """Files of the first seed of the unit that is started."""
+    return folder.files(STARTED, STARTED.seeds(folder.plan)[0]).folder
 
 
 def write_plan(root):
-    plan, complete = the_plan(), Unit(0, 0)
-    for unit in (complete, Unit(0, 1)):
-        for seed in unit.seeds(plan):
-            with unit.files(plan, root, seed).temporary() as files:
+    folder = plan_folder(root)
+    for unit in (COMPLETE, STARTED):
+        for seed in unit.seeds(folder.plan):
+            with folder.files(unit, seed).temporary() as files:
                 files.write(Outcome(seed, True, 10, ["a: b"], ["c: d"], 1.0, 1.0, 5, 1e9))
-    complete.complete(plan, root)
-    (root / PLAN).write_text(json.dumps(plan_record(plan)))
-    shutil.copy(complete.folder(plan, root) / OUTCOMES, root)  # where the table below finds them
-    shutil.copy(Unit(0, 1).files(plan, root, Unit(0, 1).seeds(plan)[0]).folder / OUTCOME, root)
+    folder.complete(COMPLETE)
+    (root / PLAN).write_text(json.dumps(folder.record()))
+    shutil.copy(folder.unit_folder(COMPLETE) / OUTCOMES, root)  # where the table below finds them
+    shutil.copy(first_seed(folder) / OUTCOME, root)
 
 
 def write_generation(root):
@@ -204,11 +211,11 @@ def read_result(root):
 
 
 def read_plan_folder(root):
-    plan, started = the_plan(), Unit(0, 1)
-    shutil.copy(root / OUTCOMES, Unit(0, 0).folder(plan, root))
-    shutil.copy(root / OUTCOME, started.files(plan, root, started.seeds(plan)[0]).folder)
+    folder = plan_folder(root)
+    shutil.copy(root / OUTCOMES, folder.unit_folder(COMPLETE))
+    shutil.copy(root / OUTCOME, first_seed(folder))
     assert read_status(root)
-    check_plan_record(root, read_plan(root))
+    read_plan(root).open(shared=True).check_record()
 
 
 def read_generation(root):

@@ -1,7 +1,38 @@
+import os
 import shutil
 
 import pytest
-from plan_stages import run_here
+from plan_stages import env_of_jobs, made_up, run_here
+
+
+@pytest.fixture(autouse=True)
+def made_up_stages():
+    with made_up():
+        yield
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory):
+    """Two nodes of Ray on this machine."""
+    pytest.importorskip("ray", reason="needs the ray extra: plans on a cluster of Ray are NOT tested")
+    from ray.cluster_utils import Cluster
+
+    before = dict(os.environ)
+    os.environ |= {
+        "RAY_USAGE_STATS_ENABLED": "0",
+        "RAY_TMPDIR": "/tmp",  # paths of sockets are short
+        "TMPDIR": f"{tmp_path_factory.mktemp('node')}",
+        "PLAN_FAULTS": f"{tmp_path_factory.mktemp('faults')}",
+        **env_of_jobs(),
+    }
+    quick = {"health_check_initial_delay_ms": 0, "health_check_period_ms": 500, "health_check_timeout_ms": 500}
+    head = {"num_cpus": 1, "include_dashboard": False, "_system_config": quick | {"health_check_failure_threshold": 6}}
+    cluster = Cluster(initialize_head=True, head_node_args=head)
+    cluster.second = cluster.add_node(num_cpus=1)
+    yield cluster
+    cluster.shutdown()
+    os.environ.clear()
+    os.environ |= before
 
 
 @pytest.fixture(scope="session")

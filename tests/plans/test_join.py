@@ -8,8 +8,8 @@ import pytest
 from plan_stages import PLAN, assert_same, run_here
 
 from robocas_ms3.core.errors import PlanError
+from robocas_ms3.plans.folder import PlanFolder, Unit
 from robocas_ms3.plans.run import Callbacks
-from robocas_ms3.plans.units import Unit
 
 
 @pytest.mark.parametrize(
@@ -68,7 +68,7 @@ def test_nothing_is_deleted_where_the_disk_does_not_keep_what_is_joined(out, mon
 
 def test_what_is_left_of_a_finished_plan_is_not_deleted_for_damaged_demonstrations(undisturbed, tmp_path, monkeypatch):
     out = shutil.copytree(undisturbed, tmp_path / "out")
-    left = Unit(0, 0).files(PLAN, out, 10).recording
+    left = PlanFolder(PLAN, out).files(Unit(0, 0), 10).recording
     left.parent.mkdir()
     left.write_bytes(b"left")
     os.truncate(out / "demos/a/trajectory.h5", 0)

@@ -7,12 +7,10 @@ import pytest
 from plan_stages import MadeUp
 
 from robocas_ms3.cli.main import run
-from robocas_ms3.core.errors import ConfigError, ExtensionError, MissingExtraError, PlanError
-from robocas_ms3.core.files import write_json
-from robocas_ms3.plans.folder import PLAN, check_plan_record, plan_record
+from robocas_ms3.core.errors import ConfigError, ExtensionError, MissingExtraError, OutputExistsError, PlanError
+from robocas_ms3.plans.folder import PLAN, PlanFolder, SeedFiles
 from robocas_ms3.plans.load import check_plan, load_plan, most_seeds, opening_part, recording_settings, shipped_plans
-from robocas_ms3.plans.render import Renderer
-from robocas_ms3.plans.units import SeedFiles
+from robocas_ms3.plans.stages import Renderer
 from robocas_ms3.scenes.config import load_task_config
 
 GOOD = "parts:\n  - {task: pick, episodes: 3}\n"
@@ -66,18 +64,18 @@ def test_configurations_and_packs_in_folders(written, tmp_path, monkeypatch):
 def test_a_pack_that_was_changed_is_noticed(written, tmp_path):
     pack, out = tmp_path / "mine", tmp_path / "out"
     pack.mkdir()
-    out.mkdir()
     path = written("parts:\n  - {task: pick, pack: mine, episodes: 3, name: a}\n")
     (pack / "manifest.json").write_text("{}")
     plan = load_plan(path)
     assert plan.packs.keys() == {str(pack), "builtin"}
-    write_json(out / PLAN, plan_record(plan))
-    check_plan_record(out, load_plan(path))
+    with PlanFolder(plan, out).open(shared=True) as output:
+        output.start(PlanFolder(plan, out).record())
+    PlanFolder(load_plan(path), out).open(shared=True).check_record()
     with opening_part(plan, 0):
         pass
     (pack / "manifest.json").write_text("{ }")
-    with pytest.raises(PlanError, match=r"packs\..*mine: "):
-        check_plan_record(out, load_plan(path))
+    with pytest.raises(OutputExistsError, match=r"packs\..*mine: "):
+        PlanFolder(load_plan(path), out).open(shared=True).check_record()
     with pytest.raises(PlanError) as error, opening_part(plan, 0):
         pass
     assert error.value.where == str(pack)
@@ -97,15 +95,16 @@ def test_a_pack_that_was_changed_is_noticed(written, tmp_path):
     ],
 )
 def test_what_fails_while_a_part_is_opened_ends_the_run(written, tmp_path, error, raised, match):
-    def fail(*_):
-        raise error
+    class Fails(Renderer):
+        def open_env(self, *_):
+            raise error
 
     plan = load_plan(written("embeddings: false\nparts:\n  - {task: pick, episodes: 3, name: a}\n"))
     files = SeedFiles(0, 7, tmp_path / "a" / "b" / "c" / "d")
     files.folder.mkdir(parents=True)
     MadeUp(plan).run(files)
     with pytest.raises(raised, match=match) as found:
-        Renderer(plan, fail).run(files)
+        Fails(plan).run(files)
     assert "\n" not in str(found.value)
 
 
@@ -136,6 +135,22 @@ def test_what_is_wrong_with_a_plan_is_a_line(written, text, match):
     with pytest.raises(PlanError, match=match) as error:
         load_plan(written(text))
     assert "\n" not in str(error.value)
+
+
+def test_the_cameras_are_all_that_the_configurations_declare_or_the_chosen_ones(written, tmp_path):
+    camera = "cameras: {side_camera: {position: [1, 0, 1], look_at: [0, 0, 0]}}\n"
+    (tmp_path / "mine.yaml").write_text(f"extends: pick_shelf_scattered\n{camera}")
+    four = "parts:\n  - {task: pick, episodes: 3, config: mine.yaml}\n"
+    standard = ["base_camera", "gripper_camera", "static_camera"]
+    assert load_plan(written(GOOD)).pictures.cameras == standard
+    assert load_plan(written(four)).pictures.cameras == [*standard, "side_camera"]
+    assert load_plan(written(four + "pictures: {cameras: [side_camera]}\n")).pictures.cameras == ["side_camera"]
+    mixed = four + "  - {task: select, episodes: 3}\n"
+    with pytest.raises(PlanError, match="different cameras"):
+        load_plan(written(mixed))
+    assert load_plan(written(mixed + "pictures: {cameras: [base_camera]}\n")).pictures.cameras == ["base_camera"]
+    with pytest.raises(PlanError, match="no such camera"):
+        load_plan(written(mixed + "pictures: {cameras: [side_camera]}\n"))
 
 
 def test_a_configuration_of_another_task_is_refused(written):

@@ -3,45 +3,40 @@
 import json
 import os
 import shutil
-import signal
-import sys
-import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import closing
 from pathlib import Path
 
-import psutil
 import pytest
-from faults import running
 from plan_stages import (
     PLAN,
-    MadeUp,
+    CannotBegin,
     assert_same,
-    cannot_begin,
     deaths_of,
-    open_worker,
+    made_up,
     plan_faults,
     run_here,
     seeds_done,
 )
 
-from robocas_ms3.core.errors import MissingExtraError, OutputExistsError, PlanError, RobocasError
+from robocas_ms3.core.checks import parse_shard
+from robocas_ms3.core.errors import OutputExistsError, PlanError, RobocasError
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.demos.recordings.entries import versions
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
 from robocas_ms3.plans.executors import LocalExecutor
-from robocas_ms3.plans.progress import parse_shard
+from robocas_ms3.plans.folder import Outcome, PlanFolder, Unit
 from robocas_ms3.plans.run import join_plan, run_shard
+from robocas_ms3.plans.stages import Recorder
 from robocas_ms3.plans.status import read_status
-from robocas_ms3.plans.units import Outcome, Unit
 from robocas_ms3.plans.worker import UnitWorker
 
 SUPPORT = Path(__file__).resolve().parents[1] / "support"
 
 
 def shard(out, text, plan=PLAN):
-    return run_shard(LocalExecutor(plan, out, open_worker=open_worker), parse_shard(text))
+    return run_shard(LocalExecutor(PlanFolder(plan, out)), parse_shard(text, PlanError))
 
 
 def test_a_plan_makes_demonstrations_and_one_dataset_of_all_parts(undisturbed):
@@ -91,7 +86,7 @@ def test_shards_in_any_order_make_the_same(undisturbed, tmp_path):
 @pytest.mark.parametrize("text", ["2/2", "1", "-1/2", "1/2/3"])
 def test_an_invalid_shard_is_refused(text):
     with pytest.raises(PlanError):
-        parse_shard(text)
+        parse_shard(text, PlanError)
 
 
 def test_two_shards_may_be_the_same_at_the_same_time(undisturbed, tmp_path):
@@ -103,7 +98,7 @@ def test_two_shards_may_be_the_same_at_the_same_time(undisturbed, tmp_path):
 
 
 def test_the_first_folder_of_a_seed_is_kept(tmp_path):
-    files = Unit(0, 0).files(PLAN, tmp_path, 10)
+    files = PlanFolder(PLAN, tmp_path).files(Unit(0, 0), 10)
     with files.temporary() as late, files.temporary() as first:
         for tmp in (late, first):
             tmp.recording.write_text("late" if tmp is late else "first")
@@ -113,9 +108,9 @@ def test_the_first_folder_of_a_seed_is_kept(tmp_path):
 
 
 def test_a_seed_whose_outcome_is_damaged_is_done_again(undisturbed, out):
-    unit = Unit(0, 0)
-    (unit.folder(PLAN, out) / "seeds.jsonl").unlink()
-    os.truncate(unit.files(PLAN, out, 11).folder / "outcome.json", 20)
+    unit = PlanFolder(PLAN, out).unit_folder(Unit(0, 0))
+    (unit / "seeds.jsonl").unlink()
+    os.truncate(unit / "0000000011" / "outcome.json", 20)
     run_here(out)
     assert_same(undisturbed, out)
 
@@ -129,7 +124,7 @@ def test_a_process_that_dies_once_costs_nothing(undisturbed, tmp_path):
     assert deaths_of(out) == [
         (10, "record: SIGSEGV"),
         (12, "record: too much memory"),
-        (13, "record: ValueError: a bug"),
+        (13, "record: ValueError: a bug of two lines"),
         (3, "record: too slow"),
     ]
 
@@ -139,26 +134,11 @@ def test_a_seed_that_kills_twice_is_left_out_and_another_takes_its_place(tmp_pat
     plan_faults(out, {11: ["crash", "crash", "crash"], 12: ["fail"], 13: ["damaged", "damaged"]})
     report = run_here(out)
     assert report["parts"]["a"]["seeds"] == [10, 14, 15, 16, 17]
-    found, damaged = read_status(out), "record: DatasetError: this recording is damaged"
+    found, damaged = read_status(out), "record: this recording is damaged"
     assert found.parts[0].failed == {"record: SIGSEGV": 1, "grasp: slipped": 1, damaged: 1}
     assert (found.parts[0].done, found.parts[0].wanted) == (5, 5)
     assert found.finished
     assert deaths_of(out) == [(11, "record: SIGSEGV")] * 2 + [(13, damaged)] * 2
-
-
-def test_an_error_of_all_seeds_ends_the_run_which_continues_later(undisturbed, tmp_path):
-    out = tmp_path / "out"
-    plan_faults(out, {12: ["limit"], 13: ["refuse"]})
-    with pytest.raises(RobocasError, match="can't start another process"):
-        run_here(out)
-    with pytest.raises(MissingExtraError):
-        run_here(out)
-    run_here(out)
-    assert deaths_of(out) == []  # of no seed
-    assert_same(undisturbed, out)
-    before = (out / "report.json").stat().st_mtime_ns
-    run_here(out)  # nothing is left to do
-    assert (out / "report.json").stat().st_mtime_ns == before
 
 
 def test_a_machine_that_cannot_open_a_part_does_no_seed(tmp_path):
@@ -167,13 +147,10 @@ def test_a_machine_that_cannot_open_a_part_does_no_seed(tmp_path):
     (tmp_path / "out" / "plan.json").write_text(
         json.dumps({"plan": plan.model_dump(mode="json"), "versions": versions()})
     )
-    worker = UnitWorker(plan, tmp_path / "out")
-    try:
+    with made_up(Recorder), closing(UnitWorker(PlanFolder(plan, tmp_path / "out"))) as worker:
         with pytest.raises(PlanError) as error:
             worker.do(Unit(0, 0))
         assert error.value.where == "part a"
-    finally:
-        worker.close()
     assert seeds_done(tmp_path / "out") == 0
 
 
@@ -186,7 +163,7 @@ def test_hardly_any_success_is_an_error(tmp_path):
 
 
 def test_episodes_whose_files_were_cut_off_are_made_again(undisturbed, out):
-    folders = [Unit(0, 0).files(PLAN, out, seed).folder for seed in (10, 11, 12)]
+    folders = [PlanFolder(PLAN, out).files(Unit(0, 0), seed).folder for seed in (10, 11, 12)]
     picture = sorted(folders[1].rglob("*.png"))[0]
     for path, length in ((folders[0] / "recording.h5", 1000), (picture, 50), (folders[2] / "recording.json", 0)):
         os.truncate(path, length)
@@ -197,10 +174,10 @@ def test_episodes_whose_files_were_cut_off_are_made_again(undisturbed, out):
 
 
 def test_a_disk_that_damages_files_again_and_again_ends_the_run(out, monkeypatch):
-    monkeypatch.setattr("robocas_ms3.plans.run.damaged_episodes", lambda *_: {Unit(1, 0): [4]})
+    monkeypatch.setattr("robocas_ms3.plans.progress.Progress.forget_damaged", lambda _: {Unit(1, 0): [4]})
     with pytest.raises(PlanError, match="files don't keep the sizes") as error:
         run_here(out)
-    assert error.value.where == Unit(1, 0).folder(PLAN, out)
+    assert error.value.where == PlanFolder(PLAN, out).unit_folder(Unit(1, 0))
     assert not (out / "datasets").exists()
 
 
@@ -209,26 +186,25 @@ def test_a_folder_of_something_else_is_refused(tmp_path):
     for flags in ({}, {"overwrite": True}):
         with pytest.raises(OutputExistsError):
             run_here(tmp_path, **flags)
-    with pytest.raises(PlanError):
+    with pytest.raises(OutputExistsError):
         shard(tmp_path, "0/2")
     assert [path.name for path in tmp_path.iterdir()] == ["thesis"]
 
 
-def test_another_plan_is_refused_unless_it_is_to_overwrite(out):
+def test_another_plan_is_refused_unless_it_is_to_overwrite_but_limits_and_description_may_change(undisturbed, out):
     other = PLAN.model_copy(update={"block": 4})
     for start in (run_here, lambda out, plan: shard(out, "1/2", plan)):
         with pytest.raises(RobocasError, match="block: 3 -> 4"):
             start(out, other)
-    run_here(out, other, overwrite=True)
-    assert Unit(0, 1).seeds(other) == range(14, 18)
-    assert Unit(0, 1).outcomes(other, out) is not None
-
-
-def test_limits_and_the_description_may_change(undisturbed, out):
     limits = PLAN.limits.model_copy(update={"memory_gb": 3.0})
     run_here(out, PLAN.model_copy(update={"limits": limits, "description": "another"}))
     assert_same(undisturbed, out)
     assert json.loads((out / "plan.json").read_text())["plan"]["limits"]["memory_gb"] == 3.0
+    before = (out / "report.json").stat().st_mtime_ns
+    run_here(out)  # nothing is left to do
+    assert (out / "report.json").stat().st_mtime_ns == before
+    run_here(out, other, overwrite=True)
+    assert PlanFolder(other, out).outcomes(Unit(0, 1))[0].seed == 14
 
 
 def test_a_machine_with_other_versions_does_no_unit(tmp_path):
@@ -237,9 +213,9 @@ def test_a_machine_with_other_versions_does_no_unit(tmp_path):
     record = json.loads((out / "plan.json").read_text())
     record["versions"]["sapien"] = "2.2.2"
     (out / "plan.json").write_text(json.dumps(record))
-    worker = open_worker(PLAN, out)
-    for start in (lambda: worker.do(Unit(0, 0)), lambda: shard(out, "0/2"), lambda: join_plan(out)):
-        with pytest.raises(PlanError, match=r"versions\.sapien: .*2\.2\.2"):
+    worker = UnitWorker(PlanFolder(PLAN, out))
+    for start in (lambda: worker.do(Unit(0, 0)), lambda: shard(out, "0/2")):
+        with pytest.raises(OutputExistsError, match=r"versions\.sapien: .*2\.2\.2"):
             start()
     assert not (out / "units").exists()
 
@@ -247,83 +223,17 @@ def test_a_machine_with_other_versions_does_no_unit(tmp_path):
 def test_a_worker_of_an_older_plan_keeps_nothing_in_the_folder_of_a_new_one(tmp_path):
     out = tmp_path / "out"
     shard(out, "4/5")
-    worker = open_worker(PLAN, out)
+    worker = UnitWorker(PlanFolder(PLAN, out))
     seeds = worker.seeds(Unit(0, 0))
     next(seeds)
     run_here(out, PLAN.model_copy(update={"block": 2}), overwrite=True)
-    with pytest.raises(PlanError):
+    with pytest.raises(OutputExistsError):
         next(seeds)
     worker.close()
     assert seeds_done(out) == 8
 
 
-def in_a_process(out):
-    """A run of two jobs, in a process of its own and a group of processes of their own."""
-    return running([sys.executable, SUPPORT / "plan_runner.py", out])
-
-
-def wait_until(what, process):
-    until = time.monotonic() + 60
-    while not what():
-        assert process.poll() is None, process.stderr.read()
-        assert time.monotonic() < until
-        time.sleep(0.02)
-
-
-def alive(group):
-    """The commands of the processes of a group that run: an orphan that ended may wait for long to be reaped."""
-    return [command for one in psutil.process_iter() if of_group(one, group) and (command := command_of(one))]
-
-
-def command_of(process):
-    with suppress(psutil.NoSuchProcess, psutil.ZombieProcess):
-        return process.cmdline()
-
-
-def of_group(process, group):
-    try:
-        return os.getpgid(process.pid) == group
-    except ProcessLookupError:
-        return False
-
-
-def test_ctrl_c_ends_all_processes_and_blames_no_seed(undisturbed, tmp_path):
-    out = tmp_path / "out"
-    with in_a_process(out) as process:
-        wait_until(lambda: seeds_done(out) >= 2, process)
-        time.sleep(0.3)  # processes that record or render are starting
-        os.killpg(process.pid, signal.SIGINT)
-        _, said = process.communicate(timeout=30)
-        assert process.returncode != 0
-        assert said.count("Traceback") <= 1  # the runner's own
-        assert "KeyboardInterrupt" in said
-        begun = time.monotonic()
-        while alive(process.pid):  # an ending one of Python's own, which keeps track of semaphores, is the last
-            assert time.monotonic() - begun < 30, alive(process.pid)
-    assert not list(out.glob("units/*/*/.*"))
-    run_here(out)
-    assert deaths_of(out) == []
-    assert_same(undisturbed, out)
-
-
 def test_a_process_that_cannot_begin_ends_the_run_and_blames_no_seed(tmp_path):
-    def open_worker(plan, out):
-        return UnitWorker(plan, out, MadeUp, cannot_begin)
-
     with pytest.raises(PlanError, match="no such library"):
-        run_here(tmp_path / "out", open_worker=open_worker)
+        run_here(tmp_path / "out", render=CannotBegin)
     assert seeds_done(tmp_path / "out") == 0
-
-
-def test_killed_at_any_moment_it_continues_and_ends_the_same(undisturbed, tmp_path):
-    out = tmp_path / "out"
-    for seeds in (0, 4):
-        with in_a_process(out) as process:
-            wait_until(lambda seeds=seeds: (out / "plan.json").is_file() and seeds_done(out) >= seeds, process)
-            os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
-        assert not (out / "report.json").exists()
-    assert 4 <= seeds_done(out) < 8  # two units of three, one of two
-    run_here(out)
-    assert_same(undisturbed, out)
-    assert seeds_done(out) == 8

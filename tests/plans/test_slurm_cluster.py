@@ -10,36 +10,47 @@ import pytest
 
 pytest.importorskip("submitit", reason='plans on Slurm need submitit: pip install -e ".[slurm]"')
 
-from plan_stages import assert_same, deaths_of, plan_faults
-from slurm_runs import NO_SLURM, SLURM, job_at, run, slurm_answers, start, wait_for
-from slurm_runs import processes_of as processes_at
+from plan_jobs import Jobs, wait_for
+from plan_stages import assert_same, deaths_of, env_of_jobs, plan_faults
 
 from robocas_ms3.core.errors import PlanError
 
 CONF = Path("/etc/slurm/slurm.conf")
 STARTS = Path(__file__).resolve().parents[2] / "scripts" / "slurm_here.sh"
 OURS = CONF.is_file() and "Written by scripts/slurm_here.sh" in CONF.read_text() and os.getuid() == 0
+JOBS = Jobs("slurm", time="10", mem_gb="1")
+
+
+def slurm_answers():
+    try:
+        return subprocess.run(["sinfo", "--noheader"], capture_output=True, timeout=10, check=False).returncode == 0
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+
+
+NO_SLURM = "no Slurm answers here: scripts/slurm_here.sh starts one"
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(not slurm_answers(), reason=NO_SLURM)]
 
 
 @pytest.fixture(autouse=True)
 def jobs_know_the_made_up_episodes(monkeypatch):
-    path = [str(STARTS.parents[1] / "tests" / "support"), os.environ.get("PYTHONPATH", "")]
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(path))
+    for name, value in env_of_jobs().items():
+        monkeypatch.setenv(name, value)
 
 
 class Running:
     """A run, one job of which hangs in the middle of a unit."""
 
-    def __init__(self, out, options=SLURM):
-        self.out, self.options = out, options
-        plan_faults(out, {11: ["hang"]})
-        self.process = start(out, options, stderr=subprocess.PIPE)
-        job_at(out, 11)
+    def __init__(self, out):
+        self.out = out
+        self.tries = plan_faults(out, {11: ["hang"]})
+        self.process = JOBS.start(out)
+        self.job()
 
     def job(self):
         """The process that is at the unit, and the id of its job."""
-        process = job_at(self.out, 11)
+        wait_for(lambda: self.tries(11), 120)
+        process = psutil.Process(self.tries(11)[-1]).parent()
         environment = process.environ()
         return process, f"{environment['SLURM_ARRAY_JOB_ID']}_{environment['SLURM_ARRAY_TASK_ID']}"
 
@@ -47,7 +58,7 @@ class Running:
         assert self.process.wait(240) == 0, self.process.stderr.read()[-2000:]
         assert_same(undisturbed, self.out)
         assert deaths_of(self.out) == []  # no seed is blamed
-        wait_for(lambda: not processes_at(self.out), 30)
+        wait_for(lambda: not JOBS.processes(self.out), 30)
 
 
 @pytest.fixture
@@ -76,13 +87,13 @@ def start_daemons():
 
 
 def test_jobs_make_what_this_machine_makes(undisturbed, tmp_path):
-    run(tmp_path / "out", SLURM | {"units_per_job": "2"})
+    JOBS.run(tmp_path / "out", units_per_job="2")
     assert_same(undisturbed, tmp_path / "out")
 
 
 def test_what_sbatch_refuses_is_said(tmp_path):
     with pytest.raises(PlanError, match="partition"):
-        run(tmp_path / "out", {"partition": "none_of_this_name"})
+        JOBS.run(tmp_path / "out", partition="none_of_this_name")
 
 
 def kill_processes(running):
@@ -125,16 +136,16 @@ def kill_the_command(running):
     running.process.kill()
     running.process.wait()
     left, _ = running.job()
-    running.process = start(running.out, running.options, stderr=subprocess.PIPE)
+    running.process = JOBS.start(running.out)
     left.wait(60)  # the next command cancels it
 
 
 def interrupt_the_command(running):
     running.process.send_signal(signal.SIGINT)
     assert running.process.wait(10) != 0
-    wait_for(lambda: not processes_at(running.out), 30)
+    wait_for(lambda: not JOBS.processes(running.out), 30)
     wait_for(lambda: "robocas-out" not in say("squeue", "--noheader", "--format=%j"), 30)
-    running.process = start(running.out, running.options, stderr=subprocess.PIPE)
+    running.process = JOBS.start(running.out)
 
 
 FAULTS = {

@@ -6,10 +6,9 @@ import pytest
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.files import make_folder, write_json
-from robocas_ms3.plans.folder import PLAN, plan_record
+from robocas_ms3.plans.folder import PLAN, Outcome, PlanFolder, Unit
 from robocas_ms3.plans.load import load_plan
 from robocas_ms3.plans.status import PartStatus, read_status, seconds_left
-from robocas_ms3.plans.units import Outcome, Unit
 
 
 @pytest.fixture
@@ -17,15 +16,15 @@ def started(tmp_path):
     """A plan that was started, and what writes an outcome."""
     path, out = tmp_path / "plan.yaml", make_folder(tmp_path / "out")
     path.write_text("block: 4\nparts:\n  - {task: pick, episodes: 6, name: a}\n")
-    plan = load_plan(path)
-    write_json(out / PLAN, plan_record(plan))
+    folder = PlanFolder(load_plan(path), out)
+    write_json(out / PLAN, folder.record())
 
     def write(*outcomes):
         for outcome in outcomes:
             unit = Unit(0, outcome.seed // 4)
-            with unit.files(plan, out, outcome.seed).temporary() as files:
+            with folder.files(unit, outcome.seed).temporary() as files:
                 files.write(outcome)
-            unit.complete(plan, out)
+            folder.complete(unit)
 
     return out, write
 

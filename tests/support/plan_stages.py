@@ -7,19 +7,18 @@ import json
 import os
 import signal
 import time
+from contextlib import contextmanager
+from pathlib import Path
 
 from synthetic import RayCaster, write_trajectory
 
 from robocas_ms3.core.errors import DatasetError, MissingExtraError, RobocasError
-from robocas_ms3.plans.executors import LocalExecutor
+from robocas_ms3.plans import worker
+from robocas_ms3.plans.folder import PlanFolder, Unit
 from robocas_ms3.plans.plan import PartConfig, Plan
-from robocas_ms3.plans.render import Renderer
-from robocas_ms3.plans.run import run_plan
-from robocas_ms3.plans.units import Unit
-from robocas_ms3.plans.worker import UnitWorker
+from robocas_ms3.plans.stages import Renderer
 
-FAULTS = "faults.json"
-"""Seed -> what happens at each of its tries, the first ones first; nothing more where the list ends."""
+SITE = Path(__file__).parent / "fault_site"
 
 
 class MadeUp:
@@ -38,6 +37,9 @@ class MadeUp:
             hog = bytearray(600 * 2**20)
             time.sleep(1000)
             del hog
+        elif fault == "kill job":
+            os.kill(os.getppid(), signal.SIGKILL)
+            time.sleep(60)
         elif fault == "bug":
             raise ValueError("a bug\nof two lines")
         elif fault == "refuse":
@@ -55,35 +57,58 @@ class MadeUp:
         pass
 
 
+def _faults_of(out):
+    """The folder with faults of a plan: next to it, or where nodes of Ray see it."""
+    return Path(os.environ.get("PLAN_FAULTS", out.parent))
+
+
 def _fault(files):
-    out = files.folder.parents[3]
-    path = out.with_name(f"{out.name}-{FAULTS}")
-    tries = out.with_name(f"{out.name}-tries-{files.seed}")
-    if not path.is_file():
+    folder = _faults_of(files.folder.parents[3])
+    if not (folder / "faults.json").is_file():
         return None
-    planned = json.loads(path.read_text()).get(str(files.seed), [])
-    with tries.open("a") as file:
+    planned = json.loads((folder / "faults.json").read_text()).get(str(files.seed), [])
+    with (folder / f"tries-{files.seed}").open("a") as file:
         file.write(f"{os.getpid()} ")
-    number = len(tries.read_text().split()) - 1
+    number = len((folder / f"tries-{files.seed}").read_text().split()) - 1
     return planned[number] if number < len(planned) else None
 
 
-def render(plan):
-    return Renderer(plan, RayCaster)
+class MadeUpRenderer(Renderer):
+    """Renders without a renderer."""
+
+    def open_env(self, *args):
+        return RayCaster(*args)
 
 
-def cannot_begin(plan):
-    raise ImportError("no such library")
+class CannotBegin:
+    def __init__(self, plan):
+        raise ImportError("no such library")
 
 
-def open_worker(plan, out):
-    """A worker whose episodes are made up."""
-    return UnitWorker(plan, out, MadeUp, render)
+@contextmanager
+def made_up(record=MadeUp, render=MadeUpRenderer):
+    """Let workers that are made inside have these stages."""
+    before = worker.Recorder, worker.Renderer
+    worker.Recorder, worker.Renderer = record, render
+    try:
+        yield
+    finally:
+        worker.Recorder, worker.Renderer = before
 
 
-def run_here(out, plan=None, jobs=1, open_worker=open_worker, **more):
+def run_here(out, plan=None, jobs=1, record=MadeUp, render=MadeUpRenderer, **more):
     """Run the made-up plan on this machine."""
-    return run_plan(LocalExecutor(plan or PLAN, out, jobs, open_worker=open_worker), **more)
+    from robocas_ms3.plans.executors import LocalExecutor
+    from robocas_ms3.plans.run import run_plan
+
+    with made_up(record, render):
+        return run_plan(LocalExecutor(PlanFolder(plan or PLAN, out), jobs), **more)
+
+
+def env_of_jobs():
+    """Return environment variables of processes whose workers have made-up stages."""
+    path = os.pathsep.join([str(SITE), str(SITE.parent), os.environ.get("PYTHONPATH", "")])
+    return {"PYTHONPATH": path, "ROBOCAS_FAULT": json.dumps({"made_up_plan": True})}
 
 
 PLAN = Plan.model_validate(
@@ -103,8 +128,21 @@ PLAN = Plan.model_validate(
 
 
 def plan_faults(out, faults):
-    """Seed -> what happens at each of its tries."""
-    out.with_name(f"{out.name}-{FAULTS}").write_text(json.dumps(faults))
+    """Seed -> what happens at each of its tries, the first ones first; nothing more where the list ends.
+
+    Return a function that returns the processes of the tries of a seed.
+    """
+    folder = _faults_of(out)
+    for old in folder.glob("tries-*"):
+        old.unlink()
+    (folder / "faults.json").write_text(json.dumps(faults))
+
+    def tries(seed):
+        path = folder / f"tries-{seed}"
+        text = path.read_text() if path.exists() else ""
+        return [int(pid) for pid in text.split(" ")[:-1]]
+
+    return tries
 
 
 def products(out):
@@ -127,7 +165,7 @@ def assert_same(one, other):
 def deaths_of(out, plan=PLAN):
     """(seed, what its process died of) in units that are complete."""
     units = [Unit(part, block) for part in range(len(plan.parts)) for block in range(9)]
-    found = (unit.outcomes(plan, out) for unit in units)
+    found = (PlanFolder(plan, out).outcomes(unit) for unit in units)
     return [(one.seed, death) for outcomes in found if outcomes for one in outcomes for death in one.deaths]
 
 

@@ -14,13 +14,13 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, NonNegativeInt
 
+from robocas_ms3.core.checks import GREATEST_SEED
 from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.strict import parse
 from robocas_ms3.core.words import one_line
 from robocas_ms3.demos.recordings.subgoals import SubGoal, SubGoals
 
-GREATEST_SEED = 2**32 - 1  # numpy's older generators, which ManiSkill uses, take no greater one
 _ENTRY = "the JSON's entry"
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
+from dataclasses import replace
 from queue import SimpleQueue
 from typing import Any
 
@@ -14,8 +14,7 @@ from pydantic import ValidationError
 from robocas_ms3.core.errors import PlanError
 from robocas_ms3.core.extensions import load
 from robocas_ms3.core.strict import StrictModel, refusal
-from robocas_ms3.plans.plan import Plan
-from robocas_ms3.plans.units import Unit
+from robocas_ms3.plans.folder import PlanFolder, Unit
 from robocas_ms3.plans.worker import UnitWorker
 
 EXECUTORS = {
@@ -30,11 +29,9 @@ class Executor(ABC):
     """Runs jobs, each of which does some work units; a context manager, which cancels them.
 
     Args:
-        plan: the plan of the units.
-        out: the output folder of the plan.
+        folder: of the plan of the units.
         jobs: maximum number of jobs at once.
         options: values of ``--executor-option``, by name.
-        open_worker: makes what does the units; can be pickled.
 
     Raises:
         PlanError: an option is unknown or invalid, or the executor can't be used on this machine.
@@ -43,15 +40,8 @@ class Executor(ABC):
 
     options_type: type[StrictModel] = StrictModel
 
-    def __init__(
-        self,
-        plan: Plan,
-        out: Path,
-        jobs: int = 1,
-        options: Mapping[str, str] | None = None,
-        open_worker: Callable[[Plan, Path], UnitWorker] = UnitWorker,
-    ) -> None:
-        self.plan, self.out, self.jobs, self.open_worker = plan, out.absolute(), jobs, open_worker
+    def __init__(self, folder: PlanFolder, jobs: int = 1, options: Mapping[str, str] | None = None) -> None:
+        self.folder, self.jobs = replace(folder, path=folder.path.absolute()), jobs
         try:
             self.options: Any = self.options_type.model_validate_strings(dict(options or {}))
         except ValidationError as error:
@@ -90,7 +80,6 @@ class ThreadExecutor(Executor):
         return self
 
     def submit(self, groups: Sequence[Sequence[Unit]]) -> Sequence[Any]:
-        """Start a thread for each group."""
         return [self.threads.submit(self.run, group) for group in groups]
 
     @abstractmethod
@@ -102,7 +91,7 @@ class LocalExecutor(ThreadExecutor):
     """Work units on this machine: a thread per job, each with two processes. It has no options."""
 
     def __enter__(self) -> LocalExecutor:
-        self._workers = [self.open_worker(self.plan, self.out) for _ in range(self.jobs)]
+        self._workers = [UnitWorker(self.folder) for _ in range(self.jobs)]
         self._idle: SimpleQueue[UnitWorker] = SimpleQueue()
         for worker in self._workers:
             self._idle.put(worker)
@@ -110,7 +99,6 @@ class LocalExecutor(ThreadExecutor):
         return self
 
     def run(self, units: Sequence[Unit]) -> None:
-        """Do some units by an idle worker."""
         worker = self._idle.get()
         try:
             for unit in units:
@@ -126,6 +114,6 @@ class LocalExecutor(ThreadExecutor):
             worker.close()
 
 
-def open_executor(name: str, plan: Plan, out: Path, jobs: int, options: Mapping[str, str]) -> Executor:
+def open_executor(name: str, folder: PlanFolder, jobs: int, options: Mapping[str, str]) -> Executor:
     """Return an executor of this name; raises as `Executor` does."""
-    return load(EXECUTORS[name])(plan, out, jobs, options)
+    return load(EXECUTORS[name])(folder, jobs, options)

@@ -9,8 +9,8 @@ import shutil
 import socket
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
 from importlib import import_module
 from itertools import groupby
 from pathlib import Path
@@ -24,9 +24,8 @@ from robocas_ms3.core.files import ABANDONED, make_folder, write_json
 from robocas_ms3.core.strict import StrictModel
 from robocas_ms3.core.words import one_line
 from robocas_ms3.plans.executors import ThreadExecutor
-from robocas_ms3.plans.folder import PLAN, read_plan_record
+from robocas_ms3.plans.folder import OUTCOME, PLAN, Outcome, PlanFolder, SeedFiles, Unit
 from robocas_ms3.plans.plan import Plan
-from robocas_ms3.plans.units import OUTCOME, Outcome, SeedFiles, Unit
 from robocas_ms3.plans.worker import UnitWorker
 
 try:
@@ -45,7 +44,6 @@ _CONNECT = 10.0  # s
 _CANCEL = 5.0  # s until tasks have ended
 _TEMPORARY = "robocas-ray-"
 _log = logging.getLogger(__name__)
-OpenWorker = Callable[[Plan, Path], UnitWorker]
 Piece = tuple[tuple[Unit, int], str, bytes]
 """(unit, seed), name of a file in the seed's folder, what follows in it."""
 
@@ -79,14 +77,14 @@ class RayExecutor(ThreadExecutor):
         """Wait for a task; one that Ray has lost leaves units that are not done."""
         options = {"num_cpus": self.options.num_cpus, "num_gpus": self.options.num_gpus}
         if self.options.gather:
-            done = [unit.partial_outcomes(self.plan, self.out) for unit in units]
+            done = [self.folder.partial_outcomes(unit) for unit in units]
             # the outcomes decide what a task sends, so a retry needs other arguments
             options |= {"max_retries": 0, "num_returns": "streaming", "_generator_backpressure_num_objects": _PIECES}
             send = ray.remote(**options)(send_units)
-            task = send.remote(self.plan, read_plan_record(self.out), units, done, self.open_worker)
+            task = send.remote(self.folder.plan, self.folder.record(), units, done)
         else:
             do = ray.remote(**options, max_retries=RETRIES)(do_units)
-            task = do.remote(self.plan, self.out, units, self.open_worker)
+            task = do.remote(self.folder, units)
         self._tasks.add(task)
         try:
             self._receive(task, units) if self.options.gather else ray.get(task)
@@ -104,14 +102,14 @@ class RayExecutor(ThreadExecutor):
         """Receive the files of a task whose node does not see the plan's folder."""
         pieces = (ray.get(reference) for reference in task)
         for (unit, seed), files in groupby(pieces, lambda piece: piece[0]):
-            with unit.files(self.plan, self.out, seed).temporary() as tmp:
+            with self.folder.files(unit, seed).temporary() as tmp:
                 for _, name, data in files:
                     path = tmp.folder / name
                     path.parent.mkdir(parents=True, exist_ok=True)
                     with path.open("ab") as file:
                         file.write(data)
         for unit in units:
-            unit.complete(self.plan, self.out)
+            self.folder.complete(unit)
 
     def log_of(self, job: Any) -> str:
         """Return where Ray says why a task died."""
@@ -158,28 +156,21 @@ def _connect(options: RayOptions, jobs: int) -> None:
         _log.warning("%s; waiting for one", error)
 
 
-def do_units(plan: Plan, out: Path, units: Sequence[Unit], open_worker: OpenWorker) -> None:
+def do_units(folder: PlanFolder, units: Sequence[Unit]) -> None:
     """Do units in the plan's folder, as a task."""
-    worker = open_worker(plan, out)
-    try:
-        until = time.monotonic() + _APPEARS
-        while not (out / PLAN).is_file():
-            if time.monotonic() > until:
-                where, fix = f"node {socket.gethostname()}", "Choose an --out that all nodes share, or gather=yes."
-                raise PlanError("this node does not see the output folder", where=where, expected=out, fix=fix)
-            time.sleep(0.5)
+    until = time.monotonic() + _APPEARS
+    while not (folder.path / PLAN).is_file():
+        if time.monotonic() > until:
+            where, fix = f"node {socket.gethostname()}", "Choose an --out that all nodes share, or gather=yes."
+            raise PlanError("this node does not see the output folder", where=where, expected=folder.path, fix=fix)
+        time.sleep(0.5)
+    with closing(UnitWorker(folder)) as worker:
         for unit in units:
             worker.do(unit)
-    finally:
-        worker.close()
 
 
 def send_units(
-    plan: Plan,
-    record: Mapping[str, Any],
-    units: Sequence[Unit],
-    done: Sequence[Sequence[Outcome]],
-    open_worker: OpenWorker,
+    plan: Plan, record: Mapping[str, Any], units: Sequence[Unit], done: Sequence[Sequence[Outcome]]
 ) -> Iterator[Piece]:
     """Do units in a temporary folder of the node, as a task, and send the files seed by seed.
 
@@ -188,22 +179,19 @@ def send_units(
         record: content of ``plan.json``.
         units: to be done.
         done: outcomes of the seeds of each unit that are done already.
-        open_worker: makes what does the units.
     """
     with _temporary_folder() as out:
+        folder = PlanFolder(plan, out)
         write_json(out / PLAN, record)
         for unit, outcomes in zip(units, done, strict=True):
             for outcome in outcomes:
-                files = unit.files(plan, out, outcome.seed)
+                files = folder.files(unit, outcome.seed)
                 make_folder(files.folder)
                 files.write(outcome)
-        worker = open_worker(plan, out)
-        try:
+        with closing(UnitWorker(folder)) as worker:
             for unit in units:
                 for files in worker.seeds(unit):
                     yield from _pieces(unit, files)
-        finally:
-            worker.close()
 
 
 def _pieces(unit: Unit, files: SeedFiles) -> Iterator[Piece]:

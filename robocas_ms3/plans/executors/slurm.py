@@ -18,7 +18,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, create_model
@@ -28,8 +27,7 @@ from robocas_ms3.core.files import make_folder
 from robocas_ms3.core.remote_errors import RemoteError
 from robocas_ms3.core.strict import StrictModel
 from robocas_ms3.plans.executors import Executor
-from robocas_ms3.plans.plan import Plan
-from robocas_ms3.plans.units import Unit
+from robocas_ms3.plans.folder import PlanFolder, Unit
 from robocas_ms3.plans.worker import UnitWorker
 
 try:
@@ -75,20 +73,19 @@ class SlurmExecutor(Executor):
     options_type = create_model("SlurmOptions", __base__=_OwnOptions, **_SBATCH_FIELDS)
 
     def check(self) -> None:
-        """Check that this machine has Slurm."""
         self._local = self.options.cluster == "local"
         if not self._local and SubmititExecutor.affinity() < 0:
             fix = "Run this where sbatch and srun are, or try --executor-option cluster=local."
             raise PlanError("there is no Slurm here", where="--executor slurm", expected="srun", fix=fix)
 
     def __enter__(self) -> SlurmExecutor:
-        digest = hashlib.sha256(os.fsencode(self.out.resolve())).hexdigest()[:8]
-        self._name = f"robocas-{re.sub(r'[^A-Za-z0-9-]', '-', self.out.name)}-{digest}"
+        digest = hashlib.sha256(os.fsencode(self.folder.path.resolve())).hexdigest()[:8]
+        self._name = f"robocas-{re.sub(r'[^A-Za-z0-9-]', '-', self.folder.path.name)}-{digest}"
         self._asked = 0.0
         self._alive: set[str] | None = None
         self._refused, self._not_before = 0, 0.0
         self._jobs: list[_Job] = []
-        folder, requeues = make_folder(self.out / LOGS), self.options.requeues
+        folder, requeues = make_folder(self.folder.path / LOGS), self.options.requeues
         if self._local:
             self._submitit = LocalExecutor(folder, max_num_timeout=requeues)
             self._submitit.update_parameters(timeout_min=self.options.time, stderr_to_stdout=True)
@@ -101,7 +98,7 @@ class SlurmExecutor(Executor):
     def _parameters(self) -> dict[str, Any]:
         options = self.options
         sbatch = options.model_dump(include=set(SBATCH_OPTIONS), exclude_none=True)
-        mem_gb = options.mem_gb or 2 * self.plan.limits.memory_gb
+        mem_gb = options.mem_gb or 2 * self.folder.plan.limits.memory_gb
         return {
             "job_name": self._name,
             "time": options.time,
@@ -115,13 +112,10 @@ class SlurmExecutor(Executor):
         }
 
     def submit(self, groups: Sequence[Sequence[Unit]]) -> list[_Job]:
-        """Submit a job array."""
         if time.monotonic() < self._not_before:
             return []
         try:
-            handles = self._submitit.submit_array(
-                [DoUnits(self.plan, self.out, tuple(group), self.open_worker) for group in groups]
-            )
+            handles = self._submitit.submit_array([DoUnits(self.folder, tuple(group)) for group in groups])
         except Exception as error:
             self._refused += 1
             self._not_before = time.monotonic() + _RETRY
@@ -154,7 +148,6 @@ class SlurmExecutor(Executor):
         return set(reasons) - stuck
 
     def log_of(self, job: _Job) -> str:
-        """Return the log of a job."""
         return f"{job.handle.paths.stdout}; --executor-option mem_gb and time may help"
 
     def __exit__(self, *error: object) -> None:
@@ -199,15 +192,13 @@ class _Job:
 class DoUnits:
     """What a job does, as submitit pickles it; a job that is requeued continues where the units stopped."""
 
-    plan: Plan
-    out: Path
+    folder: PlanFolder
     units: tuple[Unit, ...]
-    open_worker: Callable[[Plan, Path], UnitWorker]
 
     def __call__(self) -> RemoteError | None:
         """Do the units; return an error that every seed would meet."""
         signal.signal(signal.SIGTERM, _exit)  # submitit would ignore it, and Slurm wait for 30 s
-        worker = self.open_worker(self.plan, self.out)
+        worker = UnitWorker(self.folder)
         # Slurm announces the end of the time to all processes of a job: block it in those of the worker, which inherit
         # the mask of this thread
         announcements = {signal.SIGUSR1, signal.SIGUSR2}
