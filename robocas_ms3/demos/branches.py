@@ -231,7 +231,6 @@ class ForkedBranches:
         return True
 
     def _receive(self, child: Child, limit: float) -> Any:
-        """Return the next answer of a child, and take over its result."""
         answer, result = child.receive(limit)
         if isinstance(answer, RemoteError):
             answer.reraise()
@@ -247,7 +246,6 @@ class ForkedBranches:
             self._end(child)
 
     def _play(self, play: Callable[[T], float], candidate: T) -> None:
-        """Play a candidate, send its score, and wait to be told to continue."""
         try:
             score = float(play(candidate))
         except PlanningFailed as error:

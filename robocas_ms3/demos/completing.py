@@ -36,7 +36,6 @@ def complete(arm: Arm, policy: Callable[[Arm], None]) -> None:
 
 
 def _carry_on(arm: Arm, slot: int) -> None:
-    """Bring a target that is held into the basket."""
     if not arm.executor.flag("target_lifted"):
         arm.begin_subgoal("move and grasp")
         with arm.planning():

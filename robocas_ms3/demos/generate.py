@@ -48,9 +48,7 @@ class Summary:
     """Result of a run.
 
     Attributes:
-        trajectory: the HDF5 file.
-        episodes: episodes in it.
-        seeds: seeds tried for them.
+        seeds: number of seeds tried.
         mean_seconds: CPU seconds per seed tried: reset, planning, simulation, trial.
         mean_steps: control steps per episode.
         failures: ``{"stage: reason": count}`` of all attempts.
@@ -67,7 +65,6 @@ class Summary:
 
     @property
     def success_rate(self) -> float:
-        """Episodes per seed tried."""
         return self.episodes / self.seeds if self.seeds else 0.0
 
 
@@ -166,8 +163,6 @@ def generate_seeds(
 
 
 class _EpisodeWorker:
-    """Keeps the environment from one seed to the next."""
-
     def __init__(self, settings: GenerateSettings, folder: Path) -> None:
         from robocas_ms3.demos.generator import EpisodeGenerator  # takes seconds, and only workers need it
 
@@ -199,12 +194,10 @@ def _crashed_episode(task: int | Takeover, reason: str) -> EpisodeResult:
 
 
 def shard_name(seed: int) -> str:
-    """Return the name of an episode's file before merging."""
     return f"seed_{seed:09d}"
 
 
 def _lines(result: EpisodeResult) -> list[Failure]:
-    """Return the lines of a seed in the ledger."""
     given_up = [] if result.success else [Failure(result.seed, -1, "episode", "gave_up", 0.0)]
     return [*result.failures, *given_up]
 
@@ -247,7 +240,6 @@ class _Run:
             self.ledger.rewrite(lines)
 
     def _read(self, path: Path) -> dict[int, EpisodeResult]:
-        """Return the results of the episodes in a file by seed."""
         results = {}
         for episode in read_json(path)["episodes"]:
             try:
@@ -277,7 +269,6 @@ class _Run:
         return self._read(path)
 
     def finish(self, results: list[EpisodeResult]) -> Summary:
-        """Merge all episodes and write the summary."""
         merged = self._merged()
         beyond = range(results[-1].seed + 1, max(merged, default=-1) + 1)  # more are there than were asked for
         results = [*results, *(self.earlier[seed] for seed in beyond if seed in self.earlier)]

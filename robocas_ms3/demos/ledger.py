@@ -72,7 +72,6 @@ class EpisodeResult:
 
     @property
     def exhausted(self) -> bool:
-        """Whether the seed is given up."""
         return len(self.failures) >= self.max_attempts
 
     def failed(self, error: PlanningFailed) -> None:

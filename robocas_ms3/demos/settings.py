@@ -158,7 +158,6 @@ class GenerateSettings:
         return replace(self, episode=episode, out=out, set=(), noise=None)
 
     def check(self) -> None:
-        """Check the settings before anything is written; raises `RobocasError`."""
         check_number("episodes", self.episodes, 1)
         check_number("seed", self.seed, 0, GREATEST_SEED)
         check_number("jobs", self.jobs, 0)
@@ -197,5 +196,4 @@ class ReplaySettings:
 
     @property
     def file(self) -> Path:
-        """The HDF5 file."""
         return self.trajectory / "trajectory.h5" if self.trajectory.is_dir() else self.trajectory

@@ -96,7 +96,6 @@ def read_link_pairs(urdf: Path | str, srdf: Path | str, parts: list[CollisionPar
 
 
 def _collision_geometries(link: Element, name: str, file: DescriptionFile) -> Iterator[tuple[Any, Array, Array]]:
-    """Return the FCL geometry, the corners (V, 3) and the pose (4, 4) of each collision element of a link."""
     for collision in link.iterfind("collision"):
         origin = file.origin(collision)
         for shape in collision.iterfind("geometry/*"):
@@ -128,7 +127,6 @@ def _box_corners(x: float, y: float, z: float) -> Array:
 
 
 def _read_hull(path: Path, scale: Array, link: str) -> tuple[Array, NDArray[np.int32]]:
-    """Return the corners (V, 3) and triangles (F, 3) of the convex hull of a mesh."""
     import trimesh
 
     try:

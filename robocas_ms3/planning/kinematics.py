@@ -27,11 +27,7 @@ DAMPING = 1e-8  # added to the diagonal of J J^T, so that it can be inverted at 
 
 
 class Reachability:
-    """Inverse kinematics of one arm; collisions do not count.
-
-    Raises:
-        RobocasError: the robot's description names no closed form, or one for another arm.
-    """
+    """Inverse kinematics of one arm by the closed form that its description names; collisions do not count."""
 
     def __init__(self, chain: ArmChain) -> None:
         self.chain = chain
@@ -162,7 +158,6 @@ def _solve_together(chain: ArmChain, start: Array, goals: Array) -> Array | None
 
 
 def _solve_in_turn(chain: ArmChain, start: Array, goals: Array) -> Array | None:
-    """Return a path (n + 1, 7) along poses (n, 4, 4), each solved from the one before it."""
     path = [start]
     for goal in goals:
         qpos = path[-1][None]
@@ -184,7 +179,6 @@ def _largest_jump(path: Array) -> float:
 
 
 def _line_poses(first: Array, last: Array) -> Array:
-    """Return the poses (n, 4, 4) of a line after its first pose."""
     turn, shift = rotation_vector((first[:3, :3].T @ last[:3, :3])[None])[0], last[:3, 3] - first[:3, 3]
     count = max(1, int(np.ceil(max(np.linalg.norm(shift) / LINE_STEP, np.linalg.norm(turn) / LINE_TURN))))
     fractions = np.linspace(0, 1, count + 1)[1:, None]

@@ -35,7 +35,6 @@ class Push:
 
     @property
     def end(self) -> Array:
-        """4x4 of the TCP at the end."""
         pose = self.start.copy()
         pose[:3, 3] += self.length * self.direction
         return pose

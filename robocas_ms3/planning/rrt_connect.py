@@ -219,7 +219,6 @@ class RRTConnectPlanner(FclWorld):
 
 
 def _dense(points: Array) -> Array:
-    """Return configurations (M, 7) on a polyline (m, 7), dense enough for checks."""
     return np.concatenate([a + (b - a) * _fractions(a, b)[:, None] for a, b in pairwise(points)])
 
 

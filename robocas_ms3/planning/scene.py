@@ -35,7 +35,6 @@ def shape_of(part: Part) -> Shape:
 
 
 def _size(part: Part) -> float:
-    """Return how far a part reaches from its frame's origin, m."""
     return max(math.sqrt(np.einsum("ij,ij->i", hull, hull).max()) for hull in part.hulls)
 
 
@@ -46,7 +45,7 @@ def seen_from(obstacles_in_world: Iterable[Obstacle], arm_base_in_world: Array) 
 
 
 class PlanningScene:
-    """Reads one environment (``num_envs`` = 1) as a planner sees it. All poses and clouds are in the arm's base frame.
+    """Reads one environment (``num_envs`` = 1) as a planner sees it: poses (4x4) and clouds in the arm's base frame.
 
     Bodies (`obstacles`) are for planners, clouds (`obstacles_in_base`) for whatever reasons about surfaces.
     """
@@ -57,7 +56,7 @@ class PlanningScene:
     def _bodies(
         self, left_out: Collection[int], without_link: tuple[str, str] | None
     ) -> Iterator[tuple[str, Part, float, Array]]:
-        """Name, part, spacing of its samples (m) and pose in the world (4x4) of all that is there."""
+        """Yield name, part, spacing of its samples (m) and pose in the world (4x4) of all that is there."""
         for name, asset in self.env.model.furniture.items():
             frame = self.env.model.furniture_poses[name]
             yield name, asset, FURNITURE_SPACING, frame
@@ -77,7 +76,6 @@ class PlanningScene:
             part.surface_points(spacing)
 
     def joint_positions(self, furniture: str) -> dict[str, float]:
-        """Return the positions of a piece of furniture's joints by name, m or rad."""
         built = self.env.fixtures.furniture[furniture]
         if not isinstance(built, Articulation):
             return {}
@@ -96,7 +94,6 @@ class PlanningScene:
         return self.env.agent.robot.get_qpos()[0, self.env.agent.description.arm_slice].cpu().numpy().astype(float)
 
     def object_in_base(self, slot: int) -> Array:
-        """Return the pose (4x4) of an object in the arm's base frame."""
         return inverse(self.arm_base_in_world) @ from_wxyz(self.env.object_states[0, slot, :7])
 
     def object_surface(self, slot: int) -> Array:

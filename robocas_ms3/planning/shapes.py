@@ -29,8 +29,7 @@ class Pieces:
     """The convex pieces of a shape.
 
     Attributes:
-        geometries: FCL geometry of each piece.
-        vertices: (V, 3) vertices of all pieces, in the shape's frame, m.
+        vertices: (V, 3) of all pieces, in the shape's frame, m.
         first: (H,) index of each piece's first vertex.
         spares: unused FCL objects of each piece. They are kept, because python-fcl leaks memory with each object.
     """
@@ -60,7 +59,6 @@ class CollisionShapes:
         return self._remember(points, self._tree)
 
     def hull(self, vertices: Array) -> Pieces:
-        """Return the convex hull of points (V, 3), without a margin."""
         return self._remember(np.ascontiguousarray(vertices, dtype=np.float64), self._hull)
 
     def _pieces(self, shape: Shape, room: float) -> Pieces:
@@ -84,7 +82,6 @@ class CollisionShapes:
         return Pieces([fcl_convex(corners, faces)], corners, np.zeros(1, dtype=int))
 
     def _remember(self, points: Array, make: Callable[[Array], Pieces]) -> Pieces:
-        """Return the pieces built from points, from the cache where they are recent."""
         key = hashlib.blake2b(points.data).digest() + make.__name__.encode()
         made = self._recent.pop(key, None) or make(points)
         self._recent[key] = made
@@ -94,7 +91,6 @@ class CollisionShapes:
 
 
 def fcl_convex(corners: Array, faces: NDArray[np.integer]) -> Any:
-    """Build FCL's convex geometry from the corners (V, 3) and triangles (F, 3) of a hull."""
     counted = np.concatenate([np.full((len(faces), 1), 3), faces], axis=1)  # each polygon starts with its size
     return fcl.Convex(np.ascontiguousarray(corners, dtype=np.float64), len(faces), counted.ravel().tolist())
 

@@ -1,4 +1,4 @@
-"""A table scene of known boxes, and a checker of trajectories that shares no code with the planner."""
+"""A table scene of known boxes, and the arm's kinematics and shapes, read by code of its own."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from xml.etree import ElementTree
 
 import numpy as np
 import trimesh
-from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 REST = np.array([0, -1.02, 0, -2.51, 0, 1.35, 0.78])
@@ -39,11 +38,6 @@ class Box:
                 faces.append(face)
         return np.concatenate(faces) @ self.matrix().T + np.array(self.center)
 
-    def depth(self, points: np.ndarray) -> float:
-        """How deep the deepest of points (P, 3) lies inside, m; 0 when none does."""
-        inside = (np.array(self.size) / 2 - np.abs(_in_box(self, points))).min(axis=1)
-        return float(max(0.0, inside.max()))
-
 
 def table_scene(seed: int, count: int = 15) -> list[Box]:
     """A table top 4 cm below the arm's base and boxes on it."""
@@ -61,9 +55,9 @@ def cloud(boxes: list[Box], spacing: float = 0.005) -> np.ndarray:
 
 
 class Checker:
-    """Forward kinematics and penetration depths straight from the URDF's geometry."""
+    """Forward kinematics and collision shapes straight from the URDF."""
 
-    def __init__(self, urdf: Path, samples: int = 100) -> None:
+    def __init__(self, urdf: Path) -> None:
         root = ElementTree.parse(urdf).getroot()
         self._joints = {}
         for joint in root.iterfind("joint"):
@@ -76,8 +70,6 @@ class Checker:
                 np.array([float(v) for v in axis.attrib["xyz"].split()]) if axis is not None else np.zeros(3),
             )
         self.parts: list[tuple[str, np.ndarray]] = []  # link, and vertices of a convex part in its frame
-        self.surfaces: dict[str, list[np.ndarray]] = {}
-        self._hulls: dict[str, list[np.ndarray]] = {}
         for link in root.iterfind("link"):
             name = link.attrib["name"]
             for collision in link.iterfind("collision"):
@@ -88,10 +80,7 @@ class Checker:
                 else:
                     mesh = trimesh.load(urdf.parent / f"{shape.find('mesh').attrib['filename']}.convex.stl")
                 mesh.apply_transform(_origin(collision))
-                sampled, _ = trimesh.sample.sample_surface(mesh, samples, seed=0)
                 self.parts.append((name, np.asarray(mesh.vertices)))
-                self.surfaces.setdefault(name, []).append(np.concatenate([mesh.vertices, sampled]))
-                self._hulls.setdefault(name, []).append(ConvexHull(mesh.vertices).equations)
 
     def poses(self, link: str, qpos: np.ndarray, finger: float = 0.04) -> np.ndarray:
         """Poses (T, 4, 4) of a link at configurations (T, 7)."""
@@ -107,36 +96,6 @@ class Checker:
 
     def link_pose(self, link: str, qpos: np.ndarray) -> np.ndarray:
         return self.poses(link, np.asarray(qpos)[None])[0]
-
-    def penetration(self, trajectory: np.ndarray, boxes: list[Box]) -> float:
-        """Depth (m) of the worst contact of configurations (T, 7) with boxes: link points in boxes, and the reverse."""
-        worst = 0.0
-        for link, surfaces in self.surfaces.items():
-            if link in ("panda_link0", "base_link"):
-                continue
-            poses, local = self.poses(link, trajectory), np.concatenate(surfaces)
-            radius = np.linalg.norm(local, axis=1).max()
-            for box in boxes:
-                gap = np.linalg.norm(
-                    np.maximum(np.abs(_in_box(box, poses[:, :3, 3])) - np.array(box.size) / 2, 0), axis=1
-                )
-                rows = poses[gap < radius]
-                if len(rows) == 0:
-                    continue
-                points = local @ rows[:, :3, :3].transpose(0, 2, 1) + rows[:, None, :3, 3]
-                worst = max(worst, box.depth(points.reshape(-1, 3)))
-                surface = box.surface(0.01)
-                for row in rows[::20]:
-                    back = (surface - row[:3, 3]) @ row[:3, :3]
-                    back = back[np.all((back >= local.min(0)) & (back <= local.max(0)), axis=1)]
-                    for planes in self._hulls[link] if len(back) else ():
-                        depth = (-(back @ planes[:, :3].T + planes[:, 3])).min(axis=1).max()
-                        worst = max(worst, float(depth))
-        return worst
-
-
-def _in_box(box: Box, points: np.ndarray) -> np.ndarray:
-    return (points - np.array(box.center)) @ box.matrix()
 
 
 def _origin(element: ElementTree.Element) -> np.ndarray:

@@ -154,9 +154,13 @@ def test_a_damaged_description_is_refused(files, name, old, new):
 
 def test_boxes_hold_the_real_fingers_and_hand(panda_files, checker):
     """Every collision shape of the open left finger and of the hand lies in the boxes, to 1.5 mm."""
+
+    def vertices(link):
+        return np.concatenate([of for name, of in checker.parts if name == link])
+
     tcp_in_hand = MOBILE_PANDA.stock_tcp_in_hand + MOBILE_PANDA.finger_extension
-    finger = np.concatenate(checker.surfaces["panda_leftfinger"]) + [0, MOBILE_PANDA.open_finger, 0.0584 - tcp_in_hand]
-    hand = np.concatenate(checker.surfaces["panda_hand"]) - [0, 0, tcp_in_hand]
+    finger = vertices("panda_leftfinger") + [0, MOBILE_PANDA.open_finger, 0.0584 - tcp_in_hand]
+    hand = vertices("panda_hand") - [0, 0, tcp_in_hand]
     points = np.concatenate([finger, hand]) * [1, 1, 1]
     points[:, 1] = np.abs(points[:, 1])
     gaps = [

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from robocas_ms3.planning.path_search import PathSearch
 
@@ -62,15 +61,3 @@ def test_several_goals_end_at_one_of_them():
     path = search().connect(START, [GOAL, np.array([-1.0, 1.0])], np.random.default_rng(0), max_checks=20000)
     assert path is not None
     np.testing.assert_array_equal(path[-1], [-1.0, 1.0])  # on this side of the wall
-
-
-@pytest.mark.parametrize("count", [1, 7, 100])
-def test_edges_are_checked_everywhere_and_sparsely_first(count):
-    looked_at = []
-    finder = search(lambda q: looked_at.append(q[0]) or True, spacing=0.01)
-    finder.connect(START, [START.copy()], np.random.default_rng(0), max_checks=1000)  # gives it a budget
-    looked_at.clear()
-    assert finder.edge_free(np.zeros(2), np.array([0.01 * count - 1e-6, 0]))
-    assert sorted(looked_at) == pytest.approx(0.01 * np.arange(1, count + 1), abs=1e-5)
-    if count == 100:
-        assert looked_at[:12] == pytest.approx(0.08 * np.arange(1, 13), abs=1e-5)

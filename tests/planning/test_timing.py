@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robocas_ms3.planning.timing import blended, rounded, sampled, stopping, thinned, through, timed
+from robocas_ms3.planning.timing import rounded, sampled, stopping, through, timed
 
 LIMITS = {"velocity": 0.5, "acceleration": 0.5}
 
@@ -82,17 +82,3 @@ def test_spline_through_a_smooth_motion_stays_on_it():
     trajectory = timed(path, dt=0.05, **LIMITS)
     assert trajectory is not None
     np.testing.assert_array_equal(trajectory.qpos[-1], [np.sin(1.0), np.cos(1.0)])
-
-
-def test_blended_motions_cut_the_corner_between_them():
-    first = np.array([[1.0, 0], [2, 0], [3, 0]])  # along x, then along y
-    second = np.array([[3.0, 1], [3, 2], [3, 3]])
-    assert blended(first, second, 0).tolist() == [*first.tolist(), *second.tolist()]
-    # the last two rows of the first, moved by what the second does meanwhile: (0, 1), then (0, 2)
-    assert blended(first, second, 2).tolist() == [[1, 0], [2, 1], [3, 2], [3, 3]]
-
-
-def test_thinned_points_keep_their_ends_and_a_distance():
-    points = np.column_stack([[0, 0.001, 0.002, 0.1, 0.2, 0.21, 0.3], np.zeros(7)])
-    assert thinned(points, 0.1)[:, 0].tolist() == [0, 0.1, 0.2, 0.3]
-    assert thinned(points[:2], 0.1).tolist() == points[:2].tolist()

@@ -26,7 +26,6 @@ _ENTRY = "the JSON's entry"
 
 @cache  # it reads the packages' descriptions
 def versions() -> dict[str, str]:
-    """Return the versions of the packages that an episode depends on."""
     return {name: version(name) for name in ("robocas-ms3", "mani_skill", "sapien", "python-fcl", "torch", "numpy")}
 
 
@@ -124,7 +123,6 @@ class Entry:
 
 
 def read_entry(episode: Mapping[str, Any], where: object) -> Entry:
-    """Return what a trajectory's JSON says of an episode."""
     found = parse(EpisodeRecord, episode, DatasetError, where=where, about=_ENTRY)
     goals = found.robocas.subgoals
     steps = found.elapsed_steps

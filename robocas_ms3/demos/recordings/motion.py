@@ -167,7 +167,6 @@ class Motion:
 
     @cached_property
     def tcp_in_base(self) -> Array:
-        """(T, 4, 4)."""
         return inverse(self.arm_base_in_world) @ self.tcp_in_world
 
     @cached_property
@@ -187,7 +186,6 @@ class Motion:
 
     @property
     def agv_motion(self) -> Array:
-        """(T, 3), see `planar_motion`."""
         return planar_motion(self.agv_pose)
 
     @property

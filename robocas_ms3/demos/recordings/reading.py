@@ -40,7 +40,6 @@ class Recording(Entry):
     robot: RobotSpec
 
     def motion(self, samples: NDArray[np.int64]) -> Motion:
-        """Return the robot's motion at some of the states, in order."""
         commands = gripper_commands(self.actions, self.control_mode)
         return Motion.of(self.robot, self.states["articulations"][self.robot.description.uid], commands, samples)
 
@@ -116,7 +115,6 @@ class TrajectoryFile:
         return {**self.__dict__, "_file": None}
 
     def entry(self, index: int) -> Entry:
-        """Return the JSON's entry of an episode, by its position in ``episodes``."""
         return read_entry(self.episodes[index], self._where(index))
 
     def recording(self, index: int, *, bodies: bool = True) -> Recording:

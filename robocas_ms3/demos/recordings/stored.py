@@ -111,7 +111,6 @@ def copy_episode(source: h5py.File, number: int, target: h5py.File, new_number: 
 
 
 def read_actions(episode: h5py.Group) -> NDArray[np.float32]:
-    """Return the actions (S, A) of an episode."""
     where = _where(episode)
     with readable(where):
         actions = np.asarray(_read(_found(episode["actions"], 0)), np.float32)

@@ -51,7 +51,6 @@ class SubGoals(BaseModel):
 
 
 def read_subgoals(entries: Any, where: object) -> list[SubGoal]:
-    """Read sub-goals from a list of JSON."""
     return parse(SubGoals, {"subgoals": entries}, DatasetError, where=where, about="damaged sub-goals").subgoals
 
 

@@ -74,7 +74,7 @@ class EpisodeRecorder(gym.Wrapper):
         return self._base_env.bodies.split(np.stack(self._steps.states))
 
     def finish(self, episode: dict[str, Any]) -> None:
-        """Write the episode, with ``robocas`` metadata (instruction, target, sub-goals); the environment stays open."""
+        """Write the episode with its ``robocas`` metadata; the environment stays open."""
         steps, env = self._steps, self._base_env
         terminated, truncated, success, fail = np.array(steps.flags, bool).reshape(-1, 4).T
 
@@ -137,7 +137,6 @@ class _Steps:
 
 
 def _of_one_env(data: Any) -> Any:
-    """Return nested tensors (1, ...) as arrays (...) of their own."""
     if isinstance(data, dict):
         return {key: _of_one_env(value) for key, value in data.items()}
     return common.to_numpy(data)[0].copy()

@@ -66,7 +66,6 @@ class Arm:
         self.rng = np.random.default_rng(entropy)
 
     def choose(self, candidates: Iterable[T], play: Callable[[T], float], effort: Effort = ONE_BY_ONE) -> T:
-        """Decide between candidates; see ``Decisions.choose``."""
         path = self.path
 
         def play_one(numbered: tuple[int, T]) -> float:
@@ -83,7 +82,7 @@ class Arm:
 
     @property
     def env(self) -> RoboCASEnv:
-        """The environment under its wrappers: control mode ``pd_joint_pos``, one env."""
+        """Control mode ``pd_joint_pos``, one env."""
         return self.executor.base_env
 
     @property
@@ -92,25 +91,20 @@ class Arm:
 
     @property
     def target(self) -> int:
-        """Slot of the target."""
         return int(self.env.target_slot[0])
 
     @property
     def approach(self) -> Approach:
-        """From where the target is grasped."""
         return self.env.task_config.target.approach
 
     def begin_subgoal(self, goal_type: str) -> None:
-        """Label the actions that follow, see ``Executor.label``."""
         words = self.env.target_asset().asset.name, self.env.task_config.support
         self.executor.label(**subgoal(goal_type, *words))
 
     def planning(self):
-        """Count the time spent inside as planning."""
         return self.executor.seconds.spent_on("planning")
 
     def follow(self, *motions: Trajectory, until: str | None = None) -> bool:
-        """Run motions one after the other; see ``Executor.follow``."""
         reached = True
         for motion in motions:
             reached = self.executor.follow(motion, until=until)
@@ -135,7 +129,6 @@ class Arm:
     def first_line(
         self, start: Array, goals: Iterable[Array], *, stage: str, check_collisions: bool = True
     ) -> Trajectory:
-        """Plan a straight line to the first of several poses that can be reached on one."""
         return first_plan(
             goals,
             lambda goal: self.planner.plan_straight(start, goal, stage=stage, check_collisions=check_collisions),

@@ -49,14 +49,12 @@ class Heap:
 
     @property
     def env(self) -> RoboCASSearchEnv:
-        """The environment under its wrappers."""
         env = self.arm.env
         assert isinstance(env, RoboCASSearchEnv)
         return env
 
     @property
     def moves_made(self) -> int:
-        """Since the reset."""
         return sum(self.arm.executor.facts[fact] for fact in FACTS)
 
     @property
@@ -72,7 +70,6 @@ class Heap:
 
     @property
     def cleared(self) -> bool:
-        """Whether it is, and the gripper's camera sees it."""
         return self.uncovered and self.visible
 
     def moves(self) -> Iterator[Move]:
@@ -136,5 +133,4 @@ class Heap:
             raise PlanningFailed("clear", "at_the_edge")
 
     def middle(self, slot: int) -> Array:
-        """Return the middle (3,) of an object's surface."""
         return self.arm.scene.object_surface(slot).mean(axis=0)

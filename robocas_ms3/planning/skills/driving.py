@@ -47,7 +47,6 @@ def surroundings(arm: Arm, *, without: int | tuple[()] = ()) -> Surroundings:
 
 
 def base_at(arm: Arm) -> Array:
-    """Return the last commanded base pose (3,)."""
     return np.array(arm.executor.base, dtype=float)
 
 

@@ -162,7 +162,6 @@ def _clear(tcp_in_base: Array, order: NDArray[np.int_], points_in_base: Array) -
 def _plan_way_in_and_out(
     arm: Arm, slot: int, qpos: Array, tcp_in_base: Array, lift_height: float
 ) -> tuple[Trajectory, Out]:
-    """Plan straight from a pre-grasp configuration (7,) to a grasp, and out with the object."""
     inward = arm.planner.plan_straight(qpos, tcp_in_base, stage="approach")
     if arm.approach == "top":
         return inward, (arm.first_line(inward.qpos[-1], _ways_up(tcp_in_base, lift_height), stage="lift"),)

@@ -94,7 +94,6 @@ class Part:
         return Obstacle(self.handle.link, shape_of(part), pose_in_base)
 
     def surface(self, arm: Arm) -> Array:
-        """Return samples (P, 3) of the part's surface in its own frame, m."""
         return arm.env.model.furniture[self.furniture].links[self.handle.link].surface_points(SPACING)
 
     @property
@@ -117,7 +116,6 @@ class Part:
 
 
 def open_part(arm: Arm) -> None:
-    """Open what the task wants opened, by as many pulls as it takes."""
     part = Part.of(arm)
     for _ in range(PULLS):
         pull(arm, part)

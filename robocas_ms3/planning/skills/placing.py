@@ -34,7 +34,6 @@ class Inside:
 
 
 def carry_to_basket(arm: Arm, slot: int) -> None:
-    """Carry a held object to where it hangs above the basket."""
     with arm.planning():
         motion = plan_carry(arm, slot)
     arm.follow(motion)

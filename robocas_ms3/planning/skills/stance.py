@@ -125,7 +125,6 @@ def drive_to_handle(arm: Arm, *, elsewhere: bool = False) -> None:
 
 
 def bring_to_basket(arm: Arm, slot: int) -> None:
-    """Carry a held object to the basket, let go of it above it, step back."""
     arm.begin_subgoal("transfer object")
     drive_to_basket(arm, slot)
     carry_to_basket(arm, slot)
@@ -165,7 +164,6 @@ def drive_to_basket(arm: Arm, slot: int) -> None:
 
 
 def _fold(arm: Arm) -> Surroundings:
-    """Move to the rest configuration; return the surroundings."""
     with arm.planning():
         arm.planner.set_scene(arm.scene.obstacles())
         home = arm.plan_home(arm.at)
