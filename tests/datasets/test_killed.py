@@ -1,5 +1,6 @@
 """Commands that write datasets, killed at any moment: the same command again makes what an undisturbed one makes."""
 
+import importlib.util
 import shutil
 import signal
 import subprocess
@@ -15,6 +16,7 @@ from robocas_ms3.datasets.writing import convert as conversion
 
 DYING = Path(__file__).parents[1] / "support" / "dying.py"
 CONVERT = ("convert", "F.h5", "--no-embeddings")
+LEROBOT = ("convert", "F.h5", "--to", "lerobot")
 MERGE = ("merge", "a", "b")
 IMPORT = ("import-robocas", "upstream")
 
@@ -33,6 +35,10 @@ def inputs(trajectory, tmp_path_factory):
 @pytest.fixture(autouse=True)
 def made_up_images(monkeypatch):
     monkeypatch.setattr(conversion, "convert", render_by(RayCaster, conversion.convert))
+    if importlib.util.find_spec("av") and importlib.util.find_spec("pyarrow"):
+        from robocas_ms3.datasets.lerobot import convert as lerobot
+
+        monkeypatch.setattr(lerobot, "convert_lerobot", render_by(RayCaster, lerobot.convert_lerobot))
 
 
 @pytest.mark.parametrize(
@@ -41,11 +47,15 @@ def made_up_images(monkeypatch):
         (CONVERT, "picture"),  # of the second episode; the preview of the first is whole
         *(((*CONVERT, "--no-video"), moment) for moment in ("arrays", "rename", "convert overview", "rmtree")),
         *((MERGE, moment) for moment in ("file", "rename", "merge overview")),
+        *((LEROBOT, moment) for moment in ("frame", "join", "table", "folders", "joined", "parts")),
         *((IMPORT, moment) for moment in ("file", "import overview")),
     ],
     ids=lambda value: value if isinstance(value, str) else value[0],
 )
 def test_the_same_command_again_makes_the_same(inputs, tmp_path, monkeypatch, words, moment):
+    if words == LEROBOT:
+        pytest.importorskip("av", reason="needs the extra 'lerobot'")
+        pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
     monkeypatch.chdir(inputs)
     whole, out = tmp_path / "whole", tmp_path / "out"
     assert run([*words, "--out", str(whole)]) == 0

@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+from pathlib import Path
 
 from synthetic import RayCaster, render_by
 
@@ -23,6 +24,21 @@ PLACES = {  # moment -> (module, function, which call is the last)
 }
 
 
+def lerobot_places():
+    from robocas_ms3.datasets.lerobot import convert as lerobot
+    from robocas_ms3.datasets.lerobot import video, writer
+
+    lerobot.convert_lerobot = render_by(RayCaster, lerobot.convert_lerobot)
+    return {
+        "frame": (video.Encoder, "add", 50),  # in the second episode
+        "join": (video.Joiner, "add", 7),
+        "table": (writer.RollingTable, "add", 4),
+        "folders": (lerobot.os, "replace", 3),  # plan, data, videos: the third
+        "joined": (Path, "rmdir", 1),
+        "parts": (lerobot.shutil, "rmtree", 1),
+    }
+
+
 def die_at(module, name, last):
     whole, calls = getattr(module, name), []
 
@@ -36,6 +52,8 @@ def die_at(module, name, last):
 
 
 if __name__ == "__main__":
+    if "lerobot" in sys.argv:
+        PLACES |= lerobot_places()
     die_at(*PLACES[sys.argv[1]])
     convert.convert = render_by(RayCaster, convert.convert)
     sys.exit(run(sys.argv[2:]))

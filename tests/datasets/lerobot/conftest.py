@@ -5,18 +5,21 @@ import shutil
 import pytest
 from lerobot_folders import convert
 
-
-@pytest.fixture(scope="module")
-def lerobot(trajectory, tmp_path_factory):
-    """A dataset of two episodes, for reading only."""
-    out = tmp_path_factory.mktemp("lerobot") / "dataset"
-    convert(trajectory, out)
-    return out
+from robocas_ms3.datasets.lerobot.variants import VARIANTS
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
+def versions(trajectory, tmp_path_factory):
+    """A dataset of three episodes of each version, of which the second failed; for reading only."""
+    root = tmp_path_factory.mktemp("versions")
+    for version in VARIANTS:
+        convert(trajectory, root / version, include_failed=True, lerobot_version=version)
+    return root
+
+
+@pytest.fixture(scope="session")
 def valid(trajectory, tmp_path_factory):
-    """A dataset of version 0.5 with one camera, for reading only."""
+    """A dataset of version 0.5 of two episodes with one camera, for reading only."""
     out = tmp_path_factory.mktemp("checked") / "dataset"
     convert(trajectory, out, cameras=("base_camera",), lerobot_version="0.5")
     return out

@@ -1,181 +1,86 @@
+"""Conversions to LeRobot: what they take, refuse and continue."""
+
 import json
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from lerobot_folders import convert, files_of
+from managing import arrays_of, change, edit, make
 from synthetic import RayCaster, write_trajectory
 
 pytest.importorskip("av", reason="needs the extra 'lerobot'")
-pq = pytest.importorskip("pyarrow.parquet", reason="needs the extra 'lerobot'")
+pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
 
 from robocas_ms3.cli import main
-from robocas_ms3.core.errors import DatasetError, OutputExistsError, RobocasError
+from robocas_ms3.core.errors import DatasetError, IncompleteError, OutputExistsError, RobocasError
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check import check_lerobot
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
-from robocas_ms3.datasets.lerobot.schema import FileLimits
+from robocas_ms3.datasets.manage.importing import import_robocas
+from robocas_ms3.datasets.manage.splitting import Share, resplit
+from robocas_ms3.datasets.manage.survey import survey
 from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.datasets.sources.tolerant import arrays_fingerprint
-from robocas_ms3.datasets.writing.inputs import open_input
 from robocas_ms3.datasets.writing.settings import ConversionSettings
-
-
-def test_the_folder_of_version_0_6(lerobot):
-    expected = {
-        "meta/info.json",
-        "meta/stats.json",
-        "meta/tasks.parquet",
-        "meta/episodes/chunk-000/file-000.parquet",
-        "meta/robocas/conversion.json",
-        "meta/robocas/episodes.parquet",
-        "meta/robocas/checksums.json",
-        "data/chunk-000/file-000.parquet",
-    }
-    for camera in ("base", "gripper", "static"):
-        expected.add(f"videos/observation.images.{camera}_camera/chunk-000/file-000.mp4")
-        expected.add(f"videos/observation.images.{camera}_camera_depth/chunk-000/file-000.mp4")
-    for number in (0, 1):
-        expected |= {f".annotate_staging/episode_{number:06d}/{name}.jsonl" for name in ("plan", "vqa")}
-    assert set(files_of(lerobot)) == expected
-    info = json.loads((lerobot / "meta/info.json").read_text())
-    assert info["codebase_version"] == "v3.0"
-    assert (info["fps"], info["total_episodes"], info["total_frames"], info["total_tasks"]) == (5, 2, 14, 2)
-    assert info["splits"] == {"train": "0:2"}
-    video = info["features"]["observation.images.base_camera"]
-    assert (video["dtype"], video["shape"], video["info"]["video.codec"]) == ("video", [48, 64, 3], "h264")
-    # Every column but the videos, in the features' order, of their types: `datasets` casts by them.
-    table = pq.read_table(lerobot / "data/chunk-000/file-000.parquet")
-    assert table.column_names == [key for key, ft in info["features"].items() if ft["dtype"] != "video"]
-    assert str(table.schema.field("action").type) == "fixed_size_list<element: float>[7]"
-    assert table.column("index").to_pylist() == list(range(14))
-    assert table.column("frame_index").to_pylist() == [*range(7), *range(7)]
-    np.testing.assert_allclose(table.column("timestamp").to_pylist()[:7], np.arange(7) / 5, atol=1e-6)
-
-
-def test_texts_of_version_0_5(trajectory, tmp_path):
-    convert(trajectory, tmp_path / "out", lerobot_version="0.5")
-    dataset = LeRobotDataset(tmp_path / "out")
-    instructions = [f"grasp the cube {seed} on the table and move it to the basket" for seed in (3, 5)]
-    assert dataset.tasks == instructions
-    assert [row["tasks"] for row in dataset.rows] == [[text] for text in instructions]
-    columns = dataset.episode(1).columns
-    assert columns["task_index"].ravel().tolist() == [1] * 7
-    subgoals = [dataset.subtasks[i] for i in columns["subtask_index"][:, 0]]
-    assert subgoals == ["grasp the cube 5 on the table"] * 3 + ["Drop the cube 5 into the basket"] * 4
-    types = dataset.episode(1).table.column("subgoal_type").to_pylist()
-    assert types == ["move and grasp"] * 3 + ["transfer object"] * 4
 
 
 def test_from_a_folder_as_from_the_trajectory(trajectory, made, tmp_path):
     """Nothing is rendered the second time, and it is the same but for where it comes from."""
-    lerobot, out = tmp_path / "lerobot", tmp_path / "out"
-    convert(trajectory, lerobot, lerobot_version="0.5")
-    convert_lerobot(ConversionSettings(made, out, open_renderer=None, lerobot_version="0.5"))  # type: ignore[arg-type]
-    before, after = files_of(lerobot), files_of(out)
-    different = {name for name in before if before[name] != after.get(name)}
-    assert different == {"meta/robocas/conversion.json", "meta/robocas/episodes.parquet"}
+    convert(trajectory, tmp_path / "lerobot", lerobot_version="0.5")
+    convert_lerobot(ConversionSettings(made, tmp_path / "out", lerobot_version="0.5"))
+    before, after = files_of(tmp_path / "lerobot"), files_of(tmp_path / "out")
     assert set(before) == set(after)
-    assert LeRobotDataset(out).episode(1).scene == Dataset(made).episode(1).scene
-
-
-def test_and_back(made, tmp_path):
-    convert(made, tmp_path / "out", codec="av1")
-    dataset, source = LeRobotDataset(tmp_path / "out"), Dataset(made)
-    assert dataset.info["features"]["observation.images.base_camera"]["info"]["video.codec"] == "av1"
-    for number in source.numbers:
-        ours, theirs = dataset.episode(number), source.episode(number)
-        for key, values in ours.arrays.items():
-            if values.dtype.kind == "f":
-                np.testing.assert_allclose(values, theirs.arrays[key], atol=1e-6, err_msg=key)
-            else:
-                np.testing.assert_array_equal(values, theirs.arrays[key], err_msg=key)
-        for key in ("ee_pos", "ee_orn", "robot_joints", "arm_joint_vel", "base_pos", "agv_pose", "rel_pos"):
-            np.testing.assert_array_equal(ours.arrays[key], theirs.arrays[key], err_msg=key)
-        for camera in ours.cameras:
-            np.testing.assert_array_equal(ours.intrinsic(camera), theirs.intrinsic(camera))
-            np.testing.assert_array_equal(ours.camera_in_parent(camera), theirs.camera_in_parent(camera))
-            for step in (0, 3, 6):  # bit for bit, whatever the order
-                within = np.minimum(theirs.depth(camera, step), schema.MAX_DEPTH_MM)
-                np.testing.assert_array_equal(ours.depth(camera, step), within)
-                difference = np.abs(ours.rgb(camera, step).astype(int) - theirs.rgb(camera, step))
-                assert difference.mean() < 6  # the made-up pictures are all edges; subsampled colours bleed there
-        shown = np.stack(list(ours.frames("base_camera", "depth")))
-        assert shown.shape == (7, 48, 64)
-        assert shown.dtype == np.uint16
-
-
-def test_depth_of_all_16_bits(trajectory, tmp_path):
-    noise = np.random.default_rng(0).integers(0, 65536, (7, 48, 64), np.uint16)
-
-    class Noisy(RayCaster):
-        def frames(self, recording, samples):
-            for step, frame in enumerate(super().frames(recording, samples)):
-                frame.depth["gripper_camera"][:] = noise[step]
-                yield frame
-
-    convert_lerobot(ConversionSettings(trajectory, tmp_path / "out", open_renderer=Noisy, lerobot_version="0.5"))
-    found = LeRobotDataset(tmp_path / "out").episode(1)
-    np.testing.assert_array_equal(np.stack(list(found.frames("gripper_camera", "depth"))), noise)
+    different = {name for name in before if before[name] != after[name]}
+    assert different == {"meta/robocas/conversion.json", "meta/robocas/episodes.parquet"}
+    assert LeRobotDataset(tmp_path / "out").episode(1).scene == Dataset(made).episode(1).scene
 
 
 def test_each_video_frame_is_that_of_its_step(trajectory, tmp_path):
-    """The grey level is the number of the frame: joining must neither drop, double nor shift one."""
+    """Grey levels are numbers of frames: joining must neither drop, double nor shift one. Depth has all 16 bits."""
+    noise = np.random.default_rng(0).integers(0, 65536, (7, 48, 64), np.uint16)
 
     class Grey(RayCaster):
         def frames(self, recording, samples):
             for step, frame in enumerate(super().frames(recording, samples)):
                 frame.rgb["base_camera"][:] = 20 * step + 10 * recording.seed
+                frame.depth["base_camera"][:] = noise[step]
                 yield frame
 
-    out = tmp_path / "out"
-    convert_lerobot(
-        ConversionSettings(trajectory, out, open_renderer=Grey, include_failed=True, cameras=("base_camera",))
-    )
-    dataset = LeRobotDataset(out)
+    settings = {"include_failed": True, "cameras": ("base_camera",), "lerobot_version": "0.5"}
+    convert_lerobot(ConversionSettings(trajectory, tmp_path / "out", open_renderer=Grey, **settings))
     for number, seed in enumerate((3, 4, 5)):
+        episode = LeRobotDataset(tmp_path / "out").episode(number)
         for step in (6, 0, 5, 2):
-            level = dataset.episode(number).rgb("base_camera", step).mean()
-            assert abs(level - (20 * step + 10 * seed)) < 4
+            assert abs(episode.rgb("base_camera", step).mean() - (20 * step + 10 * seed)) < 4
+        np.testing.assert_array_equal(np.stack(list(episode.frames("base_camera", "depth"))), noise)
 
 
-def test_statistics_are_those_of_the_data(lerobot):
-    stats = json.loads((lerobot / "meta/stats.json").read_text())
-    dataset = LeRobotDataset(lerobot)
-    action = np.concatenate([dataset.episode(i).columns["action"] for i in (0, 1)])
-    np.testing.assert_allclose(stats["action"]["mean"], action.mean(axis=0), atol=1e-6)
-    np.testing.assert_allclose(stats["action"]["std"], action.std(axis=0), atol=1e-6)
-    np.testing.assert_allclose(stats["action"]["max"], action.max(axis=0))
-    assert stats["action"]["count"] == [14]
-    assert stats["observation.images.base_camera"]["count"] == [14]
-    frames = np.stack([frame for i in (0, 1) for frame in dataset.episode(i).frames("base_camera")])
-    mean = np.array(stats["observation.images.base_camera"]["mean"]).reshape(3)
-    np.testing.assert_allclose(mean, frames.mean(axis=(0, 1, 2)) / 255, atol=0.02)
-    rows = pq.read_table(lerobot / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
-    first = dataset.episode(0).columns["action"]
-    np.testing.assert_allclose(rows[0]["stats/action/mean"], first.mean(axis=0), atol=1e-6)
-    assert rows[0]["stats/action/count"] == [7]
+def test_depth_out_of_range_is_reported_once(trajectory, tmp_path, caplog):
+    convert(trajectory, tmp_path / "out")  # its room is 5 m deep
+    said = [record.getMessage() for record in caplog.records if "depth" in record.getMessage()]
+    assert said == ["2 episodes: depth above 4095 mm is stored as 4095 mm"]
 
 
 def test_files_roll_over_at_their_limits(trajectory, tmp_path, monkeypatch):
-    out = tmp_path / "out"
-    limits = "robocas_ms3.datasets.lerobot.convert.FILE_LIMITS"
-    monkeypatch.setattr(limits, FileLimits(data_mb=1e-6, video_mb=100, video_seconds=14 / 5))
-    convert(trajectory, out, include_failed=True)
-    dataset = LeRobotDataset(out)
-    assert [row["data/file_index"] for row in dataset.rows] == [0, 1, 2]
-    assert [row["videos/observation.images.base_camera/file_index"] for row in dataset.rows] == [0, 0, 1]
-    depth = "videos/observation.images.base_camera_depth"
-    assert [row[f"{depth}/from_timestamp"] for row in dataset.rows] == [0, 1.4, 0]
-    assert [row["meta/episodes/file_index"] for row in dataset.rows] == [0, 0, 0]
-    assert check_lerobot(out).violations == []
-    by_size = tmp_path / "by_size"
-    monkeypatch.setattr(limits, FileLimits(video_mb=1e-6))
-    convert(trajectory, by_size, include_failed=True)
-    assert [row[f"{depth}/file_index"] for row in LeRobotDataset(by_size).rows] == [0, 1, 2]
-    assert check_lerobot(by_size).violations == []
+    limits, depth = "robocas_ms3.datasets.lerobot.convert.FILE_LIMITS", "videos/observation.images.base_camera_depth"
+    for name, given, places in (
+        ("seconds", schema.FileLimits(data_mb=1e-6, video_mb=100, video_seconds=14 / 5), ([0, 1, 2], [0, 0, 1])),
+        ("size", schema.FileLimits(video_mb=1e-6), ([0, 0, 0], [0, 1, 2])),
+    ):
+        monkeypatch.setattr(limits, given)
+        convert(trajectory, tmp_path / name, include_failed=True)
+        rows = LeRobotDataset(tmp_path / name).rows
+        for key, expected in zip(("data", "videos/observation.images.base_camera"), places, strict=True):
+            assert [row[f"{key}/file_index"] for row in rows] == expected
+        starts = [0, 1.4, 0] if name == "seconds" else [0, 0, 0]
+        assert [row[f"{depth}/from_timestamp"] for row in rows] == starts
+        assert [row["meta/episodes/file_index"] for row in rows] == [0, 0, 0]
+        assert check_lerobot(tmp_path / name).violations == []
 
 
 def test_fewer_pictures_and_another_rate(trajectory, tmp_path):
@@ -189,39 +94,39 @@ def test_fewer_pictures_and_another_rate(trajectory, tmp_path):
     assert check_lerobot(out).violations == []
 
 
-def fails(match, source, out, kind=RobocasError, **kwargs):
-    with pytest.raises(kind, match=match) as caught:
-        convert(source, out, **kwargs)
+@pytest.mark.parametrize(
+    ("source", "settings"),
+    [
+        ("trajectory", {"rate_hz": 2.5}),  # no whole number
+        ("trajectory", {"rate_hz": 3}),
+        ("trajectory", {"size": (65, 48)}),
+        ("trajectory", {"lerobot_version": "0.7"}),
+        ("made", {"rate_hz": 10}),
+        ("made", {"size": (32, 32)}),
+        ("nothing", {}),
+        ("failed", {}),
+    ],
+)
+def test_errors_leave_nothing_behind(request, tmp_path, source, settings):
+    if source == "failed":
+        path = write_trajectory(tmp_path / "failed.h5", seeds=(1,), failed=(0,))
+    else:
+        path = tmp_path / "none.h5" if source == "nothing" else request.getfixturevalue(source)
+    with pytest.raises(RobocasError) as caught:
+        convert(path, tmp_path / "out", **settings)
     assert "\n" not in str(caught.value)
-    assert not Path(out).exists()
-
-
-def test_errors_leave_nothing_behind(trajectory, made, tmp_path):
-    out = tmp_path / "out"
-    fails("whole number of frames a second", trajectory, out, rate_hz=2.5)
-    fails("the rate must divide the control frequency", trajectory, out, rate_hz=3)
-    fails("no such trajectory file", tmp_path / "none.h5", out)
-    fails("no dataset here", tmp_path, out)
-    fails("a dataset keeps its rate .expected 5 Hz, found 10.", made, out, rate_hz=10)
-    fails("a dataset keeps the size of its images .expected 64 x 48", made, out, size=(32, 32))
-    fails("videos need even sizes .expected .* found 65 x 48", trajectory, out, size=(65, 48))
-    fails("no successful episodes", write_trajectory(tmp_path / "failed.h5", seeds=(1,), failed=(0,)), out)
+    assert not Path(tmp_path / "out").exists()
 
 
 def test_an_output_that_exists_is_left_alone(trajectory, tmp_path):
     out = tmp_path / "out"
     convert(trajectory, out)
     before = files_of(out)
-    with pytest.raises(OutputExistsError) as error:
-        convert(trajectory, out, codec="av1")
-    assert error.value.found == 'settings.codec: "h264" -> "av1"'
-    with pytest.raises(OutputExistsError, match='settings.lerobot_version: "0.6" -> "2.1"'):
-        convert(trajectory, out, lerobot_version="2.1")
-    with pytest.raises(OutputExistsError, match="other episodes"):
-        convert(trajectory, out, include_failed=True)
+    for settings in ({"codec": "av1"}, {"lerobot_version": "2.1"}, {"include_failed": True}):
+        with pytest.raises(OutputExistsError):
+            convert(trajectory, out, **settings)
     with pytest.raises(DatasetError):
         convert(tmp_path / "missing.h5", out, overwrite=True)
-    assert files_of(out) == before
     done = convert(trajectory, out)
     assert (done.episodes, done.kept) == ([], 2)
     assert files_of(out) == before
@@ -229,28 +134,44 @@ def test_an_output_that_exists_is_left_alone(trajectory, tmp_path):
     assert LeRobotDataset(out).info["total_episodes"] == 3
 
 
-def test_failed_episodes_of_a_folder_stay_out(made, tmp_path):
-    source = shutil.copytree(made, tmp_path / "source")
-    scene = json.loads((source / "episode_0000000/scene.json").read_text())
-    (source / "episode_0000000/scene.json").write_text(json.dumps({**scene, "success": False}))
-    convert(source, tmp_path / "out")
-    dataset = LeRobotDataset(tmp_path / "out")
-    assert [entry["source"] for entry in dataset.settings["episodes"]] == [1]
-    assert dataset.numbers == [0]
-    assert check_lerobot(tmp_path / "out").violations == []
+def test_an_episode_with_an_error_is_converted_on_resume(trajectory, tmp_path):
+    class Breaking(RayCaster):
+        def frames(self, recording, samples):
+            for step, frame in enumerate(super().frames(recording, samples)):
+                if recording.seed == 5 and step == 3:
+                    raise DatasetError("it broke")
+                yield frame
+
+    out, whole = tmp_path / "out", tmp_path / "whole"
+    with pytest.raises(DatasetError, match="it broke"):
+        convert_lerobot(ConversionSettings(trajectory, out, open_renderer=Breaking))
+    assert [path.name for path in sorted((out / ".parts").iterdir())] == ["episode_0000000", "plan.json"]
+    done = convert(trajectory, out)
+    assert (done.kept, [e.number for e in done.episodes]) == (1, [1])
+    convert(trajectory, whole)
+    assert files_of(out) == files_of(whole)
 
 
-@pytest.mark.parametrize("source", [None, {"recording": None}])
-def test_episodes_of_unknown_recordings_are_told_by_their_arrays(dataset, source):
-    scene = dataset / "episode_0000001" / "scene.json"
-    scene.write_text(json.dumps({**json.loads(scene.read_text()), "source": source}))
-    ledger = dataset / "conversion.json"
-    content = json.loads(ledger.read_text())
-    content["episodes"]["1"]["recording"] = None
-    ledger.write_text(json.dumps(content))
-    entries = open_input(ConversionSettings(dataset, dataset.with_name("out"))).entries()
-    expected = arrays_fingerprint(Dataset(dataset).episode(1).arrays)
-    assert entries[1]["recording"] == f"arrays {expected}"
+def test_an_imported_folder_can_be_resumed(dataset, tmp_path):
+    """Nobody knows its recordings, so its episodes are told by their arrays."""
+    for path in [dataset / "conversion.json", *dataset.glob("*/scene.json")]:
+        path.unlink()
+    imported, out = tmp_path / "imported", tmp_path / "out"
+    import_robocas(survey(dataset), imported)
+
+    def stop(episode):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        convert(imported, out, on_episode=stop)
+    done = convert(imported, out)
+    assert (done.kept, [e.number for e in done.episodes]) == (1, [1])
+    marks = [f"arrays {arrays_fingerprint(Dataset(imported).episode(number).arrays)}" for number in (0, 1)]
+    assert [entry["recording"] for entry in LeRobotDataset(out).settings["episodes"]] == marks
+    assert convert(imported, out).kept == 2
+    shutil.rmtree(imported / "episode_0000001")
+    with pytest.raises(OutputExistsError):
+        convert(imported, out)
 
 
 def test_from_the_command_line(made, tmp_path, capsys):
@@ -259,6 +180,84 @@ def test_from_the_command_line(made, tmp_path, capsys):
     assert capsys.readouterr().err == "error: --append: not for LeRobot datasets. Leave it out.\n"
     assert main.run([*command, "--codec", "av1", "--cameras", "static_camera", "--no-depth"]) == 0
     assert "2 episodes, 14 steps" in capsys.readouterr().out
-    assert LeRobotDataset(tmp_path / "out").cameras == ("static_camera",)
-    assert main.run(command) == 1
-    assert "written with other settings" in capsys.readouterr().err
+    dataset = LeRobotDataset(tmp_path / "out")
+    assert dataset.cameras == ("static_camera",)
+    assert dataset.info["features"]["observation.images.static_camera"]["info"]["video.codec"] == "av1"
+    assert np.abs(dataset.episode(1).rgb("static_camera", 4) - Dataset(made).episode(1).rgb("static_camera", 4)).any()
+    other = ["convert", str(made), "--out", str(tmp_path / "other"), "--lerobot-version", "2.1"]
+    assert main.run(other) == 1
+    assert capsys.readouterr().err == "error: --lerobot-version: not for RoboCAS folders. Leave it out.\n"
+
+
+def shrink(path, size):
+    cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), size))
+
+
+@pytest.mark.parametrize(
+    ("episode", "camera", "kind", "step"), [(0, "base_camera", "rgb", 1), (1, "static_camera", "depth", 6)]
+)
+def test_a_picture_of_another_size(dataset, tmp_path, episode, camera, kind, step):
+    """An encoder would scale it without a word; what is not taken is not looked at."""
+    folder = dataset / f"episode_{episode:07d}"
+    shrink(folder / camera / kind / f"{step:04d}.png", (48, 64))
+    with pytest.raises(IncompleteError) as caught:
+        convert_lerobot(ConversionSettings(dataset, tmp_path / "out"))
+    assert list(caught.value.reasons) == [folder.name]
+    assert caught.value.reasons[folder.name].startswith(f"{folder}, {camera}/{kind}, step {step}: ")
+    done = convert_lerobot(ConversionSettings(dataset, tmp_path / "others", cameras=("gripper_camera",), depth=False))
+    assert len(done.episodes) == 2
+
+
+def test_cameras_of_a_folder_may_differ_in_size(dataset, tmp_path):
+    for path in dataset.glob("episode_*/gripper_camera/*/*.png"):
+        shrink(path, (32, 24))
+    assert len(convert_lerobot(ConversionSettings(dataset, tmp_path / "out")).episodes) == 2
+
+
+def sides_of(root):
+    settings = LeRobotDataset(root).settings
+    return settings["train_eps"], settings["val_eps"]
+
+
+def test_the_split_is_the_folders_own(tmp_path):
+    """What validates after --append, merge or split must not train in the copy; failed episodes stay out."""
+    root = make(tmp_path, "ds", range(6))
+    edit(root / "episode_0000002" / "scene.json", lambda c: c.update(success=False))
+    convert_lerobot(ConversionSettings(root, tmp_path / "before", include_failed=True))
+    resplit(root, Share(0.5))
+    train, val = Dataset(root).sides
+    assert sides_of(tmp_path / "before") != (train, val)  # that of the rule alone
+    convert_lerobot(ConversionSettings(root, tmp_path / "all", include_failed=True))
+    assert sides_of(tmp_path / "all") == (train, val)
+    convert_lerobot(ConversionSettings(root, tmp_path / "good"))  # without episode 2: numbers move up
+    dataset = LeRobotDataset(tmp_path / "good")
+    assert [entry["source"] for entry in dataset.settings["episodes"]] == [0, 1, 3, 4, 5]
+    moved = [[n - (n > 2) for n in side if n != 2] for side in (train, val)]
+    assert list(sides_of(tmp_path / "good")) == moved
+    assert check_lerobot(tmp_path / "good").violations == []
+    edit(root / "data_info.json", lambda c: c.update(train_eps=[0, 1], val_eps=[2, 3]))
+    convert_lerobot(ConversionSettings(root, tmp_path / "some", include_failed=True))
+    assert sides_of(tmp_path / "some") == ([0, 1, 4, 5], [2, 3])  # those that no side lists train
+    (root / "data_info.json").unlink()
+    convert_lerobot(ConversionSettings(root, tmp_path / "none", include_failed=True))
+    assert sides_of(tmp_path / "none") == split_by_seed({n: n for n in range(6)})
+
+
+@pytest.mark.parametrize(("array", "value"), [("ee_pos", np.nan), ("gripper_width", -np.inf)])
+def test_nan_is_an_error_of_its_episode_and_array(dataset, tmp_path, array, value):
+    spoilt = arrays_of(dataset / "episode_0000001")[array]
+    spoilt[3] = value
+    change(dataset / "episode_0000001", **{array: spoilt})
+    with pytest.raises(DatasetError) as caught:
+        convert_lerobot(ConversionSettings(dataset, tmp_path / "out"))
+    assert f"{dataset / 'episode_0000001' / 'episode_info.npz'}, {array}" in str(caught.value)
+
+
+def test_a_dataset_of_others_may_have_no_videos(versions, tmp_path):
+    other = shutil.copytree(versions / "0.6", tmp_path / "other")
+    info = json.loads((other / "meta/info.json").read_text())
+    info["features"] = {key: feature for key, feature in info["features"].items() if "images" not in key}
+    (other / "meta/info.json").write_text(json.dumps(info))
+    shutil.rmtree(other / "videos")
+    dataset = LeRobotDataset(other)
+    assert (dataset.cameras, dataset.has_depth, dataset.episode(1).has_depth) == ((), False, False)

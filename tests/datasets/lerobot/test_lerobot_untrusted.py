@@ -23,14 +23,13 @@ from robocas_ms3.datasets.lerobot.tables import TEXT, Column, read_objects, read
     [
         ("codebase_version", "v2.0"),
         ("chunks_size", 0),
-        *(("fps", value) for value in (5.5, 0, 10**6, True)),
-        *(("total_frames", value) for value in (-1, 2**62)),
+        *(("fps", value) for value in (5.5, 0)),
+        ("total_frames", 2**62),
         ("data_path", "../{chunk_index}/{file_index:9999999999d}"),
         ("video_path", "{video_key.__class__}"),
         ("video_path", None),
         ("features", 3),
         ("features.action", {"dtype": "float32"}),
-        ("features.action.shape", [0]),
         ("features.action.shape", [2**40]),
         ("features.action.shape", [6]),
         ("features.action.dtype", "object"),
@@ -96,7 +95,7 @@ def test_columns_of_wrong_values(spoiled, file, key, wrong):
         read_all(spoiled)
 
 
-@pytest.mark.parametrize("dtype", ["int64", "uint8", "bool", "string"])
+@pytest.mark.parametrize("dtype", ["uint8", "bool", "string"])
 def test_stored_types_other_than_declared(spoiled, dtype):
     edit_json(spoiled, schema.INFO_FILE, lambda info: info["features"]["action"].update(dtype=dtype))
     assert (DATA, "action") in {(violation.file, violation.key) for violation in check_lerobot(spoiled).violations}
@@ -127,10 +126,10 @@ def test_irregular_files(spoiled, name, kind):
 
 @pytest.mark.parametrize("count", [0, 10**6])
 def test_totals_that_the_tables_contradict(spoiled, count):
-    totals = "total_episodes", "total_frames", "total_tasks"
+    totals = "total_episodes", "total_tasks", "total_frames"
     edit_json(spoiled, schema.INFO_FILE, lambda info: info.update(dict.fromkeys(totals, count)))
     found = [(violation.file, violation.key) for violation in check_lerobot(spoiled).violations]
-    assert found == [(schema.INFO_FILE, key) for key in ("total_episodes", "total_tasks", "total_frames")]
+    assert found == [(schema.INFO_FILE, key) for key in totals]
 
 
 def read_all(root):
@@ -159,19 +158,15 @@ def test_rows_are_counted_before_they_are_read(spoiled, file, monkeypatch):
 
     monkeypatch.setattr(pq.ParquetFile, "read_row_groups", refused)
     monkeypatch.setattr(pq, "read_table", refused)
+    dataset = LeRobotDataset(spoiled)
+    read = {
+        DATA: lambda: read_rows(spoiled / file, 0, 14),
+        EPISODES: lambda: dataset.rows,
+        schema.TASKS_FILE: lambda: dataset.tasks,
+        schema.SCENES_FILE: lambda: dataset.described,
+    }
     with pytest.raises(DatasetError):
-        read_table(spoiled, file)
-
-
-def read_table(root, file):
-    if file == DATA:
-        read_rows(root / file, 0, 14)
-    else:
-        dataset = LeRobotDataset.__new__(LeRobotDataset)
-        dataset.root = root
-        _ = {EPISODES: lambda: dataset.rows, schema.TASKS_FILE: lambda: dataset.tasks}.get(
-            file, lambda: dataset.described
-        )()
+        read[file]()
 
 
 def test_a_consistent_lie_about_rows_is_bounded_by_size(tmp_path):

@@ -2,43 +2,26 @@
 
 import json
 import shutil
-from typing import get_args
 
 import numpy as np
 import pytest
-from lerobot_folders import files_of
-from synthetic import RayCaster
+from lerobot_folders import convert, files_of
 
 pytest.importorskip("av", reason="needs the extra 'lerobot'")
 pq = pytest.importorskip("pyarrow.parquet", reason="needs the extra 'lerobot'")
 
-from robocas_ms3.cli import main
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import inverse
 from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check import check_lerobot
-from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
-from robocas_ms3.datasets.lerobot.variants import NEWEST, VARIANTS, Version
+from robocas_ms3.datasets.lerobot.variants import VARIANTS
 from robocas_ms3.datasets.pictures.stored import box_of
 from robocas_ms3.datasets.sources.reader import Dataset
-from robocas_ms3.datasets.writing.settings import ConversionSettings
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
-from robocas_ms3.viewer.source import open_source as open_page
 
-
-@pytest.fixture(scope="module")
-def datasets(trajectory, tmp_path_factory):
-    """A dataset of three episodes of each version, of which the second failed."""
-    root = tmp_path_factory.mktemp("versions")
-    for version in VARIANTS:
-        convert_lerobot(
-            ConversionSettings(
-                trajectory, root / version, open_renderer=RayCaster, include_failed=True, lerobot_version=version
-            )
-        )
-    return root
+DATA = "data/chunk-000/file-000.parquet"
 
 
 @pytest.fixture(params=VARIANTS)
@@ -46,116 +29,153 @@ def version(request):
     return request.param
 
 
-def test_the_versions_of_the_command_line_are_those_of_the_table():
-    assert get_args(Version) == tuple(VARIANTS)
-    assert NEWEST in VARIANTS
-
-
-def test_each_version_passes_the_check_and_restores_the_episodes(datasets, version, made, tmp_path):
-    root = datasets / version
-    assert check_lerobot(root, decode=True).violations == []
-    dataset, source = open_source(root), Dataset(made)
+def test_each_version_passes_the_check_and_restores_the_episodes(versions, version, made):
+    assert check_lerobot(versions / version, decode=True).violations == []
+    dataset, source = open_source(versions / version), Dataset(made)
     for ours, theirs in ((0, 0), (2, 1)):  # the source has no failed episode
         episode, wanted = dataset.episode(ours), source.episode(theirs)
         assert episode.goals == wanted.goals
-        for key in ("ee_pos", "ee_orn", "robot_joints", "agv_pose", "step_lang_goals", "step_goal_type"):
-            np.testing.assert_array_equal(episode.arrays[key], wanted.arrays[key], err_msg=key)
+        for key, values in episode.arrays.items():
+            if key in ("rel_orn", "base_rel_orn", "base_rel_pos"):  # computed from absolute poses
+                np.testing.assert_allclose(values, wanted.arrays[key], atol=1e-6, err_msg=key)
+            else:
+                np.testing.assert_array_equal(values, wanted.arrays[key], err_msg=key)
         for camera in episode.cameras:
+            np.testing.assert_array_equal(episode.intrinsic(camera), wanted.intrinsic(camera))
+            np.testing.assert_array_equal(episode.camera_in_parent(camera), wanted.camera_in_parent(camera))
             limit = schema.MAX_DEPTH_MM if VARIANTS[version].native_depth else 65535
-            np.testing.assert_array_equal(episode.depth(camera, 4), np.minimum(wanted.depth(camera, 4), limit))
-            assert np.abs(episode.rgb(camera, 4).astype(int) - wanted.rgb(camera, 4)).mean() < 6
-    assert open_page(root).episode(1)["steps"] == 7
+            for step in (6, 0, 4):  # bit for bit, whatever the order
+                depth = np.minimum(wanted.depth(camera, step), limit)
+                np.testing.assert_array_equal(episode.depth(camera, step), depth)
+                assert np.abs(episode.rgb(camera, step).astype(int) - wanted.rgb(camera, step)).mean() < 6
+        assert np.stack(list(episode.frames("base_camera", "depth"))).shape == (7, 48, 64)
 
 
-def test_the_same_input_gives_the_same_bytes(datasets, version, trajectory, tmp_path):
-    out = tmp_path / "out"
-    convert_lerobot(
-        ConversionSettings(
-            trajectory, out, open_renderer=RayCaster, include_failed=True, lerobot_version=version, jobs=2
-        )
-    )
-    assert files_of(out) == files_of(datasets / version)
+def test_the_same_input_gives_the_same_bytes(versions, version, trajectory, tmp_path):
+    convert(trajectory, tmp_path / "out", include_failed=True, lerobot_version=version, jobs=2)
+    assert files_of(tmp_path / "out") == files_of(versions / version)
 
 
-def test_each_version_from_a_folder_and_from_another_version(datasets, version, made, tmp_path):
-    convert_lerobot(ConversionSettings(made, tmp_path / "folder", lerobot_version=version))
-    assert check_lerobot(tmp_path / "folder").violations == []
+def test_each_version_from_another_version(versions, version, tmp_path):
     for other in VARIANTS:
-        convert_lerobot(
-            ConversionSettings(datasets / other, tmp_path / other, include_failed=True, lerobot_version=version)
-        )
+        convert(versions / other, tmp_path / other, include_failed=True, lerobot_version=version)
         assert check_lerobot(tmp_path / other).violations == []
-        ours, theirs = LeRobotDataset(tmp_path / other).episode(2), LeRobotDataset(datasets / other).episode(2)
+        ours, theirs = LeRobotDataset(tmp_path / other).episode(2), LeRobotDataset(versions / other).episode(2)
         assert ours.goals == theirs.goals
     again = LeRobotDataset(tmp_path / "0.6").episode(2)
-    kept = LeRobotDataset(datasets / "0.6").episode(2).target_boxes if version == "0.6" else []
+    kept = LeRobotDataset(versions / "0.6").episode(2).target_boxes if version == "0.6" else []
     assert list(again.target_boxes) == list(kept)
 
 
-def test_language_and_outcome_of_version_0_6(datasets, trajectory):
-    table = pq.read_table(datasets / "0.6" / "data/chunk-000/file-000.parquet")
+def test_the_folder_of_version_0_6(versions):
+    root = versions / "0.6"
+    expected = {
+        *(f"meta/{name}" for name in ("info.json", "stats.json", "tasks.parquet")),
+        *(f"meta/robocas/{name}" for name in ("conversion.json", "episodes.parquet", "checksums.json")),
+        "meta/episodes/chunk-000/file-000.parquet",
+        DATA,
+    }
+    for camera in ("base", "gripper", "static"):
+        expected.add(f"videos/observation.images.{camera}_camera/chunk-000/file-000.mp4")
+        expected.add(f"videos/observation.images.{camera}_camera_depth/chunk-000/file-000.mp4")
+    for number in range(3):
+        expected |= {f".annotate_staging/episode_{number:06d}/{name}.jsonl" for name in ("plan", "vqa")}
+    assert set(files_of(root)) == expected
+    info = json.loads((root / "meta/info.json").read_text())
+    assert (info["codebase_version"], info["splits"]) == ("v3.0", {"train": "0:3"})
+    assert (info["fps"], info["total_episodes"], info["total_frames"], info["total_tasks"]) == (5, 3, 21, 3)
+    video = info["features"]["observation.images.base_camera"]
+    assert (video["dtype"], video["shape"], video["info"]["video.codec"]) == ("video", [48, 64, 3], "h264")
+    # Every column but the videos, in the features' order, of their types: `datasets` casts by them.
+    table = pq.read_table(root / DATA)
+    assert table.column_names == [key for key, ft in info["features"].items() if ft["dtype"] != "video"]
+    assert str(table.schema.field("action").type) == "fixed_size_list<element: float>[7]"
+    assert table.column("index").to_pylist() == list(range(21))
+    assert table.column("frame_index").to_pylist() == [*range(7)] * 3
+    np.testing.assert_allclose(table.column("timestamp").to_pylist()[:7], np.arange(7) / 5, atol=1e-6)
+
+
+def test_statistics_are_those_of_the_data(versions):
+    root = versions / "0.6"
+    stats, dataset = json.loads((root / "meta/stats.json").read_text()), LeRobotDataset(root)
+    rows = pq.read_table(root / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    actions = [dataset.episode(number).columns["action"] for number in range(3)]
+    for found, values in (
+        (stats["action"], np.concatenate(actions)),
+        ({key: rows[1][f"stats/action/{key}"] for key in stats["action"]}, actions[1]),
+    ):
+        for key, function in (("mean", np.mean), ("std", np.std), ("max", np.max), ("q50", np.median)):
+            np.testing.assert_allclose(found[key], function(values.astype(float), axis=0), atol=1e-6, err_msg=key)
+        assert found["count"] == [len(values)]
+    assert all(type(value) is int for value in stats["next.success"]["min"] + stats["index"]["max"])
+    frames = np.stack([frame for n in range(3) for frame in dataset.episode(n).frames("base_camera")])
+    mean = np.array(stats["observation.images.base_camera"]["mean"]).reshape(3)
+    np.testing.assert_allclose(mean, frames.mean(axis=(0, 1, 2)) / 255, atol=0.02)
+
+
+def test_texts_of_version_0_5(versions):
+    dataset = LeRobotDataset(versions / "0.5")
+    assert dataset.tasks == [f"grasp the cube {seed} on the table and move it to the basket" for seed in (3, 4, 5)]
+    assert [row["tasks"] for row in dataset.rows] == [[text] for text in dataset.tasks]
+    columns = dataset.episode(2).columns
+    assert columns["task_index"].ravel().tolist() == [2] * 7
+    subgoals = [dataset.subtasks[i] for i in columns["subtask_index"][:, 0]]
+    assert subgoals == ["grasp the cube 5 on the table"] * 3 + ["Drop the cube 5 into the basket"] * 4
+    types = dataset.episode(2).table.column("subgoal_type").to_pylist()
+    assert types == ["move and grasp"] * 3 + ["transfer object"] * 4
+
+
+def test_language_and_outcome_of_version_0_6(versions):
+    table = pq.read_table(versions / "0.6" / DATA)
     assert table.column("next.done").to_pylist() == ([False] * 6 + [True]) * 3
     success = [False] * 6 + [True] + [False] * 7 + [False] * 6 + [True]  # the second episode failed
     assert table.column("next.success").to_pylist() == success
     assert table.column("next.reward").to_pylist() == [float(value) for value in success]
-    rows = table.column("language_persistent").to_pylist()
+    rows, events = (table.column(key).to_pylist() for key in ("language_persistent", "language_events"))
     assert all(frame == rows[14] for frame in rows[14:])
     starts = [(row["timestamp"], row["content"]) for row in rows[14] if row["style"] == "subtask"]
     assert starts == [(0.0, "grasp the cube 5 on the table"), (pytest.approx(0.6), "Drop the cube 5 into the basket")]
-    first = table.column("language_events").to_pylist()[14]
-    assert [row["content"] for row in first if row["role"] == "user"] == ["Where is the cube 5?"] * (len(first) // 2)
-    assert first
+    questions = [row["content"] for row in events[14] if row["role"] == "user"]
+    assert questions == ["Where is the cube 5?"] * (len(events[14]) // 2) != []
+    plan, vqa = (
+        [json.loads(line) for line in (versions / "0.6" / schema.STAGING / "episode_000002" / name).open()]
+        for name in ("plan.jsonl", "vqa.jsonl")
+    )
+    assert plan == rows[14]
+    times = table.column("timestamp").to_pylist()
+    assert vqa == [{**row, "timestamp": times[frame]} for frame in range(14, 21) for row in events[frame]]
 
 
-def test_boxes_hold_the_projected_target(datasets, trajectory):
+def test_boxes_hold_the_projected_target(versions, trajectory):
     """The centre of the target, projected into a camera that sees all of it, is in its box."""
-    episode = LeRobotDataset(datasets / "0.6").episode(0)
+    episode = LeRobotDataset(versions / "0.6").episode(0)
     with TrajectoryFile(trajectory) as file:
         centres = file.recording(0).states["actors"]["object_0"][[0, 4, 8, 12, 16, 20, 22], :3]
     world_in_camera = inverse(episode.camera_in_parent("static_camera"))
     fx, fy, cx, cy = episode.intrinsic("static_camera")
-    assert len(episode.target_boxes) == len(centres)
     for centre, boxes in zip(centres, episode.target_boxes, strict=True):
         x, y, z = world_in_camera[:3, :3] @ centre + world_in_camera[:3, 3]
         left, top, right, bottom = boxes["static_camera"]
         assert left <= fx * x / z + cx <= right + 1
         assert top <= fy * y / z + cy <= bottom + 1
         assert (right - left, bottom - top) < (20, 20)
-
-
-def test_the_box_of_a_mask():
     assert box_of(np.array([[0, 0, 0], [0, 1, 0], [0, 1, 1]], bool)) == (1, 1, 2, 2)
     assert box_of(np.zeros((2, 3), bool)) is None
 
 
-def test_staged_rows_are_those_of_the_columns(datasets):
-    root = datasets / "0.6"
-    table = pq.read_table(root / "data/chunk-000/file-000.parquet").slice(7, 7)
-    folder = root / schema.STAGING / "episode_000001"
-    plan, vqa = (
-        [json.loads(line) for line in (folder / f"{n}.jsonl").read_text().splitlines()] for n in ("plan", "vqa")
-    )
-    assert plan == table.column("language_persistent").to_pylist()[0]
-    events, times = (table.column(key).to_pylist() for key in ("language_events", "timestamp"))
-    assert vqa == [{**row, "timestamp": time} for rows, time in zip(events, times, strict=True) for row in rows]
-
-
-def test_files_of_version_2_1(datasets):
-    root = datasets / "2.1"
+def test_files_of_version_2_1(versions):
+    root = versions / "2.1"
     info = json.loads((root / "meta/info.json").read_text())
-    assert (info["codebase_version"], info["total_episodes"], info["total_videos"], info["total_chunks"]) == (
-        "v2.1",
-        3,
-        9,
-        1,
-    )
+    totals = [info[f"total_{name}"] for name in ("episodes", "videos", "chunks")]
+    assert (info["codebase_version"], totals) == ("v2.1", [3, 9, 1])
     assert info["data_path"] == "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
-    lines = [json.loads(line) for line in (root / "meta/episodes.jsonl").read_text().splitlines()]
-    tasks = [json.loads(line) for line in (root / "meta/tasks.jsonl").read_text().splitlines()]
-    assert [(line["episode_index"], line["length"]) for line in lines] == [(0, 7), (1, 7), (2, 7)]
-    assert [line["tasks"] for line in lines] == [[task["task"]] for task in tasks]
+    episodes, tasks, stats = (
+        [json.loads(line) for line in (root / f"meta/{name}.jsonl").open()]
+        for name in ("episodes", "tasks", "episodes_stats")
+    )
+    assert [(line["episode_index"], line["length"]) for line in episodes] == [(0, 7), (1, 7), (2, 7)]
+    assert [line["tasks"] for line in episodes] == [[task["task"]] for task in tasks]
     assert [task["task_index"] for task in tasks] == [0, 1, 2]
-    stats = [json.loads(line) for line in (root / "meta/episodes_stats.jsonl").read_text().splitlines()]
     second = pq.read_table(root / "data/chunk-000/episode_000001.parquet")
     assert second.column("index").to_pylist() == list(range(7, 14))
     action = np.array(second.column("action").to_pylist())
@@ -169,11 +189,6 @@ def test_files_of_version_2_1(datasets):
     assert modality["action"]["gripper_open"] == {"start": 6, "end": 7}
 
 
-@pytest.fixture
-def spoiled(datasets, tmp_path):
-    return shutil.copytree(datasets / "2.1", tmp_path / "spoiled")
-
-
 @pytest.mark.parametrize(
     ("name", "text", "file"),
     [
@@ -184,7 +199,8 @@ def spoiled(datasets, tmp_path):
         ("meta/episodes_stats.jsonl", '{"episode_index": 0, "stats": {}}', "meta/episodes_stats.jsonl"),
     ],
 )
-def test_damaged_lines(spoiled, name, text, file):
+def test_damaged_lines_of_version_2_1(versions, tmp_path, name, text, file):
+    spoiled = shutil.copytree(versions / "2.1", tmp_path / "spoiled")
     (spoiled / name).write_text(text + "\n")
     assert file in {violation.file for violation in check_lerobot(spoiled).violations}
     if file == "meta":
@@ -192,19 +208,11 @@ def test_damaged_lines(spoiled, name, text, file):
             _ = LeRobotDataset(spoiled).rows, LeRobotDataset(spoiled).tasks
 
 
-def test_videos_of_version_2_1_that_are_wrong(spoiled):
-    folder = spoiled / "videos/chunk-000/observation.images.base_camera"
-    shutil.copy(folder / "episode_000000.mp4", folder / "episode_000003.mp4")
-    (folder / "episode_000001.mp4").unlink()
+def test_videos_of_version_2_1_that_are_wrong(versions, tmp_path):
+    spoiled = shutil.copytree(versions / "2.1", tmp_path / "spoiled")
+    folder = "videos/chunk-000/observation.images.base_camera"
+    shutil.copy(spoiled / folder / "episode_000000.mp4", spoiled / folder / "episode_000003.mp4")
+    (spoiled / folder / "episode_000001.mp4").unlink()
     found = {violation.file: violation.expected for violation in check_lerobot(spoiled).violations}
-    assert found[str((folder / "episode_000003.mp4").relative_to(spoiled))] == "files of episodes only"
-    assert (folder / "episode_000001.mp4").relative_to(spoiled).as_posix() in found
-
-
-def test_an_unknown_version_lists_the_choices(trajectory, tmp_path, capsys):
-    with pytest.raises(DatasetError, match="unknown LeRobot version .expected 0.6, 0.5, 2.1, found 0.7"):
-        convert_lerobot(ConversionSettings(trajectory, tmp_path / "out", lerobot_version="0.7"))
-    assert not (tmp_path / "out").exists()
-    command = ["convert", str(trajectory), "--out", str(tmp_path / "out"), "--lerobot-version", "2.1"]
-    assert main.run(command) == 1
-    assert capsys.readouterr().err == "error: --lerobot-version: not for RoboCAS folders. Leave it out.\n"
+    assert found[f"{folder}/episode_000003.mp4"] == "files of episodes only"
+    assert f"{folder}/episode_000001.mp4" in found
