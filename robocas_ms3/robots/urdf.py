@@ -57,15 +57,12 @@ class RobotFiles:
 
 
 def robot_files(finger_extension: float = c.finger_extension) -> RobotFiles:
-    """Return the robot's files, generating them where they are missing.
+    """Return the robot's files, generating them where they are missing; raise RobocasError if they can't be written.
 
     The folder's name is a hash of all they are made from, this generator's code included.
 
     Args:
         finger_extension: how much longer than stock the fingers are, m; 0 gives ManiSkill's own fingers.
-
-    Raises:
-        RobocasError: mani_skill's Panda is not where it should be, or the cache can't be written to.
     """
     source = _panda_folder()
     folder = cache_dir() / "robots" / _fingerprint(source, finger_extension)
@@ -80,14 +77,10 @@ def robot_files(finger_extension: float = c.finger_extension) -> RobotFiles:
 
 
 def _panda_folder() -> Path:
-    """mani_skill's Panda assets, found without importing mani_skill."""
+    """Return mani_skill's Panda assets, without importing mani_skill."""
     spec = importlib.util.find_spec("mani_skill")
-    if spec is None or not spec.submodule_search_locations:
-        raise RobocasError("mani_skill is not installed", fix="Install it: pip install 'mani_skill>=3.0.1,<3.1'.")
-    folder = Path(spec.submodule_search_locations[0]) / "assets" / "robots" / "panda"
-    if not (folder / "panda_v2.urdf").is_file():
-        raise RobocasError("mani_skill's Panda is missing", where=folder / "panda_v2.urdf", fix="Reinstall mani_skill.")
-    return folder
+    assert spec is not None and spec.submodule_search_locations
+    return Path(spec.submodule_search_locations[0]) / "assets" / "robots" / "panda"
 
 
 @lru_cache(maxsize=8)

@@ -36,9 +36,7 @@ class Learner:
             self._restore(run.checkpoint)
         optimizer = torch.optim.AdamW(_parameter_groups(model, settings.weight_decay), lr=1.0, betas=settings.betas)
         self._model, self._optimizer = self._accelerator.prepare(model, optimizer)
-        if (
-            run.checkpoint is not None
-        ):  # after `prepare`, which moves the optimiser's counts to the GPU: steps would wait
+        if run.checkpoint is not None:  # after `prepare`, which moves counts to the GPU, for which steps would wait
             run.checkpoint.load_optimizer(self._optimizer)
 
     def update(self, batch: Batch, learning_rate: float) -> None:
