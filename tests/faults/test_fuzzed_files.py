@@ -56,6 +56,8 @@ from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.table import FrozenLayouts, LayoutTable, write_frozen, write_table
+from robocas_ms3.viewer.routes import Routes
+from robocas_ms3.viewer.source import open_source as open_page
 
 PACK = builtin_packs_dir() / "builtin"
 OBJECT = min(PACK.glob("*/annotations.npz")).parent
@@ -188,6 +190,14 @@ def read_recording(root):
         _ = episode.goals, episode.scene, episode.layout, source.entry(number)
 
 
+def show_page(root):
+    """Everything that the viewer serves but images: a damaged episode costs no other."""
+    routes = Routes(open_page(root))
+    assert routes.respond("/data/index.js").status == 200
+    for number in (0, 1):
+        assert routes.respond(f"/data/episode_{number}.js").status in (200, 404)
+
+
 def read_annotations(root):
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
@@ -248,6 +258,8 @@ TABLE = [  # writer, file, reader, how many kinds of damage, how many of them ar
     *((write_robocas, name, read, 16, 0) for read in (validate, read_dataset) for name in ROBOCAS_FILES),
     (write_robocas, "episode_0000000/episode_info.npz", read_dataset, 16, 0),
     *((write_lerobot, f"meta/{name}.json", check_lerobot, 10, 0) for name in ("info", "stats", "robocas/conversion")),
+    *((write_robocas, name, show_page, 16, 0) for name in ROBOCAS_FILES),
+    (write_recording, "trajectory.json", show_page, 40, 0),
     (write_recording, "trajectory.h5", read_recording, 80, 20),
     (write_recording, "trajectory.json", read_recording, 120, 30),
     (write_pack, "manifest.json", load_pack, 150, 120),

@@ -8,12 +8,9 @@ import pytest
 
 from robocas_ms3.cli.view import View, main
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.datasets.sources.records import SCENE_KEYS
 from robocas_ms3.viewer.routes import Routes, script
 from robocas_ms3.viewer.source import open_source
 from robocas_ms3.viewer.table import Failures
-
-WRONG = ["x", 7, True, ["x"], {"x": 1}, None, [[]], {"poses": 3}, [{"slot": "x"}], 2**62]
 
 
 def shown(source, numbers=(0, 1, 2)):
@@ -35,20 +32,6 @@ def spoilt(folder, tmp_path):
     return shutil.copytree(folder, tmp_path / "spoilt")
 
 
-def test_wrong_values_in_a_scene(spoilt):
-    path = spoilt / "episode_0000001/scene.json"
-    whole = path.read_text()
-    for key in SCENE_KEYS:
-        for value in WRONG:
-            path.write_text(whole)
-            change(path, **{key: value})
-            index, statuses = shown(open_source(spoilt), [1])
-            assert statuses == [200]
-            damages = [row["damage"] for row in index["episodes"]]
-            assert damages[0] == damages[2] == ""
-            assert damages[1] == "" or damages[1].startswith(f"scene.json, {key}")
-
-
 @pytest.mark.parametrize(
     ("new", "damage"),
     [
@@ -66,9 +49,7 @@ def test_the_row_says_what_is_wrong(spoilt, new, damage):
     assert open_source(spoilt).episode(1)["n"] == 1
 
 
-@pytest.mark.parametrize(
-    "text", ["[1]", "null", "7", "{", "", '"x"', "\xff", "[" * 100_000, '{"a": NaN}'], ids=lambda t: t[:5]
-)
+@pytest.mark.parametrize("text", ["[1]", "null", "{", "\xff"])
 @pytest.mark.parametrize("name", ["episode_0000001/scene.json", "conversion.json", "data_info.json"])
 def test_files_that_hold_something_else(spoilt, name, text):
     (spoilt / name).write_bytes(text.encode("latin-1"))
@@ -78,17 +59,6 @@ def test_files_that_hold_something_else(spoilt, name, text):
         assert index["episodes"][1]["damage"].startswith("scene.json: ")
     else:
         assert f"`{name}` is damaged" in index["note"]
-
-
-@pytest.mark.parametrize("name", ["conversion.json", "data_info.json"])
-def test_wrong_values_in_the_overviews(spoilt, name):
-    path = spoilt / name
-    whole = path.read_text()
-    for key in json.loads(whole):
-        for value in (*WRONG, {"1": "x"}, {"1": []}, {"1": None}, {"1": {"seed": "x", "target": 3}}):
-            path.write_text(whole)
-            change(path, **{key: value})
-            assert shown(open_source(spoilt), [1])[1] == [200]
 
 
 def test_a_rate_of_zero_is_replaced_with_a_note(spoilt):
@@ -127,18 +97,12 @@ def test_a_damaged_trajectory(run_folder, tmp_path):
         path.write_text(json.dumps(metadata))
 
     said = whole["episodes"][1]["robocas"]
-    for key in ("instruction", "target", "attempts", "recoveries", "facts", "objects", "relation", None):
-        for value in WRONG:
-            write(value if key is None else {**said, key: value})
-            index, statuses = shown(open_source(folder), [0, 1])
-            assert statuses[0] == 200
-            assert [bool(row["damage"]) for row in index["episodes"]][::2] == [False, False]
     write({**said, "target": "cube"})
-    (_, row, *_) = open_source(folder).index()["episodes"]
+    (_, row, *_) = shown(open_source(folder), [0, 1])[0]["episodes"]
     assert row["damage"] == 'its entry of the JSON, target: expected an object, found "cube"'
     assert row["instruction"].startswith("grasp the cube 4")
     write({"instruction": 3, "target": said["target"]})
-    (_, row, *_) = open_source(folder).index()["episodes"]
+    (_, row, *_) = shown(open_source(folder), [0, 1])[0]["episodes"]
     assert row["damage"].startswith("its entry of the JSON: the JSON's entry: ")
     assert (row["object"], row["seed"], row["success"], row["stages"]) == ("cube 4 (cube)", 4, False, ["grasp"])
     for spoilt in ({"episodes": 3}, {"episodes": ["x"]}, {"env_info": {"env_id": 3, "env_kwargs": 4}}, {"robocas": []}):

@@ -136,8 +136,7 @@ def test_filters_and_sorting(page):
     wait_for_rows(page, "")
 
 
-def test_an_episode_is_opened_by_a_click(any_page):
-    page = any_page
+def test_an_episode_is_opened_by_a_click(page):
     page.click(".row[data-episode='1']")
     wait_for_instruction(page, "cube 4")
     assert page.get_attribute(".row.chosen", "data-episode") == "1"
@@ -274,13 +273,6 @@ def test_a_damaged_episode_is_shown_as_such(opened, serve, folder, tmp_path, sta
     wait(page, "document.querySelector('#episode').hidden")
     assert page.text_content("#message").startswith("Episode 2 can't be shown: scene.json: this JSON is damaged")
     page.errors.clear()  # the episode could not be loaded
-
-
-def test_a_lerobot_dataset(opened, serve, lerobot):
-    page = load(opened, serve(open_source(lerobot)).url + "#episode=1&step=4")
-    wait_for_images(page, 1, "rgb", 4)
-    page.keyboard.press("d")
-    wait_for_images(page, 1, "depth", 4)
 
 
 def test_of_a_thousand_episodes_only_visible_rows_are_made(opened, serve, folder, monkeypatch):

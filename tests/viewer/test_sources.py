@@ -100,26 +100,6 @@ def test_objects_are_called_the_same_in_a_recording_and_in_its_dataset(run_folde
         assert called - {"cube 3 (cube)"} == {"white toy airplane (toy airplane c)"} | others
 
 
-def test_the_tcp_of_a_trajectory_is_where_its_joints_put_it(run_folder):
-    """Worked out from the Panda's published Denavit-Hartenberg parameters, for the first state of episode 0."""
-    from scipy.spatial.transform import Rotation
-
-    episode = open_source(run_folder).episode(0)
-    pose = np.eye(4)
-    table = [(0, 0.333, 0), (0, 0, -1), (0, 0.316, 1), (0.0825, 0, 1), (-0.0825, 0.384, -1), (0, 0, 1), (0.088, 0, 1)]
-    for (a, d, quarter), angle in zip(table, series(episode, "Arm joints")[0], strict=True):
-        link = np.eye(4)
-        link[:3, :3] = (
-            Rotation.from_euler("x", quarter * 90, degrees=True) * Rotation.from_euler("z", angle)
-        ).as_matrix()
-        link[:3, 3] = [a, 0, 0] + link[:3, 2] * d
-        pose = pose @ link
-    tcp = pose[:3, 3] + pose[:3, 2] * (0.107 + 0.1334)
-    np.testing.assert_allclose(series(episode, "TCP position")[0], tcp, atol=2e-3)
-    turned = [0.7 - tcp[1], 0.15 + tcp[0], 0.49 + tcp[2]]  # the base at (0.7, 0.15), turned by 90 degrees, 0.49 m up
-    np.testing.assert_allclose(episode["trace"]["tcp"][0], turned, atol=2e-3)
-
-
 def test_a_folder_lists_episodes(folder):
     index = open_source(folder).index()
     assert all(set(row) == ROW for row in index["episodes"])
@@ -154,20 +134,6 @@ def test_an_episode_of_a_folder(folder):
     assert episode["subgoals"][-1]["last"] == 6
     assert len(episode["trace"]["tcp"]) == 7
     assert [f["stage"] for f in episode["failures"]] == ["grasp"]
-
-
-def test_pictures_are_those_of_the_folder(folder):
-    source = open_source(folder)
-    picture = source.rgb(2, "static_camera", 3)
-    assert picture.media_type == "image/png"
-    assert picture.data == (folder / "episode_0000002/static_camera/rgb/0003.png").read_bytes()
-    assert (source.depth(2, "base_camera", 0) == Dataset(folder).episode(2).depth("base_camera", 0)).all()
-
-
-def test_there_is_no_such_episode(folder, run_folder):
-    for path in (folder, run_folder):
-        with pytest.raises(DatasetError, match="no such episode"):
-            open_source(path).episode(3)
 
 
 def test_a_seed_means_a_scene_of_its_own_environment_only(run_folder, folder, made_up, tmp_path):
