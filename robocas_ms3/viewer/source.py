@@ -112,7 +112,7 @@ class TrajectoryContent(PageContent):
         episode = self.recordings.episode(number)
         recording, arrays = episode.recording(), episode.arrays
         base = from_xyzw(arrays["base_pos"][:1].astype(float), arrays["base_orn"][:1].astype(float))[0]
-        objects = _object_paths(recording, scene, self.recordings.info(number).objects, base)
+        objects = _object_paths(recording, scene, self.recordings.objects(number), base)
         shown = show_arrays(arrays, scene, actions=_action_plots(recording), moving=objects)
         return {**shown, "facts": facts_of({**scene, "source": None})}  # which is this file
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from robocas_ms3.core.poses import from_xyzw
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.violation import NO_FILE, Violation
-from robocas_ms3.datasets.sources.tolerant import SPECS, EpisodeArrays
+from robocas_ms3.datasets.sources.arrays import SPECS, EpisodeArrays
 from robocas_ms3.demos.recordings.motion import planar_motion, relative_motion
 from robocas_ms3.scenes.language.templates import GOAL_TYPES
 

@@ -18,9 +18,9 @@ from robocas_ms3.datasets.checks.pictures import Sizes, check_cameras, check_dep
 from robocas_ms3.datasets.checks.scene import check_ledger, read_settings
 from robocas_ms3.datasets.checks.violation import Violation, read_object
 from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.sources.arrays import SPECS, EpisodeArrays, is_declared, read_arrays
 from robocas_ms3.datasets.sources.files import no_dataset
 from robocas_ms3.datasets.sources.records import DataInfoRecord, SceneRecord
-from robocas_ms3.datasets.sources.tolerant import SPECS, EpisodeArrays, is_declared, read_arrays
 from robocas_ms3.datasets.writing.plan import MARKS
 
 INFO = schema.DATA_INFO_FILE

@@ -19,8 +19,8 @@ from robocas_ms3.datasets.checks import depth as geometry
 from robocas_ms3.datasets.checks.violation import NO_FILE, Violation
 from robocas_ms3.datasets.pictures.headers import PictureHeader, read_header
 from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.sources.arrays import EpisodeArrays
 from robocas_ms3.datasets.sources.files import CAMERA_LIMIT
-from robocas_ms3.datasets.sources.tolerant import EpisodeArrays
 from robocas_ms3.robots.cameras import Parent
 
 _SURPLUS = "a file beyond them"

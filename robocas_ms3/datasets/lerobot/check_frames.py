@@ -22,7 +22,7 @@ from robocas_ms3.datasets.lerobot.language import EVENTS, PERSISTENT, Row, box_i
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.records import frame_columns as declared_columns
 from robocas_ms3.datasets.lerobot.tables import faults, numbers, open_table, read_rows
-from robocas_ms3.datasets.sources.tolerant import EpisodeArrays
+from robocas_ms3.datasets.sources.arrays import EpisodeArrays
 
 TOLERANCE = 1e-4
 """Of times, s: what LeRobot tolerates."""

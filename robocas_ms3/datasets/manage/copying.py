@@ -24,9 +24,9 @@ from robocas_ms3.datasets.checks.pictures import check_cameras, check_images
 from robocas_ms3.datasets.checks.scene import read_settings
 from robocas_ms3.datasets.checks.violation import Violation, read_object
 from robocas_ms3.datasets.pictures.headers import PictureHeader, has_both_ends, read_header
+from robocas_ms3.datasets.sources.arrays import arrays_fingerprint, read_arrays
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.records import ConversionRecord
-from robocas_ms3.datasets.sources.tolerant import arrays_fingerprint, read_arrays
 from robocas_ms3.datasets.writing.info import write_info
 from robocas_ms3.datasets.writing.plan import DATASET, SETTINGS, header
 

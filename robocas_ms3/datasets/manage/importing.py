@@ -26,11 +26,10 @@ from robocas_ms3.datasets.manage.copying import (
 )
 from robocas_ms3.datasets.manage.repairs import EMBEDDINGS, ImportedEpisode
 from robocas_ms3.datasets.manage.survey import Survey, read_episode, read_info
-from robocas_ms3.datasets.sources.arrays import with_embeddings
+from robocas_ms3.datasets.sources.arrays import SPECS, EpisodeArrays, with_embeddings
 from robocas_ms3.datasets.sources.protocol import CameraModel
 from robocas_ms3.datasets.sources.reader import Dataset, Episode
 from robocas_ms3.datasets.sources.records import SCENE_KEYS, EpisodesRecord
-from robocas_ms3.datasets.sources.tolerant import SPECS, EpisodeArrays
 from robocas_ms3.datasets.writing.episode_folder import write_episode_files
 from robocas_ms3.datasets.writing.info import write_info
 from robocas_ms3.datasets.writing.plan import dataset_settings

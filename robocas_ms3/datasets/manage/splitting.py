@@ -26,8 +26,8 @@ from robocas_ms3.datasets.manage.copying import (
     copy_episodes,
     damaged_episode,
 )
+from robocas_ms3.datasets.sources.arrays import read_arrays
 from robocas_ms3.datasets.sources.reader import Dataset
-from robocas_ms3.datasets.sources.tolerant import read_arrays
 from robocas_ms3.datasets.writing.info import info_of
 
 By = Literal["seed", "target", "task"]

@@ -25,9 +25,9 @@ from robocas_ms3.datasets.manage.repairs import (
     turn_eef_frame,
 )
 from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.sources.arrays import EpisodeArrays, arrays_fingerprint, completed, load_arrays
 from robocas_ms3.datasets.sources.files import said_of
 from robocas_ms3.datasets.sources.reader import Dataset, Episode
-from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, arrays_fingerprint, completed, load_arrays
 from robocas_ms3.robots.cameras import EE_CAMERA
 
 _FULL_SIZE = (640, 480)

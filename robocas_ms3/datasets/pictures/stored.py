@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,7 +15,7 @@ from robocas_ms3.core.words import one_line
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.headers import LARGEST, read_picture_bytes
 from robocas_ms3.datasets.pictures.png import encode_png
-from robocas_ms3.robots.cameras import CAMERA_NAME, STANDARD_NAMES
+from robocas_ms3.robots.cameras import STANDARD_NAMES
 
 _QUALITY = {
     "jpg": [cv2.IMWRITE_JPEG_QUALITY, 95],
@@ -46,9 +45,6 @@ class Pictures:
     boxes: bool = False
 
     def __post_init__(self) -> None:
-        wrong = [name for name in self.cameras if not re.fullmatch(CAMERA_NAME, name)]
-        if wrong:
-            raise DatasetError("no such camera", where="cameras", expected="names like side_camera", found=wrong)
         if self.image_format not in schema.IMAGE_FORMATS:
             raise DatasetError(
                 "no such picture format",

@@ -1,26 +1,233 @@
-"""From the motion of a recording to the arrays of an episode: pure maths, no simulator."""
+"""Arrays of an episode: made of a recording, or read, also of datasets with other types, missing keys, extra axes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import hashlib
+from collections import Counter
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.datasets.schema import EPISODE_INFO
-from robocas_ms3.demos.recordings.motion import Motion
+from robocas_ms3.core.documents import DAMAGED, open_arrays
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.poses import from_xyzw
+from robocas_ms3.core.words import one_line
+from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.sources.files import SEE_VALIDATE
+from robocas_ms3.demos.recordings.motion import Motion, planar_motion, stored_motion
 from robocas_ms3.demos.recordings.subgoals import SubGoal
 from robocas_ms3.robots.quantities import QUANTITIES
 
+SPECS = {spec.name: spec for spec in schema.EPISODE_INFO}
+PICKLED = "pickled objects, which are never loaded"
+_IDENTITY = ("ee_pos", "ee_orn", "robot_joints", "gripper_status", "language_goal", "step_lang_goals")
 
-def episode_arrays(motion: Motion, instruction: str, subgoals: Sequence[SubGoal]) -> dict[str, np.ndarray]:
-    """Return the arrays of ``episode_info.npz`` without the embeddings of its texts, see `with_embeddings`.
+
+@dataclass(frozen=True)
+class EpisodeArrays:
+    """What an ``episode_info.npz`` holds, as far as it could be read.
+
+    Attributes:
+        path: of the file.
+        arrays: by key.
+        unreadable: key -> why it could not be read; "": the file as a whole.
+        derived: key -> what it was made of, see `completed`.
+        ignored: keys that were not asked for.
+    """
+
+    path: Path
+    arrays: Mapping[str, NDArray]
+    unreadable: Mapping[str, Exception] = field(default_factory=dict)
+    derived: Mapping[str, str] = field(default_factory=dict)
+    ignored: tuple[str, ...] = ()
+
+    @property
+    def file(self) -> str:
+        return f"{self.path.parent.name}/{self.path.name}"
+
+    @property
+    def steps(self) -> int:
+        lengths = {key: len(array) for key, array in self.arrays.items() if array.ndim}
+        most = Counter(lengths.values()).most_common(1)
+        return lengths.get("ee_pos", most[0][0] if most else 0)
+
+    def reason(self, key: str = "") -> str:
+        """Return why a key could not be read."""
+        error = self.unreadable[key]
+        text = getattr(error, "strerror", None) or one_line(error)
+        pickled = PICKLED if key else f"another file, or {PICKLED}"
+        return pickled if "pickle" in text else text
+
+    def needed(self, keys: Iterable[str]) -> dict[str, NDArray]:
+        """Return the arrays of these keys; damage is an error."""
+        for key, error in self.unreadable.items():
+            where, found = f"{self.path}, {key}" if key else self.path, self.reason(key)
+            raise DatasetError("this episode can't be read", where=where, found=found, fix=SEE_VALIDATE) from error
+        missing = [key for key in keys if key not in self.arrays]
+        if missing:
+            raise DatasetError("arrays are missing", where=self.path, expected=", ".join(missing), fix=SEE_VALIDATE)
+        return {key: self.arrays[key] for key in keys}
+
+
+def read_arrays(path: Path, keys: Container[str] | None = None) -> EpisodeArrays:
+    """Read arrays as they are stored; damage is recorded, not raised.
 
     Args:
-        motion: at the T sampled states.
-        instruction: the whole episode's.
-        subgoals: from ``sample_subgoals``.
+        path: of ``episode_info.npz``.
+        keys: those to read; None: all.
     """
+    arrays: dict[str, NDArray] = {}
+    unreadable: dict[str, Exception] = {}
+    ignored: list[str] = []
+    try:
+        with open_arrays(path) as content:
+            for key in content.files:
+                if keys is not None and key not in keys:
+                    ignored.append(key)
+                    continue
+                try:
+                    arrays[key] = content[key]
+                    if not isinstance(arrays[key], np.ndarray):  # a member that is no array is read as bytes
+                        unreadable[key] = ValueError("no array")
+                        del arrays[key]
+                except (*DAMAGED, MemoryError) as error:
+                    unreadable[key] = error
+    except DAMAGED as error:
+        unreadable[""] = error
+    return EpisodeArrays(path, arrays, unreadable, ignored=tuple(ignored))
+
+
+def load_arrays(path: Path) -> EpisodeArrays:
+    """Read the arrays that the schema knows, cast to its types; those that can't be are unreadable."""
+    stored = read_arrays(path, SPECS)
+    if "" in stored.unreadable:
+        error = stored.unreadable[""]
+        if isinstance(error, FileNotFoundError):
+            raise DatasetError("no such file", where=path) from error
+        raise DatasetError("not a numpy archive, or a damaged one", where=path, found=stored.reason()) from error
+    arrays: dict[str, NDArray] = {}
+    unreadable = dict(stored.unreadable)
+    for key, array in stored.arrays.items():
+        try:
+            arrays[key] = cast(SPECS[key], array)
+        except (ValueError, MemoryError) as error:
+            unreadable[key] = error
+    return replace(stored, arrays=arrays, unreadable=unreadable)
+
+
+def cast(spec: schema.ArraySpec, array: NDArray) -> NDArray:
+    """Return an array with the schema's type and number of axes; axes of length 1 too many are dropped."""
+    for axis in reversed(range(array.ndim)):
+        if array.ndim > len(spec.shape) and array.shape[axis] == 1:
+            array = array.squeeze(axis)
+    if array.ndim != len(spec.shape):
+        raise ValueError(f"{array.ndim} axes, not {len(spec.shape)}")
+    if spec.has_dtype(array):
+        return array
+    kind = array.dtype.kind
+    if spec.dtype == "str" and kind == "S":
+        return np.char.decode(array, "utf-8")
+    number = kind in "bfiu"
+    exact = number and spec.dtype != "float32"
+    if not number or (exact and not np.array_equal(array, array.astype(spec.dtype))):
+        raise ValueError(f"{array.dtype}, not {spec.dtype}")
+    return array.astype(spec.dtype)
+
+
+def is_declared(key: str, array: NDArray) -> bool:
+    """Return whether an array has the schema's type and number of axes."""
+    return SPECS[key].has_dtype(array) and array.ndim == len(SPECS[key].shape)
+
+
+def completed(loaded: EpisodeArrays, said: Mapping[str, Any], rate_hz: float) -> EpisodeArrays:
+    """Return the arrays with what is missing made of what is there; ``derived`` says of what.
+
+    Args:
+        loaded: what could be read, of the schema's types.
+        said: ``language_goal`` and ``step_goals`` of the episode in ``data_info.json``, where they are there.
+        rate_hz: steps a second.
+    """
+    arrays, derived = dict(loaded.arrays), dict(loaded.derived)
+
+    def put(key: str, values: Any, source: str) -> None:
+        if key not in arrays:
+            arrays[key] = SPECS[key].cast(values)
+            derived[key] = source
+
+    if "ee_pos" in arrays:
+        put("episode_length", len(arrays["ee_pos"]), "the arrays' length")
+    if isinstance(said.get("language_goal"), str):
+        put("language_goal", said["language_goal"], schema.DATA_INFO_FILE)
+    goals = _goals_of_steps(said.get("step_goals"), len(arrays.get("ee_pos", ())))
+    if goals:
+        put("step_goal_type", [kind for kind, _ in goals], schema.DATA_INFO_FILE)
+        put("step_lang_goals", [text for _, text in goals], schema.DATA_INFO_FILE)
+    for keys in schema.RELATIVE_PAIRS:
+        if not set(keys[2:]) <= arrays.keys() and _poses(arrays, *keys[:2]) is not None:
+            arrays |= motion_arrays(arrays, keys)
+            derived |= dict.fromkeys(keys[2:], ", ".join(keys[:2]))
+    base = _poses(arrays, "base_pos", "base_orn")
+    if base is not None:
+        yaw = np.arctan2(base[:, 1, 0], base[:, 0, 0])
+        put("agv_pose", np.column_stack([base[:, :2, 3], np.unwrap(yaw)]), "base_pos, base_orn")
+    if arrays.get("agv_pose", np.zeros(0)).shape[1:] == (3,):
+        put("rel_agv_pose", planar_motion(arrays["agv_pose"]), "agv_pose")
+    joints = arrays.get("robot_joints", np.zeros((0, 7)))
+    if len(joints) > 1:
+        put("arm_joint_vel", np.gradient(joints.astype(np.float64), axis=0) * rate_hz, "differences of robot_joints")
+    return replace(loaded, arrays=arrays, derived=derived)
+
+
+def motion_arrays(arrays: Mapping[str, NDArray], keys: tuple[str, str, str, str]) -> dict[str, NDArray]:
+    """Return the relative motion between absolute poses, for keys of ``schema.RELATIVE_PAIRS``."""
+    poses = _poses(arrays, keys[0], keys[1])
+    assert poses is not None
+    return dict(zip(keys[2:], stored_motion(poses), strict=True))
+
+
+def arrays_fingerprint(arrays: Mapping[str, NDArray]) -> str:
+    """Return a SHA-256 of arrays, which distinguishes episodes whose recordings are not known."""
+    digest = hashlib.sha256()
+    for key in _IDENTITY:
+        if key in arrays:
+            array = arrays[key]
+            data = "\n".join(map(str, array.ravel().tolist())).encode() if array.dtype.kind == "U" else array.tobytes()
+            digest.update(f"{key} {array.shape}\n".encode() + data)
+    return digest.hexdigest()
+
+
+def _poses(arrays: Mapping[str, NDArray], position: str, orientation: str) -> NDArray[np.float64] | None:
+    """Return poses (T, 4, 4), None where they are missing or no poses."""
+    if not {position, orientation} <= arrays.keys():
+        return None
+    p, q = (arrays[key].astype(np.float64) for key in (position, orientation))
+    if p.shape[1:] != (3,) or q.shape[1:] != (4,) or len(p) != len(q) or not len(p):
+        return None
+    if not (np.isfinite(p).all() and np.isfinite(q).all() and np.linalg.norm(q, axis=1).min() > 0.5):
+        return None
+    return from_xyzw(p, q)
+
+
+def _goals_of_steps(goals: Any, steps: int) -> list[tuple[str, str]]:
+    """Return (type, text) of each step from ``step_goals``, empty if they do not cover all steps."""
+    found: list[tuple[str, str]] = []
+    try:
+        for goal in goals or []:
+            first, last = map(int, goal["goal_range"])
+            if first != len(found):
+                return []
+            found += [(str(goal["goal_type"]), str(goal["goal_description"]))] * (last - first + 1)
+    except (KeyError, TypeError, ValueError):
+        return []
+    return found if len(found) == steps else []
+
+
+def episode_arrays(motion: Motion, instruction: str, subgoals: Sequence[SubGoal]) -> dict[str, np.ndarray]:
+    """Return the arrays of ``episode_info.npz``, without embeddings, from the motion at the T sampled states."""
     of_steps = [goal for goal in subgoals for _ in range(goal.last - goal.first + 1)]
     values = {
         **{quantity.name: quantity.recorded(motion) for quantity in QUANTITIES if quantity.recorded},
@@ -29,19 +236,14 @@ def episode_arrays(motion: Motion, instruction: str, subgoals: Sequence[SubGoal]
         "step_lang_goals": [goal.goal_description for goal in of_steps],
         "step_goal_type": [goal.goal_type for goal in of_steps],
     }
-    return {spec.name: spec.cast(values[spec.name]) for spec in EPISODE_INFO if spec.name in values}
+    return {spec.name: spec.cast(values[spec.name]) for spec in schema.EPISODE_INFO if spec.name in values}
 
 
 def with_embeddings(arrays: Mapping[str, NDArray], embed: Callable[[list[str]], NDArray]) -> dict[str, NDArray]:
-    """Return the arrays and the embeddings of instruction and sub-goals, in the schema's order.
-
-    Args:
-        arrays: of `episode_arrays`.
-        embed: texts -> (N, 384).
-    """
+    """Return the arrays and the embeddings of their texts, by ``embed``: texts -> (N, 384)."""
     made = {
         **arrays,
         "language_embedding": embed([str(arrays["language_goal"])])[0],
         "step_goal_embs": embed(arrays["step_lang_goals"].tolist()),
     }
-    return {spec.name: spec.cast(made[spec.name]) for spec in EPISODE_INFO if spec.name in made}
+    return {spec.name: spec.cast(made[spec.name]) for spec in schema.EPISODE_INFO if spec.name in made}

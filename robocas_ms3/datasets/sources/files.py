@@ -1,4 +1,4 @@
-"""What lies in a dataset's folder, read with errors that say where: JSON, arrays, and folders that are no dataset."""
+"""Reads files of a dataset, with errors that say where."""
 
 from __future__ import annotations
 
@@ -20,33 +20,27 @@ SEE_VALIDATE = "robocas validate lists all that is wrong."
 
 
 def no_dataset(root: Path, expected: str) -> DatasetError:
-    """What to say of a folder that is no dataset, with what may have been meant."""
+    """Return an error for a folder that is no dataset, with what may have been meant."""
     if (root / "meta" / "info.json").is_file():
         return DatasetError("a LeRobot dataset; this takes RoboCAS folders", where=root)
-    meant = near(root)
+    # a plan has its datasets in datasets/
+    places = [
+        f"{folder}*/{name}" for folder in ("", "datasets/") for name in (schema.CONVERSION_FILE, schema.DATA_INFO_FILE)
+    ]
+    found = (sorted(root.glob(place)) for place in [*places, "*.h5"]) if root.is_dir() else ()
+    meant = next((paths[0] if paths[0].suffix == ".h5" else paths[0].parent for paths in found if paths), None)
     fix = f"Did you mean {meant}?" if meant else "Make one with robocas convert."
     return DatasetError("no dataset here", where=root, expected=expected, fix=fix)
 
 
-def near(root: Path) -> Path | None:
-    """The first dataset or recording in a folder."""
-    if not root.is_dir():
-        return None
-    files = (
-        f"{folder}*/{name}" for folder in ("", "datasets/") for name in (schema.CONVERSION_FILE, schema.DATA_INFO_FILE)
-    )
-    datasets = next(filter(None, (sorted(root.glob(file)) for file in files)), [])  # a plan has its own in datasets/
-    return next(iter([path.parent for path in datasets] or sorted(root.glob("*.h5"))), None)
-
-
 def said_of(info: Mapping[str, Any], number: int | None) -> dict[str, Any]:
-    """What ``data_info.json`` says of an episode: its entry under each key that has entries of episodes."""
+    """Return the entries of an episode in ``data_info.json``, by their keys."""
     tables = {key: info.get(key) for key in ("ep_length", "language_goal", "step_goals")}
     return {k: table[str(number)] for k, table in tables.items() if isinstance(table, dict) and str(number) in table}
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """A JSON object; empty where there is no such file."""
+    """Return a JSON object, empty if there is no such file."""
     try:
         content = load_json(path)
     except FileNotFoundError:

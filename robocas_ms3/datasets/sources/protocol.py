@@ -32,13 +32,7 @@ Kind = Literal["rgb", "depth"]
 
 @dataclass(frozen=True)
 class CameraModel:
-    """Intrinsics and mounting pose of a camera, which are constant during an episode.
-
-    Attributes:
-        intrinsic: (4,) fx, fy, cx, cy, pixels.
-        camera_in_parent: (4, 4) OpenCV camera frame.
-        parent: the frame of that pose.
-    """
+    """Intrinsics (4,) fx, fy, cx, cy in pixels, and pose (4, 4) of the OpenCV camera frame in its parent frame."""
 
     intrinsic: NDArray[np.float64]
     camera_in_parent: NDArray[np.float64]
@@ -47,14 +41,7 @@ class CameraModel:
 
 @dataclass(frozen=True)
 class Frame:
-    """The images of one step.
-
-    Attributes:
-        rgb: camera -> (H, W, 3) uint8.
-        depth: camera -> (H, W) uint16, mm; empty where depth is not wanted.
-        boxes: camera -> box of the target's visible pixels, of the cameras that see it; empty where boxes are not
-            wanted or not known.
-    """
+    """The images of one step: camera -> (H, W, 3) uint8, (H, W) uint16 in mm, box of the target's visible pixels."""
 
     rgb: dict[str, NDArray[np.uint8]]
     depth: dict[str, NDArray[np.uint16]]
@@ -62,14 +49,11 @@ class Frame:
 
 
 class SourceEpisode(Protocol):
-    """What is known of an episode.
-
-    Arrays are those of ``schema.EPISODE_INFO``, of its types and shapes; what is read raises ``DatasetError`` where it
-    is missing or damaged. Who derives from this class gets what follows from arrays and scene.
+    """An episode; what is read raises ``DatasetError`` where it is missing or damaged.
 
     Attributes:
-        where: it lies, for messages.
-        cameras: that there are pictures of.
+        where: path or name, for messages.
+        cameras: names of those with images.
     """
 
     where: Any
@@ -77,25 +61,21 @@ class SourceEpisode(Protocol):
 
     @property
     def steps(self) -> int:
-        """T."""
+        """Number of steps, T."""
         return int(self.arrays["episode_length"])
 
     @property
     def instruction(self) -> str:
-        """What the robot was told; read from an overview where there is one."""
+        """Text that the robot is told."""
         return str(self.read(["language_goal"])["language_goal"])
 
     @property
     def arrays(self) -> dict[str, NDArray]:
-        """All arrays that are there."""
+        """Arrays of ``schema.EPISODE_INFO`` that are there."""
         ...
 
     def read(self, keys: Sequence[str]) -> dict[str, NDArray]:
-        """Some of the arrays.
-
-        Raises:
-            DatasetError: one is not there.
-        """
+        """Return some of the arrays, which have to be there."""
         arrays = self.arrays
         missing = [key for key in keys if key not in arrays]
         if missing:
@@ -134,21 +114,16 @@ class SourceEpisode(Protocol):
     def frames(
         self, camera: str, kind: Kind = "rgb", first: int = 0, count: int | None = None
     ) -> Generator[NDArray, None, None]:
-        """Pictures of steps one after the other, as `rgb` or `depth` gives them.
+        """Yield the images of ``count`` steps; close the generator unless it is read to the end.
 
-        A file may be open meanwhile: who does not read to the end closes it. Here they are read one by one; a format
-        that is quicker in a run, as a video is, has a method of its own.
+        Here they are read one by one; a format that is quicker in a run, as a video is, overrides this.
         """
         picture = self.rgb if kind == "rgb" else self.depth
         for step in range(first, self.steps if count is None else first + count):
             yield picture(camera, step)
 
     def images(self, pictures: Pictures) -> Generator[Frame, None, None]:
-        """Yield the images of every step; close the generator unless it is read to the end.
-
-        Args:
-            pictures: which cameras, with depth or without, with boxes or without.
-        """
+        """Yield the images of every step; close the generator unless it is read to the end."""
         boxes = self.target_boxes if pictures.boxes else []
         with closing(shots(self, pictures.cameras, "rgb")) as rgb, ExitStack() as stack:
             depth = stack.enter_context(closing(shots(self, pictures.cameras, "depth"))) if pictures.depth else None
@@ -180,7 +155,7 @@ def _no_images(episode: SourceEpisode) -> DatasetError:
 def shots(
     episode: SourceEpisode, cameras: Sequence[str], kind: Kind = "rgb"
 ) -> Generator[dict[str, NDArray], None, None]:
-    """Pictures of every step of an episode, by camera; who does not read to the end closes it."""
+    """Yield the images of every step, by camera; close the generator unless it is read to the end."""
     steps = episode.steps
     with ExitStack() as stack:
         runs = {camera: stack.enter_context(closing(episode.frames(camera, kind, 0, steps))) for camera in cameras}
@@ -189,15 +164,15 @@ def shots(
 
 
 class EpisodeSource(Protocol):
-    """Episodes by number; what is read of them raises ``DatasetError`` where it is damaged.
+    """Episodes by number; what is read raises ``DatasetError`` where it is missing or damaged.
 
     Attributes:
         root: the folder or file.
-        rate_hz: steps a second.
+        rate_hz: steps per second.
         numbers: of its episodes, sorted.
-        cameras: that there are pictures of; empty where there are none.
-        has_depth: whether depth is there.
-        has_embeddings: whether embeddings of the texts are.
+        cameras: names of those with images.
+        has_depth: whether there are depth images.
+        has_embeddings: whether there are embeddings of the texts.
     """
 
     root: Path
@@ -213,7 +188,7 @@ class EpisodeSource(Protocol):
         return {number: self.episode(number).steps for number in self.numbers}
 
     def split(self, side: Side) -> list[int]:
-        """Numbers of the episodes of one side; of what knows none by the seeds, or else the numbers."""
+        """Return the numbers of the episodes of one side; here by seed, or by number where there is none."""
         if side == "all":
             return self.numbers
         seeds = {number: one_seed(self.entry(number).get("seed")) for number in self.numbers}
@@ -230,11 +205,11 @@ class EpisodeSource(Protocol):
         return [str(arrays["language_goal"]), *arrays["step_lang_goals"].tolist()]
 
     def entry(self, number: int) -> Mapping[str, Any]:
-        """Which recording an episode is of, see ``provenance.recording_entry``; empty where that is not known."""
+        """Return the recording of an episode, see ``provenance.recording_entry``; empty where it is not known."""
         return {}
 
     def action_space(self) -> dict[str, Any]:
-        """Range of the motion, as in ``data_info.json``; where it is not known all episodes are read for it."""
+        """Return the range of the motion, as in ``data_info.json``; here all episodes are read for it."""
         parts = [self.episode(number).read(("rel_pos", "rel_orn")) for number in self.numbers]
         return action_space([part["rel_pos"] for part in parts], [part["rel_orn"] for part in parts])
 

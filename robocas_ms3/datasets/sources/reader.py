@@ -1,33 +1,47 @@
 """Opens a RoboCAS folder: its overviews, and its episodes by number.
 
-Episodes in upstream's format made elsewhere open too: other types are cast to the schema's, what is missing is made of
-what is there (`tolerant`), either name of a camera's pose will do.
+Episodes in the format of RoboCAS-v0 open too: other types are cast to the schema's, what is missing is made of what is
+there (`arrays.completed`), and either name of a camera's pose will do.
 """
 
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BeforeValidator, TypeAdapter, ValidationError
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.stored import read_picture
+from robocas_ms3.datasets.sources.arrays import completed, is_declared, load_arrays, read_arrays
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE, no_dataset, read_array, read_json, said_of
 from robocas_ms3.datasets.sources.protocol import EpisodeSource, Side, SourceEpisode
-from robocas_ms3.datasets.sources.tolerant import completed, is_declared, load_arrays, read_arrays
+from robocas_ms3.datasets.sources.records import CameraName, Rate
 from robocas_ms3.demos.recordings.subgoals import SubGoal, read_subgoals
-from robocas_ms3.robots.cameras import CAMERA_NAME, Parent
+from robocas_ms3.robots.cameras import Parent
 
 DEFAULT_RATE = 5.0  # upstream's, Hz
 _SPLIT = "robocas split --in-place --val-share 0.1 makes a new one."
+
+
+def _number(value: Any) -> int:
+    if type(value) is int or (isinstance(value, str) and value.isdecimal()):
+        return int(value)
+    raise ValueError("an episode number")
+
+
+EpisodeIndex = Annotated[int, BeforeValidator(_number)]
+
+
+_RATE, _CAMERAS = TypeAdapter(Rate), TypeAdapter(list[CameraName])
+_NUMBERS, _LENGTHS = TypeAdapter(list[EpisodeIndex]), TypeAdapter(dict[int, int])
 
 
 @dataclass(frozen=True)
@@ -96,7 +110,7 @@ class Episode(SourceEpisode):
 
     @cached_property
     def image_format(self) -> schema.ImageFormat:
-        """Of RGB, by the first picture that is there."""
+        """Format of RGB, by the first image that is there."""
         for camera in self.cameras:
             for image_format in schema.IMAGE_FORMATS:
                 if schema.image_path(self.folder, camera, "rgb", 0, image_format).is_file():
@@ -160,32 +174,29 @@ class Dataset(EpisodeSource):
     def info(self) -> dict[str, Any]:
         return read_json(self.root / schema.DATA_INFO_FILE)
 
+    def _value(self, file: str, key: str, form: TypeAdapter[Any], default: Any, fix: str = SEE_VALIDATE) -> Any:
+        """Return a value of an overview, checked; the default if there is none."""
+        content = self.settings if file == schema.CONVERSION_FILE else self.info
+        try:
+            return form.validate_python(content[key]) if key in content else default
+        except ValidationError as error:
+            where, found = f"{self.root / file}, {key}", str(content[key])[:80]
+            expected = error.errors()[0]["msg"]
+            raise DatasetError("this value is damaged", where=where, expected=expected, found=found, fix=fix) from error
+
     @cached_property
     def sides(self) -> tuple[list[int], list[int]]:
         """Training and validation episodes, as ``data_info.json`` lists them; numbers written as texts count too."""
-        return self._side("train_eps"), self._side("val_eps")
-
-    def _side(self, key: str) -> list[int]:
-        listed = self.info.get(key, [])
-        if isinstance(listed, list) and all(type(n) is int or (isinstance(n, str) and n.isdecimal()) for n in listed):
-            return [int(n) for n in listed]
-        where = f"{self.root / schema.DATA_INFO_FILE}, {key}"
-        found = str(listed)[:60]
-        raise DatasetError("this split is damaged", where=where, expected="episode numbers", found=found, fix=_SPLIT)
+        train, val = (self._value(schema.DATA_INFO_FILE, key, _NUMBERS, [], _SPLIT) for key in ("train_eps", "val_eps"))
+        return train, val
 
     @cached_property
     def rate_hz(self) -> float:
-        said = self.settings.get("rate_hz", DEFAULT_RATE)
-        if isinstance(said, int | float) and 0 < said < np.inf:
-            return float(said)
-        raise self._damaged_settings(f"rate_hz {said!r}")
+        return float(self._value(schema.CONVERSION_FILE, "rate_hz", _RATE, DEFAULT_RATE))
 
     @cached_property
     def cameras(self) -> tuple[str, ...]:
-        said = self.settings.get("cameras", self._first.cameras)
-        if isinstance(said, list | tuple) and all(re.fullmatch(CAMERA_NAME, str(name)) for name in said):
-            return tuple(said)
-        raise self._damaged_settings(f"cameras {said!r}")
+        return tuple(self._value(schema.CONVERSION_FILE, "cameras", _CAMERAS, self._first.cameras))
 
     @property
     def has_depth(self) -> bool:
@@ -199,32 +210,14 @@ class Dataset(EpisodeSource):
     def _first(self) -> Episode:
         return Episode(self.root / schema.episode_folder(self.numbers[0]))
 
-    def _damaged_settings(self, found: str) -> DatasetError:
-        where, expected = self.root / schema.CONVERSION_FILE, "rate_hz > 0, a list of cameras"
-        fix = "robocas validate says what is wrong."
-        return DatasetError("these settings are damaged", where=where, expected=expected, found=found[:80], fix=fix)
-
     @cached_property
     def lengths(self) -> dict[int, int]:
-        where = self.root / schema.DATA_INFO_FILE
         if not self.info:
             if self.settings:
                 fix = "Run the same robocas convert again."
                 raise DatasetError("this dataset is not finished", where=self.root, fix=fix)
             raise no_dataset(self.root, f"a folder with {schema.DATA_INFO_FILE}, or a trajectory.h5")
-        try:
-            missing = [key for key in ("ep_length", "train_eps", "val_eps") if key not in self.info]
-            if missing:
-                raise KeyError(*missing)
-            return {int(number): int(length) for number, length in self.info["ep_length"].items()}
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise DatasetError(
-                "this overview is damaged",
-                where=where,
-                expected="ep_length, train_eps, val_eps",
-                found=f"{type(error).__name__}: {error}",
-                fix="robocas validate says what is wrong.",
-            ) from error
+        return self._value(schema.DATA_INFO_FILE, "ep_length", _LENGTHS, {})
 
     def split(self, side: Side) -> list[int]:
         numbers = sorted(self.lengths) if side == "all" else self.sides[side == "val"]
@@ -249,19 +242,14 @@ class Dataset(EpisodeSource):
 
 
 def open_folder(path: Path, *, rate_hz: float | None = None, include_failed: bool = False) -> Dataset:
-    """Open a folder; failed episodes are in it where it was made so."""
+    """Open a folder; it has its failed episodes or not."""
     dataset = Dataset(path)
     check_rate(dataset, rate_hz)
     return dataset
 
 
 def check_rate(source: EpisodeSource, rate_hz: float | None) -> None:
-    """Refuse another rate than a dataset's."""
+    """Raise DatasetError for another rate than that of a dataset."""
     if rate_hz is not None and rate_hz != source.rate_hz:
-        raise DatasetError(
-            "the dataset has another rate",
-            where=source.root,
-            expected=f"{source.rate_hz:g} Hz",
-            found=f"{rate_hz:g}",
-            fix="Convert the trajectory again with this --rate.",
-        )
+        what, fix = "the dataset has another rate", "Convert the trajectory again with this --rate."
+        raise DatasetError(what, where=source.root, expected=f"{source.rate_hz:g} Hz", found=f"{rate_hz:g}", fix=fix)

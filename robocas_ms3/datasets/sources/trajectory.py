@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
@@ -23,21 +22,6 @@ from robocas_ms3.demos.recordings.reading import Recording, TrajectoryFile
 from robocas_ms3.demos.recordings.subgoals import SubGoal, sample_subgoals
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.layout import PARKING_HEIGHT
-
-
-@dataclass(frozen=True)
-class RecordingInfo:
-    """An episode as the JSON of its file describes it.
-
-    Attributes:
-        entry: what was recorded.
-        scene: how it was made.
-        objects: assets by slot, as written.
-    """
-
-    entry: Entry
-    scene: dict[str, Any]
-    objects: Any
 
 
 class TrajectorySource(EpisodeSource):
@@ -73,17 +57,22 @@ class TrajectorySource(EpisodeSource):
         with TrajectoryFile(path, pack=pack) as file:
             self.stride = sample_stride(file.control_freq, self.rate_hz)
             self.index = [n for n, e in enumerate(file.episodes) if include_failed or succeeded(e)]
-            self._infos = [_read_info(file, index) for index in self.index]
+            self._entries = [_read_entry(file, index) for index in self.index]
         self.numbers, self.file = list(range(len(self.index))), file
 
-    def info(self, number: int) -> RecordingInfo:
-        info = self._infos[number]
-        if isinstance(info, DatasetError):
-            raise info
-        return info
+    def info(self, number: int) -> Entry:
+        """Return what the JSON says of an episode, which is checked."""
+        found = self._entries[number]
+        if isinstance(found, DatasetError):
+            raise found
+        return found
+
+    def objects(self, number: int) -> list[Any]:
+        """Return the assets of an episode by slot, as the JSON has them."""
+        return list(self.file.episodes[self.index[number]]["robocas"].get("objects") or ())
 
     def steps(self, number: int) -> int:
-        return len(sample_states(self.info(number).entry.control_steps, self.stride))
+        return len(sample_states(self.info(number).control_steps, self.stride))
 
     @cached_property
     def lengths(self) -> dict[int, int]:
@@ -92,14 +81,14 @@ class TrajectorySource(EpisodeSource):
     def split(self, side: Side) -> list[int]:
         if side == "all":
             return self.numbers
-        return split_by_seed({number: self.info(number).entry.seed for number in self.numbers})[side == "val"]
+        return split_by_seed({number: self.info(number).seed for number in self.numbers})[side == "val"]
 
     def entry(self, number: int) -> Mapping[str, Any]:
         with self.file.reopened() as file:
             return recording_entry(file, self.index[number])
 
     def recording(self, number: int, *, bodies: bool = True) -> Recording:
-        """All control steps of an episode, with the states of all bodies or of the robot alone."""
+        """Return all control steps of an episode, with the states of all bodies or of the robot alone."""
         with self.file.reopened() as file:
             return file.recording(self.index[number], bodies=bodies)
 
@@ -119,7 +108,7 @@ class RecordedEpisode(SourceEpisode):
 
     @property
     def _entry(self) -> Entry:
-        return self._source.info(self._number).entry
+        return self._source.info(self._number)
 
     @property
     def where(self) -> str:
@@ -146,20 +135,22 @@ class RecordedEpisode(SourceEpisode):
 
     @property
     def scene(self) -> dict[str, Any]:
-        info = self._source.info(self._number)
-        kwargs = info.scene["env_info"]["env_kwargs"]
+        """What the JSON says of how it was made, and what its objects are called, if their pack is installed."""
+        source = self._source
+        scene = recorded_scene(source.file, source.index[self._number])
+        kwargs = scene["env_info"]["env_kwargs"]
         config, names = kwargs.get("config"), _names(str(kwargs.get("pack", "builtin")))
         objects = [
             {"slot": slot, "id": asset, "name": names[asset]}
-            for slot, asset in enumerate(info.objects or ())
+            for slot, asset in enumerate(source.objects(self._number))
             if isinstance(asset, str) and asset in names
         ]
         config = config if isinstance(config, Mapping) else _shipped(str(config))
-        return {**info.scene, "config": config, "objects": objects}
+        return {**scene, "config": config, "objects": objects}
 
     @cached_property
     def layout(self) -> dict[str, Any]:
-        ids = list(self._source.info(self._number).objects or ())
+        ids = self._source.objects(self._number)
         actors = self.recording().states.get("actors", {})
         poses = [actors[f"object_{slot}"][0, :7] if f"object_{slot}" in actors else None for slot in range(len(ids))]
         there = [pose is not None and bool(pose[2] > PARKING_HEIGHT / 2) for pose in poses]
@@ -167,22 +158,22 @@ class RecordedEpisode(SourceEpisode):
         return {"object_ids": ids, "poses": known, "present": there}
 
     def recording(self, *, bodies: bool = True) -> Recording:
-        """All control steps of it, with the states of all bodies or of the robot alone."""
         return self._source.recording(self._number, bodies=bodies)
 
 
-def _read_info(file: TrajectoryFile, index: int) -> RecordingInfo | DatasetError:
-    """Return what the JSON says, or the error, which is of that episode alone."""
+def _read_entry(file: TrajectoryFile, index: int) -> Entry | DatasetError:
+    """Return the JSON's entry, or the error, which is of that episode alone."""
     try:
-        entry = file.entry(index)  # checks the JSON
-        return RecordingInfo(entry, recorded_scene(file, index), file.episodes[index]["robocas"].get("objects"))
+        entry = file.entry(index)
+        recorded_scene(file, index)
+        return entry
     except DatasetError as error:
         return error
 
 
 @cache
 def _names(pack: str) -> dict[str, str]:
-    """What instructions call the objects of an installed pack, by id; a file can't choose a folder."""
+    """Return the names of objects of an installed pack, by id; a file can't choose a folder."""
     try:
         return {asset: of.asset.name for asset, of in load_pack(pack).objects.items()} if pack in pack_folders() else {}
     except AssetError:
@@ -191,7 +182,7 @@ def _names(pack: str) -> dict[str, str]:
 
 @cache
 def _shipped(name: str) -> Mapping[str, Any]:
-    """A configuration by its name; empty where it can't be found any more."""
+    """Return a configuration by its name; empty if it can't be found any more."""
     try:
         return load_task_config(name).model_dump(mode="json")
     except RobocasError:

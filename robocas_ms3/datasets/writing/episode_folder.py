@@ -21,10 +21,9 @@ from robocas_ms3.datasets.pictures.drawing import EpisodeDrawing
 from robocas_ms3.datasets.pictures.headers import has_both_ends
 from robocas_ms3.datasets.pictures.stored import Pictures, write_picture
 from robocas_ms3.datasets.pictures.video import Preview
-from robocas_ms3.datasets.sources.arrays import with_embeddings
+from robocas_ms3.datasets.sources.arrays import read_arrays, with_embeddings
 from robocas_ms3.datasets.sources.files import CAMERA_LIMIT
 from robocas_ms3.datasets.sources.protocol import CameraModel, Frame
-from robocas_ms3.datasets.sources.tolerant import read_arrays
 from robocas_ms3.datasets.writing.workers import EpisodeWriter, GivenEpisode
 
 ENCODERS = 2  # threads; ISA-L and OpenCV work outside Python's lock

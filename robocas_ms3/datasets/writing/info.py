@@ -15,11 +15,11 @@ from robocas_ms3.core.ledger import Ledger
 from robocas_ms3.core.words import one_line
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.actions import action_space
+from robocas_ms3.datasets.sources.arrays import read_arrays
 from robocas_ms3.datasets.sources.provenance import environment_of, task_of
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.records import DataInfoRecord
 from robocas_ms3.datasets.sources.split import split_by_seed
-from robocas_ms3.datasets.sources.tolerant import read_arrays
 from robocas_ms3.demos.ledger import FAILURES_FILE
 from robocas_ms3.demos.recordings.entries import one_seed
 from robocas_ms3.demos.recordings.subgoals import subgoal_runs

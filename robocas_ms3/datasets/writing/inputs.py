@@ -17,9 +17,9 @@ from robocas_ms3.core.words import count_of, one_line
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.sources.arrays import arrays_fingerprint
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 from robocas_ms3.datasets.sources.protocol import EpisodeSource, Frame, SourceEpisode
-from robocas_ms3.datasets.sources.tolerant import arrays_fingerprint
 from robocas_ms3.datasets.writing.rendering import RenderedSource, open_env
 from robocas_ms3.datasets.writing.settings import ConversionSettings
 

@@ -90,7 +90,7 @@ class RenderedSource(TrajectorySource):
                 return unread_entry(file, number)
 
     def texts(self, number: int) -> list[str]:
-        entry = self.info(number).entry
+        entry = self.info(number)
         return [entry.instruction, *(goal.goal_description for goal in entry.subgoals)]
 
     def episode(self, number: int) -> RenderedEpisode:

@@ -13,7 +13,7 @@ import pytest
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.schema import EPISODE_INFO
-from robocas_ms3.datasets.sources.tolerant import load_arrays
+from robocas_ms3.datasets.sources.arrays import load_arrays
 
 NPZ = "episode_0000001/episode_info.npz"
 

@@ -23,9 +23,9 @@ from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.manage.importing import import_robocas
 from robocas_ms3.datasets.manage.splitting import Share, resplit
 from robocas_ms3.datasets.manage.survey import survey
+from robocas_ms3.datasets.sources.arrays import arrays_fingerprint
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.split import split_by_seed
-from robocas_ms3.datasets.sources.tolerant import arrays_fingerprint
 from robocas_ms3.datasets.writing.settings import ConversionSettings
 
 

@@ -167,7 +167,7 @@ def test_what_is_appended_leaves_a_split_of_texts_as_it_is(parts, tmp_path):
 def test_a_split_of_something_else(parts, tmp_path, listed):
     part = spoiled(parts[0], tmp_path)
     edit(part / "data_info.json", lambda c: c.update(val_eps=listed))
-    fails("data_info.json, val_eps: this split is damaged .expected episode numbers", [part], tmp_path / "out")
+    fails("data_info.json, val_eps: this value is damaged", [part], tmp_path / "out")
     resplit(part, Share(0.5))  # as the message says
     merge([part], tmp_path / "out")
 

@@ -8,7 +8,7 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks import arrays as laws
 from robocas_ms3.datasets.manage.repairs import ImportedEpisode, repair_arrays
-from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, load_arrays, motion_arrays, read_arrays
+from robocas_ms3.datasets.sources.arrays import EpisodeArrays, load_arrays, motion_arrays, read_arrays
 
 FILE = "episode_0000001/episode_info.npz"
 KEYS = ("ee_pos", "ee_orn", "rel_pos", "rel_orn")
