@@ -57,11 +57,7 @@ class ActionScale:
 
     @classmethod
     def of(cls, action_space: Mapping[str, Any], where: object = "action_space") -> ActionScale:
-        """From ``action_space`` of ``data_info.json``.
-
-        Raises:
-            DatasetError: it is not two rows of three numbers for position and for rotation.
-        """
+        """Return the scale of ``action_space`` of ``data_info.json``."""
         try:
             rows = [np.asarray(action_space[key], float) for key in ("relative_position", "relative_rotation")]
         except (KeyError, TypeError, ValueError) as error:

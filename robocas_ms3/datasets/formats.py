@@ -47,11 +47,7 @@ class Format:
     options: tuple[str, ...] = ()
 
     def part(self, name: str) -> Callable[..., Any]:
-        """Import ``reader``, ``writer`` or ``checker``.
-
-        Raises:
-            DatasetError: the format has none, or it can't be imported.
-        """
+        """Import ``reader``, ``writer`` or ``checker``."""
         path: str = getattr(self, name)
         if not path:
             raise DatasetError(f"this format has no {name}", where=self.title)

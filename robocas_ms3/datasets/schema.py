@@ -65,16 +65,7 @@ RELATIVE_PAIRS = (("ee_pos", "ee_orn", "rel_pos", "rel_orn"), ("base_pos", "base
 
 
 def check_version(found: object, where: Path, what: str = "a dataset") -> None:
-    """Refuse what is of another schema version.
-
-    Args:
-        found: its version.
-        where: its folder or file.
-        what: it is.
-
-    Raises:
-        DatasetError: it is of another, and how to come to one of this.
-    """
+    """Raise DatasetError if the schema version of a file or folder is another."""
     if found != SCHEMA_VERSION:
         fix = "Convert it again from its recording."
         if found == 0:

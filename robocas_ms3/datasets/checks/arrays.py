@@ -108,13 +108,7 @@ def check_pair(stored: EpisodeArrays, keys: tuple[str, str, str, str]) -> Iterat
 
 
 def motion_errors(stored: EpisodeArrays, keys: tuple[str, ...], order: int = 0) -> tuple[NDArray, NDArray]:
-    """Return the errors of stored relative poses: distance (T,) in m and angle (T,) in rad.
-
-    Args:
-        stored: arrays of the episode.
-        keys: one of ``schema.RELATIVE_PAIRS``.
-        order: 0 if quaternions are xyzw, -1 if they are wxyz.
-    """
+    """Return the errors (T,) of relative poses in m and in rad; ``order`` -1 reads quaternions as wxyz."""
     arrays = [stored.arrays[key].astype(np.float64) for key in keys]
     absolute, relative = (from_xyzw(arrays[i], np.roll(arrays[i + 1], order, axis=1)) for i in (0, 2))
     motion = relative_motion(absolute)

@@ -31,13 +31,7 @@ _Arrays = Mapping[str, NDArray]
 
 @dataclass(frozen=True)
 class Report:
-    """Result of a check.
-
-    Attributes:
-        episodes: number of episodes checked.
-        steps: number of their steps.
-        violations: all of them.
-    """
+    """Numbers of episodes and steps that were checked, and all violations."""
 
     episodes: int
     steps: int

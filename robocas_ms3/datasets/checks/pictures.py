@@ -81,15 +81,7 @@ def _is_rigid(matrix: NDArray) -> bool:
 def check_images(
     folder: Path, pictures: Pictures, steps: int, sizes: Sizes, read: ReadHeader = read_header
 ) -> Iterator[Violation]:
-    """Check that there is an intact image of each step, all of one size, and nothing else.
-
-    Args:
-        folder: of the episode.
-        pictures: images that ``conversion.json`` promises.
-        steps: T; of more than `schema.MAX_STEPS` the first are checked.
-        sizes: size of the images per camera if none is promised; cameras that are missing are added.
-        read: reads the header of an image.
-    """
+    """Check that there is an intact image of each step, all of one size (see `Sizes`), and nothing else."""
     places = [(camera, kind) for camera in pictures.cameras for kind in pictures.kinds]
     with ThreadPoolExecutor(_READERS) as pool:
         headers = list(pool.map(partial(_read_headers, folder, pictures.image_format, steps, read), places))

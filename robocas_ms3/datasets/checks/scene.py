@@ -66,12 +66,7 @@ def read_settings(root: Path) -> tuple[dict[str, Any], Pictures, list[Violation]
 def check_ledger(
     settings: Mapping[str, Any], episodes: Mapping[int, tuple[EpisodeArrays, dict[str, Any]]]
 ) -> Iterator[Violation]:
-    """Check that the ledger lists the episodes on disk as they are, and that no two have the same arrays.
-
-    Args:
-        settings: usable content of ``conversion.json``.
-        episodes: number -> arrays and content of ``scene.json`` of the episodes on disk.
-    """
+    """Check that the settings list the episodes on disk as they are, and that no two have the same arrays."""
     ledger = settings.get("episodes")
     for number, entry in (ledger or {}).items():
         if int(number) not in episodes:

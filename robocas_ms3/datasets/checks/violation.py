@@ -50,14 +50,7 @@ class Violation:
 def read_object(
     root: Path, name: str, model: type[BaseModel] | None = None, *, absent: str = "this file"
 ) -> tuple[dict[str, Any], list[Violation]]:
-    """Return the object in a JSON file of a dataset, empty if it can't be read, and what is wrong with it.
-
-    Args:
-        root: folder of the dataset.
-        name: path of the file in it.
-        model: declared form of the content; None: any object.
-        absent: what is expected if there is no such file.
-    """
+    """Return the object in a JSON file of a dataset, empty if it can't be read, and what is wrong with it."""
     try:
         content = load_json(root / name)
     except FileNotFoundError:

@@ -36,13 +36,7 @@ _NO_LINKS = {errno.EXDEV, errno.EPERM, errno.EACCES, errno.EMLINK, errno.EOPNOTS
 
 @dataclass(frozen=True)
 class FinishedDataset:
-    """A dataset of this schema version whose files all list the same episodes; see `open_finished`.
-
-    Attributes:
-        dataset: its reader.
-        name: in the ledger of other datasets.
-        ledger: number -> entry of ``conversion.json``.
-    """
+    """A dataset whose files all list the same episodes, its name, and its recordings; see `open_finished`."""
 
     dataset: Dataset
     name: str
@@ -64,11 +58,7 @@ def schema_version(dataset: Dataset) -> object:
 
 
 def open_finished(root: Path, name: str = "") -> FinishedDataset:
-    """Open a dataset to copy episodes from.
-
-    Raises:
-        DatasetError: there is none, it is of another version, unfinished, or contradicts itself.
-    """
+    """Open a dataset to copy episodes from, or raise DatasetError if it is unfinished or contradicts itself."""
     dataset = Dataset(root)
     schema.check_version(schema_version(dataset), root)
     if not dataset.info:
@@ -205,11 +195,7 @@ def _settings_of(record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def check_apart(out: Path, inputs: Sequence[Path]) -> None:
-    """Check that an output is no input, is in none, and holds none.
-
-    Raises:
-        DatasetError: it is.
-    """
+    """Raise DatasetError if an output is an input, is in one, or holds one."""
     target = out.resolve()
     for path in (path.resolve() for path in inputs):
         if path == target or path in target.parents or target in path.parents:
@@ -247,12 +233,7 @@ def _check_ends(path: Path) -> PictureHeader | None:
 
 @dataclass
 class FilePlacer:
-    """Links or copies files into a dataset.
-
-    Attributes:
-        link: whether hard links are tried; files of other file systems are copied.
-        linked, copied: number of files so far.
-    """
+    """Links files into a dataset, or copies them where that is not possible or not wanted, and counts both."""
 
     link: bool
     linked: int = 0

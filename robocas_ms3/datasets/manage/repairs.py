@@ -30,14 +30,7 @@ Keys = tuple[str, str, str, str]
 
 @dataclass(frozen=True)
 class Finding:
-    """A violation, and what the import does about it.
-
-    Attributes:
-        episode: its number; None: of the dataset.
-        violation: what is wrong.
-        outcome: see `Outcome`.
-        repair: what was done.
-    """
+    """A violation in an episode, or in the dataset, what the import does about it, and what was repaired."""
 
     episode: int | None
     violation: Violation
@@ -57,15 +50,7 @@ class Finding:
 
 @dataclass
 class ImportedEpisode:
-    """An episode while it is checked and repaired.
-
-    Attributes:
-        number: of the episode.
-        stored: its arrays.
-        findings: what is or was wrong.
-        turn_deg: angle about z by which its EEF frame was turned.
-        pictures: its images; None: not checked yet.
-    """
+    """An episode while it is checked and repaired; ``turn_deg``: angle about z by which its EEF frame was turned."""
 
     number: int
     stored: EpisodeArrays

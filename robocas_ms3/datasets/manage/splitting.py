@@ -37,12 +37,7 @@ Sides = tuple[list[int], list[int]]
 
 @dataclass(frozen=True)
 class Share:
-    """How training and validation are chosen.
-
-    Attributes:
-        val: share of the episodes that validate, between 0 and 1.
-        by: what stays on one side: episodes of one seed, target object or task.
-    """
+    """Fraction of the episodes that validate, and what stays on one side: episodes of a seed, target object or task."""
 
     val: float
     by: By = "seed"
@@ -57,11 +52,7 @@ class Share:
 
 
 def groups_of(dataset: Dataset, by: By) -> dict[int, str]:
-    """Return by episode number its seed, target object or task, as text.
-
-    Raises:
-        DatasetError: an episode does not have it.
-    """
+    """Return by episode number its seed, target object or task, as text."""
     groups = {}
     for number in dataset.numbers:
         scene = dataset.episode(number).scene
@@ -143,11 +134,7 @@ def resplit(root: Path, share: Share | None = None) -> Sides:
 
 
 def split_by_side(source: FinishedDataset, share: Share | None, train: Path, val: Path) -> dict[Path, Sides]:
-    """Return the sides of the episodes of two datasets: training and validation.
-
-    Raises:
-        DatasetError: both would be one folder, or one in the other.
-    """
+    """Return the sides of the episodes of two datasets: training and validation."""
     a, b = train.resolve(), val.resolve()
     if a == b or a in b.parents or b in a.parents:
         raise DatasetError("two datasets in one folder", where=val, fix="Choose two that are apart.")
@@ -183,18 +170,7 @@ def folder_names(values: Iterable[str]) -> dict[str, str]:
 def write_split(
     source: FinishedDataset, pieces: Mapping[Path, Sides], share: Share | None, options: CopyOptions | None = None
 ) -> list[CopyResult]:
-    """Write the datasets of a split.
-
-    Args:
-        source: the dataset that is split.
-        pieces: folder of each new dataset -> its training and validation episodes.
-        share: how the sides were chosen; None: as in the source.
-        options: how to copy.
-
-    Raises:
-        DatasetError: an output would be empty, or is the input; an episode is damaged.
-        OutputExistsError: an output is another dataset, or none.
-    """
+    """Write the datasets of a split, by their folders; ``share``: how the sides were chosen, None: as in the source."""
     members: dict[Path, list[CopiedEpisode]] = {}
     for out, (train, val) in pieces.items():
         if not train and not val:

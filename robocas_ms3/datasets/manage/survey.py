@@ -159,14 +159,7 @@ def _in_dataset(found: Finding) -> Finding:
 def read_episode(
     dataset: Dataset, number: int, info: Mapping[str, Any], rate_hz: float, turn_eef: bool
 ) -> ImportedEpisode:
-    """Read and repair the arrays of an episode, and check its cameras.
-
-    Args:
-        dataset: it is in.
-        number: of the episode.
-        info: ``data_info.json``.
-        rate_hz, turn_eef: see `survey`.
-    """
+    """Read and repair the arrays of an episode, and check its cameras; see `survey`."""
     source, said = dataset.episode(number), said_of(info, number)
     path = source.folder / schema.EPISODE_FILE
     episode = ImportedEpisode(number, EpisodeArrays(path, {}))

@@ -26,13 +26,7 @@ _INK, _FAINT, _PAPER = (245, 245, 245), (170, 180, 190), (24, 26, 30)
 
 
 class EpisodeDrawing:
-    """Draws the images of an episode.
-
-    Args:
-        number: of the episode.
-        arrays: by the keys of the schema.
-        rate_hz: steps per second.
-    """
+    """Draws the images of an episode, with texts of its arrays."""
 
     def __init__(self, number: int, arrays: Mapping[str, NDArray], rate_hz: float) -> None:
         self.number, self.rate_hz = number, rate_hz

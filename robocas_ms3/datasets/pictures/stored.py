@@ -67,15 +67,7 @@ class Pictures:
         object.__setattr__(self, "cameras", tuple(name for name in dict.fromkeys(names) if name in self.cameras))
 
     def choose(self, cameras: Sequence[str], where: object) -> Pictures:
-        """Return the same of those cameras that there are, in their order.
-
-        Args:
-            cameras: names of those that there are.
-            where: they are, for messages.
-
-        Raises:
-            DatasetError: a camera is not there.
-        """
+        """Return the same of those cameras that there are, in their order; ``where`` they are, for messages."""
         wrong = sorted(set(self.cameras) - set(cameras))
         if wrong:
             raise DatasetError("no such camera", where=where, expected=f"some of {', '.join(cameras)}", found=wrong)

@@ -97,16 +97,7 @@ def contact_sheet(
 
 
 class Preview:
-    """Video and row of the contact sheet of an episode that is being written; the video appears whole, at the end.
-
-    Args:
-        root: the dataset.
-        drawing: of the episode.
-        row: whether it is on the contact sheet.
-
-    Attributes:
-        row: (H, W, 3) RGB, after the last frame.
-    """
+    """Video and row of the contact sheet of an episode that is being written; the video appears whole, at the end."""
 
     def __init__(self, root: Path, drawing: EpisodeDrawing, *, row: bool) -> None:
         self.row: NDArray[np.uint8] | None = None

@@ -74,12 +74,7 @@ class EpisodeArrays:
 
 
 def read_arrays(path: Path, keys: Container[str] | None = None) -> EpisodeArrays:
-    """Read arrays as they are stored; damage is recorded, not raised.
-
-    Args:
-        path: of ``episode_info.npz``.
-        keys: those to read; None: all.
-    """
+    """Read arrays as they are stored, all or those with some keys; damage is recorded, not raised."""
     arrays: dict[str, NDArray] = {}
     unreadable: dict[str, Exception] = {}
     ignored: list[str] = []
@@ -144,13 +139,7 @@ def is_declared(key: str, array: NDArray) -> bool:
 
 
 def completed(loaded: EpisodeArrays, said: Mapping[str, Any], rate_hz: float) -> EpisodeArrays:
-    """Return the arrays with what is missing made of what is there; ``derived`` says of what.
-
-    Args:
-        loaded: what could be read, of the schema's types.
-        said: ``language_goal`` and ``step_goals`` of the episode in ``data_info.json``, where they are there.
-        rate_hz: steps a second.
-    """
+    """Return the arrays with what is missing made of others and of ``said``, the entries of ``data_info.json``."""
     arrays, derived = dict(loaded.arrays), dict(loaded.derived)
 
     def put(key: str, values: Any, source: str) -> None:

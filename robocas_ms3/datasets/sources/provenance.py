@@ -65,15 +65,7 @@ def recorded_scene(file: TrajectoryFile, index: int) -> dict[str, Any]:
 def scene_record(
     file: TrajectoryFile, index: int, recording: Recording, scene: dict[str, Any], rate_hz: float
 ) -> dict[str, Any]:
-    """Content of ``scene.json``.
-
-    Args:
-        file: the trajectory.
-        index: of the episode in it.
-        recording: the episode.
-        scene: ``task``, ``config``, ``layout`` and ``objects``, as what shows it gives them.
-        rate_hz: of the dataset.
-    """
+    """Return ``scene.json`` of a recording, with task, config, layout and objects of the rebuilt ``scene``."""
     record = {**recorded_scene(file, index), **scene, "rate_hz": rate_hz}
     record["source"]["recording"] = fingerprint(recording)
     return {key: record.get(key) for key in SCENE_KEYS}

@@ -46,12 +46,7 @@ _NUMBERS, _LENGTHS = TypeAdapter(list[EpisodeIndex]), TypeAdapter(dict[int, int]
 
 @dataclass(frozen=True)
 class Episode(SourceEpisode):
-    """One episode's folder.
-
-    Attributes:
-        folder: its path.
-        dataset: it is in; says what is not in the folder.
-    """
+    """The folder of an episode; ``dataset`` says what is not in it."""
 
     folder: Path
     dataset: Dataset | None = field(default=None, repr=False, compare=False)

@@ -123,13 +123,7 @@ class EntryRecord(_Part):
 
 
 class EpisodesRecord(_Part):
-    """The episodes of ``conversion.json``, which datasets of other writers may have too.
-
-    Attributes:
-        made_with: versions of packages.
-        episodes: number -> recording.
-        left_out: number -> recording of an episode that could not be written, with ``why``.
-    """
+    """The episodes of ``conversion.json``; those left out could not be written, with ``why``."""
 
     made_with: dict[str, str] = {}
     episodes: dict[EpisodeNumber, EntryRecord] = {}
@@ -217,11 +211,7 @@ def with_unknown(scene: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_scene(scene: Mapping[str, Any], where: object) -> SceneRecord:
-    """Return the content of ``scene.json`` as a record; keys may be missing.
-
-    Raises:
-        DatasetError: it is damaged.
-    """
+    """Return the content of ``scene.json`` as a record, or raise DatasetError; keys may be missing."""
     try:
         return SceneRecord.model_validate(with_unknown(scene))
     except ValidationError as problem:

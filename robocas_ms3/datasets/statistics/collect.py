@@ -100,19 +100,7 @@ def _edges(low: float, high: float, points: Array) -> Array:
 
 @dataclass
 class Stats:
-    """Counts of a dataset.
-
-    Attributes:
-        split: episodes of each side.
-        lengths: task -> T of each of its episodes.
-        success: of the episodes: ``true``, ``false``, ``unknown``.
-        objects: id -> in how many episodes it took part (copies count once).
-        targets: id -> of how many it was the target.
-        layouts: by configuration.
-        actions: (N, 7) all of them.
-        subgoals: type -> steps of each.
-        gripper_changes: commands to open or close in each episode.
-    """
+    """Counts of a dataset: episodes of each kind, T of the episodes of each task, steps of each type of sub-goal."""
 
     path: Path
     rate_hz: float

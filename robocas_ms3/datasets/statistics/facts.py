@@ -22,13 +22,7 @@ UNKNOWN = "unknown"
 
 @dataclass(frozen=True)
 class Surface:
-    """The surface that objects stand on.
-
-    Attributes:
-        label: furniture and name of the surface.
-        x, y, yaw: the furniture in the world, m and rad.
-        region: [min_xy, max_xy] in the furniture's frame, m; None: all of the surface.
-    """
+    """The surface that objects stand on: pose of its furniture in the world (m, rad), and region there."""
 
     label: str
     x: float

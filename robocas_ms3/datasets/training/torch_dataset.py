@@ -105,11 +105,7 @@ class RoboCASDataset(torch.utils.data.Dataset):
         return int(self._offsets[-1])
 
     def locate(self, index: int) -> tuple[int, int]:
-        """Return episode number and step of a sample.
-
-        Raises:
-            IndexError: there is no such sample.
-        """
+        """Return episode number and step of a sample."""
         if not -len(self) <= index < len(self):
             raise IndexError(f"sample {index} of {len(self)}")
         index %= len(self)
@@ -118,22 +114,14 @@ class RoboCASDataset(torch.utils.data.Dataset):
         return number, self._steps[number][index - int(self._offsets[place])]
 
     def indices(self, episode: int) -> range:
-        """Return the samples of an episode.
-
-        Raises:
-            DatasetError: the episode is not in this split.
-        """
+        """Return the samples of an episode of this split."""
         if episode not in self._steps:
             raise DatasetError("no such episode in this split", where=f"episode {episode}")
         place = self.episodes.index(episode)
         return range(int(self._offsets[place]), int(self._offsets[place + 1]))
 
     def index(self, episode: int, step: int) -> int:
-        """Return the sample of an episode's step.
-
-        Raises:
-            DatasetError: the episode is not in this split, or that step has no sample.
-        """
+        """Return the sample of a step of an episode."""
         found, steps = self.indices(episode), self._steps[episode]
         if step not in steps:
             expected = f"{steps[0]} to {steps[-1]}" if steps else "none"
@@ -141,23 +129,13 @@ class RoboCASDataset(torch.utils.data.Dataset):
         return found[step - steps.start]
 
     def weights(self) -> torch.Tensor:
-        """(N,) float64 weights for ``WeightedRandomSampler`` with which each sub-goal type is drawn equally often.
-
-        Raises:
-            DatasetError: no sub-goals are known.
-        """
+        """Return weights (N,) for ``WeightedRandomSampler``, with which each sub-goal type is drawn equally often."""
         if (self.stages < 0).all():
             raise DatasetError("no sub-goals are known here", where=self.source.root, expected="step_goals")
         _, stages, counts = np.unique(self.stages, return_inverse=True, return_counts=True)
         return torch.from_numpy(1.0 / (len(counts) * counts[stages]))
 
     def __getitem__(self, index: int) -> Any:
-        """Return a sample.
-
-        Raises:
-            IndexError: there is no such sample.
-            DatasetError: a file is missing or damaged.
-        """
         number, step = self.locate(int(index))
         arrays, options = self._arrays(number), self.options
         observed, acted = options.observed(step), options.acted(step)
@@ -212,11 +190,7 @@ class RoboCASDataset(torch.utils.data.Dataset):
 def read_images(
     episode: SourceEpisode, options: SampleOptions, observed: NDArray[np.int64], kind: Kind
 ) -> torch.Tensor:
-    """Read the images of steps (H,) one after the other, below 0 before the episode: (H, C, 3, h, w) or (H, C, h, w).
-
-    Raises:
-        DatasetError: a file is missing or damaged, or sizes differ.
-    """
+    """Read the images of steps (H,), below 0 before the episode: (H, C, 3, h, w), or (H, C, h, w) in m."""
     if get_worker_info() is not None and cv2.getNumThreads() > 1:
         cv2.setNumThreads(0)  # a pool of OpenCV does not survive a fork
     steps = np.maximum(observed, 0)

@@ -32,13 +32,7 @@ _MAX_WAITING = 24  # images, which bounds memory
 
 @dataclass(frozen=True)
 class FolderWriter(EpisodeWriter):
-    """Writes episodes of a RoboCAS folder.
-
-    Attributes:
-        out: the dataset.
-        embed: texts -> (N, 384); None leaves the embeddings out.
-        sheet: episodes on the contact sheet; None: no previews are made.
-    """
+    """Writes episodes of a RoboCAS folder; with a ``sheet`` of episodes also their previews."""
 
     out: Path
     embed: Callable[[list[str]], NDArray[np.float32]] | None = None
@@ -109,14 +103,7 @@ def _encoder(threads: int = ENCODERS) -> Generator[Callable[..., None], None, No
 
 
 def find_damaged(folder: Path, pictures: Pictures) -> Path | None:
-    """Return the first file of an episode that is missing or was cut off since it was written.
-
-    A file that is cut off lacks its end, so little is read. Other damage is found by ``robocas validate``.
-
-    Args:
-        folder: of the episode.
-        pictures: images that it should hold.
-    """
+    """Return the first file of an episode that is missing or lacks its end, as one that was cut off does."""
     length = "episode_length"
     steps = read_arrays(folder / schema.EPISODE_FILE, (length,)).arrays.get(length)
     if steps is None or steps.ndim:

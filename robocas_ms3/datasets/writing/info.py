@@ -34,12 +34,7 @@ def write_info(root: Path, before: tuple[Iterable[int], Iterable[int]] = ((), ()
 
 
 def info_of(root: Path, before: tuple[Iterable[int], Iterable[int]] = ((), ())) -> dict[str, Any]:
-    """Return the content of ``data_info.json``. An episode of unknown seed counts as one of a seed of its own.
-
-    Args:
-        root: folder of the dataset.
-        before: training and validation episodes so far, see `split_by_seed`.
-    """
+    """Return ``data_info.json``; ``before``: both sides so far. Episodes without a seed count as different seeds."""
     dataset = Dataset(root)
     seeds: dict[int, int] = {}
     lengths, instructions, goals = {}, {}, {}
@@ -79,13 +74,7 @@ def info_of(root: Path, before: tuple[Iterable[int], Iterable[int]] = ((), ())) 
 
 
 def add_failures(run: Path, out: Path, env_info: Mapping[str, Any]) -> None:
-    """Add the failures of a run to a dataset, each once, with task and environment.
-
-    Args:
-        run: folder of the trajectory, which may have a ``failures.jsonl``; lines cut off by a crash are ignored.
-        out: folder of the dataset.
-        env_info: of the trajectory.
-    """
+    """Add the failures of the run in a folder to a dataset, each once, with task and environment."""
     made_in = {"task": task_of(str(env_info.get("env_id"))), "environment": environment_of(env_info)}
     there: Ledger[dict[str, Any]] = Ledger(out / FAILURES_FILE, dict[str, Any])
     failures: Ledger[dict[str, Any]] = Ledger(run / FAILURES_FILE, dict[str, Any])

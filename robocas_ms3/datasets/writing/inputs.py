@@ -47,11 +47,7 @@ class ConversionInput:
     sizes: Mapping[str, tuple[int, int]] = field(default_factory=dict)
 
     def entries(self) -> list[dict[str, Any]]:
-        """Return the recording of each episode to convert, in order, and ``source``, its number in the source.
-
-        Raises:
-            DatasetError: there is none.
-        """
+        """Return the recording of each episode to convert, in order, with ``source``, its number in the source."""
         entries = ((number, self._entry(number)) for number in self.source.numbers)
         chosen = [{"source": number, **entry} for number, entry in entries if entry is not None]
         if not chosen:
@@ -107,11 +103,7 @@ class ConversionInput:
 
 
 def open_input(settings: ConversionSettings) -> ConversionInput:
-    """Open what is converted.
-
-    Raises:
-        DatasetError: it is neither a trajectory file nor a dataset, can't be read, or the settings don't suit it.
-    """
+    """Open the trajectory file or dataset that settings name."""
     if settings.is_trajectory:
         rendered = open_trajectory(settings)
         return ConversionInput(rendered, rendered.pictures, settings.include_failed)

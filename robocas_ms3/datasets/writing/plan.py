@@ -121,12 +121,7 @@ def _place(entry: Mapping[str, Any]) -> str:
 
 
 def planned_sides(content: Mapping[str, Any], before: tuple[list[int], list[int]]) -> tuple[list[int], list[int]]:
-    """Return the split of all planned episodes, so that missing ones change the side of no other.
-
-    Args:
-        content: of ``conversion.json``.
-        before: the sides so far.
-    """
+    """Return the split of all planned episodes, so that missing ones change the side of no other."""
     seeds = {int(number): one_seed(entry.get("seed")) for number, entry in content["episodes"].items()}
     return split_by_seed({number: number if seed is None else seed for number, seed in seeds.items()}, before)
 

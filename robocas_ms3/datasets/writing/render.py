@@ -153,11 +153,7 @@ def _numbers(pose: NDArray[np.float64]) -> list[float]:
 
 
 def require_renderer() -> None:
-    """Check that SAPIEN finds a device to render with.
-
-    Raises:
-        DatasetError: it finds none.
-    """
+    """Raise DatasetError if SAPIEN finds no device to render with."""
     import sapien
 
     try:

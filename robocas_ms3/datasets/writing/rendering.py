@@ -68,11 +68,7 @@ class RenderedSource(TrajectorySource):
         self._control_mode = ""
 
     def turn_to(self, path: Path) -> None:
-        """Read another file of the same environment, which stays open.
-
-        Raises:
-            DatasetError: the file can't be read, or is of another environment or control rate.
-        """
+        """Read another file of the same environment, which stays open."""
         env, control_freq = self.file.env, self.file.control_freq
         with TrajectoryFile(path, pack=self._pack) as file:
             if (file.env, file.control_freq) != (env, control_freq):

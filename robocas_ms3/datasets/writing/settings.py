@@ -95,11 +95,7 @@ class ConversionSettings:
 
     @property
     def pictures(self) -> Pictures:
-        """Images that are wanted.
-
-        Raises:
-            DatasetError: an invalid name of a camera, or size.
-        """
+        """Images that are wanted."""
         from robocas_ms3.datasets.pictures.stored import Pictures
 
         return Pictures(self.cameras, self.size, self.depth, self.image_format, self.boxes)
@@ -134,14 +130,7 @@ class ConversionSettings:
 
 @dataclass(frozen=True)
 class WrittenEpisode:
-    """An episode on disk.
-
-    Attributes:
-        number: in the dataset.
-        steps: T.
-        size: bytes.
-        row: its row of the contact sheet, (H, W, 3) RGB, if one was wanted.
-    """
+    """An episode on disk: T, bytes, and its row of the contact sheet, (H, W, 3) RGB, if one was wanted."""
 
     number: int
     steps: int
@@ -151,14 +140,7 @@ class WrittenEpisode:
 
 @dataclass(frozen=True)
 class Conversion:
-    """Result of a conversion.
-
-    Attributes:
-        episodes: the new ones, by number.
-        kept: number of episodes of the source that were there already.
-        seconds: wall-clock time.
-        previews: whether previews were made.
-    """
+    """Result of a conversion: new episodes by number, number of those that were there, wall-clock time."""
 
     episodes: list[WrittenEpisode]
     kept: int

@@ -36,14 +36,7 @@ Task = tuple[int, int]
 
 @dataclass(frozen=True)
 class GivenEpisode:
-    """An episode that is being written.
-
-    Attributes:
-        number: in the dataset.
-        episode: of the source.
-        arrays: all that it must have.
-        given: the source, and what of it is converted.
-    """
+    """An episode that is being written: its number in the dataset, and all arrays that it must have."""
 
     number: int
     episode: SourceEpisode
@@ -77,15 +70,7 @@ class EpisodeWriter(ABC):
 
 @dataclass(frozen=True)
 class WriteJob:
-    """The episodes of a conversion that are missing.
-
-    Attributes:
-        settings: of the conversion.
-        writer: of the format.
-        tasks: the episodes.
-        continued: whether there are episodes already.
-        fix: what to do if episodes can't be written.
-    """
+    """The episodes of a conversion that are missing; ``continued``: whether there are others already."""
 
     settings: ConversionSettings
     writer: EpisodeWriter
