@@ -81,8 +81,8 @@ def handle_interrupt(handler: Handler) -> None:
 
 
 @contextmanager
-def deferred_interrupts(*, second_ends: bool = True) -> Iterator[None]:
-    """Handle a SIGINT or SIGTERM that comes inside afterwards, once.
+def deferred_interrupts(*, second_ends: bool = True) -> Iterator[list[Any]]:
+    """Handle a SIGINT or SIGTERM that comes inside afterwards, once; gives the list that those that came are in.
 
     A signal mask is not enough: the system gives the signal to another thread, and Python tells the main thread.
 
@@ -98,7 +98,7 @@ def deferred_interrupts(*, second_ends: bool = True) -> Iterator[None]:
                 signal.signal(number, lambda number, frame: came.append((number, frame)))
     protected, _command.protected = _command.protected, _command.protected or not second_ends
     try:
-        yield
+        yield came
     finally:
         _command.protected = protected
         with ExitStack() as restored:  # one that comes now interrupts this, but not what is restored after it

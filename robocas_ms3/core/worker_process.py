@@ -32,9 +32,9 @@ Result = TypeVar("Result")
 Task_contra = TypeVar("Task_contra", contravariant=True)
 Result_co = TypeVar("Result_co", covariant=True)
 
-_START_SECONDS = 900.0  # until a worker is made
+START_SECONDS = 900.0  # until a worker is made
 _EXIT_SECONDS = 1.0  # until an idle process has left
-_POLL_SECONDS = 1.0  # between two checks of limits
+POLL_SECONDS = 1.0  # between two checks of limits
 _JOB_KILL_SECONDS = 2.0  # until this process is ended too, where a batch system ends all processes of a job
 # Not `multiprocessing`, whose spawn runs the user's main module again: it needs `if __name__ == "__main__"` there, and
 # fails in a program from standard input.
@@ -58,7 +58,9 @@ NO_LIMITS = Limits()
 
 
 class ProcessDied(WorkerCrashed):
-    """The process of a task died; other than a `WorkerCrashed` that the task itself raised."""
+    """The process of a task died, which had this ``pid``; other than a `WorkerCrashed` that the task itself raised."""
+
+    pid = 0
 
 
 class Worker(Protocol[Task_contra, Result_co]):
@@ -72,44 +74,61 @@ class Worker(Protocol[Task_contra, Result_co]):
 
 
 class WorkerProcess(Generic[Task, Result]):
-    """A process that runs one task after the other; it starts with a task, and again after it died.
+    """A process that runs one task after the other.
 
-    One thread uses it, and lives as long: Linux kills a process when the thread that started it ends.
+    The thread that starts it has to live as long: Linux kills a process when the thread that started it ends.
 
     Args:
         make_worker: is called in the process.
         limits: of each task.
         stop: a `Connection` that becomes readable when the running task has to be killed.
+
+    Attributes:
+        connection: to the process, a `Connection`.
     """
 
     def __init__(self, make_worker: Callable[[], Worker[Task, Result]], limits: Limits, stop: Any) -> None:
         self._make_worker, self._limits, self._stop = make_worker, limits, stop
         self._process: subprocess.Popen[bytes] | None = None
-        self._connection: Any = None  # a Connection
+        self.connection: Any = None
         self._checked = 0.0  # time of the last check of the memory limit
+
+    @property
+    def pid(self) -> int:
+        assert self._process is not None
+        return self._process.pid
 
     def run(self, task: Task) -> Result:
         if self._process is None or self._process.poll() is not None:
             try:
-                self._start()
+                self.launch()
+                self._receive(START_SECONDS)  # that it reads: nothing below waits for a full pipe
+                self.send(self.pickled_worker)
+                self._receive(START_SECONDS)
             except ProcessDied as crash:
-                what, fix = "a worker process died before its first task", "See its output above, and robocas doctor."
-                raise WorkerStartError(what, found=crash.found, fix=fix) from crash
+                raise start_error(crash) from crash
             except BaseException:
-                self._end()
+                self.end()
                 raise
-        return self._ask(task, self._limits.seconds)
+        self.send(task)
+        return self._receive(self._limits.seconds)
 
     def leave(self) -> None:
         """Let the process leave; kill it where that takes too long, or where it is busy."""
         if self._process is not None:
-            self._connection.close()
+            self.connection.close()
             with suppress(subprocess.TimeoutExpired):
                 self._process.wait(_EXIT_SECONDS)
-        self._end()
+        self.end()
 
-    def _start(self) -> None:
-        self._end()
+    @property
+    def pickled_worker(self) -> bytes:
+        """The first message to the process; the answer to it is None, or the error of making the worker."""
+        return cloudpickle.dumps(self._make_worker)
+
+    def launch(self) -> None:
+        """Start the process, which answers None when it reads, before any message."""
+        self.end()
         try:
             connection, theirs = Pipe()
             with theirs:
@@ -119,34 +138,40 @@ class WorkerProcess(Generic[Task, Result]):
         except OSError as error:
             what, fix = "can't start another process", "Use fewer --jobs, or raise the limits (ulimit -u, -n)."
             raise RobocasError(what, found=error.strerror or error, fix=fix) from error
-        self._connection = connection
-        self._receive(_START_SECONDS)  # that it reads: nothing below waits for a full pipe
-        self._ask(cloudpickle.dumps(self._make_worker), _START_SECONDS)
+        self.connection = connection
 
-    def _ask(self, message: object, seconds: float) -> Any:
+    def send(self, message: object) -> None:
+        """Send a message; raises ProcessDied."""
         try:
-            self._connection.send(message)
+            self.connection.send(message)
         except OSError as error:
             raise self._crash() from error
-        return self._receive(seconds)
 
     def _receive(self, seconds: float) -> Any:
-        assert self._process is not None
         deadline = time.monotonic() + seconds
         ready: list[Any] = []
         while not ready:
-            ready = wait([self._connection, self._stop], _POLL_SECONDS)
-            if not ready and time.monotonic() > deadline:
-                raise self._crash("too slow")
-            if time.monotonic() - self._checked > _POLL_SECONDS:  # also where tasks are shorter than that
-                self._checked = time.monotonic()
-                if _exceeds_memory(self._process.pid, self._limits.memory_gb):
-                    raise self._crash("too much memory")
+            ready = wait([self.connection, self._stop], POLL_SECONDS)
+            self.check_limits(math.inf if ready else deadline)
         if self._stop in ready:
-            self._end()
+            self.end()
             raise CancelledError
+        return self.read()
+
+    def check_limits(self, deadline: float) -> None:
+        """Kill the process and raise ProcessDied where it is too late (`time.monotonic`), or it has too much memory."""
+        now = time.monotonic()
+        if now > deadline:
+            raise self._crash("too slow")
+        if now - self._checked > POLL_SECONDS:  # also where tasks are shorter than that
+            self._checked = now
+            if _exceeds_memory(self.pid, self._limits.memory_gb):
+                raise self._crash("too much memory")
+
+    def read(self) -> Any:
+        """Read the answer that is there; raises ProcessDied, or the error of the task."""
         try:
-            answer = self._connection.recv()
+            answer = self.connection.recv()
         except (EOFError, OSError) as error:
             raise self._crash() from error
         if isinstance(answer, RemoteError):
@@ -163,16 +188,25 @@ class WorkerProcess(Generic[Task, Result]):
             reason = signal.Signals(-code).name if code is not None and code < 0 else f"exit code {code}"
             if code in (-signal.SIGTERM, -signal.SIGKILL):
                 wait([self._stop], _JOB_KILL_SECONDS)  # else the task would be blamed for the end of all
-        self._end()
-        return ProcessDied("its worker process died", found=reason)
+        died = ProcessDied("its worker process died", found=reason)
+        died.pid = self.pid
+        self.end()
+        return died
 
-    def _end(self) -> None:
+    def end(self) -> None:
+        """Kill the process and what it forked, if it runs."""
         if self._process is not None:
             _kill_tree(self._process)
             self._process = None
-        if self._connection is not None:
-            self._connection.close()
-            self._connection = None
+        if self.connection is not None:
+            self.connection.close()
+            self.connection = None
+
+
+def start_error(crash: ProcessDied) -> WorkerStartError:
+    """Return the error of a process that died before its first task."""
+    what, fix = "a worker process died before its first task", "See its output above, and robocas doctor."
+    return WorkerStartError(what, found=crash.found, fix=fix)
 
 
 def _exceeds_memory(pid: int, memory_gb: float) -> bool:

@@ -22,7 +22,6 @@ import threading
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import CancelledError
 from contextlib import suppress
-from functools import partial
 from itertools import islice
 from multiprocessing import Pipe
 from queue import Empty, SimpleQueue
@@ -104,25 +103,6 @@ class WorkerPool(Generic[Task, Result]):
         """Run one task and wait for it; raises as `map` does."""
         (result,) = self.map([task])
         return result
-
-    def submit(self, task: Task) -> Callable[[], Result]:
-        """Start a task in a worker process; return a function that waits for its result, and raises as `map` does.
-
-        Without processes the function runs the task.
-        """
-        if self._num_workers == 0:
-            return partial(self.run, task)
-        job = _Job(task, SimpleQueue())
-        self._submit(job)
-
-        def wait() -> Result:
-            while not job.done:
-                self._next(job.finished)
-            if job.error is not None:
-                raise job.error
-            return job.result  # pyright: ignore[reportReturnType]  (of a job that is done)
-
-        return wait
 
     def _map_here(self, tasks: Iterable[Task]) -> Generator[Result, None, None]:
         for task in tasks:

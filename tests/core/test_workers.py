@@ -113,13 +113,6 @@ def test_the_other_workers_go_on_while_a_slow_task_holds_up_results_and_few_of_t
 
 
 @pytest.mark.parametrize("num_workers", [0, 1])
-def test_a_submitted_task_is_run(num_workers):
-    with WorkerPool(Counter, num_workers) as pool:
-        waits = [pool.submit(task) for task in "ab"]
-        assert tasks_of(wait() for wait in waits) == ["a", "b"]
-
-
-@pytest.mark.parametrize("num_workers", [0, 1])
 def test_an_error_is_raised_as_it_is_and_the_worker_is_made_again(num_workers):
     with WorkerPool(Counter, num_workers) as pool:
         assert [pool.run("a")[2], pool.run("a")[2]] == [1, 2]

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import mmap
 import os
 import pickle
 import tempfile
-import weakref
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from copy import copy
@@ -19,10 +19,11 @@ import torch
 from gymnasium.vector.utils import batch_space
 from mani_skill.utils.registration import REGISTERED_ENVS
 
-from robocas_ms3.core.errors import VectorEnvError, WorkerCrashed, WorkerDied, WorkerStartError
-from robocas_ms3.core.workers import NO_LIMITS, Limits, WorkerPool
+from robocas_ms3.core.errors import VectorEnvError, WorkerDied, WorkerStartError
+from robocas_ms3.core.worker_process import NO_LIMITS, Limits, ProcessDied
 from robocas_ms3.tasks.seeds import following_seeds
-from robocas_ms3.tasks.vector.worker import AT_WORK, EnvDescription, EnvSettings, EnvWorker, Rows, join_rows, split_rows
+from robocas_ms3.tasks.vector.pinned_workers import PinnedWorkers
+from robocas_ms3.tasks.vector.worker import EnvDescription, EnvSettings, EnvWorker, Rows, join_rows, replace_rows
 
 
 class ProcessEnv(gym.Env):
@@ -66,39 +67,36 @@ class ProcessEnv(gym.Env):
             self.spec.max_episode_steps = kwargs["max_episode_steps"]
         self._seed_range: tuple[int, int] | None = kwargs.get("seeds")
         self._must_reset: set[int] = set()  # envs that an interrupted or failed call left in an unknown state
-        self._idle, self._owner = False, os.getpid()
-        self._parts: list[tuple[int, Rows]] = []  # what the envs returned last, with the number of envs of each part
+        self._owner = os.getpid()
+        self._parts: list[tuple[int, Rows]] = []  # what each worker returned last, with the number of its envs
         self.elapsed_steps = torch.zeros(num_envs, dtype=torch.int32)
         registered = REGISTERED_ENVS.get(self.spec.id)  # ours are there once they are loaded
         module = registered.cls.__module__ if registered else "robocas_ms3"
         if module == "__main__":
             fix = f'Put it into a module, and pass "the_module:{self.spec.id}".'
             raise VectorEnvError("registered in the program itself, which processes don't know", where=env_id, fix=fix)
-        states = tempfile.NamedTemporaryFile(prefix="robocas-envs-")  # noqa: SIM115  (closed in `_stop`)
-        states.write(bytes(num_envs))
-        states.flush()
-        self._states = np.memmap(states.name, np.uint8, "r")
-        settings = EnvSettings(env_id, module, kwargs, tuple(wrappers), states.name)
-        try:
-            pickled = cloudpickle.dumps(settings)
-        except Exception as error:
-            raise VectorEnvError("arguments can't be sent to processes", where=env_id, found=error) from error
         cuts = [num_envs * worker // workers for worker in range(workers + 1)]
         self._shares = [range(*cut) for cut in zip(cuts, cuts[1:], strict=False)]
-        # a pool for each process, which keeps its envs
-        self._pools: list[WorkerPool[Any, Any]] = [
-            WorkerPool(partial(EnvWorker, pickled, share), 1, limits=limits, retries=0) for share in self._shares
-        ]
-        # also when this is collected, or when Python ends
-        self._stop = weakref.finalize(self, _stop, self._pools, states)
-        try:
-            made: list[EnvDescription] = self._ask([("describe",)] * workers)
-        except BaseException:
-            self.close()
-            raise
-        self.pids = [one.pid for one in made]
-        self.render_mode, self.metadata = made[0].render_mode, made[0].metadata
-        self.single_observation_space, self.single_action_space = made[0].observation_space, made[0].action_space
+        with tempfile.NamedTemporaryFile(prefix="robocas-envs-") as at_work:
+            at_work.write(bytes(num_envs))
+            at_work.flush()
+            self._at_work = mmap.mmap(at_work.fileno(), 0, prot=mmap.PROT_READ)
+            settings = EnvSettings(env_id, module, kwargs, tuple(wrappers), at_work.name)
+            try:
+                pickled = cloudpickle.dumps(settings)
+            except Exception as error:
+                raise VectorEnvError("arguments can't be sent to processes", where=env_id, found=error) from error
+            try:
+                self._workers = PinnedWorkers([partial(EnvWorker, pickled, share) for share in self._shares], limits)
+            except WorkerStartError as error:
+                died = WorkerDied(
+                    "its process died", where=name_envs(range(num_envs)), found=error.found, fix=error.fix
+                )
+                raise died from error
+        self.pids = self._workers.pids
+        made: EnvDescription = self._ask([("describe",)] * workers)[0]
+        self.render_mode, self.metadata = made.render_mode, made.metadata
+        self.single_observation_space, self.single_action_space = made.observation_space, made.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
@@ -126,10 +124,11 @@ class ProcessEnv(gym.Env):
         shares = [[env for env in share if env in asked] for share in self._shares]
         answers = self._ask([("reset", {env: asked[env] for env in share}, options) for share in shares])
         self._must_reset -= set(envs)
-        parts = [(len(share), rows) for share, rows in zip(shares, answers, strict=True) if share]
-        if len(envs) < self.num_envs:
-            parts = [(self.num_envs, self._with_others(join_rows(parts), sum(shares, [])))] if envs else self._parts
-        found = self._batch(parts)
+        if len(envs) == self.num_envs:
+            self._parts = [(len(share), rows) for share, rows in zip(shares, answers, strict=True)]
+        elif envs:
+            self._replace_rows(shares, answers)
+        found = self._batch()
         return found.get("obs", {}), found["info"]
 
     def step(self, action: Any) -> tuple[Any, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
@@ -152,12 +151,13 @@ class ProcessEnv(gym.Env):
         self._must_reset = set(range(self.num_envs))
         answers = self._ask([("step", action[share.start : share.stop]) for share in self._shares])
         self._must_reset = set()
-        found = self._batch([(len(share), rows) for share, rows in zip(self._shares, answers, strict=True)])
+        self._parts = [(len(share), rows) for share, rows in zip(self._shares, answers, strict=True)]
+        found = self._batch()
         return found.get("obs", {}), found["reward"], found["terminated"], found["truncated"], found["info"]
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Return what a method of each env returns, or the attribute of that name; it is pickled."""
-        answers = self._ask([("call", name, args, kwargs)] * len(self._pools))
+        answers = self._ask([("call", name, args, kwargs)] * len(self._shares))
         return tuple(pickle.loads(result) for results in answers for result in results)
 
     def get_language_instruction(self) -> list[str]:
@@ -171,17 +171,15 @@ class ProcessEnv(gym.Env):
 
     def close(self) -> None:
         """Close all environments and end their processes; those that are at work are killed."""
-        if self._owner != os.getpid() or not self._stop.alive:  # a fork has no say
+        if self._owner != os.getpid() or self._workers.closed:  # a fork has no say
             return
         try:
-            if self._idle:
+            if not self._workers.busy:
                 with suppress(Exception):
                     self.call("close")
         finally:
             self._must_reset.clear()
-            self._stop()
-            for pool in self._pools:
-                pool.close()
+            self._workers.close()
 
     def _ask(self, commands: Sequence[tuple[Any, ...]]) -> list[Any]:
         """Send each worker its command, and return their answers.
@@ -191,44 +189,38 @@ class ProcessEnv(gym.Env):
             WorkerDied: a process died; all of them are ended.
             Exception: whatever the first env that failed raised.
         """
-        if not self._stop.alive:
+        if self._workers.closed:
             raise VectorEnvError("these environments are closed", fix="Make them again.")
-        self._idle = False
-        waits = [pool.submit(command) for pool, command in zip(self._pools, commands, strict=True)]
-        answers = []
-        for share, wait in zip(self._shares, waits, strict=True):
-            try:
-                answers.append(wait())
-            except (WorkerCrashed, WorkerStartError) as crash:
-                envs = [env for env in share if self._states[env] == AT_WORK] or list(share)
-                died = WorkerDied("its process died", where=name_envs(envs), found=crash.found, fix="Make them again.")
-                died.envs = tuple(envs)
-                self.close()
-                raise died from crash
-        self._idle = True
+        try:
+            answers = self._workers.ask(commands)
+        except ProcessDied as crash:
+            share = self._shares[self.pids.index(crash.pid)]
+            envs = [env for env in share if self._at_work[env]] or list(share)
+            died = WorkerDied("its process died", where=name_envs(envs), found=crash.found, fix="Make them again.")
+            died.envs = tuple(envs)
+            self._must_reset.clear()
+            self._workers.close()
+            raise died from crash
         for _, failed in answers:
             if failed is not None:
                 failed.reraise()
         return [found for found, _ in answers]
 
-    def _with_others(self, rows: Rows, envs: list[int]) -> Rows:
-        """Return rows of all envs: new ones of some, and the last ones of the others."""
-        last, found = join_rows(self._parts), {}
-        for path, new in rows.items():
-            old = last.get(path)
-            if isinstance(old, np.ndarray) and isinstance(new, np.ndarray):
-                old[envs] = new
-                found[path] = old
-            else:
-                entries = dict(zip(envs, split_rows(new), strict=True))
-                found[path] = [entries.get(env) for env in range(self.num_envs)]
-        return found
+    def _replace_rows(self, shares: list[list[int]], answers: list[Rows]) -> None:
+        """Put new rows of some envs in the place of their last ones; what a reset does not return is dropped."""
+        paths = dict.fromkeys(path for rows in answers for path in rows)
+        for number, (share, rows) in enumerate(zip(shares, answers, strict=True)):
+            count, last = self._parts[number]
+            places = [env - self._shares[number].start for env in share]
+            part = {path: last.get(path, [None] * count) for path in paths}
+            for path in paths if share else ():
+                part[path] = replace_rows(part[path], places, rows.get(path, [None] * len(share)))
+            self._parts[number] = count, part
 
-    def _batch(self, parts: list[tuple[int, Rows]]) -> dict[str, Any]:
-        """Return rows of all envs as nested dictionaries of tensors (N, ...), or of lists."""
-        self._parts = parts
+    def _batch(self) -> dict[str, Any]:
+        """Return the last rows of all envs as nested dictionaries of tensors (N, ...), or of lists."""
         nested: dict[str, Any] = {}
-        for (*path, name), value in join_rows(parts).items():
+        for (*path, name), value in join_rows(self._parts).items():
             inner = nested
             for part in path:
                 inner = inner.setdefault(part, {})
@@ -261,12 +253,6 @@ class ProcessEnv(gym.Env):
 def name_envs(envs: Sequence[int]) -> str:
     """Return words for some environments, such as "envs 0, 2"."""
     return f"env{'s' * (len(envs) > 1)} {', '.join(map(str, envs))}"
-
-
-def _stop(pools: list[WorkerPool[Any, Any]], states: Any) -> None:
-    for pool in pools:
-        pool.stop()
-    states.close()
 
 
 def _as_tensor(row: Any) -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import faulthandler
 import importlib
 import logging
+import mmap
 import os
 import pickle
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -15,12 +16,11 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-from robocas_ms3.core.errors import LayoutError, WorkerCrashed
+from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.core.remote_errors import RemoteError
 from robocas_ms3.core.workers import use_one_torch_thread
 from robocas_ms3.tasks.base import RoboCASEnv
 
-UNMADE, IDLE, AT_WORK = range(3)
 FIRST_SEED = 2022  # of env 0's resets without a seed, as in ManiSkill; env 1 has the next
 Rows = dict[tuple[str, ...], Any]
 """By path in nested dictionaries: an array (E, ...) of all envs, or a list of E where an env has none of that shape."""
@@ -36,14 +36,14 @@ class EnvSettings:
         module: that registers the environment.
         kwargs: for ``gym.make``.
         wrappers: put around each environment, the first one first.
-        states: file of (num_envs,) bytes, ``UNMADE``, ``IDLE`` or ``AT_WORK``, for when a process dies.
+        at_work: file of (num_envs,) bytes, 1 while an env works, for when a process dies.
     """
 
     env_id: str
     module: str
     kwargs: dict[str, Any]
     wrappers: tuple[Callable[[gym.Env], gym.Env], ...]
-    states: str
+    at_work: str
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,6 @@ class EnvDescription:
     action_space: gym.Space
     render_mode: str | None
     metadata: dict[str, Any]
-    pid: int
 
 
 class EnvWorker:
@@ -73,9 +72,8 @@ class EnvWorker:
         os.environ.setdefault("LP_NUM_THREADS", "1")  # several processes render in software
         use_one_torch_thread()
         self._settings: EnvSettings = pickle.loads(settings)
-        self._states = np.memmap(self._settings.states, np.uint8, "r+")
-        if self._states[envs.start] != UNMADE:  # the pool replaces a process that died
-            raise WorkerCrashed("its worker process died", found="it ended between two calls")
+        with open(self._settings.at_work, "r+b") as file:
+            self._at_work = mmap.mmap(file.fileno(), 0)
         self._first, self._envs = envs.start, dict[int, gym.Env]()
         _, failed = self._each(envs, self._make)
         if failed:
@@ -95,7 +93,7 @@ class EnvWorker:
         """Return what the environments have in common."""
         env = next(iter(self._envs.values()))
         observations, actions = (env.get_wrapper_attr(f"single_{kind}_space") for kind in ("observation", "action"))
-        return EnvDescription(observations, actions, env.render_mode, dict(env.metadata), os.getpid()), None
+        return EnvDescription(observations, actions, env.render_mode, dict(env.metadata)), None
 
     def step(self, actions: np.ndarray) -> tuple[Rows, RemoteError | None]:
         """Step all environments with actions (E, A)."""
@@ -122,12 +120,12 @@ class EnvWorker:
     def _each(self, envs: Iterable[int], act: Callable[[int], Any]) -> tuple[list[Any], RemoteError | None]:
         results, failed = [], None
         for env in list(envs):
-            self._states[env] = AT_WORK
+            self._at_work[env] = 1
             try:
                 results.append(act(env))
-            except Exception as error:  # raised again in the main process
+            except BaseException as error:  # noqa: BLE001  (raised again in the main process)
                 failed = failed or RemoteError.of(error, f"env {env}")
-            self._states[env] = IDLE
+            self._at_work[env] = 0
         return results, failed
 
     def _make(self, env: int) -> None:
@@ -185,13 +183,30 @@ def join_rows(parts: Sequence[tuple[int, Rows]]) -> Rows:
     return {path: _join([rows.get(path, [None] * count) for count, rows in parts]) for path in paths}
 
 
-def _join(pieces: list[Any]) -> Any:
-    kinds = {(piece.shape[1:], piece.dtype) if isinstance(piece, np.ndarray) else None for piece in pieces}
-    if len(kinds) == 1 and None not in kinds:
+def _join(pieces: Sequence[Any]) -> Any:
+    """Join pieces into one array, which is a copy; where that is impossible, into a list of an entry per env."""
+    first = pieces[0]
+    if all(_are_alike(piece, first) for piece in pieces):
         return np.concatenate(pieces)
-    return [row for piece in pieces for row in split_rows(piece)]
+    return [row for piece in pieces for row in _split(piece)]
 
 
-def split_rows(piece: Any) -> list[Any]:
+def _are_alike(one: Any, other: Any) -> bool:
+    both = isinstance(one, np.ndarray) and isinstance(other, np.ndarray)
+    return both and one.dtype == other.dtype and one.shape[1:] == other.shape[1:]
+
+
+def _split(piece: Any) -> list[Any]:
     """Return one entry per env of an array (E, ...), which becomes arrays (1, ...), or of a list."""
-    return [piece[i : i + 1] for i in range(len(piece))] if isinstance(piece, np.ndarray) else piece
+    return [piece[i : i + 1] for i in range(len(piece))] if isinstance(piece, np.ndarray) else list(piece)
+
+
+def replace_rows(old: Any, envs: list[int], new: Any) -> Any:
+    """Return the piece of all envs of a worker with new entries of some; an array of the same kind is changed."""
+    if _are_alike(old, new):
+        old[envs] = new
+        return old
+    rows = _split(old)
+    for env, row in zip(envs, _split(new), strict=True):
+        rows[env] = row
+    return _join(rows) if all(isinstance(row, np.ndarray) for row in rows) else rows

@@ -1,0 +1,147 @@
+"""Worker processes that each keep their own worker and work at the same time."""
+
+from __future__ import annotations
+
+import math
+import os
+import select
+import signal
+import threading
+import time
+import weakref
+from collections.abc import Callable, Sequence
+from multiprocessing import Pipe
+from typing import Any, Generic, TypeVar
+
+from robocas_ms3.core.exits import deferred_interrupts
+from robocas_ms3.core.worker_process import START_SECONDS, Limits, ProcessDied, Worker, WorkerProcess, start_error
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+_POLL_MILLISECONDS = 200  # between two checks of signals and limits
+
+
+class PinnedWorkers(Generic[Task, Result]):
+    """Worker processes with a worker each, which get a task each; none is replaced.
+
+    Unlike in a `WorkerPool`, the calling thread talks to the processes itself: steps of environments are short.
+
+    Args:
+        make_workers: called in a process each; sent by cloudpickle.
+        limits: of each task.
+
+    Raises:
+        WorkerStartError: a process died before its worker was made.
+        Exception: whatever making a worker raises.
+
+    Attributes:
+        pids: of the processes.
+    """
+
+    def __init__(self, make_workers: Sequence[Callable[[], Worker[Task, Result]]], limits: Limits) -> None:
+        stop, self._stop_writer = Pipe(duplex=False)  # never readable: the calling thread is the only one
+        self._processes = [WorkerProcess(make, limits, stop) for make in make_workers]
+        self._seconds = limits.seconds
+        self._unread: set[int] = set()  # numbers of processes that have not answered yet
+        ended = threading.Event()
+        self._end = weakref.finalize(self, _end, self._processes, self._unread, ended, os.getpid())
+        try:
+            self._launch(ended)
+            self._exchange((), START_SECONDS)
+            self._exchange([process.pickled_worker for process in self._processes], START_SECONDS)
+        except ProcessDied as crash:
+            self.close()
+            raise start_error(crash) from crash
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def closed(self) -> bool:
+        return not self._end.alive
+
+    @property
+    def busy(self) -> bool:
+        """Whether a task is running, after a call was interrupted."""
+        return bool(self._unread)
+
+    def ask(self, tasks: Sequence[Task]) -> list[Result]:
+        """Give each worker its task, and wait for all results; first for those of an interrupted call.
+
+        Raises:
+            ProcessDied: a process died, or exceeded a limit.
+            Exception: whatever the first task that failed raised.
+        """
+        if self._unread:
+            self._exchange((), self._seconds)
+        return self._exchange(tasks, self._seconds)
+
+    def close(self) -> None:
+        """End the processes; those that are busy are killed. A fork of this process ends none."""
+        self._end()
+
+    def _launch(self, ended: threading.Event) -> None:
+        launched, failed = threading.Event(), []
+
+        def launch(processes: list[WorkerProcess[Task, Result]]) -> None:
+            signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # for the processes, until they ignore Ctrl-C
+            try:
+                for process in processes:
+                    process.launch()
+            except BaseException as error:  # noqa: BLE001  (raised below)
+                failed.append(error)
+            launched.set()
+            ended.wait()  # Linux kills a process when the thread that started it ends
+
+        threading.Thread(target=launch, args=(self._processes,), daemon=True).start()
+        launched.wait()
+        if failed:
+            raise failed[0]
+        self.pids = [process.pid for process in self._processes]
+        self._poll = select.poll()
+        self._numbers = {process.connection.fileno(): i for i, process in enumerate(self._processes)}
+        for descriptor in self._numbers:
+            self._poll.register(descriptor, select.POLLIN)
+        self._unread.update(range(len(self._processes)))  # each says when it reads
+
+    def _exchange(self, messages: Sequence[Any], seconds: float) -> list[Any]:
+        """Send each process a message, or none; return the answers that are still to come, by number."""
+        answers: list[Any] = [None] * len(self._processes)
+        errors: dict[int, Exception] = {}
+        deadline = time.monotonic() + seconds
+        while messages or self._unread:
+            with deferred_interrupts() as signals:  # no message stays half sent, or half read
+                for number, message in enumerate(messages):
+                    self._processes[number].send(message)
+                    self._unread.add(number)
+                messages = ()
+                while self._unread and not signals:
+                    ready = {self._numbers[descriptor] for descriptor, _ in self._poll.poll(_POLL_MILLISECONDS)}
+                    for number in self._unread - ready:
+                        self._processes[number].check_limits(deadline)
+                    for number in ready:  # also where it has answered, and died since
+                        self._processes[number].check_limits(math.inf)
+                        self._unread.discard(number)
+                        try:
+                            answers[number] = self._processes[number].read()
+                        except ProcessDied:
+                            raise
+                        except Exception as error:  # noqa: BLE001  (of a task; raised when all have answered)
+                            errors[number] = error
+        if errors:
+            raise errors[min(errors)]
+        return answers
+
+
+def _end(processes: list[WorkerProcess[Any, Any]], busy: set[int], ended: threading.Event, owner: int) -> None:
+    if os.getpid() != owner:
+        return
+    for number, process in enumerate(processes):
+        if number in busy:
+            process.end()
+        elif process.connection is not None:
+            process.connection.close()
+    for process in processes:
+        process.leave()
+    ended.set()
