@@ -70,15 +70,6 @@ def test_what_has_no_texture_is_white(tmp_path, mtl, text, warns):
     assert bool(warnings(model)) == warns
 
 
-def test_a_missing_texture_or_material_file_that_faces_need_is_an_error(tmp_path):
-    with pytest.raises(AssetError) as caught:
-        read_model(write_obj(tmp_path / "a", mtl="newmtl skin\nmap_Kd lost.png\n"))
-    assert str(caught.value.where).endswith("lost.png")
-    with pytest.raises(AssetError) as caught:
-        read_model(write_obj(tmp_path / "b", mtl=None))
-    assert str(caught.value.where).endswith("skin.mtl")
-
-
 def test_vertex_colours_of_an_obj(tmp_path):
     mesh = box()
     text = "".join(f"v {x} {y} {z} 0 0.5 1\n" for x, y, z in mesh.vertices)
