@@ -30,6 +30,7 @@ MAX_FRICTION, MAX_WIDTH = 0.3, 0.08  # what RoboCAS keeps; m
 ROUNDING = 1e-3  # labels come in single or half precision, in steps of 0.1
 SLICE_BYTES = 24e6  # of labels read at a time
 CANDIDATES = 20_000  # labels that are looked at closely; a file has up to a million good ones
+MOST_GRASPS = 800  # of those that fit, spread over directions and places
 POINTS, CHUNK = 3000, 128  # of the surface that the gripper must not hit; grasps tested at a time
 
 SHAPES = {
@@ -86,14 +87,12 @@ class _Member:
         self.file.read(1)
 
 
-def label_grasps(path: Path, closed: trimesh.Trimesh, *, count: int = 800, seed: int = 0) -> tuple[Grasps, int]:
+def label_grasps(path: Path, closed: trimesh.Trimesh) -> tuple[Grasps, int]:
     """The labelled grasps that our open gripper reaches on a straight way in, spread over directions and places.
 
     Args:
         path: ``NNN_labels.npz``.
         closed: watertight mesh of the object in the model's frame, m.
-        count: how many at most.
-        seed: of the choice among many labels, and of surface points.
 
     Returns:
         The grasps, and the number of good labels (20 000 at most) that they were chosen from.
@@ -101,7 +100,7 @@ def label_grasps(path: Path, closed: trimesh.Trimesh, *, count: int = 800, seed:
     Raises:
         AssetError: the file is damaged or not of this format.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     labels = read_labels(path, rng)
     poses = tcp_poses(labels)
     points = surface_samples(closed, POINTS, rng)[0]
@@ -111,7 +110,7 @@ def label_grasps(path: Path, closed: trimesh.Trimesh, *, count: int = 800, seed:
     # Weight far off the approach line twists the object in the pads; along that line it does little harm.
     lever = np.linalg.norm(np.cross(to_center, poses[:, :3, 2]), axis=1)
     scores = -2.0 * frictions - lever / 0.15 - np.linalg.norm(to_center, axis=1) / 0.3
-    chosen = spread_out(poses, scores, count)
+    chosen = spread_out(poses, scores, MOST_GRASPS)
     return Grasps(poses[chosen], labels.widths[clear][chosen], frictions[chosen]), len(labels)
 
 

@@ -47,7 +47,7 @@ class Faces:
     material: Material
 
 
-def read_obj(path: Path, files: ModelFiles, color: tuple[float, float, float] | None = None) -> list[Faces]:
+def read_obj(path: Path, files: ModelFiles, color: tuple[float, float, float] | None) -> list[Faces]:
     """Read a mesh; empty where it has no faces with an area.
 
     Args:

@@ -24,6 +24,7 @@ from robocas_ms3.assets.physics import (
 
 Array = np.ndarray
 
+DROPS = 20
 DROP_HEIGHT = 0.05  # m, of the lowest point
 TIME_LIMIT = 2.0  # s, to be at rest within
 WATCHED = 1.0  # s, that it is watched for afterwards
@@ -60,8 +61,8 @@ class DropReport:
     good: NDArray[np.bool_]
 
 
-def drop_test(solid: Solid, resting_poses: Array, *, seed: int = 0, drops: int = 20) -> DropReport:
-    """Let an object fall from 5 cm above a table, turned at random, for 3 s. The same input gives the same report.
+def drop_test(solid: Solid, resting_poses: Array, *, seed: int = 0) -> DropReport:
+    """Let an object fall 20 times from 5 cm above a table, turned at random, for 3 s; repeatable.
 
     It is at rest once its kinetic energy stays below 4.5e-4 J/kg for good; so what trembles is never at rest.
 
@@ -78,15 +79,14 @@ def drop_test(solid: Solid, resting_poses: Array, *, seed: int = 0, drops: int =
         solid: the object.
         resting_poses: (S, 4, 4) ``T_plane_object``, those listed.
         seed: of the orientations.
-        drops: how many.
     """
-    poses, velocities, energies, sunk = _fall(solid, seed, drops)
+    poses, velocities, energies, sunk = _fall(solid, seed)
     last = round(WATCHED / TIME_STEP)
     moving = energies >= REST_ENERGY * solid.mass
     rest_times = TIME_STEP * (len(energies) - np.argmax(moving[::-1], axis=0)) * moving.any(axis=0)
-    matches, rolling = np.full(drops, -1), np.zeros(drops, bool)
+    matches, rolling = np.full(DROPS, -1), np.zeros(DROPS, bool)
     compare = _Comparison(solid, resting_poses)
-    for i in range(drops):
+    for i in range(DROPS):
         matches[i] = compare.find(poses[-1, i])
         if rest_times[i] > TIME_LIMIT and matches[i] >= 0:
             since = compare.since(poses[::-LOOK_EVERY, i]) * LOOK_EVERY
@@ -106,13 +106,13 @@ def _advances(velocities: Array) -> bool:
     return bool(path >= LEAST_PATH and ahead >= ONE_WAY * path)
 
 
-def _fall(solid: Solid, seed: int, drops: int) -> tuple[Array, Array, Array, Array]:
+def _fall(solid: Solid, seed: int) -> tuple[Array, Array, Array, Array]:
     """Poses (T, N, 4, 4), horizontal velocities (T, N, 2), kinetic energies (T, N), final penetrations (N,)."""
     vertices = np.concatenate([np.asarray(hull, float) for hull in solid.hulls])
-    turns = Rotation.from_quat(np.random.default_rng(seed).normal(size=(drops, 4))).as_matrix()  # evenly over all
-    origins = places(drops)
+    turns = Rotation.from_quat(np.random.default_rng(seed).normal(size=(DROPS, 4))).as_matrix()  # evenly over all
+    origins = places(DROPS)
     steps = round((TIME_LIMIT + WATCHED) / TIME_STEP)
-    poses, velocities, energies = np.zeros((steps, drops, 4, 4)), np.zeros((steps, drops, 2)), np.zeros((steps, drops))
+    poses, velocities, energies = np.zeros((steps, DROPS, 4, 4)), np.zeros((steps, DROPS, 2)), np.zeros((steps, DROPS))
     with engine_settings():
         scene = new_scene()
         bodies: list[physx.PhysxRigidDynamicComponent] = []

@@ -53,7 +53,7 @@ class _Hand:
     palm: physx.PhysxArticulationLinkComponent  # its frame is the TCP's
 
 
-def hold_test(solid: Solid, grasps_tcp_in_object: Array, *, time_step: float = TIME_STEP) -> NDArray[np.bool_]:
+def hold_test(solid: Solid, grasps_tcp_in_object: Array) -> NDArray[np.bool_]:
     """Say for each grasp whether the object stays in the hand. The same input gives the same answer.
 
     The hand points down around an object that floats in the pose of the grasp. It closes, and from then on gravity
@@ -65,7 +65,6 @@ def hold_test(solid: Solid, grasps_tcp_in_object: Array, *, time_step: float = T
     Args:
         solid: the object.
         grasps_tcp_in_object: (G, 4, 4) poses of the TCP: z approach, y closing.
-        time_step: s.
 
     Returns:
         (G,).
@@ -76,7 +75,7 @@ def hold_test(solid: Solid, grasps_tcp_in_object: Array, *, time_step: float = T
     if not np.allclose(turned, 1, atol=1e-3):
         raise AssetError("a grasp is no rigid pose", expected="determinant 1", found=float(turned.min()))
     with engine_settings():
-        scene = new_scene(time_step)
+        scene = new_scene(TIME_STEP)
         hands, objects = [], []
         for grasp, place in zip(grasps_tcp_in_object, places(len(grasps_tcp_in_object)), strict=True):
             tcp = _DOWN.copy()
@@ -85,12 +84,12 @@ def hold_test(solid: Solid, grasps_tcp_in_object: Array, *, time_step: float = T
             body = add_body(scene, solid, tcp @ inverse(grasp))
             body.disable_gravity = True
             objects.append(body)
-        for _ in range(round(CLOSING / time_step)):
+        for _ in range(round(CLOSING / TIME_STEP)):
             scene.step()
         before = _in_hand(hands, objects)
         for body in objects:
             body.disable_gravity = False
-        for carriages in _motion(time_step):
+        for carriages in _motion():
             for hand in hands:
                 for joint, (position, speed) in zip(hand.carriages, carriages, strict=True):
                     joint.set_drive_target(position)
@@ -103,10 +102,10 @@ def hold_test(solid: Solid, grasps_tcp_in_object: Array, *, time_step: float = T
     return (slipped < SLIPPED) & (cosines > np.cos(np.radians(TURNED_DEG)))
 
 
-def _motion(time_step: float) -> NDArray[np.float64]:
+def _motion() -> NDArray[np.float64]:
     """Positions and speeds (T, 3, 2) of the carriages: up (m), sideways (m), tilt (rad)."""
-    rise = np.arange(1, round(LIFTING / time_step) + 1) * time_step / LIFTING
-    time = np.arange(1, round(SHAKING / time_step) + 1) * time_step
+    rise = np.arange(1, round(LIFTING / TIME_STEP) + 1) * TIME_STEP / LIFTING
+    time = np.arange(1, round(SHAKING / TIME_STEP) + 1) * TIME_STEP
     swell = np.clip(np.minimum(time, SHAKING - time) / FADE, 0, 1)
     swell = swell * swell * (3 - 2 * swell)
     positions = np.zeros((len(rise) + len(time), 3))
@@ -114,7 +113,7 @@ def _motion(time_step: float) -> NDArray[np.float64]:
     positions[len(rise) :, 0] = LIFT + BOB * swell * np.cos(2 * np.pi * BOB_HZ * time)
     positions[len(rise) :, 1] = SWAY * swell * np.sin(2 * np.pi * SWAY_HZ * time)
     positions[len(rise) :, 2] = np.radians(TILT_DEG) * swell * np.sin(2 * np.pi * TILT_HZ * time)
-    speeds = np.diff(positions, axis=0, prepend=np.zeros((1, 3))) / time_step
+    speeds = np.diff(positions, axis=0, prepend=np.zeros((1, 3))) / TIME_STEP
     return np.stack([positions, speeds], axis=2)
 
 

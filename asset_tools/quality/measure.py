@@ -98,9 +98,9 @@ def remeasure(loaded: LoadedObject) -> ObjectQuality:
     )
 
 
-def top_grasps(annotations: Annotations, count: int = TOP_GRASPS) -> NDArray[np.intp]:
+def top_grasps(annotations: Annotations) -> NDArray[np.intp]:
     """Which grasps (K,) are the best: lowest friction first, equals in the order of the annotations."""
-    return np.argsort(annotations.grasp_qualities, kind="stable")[:count]
+    return np.argsort(annotations.grasp_qualities, kind="stable")[:TOP_GRASPS]
 
 
 def judge(assets: Mapping[str, ObjectAsset]) -> list[Violation]:
