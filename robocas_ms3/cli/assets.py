@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ import tyro
 
 from robocas_ms3.cli import assets_show
 from robocas_ms3.cli.assets_show import mesh_tools
-from robocas_ms3.cli.options import Maybe, Several
+from robocas_ms3.cli.options import CORES, Jobs, Maybe, Several
 from robocas_ms3.core.words import count_of
 
 CONTACT_SHEET = "contact_sheet.png"
@@ -24,7 +23,7 @@ Job = Any
 
 @dataclass(kw_only=True)
 class _Making:
-    jobs: Maybe[int] = None
+    jobs: Jobs = CORES
     """Processes. Default: one for each CPU core."""
     skip_bad: bool = False
     """Leave out models with errors, instead of stopping at the first one."""
@@ -119,7 +118,7 @@ class Build:
     """Its folder. Default: where the package has it."""
     ids: Several[str] = ()
     """Only these assets; needs --out. Default: all."""
-    jobs: Maybe[int] = None
+    jobs: Jobs = CORES
     """Processes. Default: one for each CPU core."""
 
 
@@ -199,23 +198,19 @@ def build(command: Build) -> int:
 def _inspecting(command: _Making) -> Iterator[Any]:
     """Yield a function that inspects models before they are imported, with a progress bar."""
     from asset_tools.inspection import inspect_models
-    from robocas_ms3.cli.bars import bar
+    from robocas_ms3.cli.bars import Bar
 
-    with bar("models read", transient=True) as shown:
+    with Bar("models read", transient=True) as shown:
 
         def inspect(models: Mapping[str, Any]) -> Mapping[str, Any]:
             shown.start(len(models))
-            return inspect_models(models, command.jobs or os.cpu_count() or 1, shown.advance)
+            return inspect_models(models, command.jobs, shown.advance)
 
         yield inspect
 
 
 def _target(name: str) -> Path:
-    """Return the folder of an imported pack.
-
-    Raises:
-        AssetError: no imported pack may have this name.
-    """
+    """Return the folder of an imported pack; raise AssetError if no imported pack may have this name."""
     from asset_tools.pipeline import check_target
     from robocas_ms3.core.errors import AssetError
     from robocas_ms3.core.paths import builtin_packs_dir, data_dir
@@ -254,11 +249,11 @@ def _make(jobs: list[Job], command: _Making, out: Path, what: str) -> int:
 
 def _write(jobs: list[Job], command: _Making, out: Path, description: str, *, record: bool = True) -> int:
     from asset_tools.pipeline import JobResult, write_pack
-    from robocas_ms3.cli.bars import bar
+    from robocas_ms3.cli.bars import Bar
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.core.paths import cache_dir
 
-    with bar(f"assets of {out.name} processed") as shown:
+    with Bar(f"assets of {out.name} processed") as shown:
         shown.start(len(jobs))
 
         def on_made(made: JobResult) -> None:
@@ -275,7 +270,7 @@ def _write(jobs: list[Job], command: _Making, out: Path, description: str, *, re
             out,
             cache_dir() / "assets",
             description=description,
-            processes=command.jobs or os.cpu_count() or 1,
+            processes=command.jobs,
             skip_bad=command.skip_bad,
             record=record,
             on_made=on_made,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -14,7 +13,7 @@ import tyro
 if TYPE_CHECKING:
     from robocas_ms3.assets.pack import Pack
 
-from robocas_ms3.cli.options import Maybe, Several
+from robocas_ms3.cli.options import CORES, Jobs, Maybe, Several
 from robocas_ms3.core.words import count_of, printable
 
 
@@ -50,7 +49,7 @@ class Verify:
     """Its name, or its folder."""
     physics: bool = False
     """Drop, grasp and shake every object, move every joint, and print a table of the quality."""
-    jobs: Maybe[int] = None
+    jobs: Jobs = CORES
     """With --physics: processes. Default: one for each CPU core."""
     json: Maybe[Path] = None
     """With --physics: write the table here too."""
@@ -157,7 +156,7 @@ def verify(command: Verify) -> int:
     for fault in faults:
         console().print(printable(str(fault)), style="red", soft_wrap=True)
     if command.physics:
-        return max(_verify_physics(pack, command.jobs or os.cpu_count() or 1, command.json), int(bool(faults)))
+        return max(_verify_physics(pack, command.jobs, command.json), int(bool(faults)))
     return int(bool(faults))
 
 
@@ -185,13 +184,13 @@ def _verify_physics(pack: Pack, jobs: int, out: Path | None) -> int:
     with mesh_tools():
         from asset_tools.quality.measure import HEADER, differences, judge, rows
         from asset_tools.quality.packs import FURNITURE_HEADER, furniture_rows, judge_furniture, remeasure_pack
-    from robocas_ms3.cli.bars import bar
+    from robocas_ms3.cli.bars import Bar
     from robocas_ms3.cli.terminal import table_console
     from robocas_ms3.core.files import write_json
 
     total = len(pack.manifest.assets)
     measured: dict[str, Any] = {}
-    with bar("assets measured") as shown:
+    with Bar("assets measured") as shown:
         shown.start(total)
         for name, found in remeasure_pack(pack, jobs):
             measured[name] = found

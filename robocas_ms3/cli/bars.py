@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext
 from typing import TYPE_CHECKING, Any
 
 from robocas_ms3.cli.terminal import tell, terminal_of_stderr
@@ -83,17 +83,23 @@ class Display:
 
 
 class Bar:
-    """Progress of one task; its methods are callbacks of the work.
+    """Progress of one task, a context manager; its methods are callbacks of the work.
 
     Args:
         description: name of the task.
-        transient: see `bar`.
+        transient: remove the bar at the end, and write nothing to a log within the first minute.
     """
 
-    def __init__(self, description: str, *, transient: bool) -> None:
+    def __init__(self, description: str, *, transient: bool = False) -> None:
         self._description, self._display = description, Display(transient=transient)
         self.note, self.close = self._display.note, self._display.close
         self._start, self._done, self._there, self._count = 0.0, 0, 0, 0
+
+    def __enter__(self) -> Bar:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
 
     def start(self, count: int, there: int = 0) -> None:
         """Show the bar for ``count`` items, ``there`` of which were done before; nothing for 0 items."""
@@ -138,14 +144,7 @@ def show_plan(display: Display, status: Status) -> None:
 
 
 def speed(done: float, count: float, there: float, seconds: float) -> str:
-    """Return speed and time left, such as ``1.5 s each, 7 min left``; empty before the first new item is done.
-
-    Args:
-        done: items that are done.
-        count: all items.
-        there: items that were done before.
-        seconds: time that the others took.
-    """
+    """Return ``1.5 s each, 7 min left`` or the like; ``there`` items were done before these seconds."""
     if done <= there or seconds <= 0:
         return ""
     each = seconds / (done - there)
@@ -161,18 +160,6 @@ def span(seconds: float) -> str:
     if minutes < 60:
         return f"{minutes} min"
     return f"{minutes // 60} h {minutes % 60} min" if minutes < 2 * 24 * 60 else f"{seconds / 86400:.1f} days"
-
-
-@contextmanager
-def bar(description: str, *, transient: bool = False) -> Iterator[Bar]:
-    """Yield a progress bar.
-
-    Args:
-        description: name of the task.
-        transient: remove the bar at the end, and write nothing to a log within the first minute.
-    """
-    with closing(Bar(description, transient=transient)) as shown:
-        yield shown
 
 
 @contextmanager

@@ -17,11 +17,11 @@ if TYPE_CHECKING:
 
 @resumable
 def main(settings: ConversionSettings) -> int:
-    from robocas_ms3.cli.bars import bar
+    from robocas_ms3.cli.bars import Bar
     from robocas_ms3.cli.terminal import say
 
     write: Callable[..., Conversion] = _find_format(settings).part("writer")
-    with bar("episodes written") as shown:
+    with Bar("episodes written") as shown:
         done = write(settings, on_start=shown.start, on_episode=shown.advance)
     count = len(done.episodes)
     words = [f"{settings.out}: {count_of(count, 'episode')}"] + ([f"{done.kept} kept"] if done.kept else [])
@@ -36,12 +36,7 @@ def main(settings: ConversionSettings) -> int:
 
 
 def _find_format(settings: ConversionSettings) -> Format:
-    """Return the format to write.
-
-    Raises:
-        ExtensionError: there is no such format.
-        DatasetError: an option does not suit it.
-    """
+    """Return the format to write; raise an error if there is none, or an option does not suit it."""
     from robocas_ms3.core.strict import nearest
     from robocas_ms3.datasets.formats import FORMATS
 

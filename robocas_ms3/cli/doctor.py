@@ -24,19 +24,16 @@ class Doctor:
 
 def main(cfg: Doctor) -> int:
     from robocas_ms3.cli.bars import working
-    from robocas_ms3.cli.terminal import say_lines
+    from robocas_ms3.cli.terminal import say_json
     from robocas_ms3.doctor.checks import examine
 
     with working("examining"):
         findings = examine()
     failed = sum(finding.status == "fail" for finding in findings)
     if cfg.json:
-        import json
-
-        report = {"ok": not failed, "findings": [asdict(finding) for finding in findings]}
-        say_lines(json.dumps(report, indent=2))
-        return 1 if failed else 0
-    _print(findings, failed)
+        say_json({"ok": not failed, "findings": [asdict(finding) for finding in findings]})
+    else:
+        _print(findings, failed)
     return 1 if failed else 0
 
 

@@ -57,7 +57,7 @@ def run(settings: EvaluationSettings) -> int:
             fix = nearest(word, [*TASKS, *COMMANDS])
             raise EvaluationError("no such task", where=word, expected=expected, fix=fix)
     settings.check()
-    from robocas_ms3.cli.bars import bar
+    from robocas_ms3.cli.bars import Bar
     from robocas_ms3.cli.terminal import say, say_lines
     from robocas_ms3.core.workers import use_one_torch_thread
     from robocas_ms3.evaluation.policies import find_policy, open_policy
@@ -71,7 +71,7 @@ def run(settings: EvaluationSettings) -> int:
 
     use_one_torch_thread()
     outcomes = []
-    with open_policy(settings.policy) as policy, bar("episodes run") as shown:
+    with open_policy(settings.policy) as policy, Bar("episodes run") as shown:
         session = EvaluationSession(policy, settings)
         for outcome in session.run(shown.start):
             outcomes.append(outcome)
@@ -100,7 +100,7 @@ def list_protocols(cfg: Protocols) -> int:
 
 
 def freeze(cfg: Freeze) -> int:
-    from robocas_ms3.cli.bars import bar
+    from robocas_ms3.cli.bars import Bar
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.core.outputs import check_replaceable
     from robocas_ms3.evaluation.freeze import freeze as make
@@ -109,7 +109,7 @@ def freeze(cfg: Freeze) -> int:
 
     plan = read_plan(cfg.plan)
     check_replaceable(cfg.out)
-    with bar("episodes chosen") as shown:
+    with Bar("episodes chosen") as shown:
         for done, total in make(plan, cfg.out, overrides=cfg.set):
             shown.at(done, total)
     protocol = load_protocol(cfg.out)

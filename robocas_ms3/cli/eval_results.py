@@ -139,7 +139,7 @@ def verify(cfg: Verify) -> int:
 
 def videos(cfg: Videos) -> int:
     """Run ``videos``."""
-    from robocas_ms3.cli.bars import bar
+    from robocas_ms3.cli.bars import Bar
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.core.checks import check_number
     from robocas_ms3.core.errors import EvaluationError
@@ -156,7 +156,7 @@ def videos(cfg: Videos) -> int:
 
     use_one_torch_thread()
     numbers = failed_of_each_kind(result, cfg.count)
-    with open_policy(name) as policy, bar("episodes filmed") as shown:
+    with open_policy(name) as policy, Bar("episodes filmed") as shown:
         for done, (path, same) in enumerate(film(result, protocol, policy, numbers), start=1):
             say(str(path) + ("" if same else ": this time it came out differently"))
             shown.at(done, len(numbers))

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 @resumable
 def main(settings: GenerateSettings) -> int:
     settings = settings.resolve()  # an invalid configuration is an error before the imports below, which take seconds
-    from robocas_ms3.cli.bars import bar
+    from robocas_ms3.cli.bars import Bar
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.demos.generate import generate
 
@@ -26,7 +26,7 @@ def main(settings: GenerateSettings) -> int:
 
         weights = check_acting(settings.episode)
         players = partial(Player, settings.episode)
-    with bar("episodes recorded") as shown:
+    with Bar("episodes recorded") as shown:
 
         def on_result(result: EpisodeResult) -> None:
             if result.success:

@@ -44,10 +44,8 @@ class ImportRobocas:
 
 
 def main(cfg: ImportRobocas) -> int:
-    import json
-
-    from robocas_ms3.cli.bars import bar
-    from robocas_ms3.cli.terminal import say, say_lines
+    from robocas_ms3.cli.bars import Bar
+    from robocas_ms3.cli.terminal import say, say_json
     from robocas_ms3.core.outputs import OutputFolder
     from robocas_ms3.core.words import count_of
     from robocas_ms3.datasets.manage.copying import CopyOptions, check_apart
@@ -63,15 +61,15 @@ def main(cfg: ImportRobocas) -> int:
         from robocas_ms3.scenes.language.embed import TextEmbedder
 
         embed = TextEmbedder()
-    with bar("episodes read") as shown:
+    with Bar("episodes read") as shown:
         found = survey(cfg.dataset, rate_hz=cfg.rate, turn_eef=cfg.turn_eef, on_episode=shown.at)
     if cfg.json:
-        say_lines(json.dumps(found.as_json(), indent=2, ensure_ascii=False))
+        say_json(found.as_json())
     else:
         _table(found)
     if not found.taken or cfg.out is None:
         return 0 if found.taken else 1
-    with bar("episodes written") as shown:
+    with Bar("episodes written") as shown:
         options = CopyOptions(cfg.link, cfg.overwrite, shown.start, shown.advance)
         kept = import_robocas(found, cfg.out, embed=embed, options=options)
     if not cfg.json:

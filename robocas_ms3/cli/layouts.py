@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +13,7 @@ if TYPE_CHECKING:
     from robocas_ms3.scenes.cache import LayoutCache
     from robocas_ms3.scenes.table import Engine, Pair
 
-from robocas_ms3.cli.options import Maybe, Repeated
+from robocas_ms3.cli.options import CORES, Jobs, Maybe, Repeated
 from robocas_ms3.core.words import count_of
 
 
@@ -47,7 +46,7 @@ class Build:
     """Seeds of objects of several envs, 0:4 or 3,7. Default: those of one env."""
     engine: Literal["auto", "cpu", "gpu"] = "auto"
     """With --objects: PhysX on the CPU or on a GPU, which is to run them. Auto: a GPU if there is one."""
-    jobs: Maybe[int] = None
+    jobs: Jobs = CORES
     """Processes. Default: one for each CPU core."""
     out: Maybe[Path] = None
     """Folder of all layout caches. Default: where environments look for them."""
@@ -66,13 +65,12 @@ class Info:
 
 def build(command: Build) -> int:
     from robocas_ms3.assets.pack import load_pack
-    from robocas_ms3.cli.bars import bar
+    from robocas_ms3.cli.bars import Bar
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.core.checks import check_number
     from robocas_ms3.scenes.config import load_task_config
 
-    if command.jobs is not None:
-        check_number("jobs", command.jobs, 1)
+    check_number("jobs", command.jobs, 1)
     objects = None if command.objects is None else parse_seeds(command.objects, "--objects", listed=True)
     seeds = parse_seeds(command.seeds, "--seeds")
     config = load_task_config(command.config, overrides=command.set)
@@ -85,9 +83,9 @@ def build(command: Build) -> int:
     engine = choose_engine(command.engine) if objects is not None else None
     there = len(pairs) - len(cache.missing(pairs))
     failures = 0
-    with bar("layouts made") as shown:
+    with Bar("layouts made") as shown:
         shown.start(len(pairs), there)
-        for (chosen, seed), problem in cache.fill(pairs, command.jobs or os.cpu_count() or 1):
+        for (chosen, seed), problem in cache.fill(pairs, command.jobs):
             if problem:
                 failures += 1
                 which = f"seed {seed}" if objects is None else f"objects {chosen}, seed {seed}"
@@ -112,11 +110,7 @@ def build(command: Build) -> int:
 
 
 def choose_engine(wanted: Literal["auto", "cpu", "gpu"]) -> Engine:
-    """Return the engine that is to run the layouts.
-
-    Raises:
-        ConfigError: there is no GPU.
-    """
+    """Return the engine that is to run the layouts; raise ConfigError if a GPU is wanted and there is none."""
     from torch.cuda import is_available
 
     from robocas_ms3.core.errors import ConfigError
@@ -128,7 +122,7 @@ def choose_engine(wanted: Literal["auto", "cpu", "gpu"]) -> Engine:
 
 def try_all(cache: LayoutCache, engine: Engine, **packs: str) -> int:
     """Let the engine try layouts in state `UNTRIED`; return how many layouts of the table it moves."""
-    from robocas_ms3.cli.bars import bar
+    from robocas_ms3.cli.bars import Bar
     from robocas_ms3.scenes.table import State
     from robocas_ms3.tasks.trial import judged, try_layouts, untried
 
@@ -137,7 +131,7 @@ def try_all(cache: LayoutCache, engine: Engine, **packs: str) -> int:
         found: dict[Pair, State] = {}
         trial = try_layouts(cache, engine, seeds, **packs)
         try:
-            with bar("layouts tried") as shown:
+            with Bar("layouts tried") as shown:
                 shown.start(sum(map(len, seeds.values())))
                 for pair, moved in trial:
                     found[pair] = judged(moved)
@@ -149,7 +143,6 @@ def try_all(cache: LayoutCache, engine: Engine, **packs: str) -> int:
 
 
 def info(command: Info) -> int:
-    from rich.markup import escape
     from rich.table import Table
 
     from robocas_ms3.cli.terminal import table_console
@@ -166,9 +159,9 @@ def info(command: Info) -> int:
         except (OSError, ValueError, KeyError, TypeError):  # the layouts are still of use
             of, furniture = (f"{ABOUT} is damaged", "", "", ""), ""
         row = (path.parent.name, count_layouts(path.parent), *of, furniture)
-        table.add_row(*(escape(str(value)) for value in row))
+        table.add_row(*map(str, row))
     table_console().print(
-        table if table.row_count else escape(f"no layout caches in {root}"),
+        table if table.row_count else f"no layout caches in {root}",
         soft_wrap=not table.row_count,
         highlight=False,
     )
@@ -176,11 +169,7 @@ def info(command: Info) -> int:
 
 
 def parse_seeds(text: str, option: str, *, listed: bool = False) -> list[int]:
-    """Return the seeds of ``FIRST:END``, or, where that is allowed, of a list ``SEED,SEED``.
-
-    Raises:
-        ConfigError: they are neither, or the range is empty.
-    """
+    """Return the seeds of ``FIRST:END``, or, where that is allowed, of a list ``SEED,SEED``."""
     from robocas_ms3.core.errors import ConfigError
 
     if listed and re.fullmatch(r"\d+(,\d+)*", text):

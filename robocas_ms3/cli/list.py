@@ -21,28 +21,20 @@ class List:
 
 
 def main(cfg: List) -> int:
-    from robocas_ms3.cli.terminal import say_lines
+    from robocas_ms3.cli.terminal import say_json
 
     found = collect()
     if cfg.json:
-        import json
-
-        say_lines(json.dumps(found, indent=2, ensure_ascii=False))
+        say_json(found)
     else:
         _print(found)
     return 0
 
 
 def collect() -> dict[str, list[dict[str, Any]]]:
-    """Gather what there is, verifying every pack.
+    """Gather what there is, verifying every pack; a damaged one has an ``error`` and no objects.
 
-    Returns:
-        ``tasks``, ``configs``, ``robots``, ``policies``, ``baselines`` and ``packs``, mappings of plain values. A
-        damaged pack has an ``error`` and no objects; policies and baselines of other packages are not imported, so a
-        broken one shows only when it is chosen.
-
-    Raises:
-        ConfigError: a shipped configuration is damaged.
+    Policies and baselines of other packages are not imported, so a broken one shows only when it is chosen.
     """
     from robocas_ms3.assets.pack import load_pack, pack_folders
     from robocas_ms3.baselines.registry import BASELINES

@@ -66,21 +66,16 @@ _ENVIRONMENT = {
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Run ``robocas`` and leave the process with its exit code.
-
-    Args:
-        argv: arguments after the program's name; default: the process's own.
-    """
+    """Run ``robocas`` and leave the process with its exit code; default arguments: the process's own."""
     escape_tracebacks()
     heed_ctrl_c()
     leave(run(sys.argv[1:] if argv is None else argv))
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run ``robocas`` and give its exit code: 0, 1 for a failure (one line on stderr), 2 for wrong arguments.
+    """Run ``robocas``; return its exit code: 0, 1 for a failure (one line on stderr), 2 for wrong arguments.
 
-    Args:
-        argv: arguments after the program's name. ``--debug`` anywhere gives tracebacks.
+    ``--debug`` among the arguments gives tracebacks.
     """
     arguments = [word for word in argv if word != "--debug"]
     debug = len(arguments) < len(argv) or os.environ.get("ROBOCAS_DEBUG", "0") not in {"", "0"}
@@ -123,16 +118,9 @@ def run(argv: Sequence[str]) -> int:
 
 
 def parse(words: Sequence[str]) -> tuple[Callable[[Any], int], Any]:
-    """Parse a command line without running it. Only the module of its command is imported.
+    """Parse a command line without running it; only the module of its command is imported.
 
-    Args:
-        words: command, then its own arguments.
-
-    Returns:
-        The function of the command, and its settings.
-
-    Raises:
-        SystemExit: help was printed (exit code 0), or the words are wrong (exit code 2).
+    Return the function of the command and its settings. SystemExit: help was printed (0), or the words are wrong (2).
     """
     if not words or words[0] not in COMMANDS:
         commands = {name: module_of(name) for name in COMMANDS}
@@ -184,11 +172,7 @@ def _print_help(prog: str, description: str, commands: Mapping[str, Any], words:
 
 
 def _lend_folders() -> None:
-    """Give libraries that only want a place to write one, where theirs is missing or read-only.
-
-    Raises:
-        RobocasError: see `ensure_home`.
-    """
+    """Give libraries that only want a place to write one, where theirs is missing or read-only."""
     ensure_home()
     places = {
         "MPLCONFIGDIR": platformdirs.user_config_path("matplotlib"),

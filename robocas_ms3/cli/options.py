@@ -20,12 +20,13 @@ _NO_DEFAULT = tyro.conf.arg(help_behavior_hint="")
 
 Maybe = Annotated[_T | None, _NO_DEFAULT]
 """A value; default: None."""
+CORES = os.cpu_count() or 1
+Jobs = Annotated[int, _NO_DEFAULT]
+"""A number of processes; default: `CORES`."""
 Several = Annotated[tuple[_T, ...], _NO_DEFAULT]
 """Values; default: none."""
 Repeated = Annotated[tuple[_T, ...], _NO_DEFAULT, tyro.conf.UseAppendAction]
 """Values of an option that may be given several times; default: none."""
-Word = Annotated[str, _NO_DEFAULT]
-"""A text; default: empty."""
 Folders = Annotated[
     tuple[Path, ...],
     tyro.conf.Positional,
@@ -39,9 +40,6 @@ def with_absolute_paths(settings: _T) -> _T:
     """Return settings with absolute paths, because libraries may change the working directory.
 
     The folders named by environment variables become absolute too.
-
-    Raises:
-        RobocasError: the working directory was removed.
     """
     try:
         os.getcwd()

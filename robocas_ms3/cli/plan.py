@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import os
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -13,7 +11,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from robocas_ms3.cli.interrupts import resumable
-from robocas_ms3.cli.options import Maybe, Repeated
+from robocas_ms3.cli.options import CORES, Jobs, Maybe, Repeated
 from robocas_ms3.core.words import count_of
 
 
@@ -32,7 +30,7 @@ class Run:
     """Output folder."""
     executor: Literal["local", "slurm", "ray"] = "local"
     """What does the work: this machine, jobs of Slurm, or tasks of Ray."""
-    jobs: Maybe[int] = None
+    jobs: Jobs = CORES
     """How many episodes are made at once. Default: one per CPU core of this machine."""
     executor_option: Repeated[str] = ()
     """Set an option of Slurm or Ray, such as `--executor-option partition=cpu`; repeatable (docs/scale.md)."""
@@ -51,7 +49,7 @@ class Join:
 
     out: Annotated[Path, tyro.conf.Positional]
     """Output folder of the plan."""
-    jobs: Maybe[int] = None
+    jobs: Jobs = CORES
     """Processes that make the LeRobot dataset. Default: one per CPU core."""
 
 
@@ -85,17 +83,16 @@ def run(command: Run) -> int:
     from robocas_ms3.plans.executors import open_executor
     from robocas_ms3.plans.folder import PlanFolder
     from robocas_ms3.plans.load import load_plan
-    from robocas_ms3.plans.run import Callbacks, run_plan, run_shard
+    from robocas_ms3.plans.run import run_plan, run_shard
 
-    jobs = command.jobs if command.jobs is not None else os.cpu_count() or 1
-    check_number("jobs", jobs, 1)
+    check_number("jobs", command.jobs, 1)
     shard = parse_shard(command.shard, PlanError) if command.shard is not None else None
     if shard and (command.overwrite or command.executor != "local"):
         found = "--overwrite" if command.overwrite else f"--executor {command.executor}"
         raise PlanError("a shard continues in its folder, on this machine", where="--shard", found=found)
     options = dict(_option(word) for word in command.executor_option)
     plan = load_plan(command.plan)
-    executor = open_executor(command.executor, PlanFolder(plan, command.out), jobs, options)
+    executor = open_executor(command.executor, PlanFolder(plan, command.out), command.jobs, options)
     if command.executor == "local" and plan.makes_datasets:
         from robocas_ms3.datasets.writing.render import require_renderer
 
@@ -106,11 +103,11 @@ def run(command: Run) -> int:
             display.flush()  # the progress when the stage began
             display.note(text)
 
-        callbacks = Callbacks(partial(show_plan, display), show_stage)
+        show = partial(show_plan, display)
         if shard:
-            complete = run_shard(executor, shard, callbacks)
+            complete = run_shard(executor, shard, show)
         else:
-            report = run_plan(executor, overwrite=command.overwrite, callbacks=callbacks)
+            report = run_plan(executor, overwrite=command.overwrite, show=show, say=show_stage)
     if shard:
         then = f"robocas plan join {command.out} joins all" if complete else "other work units are missing"
         say(f"{command.out}: the work units of shard {command.shard} are done; {then}")
@@ -123,8 +120,7 @@ def join(command: Join) -> int:
     from robocas_ms3.cli.terminal import tell
     from robocas_ms3.plans.run import join_plan
 
-    jobs = command.jobs if command.jobs is not None else os.cpu_count() or 1
-    _say_products(command.out, join_plan(command.out, jobs=jobs, say=tell))
+    _say_products(command.out, join_plan(command.out, jobs=command.jobs, say=tell))
     return 0
 
 
@@ -139,15 +135,14 @@ def list_plans(cfg: List) -> int:
 
 
 def show_status(command: Status) -> int:
-    from rich.markup import escape
     from rich.table import Table
 
-    from robocas_ms3.cli.terminal import say, say_lines, table_console
+    from robocas_ms3.cli.terminal import say, say_json, table_console
     from robocas_ms3.plans.status import read_status
 
     found = read_status(command.out)
     if command.json:
-        say_lines(json.dumps(asdict(found), indent=2))
+        say_json(asdict(found))
         return 0
     table = Table("part", "episodes", "seeds", "failed", "record, CPU s each", "render, CPU s each", "MB")
     for part in found.parts:
@@ -156,7 +151,7 @@ def show_status(command: Status) -> int:
             part.name,
             f"{part.done} of {part.wanted}",
             str(part.tried),
-            escape(failed),  # a reason may be any text
+            failed,
             f"{part.record_seconds:.1f}",
             f"{part.render_seconds:.1f}",
             f"{part.bytes / 1e6:.0f}",

@@ -9,7 +9,7 @@ from robocas_ms3.demos.settings import ReplaySettings
 def main(settings: ReplaySettings) -> int:
     import numpy as np
 
-    from robocas_ms3.cli.bars import bar
+    from robocas_ms3.cli.bars import Bar
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.demos.recordings.entries import read_json
 
@@ -20,7 +20,7 @@ def main(settings: ReplaySettings) -> int:
     use_one_torch_thread()
     replayed = replay(settings)
     done = []
-    with bar("episodes replayed") as shown:
+    with Bar("episodes replayed") as shown:
         for result in replayed:
             done.append(result)
             shown.next_of(total)

@@ -46,7 +46,7 @@ class Split:
 
 
 def main(cfg: Split) -> int:
-    from robocas_ms3.cli.bars import bar
+    from robocas_ms3.cli.bars import Bar
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.core.words import count_of
     from robocas_ms3.datasets.manage import splitting
@@ -71,7 +71,7 @@ def main(cfg: Split) -> int:
             else splitting.split_by_value(source.dataset, by, share)
         )
         pieces = {cfg.out / name: sides for name, sides in named.items()}
-    with bar("episodes written") as shown:
+    with Bar("episodes written") as shown:
         options = CopyOptions(not cfg.copy, cfg.overwrite, shown.start, shown.advance)
         done = splitting.write_split(source, pieces, share, options)
     for written in done:
@@ -80,11 +80,7 @@ def main(cfg: Split) -> int:
 
 
 def _check(cfg: Split) -> None:
-    """Check that exactly one way of splitting was chosen, with all of its options.
-
-    Raises:
-        DatasetError: it was not.
-    """
+    """Check that exactly one way of splitting was chosen, with all of its options."""
     from robocas_ms3.core.errors import DatasetError
 
     sides = cfg.out_train is not None or cfg.out_val is not None

@@ -30,21 +30,19 @@ class Stats:
 
 
 def main(cfg: Stats) -> int:
-    import json
-
-    from robocas_ms3.cli.bars import bar
-    from robocas_ms3.cli.terminal import say, say_lines
+    from robocas_ms3.cli.bars import Bar
+    from robocas_ms3.cli.terminal import say, say_json
     from robocas_ms3.datasets.schema import PREVIEW_FOLDER
     from robocas_ms3.datasets.statistics.collect import collect
     from robocas_ms3.datasets.statistics.plots import write_stats
 
-    with bar("episodes read") as shown:
+    with Bar("episodes read") as shown:
         stats = collect(cfg.path, rate_hz=cfg.rate, on_episode=shown.at)
     default = cfg.path / PREVIEW_FOLDER / "stats" if cfg.path.is_dir() else cfg.path.with_name(f"{cfg.path.stem}_stats")
     out = cfg.out or (None if cfg.json else default)
     paths = write_stats(stats, out) if out else []
     if cfg.json:
-        say_lines(json.dumps(stats.as_json(), indent=2, ensure_ascii=False))
+        say_json(stats.as_json())
         return 0
     pictures = len(paths) - 1
     say(f"{cfg.path}: {stats.summary()}; {out}: stats.json and {count_of(pictures, 'picture')}")

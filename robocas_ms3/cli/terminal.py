@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Iterable
 from functools import lru_cache
@@ -16,11 +17,7 @@ _PIPED_WIDTH = 200  # with 80 columns long names would be broken, and no search 
 
 
 def console(**options: Any) -> Console:
-    """Return a console that shows control characters as escapes and does not interpret markup.
-
-    Args:
-        options: options of `rich.console.Console`.
-    """
+    """Return a console that shows control characters as escapes and does not interpret markup."""
     return _printable_console()(**{"markup": False, "emoji": False, "highlight": False, **options})
 
 
@@ -46,6 +43,11 @@ def say(text: str) -> None:
 def say_lines(text: str) -> None:
     """Print lines on stdout. Data in them must have no line breaks of its own."""
     console().print(text, soft_wrap=True)
+
+
+def say_json(values: object) -> None:
+    """Print values as JSON on stdout."""
+    say_lines(json.dumps(values, indent=2, ensure_ascii=False))
 
 
 def tell(text: str) -> None:

@@ -118,13 +118,13 @@ DEFAULT = "small"
 def train(baseline: str, cfg: Training) -> int:
     from robocas_ms3.baselines.training.record import find_run
     from robocas_ms3.baselines.training.session import Progress, RunOptions, train_run
-    from robocas_ms3.cli.bars import bar
+    from robocas_ms3.cli.bars import Bar
     from robocas_ms3.cli.terminal import say
 
     data = getattr(cfg, "data", None)
     out = cfg.out or _default_out(baseline, data)
     start = None if cfg.start is None else find_run(Path(cfg.start)).absolute()
-    with bar("episodes read", transient=True) as reading, bar("steps trained") as stepping:
+    with Bar("episodes read", transient=True) as reading, Bar("steps trained") as stepping:
 
         def step(done: int, of: int) -> None:
             reading.close()  # a terminal has room for one

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from robocas_ms3.cli.bars import bar
+from robocas_ms3.cli.bars import Bar
 from robocas_ms3.cli.options import Maybe
-from robocas_ms3.cli.terminal import say, say_lines
+from robocas_ms3.cli.terminal import say, say_json
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.words import count_of
 
@@ -55,7 +54,7 @@ def main(cfg: Validate) -> int:
     found = format_of(cfg.dataset)
     if found and found.name != "robocas" and cfg.replay:
         raise DatasetError("only RoboCAS folders can be replayed", where=cfg.dataset)
-    with bar("episodes checked", transient=True) as shown:
+    with Bar("episodes checked", transient=True) as shown:
         check = found.part("checker") if found and found.checker else validate
         report: Report = check(cfg.dataset, on_episode=shown.at)
     if not cfg.json:
@@ -74,7 +73,7 @@ def main(cfg: Validate) -> int:
             for line in _lines(replays):
                 say(line)
     if cfg.json:
-        say_lines(json.dumps(content, indent=2, ensure_ascii=False))
+        say_json(content)
     return 1 if wrong else 0
 
 
@@ -84,7 +83,7 @@ def _replay(root: Path, pack: str | None) -> ReplayReport:
     from robocas_ms3.datasets.checks.replay import replay_dataset
 
     use_one_torch_thread()
-    with bar("episodes replayed", transient=True) as shown:
+    with Bar("episodes replayed", transient=True) as shown:
         return replay_dataset(root, pack=pack, on_episode=lambda _, count: shown.next_of(count))
 
 

@@ -31,7 +31,7 @@ class Video:
 
 
 def main(cfg: Video) -> int:
-    from robocas_ms3.cli.bars import bar
+    from robocas_ms3.cli.bars import Bar
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.datasets.formats import open_source
     from robocas_ms3.datasets.pictures.video import contact_sheet, write_video
@@ -43,7 +43,7 @@ def main(cfg: Video) -> int:
     for number in numbers:  # before anything is written
         dataset.episode(number)
     suffix = "" if cfg.kind == "rgb" else f"_{cfg.kind}"
-    with bar("episodes filmed") as shown:
+    with Bar("episodes filmed") as shown:
         shown.start(len(numbers))
         for number in numbers:
             path = out / f"{episode_folder(number)}{suffix}.mp4"

@@ -65,13 +65,13 @@ def main(cfg: View) -> int:
 
 
 def _write(cfg: View, out: Path, source) -> int:
-    from robocas_ms3.cli.bars import bar
+    from robocas_ms3.cli.bars import Bar
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.core.outputs import check_replaceable
     from robocas_ms3.viewer.export import export
 
     check_replaceable(out, overwrite=cfg.overwrite, marks=("data/index.js",))
-    with bar("episodes written", transient=True) as shown:
+    with Bar("episodes written", transient=True) as shown:
         count, damaged = export(
             source,
             out,

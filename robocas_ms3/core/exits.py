@@ -127,11 +127,7 @@ def die_with_parent(parent: int) -> None:
 
 @contextmanager
 def no_exit(source: str) -> Iterator[None]:
-    """Turn a SystemExit, or a KeyboardInterrupt without a signal, of foreign code into ExtensionError.
-
-    Args:
-        source: whose code is called, such as ``policy mine:Policy``.
-    """
+    """Turn a SystemExit, or a KeyboardInterrupt without a signal, of the code of ``source`` into ExtensionError."""
     try:
         yield
     except (SystemExit, KeyboardInterrupt) as error:

@@ -211,17 +211,9 @@ def write_json(path: Path | str, data: Any, *, sync: bool = False) -> None:
 def json_text(
     data: Any, where: object, *, indent: int | None = None, ascii_only: bool = False, error: type[_Error] = RobocasError
 ) -> str:
-    """Return values as a JSON text that `documents.load_json` and pydantic read.
+    """Return values as a JSON text that `documents.load_json` and pydantic read; indent None: one line.
 
-    Args:
-        data: dicts, lists, strings, numbers, booleans and None.
-        where: the file or object, for messages.
-        indent: spaces per level; None: one line.
-        ascii_only: whether to escape all other characters.
-        error: type of the error.
-
-    Raises:
-        RobocasError: ``error``: they would refuse a value, such as NaN; ``where`` names its key.
+    Raises ``error``, whose ``where`` names the key, for a value that they would refuse, such as NaN.
     """
     from robocas_ms3.core.documents import json_fault  # with YAML, for which `robocas --help` need not wait
 

@@ -63,15 +63,7 @@ class Ledger(Generic[Record]):
         return [line.record for line in self.lines() if line.record is not None]
 
     def append(self, records: Iterable[Record], *, sync: bool = False) -> None:
-        """Add lines.
-
-        Args:
-            records: of finite numbers; if there are none, the file is not touched.
-            sync: whether they are on the disk when this returns.
-
-        Raises:
-            RobocasError: a record can't be written as JSON, or the file is a symbolic link.
-        """
+        """Add lines, which are on the disk when this returns if ``sync``; no records leave the file as it is."""
         text = _text(records, self.path)
         if not text:
             return

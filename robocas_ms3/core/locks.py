@@ -49,13 +49,7 @@ def locked_folder(path: Path | str) -> Iterator[None]:
 def lock_file(file: IO[Any], path: Path, *, wait: bool) -> None:
     """Lock an open file until it is closed; a file system without locks gives a warning.
 
-    Args:
-        file: open for writing.
-        path: the folder or file that the lock protects, for messages.
-        wait: whether to wait until no other process holds the lock.
-
-    Raises:
-        RobocasError: another process holds the lock, or locking failed.
+    Raises RobocasError, which names ``path``, if another process holds the lock and ``wait`` is not set.
     """
     until = time.monotonic() + _DYING
     while True:

@@ -30,22 +30,13 @@ _SHOWN_VALUE = 60  # characters
 
 @dataclass(frozen=True)
 class FolderKind:
-    """What tells the output folders of a command from other folders.
+    """What tells the output folders of a command from other folders."""
 
-    Attributes:
-        command: which writes them, such as ``robocas generate``.
-        records: paths of the JSON file with the settings. `OutputFolder.start` writes the first; the folder of a
-            finished run may have another.
-        key: a key that the record of this command has, and of no other.
-        marks: other paths by which such a folder is known. Without a record it can only be overwritten.
-        upgrade: returns a record as its settings are compared, such as one of an older version with defaults.
-    """
-
-    command: str
-    records: tuple[str, ...]
-    key: str
-    marks: tuple[str, ...] = ()
-    upgrade: Callable[[dict[str, Any]], dict[str, Any]] = dict
+    command: str  # such as "robocas generate"
+    records: tuple[str, ...]  # paths of the JSON file with the settings; a run starts with the first
+    key: str  # that the record of this command has, and of no other
+    marks: tuple[str, ...] = ()  # other paths; a folder that is known by them alone can only be overwritten
+    upgrade: Callable[[dict[str, Any]], dict[str, Any]] = dict  # a record as its settings are compared
 
 
 class OutputFolder:

@@ -13,17 +13,11 @@ from robocas_ms3.core.exits import exit_error
 
 @dataclass(frozen=True)
 class RemoteError:
-    """An error in a form that can be pickled.
+    """An error in a form that can be pickled."""
 
-    Attributes:
-        error: the error, or another with its message where it can't be pickled.
-        where: the process that raised it, such as "a branch".
-        traceback: the text of its traceback there.
-    """
-
-    error: BaseException
-    where: str
-    traceback: str
+    error: BaseException  # another with its message where it can't be pickled
+    where: str  # the process that raised it, such as "a branch"
+    traceback: str  # there
 
     @classmethod
     def of(cls, error: BaseException, where: str) -> RemoteError:

@@ -119,11 +119,6 @@ def count_of(count: int, noun: str) -> str:
 
 
 def called(asset_id: str, name: str = "") -> str:
-    """Return the name of an object in instructions, and its id where that differs.
-
-    Args:
-        asset_id: of its pack; empty: not known.
-        name: in instructions; empty: not known.
-    """
+    """Return the name of an object in instructions, and its id where that differs; either may be unknown, empty."""
     plain = asset_id.replace("_", " ")
     return f"{name} ({plain})" if name and plain and name != plain else name or plain

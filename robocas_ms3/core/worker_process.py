@@ -43,15 +43,10 @@ _PROGRAM = "import sys; sys.path[:] = {path!r}; from robocas_ms3.core.worker_pro
 
 @dataclass(frozen=True)
 class Limits:
-    """What one task may take.
+    """What one task may take."""
 
-    Attributes:
-        seconds: of wall-clock time.
-        memory_gb: GiB of resident memory, of the worker process and of each process that it forked.
-    """
-
-    seconds: float = math.inf
-    memory_gb: float = math.inf
+    seconds: float = math.inf  # wall-clock time
+    memory_gb: float = math.inf  # GiB, resident, of the worker process and of each process that it forked
 
 
 NO_LIMITS = Limits()
@@ -232,12 +227,7 @@ def _kill_tree(process: subprocess.Popen[bytes]) -> None:
 
 
 def main(descriptor: int, parent: int) -> None:
-    """Run tasks in this process until the pool closes the connection.
-
-    Args:
-        descriptor: file descriptor of the connection.
-        parent: process id of the pool's process.
-    """
+    """Run tasks of the pool in process ``parent`` until it closes the connection, a file descriptor."""
     for number in (signal.SIGINT, signal.SIGTERM):  # a terminal or a batch system sends them to all processes
         signal.signal(number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})

@@ -54,18 +54,11 @@ RENDERER_FIX = (
 
 @dataclass(frozen=True)
 class Finding:
-    """Result of a check.
+    """Result of a check."""
 
-    Attributes:
-        name: of the thing that was checked.
-        status: ``ok``; ``fail``: something required does not work; ``limited``: something optional does not.
-        found: version, device or reason.
-        fix: what to do; empty if ``ok``.
-    """
-
-    name: str
-    status: Literal["ok", "limited", "fail"]
-    found: str
+    name: str  # of the thing that was checked
+    status: Literal["ok", "limited", "fail"]  # limited: something optional does not work
+    found: str  # version, device or reason
     fix: str = ""
 
 

@@ -40,28 +40,17 @@ Seconds = Annotated[float, Field(ge=0, le=1e12)]
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of a seed.
-
-    Attributes:
-        seed: the seed.
-        success: whether there is an episode.
-        steps: its length in control steps.
-        failures: ``stage: reason`` of each attempt that failed.
-        deaths: ``stage: reason`` of each process that died, or was killed for a limit, at this seed.
-        record_seconds, render_seconds: CPU time, of the processes that made it.
-        size: bytes of its files, without ``outcome.json``.
-        at: when it was complete, s since 1970, by the clock of the machine that made it.
-    """
+    """Outcome of a seed."""
 
     seed: Annotated[int, Field(ge=0, le=GREATEST_SEED)]
-    success: bool
-    steps: Count = 0
-    failures: list[str] = field(default_factory=list)
-    deaths: list[str] = field(default_factory=list)
-    record_seconds: Seconds = 0.0
+    success: bool  # whether there is an episode
+    steps: Count = 0  # control steps of the episode
+    failures: list[str] = field(default_factory=list)  # "stage: reason" of each attempt that failed
+    deaths: list[str] = field(default_factory=list)  # of each process that died, or was killed for a limit
+    record_seconds: Seconds = 0.0  # CPU time, of the processes that made the episode
     render_seconds: Seconds = 0.0
-    size: Count = 0
-    at: Seconds = 0.0
+    size: Count = 0  # bytes of the files, without `outcome.json`
+    at: Seconds = 0.0  # end of the seed since 1970, by the clock of the machine
 
 
 _OUTCOME: TypeAdapter[Outcome] = TypeAdapter(Outcome)

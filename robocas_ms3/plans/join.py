@@ -191,11 +191,7 @@ def rule_of(plan: Plan) -> str:
 
 
 def split_of(plan: Plan, root: Path) -> tuple[list[int], list[int]]:
-    """Return training and validation episodes of a dataset; of the parts that name no split, by the plan's rule.
-
-    Raises:
-        DatasetError: an episode lacks its seed, target or task.
-    """
+    """Return training and validation episodes of a dataset; of the parts that name no split, by the plan's rule."""
     train: list[int] = []
     val: list[int] = []
     free: list[int] = []

@@ -82,11 +82,7 @@ def check_packs(plan: Plan, packs: Iterable[str]) -> None:
 
 
 def check_plan(plan: Plan) -> None:
-    """Check that this machine can record, render and join a plan: errors that would come after days of work.
-
-    Raises:
-        RobocasError: a rate, a size or a pack is invalid, or an extra is missing.
-    """
+    """Check that this machine can record, render and join a plan: errors that would come after days of work."""
     from robocas_ms3.demos.recordings.motion import sample_stride
 
     for number in range(len(plan.parts)):

@@ -6,7 +6,6 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from threading import Event
@@ -30,24 +29,16 @@ _LOOK = 1.0  # s between two looks at the folder, at least
 _LOOKS = 10_000.0  # seeds per second that are looked at, at most
 
 
-@dataclass(frozen=True)
-class Callbacks:
-    """What a run calls.
-
-    Attributes:
-        progress: called now and then.
-        stage: called with what is done now, when that changes.
-    """
-
-    progress: Callable[[Status], None] = lambda status: None
-    stage: Callable[[str], None] = lambda text: None
+def _ignore(value: object) -> None:
+    pass
 
 
 def run_plan(
     executor: Executor,
     *,
     overwrite: bool = False,
-    callbacks: Callbacks = Callbacks(),  # noqa: B008  (frozen)
+    show: Callable[[Status], None] = _ignore,
+    say: Callable[[str], None] = _ignore,
 ) -> dict[str, Any]:
     """Make the dataset of a plan, or continue, and return the content of ``report.json``.
 
@@ -57,7 +48,8 @@ def run_plan(
         executor: has the units done. Its output folder gets ``plan.json``, ``units/``, and in the end ``demos/``,
             ``datasets/``, ``statistics/``, ``report.json``.
         overwrite: replace the content of the folder.
-        callbacks: see there.
+        show: is called with the progress now and then.
+        say: is called with each stage.
 
     Raises:
         OutputExistsError: the folder was started with another plan or other versions, or by another command.
@@ -71,23 +63,23 @@ def run_plan(
         with executor:
             progress = Progress(folder)
             for _ in range(_ROUNDS):
-                _do_units(executor, progress, output, callbacks)
+                _do_units(executor, progress, output, show)
                 damaged = progress.forget_damaged()
                 if not damaged:
                     break
-                callbacks.stage(f"{count_of(sum(map(len, damaged.values())), 'episode')} again: damaged files")
+                say(f"{count_of(sum(map(len, damaged.values())), 'episode')} again: damaged files")
             else:
                 unit, seeds = min(damaged.items())
                 found, fix = f"seed {seeds[0]}, made {_ROUNDS} times", "Check the disk; then run the command again."
                 what, where = "files don't keep the sizes that they were written with", folder.unit_folder(unit)
                 raise PlanError(what, where=where, found=found, fix=fix)
-        return join(folder, progress.chosen(), jobs=executor.jobs, say=callbacks.stage)
+        return join(folder, progress.chosen(), jobs=executor.jobs, say=say)
 
 
 def run_shard(
     executor: Executor,
     shard: Shard,
-    callbacks: Callbacks = Callbacks(),  # noqa: B008  (frozen)
+    show: Callable[[Status], None] = _ignore,
 ) -> bool:
     """Do the work units of a shard that are needed and not done, next to other shards in the same folder.
 
@@ -100,12 +92,12 @@ def run_shard(
         progress = Progress(folder)
         if next(progress.missing(shard), None):
             with executor:
-                _do_units(executor, progress, output, callbacks, shard)
+                _do_units(executor, progress, output, show, shard)
     progress.read()
     return next(progress.missing(), None) is None
 
 
-def join_plan(out: Path, *, jobs: int = 1, say: Callable[[str], None] = lambda text: None) -> dict[str, Any]:
+def join_plan(out: Path, *, jobs: int = 1, say: Callable[[str], None] = _ignore) -> dict[str, Any]:
     """Join the episodes of a plan whose work units are done; return the content of ``report.json``.
 
     Raises:
@@ -125,7 +117,7 @@ def join_plan(out: Path, *, jobs: int = 1, say: Callable[[str], None] = lambda t
 
 
 def _do_units(
-    executor: Executor, progress: Progress, output: OutputFolder, callbacks: Callbacks, shard: Shard = (0, 1)
+    executor: Executor, progress: Progress, output: OutputFolder, show: Callable[[Status], None], shard: Shard = (0, 1)
 ) -> None:
     """Do the units that are needed; which ones these are is seen as seeds fail."""
     running: dict[Any, Sequence[Unit]] = {}
@@ -145,10 +137,10 @@ def _do_units(
             progress.read()
             progress.check_failures()
             status = status_of(progress)
-            callbacks.progress(status)
+            show(status)
             shown = time.monotonic() + max(_LOOK, sum(part.tried for part in status.parts) / _LOOKS)
         if next(progress.missing(shard), None) is None:
-            callbacks.progress(status_of(progress))
+            show(status_of(progress))
             return
         for job in _ended(running, shown):
             job.result()

@@ -16,45 +16,27 @@ _RECENT = 600.0  # s before the last episode that the rate is measured over
 
 @dataclass(frozen=True)
 class PartStatus:
-    """Status of a part.
-
-    Attributes:
-        name: of its folders.
-        wanted: episodes that the plan asks for.
-        done: episodes that are done, at most ``wanted``.
-        tried: seeds.
-        failed: ``stage: reason`` -> number of seeds whose last attempt failed for it.
-        record_seconds, render_seconds: CPU time per episode, s.
-        bytes: of the files of the episodes that are done.
-    """
+    """Status of a part."""
 
     name: str
-    wanted: int
-    done: int
-    tried: int
-    failed: dict[str, int]
-    record_seconds: float
+    wanted: int  # episodes that the plan asks for
+    done: int  # episodes that are done, at most `wanted`
+    tried: int  # seeds
+    failed: dict[str, int]  # "stage: reason" -> number of seeds whose last attempt failed for it
+    record_seconds: float  # CPU time per episode
     render_seconds: float
-    bytes: int
+    bytes: int  # of the files of the episodes that are done
 
 
 @dataclass(frozen=True)
 class Status:
-    """Status of a plan; the content of ``robocas plan status --json``.
-
-    Attributes:
-        parts: status of each part.
-        episodes_an_hour: in the ten minutes before the last episode.
-        seconds_left: until all episodes are done, if they take the CPU time of others of their part; None: unknown.
-        idle_seconds: since the last episode; None: there is none.
-        finished: whether everything is joined.
-    """
+    """Status of a plan; the content of ``robocas plan status --json``."""
 
     parts: list[PartStatus]
-    episodes_an_hour: float
-    seconds_left: float | None
-    idle_seconds: float | None
-    finished: bool
+    episodes_an_hour: float  # in the ten minutes before the last episode
+    seconds_left: float | None  # until all are done, if they take the CPU time of others of their part; None: unknown
+    idle_seconds: float | None  # since the last episode; None: there is none
+    finished: bool  # whether everything is joined
 
 
 def read_status(out: Path) -> Status:

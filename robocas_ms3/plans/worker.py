@@ -44,12 +44,7 @@ class UnitWorker:
         self._render = WorkerPool(partial(Renderer, self._plan), 1, limits=limits[1], retries=0)
 
     def do(self, unit: Unit) -> None:
-        """Do the seeds of a unit that are not done.
-
-        Raises:
-            RobocasError: an error that every seed would meet.
-            OSError: an error of the disk or the system.
-        """
+        """Do the seeds of a unit that are not done; an error is one that every seed would meet."""
         for _ in self.seeds(unit):
             pass
 

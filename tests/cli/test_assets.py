@@ -7,7 +7,6 @@ import trimesh
 
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.cli import main as cli
-from robocas_ms3.core.errors import AssetError
 from robocas_ms3.core.paths import builtin_packs_dir
 
 
@@ -102,15 +101,6 @@ def test_build_never_replaces_what_is_no_pack_nor_a_pack_by_a_part_of_it(scans, 
     code, shown = run(capsys, "build", "--ids", "plate")
     assert code == 1 and "--out" in shown
     assert len(list((builtin_packs_dir() / "builtin").iterdir())) > 50
-
-
-def test_a_damaged_pack_is_listed_whatever_is_said_of_it(monkeypatch, capsys):
-    def damaged(name):
-        raise AssetError("damaged", found="[/red]")
-
-    monkeypatch.setattr("robocas_ms3.assets.pack.load_pack", damaged)
-    code, shown = run(capsys, "list")
-    assert code == 0 and "[/red]" in shown
 
 
 def test_a_sheet_is_a_picture(scans, tmp_path, capsys):

@@ -14,22 +14,22 @@ from robocas_ms3.cli.terminal import console
 from robocas_ms3.plans.status import PartStatus, Status
 
 SCRIPT = """
-from robocas_ms3.cli.bars import bar, working
+from robocas_ms3.cli.bars import Bar, working
 from robocas_ms3.cli.terminal import say
 with working("looking about"):
     pass
-with bar("counted") as shown:
+with Bar("counted") as shown:
     shown.start(2)
     shown.advance()
     shown.note("[1] is :odd: " + 90 * "x")
     say("one")
     shown.at(2, 2)
-with bar("replayed", transient=True) as shown:
+with Bar("replayed", transient=True) as shown:
     shown.next_of(3)
     shown.next_of(3)
-with bar("none") as shown:
+with Bar("none") as shown:
     shown.start(0)
-with bar("never begun") as shown:
+with Bar("never begun") as shown:
     pass
 say("done")
 """
@@ -73,7 +73,7 @@ def clock(monkeypatch):
 
 
 def test_a_log_has_the_first_line_one_per_minute_and_the_last(clock, capsys):
-    with bars.bar("episodes") as shown:
+    with bars.Bar("episodes") as shown:
         shown.start(300)
         for _ in range(300):
             clock[0] += 1.5
@@ -85,7 +85,7 @@ def test_a_log_has_the_first_line_one_per_minute_and_the_last(clock, capsys):
 
 
 def test_items_done_before_do_not_count_in_the_rate(clock, capsys):
-    with pytest.raises(KeyboardInterrupt), bars.bar("layouts") as shown:
+    with pytest.raises(KeyboardInterrupt), bars.Bar("layouts") as shown:
         clock[0] += 500  # before the first item
         shown.at(90, 100)
         clock[0] += 40
@@ -99,7 +99,7 @@ def test_items_done_before_do_not_count_in_the_rate(clock, capsys):
 
 
 def test_a_transient_bar_writes_nothing_within_a_minute(clock, capsys):
-    with bars.bar("checked", transient=True) as shown:
+    with bars.Bar("checked", transient=True) as shown:
         for done in range(1, 9):
             shown.at(done, 9)
             clock[0] += 10

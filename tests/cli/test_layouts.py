@@ -1,5 +1,3 @@
-import json
-
 import pytest
 
 from robocas_ms3.cli import layouts
@@ -27,15 +25,6 @@ def test_layouts_are_made_once_and_a_later_run_goes_on(tmp_path, monkeypatch, ca
     layouts.info(Info(tmp_path))
     listed = capsys.readouterr().out
     assert "scattered" in listed and "builtin" in listed and " 3 " in listed
-
-
-def test_a_description_with_brackets_is_shown_as_it_is(tmp_path, capsys):
-    build(tmp_path, "0:1")
-    (about,) = tmp_path.glob(f"*/{cache.ABOUT}")
-    said = json.loads(about.read_text())
-    about.write_text(json.dumps({**said, "object_pack": {"name": "[/red]"}}))
-    assert layouts.info(Info(tmp_path)) == 0
-    assert "[/red]" in capsys.readouterr().out
 
 
 def test_seeds_without_a_layout_are_named_and_the_others_made(tmp_path, monkeypatch, capsys):

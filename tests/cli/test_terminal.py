@@ -48,7 +48,7 @@ def test_bars_and_their_notes(monkeypatch):
     file = io.StringIO()
     made = console(file=file, force_terminal=True, width=200, color_system=None)
     monkeypatch.setattr(bars, "terminal_of_stderr", lambda: made)
-    with bars.bar(HOSTILE) as shown:
+    with bars.Bar(HOSTILE) as shown:
         shown.start(2)
         shown.note(HOSTILE)
         shown.advance()

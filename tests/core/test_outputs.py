@@ -153,6 +153,27 @@ def test_two_runs_in_one_folder(tmp_path):
         write_run(tmp_path / "out")
 
 
+def test_shared_folder_is_neither_locked_nor_swept_and_keeps_its_record(tmp_path):
+    out = tmp_path / "out"
+    with OutputFolder(out, KIND, SETTINGS, shared=True) as first:
+        first.start({**SETTINGS, "started": 1})
+        (out / ".run.1.tmp.json").touch()  # of another process that starts
+        with pytest.raises(ZeroDivisionError), OutputFolder(out, KIND, SETTINGS, shared=True) as second:
+            second.start({**SETTINGS, "started": 2})
+            _ = 1 / 0
+        assert json.loads((out / "run.json").read_text())["started"] == 1
+        assert names(out) == [".run.1.tmp.json", "run.json"]
+        with pytest.raises(OutputExistsError), OutputFolder(out, KIND, {"rate": 10}, shared=True):
+            pass
+        first.check_record()
+        (out / "run.json").write_text('{"rate": 10}')  # of a run that overwrites
+        with pytest.raises(OutputExistsError):
+            first.check_record()
+        (out / "run.json").unlink()
+        with pytest.raises(RobocasError):
+            first.check_record()
+
+
 def test_output_written_in_one_go(tmp_path):
     out = tmp_path / "out"
     check_replaceable(out)

@@ -9,7 +9,6 @@ from plan_stages import PLAN, assert_same, run_here
 
 from robocas_ms3.core.errors import PlanError
 from robocas_ms3.plans.folder import PlanFolder, Unit
-from robocas_ms3.plans.run import Callbacks
 
 
 @pytest.mark.parametrize(
@@ -95,5 +94,5 @@ def test_all_that_is_joined_is_on_the_disk_before_it_has_its_name(out, monkeypat
 def test_nothing_is_joined_twice(undisturbed, tmp_path):
     out = shutil.copytree(undisturbed, tmp_path / "out")
     said = []
-    run_here(out, callbacks=Callbacks(stage=said.append))
+    run_here(out, say=said.append)
     assert said == []

@@ -48,10 +48,6 @@ class Executor(ABC):
             about = "not a valid option of this executor"
             raise refusal(error, self.options_type, PlanError, where="--executor-option", about=about) from error
         self.units_per_job: int = getattr(self.options, "units_per_job", 1)
-        self.check()
-
-    def check(self) -> None:  # noqa: B027  (most have nothing to check)
-        """Check that this machine can submit jobs."""
 
     @abstractmethod
     def __enter__(self) -> Any: ...

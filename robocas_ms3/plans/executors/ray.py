@@ -174,11 +174,7 @@ def send_units(
 ) -> Iterator[Piece]:
     """Do units in a temporary folder of the node, as a task, and send the files seed by seed.
 
-    Args:
-        plan: the plan of the units.
-        record: content of ``plan.json``.
-        units: to be done.
-        done: outcomes of the seeds of each unit that are done already.
+    ``record`` is the content of ``plan.json``, ``done`` has the outcomes of the seeds that are done of each unit.
     """
     with _temporary_folder() as out:
         folder = PlanFolder(plan, out)

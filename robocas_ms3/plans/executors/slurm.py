@@ -14,7 +14,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
@@ -72,7 +72,8 @@ class SlurmExecutor(Executor):
 
     options_type = create_model("SlurmOptions", __base__=_OwnOptions, **_SBATCH_FIELDS)
 
-    def check(self) -> None:
+    def __init__(self, folder: PlanFolder, jobs: int = 1, options: Mapping[str, str] | None = None) -> None:
+        super().__init__(folder, jobs, options)
         self._local = self.options.cluster == "local"
         if not self._local and SubmititExecutor.affinity() < 0:
             fix = "Run this where sbatch and srun are, or try --executor-option cluster=local."
