@@ -179,3 +179,20 @@ def test_a_warning_says_what_would_show():
     assert "5 episodes show no difference, however large" in (too_few(Comparison.of(0, 5, 0, 0)) or "")
     assert too_few(Comparison.of(0, 6, 0, 0)) is None  # p = 1/32
     assert too_few(Comparison.of(0, 6, 0, 0), alpha=0.05 / 2) is not None  # one of two comparisons
+
+
+def test_another_package_says_the_same():
+    """Run by scripts/check_others.sh, whose environment has it."""
+    robostats = pytest.importorskip("robostats")
+    for n in (1, 2, 10, 39, 200):
+        for k in {0, 1, n // 3, n - 1, n}:
+            theirs = robostats.clopper_pearson(k, n)
+            assert (share(k, n).low, share(k, n).high) == pytest.approx((theirs.lower, theirs.upper), abs=1e-12)
+    for counts in [(20, 8, 5, 7), (59, 6, 16, 80), (0, 12, 0, 0), (9, 0, 0, 4), (3, 0, 6, 1), (0, 4, 4, 0)]:
+        table = robostats.PairedResult("a", "b", *counts, tuple(map(str, range(sum(counts)))), 0, 0, ("",), ("",), None)
+        theirs, ours = robostats.compare(table), Comparison.of(*counts)
+        assert ours.p_value == pytest.approx(theirs.p_value, abs=1e-12)
+        assert (ours.low, ours.high) == pytest.approx((theirs.interval.lower, theirs.interval.upper), abs=1e-10)
+    kmodel = pytest.importorskip("robostats.kmodel")
+    for p_values in ([0.01, 0.04, 0.03, 0.005], [0.2, 0.2, 0.9], [0.001]):
+        assert holm(p_values) == pytest.approx(kmodel.adjust(p_values, "holm"), abs=1e-15)

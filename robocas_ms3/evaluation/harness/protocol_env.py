@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from copy import deepcopy
 from typing import Any, cast
@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.harness.proprioception import WIDTHS, Proprioception, depth_key
+from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.policy import CONVENTIONS, ExternalPolicy, PolicySpec
 from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
@@ -76,8 +77,6 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         self.episodes = np.zeros(count, np.int64)  # numbers in the protocol's list
         self._instructions = [""] * count
         self._grippers: list[float | None] = [None] * count  # last command, -1 closed to 1 open
-        self._success, self._truncated = np.zeros(count, bool), np.zeros(count, bool)
-        self._ended = np.ones(count, bool)
         self._obs: dict[str, Any] = {}
 
     def reset(
@@ -106,11 +105,9 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         robot, obs = find_robot(self._session.protocol.rules.robot), self._session.observation
         for env in range(self.num_envs):
             self._proprioception.reset(env, obs, robot)
-        for flags in (self._ended, self._success, self._truncated):
-            flags[:] = False
         self._obs = cast(dict[str, Any], create_empty_array(self.single_observation_space, self.num_envs))
         self._read(list(range(self.num_envs)))
-        return deepcopy(self._obs), self._info()  # the caller may keep them
+        return deepcopy(self._obs), self._info(np.zeros(self.num_envs, bool))  # the caller may keep them
 
     def step(
         self, actions: ArrayLike
@@ -125,19 +122,20 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         acts = np.asarray(actions, np.float32)
         if acts.shape != self.action_space.shape:
             raise ValueError(f"actions: expected {self.action_space.shape}, found {acts.shape}")
-        before, running = self._success.copy(), np.flatnonzero(~self._ended).tolist()
         if not self._obs:
             raise EvaluationError("no episode is running", fix="Call reset first.")
-        if running:
+        before = self._by_env(lambda outcome: True)
+        if running := np.flatnonzero(~before).tolist():
             self._session.step(acts)
             for env, command in zip(running, self._commands(acts[running]), strict=True):
                 self._grippers[env] = command
-            self._record(running)
             self._read(running)
-        reward = (self._success & ~before).astype(np.float64)
-        just_ended = np.isin(np.arange(self.num_envs), running) & self._ended
-        terminated, truncated = self._ended & ~self._truncated, self._truncated.copy()
-        return deepcopy(self._obs), reward, terminated, truncated, self._info(just_ended)
+        ended = self._by_env(lambda outcome: True)
+        self._record(np.flatnonzero(ended & ~before).tolist())
+        truncated = self._by_env(lambda outcome: not outcome.success and outcome.steps >= self._max_steps)
+        info = self._info(ended & ~before)
+        reward = (info["is_success"] & ~before).astype(np.float64)
+        return deepcopy(self._obs), reward, ended & ~truncated, truncated, info
 
     def render(self) -> tuple[NDArray[np.uint8], ...]:
         """Return the first camera's image (H, W, 3) of each env."""
@@ -165,14 +163,14 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         opened = self._convention.read(np.nan_to_num(actions.astype(np.float64))).open
         return np.where(opened, 1.0, -1.0).tolist()
 
+    def _by_env(self, holds: Callable[[Outcome], bool]) -> NDArray[np.bool_]:
+        """Return (N,) whether an env's episode has ended with an outcome of which something holds."""
+        outcomes = [self._session.outcomes.get(env) for env in range(self.num_envs)]
+        return np.array([outcome is not None and holds(outcome) for outcome in outcomes])
+
     def _record(self, envs: list[int]) -> None:
-        """Record the outcomes of episodes that have just ended in some of these envs."""
-        for env in envs:
-            outcome = self._session.outcomes.get(env)
-            if outcome is None:
-                continue
-            self._ended[env], self._success[env] = True, outcome.success
-            self._truncated[env] = not outcome.success and outcome.steps >= self._max_steps
+        """Write the outcomes of envs into the result, each episode once."""
+        for outcome in (self._session.outcomes[env] for env in envs):
             if self._folder is not None and outcome.episode not in self._recorded:
                 results.append(self._folder, outcome)
                 self._recorded.add(outcome.episode)
@@ -188,10 +186,11 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
             if self._spec.depth:
                 self._obs[depth_key(camera)][envs] = images["depth"][envs].transpose(0, 3, 1, 2)
 
-    def _info(self, just_ended: NDArray[np.bool_] | None = None) -> dict[str, Any]:
-        info: dict[str, Any] = {"is_success": self._success.copy(), "_is_success": np.ones(self.num_envs, bool)}
-        if just_ended is not None and just_ended.any():
-            info["final_info"] = {"is_success": self._success.copy(), "_is_success": just_ended}
+    def _info(self, just_ended: NDArray[np.bool_]) -> dict[str, Any]:
+        success = self._by_env(lambda outcome: outcome.success)
+        info: dict[str, Any] = {"is_success": success, "_is_success": np.ones(self.num_envs, bool)}
+        if just_ended.any():
+            info["final_info"] = {"is_success": success.copy(), "_is_success": just_ended}
             info["_final_info"] = just_ended
         return info
 

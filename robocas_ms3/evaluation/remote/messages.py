@@ -89,7 +89,7 @@ class Request(BaseModel):
 
     def episode_spec(self, env: int) -> EpisodeSpec:
         """Return the episode that starts, in an env of the policy."""
-        values = self.start.model_dump(exclude_none=True)
+        values: dict[str, Any] = self.start.model_dump(exclude_none=True)
         return EpisodeSpec(env=env, **{"instruction": self.prompt} | values)
 
 
