@@ -161,9 +161,9 @@ def test_real_episodes_have_the_outcomes_and_images_of_robocas_eval(needs_render
 
     shutil.copytree(SMOKE.folder, tmp_path / "short")
     rules = tmp_path / "short" / "protocol.yaml"
-    rules.write_text(rules.read_text().replace("max_steps: null", "max_steps: 10"))
+    rules.write_text(rules.read_text().replace("max_steps: null", "max_steps: 5"))
     protocol, policy = str(tmp_path / "short"), Down()
-    settings = EvaluationSettings(("search",), "down", protocol, tmp_path / "ours", workers=1, backend="processes")
+    settings = EvaluationSettings(("pick",), "down", protocol, tmp_path / "ours", workers=1, backend="processes")
     list(EvaluationSession(policy, settings).run())
     env = ProtocolVectorEnv(spec, replace(settings, out=tmp_path / "theirs"))
     obs, _ = env.reset(seed=2000)
@@ -176,4 +176,4 @@ def test_real_episodes_have_the_outcomes_and_images_of_robocas_eval(needs_render
     assert seen == policy.seen and truncated.all()
     ours, theirs = (results.read(tmp_path / name).outcomes for name in ("ours", "theirs"))
     assert {n: one.without_clock() for n, one in ours.items()} == {n: one.without_clock() for n, one in theirs.items()}
-    assert all(one.measures["path_length"] > 0.1 for one in theirs.values())
+    assert all(one.measures["path_length"] > 0.05 for one in theirs.values())
