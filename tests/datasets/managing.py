@@ -67,12 +67,15 @@ def arrays_of(episode):
         return dict(content)
 
 
-def make(folder, name, seeds, **kwargs):
+def convert_made_up(trajectory, out, on_episode=None, **settings):
+    """Convert with made-up images, without embeddings and videos unless they are asked for."""
+    settings = {"embeddings": False, "video": False, "open_renderer": RayCaster} | settings
+    return convert(ConversionSettings(trajectory, out, **settings), on_episode=on_episode)
+
+
+def make(folder, name, seeds, **settings):
     """A dataset of these seeds, without embeddings."""
-    trajectory = write_trajectory(folder / f"{name}.h5", seeds=tuple(seeds))
-    convert(
-        ConversionSettings(trajectory, folder / name, embeddings=False, video=False, open_renderer=RayCaster, **kwargs)
-    )
+    convert_made_up(write_trajectory(folder / f"{name}.h5", seeds=tuple(seeds)), folder / name, **settings)
     return folder / name
 
 

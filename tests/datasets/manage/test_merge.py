@@ -3,7 +3,8 @@ import shutil
 
 import pytest
 from managing import DAMAGES, change, edit, files_of, make, read
-from synthetic import RayCaster, write_trajectory
+from managing import convert_made_up as convert
+from synthetic import write_trajectory
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import DatasetError, OutputExistsError, RobocasError
@@ -13,8 +14,6 @@ from robocas_ms3.datasets.manage.copying import CopyOptions, FilePlacer
 from robocas_ms3.datasets.manage.merging import merge
 from robocas_ms3.datasets.manage.splitting import Share, resplit
 from robocas_ms3.datasets.sources.reader import Dataset
-from robocas_ms3.datasets.writing.convert import convert
-from robocas_ms3.datasets.writing.settings import ConversionSettings
 
 
 @pytest.fixture(scope="module")
@@ -158,7 +157,7 @@ def test_what_is_appended_leaves_a_split_of_texts_as_it_is(parts, tmp_path):
     for number, seed in ((0, [10]), (1, [11])):  # as ManiSkill writes seeds
         edit(part / f"episode_000000{number}" / "scene.json", lambda c, seed=seed: c.update(seed=seed))
     trajectory = write_trajectory(tmp_path / "more.h5", seeds=(30,))
-    convert(ConversionSettings(trajectory, part, embeddings=False, video=False, open_renderer=RayCaster, append=True))
+    convert(trajectory, part, append=True)
     train, val = Dataset(part).sides
     assert ([n for n in train if n < 2], [n for n in val if n < 2]) == sides
 
@@ -247,10 +246,9 @@ def test_the_command_wants_datasets(tmp_path, capsys):
 
 def test_a_merged_dataset_can_be_appended_to(parts, tmp_path):
     merge(parts, tmp_path / "out")
-    settings = {"embeddings": False, "video": False, "append": True, "open_renderer": RayCaster}
-    known = convert(ConversionSettings(parts[1].with_suffix(".h5"), tmp_path / "out", **settings))
+    known = convert(parts[1].with_suffix(".h5"), tmp_path / "out", append=True)
     assert (known.kept, known.episodes) == (2, [])
-    new = convert(ConversionSettings(write_trajectory(tmp_path / "c.h5", seeds=(30,)), tmp_path / "out", **settings))
+    new = convert(write_trajectory(tmp_path / "c.h5", seeds=(30,)), tmp_path / "out", append=True)
     assert [episode.number for episode in new.episodes] == [4]
     assert validate(parts[0]).violations == []  # whose files are shared
     assert validate(tmp_path / "out").violations == []

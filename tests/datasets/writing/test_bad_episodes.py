@@ -5,6 +5,7 @@ import json
 import h5py
 import numpy as np
 import pytest
+from managing import convert_made_up as run
 from managing import files_of
 from synthetic import RayCaster, render_by, write_trajectory
 
@@ -13,8 +14,6 @@ from robocas_ms3.core.errors import AssetError, IncompleteError
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing import convert as conversion
-from robocas_ms3.datasets.writing.convert import convert
-from robocas_ms3.datasets.writing.settings import ConversionSettings
 
 SEEDS = tuple(range(10, 24))
 
@@ -35,14 +34,6 @@ class OfOddSeeds(RayCaster):
     def load(self, recording):
         if recording.seed % 2:
             raise RuntimeError("odd")
-
-
-def run(trajectory, out, **kwargs):
-    return convert(
-        ConversionSettings(
-            trajectory, out, **{"embeddings": False, "video": False, "open_renderer": RayCaster, **kwargs}
-        )
-    )
 
 
 @pytest.fixture(scope="module")

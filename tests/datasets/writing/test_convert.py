@@ -6,6 +6,7 @@ import cv2
 import h5py
 import numpy as np
 import pytest
+from managing import convert_made_up as run
 from managing import files_of
 from synthetic import STEPS, RayCaster, made_up_vectors, write_trajectory
 
@@ -18,11 +19,6 @@ from robocas_ms3.datasets.sources.records import SCENE_KEYS, DataInfoRecord
 from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.datasets.writing.settings import ConversionSettings
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
-
-
-def run(trajectory, out, on_episode=None, **kwargs):
-    settings = ConversionSettings(trajectory, out, embeddings=False, video=False, open_renderer=RayCaster, **kwargs)
-    return convert(settings, on_episode=on_episode)
 
 
 def test_the_folder_is_the_schemas(made):
@@ -122,11 +118,7 @@ def test_resume_keeps_what_is_there(trajectory, tmp_path):
     run(trajectory, out)
     before = files_of(out)
     (out / "data_info.json").unlink()
-    (out / "episode_0000001" / "episode_info.npz").rename(out / "gone")
-    (out / "gone").unlink()
-    for path in sorted((out / "episode_0000001").rglob("*"), reverse=True):
-        path.rmdir() if path.is_dir() else path.unlink()
-    (out / "episode_0000001").rmdir()
+    shutil.rmtree(out / "episode_0000001")
     kept = (out / "episode_0000000" / "episode_info.npz").stat().st_mtime_ns
     done = run(trajectory, out)
     assert (done.kept, [e.number for e in done.episodes]) == (1, [1])
@@ -272,26 +264,24 @@ def test_what_would_be_numbered_alike_is_refused(trajectory, tmp_path, monkeypat
     more = write_trajectory(tmp_path / "more.h5", seeds=(10,))
     other = write_trajectory(tmp_path / "other.h5", seeds=(11,))
     monkeypatch.setattr("robocas_ms3.datasets.writing.convert.embed_texts", made_up_vectors)
-    convert(ConversionSettings(trajectory, out, video=False, open_renderer=RayCaster))
+    run(trajectory, out, embeddings=True)
 
     def meanwhile(file, chosen):
         with pytest.raises(RobocasError, match="another process is writing here"):
-            convert(ConversionSettings(other, out, append=True, video=False, open_renderer=RayCaster))
+            run(other, out, append=True, embeddings=True)
         return made_up_vectors(file, chosen)
 
     monkeypatch.setattr("robocas_ms3.datasets.writing.convert.embed_texts", meanwhile)
-    convert(ConversionSettings(more, out, append=True, video=False, open_renderer=RayCaster))
+    run(more, out, append=True, embeddings=True)
     monkeypatch.setattr("robocas_ms3.datasets.writing.convert.embed_texts", made_up_vectors)
-    convert(ConversionSettings(other, out, append=True, video=False, open_renderer=RayCaster))
+    run(other, out, append=True, embeddings=True)
     ledger = json.loads((out / "conversion.json").read_text())["episodes"]
     assert [entry["seed"] for entry in ledger.values()] == [3, 5, 10, 11]
 
 
 def test_a_recording_that_is_there_twice_is_converted_once(tmp_path, caplog):
     trajectory = write_trajectory(tmp_path / "trajectory.h5", seeds=(3, 4, 3))
-    done = convert(
-        ConversionSettings(trajectory, tmp_path / "out", embeddings=False, video=False, open_renderer=RayCaster)
-    )
+    done = run(trajectory, tmp_path / "out")
     assert [episode.number for episode in done.episodes] == [0, 1]
     assert "the same recordings again, left out: 2" in caplog.text
     assert validate(tmp_path / "out").violations == []

@@ -4,12 +4,12 @@ import json
 import shutil
 
 import pytest
+from managing import convert_made_up as convert
 from synthetic import RayCaster, render_by, write_trajectory
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.writing import convert as conversion
-from robocas_ms3.datasets.writing.settings import ConversionSettings
 
 
 @pytest.fixture
@@ -52,11 +52,7 @@ def tried(path, *rates):
 )
 def test_actions_that_were_tried_at_another_rate(tmp_path, caplog, rates, rate_hz, said):
     trajectory = tried(tmp_path / "F.h5", *rates)
-    conversion.convert(
-        ConversionSettings(
-            trajectory, tmp_path / "out", rate_hz=rate_hz, embeddings=False, video=False, open_renderer=RayCaster
-        )
-    )
+    convert(trajectory, tmp_path / "out", rate_hz=rate_hz)
     warnings = [record.getMessage() for record in caplog.records if record.name.startswith("robocas_ms3")]
     assert len(warnings) == bool(said)
     assert not said or warnings[0].startswith(said)
@@ -67,9 +63,7 @@ def test_only_the_recordings_that_are_converted_count(tmp_path, caplog):
     content = json.loads(path.with_suffix(".json").read_text())
     content["episodes"][0]["success"] = False
     path.with_suffix(".json").write_text(json.dumps(content))
-    conversion.convert(
-        ConversionSettings(path, tmp_path / "out", rate_hz=10, embeddings=False, video=False, open_renderer=RayCaster)
-    )
+    convert(path, tmp_path / "out", rate_hz=10)
     assert caplog.records == []
 
 
@@ -105,36 +99,22 @@ def test_an_interrupted_conversion_says_how_to_go_on(monkeypatch, tmp_path, caps
     assert capsys.readouterr().err == f"interrupted{said}\n"
 
 
-@pytest.mark.parametrize(
-    ("flags", "said"),
-    [
-        ("--min-share 0.5", "--min-share: a share of replayed episodes needs --replay"),
-        ("--replay --min-share 50", "--min-share: no such share (expected 0 to 1, found 50.0)"),
-        ("--replay --min-share nan", "--min-share: no such share (expected 0 to 1, found nan)"),
-    ],
-)
-def test_shares_that_make_no_sense(made, capsys, flags, said):
-    assert run(["validate", str(made), *flags.split()]) == 1
-    assert capsys.readouterr().err == f"error: {said}\n"
-
-
 def test_what_another_trajectory_left_missing_is_said(tmp_path, caplog):
     """--append of b was killed; converting a again can't make b's episodes."""
     a, b = (write_trajectory(tmp_path / f"{n}.h5", seeds=seeds) for n, seeds in (("a", (1, 2)), ("b", (3, 4, 5))))
     out = tmp_path / "out"
-    options = {"embeddings": False, "video": False, "open_renderer": RayCaster}
-    conversion.convert(ConversionSettings(a, out, **options))
-    conversion.convert(ConversionSettings(b, out, append=True, **options))
+    convert(a, out)
+    convert(b, out, append=True)
     for number in (2, 4):
         shutil.rmtree(out / f"episode_000000{number}")
     assert caplog.records == []
-    conversion.convert(ConversionSettings(a, out, **options))
+    convert(a, out)
     said = [record.getMessage() for record in caplog.records]
     assert said == [f"{out}: episodes 2, 4 of b.h5 are still missing: convert that with --append"]
     hint = "found no folder (convert b.h5 again, or with --append)"
     assert [str(v) for v in validate(out).violations] == [
         f"conversion.json, episodes.{number}: expected the episodes on disk, {hint}" for number in (2, 4)
     ]
-    conversion.convert(ConversionSettings(b, out, append=True, **options))
+    convert(b, out, append=True)
     assert len(caplog.records) == 1
     assert validate(out).violations == []

@@ -3,13 +3,13 @@
 import shutil
 
 import pytest
+from managing import convert_made_up as run
 from managing import files_of
 from synthetic import RayCaster
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.pictures.stored import Pictures
-from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.datasets.writing.episode_folder import find_damaged
 from robocas_ms3.datasets.writing.settings import ConversionSettings
 
@@ -21,12 +21,6 @@ FILES = (
     "static_camera/intrinsic.npy",
     "base_camera/cam_pose_wrt_arm_base.npy",
 )
-
-
-def run(trajectory, out, **kwargs):
-    return convert(
-        ConversionSettings(trajectory, out, embeddings=False, video=False, open_renderer=RayCaster, **kwargs)
-    )
 
 
 def harm(path, left):

