@@ -72,13 +72,10 @@ def prepare(source: Path, out: Path, embed: Embed | None) -> None:
         vectors: dict[str, NDArray[np.float32]] = {}
         if embed is not None:
             vectors = dict(zip(dataset.tasks, scale_embeddings(embed(dataset.tasks)), strict=True))
-        by_file: dict[Path, list[int]] = defaultdict(list)
-        for number, row in dataset.row_of.items():
-            by_file[dataset.layout.path_of(source, "data", row)].append(number)
         parts: dict[str, list[NDArray]] = defaultdict(list)
-        for path, numbers in by_file.items():
+        for path, rows in dataset.files("data").items():
             tables = []
-            for episode in map(dataset.episode, numbers):
+            for episode in (dataset.episode(row["episode_index"]) for row in rows):
                 columns = _columns(episode, vectors)
                 for key, values in columns.items():
                     parts[key].append(values)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from robocas_ms3.core.words import one_line
 from robocas_ms3.datasets.checks.dataset import Report
 from robocas_ms3.datasets.checks.violation import Violation, check_form, read_object
 from robocas_ms3.datasets.lerobot import schema
-from robocas_ms3.datasets.lerobot.check_frames import TOLERANCE, Fault, Ranges, check_data
+from robocas_ms3.datasets.lerobot.check_frames import TOLERANCE, Fault, Ranges, check_data, surplus_files
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.records import MAX_EPISODES, MAX_FRAMES, InfoRecord, StatsLine, read_lines
 from robocas_ms3.datasets.lerobot.stats import QUANTILES
@@ -59,11 +58,10 @@ def check_lerobot(
     except DatasetError as error:
         return Report(0, 0, [Violation("meta", "", "readable tables", one_line(error))])
     data, ranges = check_data(dataset, texts, on_episode or (lambda *_: None))
-    videos = [key for key, feature in features.items() if feature["dtype"] == "video"]
     violations = [
         *wrong,
         *data,
-        *(wrong for key in videos for wrong in _check_videos(dataset, key, decode)),
+        *(wrong for key in dataset.videos for wrong in _check_videos(dataset, key, decode)),
         *_check_statistics(dataset, ranges),
         *_check_our_files(dataset),
         *_check_checksums(root),
@@ -98,18 +96,14 @@ def _check_videos(dataset: LeRobotDataset, key: str, decode: bool) -> Iterator[V
     size, extra = dataset.info["features"][key]["shape"][:2], f"depth/{schema.camera_of(key)}"
     has_extra = any(f"{extra}/file_index" in row for row in dataset.rows)
     for prefix in (f"videos/{key}", extra) if has_extra else (f"videos/{key}",):
-        by_file: dict[Path, list[dict[str, Any]]] = defaultdict(list)
-        for row in dataset.rows:
-            by_file[layout.path_of(root, prefix, row)].append(row)
+        by_file = dataset.files(prefix)
         for path, inside in by_file.items():
             yield from _check_times(inside, prefix, fps)
             frames, name = sum(row["length"] for row in inside), str(path.relative_to(root))
             yield from (Violation(name, *fault) for fault in _video_faults(path, frames, fps, size, decode))
         folder = layout.path(root, prefix, 0, 0).parent  # chunk-000, or below it
         chunks = folder.parent.parent.glob(f"*/{folder.name}") if layout.one_file_per_episode else [folder.parent]
-        for path in sorted(path for chunk in chunks for path in chunk.rglob("*") if path.is_file()):
-            if path not in by_file:
-                yield Violation(str(path.relative_to(root)), "", "files of episodes only", "of none")
+        yield from surplus_files(root, chunks, by_file)
 
 
 def _check_times(rows: list[dict[str, Any]], prefix: str, fps: int) -> Iterator[Violation]:

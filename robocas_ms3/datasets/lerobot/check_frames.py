@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -42,10 +42,7 @@ def check_data(
     dataset: LeRobotDataset, texts: Texts, on_episode: Callable[[int, int], None]
 ) -> tuple[list[Violation], Ranges]:
     """Return the violations in all frames, and the ranges of their numbers."""
-    root, features = dataset.root, dataset.info["features"]
-    by_file: dict[Path, list[dict[str, Any]]] = defaultdict(list)
-    for row in dataset.rows:
-        by_file[dataset.layout.path_of(root, "data", row)].append(row)
+    root, features, by_file = dataset.root, dataset.info["features"], dataset.files("data")
     violations: list[Violation] = []
     ranges: Ranges = {}
     done = 0
@@ -73,9 +70,14 @@ def check_data(
                 on_episode(done, len(dataset.rows))
         except DatasetError as error:
             violations.append(Violation(name, "", "a readable table", one_line(error)))
-    others = sorted(path for path in (root / "data").rglob("*") if path.is_file() and path not in by_file)
-    violations += [Violation(str(path.relative_to(root)), "", "files of episodes only", "of none") for path in others]
-    return violations, ranges
+    return [*violations, *surplus_files(root, [root / "data"], by_file)], ranges
+
+
+def surplus_files(root: Path, folders: Iterable[Path], known: Container[Path]) -> Iterator[Violation]:
+    """Yield the files of folders that no episode has."""
+    for path in sorted(path for folder in folders for path in folder.rglob("*") if path.is_file()):
+        if path not in known:
+            yield Violation(str(path.relative_to(root)), "", "files of episodes only", "of none")
 
 
 def _file_faults(path: Path, rows: list[dict[str, Any]], features: Mapping[str, Any]) -> Iterator[Fault]:
@@ -108,15 +110,7 @@ def _number_fault(values: NDArray, feature: Mapping[str, Any]) -> tuple[str, str
 def _check_episode(
     table: pa.Table, columns: Columns, row: Mapping[str, Any], info: Mapping[str, Any], texts: Texts
 ) -> Iterator[Fault]:
-    """Check indices, timestamps, texts and outcome of an episode, and that features are consistent.
-
-    Args:
-        table: frames of the episode.
-        columns: their numeric features (T, D).
-        row: of the episode in ``meta/episodes``.
-        info: of the dataset.
-        texts: that the index columns number.
-    """
+    """Check indices, timestamps, texts and outcome of an episode, and that features are consistent."""
     length = row["length"]
     if len(table) != length:
         yield "", count_of(length, "frame"), str(len(table))
@@ -189,13 +183,7 @@ def _check_content(columns: Columns, types: list[Any], instruction: str) -> Iter
 
 
 def check_language(table: pa.Table, file: str, info: Mapping[str, Any]) -> Iterator[Fault]:
-    """Check the language rows of an episode, those of ``lerobot-annotate`` too.
-
-    Args:
-        table: frames of the episode.
-        file: name of the file, for messages.
-        info: of the dataset.
-    """
+    """Check the language rows of an episode, those of ``lerobot-annotate`` too."""
     persistent, events = (read_rows_of(table, key, file) for key in (PERSISTENT, EVENTS))
     if any(rows != persistent[0] for rows in persistent[1:]):
         yield PERSISTENT, "the same rows in each frame", "others"

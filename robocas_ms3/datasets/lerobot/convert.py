@@ -113,8 +113,9 @@ def _plan(given: ConversionInput, codec: str, variant: Variant) -> dict[str, Any
     entries, pictures = given.entries(), given.pictures
     place = {entry["source"]: i for i, entry in enumerate(entries)}
     before_train, before_val = ([place[n] for n in side if n in place] for side in given.source.settled_split())
-    seeds = {i: i if entry["seed"] is None else one_seed(entry["seed"]) for i, entry in enumerate(entries)}
-    train, val = split_by_seed(seeds, (before_train, before_val))
+    seeds = [one_seed(entry["seed"]) for entry in entries]
+    known = {i: i if seed is None else seed for i, seed in enumerate(seeds)}
+    train, val = split_by_seed(known, (before_train, before_val))
     plan = {
         "format": "lerobot",
         "made_with": versions(),

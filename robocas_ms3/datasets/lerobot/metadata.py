@@ -56,11 +56,7 @@ class Metadata:
         if not path.is_file():
             raise DatasetError("no LeRobot dataset here", where=path, found="no file")
         found = read_json(path)
-        version = found.get("codebase_version")
-        if not isinstance(version, str) or version not in LAYOUTS:
-            what = "a LeRobot dataset of another version"
-            raise DatasetError(what, where=self.root, expected=" or ".join(LAYOUTS), found=version)
-        parse(InfoRecord, found, DatasetError, where=path)
+        parse(InfoRecord, found, DatasetError, where=path, about="not a LeRobot dataset of these versions")
         return found
 
     @cached_property
@@ -78,10 +74,13 @@ class Metadata:
     @cached_property
     def cameras(self) -> tuple[str, ...]:
         """Names of the cameras, without those of native depth."""
-        features = self.info["features"].items()
-        return tuple(
-            schema.camera_of(key) for key, ft in features if ft["dtype"] == "video" and not schema.is_depth(ft)
-        )
+        features = self.info["features"]
+        return tuple(schema.camera_of(key) for key in self.videos if not schema.is_depth(features[key]))
+
+    @property
+    def videos(self) -> list[str]:
+        """Keys of the features that are videos."""
+        return [key for key, feature in self.info["features"].items() if feature["dtype"] == "video"]
 
     def depth_feature(self, camera: str) -> dict[str, Any] | None:
         """Return the feature of a camera's native depth video, or None."""
@@ -132,8 +131,7 @@ class Metadata:
 
     def _table_of_lines(self, most: int) -> pa.Table:
         """Return ``meta/episodes.jsonl`` as the table that format v3.0 has in its place."""
-        features, fps = self.info["features"], self.info["fps"]
-        prefixes = [f"videos/{key}" for key, feature in features.items() if feature["dtype"] == "video"]
+        fps, prefixes = self.info["fps"], ["data", *(f"videos/{key}" for key in self.videos)]
         if (self.root / "depth").is_dir():
             prefixes += [f"depth/{camera}" for camera in self.cameras]
         rows, start = [], 0
@@ -141,16 +139,22 @@ class Metadata:
             chunk, file = divmod(line.episode_index, CHUNK_FILES)
             row = {"episode_index": line.episode_index, "tasks": line.tasks, "length": line.length}
             row |= {"dataset_from_index": start, "dataset_to_index": start + line.length}
-            for prefix in ("data", *prefixes):
+            for prefix in prefixes:
                 row |= {f"{prefix}/chunk_index": chunk, f"{prefix}/file_index": file}
                 row |= {f"{prefix}/from_timestamp": 0.0, f"{prefix}/to_timestamp": line.length / fps}
             rows.append(row)
             start += line.length
         return pa.Table.from_pylist(rows)
 
+    def files(self, prefix: str) -> dict[Path, list[dict[str, Any]]]:
+        """Return the rows of the episodes in each file; ``prefix`` as in `Layout.path`."""
+        found: dict[Path, list[dict[str, Any]]] = {}
+        for row in self.rows:
+            found.setdefault(self.layout.path_of(self.root, prefix, row), []).append(row)
+        return found
+
     @cached_property
     def row_of(self) -> dict[int, dict[str, Any]]:
-        """Number -> row of ``meta/episodes``."""
         return {row["episode_index"]: row for row in self.rows}
 
     @cached_property
@@ -169,7 +173,6 @@ class Metadata:
         return read_texts(self.root / schema.SUBTASKS_FILE, "subtask_index", self.info["total_frames"])
 
     def subtask_texts(self, places: NDArray, where: object) -> list[str]:
-        """Return the texts of sub-goals by their numbers."""
         known = len(self.subtasks)
         wrong = places[~((places >= 0) & (places < known) & (places == np.floor(places)))]
         if len(wrong):
@@ -179,11 +182,7 @@ class Metadata:
 
     @cached_property
     def described(self) -> dict[int, dict[str, str]]:
-        """Number -> ``scene`` and ``cameras``, JSON, by ``meta/robocas/episodes.parquet``; empty without.
-
-        Raises:
-            DatasetError: the table is damaged.
-        """
+        """Number -> ``scene`` and ``cameras``, JSON, by ``meta/robocas/episodes.parquet``; empty without."""
         path = self.root / schema.SCENES_FILE
         rows = read_objects(path, SCENES, most_rows=self.info["total_episodes"]).to_pylist() if path.exists() else []
         return {row.pop("episode_index"): row for row in rows}

@@ -7,21 +7,20 @@ from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from robocas_ms3.core.documents import DocumentError, json_values
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.strict import parse
+from robocas_ms3.core.strict import parse_json
 from robocas_ms3.core.words import one_line
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.arrays import robocas_arrays
 from robocas_ms3.datasets.lerobot.language import EVENTS, PERSISTENT, boxes_of, goals_of, read_rows_of
 from robocas_ms3.datasets.lerobot.metadata import Metadata
-from robocas_ms3.datasets.lerobot.records import CameraRecord, CamerasRecord, frame_columns
+from robocas_ms3.datasets.lerobot.records import CameraRecord, CamerasText, SceneText, frame_columns
 from robocas_ms3.datasets.lerobot.tables import check_columns, is_numeric, numbers, read_rows
 from robocas_ms3.datasets.lerobot.video import read_frames, to_depth
 from robocas_ms3.datasets.pictures.stored import Box
@@ -30,6 +29,8 @@ from robocas_ms3.datasets.sources.protocol import EpisodeSource, Kind, Side, Sou
 from robocas_ms3.datasets.sources.reader import check_rate
 from robocas_ms3.demos.recordings.subgoals import SubGoal, subgoal_runs
 from robocas_ms3.robots.cameras import Parent, standard_parent
+
+_Text = TypeVar("_Text", SceneText, CamerasText)
 
 
 class LeRobotDataset(Metadata, EpisodeSource):
@@ -166,24 +167,17 @@ class LeRobotEpisode(SourceEpisode):
             return []
         return [boxes_of(rows) for rows in read_rows_of(self.table, EVENTS, self.where)]
 
-    def _described(self, key: str, otherwise: str) -> dict[str, Any]:
-        where = f"{self.where}, {schema.SCENES_FILE}, {key}"
-        try:
-            found = json_values(self.dataset.described.get(self.number, {}).get(key, otherwise))
-        except DocumentError as error:
-            raise DatasetError("this JSON is damaged", where=where, found=error) from error
-        if not isinstance(found, dict):
-            raise DatasetError("this JSON is damaged", where=where, expected="an object", found=type(found).__name__)
-        return found
-
     @cached_property
     def scene(self) -> dict[str, Any]:
-        return self._described("scene", "{}")
+        return self._described("scene", SceneText).root
 
     @cached_property
     def _cameras(self) -> dict[str, CameraRecord]:
-        found = {"cameras": self._described("cameras", "{}")}
-        return parse(CamerasRecord, found, DatasetError, where=f"{self.where}, {schema.SCENES_FILE}").cameras
+        return self._described("cameras", CamerasText).root
+
+    def _described(self, key: str, model: type[_Text]) -> _Text:
+        text, where = self.dataset.described.get(self.number, {}).get(key, "{}"), f"{schema.SCENES_FILE}, {key}"
+        return parse_json(model, text, DatasetError, where=f"{self.where}, {where}", about="damaged")
 
     def _camera(self, name: str) -> CameraRecord:
         if name not in self._cameras:

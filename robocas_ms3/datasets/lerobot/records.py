@@ -7,7 +7,16 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, NonNegativeInt, StringConstraints, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    NonNegativeInt,
+    RootModel,
+    StringConstraints,
+    model_validator,
+)
 
 from robocas_ms3.core.documents import JSON_LIMIT, json_values, read_text
 from robocas_ms3.core.errors import DatasetError
@@ -159,10 +168,12 @@ class CameraRecord(_Record):
         return cls(intrinsic=intrinsic, camera_in_parent=pose, parent=parent)
 
 
-class CamerasRecord(_Record):
+class CamerasText(RootModel[dict[Name, CameraRecord]]):
     """The cameras of an episode, by name."""
 
-    cameras: dict[Name, CameraRecord]
+
+class SceneText(RootModel[dict[str, Any]]):
+    """The content of an episode's ``scene.json``."""
 
 
 SCENES: Mapping[str, Column] = {"episode_index": Column(INTEGER), "scene": Column(TEXT), "cameras": Column(TEXT)}

@@ -60,7 +60,7 @@ def test_what_takes_robocas_folders_says_what_else_lies_there(tmp_path, ask):
 
 def test_a_lerobot_dataset_is_counted_as_one(tmp_path):
     lerobot(tmp_path / "here")
-    with pytest.raises(DatasetError, match="a LeRobot dataset of another version"):
+    with pytest.raises(DatasetError, match="codebase_version"):
         collect(tmp_path / "here")
 
 
