@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
@@ -46,9 +46,6 @@ class EpisodeRecord(BaseModel):
     """``episode.json`` of a part.
 
     Attributes:
-        instruction: of the episode.
-        scene: content of ``scene.json``.
-        cameras: by name.
         depth: whether there are videos of depth.
         depth_clipped: whether depth was out of the range of a native depth video.
         levels: counts of the levels of each video feature, see `stats.Levels`.
@@ -76,41 +73,49 @@ def _sizes(folder: Path) -> dict[str, int]:
 
 @dataclass(frozen=True)
 class PartWriter(EpisodeWriter):
-    """Writes the parts of a LeRobot dataset.
-
-    Attributes:
-        parts: folder of the parts.
-        codec: of RGB.
-        variant: of the dataset.
-    """
+    """Writes the parts of a LeRobot dataset into the folder ``parts``; ``codec`` is that of RGB."""
 
     parts: Path
     codec: str
     variant: Variant
 
     def folder(self, number: int) -> Path:
-        """Return the folder of a part."""
         return self.parts / episode_folder(number)
 
     def write_files(self, folder: Path, wanted: GivenEpisode, frames: Generator[Frame, None, None]) -> None:
-        """Write a part into a folder."""
         episode, arrays, pictures = wanted.episode, wanted.arrays, wanted.given.pictures
         fps, steps = schema.whole_rate(wanted.given.source.rate_hz), int(arrays["episode_length"])
-        with _Videos(folder, self, fps) as videos:
+        encoders: dict[str, Encoder] = {}  # opened with the first frame
+        levels: dict[str, Levels] = {}
+        boxes: list[dict[str, Box]] = []
+        clipped = False
+        with ExitStack() as stack:
             for frame in frames:
-                videos.add(frame)
-        if len(videos.boxes) != steps:
+                boxes.append(frame.boxes)
+                for camera, kind, image in _images(frame):
+                    if kind == "rgb":
+                        levels.setdefault(schema.image_key(camera), Levels.rgb()).add(image)
+                    elif self.variant.native_depth:
+                        clipped = clipped or bool(image.max() > schema.MAX_DEPTH_MM)
+                        image = to_levels(image)  # noqa: PLW2901
+                        levels.setdefault(schema.depth_key(camera), Levels.depth()).add(image)
+                    name = video_name(camera, kind, self.codec, self.variant)
+                    if name not in encoders:
+                        coding, size = coding_of(kind, self.codec, self.variant), (image.shape[1], image.shape[0])
+                        encoders[name] = stack.enter_context(Encoder(folder / name, coding, fps, size))
+                    encoders[name].add(image)
+        if len(boxes) != steps:
             what = "images and arrays differ in length"
-            raise DatasetError(what, where=episode.where, expected=steps, found=len(videos.boxes))
+            raise DatasetError(what, where=episode.where, expected=steps, found=len(boxes))
         scene = episode.scene
-        pq.write_table(self._table(arrays, videos.boxes, scene, fps), folder / FRAMES_FILE)
+        pq.write_table(self._table(arrays, boxes, scene, fps), folder / FRAMES_FILE)
         record = EpisodeRecord(
             instruction=str(arrays["language_goal"]),
             scene=scene,
             cameras={name: CameraRecord.of(name, episode.camera(name)) for name in pictures.cameras},
             depth=pictures.depth,
-            depth_clipped=videos.clipped,
-            levels={key: levels.counts.tolist() for key, levels in videos.levels.items()},
+            depth_clipped=clipped,
+            levels={key: counted.counts.tolist() for key, counted in levels.items()},
             sizes=_sizes(folder),
         )
         (folder / EPISODE_FILE).write_text(record.model_dump_json(), encoding="utf-8")
@@ -132,48 +137,11 @@ class PartWriter(EpisodeWriter):
         return pa.table(columns)
 
 
-class _Videos:
-    """Encodes the images of an episode: one encoder per camera and kind, opened with the first frame.
-
-    Attributes:
-        levels, clipped: see `EpisodeRecord`.
-        boxes: of each frame.
-    """
-
-    def __init__(self, folder: Path, writer: PartWriter, fps: int) -> None:
-        self._folder, self._writer, self._fps = folder, writer, fps
-        self._encoders: dict[str, Encoder] = {}
-        self._stack = ExitStack()
-        self.levels: dict[str, Levels] = {}
-        self.boxes: list[dict[str, Box]] = []
-        self.clipped = False
-
-    def __enter__(self) -> _Videos:
-        return self
-
-    def __exit__(self, *error: Any) -> None:
-        self._stack.__exit__(*error)
-
-    def add(self, frame: Frame) -> None:
-        for camera, image in frame.rgb.items():
-            self._encode("rgb", camera, image)
-            self.levels.setdefault(schema.image_key(camera), Levels.rgb()).add(image)
-        for camera, image in frame.depth.items():
-            if self._writer.variant.native_depth:
-                self.clipped = self.clipped or bool(image.max() > schema.MAX_DEPTH_MM)
-                image = to_levels(image)  # noqa: PLW2901
-                self.levels.setdefault(schema.depth_key(camera), Levels.depth()).add(image)
-            self._encode("depth", camera, image)
-        self.boxes.append(frame.boxes)
-
-    def _encode(self, kind: Kind, camera: str, image: NDArray) -> None:
-        name = video_name(camera, kind, self._writer.codec, self._writer.variant)
-        if name not in self._encoders:
-            height, width = image.shape[:2]
-            coding = coding_of(kind, self._writer.codec, self._writer.variant)
-            encoder = Encoder(self._folder / name, coding, self._fps, (width, height))
-            self._encoders[name] = self._stack.enter_context(encoder)
-        self._encoders[name].add(image)
+def _images(frame: Frame) -> Iterator[tuple[str, Kind, NDArray]]:
+    for camera, image in frame.rgb.items():
+        yield camera, "rgb", image
+    for camera, image in frame.depth.items():
+        yield camera, "depth", image
 
 
 @dataclass(frozen=True)
@@ -192,11 +160,6 @@ class Part:
 
     @cached_property
     def record(self) -> EpisodeRecord:
-        """Its ``episode.json``.
-
-        Raises:
-            DatasetError: it is damaged.
-        """
         path = self.folder / EPISODE_FILE
         try:
             return EpisodeRecord.model_validate_json(read_text(path, JSON_LIMIT))
@@ -205,7 +168,6 @@ class Part:
 
     @cached_property
     def table(self) -> pa.Table:
-        """Its frames."""
         path = self.folder / FRAMES_FILE
         try:
             return pq.read_table(path)

@@ -31,7 +31,7 @@ from robocas_ms3.datasets.sources.protocol import Kind
 
 @dataclass(frozen=True)
 class Coding:
-    """FFmpeg's encoder and pixel format, suffix of the file, options of the encoder."""
+    """FFmpeg's encoder, pixel format, suffix of the file, options of the encoder."""
 
     encoder: str
     pixels: str
@@ -111,14 +111,7 @@ def coding_of(kind: Kind, codec: str, variant: Variant) -> Coding:
 
 
 class Encoder:
-    """Writes one video; use it in a ``with`` statement.
-
-    Args:
-        path: of the video.
-        coding: how images are encoded.
-        fps: frames per second.
-        size: width and height, pixels.
-    """
+    """Writes one video of a width and height in pixels; use it in a ``with`` statement."""
 
     def __init__(self, path: Path, coding: Coding, fps: int, size: tuple[int, int]) -> None:
         width, height = size
@@ -246,12 +239,7 @@ def read_frames(path: Path, first: int, count: int, fps: int) -> Generator[NDArr
 
 
 def packet_times(path: Path, most: int | None = None) -> tuple[list[Fraction], dict[str, Any]]:
-    """Return the times of the frames of a video in s, without decoding them, and its description in ``info.json``.
-
-    Args:
-        path: of the video.
-        most: expected number of frames; at most one more is read.
-    """
+    """Return the times of the frames of a video in s, at most ``most`` and one more, and its ``info``."""
     try:
         check_regular(path)
         with av.open(str(path)) as video:
@@ -281,12 +269,7 @@ def to_levels(depth: NDArray[np.uint16]) -> NDArray[np.uint16]:
 
 
 def to_depth(levels: NDArray[np.uint16], info: Mapping[str, Any]) -> NDArray[np.uint16]:
-    """Return the depth in mm of an image of levels (H, W).
-
-    Args:
-        levels: 0 to 4095.
-        info: ``info`` of the video's feature; missing values are LeRobot's defaults.
-    """
+    """Return the depth in mm of an image of levels (H, W), 0 to 4095, by ``info`` of the video's feature."""
     values = parse(_Range, dict(info), DatasetError, where="info", about="invalid range of a depth video")
     low, high, shift = values.depth_min, values.depth_max, values.shift
     share = levels.astype(np.float64) / (_LEVELS - 1)
