@@ -79,7 +79,6 @@ class Sampler:
         self._object_ids: dict[int, ObjectIds] = {}
 
     def __call__(self, objects_seed: int, seed: int) -> Layout:
-        """Return the layout of two seeds; see `sample_layout`."""
         if objects_seed == seed:
             return self.make(seed, seed)
         if objects_seed not in self._object_ids:

@@ -52,11 +52,7 @@ def find_furniture(pack: Pack, asset_id: str, *, key: str) -> LoadedFurniture:
 
 
 def find_room(pack: Pack, config: TaskConfig) -> LoadedFurniture:
-    """Return the room.
-
-    Raises:
-        ConfigError: there is no such room, part or finish.
-    """
+    """Return the room."""
     room = find_furniture(pack, config.room.asset, key="room.asset")
     known, random = room.asset.finishes, config.randomisation
     for part, finish in config.room.finishes.items():
@@ -71,11 +67,7 @@ def find_room(pack: Pack, config: TaskConfig) -> LoadedFurniture:
 
 
 def find_container(pack: Pack, config: PlacedConfig) -> LoadedFurniture:
-    """Return the basket.
-
-    Raises:
-        ConfigError: no such furniture, or it isn't a movable container.
-    """
+    """Return the basket."""
     basket = find_furniture(pack, config.asset, key="basket.asset")
     if basket.asset.inner is None or basket.asset.mass is None:
         raise ConfigError("basket.asset: this furniture is no movable container", found=config.asset)
@@ -83,11 +75,7 @@ def find_container(pack: Pack, config: PlacedConfig) -> LoadedFurniture:
 
 
 def find_objects(pack: Pack, config: TaskConfig) -> list[str]:
-    """Return the ids of the configuration's objects.
-
-    Raises:
-        ConfigError: an id is not in the pack, the pack has no objects, or too few are alike for a relation.
-    """
+    """Return the ids of the configuration's objects."""
     wanted = sorted(pack.objects) if config.objects.ids == "all" else config.objects.ids
     ids = resolve_ids(pack, wanted, key="objects.ids")
     if not ids:
@@ -132,11 +120,7 @@ def _most_alike(pack: Pack, ids: list[str], config: TaskConfig, copies: int) -> 
 
 
 def resolve_ids(pack: Pack, wanted: list[str | int] | list[str], *, key: str) -> list[str]:
-    """Return the ids of a pack's objects, from ids or GraspNet-1Billion's numbers.
-
-    Raises:
-        ConfigError: one is not in the pack.
-    """
+    """Return the ids of a pack's objects, from ids or GraspNet-1Billion's numbers."""
     numbers = {
         loaded.asset.graspnet_id: i for i, loaded in pack.objects.items() if loaded.asset.graspnet_id is not None
     }
@@ -155,11 +139,7 @@ def resolve_ids(pack: Pack, wanted: list[str | int] | list[str], *, key: str) ->
 
 
 def find_region(config: SurfaceConfig, furniture: LoadedFurniture) -> Region:
-    """Return the rectangle that objects are placed on, in the furniture's frame.
-
-    Raises:
-        ConfigError: the furniture has no such surface, or the rectangle sticks out of it.
-    """
+    """Return the rectangle that objects are placed on, in the furniture's frame."""
     surfaces = furniture.asset.surfaces
     _check_known("surface.name: no such surface", config.name, surfaces)
     whole = surfaces[config.name]
@@ -175,11 +155,7 @@ def find_region(config: SurfaceConfig, furniture: LoadedFurniture) -> Region:
 
 
 def check_joints(config: TaskConfig, furniture: dict[str, LoadedFurniture]) -> None:
-    """Check positions of doors and drawers, and that the one to open is closed at first and can be pulled open.
-
-    Raises:
-        ConfigError: no such joint or handle, or a position or share out of range.
-    """
+    """Check positions of doors and drawers, and that the one to open is closed at first and can be pulled open."""
     for name, item in config.furniture.items():
         known = {link.joint.name: link.joint.limits for link in furniture[name].asset.links}
         for joint, position in item.joints.items():

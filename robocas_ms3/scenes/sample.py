@@ -178,11 +178,7 @@ def _kinds_that_fit(rng: np.random.Generator, model: SceneModel, ids: list[str],
 
 
 def _usable(model: SceneModel, ids: list[str], *, columns: bool = False) -> list[str]:
-    """Return the ids of objects that fit under what is above; for columns those with a display pose, if any has one.
-
-    Raises:
-        LayoutError: none fits.
-    """
+    """Return the ids of objects that fit under what is above; for columns those with a display pose, if any has one."""
     if not columns and model.headroom == np.inf:
         return ids
     things = {i: placeable(model.object_pack.objects[i], model.headroom) for i in ids}

@@ -24,11 +24,7 @@ _BODY_BOXES = PANDA_ENVELOPE.body_boxes  # whatever robot: a layout follows from
 
 
 def place_robot(model: SceneModel, rng: np.random.Generator) -> Array:
-    """Draw 4x4 of the robot's root until its body is clear of furniture; as configured where nothing moves it.
-
-    Raises:
-        LayoutError: it never is.
-    """
+    """Draw 4x4 of the robot's root until its body is clear of furniture; as configured where nothing moves it."""
     by = model.config.randomisation.robot
     points = np.zeros((0, 3)) if by is None else model.furniture_points
     return _place("robot", model.robot_pose, by, rng, lambda pose: body_is_free(pose, points))
@@ -39,9 +35,6 @@ def place_basket(model: SceneModel, robot_pose: Array, rng: np.random.Generator)
 
     Returns:
         None where there is no basket.
-
-    Raises:
-        LayoutError: it never does.
     """
     if model.basket is None or model.basket_pose is None:
         return None

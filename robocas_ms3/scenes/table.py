@@ -105,14 +105,7 @@ def write_table(
     layouts: Mapping[Pair, Layout],
     states: Mapping[Pair, State] = MappingProxyType({}),
 ) -> None:
-    """Write layouts as a table.
-
-    Args:
-        path: of the file.
-        names: ids of the object pack's objects, sorted.
-        layouts: by pair; those of an objects seed have the same objects. Other pairs of the same seeds are lacking.
-        states: of these layouts; default: `State.UNTRIED`.
-    """
+    """Write layouts as a table; ``names`` are sorted, and pairs of its seeds without a layout are `State.LACKING`."""
     records = _records(names, layouts, states)
     sets, row = np.unique(records["objects_seed"], return_inverse=True)
     seeds, column = np.unique(records["seed"], return_inverse=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import _thread
 import gc
 import os
 import signal
@@ -122,15 +121,6 @@ def test_objects_that_can_not_be_laid_out_are_tried_once_and_leave_nothing_behin
     assert count_layouts(cache.folder) == 0
 
 
-def test_without_a_cache_the_objects_of_a_seed_are_looked_for_once(monkeypatch):
-    asked = []
-    monkeypatch.setattr(cache_module, "sample_layout", lambda *order: asked.append(order[1:]) or sample_layout(*order))
-    layouts = layout_source(load_scene(), None)
-    ids = layouts(1, 2).object_ids
-    assert layouts(1, 3).object_ids == layouts(1, 1).object_ids == ids
-    assert asked == [(1, 1, None), (1, 2, ids), (1, 3, ids), (1, 1, None)]
-
-
 # ------------------------------------------------------------- where PhysX has a GPU, a worker process samples
 
 
@@ -172,17 +162,6 @@ def test_a_process_that_dies_twice_is_not_a_missing_layout(gpu):
     with pytest.raises(SimulationError) as caught:
         Sampler(load_scene()).make(0, 1, Deadly())  # pyright: ignore[reportArgumentType]
     assert (caught.value.where, caught.value.found) == ("seed 1", "SIGSEGV")
-
-
-def test_after_an_interruption_no_layout_is_taken_for_another(gpu):
-    scene = load_scene()
-    sampler = Sampler(scene)
-    sampler(1, 1)
-    threading.Timer(0.05, _thread.interrupt_main).start()
-    with pytest.raises(KeyboardInterrupt):
-        for seed in range(2, 1000):
-            sampler(seed, seed)
-    np.testing.assert_array_equal(sampler(3, 3).object_poses, sample_layout(scene, 3, 3).object_poses)
 
 
 @pytest.mark.slow

@@ -57,12 +57,6 @@ def test_neighbours_closer_than_3_cm_are_not_told_apart(gap, clear):
     assert related("rightmost", row) == 2  # it has not
 
 
-def test_a_column_ahead_is_told_apart_by_distance_only():
-    column = np.array([[0.5, 0.0], [0.6, 0.0], [0.7, 0.0]])
-    assert [related(r, column) for r in ("nearest", "second_nearest", "farthest")] == [0, 1, 2]
-    assert [related(r, column) for r in ("leftmost", "middle", "rightmost")] == [None] * 3
-
-
 POINTS = st.lists(
     st.tuples(st.floats(0.2, 1.0), st.floats(-0.5, 0.5)).map(lambda p: (round(p[0], 3), round(p[1], 3))),
     min_size=2,
@@ -85,8 +79,3 @@ def test_what_is_named_differs_from_all_others(points):
         found = related(relation, here)
         if found is not None:
             assert np.delete(key, found).max() <= key[found] - MARGIN + 1e-12
-
-
-def test_distance_is_horizontal_and_from_the_robot():
-    # 0.5 ahead and 0.3 aside (0.583) is farther than 0.54 straight ahead
-    assert related("nearest", np.array([[0.5, 0.3], [0.54, 0.0]])) == 1

@@ -86,11 +86,7 @@ def load_task_config(
 
 
 def check_no_base(path: Path) -> None:
-    """Check that a file of a frozen protocol has no base, on which it would depend.
-
-    Raises:
-        ConfigError: the file has a base, or cannot be read.
-    """
+    """Check that a file of a frozen protocol has no base, on which it would depend."""
     try:
         text = read_text(path, YAML_LIMIT)
     except (OSError, DocumentError) as error:

@@ -8,12 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import ConfigError
 from robocas_ms3.evaluation.freeze import read_plan
 from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.scenes.config import load_task_config
-from robocas_ms3.scenes.language.texts import synonym_texts
 
 ROOT = Path(__file__).resolve().parents[3]
 PAGE = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
@@ -69,33 +67,7 @@ def test_the_commands_set_keys_that_there_are():
             assert load_task_config(name, overrides=overrides) != load_task_config(name)
 
 
-def test_the_message_is_the_one_of_the_page(capsys):
-    (text,) = blocks("console", "Changing keys on the command line")
-    command, said = text.splitlines()
-    assert run(shlex.split(command)[2:]) == 1
-    assert capsys.readouterr().err == f"{said}\n"
-
-
 def test_the_reference_is_that_of_the_declared_form():
     assert PAGE.endswith(f"\n\n{REFERENCE}\n"), "run scripts/configuration_reference.py"
     rows = [row.split(" | ") for row in REFERENCE.splitlines() if row.startswith("| `")]
     assert [row for row in rows if not row[3].strip(" |") and row[0] != "| `kind`"] == []  # each key has a meaning
-
-
-@pytest.mark.parametrize(
-    "row",
-    [
-        "| `task` | `pick`, `select`, `search`, `open_pick` | required |",
-        "| `drop_height` | number, above 0 and at most 1 | 0.3 | above the surface or heap, m |",
-        "| `min_xy` | 2 numbers, each -100 to 100 | none | a corner of the part, m; none: the whole surface |",
-        "| `ids` | list of strings or whole numbers or `all` | `all` |",
-        "| `furniture` | mapping: NAME to block | required | A piece of furniture. |",
-        "### `layout` (stacked)",
-    ],
-)
-def test_rows_say_type_range_and_default(row):
-    assert row in REFERENCE
-
-
-def test_the_supports_of_the_page_are_those_of_the_texts():
-    assert f"by alphabet: {', '.join(sorted(synonym_texts().supports))}." in " ".join(PAGE.split())

@@ -3,7 +3,6 @@ import re
 from itertools import combinations
 from pathlib import Path
 
-import numpy as np
 import pytest
 import yaml
 
@@ -12,12 +11,11 @@ from robocas_ms3.core.paths import builtin_packs_dir
 from robocas_ms3.scenes.language.instructions import (
     SPLITS,
     InstructionSlots,
-    choose_instruction,
     could_mean,
     instruction,
     template_ids,
 )
-from robocas_ms3.scenes.language.templates import SUBGOALS, subgoal
+from robocas_ms3.scenes.language.templates import subgoal
 from robocas_ms3.scenes.language.texts import (
     INSTRUCTIONS_FILE,
     InstructionTexts,
@@ -141,26 +139,6 @@ def test_unknown_keys_are_refused(tmp_path):
     path.write_text("plurals: []\nobjects: {mug: {test: [cup]}}\nsupports: {}\n")
     with pytest.raises(ConfigError, match=r"unknown key 'objects\.mug\.test' .*'held_out', 'train'"):
         read_texts(path, SynonymTexts)
-
-
-def test_counts_in_the_docs():
-    docs = (ROOT / "docs" / "language.md").read_text()
-    for task, templates in TEXTS.tasks.items():
-        assert f"| {task} | {' | '.join(str(len(templates.of(s))) for s in SPLITS)} |" in docs
-    for what, groups in (("relations", TEXTS.relations), ("objects", WORDS.objects), ("supports", WORDS.supports)):
-        train, held_out = (sum(len(words.of(split)) for words in groups.values()) for split in ("train", "held_out"))
-        assert f"| {what} | {len(groups)} | {train} | {held_out} |" in docs
-    for relation in RELATIONS:
-        assert f"`{relation}`" in docs
-    for goal_type, text in SUBGOALS.items():
-        assert f"| {goal_type} | {text} |" in docs
-
-
-def test_the_example_in_the_docs():
-    docs = (ROOT / "docs" / "language.md").read_text()
-    rng = np.random.default_rng(1)
-    found = choose_instruction(rng, InstructionSlots("select", "mug", "shelf", "nearest"), "train")
-    assert repr(found) in docs.replace("\n#   ", " ")
 
 
 def test_a_subgoal_as_episodes_record_it():

@@ -1,14 +1,12 @@
 """`make_vec` without simulation: backend, arguments, and conventions on a batch that counts its steps."""
 
 import gymnasium as gym
-import numpy as np
 import pytest
 import torch
 from vector_envs import STATE_ONLY, with_gpu
 
 import robocas_ms3
 from robocas_ms3.core.errors import VectorEnvError
-from robocas_ms3.tasks import vector
 from robocas_ms3.tasks.vector import RoboCASVectorEnv, choose_backend
 
 
@@ -76,8 +74,8 @@ class FakeBatch(gym.Env):
     single_observation_space = gym.spaces.Box(0, 9, (1,))
     action_space, observation_space = gym.spaces.Box(-1, 1, (3, 2)), gym.spaces.Box(0, 9, (3, 1))
 
-    def __init__(self, **kwargs) -> None:
-        self.metadata, self.kwargs, self.num_envs = {}, kwargs, kwargs.get("num_envs", 3)
+    def __init__(self) -> None:
+        self.metadata, self.num_envs = {}, 3
         self.elapsed_steps = torch.zeros(3, dtype=torch.int32)
 
     def reset(self, *, seed=None, options=None):
@@ -121,21 +119,3 @@ def test_calls_reach_through_wrappers():
     env.reset()
     assert env.call("elapsed_steps").tolist() == [0, 0, 0]
     assert len(env.call("step", None)) == 5
-
-
-def test_a_gpu_gets_the_same_arguments_in_one_batch(monkeypatch):
-    with_gpu(monkeypatch, True)
-    monkeypatch.setattr(vector.gym, "make", lambda env_id, **kwargs: FakeBatch(env_id=env_id, **kwargs))
-    wrapped = []
-    env = robocas_ms3.make_vec("RoboCASPick-v1", 3, wrappers=[lambda env: wrapped.append(env) or env], **STATE_ONLY)
-    expected = {"env_id": "RoboCASPick-v1", "num_envs": 3, "sim_backend": "physx_cuda", **STATE_ONLY}
-    assert env.unwrapped.kwargs == expected
-    assert wrapped == [env.unwrapped]
-    assert (env.auto_reset, env.ignore_terminations, env.record_metrics) == (True, False, True)
-    assert env.metadata["autoreset_mode"] == gym.vector.AutoresetMode.SAME_STEP
-    env = robocas_ms3.make_vec("RoboCASPick-v1", 3, sim_backend="cuda:1", arrays="numpy", **STATE_ONLY)
-    assert env.unwrapped.kwargs["sim_backend"] == "cuda:1"
-    env.reset()
-    obs, reward, terminated, truncated, info = env.step(None)
-    for array in (obs, reward, terminated, truncated, info["episode"]["success_once"]):
-        assert isinstance(array, np.ndarray)
