@@ -49,10 +49,6 @@ def said(violation):
     return violation.key, violation.expected, violation.found
 
 
-def test_the_declared_keys_are_those_of_the_schema():
-    assert list(SceneRecord.model_fields) == list(WHOLE)
-
-
 def test_what_is_whole_has_no_violations():
     assert check_values(WHOLE) == []
     assert valid_values(WHOLE) == (WHOLE, "")
@@ -64,11 +60,11 @@ def test_what_nobody_knows_is_null():
     assert check_values({key: known.get(key) for key in SCENE_KEYS}) == []
 
 
-@pytest.mark.parametrize("key", SCENE_KEYS)
-def test_each_key_is_missed(key):
-    without = {name: value for name, value in WHOLE.items() if name != key}
-    assert [said(v) for v in check_values(without)] == [(key, "this key", "no such key")]
-    assert valid_values(without) == (without, "")  # an older file, which can be shown as far as it goes
+def test_each_key_is_missed():
+    for key in SCENE_KEYS:
+        without = {name: value for name, value in WHOLE.items() if name != key}
+        assert [said(v) for v in check_values(without)] == [(key, "this key", "no such key")]
+        assert valid_values(without) == (without, "")  # an older file, which can be shown as far as it goes
 
 
 @pytest.mark.parametrize(
