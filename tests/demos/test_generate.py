@@ -109,16 +109,20 @@ def test_motion_is_a_robots(run):
         assert longest <= 10  # 0.5 s
 
 
-def test_the_same_seed_gives_the_same_episode_bit_for_bit(run, pick_generator, tmp_path):
+def test_the_same_seed_gives_the_same_episode_bit_for_bit_and_a_run_continues(run, pick_generator, tmp_path):
     summary, _ = run
-    last = read_json(summary.trajectory)["episodes"][-1]
+    whole, last = load(summary.trajectory), read_json(summary.trajectory)["episodes"][-1]
     assert pick_generator.generate(last["episode_seed"], tmp_path, "again").success  # first here, last there
-    again = load(tmp_path / "again.h5")["traj_0"]
-    recorded = load(summary.trajectory)[f"traj_{last['episode_id']}"]
+    again, recorded = load(tmp_path / "again.h5")["traj_0"], whole[f"traj_{last['episode_id']}"]
     assert np.array_equal(again["actions"], recorded["actions"])
     assert again["states"].keys() == recorded["states"].keys()
     for name, values in again["states"].items():
         assert np.array_equal(values, recorded["states"][name]), name
+    for episodes in (1, 2):
+        resumed = generate(GenerateSettings(PICK, tmp_path / "resumed", episodes=episodes, jobs=0))
+    assert resumed.episodes == 2
+    parts = load(resumed.trajectory)
+    assert all(np.array_equal(whole[name]["actions"], parts[name]["actions"]) for name in ("traj_0", "traj_1"))
 
 
 def test_action_replay_is_exact_and_ee_deltas_succeed(run):
@@ -126,17 +130,6 @@ def test_action_replay_is_exact_and_ee_deltas_succeed(run):
     assert [(r.success, r.state_error) for r in replay(ReplaySettings(summary.trajectory))] == [(True, 0.0)] * SEEDS
     assert all(r.success for r in replay(ReplaySettings(summary.trajectory, use_env_states=True, count=1)))
     assert all(r.success for r in replay(ReplaySettings(summary.trajectory, control_mode="pd_ee_delta_pose")))
-
-
-def test_resuming_adds_episodes_and_equals_an_uninterrupted_run(run, tmp_path):
-    summary, _ = run
-    out = tmp_path / "resumed"
-    for episodes in (1, 2):
-        resumed = generate(GenerateSettings(PICK, out, episodes=episodes, jobs=0))
-    assert resumed.episodes == 2
-    whole, parts = load(summary.trajectory), load(resumed.trajectory)
-    for name in ("traj_0", "traj_1"):
-        assert np.array_equal(whole[name]["actions"], parts[name]["actions"])
 
 
 def call_it_done(monkeypatch):
@@ -325,7 +318,7 @@ def test_an_attempt_whose_own_actions_do_not_come_out_the_same_is_undone(tmp_pat
     assert (data["replay_rate"], data["noisy_trials"]) == (5, 1)
 
 
-def test_where_noise_alone_spoils_attempts_an_episode_counts_without_in_the_end(tmp_path, monkeypatch, pick_generator):
+def test_where_noise_alone_spoils_attempts_an_episode_counts_without(tmp_path, monkeypatch, pick_generator):
     change(monkeypatch, pick_generator, noisy_failures=2)
     monkeypatch.setattr(pick_generator.worlds[1], "settle", lambda: False)
     result = pick_generator.generate(1, tmp_path, "spoilt")

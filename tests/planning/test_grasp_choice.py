@@ -36,9 +36,6 @@ def test_grasps_from_the_right_side_stay_and_get_a_turned_twin():
     np.testing.assert_allclose(kept.tcp_in_world[1][:3, 2:], poses[0][:3, 2:], atol=1e-12)  # same approach, same place
     np.testing.assert_allclose(kept.tcp_in_world[1][:3, :2], -poses[0][:3, :2], atol=1e-12)
     assert len(filtered([], [])) == 0
-
-
-def test_the_filter_knows_the_approach():
     for approach, index in (("front", [1, 1]), ("top", [0, 0])):
         assert filtered([grasp(), grasp(91)], [0.05, 0.05], approach).index.tolist() == index
 

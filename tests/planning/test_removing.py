@@ -10,7 +10,6 @@ import torch
 from mani_skill.utils.structs import Pose
 
 from robocas_ms3.core.errors import EpisodeLost, PlanningFailed
-from robocas_ms3.core.poses import transform
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.planning.decisions import StraightDecisions
@@ -45,7 +44,7 @@ def begin(generator, seed):
 
 
 def surface(arm, slot):
-    return transform(arm.scene.object_in_base(slot), arm.env.object_assets[0][slot].surface_points())
+    return arm.scene.object_surface(slot)
 
 
 def first_that_works(skill, slots):
@@ -85,14 +84,6 @@ def test_a_removed_object_stands_on_a_free_place_of_the_table(generator, monkeyp
     assert float(arm.env.agent.gripper_width[0]) > 0.07
 
 
-def test_ranking_grasps_does_not_change_later_results(generator):
-    arm, target, _ = begin(generator, 3)
-    state = arm.rng.bit_generator.state
-    seen = [(clear_grasps(arm, target), blockers(arm, target)) for _ in range(2)]
-    assert seen[0] == seen[1]
-    assert arm.rng.bit_generator.state == state
-
-
 def test_a_push_moves_an_object_away_from_the_target(generator):
     arm, target, slots = begin(generator, 4)
     starts = {slot: surface(arm, slot).mean(axis=0) for slot in [*slots, target]}
@@ -127,8 +118,12 @@ def test_push_that_moves_nothing_is_a_failure(generator, monkeypatch):
         next(heap.moves())
 
 
-def test_moves_begin_with_pushes_of_what_is_highest(generator):
+def test_moves_begin_with_pushes_of_what_is_highest_and_looking_changes_nothing(generator):
     arm, target, _ = begin(generator, 3)
+    state = arm.rng.bit_generator.state
+    seen = [(clear_grasps(arm, target), blockers(arm, target)) for _ in range(2)]
+    assert seen[0] == seen[1]
+    assert arm.rng.bit_generator.state == state
     heap = Heap(arm, target)
     moves = list(heap.moves())
     assert target not in {move.slot for move in moves}

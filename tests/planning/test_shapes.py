@@ -52,16 +52,10 @@ def decode(stream: list[int], voxel: float) -> set[tuple[int, int, int]]:
 
 def test_stream_contains_the_voxels_of_the_points():
     points, voxel = np.random.default_rng(0).uniform(-2, 2, (500, 3)), 0.01
-    points = np.concatenate([points, points[:50] + 1e-5, [[0, 0, 0]]])
+    half = voxel * (1 << (DEPTH - 1))
+    edges = [[half - 0.005] * 3, [0.005 - half] * 3]
+    points = np.concatenate([points, points[:50] + 1e-5, [[0, 0, 0]], edges])
     expected = {tuple(key) for key in np.floor(points / voxel).astype(int).tolist()}
-    assert decode(encode_octree(points, voxel), voxel) == expected
-
-
-def test_points_outside_of_the_tree_are_dropped():
-    voxel, half = 0.01, 0.01 * (1 << (DEPTH - 1))
-    inside = np.array([[0.005, 0.005, 0.005], [half - 0.005] * 3, [0.005 - half] * 3])
-    outside = np.array([[half + 0.005, 0, 0], [0, -half - 0.005, 0], [0, 0, 1e300], [0, -1e300, 0], [2 * half, 0, 0]])
-    expected = {(0, 0, 0), ((1 << (DEPTH - 1)) - 1,) * 3, (-(1 << (DEPTH - 1)),) * 3}
-    assert decode(encode_octree(np.concatenate([outside, inside]), voxel), voxel) == expected
-    assert encode_octree(outside, voxel) == []
-    assert encode_octree(np.zeros((0, 3)), voxel) == []
+    outside = np.array([[half + 0.005, 0, 0], [0, -half - 0.005, 0], [0, 0, 1e300], [2 * half, 0, 0]])  # dropped
+    assert decode(encode_octree(np.concatenate([outside, points]), voxel), voxel) == expected
+    assert encode_octree(outside, voxel) == encode_octree(np.zeros((0, 3)), voxel) == []

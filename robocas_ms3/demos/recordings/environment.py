@@ -16,12 +16,12 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from robocas_ms3.assets.pack import pack_folders
-from robocas_ms3.core.errors import DatasetError, ExtensionError, RobocasError
+from robocas_ms3.core.errors import DatasetError, ExtensionError
 from robocas_ms3.core.strict import StrictModel, mistakes
-from robocas_ms3.robots.cameras import STANDARD_CAMERAS, CameraSpec
+from robocas_ms3.robots.cameras import CameraSpec
 from robocas_ms3.robots.table import RobotSpec, find_robot
 from robocas_ms3.scenes.config.load import load_config_of, shipped_configs
-from robocas_ms3.scenes.task_specs import TASKS
+from robocas_ms3.scenes.task_specs import TASKS, TaskSpec
 
 _PREFIX = "robocas_ms3:"  # lets gymnasium import this package by itself: ManiSkill's own tools then work
 _DEEP = 3  # dicts in dicts that settings of simulation and cameras may have
@@ -90,28 +90,23 @@ class RecordedEnv:
             raise DatasetError(error.what, where=where, expected=error.expected, found=error.found, fix=fix) from error
 
     def cameras(self) -> tuple[CameraSpec, ...]:
-        """Return the cameras of its task and robot; the standard ones of what can't be made."""
-        config = self.kwargs.get("config")
-        try:
-            if isinstance(config, str) and config not in shipped_configs():
-                return STANDARD_CAMERAS
-            spec = next((spec for spec in TASKS.values() if spec.env_id == self.env_id), None)
-            robot = self.robot().description
-            return load_config_of(spec, config).cameras_of(robot) if spec else robot.cameras
-        except RobocasError:
-            return STANDARD_CAMERAS
+        """Return the cameras of its task and robot; raises ``DatasetError`` if what it names is not installed."""
+        return load_config_of(self._task(), self.kwargs.get("config")).cameras_of(self.robot().description)
+
+    def _task(self) -> TaskSpec:
+        known, config = {spec.env_id: spec for spec in TASKS.values()}, self.kwargs.get("config")
+        if self.env_id not in known:
+            raise DatasetError("no such task", where="env_id", expected=f"one of {sorted(known)}", found=self.env_id)
+        if isinstance(config, str) and config not in shipped_configs():
+            raise DatasetError("no such configuration", where="config", expected="a shipped one", found=config)
+        return known[self.env_id]
 
     def make(self, **kwargs: Any) -> Any:
         """Make it with further arguments of ``gym.make``; raises ``DatasetError`` if what it names is not installed."""
         import gymnasium as gym
 
-        known = sorted(spec.env_id for spec in TASKS.values())
-        if self.env_id not in known:
-            raise DatasetError("no such task", where="env_id", expected=f"one of {known}", found=self.env_id)
+        self._task()
         self.robot()
-        config = self.kwargs.get("config")
-        if isinstance(config, str) and config not in shipped_configs():
-            raise DatasetError("no such configuration", where="config", expected="a shipped one", found=config)
         for key in ("pack", "furniture_pack"):
             name = self.kwargs.get(key, "builtin")
             if not Path(name).is_absolute() and name not in pack_folders():

@@ -54,7 +54,7 @@ def test_another_task_has_seeds_of_its_own(tmp_path):
     second = run_of(tmp_path / "more", [LOST], seeds=(3, 7), steps=24)
     edit(second.with_suffix(".json"), lambda c: c["env_info"].update(env_id="robocas_ms3:RoboCASOpenPick-v1"))
     third = run_of(tmp_path / "third", [LOST], seeds=(9,))
-    edit(third.with_suffix(".json"), lambda c: c["env_info"]["env_kwargs"].update(config="pick_table_orderly"))
+    edit(third.with_suffix(".json"), lambda c: c["env_info"]["env_kwargs"].update(config="pick_shelf_scattered"))
     convert(first, out)
     for more in (second, second, third):
         convert(more, out, append=True)

@@ -65,9 +65,12 @@ def test_the_user_may_choose_a_pack(tmp_path):
     assert read_env(info, "F.json", pack=tmp_path).kwargs["pack"] == str(tmp_path)
 
 
-def test_only_registered_tasks_are_made():
+@pytest.mark.parametrize("use", [RecordedEnv.make, RecordedEnv.cameras])
+def test_only_registered_tasks_are_made(use):
     with pytest.raises(DatasetError, match=r"no such task .expected one of .*RoboCASPick-v1.*found CartPole-v1"):
-        read_env({"env_id": "CartPole-v1", "env_kwargs": {}}, "F.json").make()
+        use(read_env({"env_id": "CartPole-v1", "env_kwargs": {}}, "F.json"))
+    with pytest.raises(DatasetError, match="no such configuration"):
+        use(read_env({"env_id": ID, "env_kwargs": {"config": "mine"}}, "F.json"))
 
 
 @pytest.mark.parametrize(("key", "name"), [("pack", "mine"), ("furniture_pack", "mine"), ("config", "mine.yaml")])
