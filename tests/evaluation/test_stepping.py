@@ -174,9 +174,11 @@ def test_pictures_are_rendered_when_the_policy_looks(monkeypatch):
     env.close()
 
 
-@pytest.mark.parametrize("num_envs", [2, pytest.param(4, marks=[pytest.mark.gpu, needs_cuda])])
-def test_each_of_several_envs_is_looked_at_in_its_own_steps(num_envs):
+@pytest.mark.gpu
+@needs_cuda
+def test_each_env_of_a_batch_is_looked_at_in_its_own_steps():
     """The last is reset after a step, and is one behind from there on."""
+    num_envs = 4
     envs = make_vec(
         "RoboCASPick-v1",
         num_envs,
