@@ -105,15 +105,6 @@ def test_a_branch_is_skipped_for_whole_images():
     assert torch.equal(skip.eval()(branch), branch)
 
 
-def test_norms_begin_with_one_and_keep_running_means(config):
-    net = efficientnet(config)
-    norms = [module for module in net.modules() if isinstance(module, torch.nn.BatchNorm2d)]
-    assert {module.momentum for module in norms} == {0.1}
-    assert all((module.weight == 1).all() for module in norms)
-    shares = [block.projection.dropout.share for block in net.encoder.blocks]
-    assert shares == pytest.approx([0.2 * number / 7 for number in range(7)])
-
-
 @pytest.fixture
 def weights(config):
     """Those of another network of this size, by transformers' names, with those of a classifier."""

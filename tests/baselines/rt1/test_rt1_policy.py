@@ -101,25 +101,21 @@ def test_after_the_end_an_env_does_nothing(policy, model, seen):
     assert np.allclose(policy.act(observations([4], images[0, :1], words[:1])), [[0.0] * 6 + [0.03]])  # no prediction
 
 
-def test_five_episodes_are_learned(folder):
-    """At least 95 % of action tokens."""
+def test_samples_are_learned(folder):
+    """The loss of one batch falls, from chance on."""
     sizes = {"picture": (48, 36), "crop_height": 32, "frames": 2, "image_width": 0.1, "token_width": 64, "width": 64}
     config = RT1Config(**{**SIZES, **sizes, "dropout": 0.0, "drop_connect": 0.0})
     samples = BASELINE.data(config, folder, "train", lambda done, total: None)
     torch.manual_seed(0)
-    model = BASELINE.model(config, samples.facts)
+    model = BASELINE.model(config, samples.facts).train()
     batch = samples.__getitems__(list(range(len(samples))))
     optimizer = torch.optim.AdamW(model.parameters(), lr=8e-3)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 110)
-    model.train()
-    for _ in range(110):
+    losses = []
+    for _ in range(25):
         loss = model(batch)["loss"]
+        losses.append(loss.item())
         optimizer.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(model.parameters(), config.train.clip_norm)
         optimizer.step()
-        schedule.step()
-    with torch.inference_mode():
-        found = model.eval()(batch)
-    assert found["action_accuracy"] >= 0.95
-    assert found["terminate_accuracy"] >= 0.95
+    assert losses[-1] < 0.4 * losses[0]

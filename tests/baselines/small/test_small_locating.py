@@ -7,7 +7,6 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.baselines.chunks import state_of
 from robocas_ms3.baselines.small.config import View
 from robocas_ms3.baselines.small.locating import (
     NOWHERE,
@@ -18,7 +17,6 @@ from robocas_ms3.baselines.small.locating import (
     heights_of,
     pointing_losses,
     project_points,
-    tcp_of,
 )
 from robocas_ms3.baselines.training.metrics import mean_of_sum
 from robocas_ms3.core.poses import from_parts, inverse, transform
@@ -110,17 +108,6 @@ def turned(seed=0):
     draw = np.random.default_rng(seed)
     turn = Rotation.from_euler("xyz", [np.pi, 0, 0]) * Rotation.from_rotvec(draw.normal(size=3) * 0.2)
     return from_parts(np.array([[0.5, 0.1, 0.3]]) + draw.normal(size=(1, 3)) * 0.1, turn.as_matrix()[None])
-
-
-def test_proprioception_has_the_tcp():
-    tcp = turned()
-    assert tcp_of(torch.from_numpy(state_of(tcp, np.array([0.08])))).numpy() == pytest.approx(tcp, abs=1e-6)
-
-
-def test_a_pixel_of_a_camera_that_looks_down():
-    """16 of 32 pixels' focal length off the middle: half as far aside as it is deep, 0.8 m above a level of 0.2."""
-    found = lift().locate(torch.tensor([[48.0, 24.0]]), torch.tensor([0.2]), torch.eye(4)[None])
-    assert found[0].tolist() == pytest.approx([0.4, 0.0, 0.2], abs=1e-6)
 
 
 def test_a_height_above_the_camera_gives_no_point_behind_it():
