@@ -198,15 +198,6 @@ def test_arrays_that_an_import_could_not_make_may_be_missing(parts, tmp_path):
     assert merge([part], tmp_path / "out").written.episodes == 2
 
 
-@pytest.mark.parametrize("image_format", ["jpg"])
-def test_other_formats(tmp_path, image_format):
-    part = make(tmp_path, "a", (10,), image_format=image_format)
-    picture = part / "episode_0000000" / "base_camera" / "rgb" / f"0003.{image_format}"
-    assert merge([part], tmp_path / "out").written.episodes == 1
-    picture.write_bytes(picture.read_bytes()[:-9])
-    fails(f"base_camera/rgb/0003.{image_format}: this episode is damaged", [part], tmp_path / "again")
-
-
 def test_the_output(parts, tmp_path):
     a, b = parts
     before = files_of(a)

@@ -16,10 +16,8 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.sources.trajectory import TrajectorySource
-from robocas_ms3.datasets.statistics.collect import collect
 from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.datasets.writing.settings import ConversionSettings
-from robocas_ms3.demos.recordings import reading
 
 
 @pytest.fixture(scope="module")
@@ -74,18 +72,13 @@ def test_recordings_have_every_control_step(paths):
     assert set(recording.states) == {"actors", "articulations"}
 
 
-def test_the_json_of_a_trajectory_is_read_once(paths, monkeypatch):
-    read, found = reading.read_json, []
-    monkeypatch.setattr(reading, "read_json", lambda path: found.append(path) or read(path))
-    assert collect(paths["trajectory"]).steps == 21
-    assert found == [paths["trajectory"]]
+def test_a_pickled_source_reads_what_its_original_reads(paths):
     source = pickle.loads(pickle.dumps(open_source(paths["trajectory"])))
     assert [source.entry(number)["seed"] for number in source.numbers] == [1, 2, 3]
     for number in source.numbers:
         episode = source.episode(number)
         assert len(episode.arrays["ee_pos"]) == episode.steps == 7
         assert len(episode.layout["object_ids"]) == len(episode.layout["poses"])
-    assert len(found) == 2
 
 
 def test_lerobot_episodes_are_found_by_their_number(paths, tmp_path):

@@ -12,6 +12,7 @@ from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.writing.episode_folder import find_damaged
 from robocas_ms3.datasets.writing.settings import ConversionSettings
+from robocas_ms3.robots.cameras import STANDARD_NAMES
 
 FILES = (
     "episode_info.npz",
@@ -40,12 +41,19 @@ def whole(trajectory, tmp_path_factory):
 
 @pytest.mark.parametrize("name", FILES)
 @pytest.mark.parametrize("left", [0.97, None])
-def test_its_episode_is_written_again(whole, trajectory, tmp_path, caplog, name, left):
-    out = tmp_path / "out"
-    shutil.copytree(whole, out)
-    path = out / "episode_0000001" / name
-    harm(path, left)
+def test_each_file_is_found(whole, tmp_path, name, left):
+    out = shutil.copytree(whole, tmp_path / "out")
+    harm(out / "episode_0000001" / name, left)
+    pictures = Pictures(STANDARD_NAMES)
+    assert find_damaged(out / "episode_0000000", pictures) is None
+    assert find_damaged(out / "episode_0000001", pictures) == out / "episode_0000001" / name
     assert any(name.rpartition("/")[2] in str(violation) for violation in validate(out).violations)
+
+
+def test_its_episode_is_written_again(whole, trajectory, tmp_path, caplog):
+    out = shutil.copytree(whole, tmp_path / "out")
+    path = out / "episode_0000001" / FILES[2]
+    harm(path, 0.97)
     done = run(trajectory, out)
     assert (done.kept, [episode.number for episode in done.episodes]) == (1, [1])
     assert f"{path}: cut off, or gone" in caplog.text
