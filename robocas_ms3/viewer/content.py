@@ -73,7 +73,6 @@ class PageContent:
         }
 
     def episode(self, number: int) -> dict[str, Any]:
-        """Return everything of an episode except its images."""
         where = f"{self.root.name}, episode {number}"
         with readable(where):
             scene, _ = self._scene(number)  # the table says what is wrong
@@ -126,7 +125,6 @@ class PageContent:
         return read_scene(lambda: self.source.episode(number).scene, self.scene_name)
 
     def _entry(self, number: int) -> Any:
-        """Return what the overview of the dataset says of an episode."""
         entry = self.source.entry(number)
         known = ("seed", "success", "target")
         return {key: entry[key] for key in known if key in entry} if isinstance(entry, Mapping) else entry

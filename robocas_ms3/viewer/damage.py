@@ -45,12 +45,7 @@ def reason(error: DatasetError) -> str:
 
 
 def join_reasons(*reasons: str) -> str:
-    """Return all that is wrong, each thing once."""
-    different: list[str] = []
-    for text in reasons:
-        if not any(text in other for other in different):
-            different.append(text)
-    return "; ".join(filter(None, different))
+    return "; ".join(dict.fromkeys(filter(None, reasons)))
 
 
 def read_object(read: Callable[[], Any], name: str) -> tuple[dict[Any, Any], str]:

@@ -120,7 +120,6 @@ def continuous(xyzw: NDArray) -> NDArray:
 
 
 def gripper_plot(width: NDArray, is_open: NDArray | None) -> Plot:
-    """Plot the width in mm, and the command as the commanded width."""
     columns: dict[str, NDArray] = {"width": np.ravel(width)}
     if is_open is not None:
         columns["command"] = np.where(np.asarray(is_open, bool), _OPEN_WIDTH, 0.0)

@@ -58,7 +58,6 @@ def export(
 
 
 def _write_episode(source: PageContent, index: dict[str, Any], number: int, folder: Path, width: int) -> str:
-    """Write an episode, and return what of it can't be read."""
     lost = ""
     if index["cameras"]:
         lost = _write(folder / "thumbnails" / f"{number}.jpg", lambda: make_thumbnail(source, index, number))

@@ -66,7 +66,6 @@ class Routes:
 
     @property
     def index(self) -> dict[str, Any]:
-        """The table, made once."""
         with self._making:
             return self._index
 
@@ -75,7 +74,6 @@ class Routes:
         return self.source.index()
 
     def respond(self, path: str) -> Response:
-        """Return the response for an address without its query."""
         name = "index.html" if path in ("/", "/index.html") else path.removeprefix("/page/")
         if name in PAGE_FILES and (path.startswith("/page/") or name == "index.html"):
             return Response(200, PAGE_FILES[name], page_file(name))

@@ -62,7 +62,6 @@ class Viewer(ThreadingHTTPServer):
         super().shutdown_request(request)
 
     def server_close(self) -> None:
-        """Cut the connections, and wait for responses that are being made."""
         for connection in list(self._connections):
             with suppress(OSError):
                 connection.shutdown(socket.SHUT_RDWR)
@@ -71,7 +70,6 @@ class Viewer(ThreadingHTTPServer):
             self._warming.join(5.0)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Ignore browsers that went away."""
         error = sys.exc_info()[1]
         if error is not None and not isinstance(error, ConnectionError | TimeoutError):
             print_traceback(type(error), error, error.__traceback__)

@@ -105,7 +105,6 @@ class TrajectoryContent(PageContent):
         super().__init__(self.recordings, "trajectory file", notes=[_NO_IMAGES.format(name=path.name)], split={})
 
     def _entry(self, number: int) -> dict[str, Any]:
-        """Return what is known of an episode even if its recording is damaged."""
         return {key: self._entries[number][key] for key in ("task", "seed", "success", "target")}
 
     def _show(self, number: int, scene: Mapping[str, Any]) -> dict[str, Any]:
@@ -172,7 +171,6 @@ class LeRobotContent(PageContent):
 
 
 def _names(feature: dict[str, Any], width: int) -> list[str]:
-    """Return the names of a feature's numbers; datasets have a list, a dictionary of lists, or nothing."""
     names = feature.get("names")
     if isinstance(names, dict):
         names = [str(word) for part in names.values() for word in (part if isinstance(part, list) else [part])]

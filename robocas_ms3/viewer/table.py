@@ -46,7 +46,6 @@ class FailedAttempt(Failure):
     environment: str | None = None
 
     def is_of(self, env_info: Any) -> bool:
-        """Return whether the attempt may be of a run in this environment."""
         if not self.environment or not isinstance(env_info, Mapping):
             return True
         return environment_of(env_info) in ("", self.environment)
@@ -71,13 +70,8 @@ class Failures:
             if line.record is not None:
                 found[line.record.seed].append(line.record)
         damaged = [str(line.number) for line in lines if line.record is None]
-        if not damaged:
-            return cls(dict(found))
-        which = f"Line {damaged[0]} of `{FAILURES_FILE}` is damaged and left out."
-        if len(damaged) > 1:
-            listed = ", ".join(damaged[:5]) + (", ..." if len(damaged) > 5 else "")
-            which = f"{len(damaged)} lines of `{FAILURES_FILE}` are damaged and left out: {listed}"
-        return cls(dict(found), which)
+        listed = ", ".join(damaged[:5]) + (", ..." if len(damaged) > 5 else "")
+        return cls(dict(found), f"Damaged and left out: line {listed} of `{FAILURES_FILE}`." if damaged else "")
 
     def of_seed(self, seed: int | None, env_info: Any = None) -> list[FailedAttempt]:
         """Return the failures of a seed in an environment; none if the seed is unknown."""
@@ -107,13 +101,11 @@ class Failures:
 
 
 def stages(failures: Iterable[Failure], recorded: Mapping[str, Any]) -> list[str]:
-    """Return the stages at which attempts at an episode failed."""
     named = {failure.stage for failure in failures if not failure.gave_up}
     return sorted(named | {recovery["stage"] for recovery in recorded.get("recoveries") or ()})
 
 
 def describe(failures: Iterable[Failure], recorded: Mapping[str, Any]) -> list[dict[str, str]]:
-    """Describe each failed attempt for people."""
     lines = [
         {"stage": f.stage, "reason": f.reason, "text": f"attempt {f.attempt + 1}, {f.seconds:.1f} s, undone"}
         for f in failures

@@ -176,11 +176,11 @@ def test_damaged_lines_of_failures_are_left_out_with_a_note(tmp_path, spoilt):
     (tmp_path / "failures.jsonl").write_bytes("\n".join([LINE, *wrong, "", LINE, LINE[:30]]).encode("latin-1"))
     read = Failures.read(tmp_path)
     assert [len(failures) for failures in read.by_seed.values()] == [2]
-    assert read.note == "6 lines of `failures.jsonl` are damaged and left out: 2, 3, 4, 5, 6, ..."
+    assert read.note == "Damaged and left out: line 2, 3, 4, 5, 6, ... of `failures.jsonl`."
     with (spoilt / "failures.jsonl").open("a") as file:
         file.write('{"seed": 12, "att')
     index = open_source(spoilt).index()
-    assert index["note"] == "Line 4 of `failures.jsonl` is damaged and left out."
+    assert index["note"] == "Damaged and left out: line 4 of `failures.jsonl`."
     assert [row["seed"] for row in index["episodes"]] == [3, 4, 5, 9]
     (spoilt / "failures.jsonl").unlink()
     (spoilt / "failures.jsonl").mkdir()

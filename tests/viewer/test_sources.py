@@ -14,6 +14,7 @@ from robocas_ms3.viewer.episode import base_plot, continuous, plot, rounded
 from robocas_ms3.viewer.source import open_source
 
 ROW = {"n", "steps", "instruction", "task", "object", "seed", "success", "split", "stages", "attempts", "damage"}
+CAMERAS = ("base_camera", "gripper_camera", "static_camera")
 EPISODE = {"n", "instruction", "steps", "times", "subgoals", "plots", "trace", "facts", "failures"}
 
 
@@ -44,19 +45,24 @@ def test_orientation_and_yaw_do_not_jump():
     assert base_plot(np.ones((3, 3))) == []
 
 
-def test_a_trajectory_lists_episodes_and_seeds_that_were_given_up(run_folder):
-    index = open_source(run_folder).index()  # the folder is its trajectory
+@pytest.mark.parametrize("made", ["run_folder", "folder"])  # the run's folder is its trajectory
+def test_episodes_and_seeds_that_were_given_up_are_listed(request, made):
+    index = open_source(request.getfixturevalue(made)).index()
     assert index == json.loads(json.dumps(index, allow_nan=False))
-    assert all(set(row) == ROW for row in index["episodes"])
-    assert [row["n"] for row in index["episodes"]] == [0, 1, 2, None]
-    assert [row["seed"] for row in index["episodes"]] == [3, 4, 5, 9]
-    assert [row["success"] for row in index["episodes"]] == [True, False, True, False]
-    assert [row["stages"] for row in index["episodes"]] == [[], ["grasp"], [], ["reach"]]
-    assert [row["attempts"] for row in index["episodes"]] == [None, 2, None, 1]
-    assert index["episodes"][0]["task"] == "pick"
-    assert index["episodes"][0]["object"] == "cube 3 (cube)"
-    assert (index["cameras"], index["depth"], index["rate_hz"]) == ([], False, 20)
-    assert "`robocas convert trajectory.h5" in index["note"]
+    rows = {key: [row[key] for row in index["episodes"]] for key in ROW}
+    assert rows["n"] == [0, 1, 2, None]
+    assert rows["seed"] == [3, 4, 5, 9]
+    assert rows["success"] == [True, False, True, False]
+    assert rows["stages"] == [[], ["grasp"], [], ["reach"]]
+    assert rows["attempts"] == [None, 2, None, 1]
+    assert rows["task"] == ["pick"] * 4
+    assert rows["object"] == ["cube 3 (cube)", "cube 4 (cube)", "cube 5 (cube)", ""]
+    if made == "folder":
+        assert (index["cameras"], index["depth"], index["rate_hz"], index["note"]) == (list(CAMERAS), True, 5, "")
+        assert sorted(rows["split"]) == ["", "train", "train", "val"]
+    else:
+        assert (index["cameras"], index["depth"], index["rate_hz"]) == ([], False, 20)
+        assert "`robocas convert trajectory.h5" in index["note"]
 
 
 def test_an_episode_of_a_trajectory(run_folder, made_up):
@@ -98,21 +104,6 @@ def test_objects_are_called_the_same_in_a_recording_and_in_its_dataset(run_folde
     for path, others in ((recorded.with_suffix(".h5"), {"some thing"}), (converted.parents[1], {"cube"})):
         called = {thing["name"] for thing in open_source(path).episode(0)["trace"]["objects"]}
         assert called - {"cube 3 (cube)"} == {"white toy airplane (toy airplane c)"} | others
-
-
-def test_a_folder_lists_episodes(folder):
-    index = open_source(folder).index()
-    assert all(set(row) == ROW for row in index["episodes"])
-    assert [row["n"] for row in index["episodes"]] == [0, 1, 2, None]  # the last one is a seed that was given up
-    assert [row["seed"] for row in index["episodes"]] == [3, 4, 5, 9]
-    assert [row["success"] for row in index["episodes"]] == [True, False, True, False]
-    assert [row["stages"] for row in index["episodes"]] == [[], ["grasp"], [], ["reach"]]
-    assert [row["object"] for row in index["episodes"]] == ["cube 3 (cube)", "cube 4 (cube)", "cube 5 (cube)", ""]
-    assert [row["steps"] for row in index["episodes"]] == [7, 7, 7, 0]
-    assert {row["damage"] for row in index["episodes"]} == {""}
-    assert index["cameras"] == ["base_camera", "gripper_camera", "static_camera"]
-    assert (index["depth"], index["rate_hz"], index["note"]) == (True, 5, "")
-    assert sorted(row["split"] for row in index["episodes"]) == ["", "train", "train", "val"]
 
 
 def test_an_episode_that_is_not_listed_is_on_no_side(folder, tmp_path):

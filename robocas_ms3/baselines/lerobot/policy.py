@@ -135,7 +135,6 @@ class LeRobotPolicy:
 
 
 def _copy_with_queues(model: Any) -> Any:
-    """Return a policy with the same weights and its own queues."""
     copied = copy.copy(model)
     for name, value in vars(model).items():
         if hasattr(value, "reset"):  # such as ACT's ensembler, which is no module and is reset in place

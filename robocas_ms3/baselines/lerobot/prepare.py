@@ -103,7 +103,6 @@ def _open(source: Path) -> LeRobotDataset:
 
 
 def _columns(episode: LeRobotEpisode, vectors: dict[str, NDArray[np.float32]]) -> dict[str, NDArray]:
-    """Return the numbers (T, D) of an episode by key."""
     arrays, steps = episode.arrays, episode.steps
     check_base_stands(arrays["rel_agv_pose"], episode.where)
     parts = (arrays[key].reshape(steps, -1) for key in ("ee_pos", "ee_orn", "robot_joints", GRIPPER_WIDTH))
@@ -139,7 +138,6 @@ def _link(source: str, target: str) -> None:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Run the command and return the exit code."""
     parser = argparse.ArgumentParser(description="Make a LeRobot export fit for LeRobot's policies on our socket.")
     parser.add_argument("dataset", type=Path)
     parser.add_argument("out", type=Path)

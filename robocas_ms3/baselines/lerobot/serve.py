@@ -65,7 +65,6 @@ def open_checkpoint(checkpoint: Path, rate_hz: float, device: str, play: int | N
 
 
 def rate_of(info: Path) -> float:
-    """Return the frames per second of a dataset."""
     try:
         rate_hz = load_json(info)["fps"]
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -77,7 +76,6 @@ def rate_of(info: Path) -> float:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Run the command and return the exit code."""
     parser = argparse.ArgumentParser(description="Serve a LeRobot checkpoint over the policy socket.")
     parser.add_argument("run", type=Path, help="folder of train_lerobot.sh, or a checkpoint's pretrained_model")
     parser.add_argument("--host", default="127.0.0.1", help="there is no password: keep to loopback, and tunnel")

@@ -107,7 +107,6 @@ def _check_videos(dataset: LeRobotDataset, key: str, decode: bool) -> Iterator[V
 
 
 def _check_times(rows: list[dict[str, Any]], prefix: str, fps: int) -> Iterator[Violation]:
-    """Check that the episodes of a file follow each other."""
     first = 0
     for row in rows:
         span = (first / fps, (first + row["length"]) / fps)
@@ -139,7 +138,6 @@ def _video_faults(path: Path, frames: int, fps: int, size: list[int], decode: bo
 
 
 def _check_statistics(dataset: LeRobotDataset, ranges: Ranges) -> Iterator[Violation]:
-    """Check that there are statistics of every feature, with the ranges of the data."""
     if dataset.layout.one_file_per_episode:
         yield from _check_lines(dataset)
         if not (dataset.root / schema.STATS_FILE).exists():  # of an older format, and optional
@@ -180,7 +178,6 @@ def _statistics_faults(found: Any, feature: Mapping[str, Any], seen: Any) -> Ite
 
 
 def _check_lines(dataset: LeRobotDataset) -> Iterator[Violation]:
-    """Check that each episode has statistics of every feature."""
     features = {key for key, feature in dataset.info["features"].items() if feature["dtype"] not in ("string", "image")}
     try:
         lines = read_lines(dataset.root / schema.STATS_LINES, StatsLine, len(dataset.rows))

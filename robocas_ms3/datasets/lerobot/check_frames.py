@@ -74,7 +74,6 @@ def check_data(
 
 
 def surplus_files(root: Path, folders: Iterable[Path], known: Container[Path]) -> Iterator[Violation]:
-    """Yield the files of folders that no episode has."""
     for path in sorted(path for folder in folders for path in folder.rglob("*") if path.is_file()):
         if path not in known:
             yield Violation(str(path.relative_to(root)), "", "files of episodes only", "of none")
@@ -140,7 +139,6 @@ def _check_episode(
 
 
 def _check_outcome(columns: Columns) -> Iterator[Fault]:
-    """Check that an episode ends in its last frame, and succeeds there or nowhere."""
     if any(feature.key not in columns for feature in schema.OUTCOME):
         return
     reward, success, done = (columns[feature.key][:, 0] for feature in schema.OUTCOME)

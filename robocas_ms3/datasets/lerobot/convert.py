@@ -109,7 +109,6 @@ def convert_lerobot(
 
 
 def _plan(given: ConversionInput, codec: str, variant: Variant) -> dict[str, Any]:
-    """Return ``conversion.json``: settings, episodes, split."""
     entries, pictures = given.entries(), given.pictures
     place = {entry["source"]: i for i, entry in enumerate(entries)}
     before_train, before_val = ([place[n] for n in side if n in place] for side in given.source.settled_split())
@@ -157,7 +156,6 @@ def _is_same(before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
 
 
 def _missing_parts(settings: ConversionSettings, variant: Variant, episodes: list[dict[str, Any]]) -> WriteJob:
-    """Return the parts that are missing; damaged ones are removed."""
     from robocas_ms3.datasets.lerobot.parts import Part, PartWriter
 
     writer = PartWriter(settings.out / _PARTS, settings.codec, variant)
@@ -184,7 +182,6 @@ def _without_missing(plan: dict[str, Any], parts: Path, incomplete: IncompleteEr
 
 
 def _join(out: Path, plan: Mapping[str, Any]) -> None:
-    """Make the dataset of all parts that are there."""
     from robocas_ms3.datasets.lerobot.writer import join_parts
 
     joined = make_folder(out / _JOINED)

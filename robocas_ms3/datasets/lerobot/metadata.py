@@ -7,9 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.strict import parse
@@ -51,7 +49,6 @@ class Metadata:
 
     @cached_property
     def info(self) -> dict[str, Any]:
-        """``meta/info.json``."""
         path = self.root / schema.INFO_FILE
         if not path.is_file():
             raise DatasetError("no LeRobot dataset here", where=path, found="no file")
@@ -79,7 +76,6 @@ class Metadata:
 
     @property
     def videos(self) -> list[str]:
-        """Keys of the features that are videos."""
         return [key for key, feature in self.info["features"].items() if feature["dtype"] == "video"]
 
     def depth_feature(self, camera: str) -> dict[str, Any] | None:
@@ -171,14 +167,6 @@ class Metadata:
     def subtasks(self) -> list[str]:
         """Texts of sub-goals, by ``subtask_index``."""
         return read_texts(self.root / schema.SUBTASKS_FILE, "subtask_index", self.info["total_frames"])
-
-    def subtask_texts(self, places: NDArray, where: object) -> list[str]:
-        known = len(self.subtasks)
-        wrong = places[~((places >= 0) & (places < known) & (places == np.floor(places)))]
-        if len(wrong):
-            what, expected = "no such sub-goal", f"0 to {known - 1}"
-            raise DatasetError(what, where=f"{where}, subtask_index", expected=expected, found=wrong[0])
-        return [self.subtasks[place] for place in places.astype(np.int64).tolist()]
 
     @cached_property
     def described(self) -> dict[int, dict[str, str]]:

@@ -152,7 +152,6 @@ class Part:
 
     @property
     def is_whole(self) -> bool:
-        """Whether its files are as large as when they were written."""
         try:
             return self.record.sizes == _sizes(self.folder)
         except (DatasetError, OSError):

@@ -21,7 +21,7 @@ from robocas_ms3.datasets.lerobot.arrays import robocas_arrays
 from robocas_ms3.datasets.lerobot.language import EVENTS, PERSISTENT, boxes_of, goals_of, read_rows_of
 from robocas_ms3.datasets.lerobot.metadata import Metadata
 from robocas_ms3.datasets.lerobot.records import CameraRecord, CamerasText, SceneText, frame_columns
-from robocas_ms3.datasets.lerobot.tables import check_columns, is_numeric, numbers, read_rows
+from robocas_ms3.datasets.lerobot.tables import INTEGER, Column, check_columns, is_numeric, numbers, read_rows
 from robocas_ms3.datasets.lerobot.video import read_frames, to_depth
 from robocas_ms3.datasets.pictures.stored import Box
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
@@ -66,7 +66,6 @@ class LeRobotDataset(Metadata, EpisodeSource):
         return list(listed)
 
     def entry(self, number: int) -> dict[str, Any]:
-        """Return the entry of an episode in ``conversion.json``."""
         entries = self.settings.get("episodes", [])
         return entries[number] if number < len(entries) else {}
 
@@ -89,7 +88,6 @@ class LeRobotEpisode(SourceEpisode):
 
     @property
     def row(self) -> dict[str, Any]:
-        """Row of ``meta/episodes``."""
         return self.dataset.row_of[self.number]
 
     @property
@@ -111,7 +109,6 @@ class LeRobotEpisode(SourceEpisode):
 
     @cached_property
     def table(self) -> pa.Table:
-        """Frames of the episode."""
         path = self.dataset.layout.path_of(self.dataset.root, "data", self.row)
         table = read_rows(path, self.number, self.dataset.info["total_frames"])
         if len(table) != self.steps:
@@ -121,7 +118,6 @@ class LeRobotEpisode(SourceEpisode):
 
     @cached_property
     def columns(self) -> dict[str, NDArray]:
-        """Numeric features, (T, D)."""
         table = self.table
         return {name: numbers(table.column(name)) for name in table.column_names if is_numeric(table.field(name).type)}
 
@@ -147,14 +143,15 @@ class LeRobotEpisode(SourceEpisode):
         return subgoal_runs(*self._subgoals()) if self.dataset.is_ours else []
 
     def _subgoals(self) -> tuple[list[str], list[str]]:
-        """Return type and text of the sub-goal of each step."""
-        check_columns(self.table, frame_columns(self.dataset.info["features"]), Path(self.where))
+        key, columns = schema.SUBTASK_INDEX.key, frame_columns(self.dataset.info["features"])
+        if not self.dataset.has_language:
+            columns[key] = Column(INTEGER, greatest=len(self.dataset.subtasks) - 1)
+        check_columns(self.table, columns, Path(self.where))
         types = self.table.column(schema.SUBGOAL_TYPE.key).to_pylist()
         if self.dataset.has_language:
             rows = read_rows_of(self.table.slice(0, 1), PERSISTENT, self.where)[0]
             return types, goals_of(rows, self.steps, self.dataset.info["fps"])
-        places = self.columns[schema.SUBTASK_INDEX.key][:, 0]
-        return types, self.dataset.subtask_texts(places, self.where)
+        return types, [self.dataset.subtasks[place] for place in self.table.column(key).to_pylist()]
 
     @cached_property
     def target_boxes(self) -> Sequence[dict[str, Box]]:
@@ -221,7 +218,6 @@ class LeRobotEpisode(SourceEpisode):
 
 
 def _depths(levels: Generator[NDArray, None, None], info: dict[str, Any]) -> Generator[NDArray, None, None]:
-    """Yield the depth in mm of images of levels, and close their video."""
     with closing(levels):
         for picture in levels:
             yield to_depth(picture, info)

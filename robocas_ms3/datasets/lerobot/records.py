@@ -162,7 +162,6 @@ class CameraRecord(_Record):
 
     @classmethod
     def of(cls, name: str, model: CameraModel) -> CameraRecord:
-        """Return the record of a camera."""
         intrinsic, pose = (np.asarray(array).tolist() for array in (model.intrinsic, model.camera_in_parent))
         parent = None if model.parent == standard_parent(name) else model.parent
         return cls(intrinsic=intrinsic, camera_in_parent=pose, parent=parent)
@@ -202,7 +201,6 @@ def episode_columns(names: Iterable[str], features: Mapping[str, Any]) -> dict[s
 
 
 def frame_columns(features: Mapping[str, Any]) -> dict[str, Column]:
-    """Return the columns of the data."""
     columns: dict[str, Column] = {}
     for key, dtype in ((key, feature["dtype"]) for key, feature in features.items()):
         if dtype not in ("image", "video", "language"):

@@ -118,7 +118,6 @@ def is_depth(feature: dict[str, Any]) -> bool:
 
 
 def robot_type(scene: dict[str, Any]) -> str:
-    """Return LeRobot's name of the robot of a scene."""
     env_info = scene.get("env_info")
     kwargs = env_info.get("env_kwargs") if isinstance(env_info, dict) else None
     named = kwargs.get("robot_uids") if isinstance(kwargs, dict) else None

@@ -38,7 +38,6 @@ class Column:
     greatest: float = 2**53
 
     def fault(self, values: pa.ChunkedArray) -> tuple[str, str] | None:
-        """Return expected and found, if values break the declaration."""
         if not _is_kind(values.type, self.kind):
             return self.kind, str(values.type)
         if values.null_count:
@@ -127,7 +126,6 @@ def read_columns(
 
 
 def read_objects(path: Path, columns: Mapping[str, Column], *, most_rows: float = np.inf) -> pa.Table:
-    """Read columns that will become Python objects, and check them."""
     with open_table(path, most_rows=most_rows) as file:
         table = read_columns(file, path, columns, limit=OBJECTS_LIMIT)
         check_columns(table, columns, path)
@@ -214,7 +212,6 @@ def _footer(path: Path, _changed_ns: int) -> tuple[pq.FileMetaData, list[str], l
 
 
 def read_texts(path: Path, name: str, most_rows: float = np.inf) -> list[str]:
-    """Read a table of texts, in the order of their numbers."""
     table = read_objects(path, {name: Column(INTEGER), TEXT_INDEX: Column(TEXT)}, most_rows=most_rows)
     return in_order(table.column(name).to_pylist(), table.column(TEXT_INDEX).to_pylist(), f"{path}, {name}")
 

@@ -85,7 +85,6 @@ class LeRobotWriter:
                 yield _Stream(kind, prefix, video_name(camera, kind, codec, variant), joiner)
 
     def add_episode(self, part: Part, entry: Mapping[str, Any]) -> None:
-        """Append an episode with its entry in ``conversion.json``."""
         record, steps, variant, fps = part.record, len(part.table), self._variant, self._fps
         index, start = self._episodes_done, self._frames
         columns = self._columns(part, index, start, succeeded=entry.get("success") is True)
@@ -158,7 +157,6 @@ class LeRobotWriter:
         return {key: made[key] if key in made else numbers(part.table.column(key)) for key in self._numbers}
 
     def _frame_table(self, part: Part, columns: dict[str, NDArray], persistent: list[Row]) -> pa.Table:
-        """Return the rows of the data, columns in the order of the features."""
         made: dict[str, Any] = {}
         for key in (*schema.OUR_KEYS, *(feature.key for feature in schema.single_features(self._variant))):
             made[key] = as_column(columns[key]) if key in columns else part.table.column(key)
@@ -179,7 +177,6 @@ class LeRobotWriter:
             _write_lines(folder / f"{name}.jsonl", rows)
 
     def finalize(self) -> None:
-        """Write texts, statistics, ``info.json``, ``conversion.json`` and checksums."""
         root, layout = self._root, self._layout
         if self._clipped:
             limit = schema.MAX_DEPTH_MM
@@ -227,7 +224,6 @@ class LeRobotWriter:
         }
 
     def _describe(self, stream: _Stream) -> dict[str, Any]:
-        """Return ``info`` of the feature of a video."""
         mark = "is_depth_map" if self._variant.native_depth else "video.is_depth_map"
         description = packet_times(self._layout.path(self._root, stream.prefix, 0, 0))[1]
         return {**description, **(DEPTH_INFO if stream.kind == "depth" else {mark: False})}
@@ -271,7 +267,6 @@ class RollingTable:
         return divmod(number, CHUNK_FILES)
 
     def add(self, table: pa.Table) -> None:
-        """Append rows to the file that `place` returned."""
         if self._file is None:
             path = self._path(*divmod(self._count, CHUNK_FILES))
             path.parent.mkdir(parents=True, exist_ok=True)
