@@ -71,42 +71,30 @@ class Sheet:
 
 
 def list_packs(command: ListPacks) -> int:
-    from rich.table import Column, Table
     from rich.text import Text
 
     from robocas_ms3.assets.pack import load_pack, pack_folders
-    from robocas_ms3.cli.terminal import table_console
+    from robocas_ms3.cli.terminal import print_table
     from robocas_ms3.core.errors import AssetError
 
-    table = Table(Column("pack", no_wrap=True), "objects", "furniture", "folder")
+    rows: list[tuple[object, ...]] = []
     for name, folder in pack_folders().items():
         try:
             pack = load_pack(name)
-            table.add_row(name, str(len(pack.objects)), str(len(pack.furniture)), str(folder))
+            rows.append((name, len(pack.objects), len(pack.furniture), folder))
         except AssetError as error:
-            table.add_row(name, "-", "-", Text(str(error), "red"))
-    table_console().print(table)
+            rows.append((name, "-", "-", Text(str(error), "red")))
+    print_table(("pack", "objects", "furniture", "folder"), rows)
     return 0
 
 
 def info(command: Info) -> int:
-    from rich.table import Column, Table
-
     from robocas_ms3.assets.pack import load_pack
-    from robocas_ms3.cli.terminal import table_console
+    from robocas_ms3.cli.terminal import print_table
 
     pack = load_pack(command.pack)
-
-    def show(title: str, names: tuple[str, ...], rows: list[tuple[object, ...]]) -> None:
-        table = Table(Column(title, no_wrap=True), *names)
-        for row in rows:
-            table.add_row(*map(str, row))
-        if rows:
-            table_console().print(table)
-
-    show(
-        "object",
-        ("size (mm)", "mass (g)", "hulls", "overlap", "resting poses", "grasps", "repairs"),
+    print_table(
+        ("object", "size (mm)", "mass (g)", "hulls", "overlap", "resting poses", "grasps", "repairs"),
         [
             (
                 asset.id,
@@ -122,9 +110,8 @@ def info(command: Info) -> int:
             for asset in (loaded.asset,)
         ],
     )
-    show(
-        "furniture",
-        ("size (mm)", "surfaces", "joints", "handles", "finishes", "repairs"),
+    print_table(
+        ("furniture", "size (mm)", "surfaces", "joints", "handles", "finishes", "repairs"),
         [
             (
                 asset.id,
@@ -179,13 +166,11 @@ def sheet(command: Sheet) -> int:
 
 
 def _verify_physics(pack: Pack, jobs: int, out: Path | None) -> int:
-    from rich.table import Table
-
     with mesh_tools():
         from asset_tools.quality.measure import HEADER, differences, judge, rows
         from asset_tools.quality.packs import FURNITURE_HEADER, furniture_rows, judge_furniture, remeasure_pack
     from robocas_ms3.cli.bars import Bar
-    from robocas_ms3.cli.terminal import table_console
+    from robocas_ms3.cli.terminal import print_table, table_console
     from robocas_ms3.core.files import write_json
 
     total = len(pack.manifest.assets)
@@ -199,11 +184,7 @@ def _verify_physics(pack: Pack, jobs: int, out: Path | None) -> int:
     furniture = {name: measured[name] for name in pack.furniture}
     console = table_console()
     for header, cells in ((HEADER, rows(objects)), (FURNITURE_HEADER, furniture_rows(furniture))):
-        if cells:
-            table = Table(*header)
-            for row in cells:
-                table.add_row(*row)
-            console.print(table)
+        print_table(header, cells)
     anew = {name: pack.objects[name].asset.model_copy(update={"quality": found}) for name, found in objects.items()}
     violations = [*judge(anew), *judge_furniture(furniture)]
     violations += [other for name, found in objects.items() for other in differences(pack.objects[name], found)]

@@ -38,21 +38,14 @@ def main(cfg: Doctor) -> int:
 
 
 def _print(findings: list[Finding], failed: int) -> None:
-    from rich.table import Table
     from rich.text import Text
 
-    from robocas_ms3.cli.terminal import table_console
+    from robocas_ms3.cli.terminal import print_table, table_console
 
     marks = {"ok": Text("ok", "green"), "limited": Text("limited", "yellow"), "fail": Text("FAIL", "bold red")}
-    table = Table("", "what")
-    table.add_column("found", overflow="fold")
-    if any(finding.fix for finding in findings):
-        table.add_column("fix", overflow="fold")
-    for finding in findings:
-        row = (finding.name, finding.found, finding.fix)[: len(table.columns) - 1]
-        table.add_row(marks[finding.status], *row)
-    console = table_console()
-    console.print(table)
+    columns = ("", "what", "found", *(["fix"] if any(finding.fix for finding in findings) else []))
+    rows = [(marks[each.status], each.name, each.found, each.fix)[: len(columns)] for each in findings]
+    print_table(columns, rows)
     limited = sum(finding.status == "limited" for finding in findings)
     verdict = f"{failed} of what is needed fails" if failed else "everything needed works"
-    console.print(verdict + (f"; {count_of(limited, 'optional row')} limited" if limited else ""))
+    table_console().print(verdict + (f"; {count_of(limited, 'optional row')} limited" if limited else ""))

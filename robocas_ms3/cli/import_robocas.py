@@ -79,9 +79,7 @@ def main(cfg: ImportRobocas) -> int:
 
 def _table(found: Survey) -> None:
     """Print what is wrong, the same fault of several episodes in one line."""
-    from rich.table import Table
-
-    from robocas_ms3.cli.terminal import say, table_console
+    from robocas_ms3.cli.terminal import print_table, say
     from robocas_ms3.core.words import count_of, format_ranges
 
     rows: dict[tuple[str, str, str], list[int]] = defaultdict(list)
@@ -91,12 +89,7 @@ def _table(found: Survey) -> None:
         numbers = rows[(finding.outcome, place, finding.problem)]
         if finding.episode is not None:
             numbers.append(finding.episode)
-    if rows:
-        table = Table(box=None, pad_edge=False, header_style="bold")
-        for name in ("episodes", "what", "where", "problem"):
-            table.add_column(name, overflow="fold", no_wrap=False)
-        for (outcome, place, problem), numbers in sorted(rows.items()):
-            table.add_row(format_ranges(numbers) or "all", outcome, place, problem)
-        table_console().print(table)
+    cells = [(format_ranges(numbers) or "all", *key) for key, numbers in sorted(rows.items())]
+    print_table(("episodes", "what", "where", "problem"), cells, box=None, pad_edge=False, header_style="bold")
     counts = f"can be taken: {len(found.taken)}, left out: {len(found.left_out)}"
     say(f"{found.root}: {count_of(found.episodes, 'episode')}, {counts}")

@@ -143,14 +143,12 @@ def try_all(cache: LayoutCache, engine: Engine, **packs: str) -> int:
 
 
 def info(command: Info) -> int:
-    from rich.table import Table
-
-    from robocas_ms3.cli.terminal import table_console
+    from robocas_ms3.cli.terminal import print_table, say
     from robocas_ms3.core.documents import load_json
     from robocas_ms3.scenes.cache import ABOUT, caches_folder, count_layouts
 
     root = caches_folder(command.folder or "auto")
-    table = Table("cache", "layouts", "task", "layout", "objects", "object pack", "furniture")
+    rows = []
     for path in sorted(root.glob(f"*/{ABOUT}")):
         try:
             about = load_json(path)
@@ -158,13 +156,10 @@ def info(command: Info) -> int:
             of = (config["task"], config["layout"]["kind"], config["objects"]["count"], about["object_pack"]["name"])
         except (OSError, ValueError, KeyError, TypeError):  # the layouts are still of use
             of, furniture = (f"{ABOUT} is damaged", "", "", ""), ""
-        row = (path.parent.name, count_layouts(path.parent), *of, furniture)
-        table.add_row(*map(str, row))
-    table_console().print(
-        table if table.row_count else f"no layout caches in {root}",
-        soft_wrap=not table.row_count,
-        highlight=False,
-    )
+        rows.append((path.parent.name, count_layouts(path.parent), *of, furniture))
+    print_table(("cache", "layouts", "task", "layout", "objects", "object pack", "furniture"), rows)
+    if not rows:
+        say(f"no layout caches in {root}")
     return 0
 
 

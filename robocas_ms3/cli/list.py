@@ -87,9 +87,7 @@ def _size(folder: Path) -> int:
 
 
 def _print(found: dict[str, list[dict[str, Any]]]) -> None:
-    from rich.table import Table
-
-    from robocas_ms3.cli.terminal import table_console
+    from robocas_ms3.cli.terminal import print_table, table_console
 
     tables = {
         "tasks": ("name", "env_id", "default_config", "summary"),
@@ -99,16 +97,12 @@ def _print(found: dict[str, list[dict[str, Any]]]) -> None:
         "baselines": ("name", "package", "about"),
         "packs": ("name", "objects", "furniture", "megabytes", "folder"),
     }
-    console = table_console()
     for kind, columns in tables.items():
-        table = Table(title=kind, title_justify="left", title_style="bold")
-        for column in columns:
-            name = column in {"name", "env_id", "default_config", "task"}
-            table.add_column(column.replace("_", " "), overflow="fold", no_wrap=name)
-        for row in found[kind]:
-            values = (row[column] for column in columns)
-            table.add_row(*(", ".join(value) if isinstance(value, list) else str(value) for value in values))
-        console.print(table)
+        rows = [[row[column] for column in columns] for row in found[kind]]
+        cells = [[", ".join(cell) if isinstance(cell, list) else cell for cell in row] for row in rows]
+        heads = [column.replace("_", " ") for column in columns]
+        whole = ("env id", "default config", "task")
+        print_table(heads, cells, whole=whole, title=kind, title_justify="left", title_style="bold")
     for pack in found["packs"]:
         if pack["error"]:
-            console.print(f"damaged: {pack['error']}", style="red", soft_wrap=True)
+            table_console().print(f"damaged: {pack['error']}", style="red", soft_wrap=True)

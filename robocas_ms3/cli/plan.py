@@ -135,28 +135,22 @@ def list_plans(cfg: List) -> int:
 
 
 def show_status(command: Status) -> int:
-    from rich.table import Table
-
-    from robocas_ms3.cli.terminal import say, say_json, table_console
+    from robocas_ms3.cli.terminal import print_table, say, say_json
     from robocas_ms3.plans.status import read_status
 
     found = read_status(command.out)
     if command.json:
         say_json(asdict(found))
         return 0
-    table = Table("part", "episodes", "seeds", "failed", "record, CPU s each", "render, CPU s each", "MB")
+    rows = []
     for part in found.parts:
         failed = ", ".join(f"{reason} x{count}" for reason, count in part.failed.items()) or "-"
-        table.add_row(
-            part.name,
-            f"{part.done} of {part.wanted}",
-            str(part.tried),
-            failed,
-            f"{part.record_seconds:.1f}",
-            f"{part.render_seconds:.1f}",
-            f"{part.bytes / 1e6:.0f}",
+        seconds = f"{part.record_seconds:.1f}", f"{part.render_seconds:.1f}"
+        rows.append(
+            (part.name, f"{part.done} of {part.wanted}", part.tried, failed, *seconds, f"{part.bytes / 1e6:.0f}")
         )
-    table_console().print(table)
+    columns = ("part", "episodes", "seeds", "failed", "record, CPU s each", "render, CPU s each", "MB")
+    print_table(columns, rows, whole=columns[:3])
     if found.finished:
         say("finished")
     elif found.seconds_left is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +25,28 @@ def table_console() -> Console:
     """Return a console for tables: as wide as the terminal, or 200 columns in a pipe or a file."""
     made = console()
     return made if made.is_terminal else console(width=_PIPED_WIDTH)
+
+
+def print_table(
+    columns: Sequence[str], rows: Iterable[Sequence[object]], *, whole: Collection[str] = (), **options: Any
+) -> None:
+    """Print a table, unless it is empty.
+
+    Args:
+        columns: their heads; those in ``whole``, and the first one, are never broken.
+        rows: a cell is text, or a renderable of rich.
+        options: options of `rich.table.Table`.
+    """
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(**options)
+    for number, column in enumerate(columns):
+        table.add_column(column, overflow="fold", no_wrap=number == 0 or column in whole)
+    for row in rows:
+        table.add_row(*(cell if isinstance(cell, Text) else str(cell) for cell in row))
+    if table.row_count:
+        table_console().print(table)
 
 
 def terminal_of_stderr() -> Console | None:

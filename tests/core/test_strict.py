@@ -6,7 +6,7 @@ import pytest
 from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
 
 from robocas_ms3.core.errors import AssetError, ConfigError
-from robocas_ms3.core.strict import StrictModel, mistakes, nearest, parse, parse_json, refusal
+from robocas_ms3.core.strict import FileName, StrictModel, check_name, mistakes, nearest, parse, parse_json, refusal
 
 
 def _even(number: int) -> int:
@@ -107,3 +107,25 @@ def test_other_words_and_other_forms():
 def test_the_nearest_words():
     assert nearest("shelv", ["table", "shelf"]) == "Did you mean shelf?"
     assert nearest("sofa", ["table", "shelf"]) == ""
+
+
+class Form(StrictModel):
+    name: FileName
+
+
+@pytest.mark.parametrize("name", ["a", "link_0", "Left Tür 1", "a.b-c", "机器人", "x" * 200])
+def test_plain_names_are_names_of_files(tmp_path, name):
+    assert check_name(name, AssetError, where="file") == name
+    (tmp_path / name).mkdir()
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+@pytest.mark.parametrize(
+    "name", ["", ".", "..", ".hidden", "a/b", "/a", "..\\a", "a\nb", "a\x00", "\x1b[31m", "\ud800", "ü" * 101]
+)
+def test_other_names_are_refused(name):
+    with pytest.raises(AssetError) as raised:
+        check_name(name, AssetError, where="file")
+    assert raised.value.where == "file" and len(str(raised.value)) < 300
+    with pytest.raises(AssetError):
+        parse(Form, {"name": name}, AssetError, where="file")
