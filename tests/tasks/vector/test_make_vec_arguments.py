@@ -1,6 +1,7 @@
 """`make_vec` without simulation: backend, arguments, and conventions on a batch that counts its steps."""
 
 import gymnasium as gym
+import numpy as np
 import pytest
 import torch
 from vector_envs import STATE_ONLY, with_gpu
@@ -8,6 +9,7 @@ from vector_envs import STATE_ONLY, with_gpu
 import robocas_ms3
 from robocas_ms3.core.errors import VectorEnvError
 from robocas_ms3.tasks.vector import RoboCASVectorEnv, choose_backend
+from robocas_ms3.tasks.vector.worker import replace_rows
 
 
 @pytest.mark.parametrize(
@@ -112,6 +114,17 @@ def test_an_episode_that_ends_with_success_succeeded_at_its_end():
     *_, info = env.step(None)
     assert info["_final_info"].tolist() == [True, False, False]
     assert info["final_info"]["episode"]["success_at_end"].tolist() == [True, False, False]
+
+
+def test_new_rows_of_some_envs_take_the_place_of_old_ones_of_any_kind():
+    old = np.zeros((3, 2), np.float32)
+    assert replace_rows(old, [1], np.ones((1, 2), np.float32)) is old and old.tolist() == [[0, 0], [1, 1], [0, 0]]
+    for other in (np.full((1, 2), 0.1), np.ones((1, 4), np.float32), ["text"]):  # another type, shape, no array
+        first, new, last = replace_rows(np.zeros((3, 2), np.float32), [1], other)
+        assert new is other[0] or np.array_equal(new, other)
+        assert first.dtype == last.dtype == np.float32
+    rows = replace_rows([None, None], [0, 1], np.ones((2, 4)))
+    assert isinstance(rows, np.ndarray) and rows.shape == (2, 4)
 
 
 def test_calls_reach_through_wrappers():

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from vector_envs import HORIZON, doing, gone, make
-from vector_wrappers import LacksLayouts, Misbehaves, OwnError, Wins
+from vector_wrappers import DiesWhenMade, LacksLayouts, Misbehaves, OwnError, Wins
 
 from robocas_ms3.core.errors import ConfigError, LayoutError, VectorEnvError, WorkerDied
 from robocas_ms3.tasks import RoboCASPickEnv
@@ -115,7 +115,7 @@ def test_what_goes_wrong_in_a_process(capfd):
         # killed
         pids = env.unwrapped.pids
         with pytest.raises(WorkerDied, match=r"env 3: its process died \(found SIGKILL"):
-            env.step(doing(0, 0, 0, 4))
+            env.step(doing(7, 0, 0, 4))  # without waiting for the first one
         assert gone(pids)
         with pytest.raises(VectorEnvError, match="closed"):
             env.step(doing(0, 0, 0, 0))
@@ -151,12 +151,14 @@ def test_a_busy_process_is_not_waited_for():
 
 @slow
 def test_errors_of_making_arrive_as_themselves():
-
     with pytest.raises(ConfigError, match="no_such_config") as error:
         make(2, 1, config="no_such_config")
     assert "env 0" in str(error.value.__cause__)
     with pytest.raises(VectorEnvError, match="can't be sent"):
         make(1, 1, config={"lock": threading.Lock()})
+    with pytest.raises(WorkerDied) as died:
+        make(1, 1, wrappers=[DiesWhenMade])
+    assert died.value.found == "SIGSEGV" and "robocas doctor" in died.value.fix
 
 
 def test_an_env_of_the_program_itself_can_not_be_sent(monkeypatch):
