@@ -60,7 +60,7 @@ class Scene(StrictModel):
         return self.name or Path(self.config).stem
 
 
-class Part(Scene):
+class ProtocolPart(Scene):
     """Episodes of one configuration."""
 
     count: int = Field(ge=1, description="how many episodes")
@@ -75,16 +75,16 @@ class Part(Scene):
         return self.name or super().file + ("" if self.split == "test" else f"-{self.split}")
 
 
-class Plan(StrictModel):
+class ProtocolPlan(StrictModel):
     """What a protocol is made from."""
 
     rules: dict[str, object] = Field(description="of `Protocol`, but for the pack's hash")
-    parts: list[Part]
+    parts: list[ProtocolPart]
     train: list[Scene] = Field(default=[], description="configurations to train on")
     lists: dict[str, Any] = Field(default={}, description="for YAML's anchors: lists that changes refer to")
 
 
-def read_plan(path: Path) -> Plan:
+def read_plan(path: Path) -> ProtocolPlan:
     """Read a plan. Files that it names are in its folder, or where the command runs.
 
     Raises:
@@ -94,7 +94,7 @@ def read_plan(path: Path) -> Plan:
         data = load_yaml(path)
     except (OSError, DocumentError) as error:
         raise EvaluationError(NO_PLAN, where=path, found=error) from error
-    plan = parse(Plan, data, EvaluationError, where=path, about=NO_PLAN)
+    plan = parse(ProtocolPlan, data, EvaluationError, where=path, about=NO_PLAN)
 
     def located(scene: Scene) -> Scene:
         file = path.parent / scene.config
@@ -104,7 +104,7 @@ def read_plan(path: Path) -> Plan:
     return plan.model_copy(update={name: list(map(located, getattr(plan, name))) for name in ("parts", "train")})
 
 
-def freeze(plan: Plan, folder: Path, overrides: Sequence[str] = ()) -> Iterator[tuple[int, int]]:
+def freeze(plan: ProtocolPlan, folder: Path, overrides: Sequence[str] = ()) -> Iterator[tuple[int, int]]:
     """Write a protocol into a folder, which appears whole; yield the number of episodes that are chosen, and of all.
 
     ``overrides`` are keys to set in all its configurations, see `load_task_config`.
@@ -153,7 +153,7 @@ def _write_yaml(values: dict[str, Any], path: Path) -> None:
     path.write_text(yaml.safe_dump(values, sort_keys=False, allow_unicode=True), encoding="utf-8")
 
 
-def _scenes(part: Part, config: TaskConfig, pack: str) -> Iterator[tuple[int, Layout, RoboCASEnv]]:
+def _scenes(part: ProtocolPart, config: TaskConfig, pack: str) -> Iterator[tuple[int, Layout, RoboCASEnv]]:
     env = gym.make(TASKS[config.task].env_id, config=config, pack=pack, obs_mode="none", render_backend="none")
     base: Any = env.unwrapped
     try:
@@ -171,7 +171,7 @@ def _scenes(part: Part, config: TaskConfig, pack: str) -> Iterator[tuple[int, La
         env.close()
 
 
-def _episode(number: int, part: Part, seed: int, layout: Layout, env: RoboCASEnv) -> Episode:
+def _episode(number: int, part: ProtocolPart, seed: int, layout: Layout, env: RoboCASEnv) -> Episode:
     p_vis = float(layout.visible_shares[layout.target])
     return Episode(
         episode=number,
@@ -185,7 +185,7 @@ def _episode(number: int, part: Part, seed: int, layout: Layout, env: RoboCASEnv
     )
 
 
-def _instruction(part: Part, env: RoboCASEnv, seed: int) -> str:
+def _instruction(part: ProtocolPart, env: RoboCASEnv, seed: int) -> str:
     if part.words == "empty":
         return ""
     if part.words == "asked":

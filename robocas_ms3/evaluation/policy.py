@@ -32,7 +32,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Motion:
+class TcpMotion:
     """Relative motions of E TCPs, each in its own frame (z approach, y closing): (E, 3) m, E rotations, (E,) bool."""
 
     translation: Array
@@ -45,12 +45,12 @@ class Convention:
     """A convention of actions: numbers per action, and how actions (E, size) become motions; None: joint targets."""
 
     size: int
-    read: Callable[[Array], Motion] | None
+    read: Callable[[Array], TcpMotion] | None
 
 
-def _motions(rotation: Callable[[Array], Rotation], open_above: float = 0.0) -> Callable[[Array], Motion]:
-    def read(actions: Array) -> Motion:
-        return Motion(actions[:, :3], rotation(actions[:, 3:-1]), actions[:, -1] > open_above)
+def _motions(rotation: Callable[[Array], Rotation], open_above: float = 0.0) -> Callable[[Array], TcpMotion]:
+    def read(actions: Array) -> TcpMotion:
+        return TcpMotion(actions[:, :3], rotation(actions[:, 3:-1]), actions[:, -1] > open_above)
 
     return read
 

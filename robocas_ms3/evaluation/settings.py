@@ -59,8 +59,7 @@ class EvaluationSettings:
     render_size: Annotated[tuple[int, int] | None, tyro.conf.Suppress] = None
     """Width and height of the images of the env's ``render``, pixels; None: it renders none."""
 
-    def check(self) -> None:
-        """Check the numbers."""
+    def __post_init__(self) -> None:
         for name in ("envs", "episodes", "workers"):
             if (number := getattr(self, name)) is not None:
                 check_number(name, number, 1)

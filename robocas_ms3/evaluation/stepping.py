@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.metrics import EpisodeMetrics
-from robocas_ms3.evaluation.policy import CONVENTIONS, Motion, PolicySpec
+from robocas_ms3.evaluation.policy import CONVENTIONS, PolicySpec, TcpMotion
 from robocas_ms3.robots.ee_deltas import to_ee_delta_action
 from robocas_ms3.tasks import terms
 
@@ -111,11 +111,11 @@ class PolicyStepping(gym.Wrapper):
     def _measures(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
         return {**self._metrics.read(), **(self._weld.read(info) if self._weld else {})}
 
-    def _timed(self, motion: Motion) -> tuple:
+    def _timed(self, motion: TcpMotion) -> tuple:
         start = self._tcp() if self._reference == "tcp" else self._target()
         return self._go(*_moved(start, motion), motion.open)
 
-    def _upstream(self, motion: Motion) -> tuple:
+    def _upstream(self, motion: TcpMotion) -> tuple:
         """Gripper, then motion; an env that is done with either waits."""
         result, here = None, self._target()
         turned = motion.open != self._open
@@ -265,6 +265,6 @@ def _pose(pose: Pose) -> tuple[np.ndarray, Rotation]:
     return raw[:, :3], Rotation.from_quat(raw[:, [4, 5, 6, 3]])
 
 
-def _moved(start: tuple[np.ndarray, Rotation], motion: Motion) -> tuple[np.ndarray, Rotation]:
+def _moved(start: tuple[np.ndarray, Rotation], motion: TcpMotion) -> tuple[np.ndarray, Rotation]:
     position, turn = start
     return position + turn.apply(motion.translation), turn * motion.rotation

@@ -9,27 +9,30 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from mani_skill.utils.structs import Pose
 
 import robocas_ms3  # noqa: F401
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.metrics import read_sum
 from robocas_ms3.evaluation.policy import PolicySpec
-from robocas_ms3.evaluation.stepping import PolicyStepping, control_mode
+from robocas_ms3.evaluation.stepping import PolicyStepping, env_kwargs
 from robocas_ms3.tasks.vector import make_vec
 
 needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device: unproven on a GPU")
 
 
+IMAGES = {
+    "obs_mode": "rgb",
+    "reward_mode": "none",
+    "control_mode": "pd_ee_delta_pose",
+    "sim_config": {"control_freq": 5},
+    "sensor_configs": {"width": 32, "height": 24},
+    "max_episode_steps": 10_000,
+}
+
+
 def made(convention="robocas", reference="tcp", stepping="timed", rate=5) -> PolicyStepping:
-    env = gym.make(
-        "RoboCASPick-v1",
-        obs_mode="none",
-        reward_mode="none",
-        render_backend="none",
-        control_mode=control_mode(convention),
-        sim_config={"control_freq": rate},
-        max_episode_steps=10_000,
-    )
+    env = gym.make("RoboCASPick-v1", **env_kwargs(PolicySpec(convention), rate))
     stepped = PolicyStepping(env, PolicySpec(convention, reference), stepping)
     stepped.reset(seed=3)
     return stepped
@@ -113,19 +116,19 @@ def test_what_happened_is_counted_from_the_reset_on():
         env.step(along(0.02))
     pose = base.objects[slot].pose.raw_pose.clone()
     above = torch.cat([base.basket_pose[:, :2], pose[:, 2:3]], dim=1)
-    base.objects[slot].set_pose(robot_pose(above, pose))
+    base.objects[slot].set_pose(Pose.create_from_pq(above, pose[:, 3:]))
     *_, info = env.step(along(0.0))
     assert bool(info["success_v0"])  # near the basket in xy, gripper open: upstream's rule asks for no more
     assert read_sum(info, "v0_steps") == 1
     assert not bool(info["success"])
     other = next(i for i in range(len(base.objects)) if i != slot)
     pose = base.objects[other].pose.raw_pose.clone()
-    base.objects[other].set_pose(robot_pose(torch.tensor([[3.0, 3.0, 0.05]]), pose))
+    base.objects[other].set_pose(Pose.create_from_pq(torch.tensor([[3.0, 3.0, 0.05]]), pose[:, 3:]))
     *_, info = env.step(along(0.0, gripper=0.0))
     assert not bool(info["success_v0"])
     assert read_sum(info, "fallen") == 1
     assert read_sum(info, "disturbed_most") >= 1
-    base.objects[slot].set_pose(robot_pose(torch.tensor([[3.0, 2.0, 0.05]]), pose))
+    base.objects[slot].set_pose(Pose.create_from_pq(torch.tensor([[3.0, 2.0, 0.05]]), pose[:, 3:]))
     *_, info = env.step(along(0.0))
     assert bool(info["fail"])
     assert read_sum(info, "fallen") == 1  # others only
@@ -136,23 +139,9 @@ def test_what_happened_is_counted_from_the_reset_on():
     env.close()
 
 
-def robot_pose(position: torch.Tensor, raw: torch.Tensor) -> Any:
-    from mani_skill.utils.structs import Pose
-
-    return Pose.create_from_pq(position, raw[:, 3:])
-
-
 def test_pictures_are_rendered_when_the_policy_looks(monkeypatch):
     """Once an action of several control steps, and with ``look_every=2`` after every other action; black in between."""
-    env = gym.make(
-        "RoboCASPick-v1",
-        obs_mode="rgb",
-        reward_mode="none",
-        control_mode="pd_ee_delta_pose",
-        sim_config={"control_freq": 5},
-        sensor_configs={"width": 32, "height": 24},
-        max_episode_steps=10_000,
-    )
+    env = gym.make("RoboCASPick-v1", **IMAGES)
     base: Any = env.unwrapped
     rendered, capture = [], base.capture_sensor_data
     monkeypatch.setattr(base, "capture_sensor_data", lambda: (rendered.append(1), capture()))
@@ -186,12 +175,7 @@ def test_each_env_of_a_batch_is_looked_at_in_its_own_steps():
         ignore_terminations=True,
         record_metrics=False,
         wrappers=[partial(PolicyStepping, spec=PolicySpec("robocas", "tcp", look_every=3), stepping="upstream")],
-        obs_mode="rgb",
-        reward_mode="none",
-        control_mode="pd_ee_delta_pose",
-        sim_config={"control_freq": 5},
-        sensor_configs={"width": 32, "height": 24},
-        max_episode_steps=10_000,
+        **IMAGES,
     )
 
     def shows(obs: Any) -> list[bool]:

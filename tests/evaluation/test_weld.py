@@ -18,7 +18,7 @@ from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
-from robocas_ms3.evaluation.stepping import PolicyStepping, control_mode
+from robocas_ms3.evaluation.stepping import PolicyStepping, env_kwargs
 from robocas_ms3.evaluation.verify import problems
 from robocas_ms3.robots.description import MOBILE_PANDA
 
@@ -34,22 +34,12 @@ class ClaimsSuccess(gym.Wrapper):
 
 
 def make(**kwargs: Any) -> gym.Env:
-    return gym.make(
-        "RoboCASPick-v1",
-        obs_mode="none",
-        reward_mode="none",
-        render_backend="none",
-        control_mode=control_mode("robocas"),
-        sim_config={"control_freq": 5},
-        max_episode_steps=10_000,
-        **kwargs,
-    )
+    return gym.make("RoboCASPick-v1", **env_kwargs(PolicySpec(), 5), **kwargs)
 
 
 @pytest.fixture(scope="module")
 def pick():
-    env = make()
-    yield env
+    return make()
 
 
 def welding(env: gym.Env, weld: bool = True) -> PolicyStepping:

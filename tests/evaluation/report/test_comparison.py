@@ -62,31 +62,23 @@ def test_too_few_for_several_claims_though_enough_for_one(tmp_path):
     assert "- all: " not in said
 
 
-def test_scenes_that_are_there_several_times_are_not_pooled(tmp_path):
+def test_scenes_that_occur_several_times_are_not_pooled_and_other_backends_are_named(tmp_path):
     outcomes = [outcome(n, seed=n % 4, config="ab"[n // 4], split="ab"[n // 4]) for n in range(8)]
-    one, other = (write(tmp_path / name, outcomes) for name in "ab")
-    assert [row[0] for row in rows(comparison([one, other]))] == ["a", "b"]
+    said = comparison([write(tmp_path / name, outcomes, backend=name) for name in ("gpu", "processes")])
+    assert [row[0] for row in rows(said)] == ["a", "b"]
+    assert "**Measured with different backend.**" in said
 
 
-def test_other_versions_are_said(tmp_path):
-    one, other = (write(tmp_path / name, [outcome(0)], backend=name) for name in ("gpu", "processes"))
-    assert "**Measured with different backend.**" in comparison([one, other])
-
-
-def test_of_different_protocols_or_of_nothing(tmp_path):
-    one = write(tmp_path / "a", [outcome(0)])
+def test_results_that_can_not_be_compared(tmp_path):
+    one, other = write(tmp_path / "a", [outcome(0)]), write(tmp_path / "b", [outcome(0)], protocol_hash="ef" * 32)
     with pytest.raises(EvaluationError, match="different protocols"):
-        comparison([one, one, write(tmp_path / "b", [outcome(0)], protocol_hash="ef" * 32)])
+        comparison([one, one, other])
     with pytest.raises(EvaluationError, match="no episodes in common"):
         comparison([one, write(tmp_path / "c", [outcome(1)])])
-
-
-def test_with_the_weld_it_is_compared_with_its_like_alone(tmp_path):
-    without = write(tmp_path / "a", [outcome(0)])
-    one, other = (write(tmp_path / name, [outcome(0)], weld=True) for name in "bc")
-    assert "1 episode of made_up with upstream's weld that both have" in comparison([one, other])
-    for pair in ([one, without], [without, one]):
-        with pytest.raises(EvaluationError, match=r"/b: a result with upstream's weld can't be compared"):
+    welded = write(tmp_path / "d", [outcome(0)], weld=True)
+    assert "1 episode of made_up with upstream's weld that both have" in comparison([welded, welded])
+    for pair in ([one, welded], [welded, one]):
+        with pytest.raises(EvaluationError, match=r"/d: a result with upstream's weld can't be compared"):
             comparison(pair)
 
 

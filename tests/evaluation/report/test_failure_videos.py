@@ -8,7 +8,7 @@ from made_up_results import of_protocol, outcome, write
 from robocas_ms3.cli.eval import run
 from robocas_ms3.cli.eval_results import Videos, videos
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.evaluation.freeze import Plan, freeze
+from robocas_ms3.evaluation.freeze import ProtocolPlan, freeze
 from robocas_ms3.evaluation.policies.plain import RandomPolicy
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.report.videos import SIZE, failed_of_each_kind, film
@@ -53,7 +53,7 @@ def test_a_result_chooses_no_code(tmp_path, capsys):
 def test_a_failure_is_filmed_and_linked(tmp_path, needs_renderer, capsys):
     rules = {"name": "tiny", "description": "Two steps.", "max_steps": 2, "stepping": "upstream"}
     plan = {"rules": rules, "parts": [{"config": "pick_table_scattered", "count": 1, "first_seed": 110000}]}
-    list(freeze(Plan.model_validate(plan), tmp_path / "tiny"))
+    list(freeze(ProtocolPlan.model_validate(plan), tmp_path / "tiny"))
     out, protocol = tmp_path / "result", str(tmp_path / "tiny")
     assert run(EvaluationSettings((), "random", protocol, out, backend="processes", weld=True)) == 0
     assert videos(Videos(out, protocol=protocol)) == 0

@@ -75,9 +75,7 @@ def test_numbers_stages_failures_and_the_record(result):
 
 
 def test_it_names_the_weld(result, tmp_path):
-    welded = write(tmp_path / "welded", result.outcomes.values(), weld=True)
-    reader = Reader(page(welded))
-    assert reader.texts[:2] == ["mine by made_up with upstream's weld"] * 2
+    reader = Reader(page(write(tmp_path / "welded", result.outcomes.values(), weld=True)))
     assert any(text.startswith("With upstream's weld: ") for text in reader.texts)
     assert reader.after("upstream's weld", 1) == ["yes"]
     assert Reader(page(result)).after("upstream's weld", 1) == ["no"]
@@ -109,18 +107,16 @@ def test_small_results(tmp_path, count):
     Reader(page(write(tmp_path / "b", [outcome(0, came_to=0)][:count])))
 
 
-def test_columns(result, tmp_path):
+def test_columns(result, monkeypatch, capsys):
     parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra 'lerobot'")
-    write_report(result, tmp_path / "out")
-    table = parquet.read_table(tmp_path / "out" / PARQUET).to_pydict()
+    write_report(result, result.folder)
+    table = parquet.read_table(result.folder / PARQUET).to_pydict()
     assert table["episode"] == list(range(6))
     assert table["flags.target_lifted"] == [50, 50, 50, None, 50, 50]
     assert table["flag_seconds.success"] == [3.5, 3.5, None, None, 3.5, 3.5]
     assert np.isclose(table["measures.path_length"], 1.5).all()
     assert table["p_vis"] == [None] * 4 + [0.3, 0.3]
-
-
-def test_without_pyarrow_there_are_no_columns(result, tmp_path, monkeypatch, capsys):
+    (result.folder / PARQUET).unlink()
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "pyarrow" else find(name))
     assert report(Report((result.folder,))) == 0

@@ -19,29 +19,19 @@ def row(text: str, first: str) -> list[str]:
     return [cell.strip() for cell in line.strip("|").split("|")]
 
 
-def test_a_configuration_is_a_row(result):
+def test_successes_failures_and_occlusion(result, tmp_path):
     # 2 of 4: Clopper and Pearson 6.8 to 93.2; steps (70 + 70 + 800 + 800) / 4; RA 3 of 4; no obstacles
     expected = ["table", "4", "50 % (7 to 93)", "50 %", "50 %", "75 %", "75 %", "75 %", "", "435", "21.8"]
     assert row(markdown(result), "table") == expected
-
-
-def test_failure_stages_are_counted(result):
     said = markdown(result).partition("Where episodes failed")[2]
     assert row(said, "configuration") == ["configuration", "n", "failed", "an object touched", "placed, at rest"]
     assert row(said, "table") == ["table", "4", "2", "1", "1"]
-
-
-def test_bins_of_occlusion(result):
+    assert "weld" not in markdown(result)
+    assert "**With upstream's weld: " in markdown(write(tmp_path / "b", [outcome(0)], weld=True))
     # of one episode 2.5 or 97.5 %, rounded up
     assert row(markdown(result), "0.2 to 0.4") == ["0.2 to 0.4", "1", "100 % (3 to 100)"]
     assert row(markdown(result), "0.8 to 1") == ["0.8 to 1", "1", "0 % (0 to 98)"]
     assert row(markdown(result), "0 to 0.2") == ["0 to 0.2", "0", ""]
-
-
-def test_the_weld_is_named(tmp_path):
-    one = write(tmp_path / "a", [outcome(0)], weld=True)
-    assert markdown(one).startswith("# mine by made_up with upstream's weld\n\n**With upstream's weld: ")
-    assert "weld" not in markdown(write(tmp_path / "b", [outcome(0)]))
 
 
 def test_splits_are_side_by_side(tmp_path):
