@@ -59,15 +59,18 @@ def run(settings: EvaluationSettings) -> int:
     from robocas_ms3.cli.bars import Bar
     from robocas_ms3.cli.terminal import say, say_lines
     from robocas_ms3.core.workers import use_one_torch_thread
-    from robocas_ms3.evaluation.policies import open_policy
+    from robocas_ms3.evaluation.policies import find_policy, open_policy
+    from robocas_ms3.evaluation.protocol import load_protocol
     from robocas_ms3.evaluation.report.tables import markdown
     from robocas_ms3.evaluation.results import read
+
+    find_policy(settings.policy)
+    load_protocol(settings.protocol)
+    from robocas_ms3.evaluation.session import EvaluationSession
 
     use_one_torch_thread()
     outcomes = []
     with open_policy(settings.policy) as policy, Bar("episodes run") as shown:
-        from robocas_ms3.evaluation.session import EvaluationSession  # imports the simulator
-
         session = EvaluationSession(policy, settings)
         for outcome in session.run(shown.start):
             outcomes.append(outcome)
