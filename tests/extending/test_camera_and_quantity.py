@@ -27,6 +27,11 @@ quantities.QUANTITIES = (
         recorded=lambda motion: motion.qpos[:, 10:],
         feature="observation.fingers",
     ),
+    quantities.Quantity(
+        "gap", "float32", ("T",), "m", "between the fingers",
+        recorded=lambda motion: motion.qpos[:, 10:].sum(axis=1),
+        optional=True,
+    ),
 )
 """
 CONFIG = """
@@ -60,6 +65,7 @@ class Sees:
         return np.zeros((1, 7))
 """
 STEPS = """
+import shutil
 import sys
 from pathlib import Path
 
@@ -81,6 +87,18 @@ def main():
         "validate lerobot",
         "eval freeze plan.yaml --out tiny",
         "eval --policy sees:Sees --protocol tiny --out result --backend processes --envs 1",
+    ):
+        assert run(words.split()) == 0, words
+    older = Path(shutil.copytree("robocas", "older")) / "episode_0000000" / "episode_info.npz"  # before it was added
+    arrays = dict(np.load(older))
+    assert arrays.pop("gap").max() > 0.03
+    np.savez(older, **arrays)
+    for words in (
+        "validate older",
+        "merge older --out merged",
+        "convert older --to lerobot --out of_older",
+        "convert lerobot --to lerobot --out again",  # LeRobot holds no gap
+        "validate again",
     ):
         assert run(words.split()) == 0, words
     sources = [open_source(Path(name)) for name in ("demos/trajectory.h5", "robocas", "lerobot")]
