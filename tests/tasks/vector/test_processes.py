@@ -12,8 +12,7 @@ from contextlib import closing
 import numpy as np
 import pytest
 import torch
-from vector_envs import HORIZON, doing, gone, make
-from vector_wrappers import DiesWhenMade, LacksLayouts, Misbehaves, OwnError, Wins
+from vector_envs import HORIZON, DiesWhenMade, LacksLayouts, Misbehaves, OwnError, Wins, doing, gone, make
 
 from robocas_ms3.core.errors import ConfigError, LayoutError, VectorEnvError, WorkerDied
 from robocas_ms3.tasks import RoboCASPickEnv

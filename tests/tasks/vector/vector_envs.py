@@ -1,12 +1,16 @@
-"""Vector environments of a few short episodes, in processes of their own."""
+"""Vector environments of a few short episodes in processes, and wrappers that misbehave when an action says so."""
 
 import os
+import signal
+import threading
 import time
 
+import gymnasium as gym
 import numpy as np
 import torch
 
 import robocas_ms3
+from robocas_ms3.core.errors import LayoutError
 
 STATE_ONLY = {"render_backend": "none", "control_mode": "pd_joint_delta_pos", "obs_mode": "state"}
 HORIZON = 4
@@ -35,3 +39,77 @@ def gone(pids: list[int]) -> bool:
             return True
         time.sleep(0.05)
     return False
+
+
+class OwnError(Exception):
+    """Of a user's wrapper; made of two words."""
+
+    def __init__(self, what: str, code: int) -> None:
+        super().__init__(what, code)
+
+
+class Unsendable(Exception):
+    """Pickles, and can't be read again."""
+
+    def __init__(self, what: str, where: str) -> None:
+        super().__init__(f"{what} {where}")
+
+
+class Misbehaves(gym.Wrapper):
+    """First number of an action: 2 an error, 3 one that can't be sent, 4 the process is killed, 5 takes 3 s.
+
+    6: a lock in the info; 7 takes an hour.
+    """
+
+    def step(self, action):
+        what = round(float(action[0]))
+        if what == 2:
+            raise OwnError("gripper fell off", 7)
+        if what == 3:
+            raise Unsendable("lost", "somewhere")
+        if what == 4:
+            os.kill(os.getpid(), signal.SIGKILL)
+        if what in (5, 7):
+            time.sleep(3 if what == 5 else 3600)
+        *result, info = self.env.step(action)
+        return *result, {**info, "lock": threading.Lock()} if what == 6 else info
+
+
+class DiesWhenMade(gym.Wrapper):
+    def __init__(self, env):
+        os.kill(os.getpid(), signal.SIGSEGV)
+
+
+class Wins(gym.Wrapper):
+    """Succeeds at step 2 of an episode alone, where the first number of the action is positive."""
+
+    def step(self, action):
+        obs, _, _, truncated, info = self.env.step(action)
+        won = (info["elapsed_steps"] == 2) & bool(action[0] > 0)
+        info = {**info, "success": won, "note": f"step {int(info['elapsed_steps'])}", "more": torch.ones(1, 2)}
+        if won:
+            info["of_some"] = torch.ones(1)
+        return obs, won.float(), won.clone(), truncated, info
+
+
+class LacksLayouts(gym.Wrapper):
+    """There is no layout for seed 5, nor every other time without a seed if the last one was ``draws_none_after``."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.times = 0
+        base, layouts = env.unwrapped, env.unwrapped.seeds.layouts
+
+        def fussy(objects, seed):
+            if seed == 5:
+                raise LayoutError("no object qualifies as the target", where="layout")
+            return layouts(objects, seed)
+
+        base.seeds.layouts = fussy
+
+    def reset(self, *, seed=None, options=None):
+        if seed is None and self.unwrapped._main_seed[0] == options.get("draws_none_after"):
+            self.times += 1
+            if self.times % 2:
+                raise LayoutError("none was drawn", where="layout")
+        return self.env.reset(seed=seed, options=options)
