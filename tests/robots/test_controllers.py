@@ -137,7 +137,7 @@ def velocity_profile(distance: float, dt: float) -> np.ndarray:
 
 @pytest.mark.parametrize("control_freq", [20, 5])
 def test_planned_motion_is_tracked_smoothly_and_the_base_is_held(make_env, control_freq):
-    env, agent = make_env(control_freq=control_freq)
+    env, agent = make_env(control_freq=control_freq, fresh=True)
     start = np.array(MOBILE_PANDA.arm_evaluation_start)
     direction = np.array([1.0, -0.6, 0.8, 0.5, -0.8, -0.9, 1.0])
     qvel, base = [], []

@@ -128,7 +128,7 @@ def project(camera: dict, point: np.ndarray) -> tuple[float, float]:
 
 def test_gripper_holds_a_box(make_env):
     """A free 0.3 kg box, 5 cm wide, held against gravity, swung about, and let go."""
-    env, agent = make_env()
+    env, agent = make_env(fresh=True)
     scene = env.unwrapped.scene
     arm = MOBILE_PANDA.arm_evaluation_start
     builder = env.unwrapped.scene.create_actor_builder()
