@@ -85,11 +85,7 @@ class ProtocolPlan(StrictModel):
 
 
 def read_plan(path: Path) -> ProtocolPlan:
-    """Read a plan. Files that it names are in its folder, or where the command runs.
-
-    Raises:
-        EvaluationError: it is none.
-    """
+    """Read a plan. Files that it names are in its folder, or where the command runs."""
     try:
         data = load_yaml(path)
     except (OSError, DocumentError) as error:

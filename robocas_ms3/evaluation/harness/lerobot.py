@@ -82,13 +82,7 @@ class RoboCASEnvConfig(EnvConfig):
         return {}
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, Any]]:
-        """Make the vector environments, ``{task: {0: environment}}``; ``use_async_envs`` is ignored.
-
-        Raises:
-            EvaluationError: no task is named, or the settings don't fit the protocol.
-            DatasetError: there is no render device.
-            RobocasError: another process writes to a folder of the results.
-        """
+        """Make the vector environments, ``{task: {0: environment}}``; ``use_async_envs`` is ignored."""
         from robocas_ms3.evaluation.harness.protocol_env import ProtocolVectorEnv
         from robocas_ms3.evaluation.settings import EvaluationSettings
 

@@ -38,12 +38,6 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         spec: cameras, action convention and rate.
         settings: protocol; ``tasks`` names the task; number of envs, where they run, split, name of the policy; folder
             for a result that ``robocas eval report`` reads, if ``out`` names one.
-
-    Raises:
-        EvaluationError: the protocol has no such task or split, the policy does not fit it, N > 1 and the task has
-            several configurations, or the folder holds a result.
-        DatasetError: there are cameras, and no render device.
-        RobocasError: another process or environment writes to the folder.
     """
 
     def __init__(self, spec: PolicySpec, settings: EvaluationSettings) -> None:
@@ -87,9 +81,6 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         Args:
             seed: of the first env, whose successors the other envs get, or one per env; None: the episodes after
                 those of the last reset.
-
-        Raises:
-            ValueError: there are more or fewer seeds than envs, or one is None.
         """
         first: Any = self._next if seed is None else seed
         seeds = [first + env for env in range(self.num_envs)] if np.ndim(first) == 0 else list(first)
@@ -112,13 +103,7 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
     def step(
         self, actions: ArrayLike
     ) -> tuple[dict[str, Any], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        """Step the envs whose episodes run, by actions (N, A).
-
-        Raises:
-            ValueError: the actions have another shape.
-            EvaluationError: there was no reset.
-            WorkerDied: a process of the environment died.
-        """
+        """Step the envs whose episodes run, by actions (N, A)."""
         acts = np.asarray(actions, np.float32)
         if acts.shape != self.action_space.shape:
             raise ValueError(f"actions: expected {self.action_space.shape}, found {acts.shape}")

@@ -44,10 +44,6 @@ class RoboCAS:
         convention: meaning of the actions, one of ``evaluation.policy.CONVENTIONS``.
         reference: what motions are relative to: ``tcp`` or ``target``.
         rate_hz: actions per second; None: the protocol's.
-
-    Raises:
-        EvaluationError: there is no such protocol, or the other arguments do not fit it.
-        DatasetError: there are cameras, and no render device.
     """
 
     def __init__(

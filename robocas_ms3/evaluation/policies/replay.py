@@ -104,10 +104,6 @@ class ReplayPolicy(TrackPolicy):
 
     Args:
         trajectory: HDF5 file of joint targets (``pd_joint_pos``), with its JSON file next to it.
-
-    Raises:
-        EvaluationError: its actions are no joint targets.
-        DatasetError: it can't be read.
     """
 
     def __init__(self, trajectory: Path) -> None:

@@ -69,9 +69,6 @@ class RemotePolicy:
 
     Args:
         address: ``ws://host:port``, with options (`read_address`).
-
-    Raises:
-        EvaluationError: no such server, or its policy's specification is missing or invalid.
     """
 
     def __init__(self, address: str) -> None:

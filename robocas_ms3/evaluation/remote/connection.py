@@ -112,9 +112,6 @@ async def open_connection(url: str, connect_s: float, *, pings: bool) -> tuple[C
     """Connect to a policy server and read its metadata; retry for ``connect_s`` while there is no server.
 
     ``pings``: whether the server answers websocket pings during inference.
-
-    Raises:
-        EvaluationError: no server answers in time, or its metadata are an error text or invalid.
     """
     deadline, warned = time.monotonic() + connect_s, False
     while True:

@@ -10,14 +10,13 @@ import pytest
 pytest.importorskip("websockets")
 pytest.importorskip("msgpack")
 
-from counting_env import CountingEnv
+from counting_env import CountingEnv, play
 from remote_ends import IN_A_HURRY, Told, a_start, answering, serving, some_observations, talking
 
 from robocas_ms3.core.errors import EvaluationError, PolicyFailed
 from robocas_ms3.evaluation.remote.client import RemotePolicy
 from robocas_ms3.evaluation.remote.connection import MAX_ANSWER
 from robocas_ms3.evaluation.remote.wire import pack, unpack
-from robocas_ms3.evaluation.rollout import EndConditions, EpisodeBatch, rollout
 
 
 @pytest.mark.parametrize(
@@ -158,23 +157,14 @@ class Stumbling(Told):
         return super().act(observations)
 
 
-def play(policy, count=7, envs=1):
-    batch = EpisodeBatch(CountingEnv(envs, 4, steps=True), policy.spec, EndConditions(10), 0.05, refill=True)
-    starts = [a_start(-1, episode=number) for number in range(count)]
-    return {one.start.episode: one for one in rollout(batch, policy, starts)}
-
-
-def test_a_run_continues_after_episodes_in_which_the_policy_fails():
+def test_a_run_continues_after_episodes_in_which_the_policy_fails_and_ends_without_a_server():
+    env, starts = CountingEnv(1, 4, steps=True), [a_start(-1, episode=number) for number in range(7)]
     with serving(Stumbling()) as url:
-        played = play(RemotePolicy(url))
+        remote = RemotePolicy(f"{url}?{IN_A_HURRY}")
+        played = {one.start.episode: one for one in play(env, remote, starts, 10)}
     assert {number: one.steps for number, one in played.items()} == {0: 4, 1: 4, 2: 0, 3: 4, 4: 4, 5: 0, 6: 4}
     assert {number for number, one in played.items() if one.error} == {2, 5}
     assert played[2].error == "the server failed: RuntimeError: out of memory"
-
-
-def test_a_run_ends_when_its_server_can_not_be_reached_again():
-    with serving(Told()) as url:
-        remote = RemotePolicy(f"{url}?{IN_A_HURRY}")
     with pytest.raises(EvaluationError, match="no server within 0.5 s"):
-        play(remote, count=50)
+        play(env, remote, starts, 10)
     remote.close()

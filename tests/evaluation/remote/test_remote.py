@@ -14,7 +14,7 @@ import pytest
 pytest.importorskip("websockets")
 pytest.importorskip("msgpack")
 
-from counting_env import CountingEnv
+from counting_env import CountingEnv, play
 from remote_ends import CAMERA, IN_A_HURRY, Told, a_start, answering, serving, some_observations
 
 from robocas_ms3.core.errors import EvaluationError, PolicyFailed
@@ -25,7 +25,6 @@ from robocas_ms3.evaluation.remote.connection import Address, read_address
 from robocas_ms3.evaluation.remote.messages import batch_limit, message_bytes, observation_message, read_request
 from robocas_ms3.evaluation.remote.server import PolicyServer, ServedFiles
 from robocas_ms3.evaluation.remote.wire import MAX_BYTES
-from robocas_ms3.evaluation.rollout import EndConditions, EpisodeBatch, rollout
 
 ALL = PolicySpec(cameras={"base_camera": CAMERA}, depth=True, state=True, rate_hz=10, reference="tcp")
 PAGE = Path(__file__).resolve().parents[3] / "docs/remote_policies.md"
@@ -70,20 +69,19 @@ class SharedNoise(Told):
         return noise * observations.tcp_in_base[:, None] + noise.mean()
 
 
-def play(policy):
+def play_eight(policy):
     """Play eight episodes in three envs that end after different numbers of steps."""
     env = CountingEnv(3, np.array([3, 4, 7]), steps=True)
     starts = [a_start(-1, episode=number, seed=number) for number in range(8)]
-    batch = EpisodeBatch(env, policy.spec, EndConditions(9), 0.05, refill=True)
-    return [replace(one, inference_seconds=0.0) for one in rollout(batch, policy, starts)], env.actions
+    return [replace(one, inference_seconds=0.0) for one in play(env, policy, starts, 9)], env.actions
 
 
 def test_a_remote_run_is_equal_to_a_local_run_bit_for_bit():
     local, served = SharedNoise(), SharedNoise()
-    expected, expected_actions = play(local)
+    expected, expected_actions = play_eight(local)
     with serving(served) as url:
         remote = RemotePolicy(url)
-        played, actions = play(remote)
+        played, actions = play_eight(remote)
         remote.close()
     assert served.calls == local.calls
     assert any(envs != sorted(envs) for _, envs in local.calls), "the order of rows would not be tested"
