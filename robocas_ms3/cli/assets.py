@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -129,8 +129,7 @@ def import_scans(command: ImportScans) -> int:
     settings = ImportSettings(command.units, command.up, masses, command.licence, command.attribution)
     from robocas_ms3.cli.terminal import say
 
-    with _inspecting(command) as inspect:
-        jobs = scan_jobs(command.source, settings, inspect, lambda reason: say(f"skipped {reason}"))
+    jobs = scan_jobs(command.source, settings, partial(_inspect, command), lambda reason: say(f"skipped {reason}"))
     return _make(jobs, command, out, "scan")
 
 
@@ -138,8 +137,7 @@ def import_graspnet(command: ImportGraspNet) -> int:
     with mesh_tools():
         from asset_tools.graspnet.importer import graspnet_jobs
     out = _target(command.pack)
-    with _inspecting(command) as inspect:
-        jobs = graspnet_jobs(command.root, command.ids, inspect)
+    jobs = graspnet_jobs(command.root, command.ids, partial(_inspect, command))
     return _make(jobs, command, out, "GraspNet object")
 
 
@@ -147,8 +145,7 @@ def import_ycb(command: ImportYCB) -> int:
     with mesh_tools():
         from asset_tools.import_ycb import ycb_jobs
     out = _target(command.pack)
-    with _inspecting(command) as inspect:
-        jobs = ycb_jobs(command.root, command.ids, inspect)
+    jobs = ycb_jobs(command.root, command.ids, partial(_inspect, command))
     return _make(jobs, command, out, "YCB object")
 
 
@@ -194,19 +191,14 @@ def build(command: Build) -> int:
     return status
 
 
-@contextmanager
-def _inspecting(command: _Making) -> Iterator[Any]:
-    """Yield a function that inspects models before they are imported, with a progress bar."""
+def _inspect(command: _Making, models: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Inspect models before they are imported, with a progress bar."""
     from asset_tools.inspection import inspect_models
     from robocas_ms3.cli.bars import Bar
 
     with Bar("models read", transient=True) as shown:
-
-        def inspect(models: Mapping[str, Any]) -> Mapping[str, Any]:
-            shown.start(len(models))
-            return inspect_models(models, command.jobs, shown.advance)
-
-        yield inspect
+        shown.start(len(models))
+        return inspect_models(models, command.jobs, shown.advance)
 
 
 def _target(name: str) -> Path:
