@@ -5,20 +5,14 @@ from __future__ import annotations
 import json
 
 import pytest
-import synthetic
+from synthetic import RayCaster, write_trajectory
 
 
 @pytest.fixture(scope="session")
-def made_up():
-    """The module that makes trajectories and pictures for the tests of datasets."""
-    return synthetic
-
-
-@pytest.fixture(scope="session")
-def run_folder(made_up, tmp_path_factory):
+def run_folder(tmp_path_factory):
     """A run of three episodes: seed 4 failed once before, seed 9 was given up."""
     folder = tmp_path_factory.mktemp("run")
-    path = made_up.write_trajectory(folder / "trajectory.h5", seeds=(3, 4, 5), failed=(1,))
+    path = write_trajectory(folder / "trajectory.h5", seeds=(3, 4, 5), failed=(1,))
     metadata = json.loads(path.with_suffix(".json").read_text())
     metadata["episodes"][1]["robocas"]["attempts"] = 2
     path.with_suffix(".json").write_text(json.dumps(metadata))
@@ -32,22 +26,14 @@ def run_folder(made_up, tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def folder(run_folder, made_up, tmp_path_factory):
+def folder(run_folder, tmp_path_factory):
     """The same as a RoboCAS folder of all three, small pictures, nobody may change it."""
     from robocas_ms3.datasets.writing.convert import convert
     from robocas_ms3.datasets.writing.settings import ConversionSettings
 
     out = tmp_path_factory.mktemp("folder") / "dataset"
-    convert(
-        ConversionSettings(
-            run_folder / "trajectory.h5",
-            out,
-            open_renderer=made_up.RayCaster,
-            embeddings=False,
-            video=False,
-            include_failed=True,
-        )
-    )
+    settings = {"open_renderer": RayCaster, "embeddings": False, "video": False, "include_failed": True}
+    convert(ConversionSettings(run_folder / "trajectory.h5", out, **settings))
     (out / "failures.jsonl").write_bytes((run_folder / "failures.jsonl").read_bytes())
     return out
 

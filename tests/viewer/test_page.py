@@ -243,18 +243,14 @@ def test_a_trajectory_shows_traces_and_says_how_to_get_images(opened, serve, run
     assert page.text_content("#clock").startswith("step 22 / 22")
 
 
-@pytest.mark.parametrize("static", [False, True])
-def test_a_damaged_episode_is_shown_as_such(opened, serve, folder, tmp_path, static):
+def test_a_damaged_episode_is_shown_as_such(opened, serve, folder, tmp_path):
     spoilt = shutil.copytree(folder, tmp_path / "spoilt")
     for number, new in ((0, {"recorded": "x", "layout": {"poses": 3}}), (1, {"seed": {}, "objects": 7, "target": []})):
         path = spoilt / f"episode_000000{number}/scene.json"
         path.write_text(json.dumps({**json.loads(path.read_text()), **new}))
     (spoilt / "episode_0000002/scene.json").write_text("[]")
     (spoilt / "episode_0000002/episode_info.npz").write_bytes(b"PK")
-    if static:
-        export(open_source(spoilt), tmp_path / "page", width=32)
-    url = (tmp_path / "page/index.html").as_uri() if static else serve(open_source(spoilt)).url
-    page = load(opened, url)
+    page = load(opened, serve(open_source(spoilt)).url)
     assert page.text_content("#damage") == (
         "Damaged and left out: scene.json, layout.poses: expected a list, found 3;"
         ' scene.json, recorded: expected an object, found "x"'

@@ -5,6 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
+from synthetic import STEPS, RayCaster, make_states, write_trajectory
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.sources.reader import Dataset
@@ -65,13 +66,13 @@ def test_episodes_and_seeds_that_were_given_up_are_listed(request, made):
         assert "`robocas convert trajectory.h5" in index["note"]
 
 
-def test_an_episode_of_a_trajectory(run_folder, made_up):
+def test_an_episode_of_a_trajectory(run_folder):
     episode = open_source(run_folder / "trajectory.h5").episode(1)
-    states = made_up.make_states(4)
+    states = make_states(4)
     assert set(episode) == EPISODE
-    steps = made_up.STEPS + 1
+    steps = STEPS + 1
     assert episode["steps"] == len(episode["times"]) == steps
-    assert episode["times"][-1] == pytest.approx(made_up.STEPS / 20)
+    assert episode["times"][-1] == pytest.approx(STEPS / 20)
     assert all(len(s["values"]) == steps for p in episode["plots"] for s in p["series"])
     robot = states["articulations"]["robocas_mobile_panda"]
     np.testing.assert_allclose(series(episode, "Arm joints"), robot[:, 16:23], atol=1e-5)
@@ -127,9 +128,9 @@ def test_an_episode_of_a_folder(folder):
     assert [f["stage"] for f in episode["failures"]] == ["grasp"]
 
 
-def test_a_seed_means_a_scene_of_its_own_environment_only(run_folder, folder, made_up, tmp_path):
+def test_a_seed_means_a_scene_of_its_own_environment_only(run_folder, folder, tmp_path):
     """Seeds 4 and 9 failed at one task; another task's episodes of the same seeds have nothing to do with it."""
-    other = made_up.write_trajectory(tmp_path / "trajectory.h5", seeds=(4, 9), steps=24)
+    other = write_trajectory(tmp_path / "trajectory.h5", seeds=(4, 9), steps=24)
     metadata = json.loads(other.with_suffix(".json").read_text())
     metadata["env_info"]["env_id"] = "robocas_ms3:RoboCASOpenPick-v1"
     other.with_suffix(".json").write_text(json.dumps(metadata))
@@ -138,17 +139,8 @@ def test_a_seed_means_a_scene_of_its_own_environment_only(run_folder, folder, ma
     both = shutil.copytree(folder, tmp_path / "both")
     (both / "failures.jsonl").unlink()
     for path in (run_folder / "trajectory.h5", other):
-        convert(
-            ConversionSettings(
-                path,
-                both,
-                open_renderer=made_up.RayCaster,
-                embeddings=False,
-                video=False,
-                include_failed=True,
-                append=True,
-            )
-        )
+        settings = {"open_renderer": RayCaster, "embeddings": False, "video": False, "include_failed": True}
+        convert(ConversionSettings(path, both, append=True, **settings))
     for scene in both.glob("*/scene.json"):  # the frames' source has one task
         change = {"task": "open_pick"} if "OpenPick" in scene.read_text() else {}
         scene.write_text(json.dumps({**json.loads(scene.read_text()), **change}))

@@ -102,19 +102,6 @@ def test_videos_are_the_same_files(source, out):
         prepare(source, out, embed)
 
 
-def test_another_format_is_refused(source, tmp_path):
-    convert_lerobot(ConversionSettings(source, tmp_path / "old", lerobot_version="2.1"))
-    with pytest.raises(DatasetError, match="no LeRobot dataset of ours"):
-        prepare(tmp_path / "old", tmp_path / "out", None)
-    assert not (tmp_path / "out").exists()
-
-
-def test_without_language(source, tmp_path):
-    prepare(source, tmp_path / "out", None)
-    assert EMBEDDING not in pq.read_table(tmp_path / "out" / DATA).column_names
-    assert EMBEDDING not in json.loads((tmp_path / "out/meta/info.json").read_text())["features"]
-
-
 @pytest.mark.parametrize("key, value", [("action", np.nan), ("action.base", 0.02)])
 def test_nan_and_a_base_that_drives_are_refused(source, tmp_path, key, value):
     spoiled = tmp_path / "spoiled"
@@ -129,11 +116,14 @@ def test_nan_and_a_base_that_drives_are_refused(source, tmp_path, key, value):
     assert not (tmp_path / "out").exists()
 
 
-def test_what_is_no_dataset_is_one_line(tmp_path, capsys):
-    assert main([str(tmp_path), str(tmp_path / "out"), "--no-language"]) == 1
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert "no LeRobot dataset of ours" in said
+def test_other_datasets_are_refused_in_one_line(source, tmp_path, capsys):
+    convert_lerobot(ConversionSettings(source, tmp_path / "old", lerobot_version="2.1"))
+    for path in (tmp_path, tmp_path / "old"):
+        assert main([str(path), str(tmp_path / "out"), "--no-language"]) == 1
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1
+        assert "no LeRobot dataset of ours" in said
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_disk_without_links_gets_copies(source, tmp_path, monkeypatch):
@@ -141,7 +131,9 @@ def test_a_disk_without_links_gets_copies(source, tmp_path, monkeypatch):
         raise OSError("no links here")
 
     monkeypatch.setattr(module.os, "link", refuse)
-    prepare(source, tmp_path / "out", None)
+    prepare(source, tmp_path / "out", None)  # without language
+    assert EMBEDDING not in pq.read_table(tmp_path / "out" / DATA).column_names
+    assert EMBEDDING not in json.loads((tmp_path / "out/meta/info.json").read_text())["features"]
     for path in (path for path in source.rglob("*.mp4") if "_depth" not in str(path)):
         copy = tmp_path / "out" / path.relative_to(source)
         assert copy.read_bytes() == path.read_bytes()

@@ -134,24 +134,6 @@ def test_an_output_that_exists_is_left_alone(trajectory, tmp_path):
     assert LeRobotDataset(out).info["total_episodes"] == 3
 
 
-def test_an_episode_with_an_error_is_converted_on_resume(trajectory, tmp_path):
-    class Breaking(RayCaster):
-        def frames(self, recording, samples):
-            for step, frame in enumerate(super().frames(recording, samples)):
-                if recording.seed == 5 and step == 3:
-                    raise DatasetError("it broke")
-                yield frame
-
-    out, whole = tmp_path / "out", tmp_path / "whole"
-    with pytest.raises(DatasetError, match="it broke"):
-        convert_lerobot(ConversionSettings(trajectory, out, open_renderer=Breaking))
-    assert [path.name for path in sorted((out / ".parts").iterdir())] == ["episode_0000000", "plan.json"]
-    done = convert(trajectory, out)
-    assert (done.kept, [e.number for e in done.episodes]) == (1, [1])
-    convert(trajectory, whole)
-    assert files_of(out) == files_of(whole)
-
-
 def test_an_imported_folder_can_be_resumed(dataset, tmp_path):
     """Nobody knows its recordings, so its episodes are told by their arrays."""
     for path in [dataset / "conversion.json", *dataset.glob("*/scene.json")]:

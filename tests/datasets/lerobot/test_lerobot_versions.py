@@ -113,18 +113,6 @@ def test_statistics_are_those_of_the_data(versions):
     np.testing.assert_allclose(mean, frames.mean(axis=(0, 1, 2)) / 255, atol=0.02)
 
 
-def test_texts_of_version_0_5(versions):
-    dataset = LeRobotDataset(versions / "0.5")
-    assert dataset.tasks == [f"grasp the cube {seed} on the table and move it to the basket" for seed in (3, 4, 5)]
-    assert [row["tasks"] for row in dataset.rows] == [[text] for text in dataset.tasks]
-    columns = dataset.episode(2).columns
-    assert columns["task_index"].ravel().tolist() == [2] * 7
-    subgoals = [dataset.subtasks[i] for i in columns["subtask_index"][:, 0]]
-    assert subgoals == ["grasp the cube 5 on the table"] * 3 + ["Drop the cube 5 into the basket"] * 4
-    types = dataset.episode(2).table.column("subgoal_type").to_pylist()
-    assert types == ["move and grasp"] * 3 + ["transfer object"] * 4
-
-
 def test_language_and_outcome_of_version_0_6(versions):
     table = pq.read_table(versions / "0.6" / DATA)
     assert table.column("next.done").to_pylist() == ([False] * 6 + [True]) * 3
