@@ -45,7 +45,7 @@ class EpisodeMetrics:
 
     def reset(self, envs: Any) -> None:
         self._sums[envs] = 0
-        self._near, self._in_v0 = _cleared(self._near, envs), _cleared(self._in_v0, envs)
+        self._near[envs] = self._in_v0[envs] = False
         self._tcp[envs] = self._tcp_pos()[envs]
         self._moment = None
         if self._retrieval is not None:
@@ -88,19 +88,13 @@ class EpisodeMetrics:
         at this moment, where there is a basket. Of search also ``retrieval``, `RetrievalOrder.read`.
         """
         order = {} if self._retrieval is None else {"retrieval": self._retrieval.read()}
-        v0 = {} if self._env.model.basket is None else {"success_v0": as_tensor(self._in_v0)}
+        v0 = {} if self._env.model.basket is None else {"success_v0": as_tensor(self._in_v0).clone()}
         return {"sums": as_tensor(self._sums).clone(), **v0, **order}
 
 
 def read_sum(info: dict[str, Any], name: str) -> Any:
     """Return one column of an info's ``sums`` by name, (N,)."""
     return info["sums"][:, SUMS.index(name)]
-
-
-def _cleared(values: Any, envs: Any) -> Any:
-    changed = values.clone() if isinstance(values, torch.Tensor) else values.copy()
-    changed[envs] = 0
-    return changed
 
 
 class RetrievalOrder:
