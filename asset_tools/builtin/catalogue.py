@@ -25,7 +25,7 @@ FOLDER = Path(__file__).parent / "products"
 
 
 class Formula(StrictModel):
-    """A function by its name (``kind``); the other keys are its keyword arguments, and checked as these."""
+    """A function, or a class of functions, by its name (``kind``); the other keys are its keyword arguments."""
 
     function: ClassVar[Callable[..., Any]]
 
@@ -34,14 +34,15 @@ class Formula(StrictModel):
     def __call__(self, *given: Any) -> Any:
         """What the function makes of it."""
         named = {key: getattr(self, key) for key in type(self).model_fields if key != "kind"}
-        return type(self).function(*given, **named)
+        function = type(self).function
+        return function(**named)(*given) if isinstance(function, type) else function(*given, **named)
 
 
 def _any_of(functions: Iterable[Callable[..., Any]]) -> Any:
     """Type of a key that names one of these."""
     kinds: list[Any] = []
     for function in functions:
-        kind = function.__name__.removeprefix("paint_")
+        kind = function.__name__.removeprefix("paint_").lower()
         types = get_type_hints(function, include_extras=True)
         fields: dict[str, Any] = {"kind": (Literal[kind], ...)}
         for name, parameter in inspect.signature(function).parameters.items():
@@ -65,7 +66,7 @@ ShapeFormula = _any_of(
 PaintFormula = _any_of(
     (
         *(labels.paint_carton, labels.paint_wrapped, labels.paint_tube, labels.paint_soap, labels.paint_mug),
-        *(skins.paint_fruit, skins.paint_banana, toys.paint_racquetball, toys.paint_rubiks_cube),
+        *(skins.Fruit, skins.paint_banana, toys.paint_racquetball, toys.paint_rubiks_cube),
     )
 )
 MODELS: dict[str, Callable[[], Model]] = {

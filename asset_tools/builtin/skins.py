@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from PIL import Image
 
@@ -9,27 +11,11 @@ from asset_tools.builtin.mesh import Shape
 from asset_tools.builtin.textures import Colour, Painter, blend, noise
 
 
-def paint_fruit(
-    shape: Shape,
-    rng: np.random.Generator,
-    *,
-    base: Colour,
-    blush: Colour,
-    blush_amount: float = 0.5,
-    streaks: float = 0.0,
-    poles: Colour | None = None,
-    crown: Colour | None = None,
-    speckle: Colour | None = None,
-    pores: float = 0.0,
-    bloom: Colour | None = None,
-    groove: float = 0.0,
-    stem: Colour = (92, 62, 34),
-) -> Image.Image:
+@dataclass(frozen=True, kw_only=True)
+class Fruit:
     """Skin and stem of a round fruit.
 
-    Args:
-        shape: with a ``skin`` region.
-        rng: source of variation.
+    Attributes:
         base, blush: ground colour, and the colour of its sunny side.
         blush_amount: how much of the surface is blushed, 0 to 1.
         streaks: how strongly the blush runs in lines from stem to bottom.
@@ -41,43 +27,58 @@ def paint_fruit(
         groove: how much darker the groove along the front is, as a fraction of the brightness.
         stem: its colour.
     """
-    painter = Painter(shape, rng, base)
-    angle, level = painter.grid("skin")
-    polar = np.pi * (1 - level)[:, None]
-    points = np.stack(
-        np.broadcast_arrays(np.sin(polar) * np.cos(angle), np.sin(polar) * np.sin(angle), np.cos(polar)), axis=-1
-    )
-    side = points @ np.array([0.5, -0.8, 0.3])
-    amount = blush_amount - 0.5 + 0.55 * side + 0.35 * noise(points, rng, frequency=0.5)
-    if streaks:
-        lines = points * np.array([1.0, 1.0, 0.12]) / np.maximum(np.sin(polar), 0.15)[..., None]
-        amount = amount + streaks * noise(lines, rng, frequency=3.0, octaves=4)
-    colours = blend(1 / (1 + np.exp(-5 * amount)), base, blush)
-    if poles:
-        cap = np.exp(-(((1 - np.abs(points[..., 2])) / 0.09) ** 2))
-        colours = blend(cap * (0.8 + 0.2 * noise(points, rng, frequency=2.0)), colours, poles)
-    if crown:
-        ragged = 0.22 * noise(points, rng, frequency=1.2)
-        colours = blend(0.9 / (1 + np.exp(-9 * (points[..., 2] - 0.72 + ragged))), colours, crown)
-    if bloom:
-        film = (
-            0.55
-            + 0.6 * noise(points, rng, frequency=1.1)
-            + 0.25 * noise(points, rng, frequency=8.0, octaves=1, waves=30)
+
+    base: Colour
+    blush: Colour
+    blush_amount: float = 0.5
+    streaks: float = 0.0
+    poles: Colour | None = None
+    crown: Colour | None = None
+    speckle: Colour | None = None
+    pores: float = 0.0
+    bloom: Colour | None = None
+    groove: float = 0.0
+    stem: Colour = (92, 62, 34)
+
+    def __call__(self, shape: Shape, rng: np.random.Generator) -> Image.Image:
+        """Paint a shape with a ``skin`` region."""
+        painter = Painter(shape, rng, self.base)
+        angle, level = painter.grid("skin")
+        polar = np.pi * (1 - level)[:, None]
+        points = np.stack(
+            np.broadcast_arrays(np.sin(polar) * np.cos(angle), np.sin(polar) * np.sin(angle), np.cos(polar)), axis=-1
         )
-        colours = blend(np.clip(0.42 * film, 0, 0.6), colours, bloom)
-    if groove:
-        off_front = np.angle(np.exp(1j * (angle - np.pi)))[None, :]
-        colours = colours * (1 - groove * np.exp(-((off_front / 0.09) ** 2)) * np.sin(polar))[..., None]
-    if speckle:
-        spots = noise(points, rng, frequency=9.0, octaves=1, waves=40)
-        colours = blend(np.clip(6 * (spots - 0.72), 0, 0.75), colours, speckle)
-    if pores:
-        colours = colours * (1 + pores * noise(points, rng, frequency=14.0, octaves=2, waves=40))[..., None]
-    colours = colours * (1 + 0.05 * noise(points, rng, frequency=1.5))[..., None]
-    painter.put("skin", np.clip(colours, 0, 255).astype(np.uint8))
-    painter.fill("stem", stem)
-    return painter.image()
+        side = points @ np.array([0.5, -0.8, 0.3])
+        amount = self.blush_amount - 0.5 + 0.55 * side + 0.35 * noise(points, rng, frequency=0.5)
+        if self.streaks:
+            lines = points * np.array([1.0, 1.0, 0.12]) / np.maximum(np.sin(polar), 0.15)[..., None]
+            amount = amount + self.streaks * noise(lines, rng, frequency=3.0, octaves=4)
+        colours = blend(1 / (1 + np.exp(-5 * amount)), self.base, self.blush)
+        if self.poles:
+            cap = np.exp(-(((1 - np.abs(points[..., 2])) / 0.09) ** 2))
+            colours = blend(cap * (0.8 + 0.2 * noise(points, rng, frequency=2.0)), colours, self.poles)
+        if self.crown:
+            ragged = 0.22 * noise(points, rng, frequency=1.2)
+            colours = blend(0.9 / (1 + np.exp(-9 * (points[..., 2] - 0.72 + ragged))), colours, self.crown)
+        if self.bloom:
+            film = (
+                0.55
+                + 0.6 * noise(points, rng, frequency=1.1)
+                + 0.25 * noise(points, rng, frequency=8.0, octaves=1, waves=30)
+            )
+            colours = blend(np.clip(0.42 * film, 0, 0.6), colours, self.bloom)
+        if self.groove:
+            off_front = np.angle(np.exp(1j * (angle - np.pi)))[None, :]
+            colours = colours * (1 - self.groove * np.exp(-((off_front / 0.09) ** 2)) * np.sin(polar))[..., None]
+        if self.speckle:
+            spots = noise(points, rng, frequency=9.0, octaves=1, waves=40)
+            colours = blend(np.clip(6 * (spots - 0.72), 0, 0.75), colours, self.speckle)
+        if self.pores:
+            colours = colours * (1 + self.pores * noise(points, rng, frequency=14.0, octaves=2, waves=40))[..., None]
+        colours = colours * (1 + 0.05 * noise(points, rng, frequency=1.5))[..., None]
+        painter.put("skin", np.clip(colours, 0, 255).astype(np.uint8))
+        painter.fill("stem", self.stem)
+        return painter.image()
 
 
 def paint_banana(shape: Shape, rng: np.random.Generator) -> Image.Image:
