@@ -15,7 +15,7 @@ from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PositiveInt, TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, PositiveInt, TypeAdapter, ValidationError
 
 from robocas_ms3.core.errors import EvaluationError, WireError
 from robocas_ms3.core.paths import protocols_dir
@@ -31,17 +31,9 @@ DEFAULT_BATCH, LARGEST_BATCH = 64, 256  # envs
 FILE_NAME_PARTS = 3  # of a file's name in messages: folder of the protocol, folder in it, file
 _LARGEST_ACTION = 1e3  # m or rad; physics breaks far below it
 _OTHER_BYTES = 8 * 2**20  # of a request, besides images
-_MAX_DESCRIPTION = 2**20  # characters of JSON
 _POLICY_SPEC = TypeAdapter(PolicySpec)
 _Text = Annotated[str, Field(max_length=10_000)]
 _Number = Annotated[int, Field(ge=0, le=2**32 - 1)]
-
-
-def _as_json(description: Any) -> Any:
-    text = json.dumps(description, default=str)
-    if len(text) > _MAX_DESCRIPTION:
-        raise ValueError(f"expected {_MAX_DESCRIPTION} characters of JSON at most, found {len(text)}")
-    return json.loads(text)
 
 
 class ServerMetadata(BaseModel):
@@ -49,7 +41,7 @@ class ServerMetadata(BaseModel):
 
     Attributes:
         spec: what the policy declares, as a message has it; None: not announced.
-        policy: description of the policy, JSON values.
+        policy: description of the policy.
         max_batch: number of envs that a batched request may have; None: no batched requests.
         answers_pings: whether the server answers websocket pings during inference.
     """
@@ -57,7 +49,7 @@ class ServerMetadata(BaseModel):
     model_config = ConfigDict(strict=True, frozen=True)
 
     spec: Any = Field(default=None, alias="robocas_wants")
-    policy: Annotated[Any, BeforeValidator(_as_json)] = Field(default=None, alias="robocas_policy")
+    policy: JsonValue = Field(default=None, alias="robocas_policy")
     max_batch: PositiveInt | None = Field(default=None, alias="robocas_max_batch")
     answers_pings: bool = Field(default=False, alias="robocas_answers_pings")
 

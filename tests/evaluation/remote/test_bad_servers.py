@@ -104,8 +104,9 @@ WANTS = (
         *(pack({"robocas_wants": wants}) for wants in WANTS),
         *(pack({"robocas_max_batch": value}) for value in (0, -1, True, 1.5, "8", [])),
         pack({"robocas_answers_pings": 1}),
+        pack({"robocas_policy": {"weights": b"no text"}}),
     ],
-    ids=range(16),
+    ids=range(17),
 )
 def test_bad_metadata_are_an_error_before_anything_is_played(first):
     def talk(socket):
