@@ -146,7 +146,6 @@ class LayoutCache:
             return None
 
     def table_path(self, engine: Engine) -> Path:
-        """Return the path of an engine's table."""
         return self.folder / f"table-{engine}.npy"
 
     def write_table(self, engine: Engine, pairs: Iterable[Pair]) -> LayoutTable | None:
@@ -177,7 +176,6 @@ class LayoutCache:
             yield
 
     def path(self, objects_seed: int, seed: int) -> Path:
-        """Return the path of a layout's file."""
         name = f"{seed:010d}" if seed == objects_seed else f"{seed:010d}-of-{objects_seed:010d}"
         return self.folder / f"{seed // _FOLDER_SIZE:07d}" / f"{name}.npz"
 
@@ -207,7 +205,6 @@ class LayoutCache:
     __call__ = get
 
     def missing(self, pairs: Iterable[Pair]) -> list[Pair]:
-        """Return the pairs whose layouts do not exist yet."""
         return [pair for pair in pairs if not self.path(*pair).is_file()]
 
     def fill(self, pairs: Iterable[Pair], jobs: int = 1) -> Generator[tuple[Pair, str], None, None]:
@@ -260,7 +257,6 @@ def pairs_of(seeds: Iterable[int], objects: Iterable[int] | None = None) -> list
 
 
 def count_layouts(folder: Path) -> int:
-    """Return how many layouts the folder of a cache holds."""
     return sum(1 for path in folder.glob("*/*.npz") if not path.name.startswith("."))
 
 

@@ -73,7 +73,6 @@ LayoutSource = Callable[[int, int], Layout]
 
 
 def write_layout(layout: Layout, path: Path) -> None:
-    """Write a layout as ``.npz``."""
     values = {f.name: getattr(layout, f.name) for f in fields(Layout)}
     arrays: dict[str, Any] = {
         name: np.zeros(0) if value is None else np.asarray(value) for name, value in values.items()

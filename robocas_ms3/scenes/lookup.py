@@ -21,7 +21,6 @@ OPENED_AT_MOST = {"prismatic": 0.95, "revolute": 0.8}  # share of a joint's rang
 
 
 def fixture_pose(config: PoseConfig) -> Array:
-    """Return 4x4 of a pose in the configuration."""
     return planar(*config.position, np.deg2rad(config.yaw_deg))
 
 
@@ -52,7 +51,6 @@ def find_furniture(pack: Pack, asset_id: str, *, key: str) -> LoadedFurniture:
 
 
 def find_room(pack: Pack, config: TaskConfig) -> LoadedFurniture:
-    """Return the room."""
     room = find_furniture(pack, config.room.asset, key="room.asset")
     known, random = room.asset.finishes, config.randomisation
     for part, finish in config.room.finishes.items():
@@ -67,7 +65,6 @@ def find_room(pack: Pack, config: TaskConfig) -> LoadedFurniture:
 
 
 def find_container(pack: Pack, config: PlacedConfig) -> LoadedFurniture:
-    """Return the basket."""
     basket = find_furniture(pack, config.asset, key="basket.asset")
     if basket.asset.inner is None or basket.asset.mass is None:
         raise ConfigError("basket.asset: this furniture is no movable container", found=config.asset)
@@ -75,7 +72,6 @@ def find_container(pack: Pack, config: PlacedConfig) -> LoadedFurniture:
 
 
 def find_objects(pack: Pack, config: TaskConfig) -> list[str]:
-    """Return the ids of the configuration's objects."""
     wanted = sorted(pack.objects) if config.objects.ids == "all" else config.objects.ids
     ids = resolve_ids(pack, wanted, key="objects.ids")
     if not ids:
@@ -189,7 +185,6 @@ def check_joints(config: TaskConfig, furniture: dict[str, LoadedFurniture]) -> N
 
 
 def find_opened_joint(config: TaskConfig, furniture: dict[str, LoadedFurniture]) -> Joint:
-    """Return the joint of the configuration's handle."""
     opening = config.opening
     assert opening is not None
     asset = furniture[opening.furniture].asset

@@ -73,7 +73,6 @@ class LayoutTable:
         return np.where(there, self._states[rows, columns], State.LACKING), rows, columns
 
     def state(self, pair: Pair) -> State:
-        """Return the state of a layout."""
         return State(int(self.places(np.array([pair[0]]), np.array([pair[1]]))[0][0]))
 
     def pairs(self, *states: State) -> list[Pair]:
@@ -163,7 +162,6 @@ class FrozenLayouts:
 
 
 def write_frozen(path: Path, names: Collection[str], layouts: Mapping[int, Layout]) -> None:
-    """Write layouts by their seeds; see `FrozenLayouts`."""
     _save(path, _records(sorted(names), {(seed, seed): layout for seed, layout in layouts.items()}))
 
 

@@ -60,7 +60,6 @@ class Arrangement:
 
     @property
     def names(self) -> list[str]:
-        """Names of the K objects."""
         return [asset.asset.name for asset in self.assets]
 
     @cached_property
@@ -135,7 +134,6 @@ class TargetRule:
 
 
 def target_rule(task: str) -> TargetRule:
-    """Return the rule of a task."""
     return load(TASKS[task].target)
 
 

@@ -41,7 +41,6 @@ class PinholeCamera:
 
     @property
     def focal_length(self) -> float:
-        """Focal length, pixels."""
         return self.height / 2 / np.tan(self.fov_y / 2)
 
     def rays(self, box: PixelBox) -> Array:

@@ -70,7 +70,6 @@ def check_engine(
 
 
 def sim_config(num_envs: int, config: TaskConfig) -> SimConfig:
-    """Return the default configuration of the simulation of a number of envs."""
     distractors = config.randomisation.distractors
     objects = config.objects.count + (distractors.count[1] if distractors else 0)
     return SimConfig(
@@ -140,7 +139,6 @@ class EngineErrors:
         self._log: IO[bytes] | None = None
 
     def open(self) -> None:
-        """Start reading, unless it has."""
         if self._log is None:
             self._log = open(_log_standard_error(), "rb", buffering=0)  # noqa: SIM115  (closed in `close`)
             self._log.seek(0, os.SEEK_END)
@@ -159,7 +157,6 @@ class EngineErrors:
                 raise SimulationError("PhysX ran out of memory on the GPU", found=found, fix=_FIX)
 
     def close(self) -> None:
-        """Stop reading."""
         if self._log is not None:
             self._log.close()
 

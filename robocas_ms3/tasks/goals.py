@@ -121,7 +121,6 @@ class InBasket(Goal):
         self._drop = native(torch.cat([(low + high)[:2] / 2, high[2:] + _DROP_HEIGHT]))  # in the basket's frame
 
     def holds(self, centers: Array, basket: Array | None) -> Array:
-        """See `Goal`."""
         return terms.inside_box(centers, *_split(basket), *self._inside)
 
     def point(self, basket: Array | None) -> Array:
@@ -130,12 +129,10 @@ class InBasket(Goal):
         return position + rotations.rotate(quaternion, self._drop)
 
     def measures(self, basket: Array | None) -> dict[str, Array]:
-        """``basket_stands``."""
         start = native(self.env.basket_at_start)
         return {"basket_stands": terms.stands(*_split(basket), *_split(start))}
 
     def lost(self, basket: Array | None, measures: dict[str, Array]) -> Array | None:
-        """See `Goal`."""
         if known_all_true(measures["basket_stands"]):  # as nearly always
             return None
         start = native(self.env.basket_at_start)
@@ -178,7 +175,6 @@ class InBasket(Goal):
         }
 
     def penalties(self, now: Moment) -> dict[str, Array]:
-        """``basket_shift``."""
         return {"basket_shift": rewards.shift(_split(now.basket)[0], native(self.env.basket_at_start)[:, :3])}
 
 

@@ -39,7 +39,6 @@ class RewardTable:
 
     @cached_property
     def total(self) -> float:
-        """The reward of a success."""
         return sum(self.weights.values())
 
     def index(self, stage: str) -> int:
@@ -156,7 +155,6 @@ class DenseReward:
         self.last_level: torch.Tensor | None = None
 
     def reset(self, envs: Any) -> None:
-        """Forget the last action and reward of some envs."""
         for last in (self.last_action, self.last_level):
             if last is not None:
                 last[envs] = torch.nan

@@ -213,7 +213,6 @@ class PeriodicSchedule:
         self._indices = []
 
     def advance(self) -> None:
-        """Note that all envs make a control step."""
         self._step += 1
 
     def due(self) -> torch.Tensor:

@@ -185,12 +185,10 @@ class EpisodeSeeds:
         return found.with_rows(tabled, Starts.of(others, device))
 
     def forget_layouts(self, envs: NDArray[np.int64]) -> None:
-        """Forget the layouts of some envs, whose seeds have changed."""
         for env in envs.tolist():
             self._found.pop(env, None)
 
     def layout(self, env: int) -> Layout:
-        """Return the layout of an env's episode."""
         if env not in self._found:
             objects_seed = int(self.objects_seeds[env])
             self._found[env] = self._first_possible(

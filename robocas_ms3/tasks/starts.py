@@ -36,7 +36,6 @@ class Starts:
 
     @classmethod
     def of(cls, layouts: Sequence[Layout], device: torch.device | str) -> Starts:
-        """Stack layouts, one per env."""
 
         def poses(matrices: list[NDArray[np.float64]]) -> torch.Tensor:
             return torch.from_numpy(to_wxyz(np.stack(matrices)).astype(np.float32)).to(device)

@@ -45,7 +45,6 @@ class CameraConfig(StrictModel):
         return self
 
     def change(self, camera: CameraSpec) -> CameraSpec:
-        """Return a camera with the values that are given."""
         given: dict[str, Any] = self.model_dump(exclude_none=True)
         angles, fov = given.pop("rotation_deg", None), given.pop("fov_deg", None)
         if angles is not None:

@@ -106,13 +106,11 @@ class SynonymTexts(StrictModel):
 
 @lru_cache
 def instruction_texts() -> InstructionTexts:
-    """Return the templates of all tasks and the phrases of all relations."""
     return read_texts(INSTRUCTIONS_FILE, InstructionTexts)
 
 
 @lru_cache
 def synonym_texts() -> SynonymTexts:
-    """Return the synonyms of objects and supports."""
     return read_texts(SYNONYMS_FILE, SynonymTexts)
 
 

@@ -126,7 +126,6 @@ class RoboCASVectorEnv(ManiSkillVectorEnv):
         )
 
     def step(self, actions: Any) -> tuple[Any, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Step every env; see ``ManiSkillVectorEnv``."""
         obs, reward, terminated, truncated, info = super().step(actions)
         if "final_observation" in info:  # ManiSkill's name
             info["final_obs"] = info.pop("final_observation")
@@ -148,11 +147,9 @@ class NumpyVectorEnv(gym.vector.VectorWrapper):
     """A vector environment whose tensors are NumPy arrays."""
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Reset; see the environment."""
         return _as_numpy(self.env.reset(seed=seed, options=options))
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Step every env; see the environment."""
         return _as_numpy(self.env.step(actions))
 
 

@@ -23,7 +23,7 @@ from robocas_ms3.core.errors import VectorEnvError, WorkerDied, WorkerStartError
 from robocas_ms3.core.worker_process import NO_LIMITS, Limits, ProcessDied
 from robocas_ms3.tasks.seeds import following_seeds
 from robocas_ms3.tasks.vector.pinned_workers import PinnedWorkers
-from robocas_ms3.tasks.vector.worker import EnvDescription, EnvSettings, EnvWorker, Rows, join_rows, replace_rows
+from robocas_ms3.tasks.vector.worker import EnvSettings, EnvWorker, Rows, join_rows, replace_rows
 
 
 class ProcessEnv(gym.Env):
@@ -50,6 +50,9 @@ class ProcessEnv(gym.Env):
         pids: ids of the worker processes.
         elapsed_steps: (N,) int32 control steps since each env's reset; don't write to it.
     """
+
+    single_observation_space: gym.Space
+    single_action_space: gym.Space
 
     def __init__(
         self,
@@ -94,9 +97,8 @@ class ProcessEnv(gym.Env):
                 )
                 raise died from error
         self.pids = self._workers.pids
-        made: EnvDescription = self._ask([("describe",)] * workers)[0]
-        self.render_mode, self.metadata = made.render_mode, made.metadata
-        self.single_observation_space, self.single_action_space = made.observation_space, made.action_space
+        for name in ("render_mode", "metadata", "single_observation_space", "single_action_space"):
+            setattr(self, name, self.call(name)[0])
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
@@ -161,7 +163,6 @@ class ProcessEnv(gym.Env):
         return tuple(pickle.loads(result) for results in answers for result in results)
 
     def get_language_instruction(self) -> list[str]:
-        """Return the instruction of each env."""
         return [text for texts in self.call("get_language_instruction") for text in texts]
 
     def render(self) -> Any:

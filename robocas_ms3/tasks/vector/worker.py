@@ -46,16 +46,6 @@ class EnvSettings:
     at_work: str
 
 
-@dataclass(frozen=True)
-class EnvDescription:
-    """What the environments of a worker have in common."""
-
-    observation_space: gym.Space
-    action_space: gym.Space
-    render_mode: str | None
-    metadata: dict[str, Any]
-
-
 class EnvWorker:
     """Runs commands, ``(method, *arguments)``; returns a pair of what was found, and the first error if any.
 
@@ -81,19 +71,11 @@ class EnvWorker:
             failed.reraise()
 
     def run(self, command: tuple[Any, ...]) -> tuple[Any, RemoteError | None]:
-        """Run a command."""
         name, *arguments = command
         return getattr(self, name)(*arguments)
 
     def close(self) -> None:
-        """Close the environments."""
         self._each(self._envs, lambda env: self._envs[env].close())
-
-    def describe(self) -> tuple[EnvDescription, None]:
-        """Return what the environments have in common."""
-        env = next(iter(self._envs.values()))
-        observations, actions = (env.get_wrapper_attr(f"single_{kind}_space") for kind in ("observation", "action"))
-        return EnvDescription(observations, actions, env.render_mode, dict(env.metadata)), None
 
     def step(self, actions: np.ndarray) -> tuple[Rows, RemoteError | None]:
         """Step all environments with actions (E, A)."""
