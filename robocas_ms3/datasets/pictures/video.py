@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import ExitStack, closing
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -97,25 +97,13 @@ def contact_sheet(
 
 
 class Preview:
-    """Video and row of the contact sheet of an episode that is being written; the video appears whole, at the end."""
+    """Video and row of the contact sheet of an episode that is being written; see `open_preview`."""
 
-    def __init__(self, root: Path, drawing: EpisodeDrawing, *, row: bool) -> None:
+    def __init__(self, video: Any, drawing: EpisodeDrawing, *, row: bool) -> None:
         self.row: NDArray[np.uint8] | None = None
-        self._path = make_folder(root / schema.PREVIEW_FOLDER) / f"{schema.episode_folder(drawing.number)}.mp4"
-        self._drawing, self._wanted = drawing, drawing.row_steps if row else []
+        """(H, W, 3) RGB, after the last frame, if it is wanted."""
+        self._video, self._drawing, self._wanted = video, drawing, drawing.row_steps if row else []
         self._shown: dict[int, Images] = {}
-        self._stack = ExitStack()
-        self._video: Any = None
-
-    def __enter__(self) -> Preview:
-        with ExitStack() as stack:
-            tmp = stack.enter_context(replacing(self._path))
-            self._video = stack.enter_context(open_video(tmp, self._drawing.rate_hz, *_PREVIEW_OPTIONS, quality=6))
-            self._stack = stack.pop_all()
-        return self
-
-    def __exit__(self, *error: Any) -> None:
-        self._stack.__exit__(*error)
 
     def add(self, step: int, rgb: Images) -> None:
         self._video.append_data(self._drawing.frame(step, rgb, PREVIEW_PANEL))
@@ -123,6 +111,14 @@ class Preview:
             self._shown[step] = rgb
             if step == self._wanted[-1]:
                 self.row, self._shown = self._drawing.row(self._shown), {}
+
+
+@contextmanager
+def open_preview(root: Path, drawing: EpisodeDrawing, *, row: bool) -> Iterator[Preview]:
+    """Open the preview of an episode, with a row of the contact sheet or without; the video appears whole."""
+    path = make_folder(root / schema.PREVIEW_FOLDER) / f"{schema.episode_folder(drawing.number)}.mp4"
+    with replacing(path) as tmp, open_video(tmp, drawing.rate_hz, *_PREVIEW_OPTIONS, quality=6) as video:
+        yield Preview(video, drawing, row=row)
 
 
 def on_sheet(numbers: Iterable[int]) -> tuple[int, ...]:

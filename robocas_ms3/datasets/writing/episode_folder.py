@@ -20,7 +20,7 @@ from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.drawing import EpisodeDrawing
 from robocas_ms3.datasets.pictures.headers import has_both_ends
 from robocas_ms3.datasets.pictures.stored import Pictures, write_picture
-from robocas_ms3.datasets.pictures.video import Preview
+from robocas_ms3.datasets.pictures.video import open_preview
 from robocas_ms3.datasets.sources.arrays import read_arrays, with_embeddings
 from robocas_ms3.datasets.sources.files import CAMERA_LIMIT
 from robocas_ms3.datasets.sources.protocol import CameraModel, Frame
@@ -51,7 +51,7 @@ class FolderWriter(EpisodeWriter):
         with ExitStack() as stack:
             if self.sheet is not None:
                 drawing = EpisodeDrawing(wanted.number, arrays, wanted.given.source.rate_hz)
-                preview = stack.enter_context(Preview(self.out, drawing, row=wanted.number in self.sheet))
+                preview = stack.enter_context(open_preview(self.out, drawing, row=wanted.number in self.sheet))
             encode = stack.enter_context(_encoder())
             in_order = stack.enter_context(_encoder(1))  # frames of a video
             for step, frame in enumerate(frames):

@@ -84,18 +84,15 @@ class ConversionInput:
         }
 
     def frames(self, episode: SourceEpisode) -> Generator[Frame, None, None]:
+        """Yield the images of every step; close the generator unless it is read to the end."""
         with closing(episode.images(self.pictures)) as frames:
             for step, frame in enumerate(frames):
-                for camera, size in self.sizes.items():
-                    for kind, images in (("rgb", frame.rgb), ("depth", frame.depth)):
-                        if camera in images and _size(images[camera]) != size:
-                            raise DatasetError(
-                                "this image is not of the dataset's size",
-                                where=f"{episode.where}, {camera}/{kind}, step {step}",
-                                expected="{} x {}".format(*size),
-                                found="{} x {}".format(*_size(images[camera])),
-                                fix=SEE_VALIDATE,
-                            )
+                for kind, images in (("rgb", frame.rgb), ("depth", frame.depth)) if self.sizes else ():
+                    for camera, image in images.items():
+                        expected, found = (f"{w} x {h}" for w, h in (self.sizes[camera], _size(image)))
+                        if found != expected:
+                            what, where = "not of the dataset's size", f"{episode.where}, {camera}/{kind}, step {step}"
+                            raise DatasetError(what, where=where, expected=expected, found=found, fix=SEE_VALIDATE)
                 yield frame
 
     def close(self) -> None:
@@ -107,21 +104,16 @@ def open_input(settings: ConversionSettings) -> ConversionInput:
     if settings.is_trajectory:
         rendered = open_trajectory(settings)
         return ConversionInput(rendered, rendered.pictures, settings.include_failed)
-    source, wanted = open_source(settings.source), settings.pictures
-    where = source.root
-    if settings.rate_hz is not None and abs(settings.rate_hz - source.rate_hz) > 1e-9:
-        found, expected = f"{settings.rate_hz:g}", f"{source.rate_hz:g} Hz"
-        fix = "Convert the trajectory at this rate."
-        raise DatasetError("a dataset keeps its rate", where=where, expected=expected, found=found, fix=fix)
+    source, wanted = open_source(settings.source, rate_hz=settings.rate_hz), settings.pictures
     first = source.episode(source.numbers[0])
-    pictures = wanted.choose(first.cameras, where)
+    pictures = wanted.choose(first.cameras, source.root)
     sizes = {camera: _size(first.rgb(camera, 0)) for camera in pictures.cameras}
     different = sorted(set(sizes.values()))
     size = different[0] if len(different) == 1 else None
     if wanted.size not in (None, size):
         what, fix = "a dataset keeps the size of its images", "Convert the trajectory with this size."
         expected = ", ".join(f"{width} x {height}" for width, height in different)
-        raise DatasetError(what, where=where, expected=expected, found=list(wanted.size or ()), fix=fix)
+        raise DatasetError(what, where=source.root, expected=expected, found=list(wanted.size or ()), fix=fix)
     pictures = replace(pictures, size=size, depth=wanted.depth and source.has_depth)
     return ConversionInput(source, pictures, settings.include_failed, sizes)
 
@@ -137,21 +129,21 @@ def open_trajectory(settings: ConversionSettings) -> RenderedSource:
 
 
 def complete_arrays(episode: SourceEpisode) -> dict[str, NDArray]:
-    fix = "robocas validate says what is wrong."
+    """Return the arrays of an episode, or raise DatasetError if it lacks any that it must have."""
     try:
         arrays = episode.arrays
     except DAMAGED as error:
-        found = one_line(error)
-        raise DatasetError("these arrays can't be read", where=episode.where, found=found, fix=fix) from error
-    there = NEEDED & set(arrays)
-    for key in sorted(there):
+        what, found = "these arrays can't be read", one_line(error)
+        raise DatasetError(what, where=episode.where, found=found, fix=SEE_VALIDATE) from error
+    missing, lengths = sorted(NEEDED - set(arrays)), set()
+    for key in sorted(NEEDED & set(arrays)):
         if arrays[key].dtype.kind == "f" and not np.isfinite(arrays[key]).all():
             where = f"{episode.where}/{schema.EPISODE_FILE}, {key}"
             raise DatasetError("this array holds NaN or infinity", where=where, fix=SEE_VALIDATE)
-    missing, lengths = sorted(NEEDED - set(arrays)), {len(arrays[key]) for key in there if arrays[key].ndim}
+        lengths |= {len(arrays[key])} if arrays[key].ndim else set()
     if missing or lengths != {episode.steps}:
         found = f"no {', '.join(missing)}" if missing else f"lengths {sorted(lengths)}"
-        raise DatasetError("this episode is not complete", where=episode.where, found=found, fix=fix)
+        raise DatasetError("this episode is not complete", where=episode.where, found=found, fix=SEE_VALIDATE)
     return arrays
 
 

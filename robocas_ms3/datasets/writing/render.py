@@ -60,29 +60,25 @@ class EnvRenderer:
         self._check_scene(recording)
 
     def _check_scene(self, recording: Recording) -> None:
-        for name, expected, found in self._scene_differences(recording):
+        """Raise DatasetError if the rebuilt scene is not the recorded one."""
+
+        def refuse(name: str, expected: object, found: object) -> None:
             where = f"episode {recording.episode_id}, seed {recording.seed}{f', {name}' if name else ''}"
-            what, fix = (
-                "the seed builds another scene",
-                "Use the pack, configuration and versions it was recorded with.",
-            )
+            what, fix = "the seed builds another scene", "Use the pack, configuration and versions of the recording."
             raise DatasetError(what, where=where, expected=expected, found=found, fix=fix)
 
-    def _scene_differences(self, recording: Recording) -> Iterator[tuple[str, object, object]]:
-        """Yield name, expected and found of differences between the rebuilt and the recorded scene."""
         built = self._base.get_state_dict()
         for kind in ("actors", "articulations"):
             mine, theirs = set(built.get(kind, {})), set(recording.states.get(kind, {}))
             if mine != theirs:
-                yield "", sorted(theirs), sorted(mine)
-        placed = {} if recording.taken_over else recording.states.get("actors", {})
-        for name, states in placed.items():
+                refuse("", sorted(theirs), sorted(mine))
+        for name, states in () if recording.taken_over else recording.states.get("actors", {}).items():
             distance = float(np.linalg.norm(built["actors"][name][0, :3].cpu().numpy() - states[0, :3]))
             if distance > _SAME_PLACE:
-                yield name, "the recorded place", f"{distance * 1000:.1f} mm away"
+                refuse(name, "the recorded place", f"{distance * 1000:.1f} mm away")
         instruction = self._base.get_language_instruction()[0]
         if instruction != recording.instruction:
-            yield "", recording.instruction, instruction
+            refuse("", recording.instruction, instruction)
 
     def frames(self, recording: Recording, samples: NDArray[np.int64]) -> Iterator[Frame]:
         for index in samples:
