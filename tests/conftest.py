@@ -28,7 +28,6 @@ LONGEST = {
     "tests/asset_tools/builtin/test_builtin_shapes.py",
     "tests/datasets/writing/test_render.py",
     "tests/demos/test_generate.py",
-    "tests/evaluation/test_run.py",
     "tests/evaluation/test_weld.py",
     "tests/examples/test_examples.py",
     "tests/plans/test_run_plan.py",

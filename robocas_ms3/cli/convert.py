@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import fields
 from typing import TYPE_CHECKING
 
-from robocas_ms3.cli.interrupts import resumable
+from robocas_ms3.cli.options import resumable
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.words import count_of
 from robocas_ms3.datasets.writing.settings import Conversion, ConversionSettings

@@ -9,8 +9,7 @@ from typing import Annotated
 import tyro
 
 from robocas_ms3.cli import eval_results
-from robocas_ms3.cli.interrupts import resumable
-from robocas_ms3.cli.options import Repeated
+from robocas_ms3.cli.options import Repeated, resumable
 from robocas_ms3.core.words import count_of
 from robocas_ms3.evaluation.settings import EvaluationSettings
 

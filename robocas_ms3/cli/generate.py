@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING
 
-from robocas_ms3.cli.interrupts import resumable
+from robocas_ms3.cli.options import resumable
 from robocas_ms3.core.words import count_of
 from robocas_ms3.demos.settings import GenerateSettings
 

@@ -20,10 +20,9 @@ import platformdirs
 import tyro
 
 from robocas_ms3 import __version__
-from robocas_ms3.cli.interrupts import INTERRUPTED, heed_ctrl_c, leave
 from robocas_ms3.cli.options import with_absolute_paths
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.core.exits import no_exit
+from robocas_ms3.core.exits import INTERRUPTED, heed_ctrl_c, leave, no_exit
 from robocas_ms3.core.files import FULL
 from robocas_ms3.core.paths import ensure_home, is_writable, temporary_cache, variable_of
 from robocas_ms3.core.words import escape_log_lines, escape_tracebacks, printable

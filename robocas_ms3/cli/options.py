@@ -1,4 +1,4 @@
-"""Options of the commands: types for the settings dataclasses, and absolute paths.
+"""Options of the commands: types for the settings dataclasses, absolute paths, and what Ctrl-C says.
 
 Help texts of options with these types say themselves what happens without the option, so tyro adds no default.
 """
@@ -6,9 +6,11 @@ Help texts of options with these types say themselves what happens without the o
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import fields, is_dataclass, replace
+from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, ParamSpec, TypeVar
 
 import tyro
 
@@ -16,6 +18,7 @@ from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.core.paths import CACHE, DATA
 
 _T = TypeVar("_T")
+_P = ParamSpec("_P")
 _NO_DEFAULT = tyro.conf.arg(help_behavior_hint="")
 
 Maybe = Annotated[_T | None, _NO_DEFAULT]
@@ -59,3 +62,20 @@ def _absolute(value: Any) -> Any:
     if is_dataclass(value) and not isinstance(value, type):
         return replace(value, **{field.name: _absolute(getattr(value, field.name)) for field in fields(value)})
     return value
+
+
+def resumable(command: Callable[_P, int]) -> Callable[_P, int]:
+    """Decorate a command that continues its work when it is run again: Ctrl-C says so.
+
+    With ``overwrite`` in its settings, it continues without that.
+    """
+
+    @wraps(command)
+    def run(*args: _P.args, **kwargs: _P.kwargs) -> int:
+        try:
+            return command(*args, **kwargs)
+        except KeyboardInterrupt:
+            without = " without --overwrite" if any(getattr(cfg, "overwrite", False) for cfg in args) else ""
+            raise KeyboardInterrupt(f"the same command{without} continues") from None
+
+    return run

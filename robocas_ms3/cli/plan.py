@@ -10,8 +10,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from robocas_ms3.cli.interrupts import resumable
-from robocas_ms3.cli.options import CORES, Jobs, Maybe, Repeated
+from robocas_ms3.cli.options import CORES, Jobs, Maybe, Repeated, resumable
 from robocas_ms3.core.words import count_of
 
 

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from robocas_ms3.baselines.registry import BASELINES
-from robocas_ms3.cli.interrupts import resumable
-from robocas_ms3.cli.options import Maybe, Repeated
+from robocas_ms3.cli.options import Maybe, Repeated, resumable
 
 DESCRIPTION = """Train a baseline on demonstrations, for `robocas eval TASK --policy RUN`; docs/baselines.md.
 

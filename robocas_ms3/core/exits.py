@@ -8,7 +8,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from traceback import extract_tb
 from types import FrameType
@@ -16,36 +16,49 @@ from typing import Any, NoReturn
 
 from robocas_ms3.core.errors import ExtensionError
 
-Handler = Callable[[int, FrameType | None], Any]
-_PR_SET_PDEATHSIG = 1
+INTERRUPTED = 130
+"""Exit code of a program that Ctrl-C ended, as a shell reports it."""
+_TERMINATED = 143  # and of one that `timeout`, `kill` or a batch system ended
+_GRACE = 2.2  # s to end in: processes, files, policies
 _SECOND = 0.5  # s from one SIGINT to the next that is a second one; sooner, it is the same key pressed, sent twice
+_PR_SET_PDEATHSIG = 1
 
 
 class _CommandInterrupt:
-    """Ctrl-C of a command: its handler is called once; the second one ends the process if it was not called by then.
+    """Ctrl-C and SIGTERM of a command: the first ends it within seconds, later ones change nothing.
 
-    Python only notes a signal, and calls the handler when native code returns or a deferral ends. A thread that learns
-    of the first SIGINT at once ignores those of the next half second, and then restores the system's default.
+    Python only notes a signal, and calls the handler when native code returns or a deferral ends. Until then a second
+    SIGINT ends the process at once: a thread that learns of the first one ignores those of the next half second, and
+    then restores the system's default.
     """
 
     def __init__(self) -> None:
         self.installed = False
         self.protected = False  # from the second SIGINT too
-        self._handler: Handler = signal.default_int_handler
+        self.code = INTERRUPTED
         self._handled = threading.Event()
 
-    def install(self, handler: Handler) -> None:
-        read, write = os.pipe()
-        os.set_blocking(write, False)
-        signal.set_wakeup_fd(write, warn_on_full_buffer=False)
-        threading.Thread(target=self._watch, args=(read,), name="interrupts", daemon=True).start()
-        self._handler, self.installed = handler, True
-        signal.signal(signal.SIGINT, self.handle)
-        self.arm()
+    def install(self) -> None:
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not where a shell has it ignored
+            read, write = os.pipe()
+            os.set_blocking(write, False)
+            signal.set_wakeup_fd(write, warn_on_full_buffer=False)
+            threading.Thread(target=self._watch, args=(read,), name="interrupts", daemon=True).start()
+            self.installed = True
+            signal.signal(signal.SIGINT, self.handle)
+            self.arm()
+        if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
+            signal.signal(signal.SIGTERM, self.handle)
 
     def handle(self, number: int, frame: FrameType | None) -> None:
         self._handled.set()
-        self._handler(number, frame)
+        for one in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(one, signal.SIG_IGN)  # who is impatient would interrupt what ends the processes
+        self.code = _TERMINATED if number == signal.SIGTERM else INTERRUPTED
+        last = threading.Timer(_GRACE, os._exit, (self.code,))
+        last.daemon = True
+        last.start()
+        raise KeyboardInterrupt
 
     def waits(self) -> bool:
         return self.installed and signal.getsignal(signal.SIGINT) == self.handle
@@ -75,9 +88,16 @@ class _CommandInterrupt:
 _command = _CommandInterrupt()
 
 
-def handle_interrupt(handler: Handler) -> None:
-    """Install a command's handler of SIGINT; a second SIGINT ends the process while Python can't run the handler."""
-    _command.install(handler)
+def heed_ctrl_c() -> None:
+    """Let the first Ctrl-C or SIGTERM end this process, a command, within seconds; later ones change nothing."""
+    _command.install()
+
+
+def leave(code: int) -> NoReturn:
+    """Leave the process with an exit code, at once if it was interrupted."""
+    if code == INTERRUPTED:
+        end_process(_command.code)
+    sys.exit(code)
 
 
 @contextmanager
@@ -144,7 +164,7 @@ def exit_error(error: BaseException, source: str) -> ExtensionError:
     return ExtensionError("this code tried to end the process", where=source, found=f"{error!r}{line}", fix=fix)
 
 
-def _restore(number: int, handler: Handler) -> None:
+def _restore(number: int, handler: Any) -> None:
     signal.signal(number, handler)
-    if handler == _command.handle:
+    if number == signal.SIGINT and handler == _command.handle:
         _command.arm()

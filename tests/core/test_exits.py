@@ -21,8 +21,7 @@ PYTHONS_OWN = "import signal; signal.signal(signal.SIGINT, signal.default_int_ha
 NATIVE = """
 import hashlib
 from contextlib import nullcontext
-from robocas_ms3.cli.interrupts import heed_ctrl_c
-from robocas_ms3.core.exits import deferred_interrupts
+from robocas_ms3.core.exits import deferred_interrupts, heed_ctrl_c
 heed_ctrl_c()
 with deferred_interrupts(second_ends=False):
     pass
@@ -38,8 +37,7 @@ LONG_CALLS = {
 }
 STEP = """
 import hashlib
-from robocas_ms3.cli.interrupts import heed_ctrl_c
-from robocas_ms3.core.exits import deferred_interrupts
+from robocas_ms3.core.exits import deferred_interrupts, heed_ctrl_c
 heed_ctrl_c()
 try:
     with deferred_interrupts():
@@ -51,8 +49,7 @@ except KeyboardInterrupt:
 """
 WRITING = """
 import time
-from robocas_ms3.cli.interrupts import heed_ctrl_c
-from robocas_ms3.core.exits import deferred_interrupts
+from robocas_ms3.core.exits import deferred_interrupts, heed_ctrl_c
 heed_ctrl_c()
 try:
     with deferred_interrupts(second_ends=False):
@@ -80,10 +77,21 @@ try:
 except KeyboardInterrupt:
     print("handled", flush=True)
 """
+ENDING = """
+import sys, time
+from robocas_ms3.core.exits import INTERRUPTED, heed_ctrl_c, leave
+heed_ctrl_c()
+try:
+    print("ready", flush=True)
+    time.sleep(100)
+except KeyboardInterrupt:
+    time.sleep({seconds})  # ends processes
+    print("interrupted", file=sys.stderr)
+    leave(INTERRUPTED)
+"""
 UNSIGNALLED = """
-from robocas_ms3.cli.interrupts import heed_ctrl_c
 from robocas_ms3.core.errors import ExtensionError
-from robocas_ms3.core.exits import no_exit
+from robocas_ms3.core.exits import heed_ctrl_c, no_exit
 heed_ctrl_c()
 try:
     with no_exit("policy mine:Policy"):
@@ -99,8 +107,22 @@ def python(program: str) -> subprocess.Popen:
         [sys.executable, "-c", PYTHONS_OWN + program],
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
         text=True,
     )
+
+
+@pytest.mark.parametrize(
+    ("number", "code", "seconds", "said"),
+    [(signal.SIGINT, 130, 0.5, "interrupted\n"), (signal.SIGINT, 130, 100, ""), (signal.SIGTERM, 143, 100, "")],
+)
+def test_a_command_ends_once_and_soon_however_often_it_is_interrupted(number, code, seconds, said):
+    with python(ENDING.format(seconds=seconds)) as process:
+        assert process.stdout is not None and process.stdout.readline() == "ready\n"
+        for _ in range(3):
+            process.send_signal(number)
+            time.sleep(0.1)
+        assert (process.communicate(timeout=20)[1], process.returncode) == (said, code)
 
 
 @pytest.mark.parametrize(("around", "call"), LONG_CALLS.values(), ids=LONG_CALLS)
