@@ -35,7 +35,6 @@ class PageContent:
         source: reader of the episodes.
         kind: name of its format, for people.
         notes: remarks on the dataset, for people.
-        split: ``train`` or ``val`` by episode; None: as the source says.
     """
 
     scene_name = schema.SCENE_FILE
@@ -43,10 +42,8 @@ class PageContent:
     entry_name = schema.CONVERSION_FILE
     """File that holds ``entry`` of the source, for messages."""
 
-    def __init__(
-        self, source: EpisodeSource, kind: str, *, notes: Sequence[str] = (), split: Mapping[int, str] | None = None
-    ) -> None:
-        self.root, self.source, self._kind, self._split = source.root, source, kind, split
+    def __init__(self, source: EpisodeSource, kind: str, notes: Sequence[str] = ()) -> None:
+        self.root, self.source, self._kind = source.root, source, kind
         self.failures = Failures.read(self.root if self.root.is_dir() else self.root.parent)
         self._note = " ".join(filter(None, (*notes, self.failures.note)))
         self._reading = threading.Lock()
@@ -130,8 +127,6 @@ class PageContent:
         return {key: entry[key] for key in known if key in entry} if isinstance(entry, Mapping) else entry
 
     def _sides(self) -> Mapping[int, str]:
-        if self._split is not None:
-            return self._split
         train, _ = attempt(lambda: self.source.split("train"), [])
         val, _ = attempt(lambda: self.source.split("val"), [])
         return {**dict.fromkeys(train, "train"), **dict.fromkeys(val, "val")}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
@@ -62,9 +62,3 @@ def read_scene(read: Callable[[], Any], name: str) -> tuple[dict[str, Any], str]
     """Return the valid values of a ``scene.json``, or of what has some of its keys, and what is wrong with the rest."""
     (found, wrong), failed = attempt(lambda: valid_values(read(), name), ({}, ""))
     return found, f"{name}: {failed}" if failed else wrong
-
-
-def split_of(info: Mapping[str, Any]) -> dict[int, str]:
-    """Return the side of each episode that a dataset lists, "train" or "val"."""
-    sides = {side: info.get(f"{side}_eps") for side in ("train", "val")}
-    return {n: side for side, listed in sides.items() if isinstance(listed, list) for n in listed if type(n) is int}

@@ -22,7 +22,7 @@ from robocas_ms3.datasets.sources.reader import DEFAULT_RATE, Dataset
 from robocas_ms3.datasets.sources.trajectory import TrajectorySource
 from robocas_ms3.demos.recordings.reading import Recording, TrajectoryFile
 from robocas_ms3.viewer.content import PageContent
-from robocas_ms3.viewer.damage import attempt, read_object, readable, split_of
+from robocas_ms3.viewer.damage import attempt, read_object, readable
 from robocas_ms3.viewer.episode import ARM, ROLL_PITCH_YAW, XYZ, Plot, facts_of, plot, show_arrays
 from robocas_ms3.viewer.images import EncodedImage, check_inside
 
@@ -75,7 +75,7 @@ class FolderContent(PageContent):
         assumed = f"`rate_hz` of `{schema.CONVERSION_FILE}`: {wrong}; {DEFAULT_RATE:g} Hz is assumed."
         dataset.cameras, _ = attempt(lambda: dataset.cameras, dataset.episode(dataset.numbers[0]).cameras)
         notes = wrong_settings, assumed if wrong else "", wrong_info
-        super().__init__(dataset, "RoboCAS folder", notes=notes, split=split_of(dataset.info))
+        super().__init__(dataset, "RoboCAS folder", notes)
 
     def rgb(self, number: int, camera: str, step: int) -> EncodedImage:
         path = check_inside(self.dataset.episode(number).image_path(camera, "rgb", step), self.root)
@@ -102,10 +102,13 @@ class TrajectoryContent(PageContent):
                 task = task_of(file.env_info["env_id"])
                 self._entries = [{"task": task, **unread_entry(file, index)} for index in range(len(file.episodes))]
             self.recordings = TrajectorySource(path, rate_hz=file.control_freq, include_failed=True)
-        super().__init__(self.recordings, "trajectory file", notes=[_NO_IMAGES.format(name=path.name)], split={})
+        super().__init__(self.recordings, "trajectory file", [_NO_IMAGES.format(name=path.name)])
 
     def _entry(self, number: int) -> dict[str, Any]:
         return {key: self._entries[number][key] for key in ("task", "seed", "success", "target")}
+
+    def _sides(self) -> Mapping[int, str]:
+        return {}
 
     def _show(self, number: int, scene: Mapping[str, Any]) -> dict[str, Any]:
         episode = self.recordings.episode(number)
@@ -127,10 +130,11 @@ class LeRobotContent(PageContent):
             self.dataset = dataset = LeRobotDataset(root)
             _ = dataset.is_ours, dataset.lengths, dataset.rate_hz, dataset.cameras, dataset.has_depth
         self.entry_name, self._indices = lerobot.CONVERSION_FILE, {*lerobot.INDICES, lerobot.SUBTASK_INDEX.key}
-        dataset.settings, wrong_settings = read_object(lambda: dataset.settings, lerobot.CONVERSION_FILE)
+        settings, wrong_settings = read_object(lambda: dataset.settings, lerobot.CONVERSION_FILE)
+        dataset.settings = settings or {"train_eps": []}
         dataset.described, wrong_scenes = read_object(lambda: dataset.described, lerobot.SCENES_FILE)
         notes = wrong_scenes, wrong_settings
-        super().__init__(dataset, "LeRobot dataset", notes=notes, split=split_of(dataset.settings))
+        super().__init__(dataset, "LeRobot dataset", notes)
         self._decoded: OrderedDict[tuple[int, str, Kind, int], NDArray] = OrderedDict()  # the last used is last
 
     def _show(self, number: int, scene: Mapping[str, Any]) -> dict[str, Any]:
