@@ -43,7 +43,7 @@ def cut_off(path):
     path.write_bytes(path.read_bytes()[:-9])
 
 
-DAMAGES = {  # what is done to an episode's folder -> (file, what the message says)
+DAMAGES = {  # what is done to an episode's folder -> (file, what the validator finds)
     "NaN in rel_pos": (lambda e: spoil_array(e, "rel_pos", np.nan), "episode_info.npz, rel_pos", "found 3 others"),
     "infinite ee_pos": (lambda e: spoil_array(e, "ee_pos", np.inf), "episode_info.npz, ee_pos", "found 3 others"),
     "pickles": (
