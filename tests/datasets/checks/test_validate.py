@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from robocas_ms3.datasets.checks.dataset import validate
-from robocas_ms3.datasets.schema import EPISODE_INFO
 from robocas_ms3.datasets.sources.arrays import load_arrays
 
 NPZ = "episode_0000001/episode_info.npz"
@@ -68,12 +67,6 @@ def test_an_empty_folder(tmp_path):
         "conversion.json: expected this file (robocas import-robocas writes one), found no file",
         "data_info.json: expected this file, found no file",
     ]
-
-
-@pytest.mark.parametrize("spec", EPISODE_INFO, ids=lambda spec: spec.name)
-def test_every_key_is_missed(dataset, spec):
-    change(dataset, **{spec.name: None})
-    assert f"{NPZ}, {spec.name}: expected this key, found no such key" in found(dataset)
 
 
 @pytest.mark.parametrize(

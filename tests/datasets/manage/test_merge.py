@@ -155,7 +155,7 @@ def test_what_is_appended_leaves_a_split_of_texts_as_it_is(parts, tmp_path):
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_a_damaged_episode_stops_it_before_anything_is_written(parts, tmp_path, damage):
     part = spoiled(parts[0], tmp_path)
-    spoil, file, _ = DAMAGES[damage]
+    spoil, file = DAMAGES[damage]
     spoil(part / "episode_0000001")
     with pytest.raises(DatasetError) as error:
         merge([parts[1], part], tmp_path / "out")

@@ -193,7 +193,7 @@ def test_wrong_words(six, tmp_path, capsys):
 @pytest.mark.parametrize("damage", ["infinite ee_pos", "no archive"])
 def test_in_place_leaves_all_as_it_is_where_arrays_are_damaged(six, tmp_path, damage):
     root = shutil.copytree(six, tmp_path / "ds")
-    spoil, file, _ = DAMAGES[damage]
+    spoil, file = DAMAGES[damage]
     spoil(root / "episode_0000004")
     before = files_of(root)
     with pytest.raises(DatasetError, match=f"episode_0000004/{file}: this episode is damaged"):
