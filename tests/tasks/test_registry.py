@@ -76,7 +76,7 @@ def test_same_seed_same_scene_other_seed_other_scene(env):
     assert not torch.equal(env.unwrapped.get_state(), states[1])
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_layouts_are_settled_and_as_their_kind_says(env, seed):
     env.reset(seed=seed)
     base = env.unwrapped
@@ -125,8 +125,7 @@ def complaints(env_id: str, mode: str) -> tuple[str, list[str]]:
     return error, sorted({re.sub(r"\(<.*>\)", "", str(one.message)) for one in caught if "WARN" in str(one.message)})
 
 
-@pytest.mark.parametrize("mode", ["state", "rgb"])
-@pytest.mark.parametrize("name", sorted(TASKS))
+@pytest.mark.parametrize(("name", "mode"), [*((name, "state") for name in sorted(TASKS)), ("pick", "rgb")])
 def test_gymnasiums_checker_finds_nothing_that_it_does_not_find_in_pick_cube(name, mode, needs_renderer):
     import mani_skill.envs  # noqa: F401  (registers PickCube-v1)
 

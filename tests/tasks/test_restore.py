@@ -14,9 +14,10 @@ MODES = ("pd_joint_pos", "pd_joint_delta_pos", "pd_ee_delta_pose", "pd_ee_pose",
 FREE_FALL = 1e-5  # m, rad: contacts are found anew, and nothing else is
 
 
-@pytest.fixture(params=MODES)
+@pytest.fixture
 def env(request):
-    made = gym.make("RoboCASPick-v1", obs_mode="state_dict", control_mode=request.param, render_backend="none")
+    mode = getattr(request, "param", MODES[0])
+    made = gym.make("RoboCASPick-v1", obs_mode="state_dict", control_mode=mode, render_backend="none")
     yield made
     made.close()
 
@@ -44,6 +45,7 @@ def play(env, todo: list[np.ndarray]) -> tuple[torch.Tensor, dict, dict]:
     return env.unwrapped.agent.robot.get_qpos().clone(), observation, info
 
 
+@pytest.mark.parametrize("env", MODES, indirect=True)
 def test_what_follows_is_what_followed(env):
     base = env.unwrapped
     env.reset(seed=0)
