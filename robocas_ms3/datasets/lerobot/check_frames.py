@@ -20,7 +20,7 @@ from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.arrays import frame_columns, robocas_arrays
 from robocas_ms3.datasets.lerobot.language import EVENTS, PERSISTENT, Row, box_in, read_rows_of
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
-from robocas_ms3.datasets.lerobot.records import frame_columns as declared_columns
+from robocas_ms3.datasets.lerobot.records import declared_columns
 from robocas_ms3.datasets.lerobot.tables import faults, numbers, open_table, read_rows
 from robocas_ms3.datasets.sources.arrays import EpisodeArrays
 

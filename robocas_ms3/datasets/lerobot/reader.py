@@ -20,7 +20,7 @@ from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.arrays import robocas_arrays
 from robocas_ms3.datasets.lerobot.language import EVENTS, PERSISTENT, boxes_of, goals_of, read_rows_of
 from robocas_ms3.datasets.lerobot.metadata import Metadata
-from robocas_ms3.datasets.lerobot.records import CameraRecord, CamerasText, SceneText, frame_columns
+from robocas_ms3.datasets.lerobot.records import CameraRecord, CamerasText, SceneText, declared_columns
 from robocas_ms3.datasets.lerobot.tables import INTEGER, Column, check_columns, is_numeric, numbers, read_rows
 from robocas_ms3.datasets.lerobot.video import read_frames, to_depth
 from robocas_ms3.datasets.pictures.stored import Box
@@ -143,7 +143,7 @@ class LeRobotEpisode(SourceEpisode):
         return subgoal_runs(*self._subgoals()) if self.dataset.is_ours else []
 
     def _subgoals(self) -> tuple[list[str], list[str]]:
-        key, columns = schema.SUBTASK_INDEX.key, frame_columns(self.dataset.info["features"])
+        key, columns = schema.SUBTASK_INDEX.key, declared_columns(self.dataset.info["features"])
         if not self.dataset.has_language:
             columns[key] = Column(INTEGER, greatest=len(self.dataset.subtasks) - 1)
         check_columns(self.table, columns, Path(self.where))

@@ -200,7 +200,7 @@ def episode_columns(names: Iterable[str], features: Mapping[str, Any]) -> dict[s
     return columns
 
 
-def frame_columns(features: Mapping[str, Any]) -> dict[str, Column]:
+def declared_columns(features: Mapping[str, Any]) -> dict[str, Column]:
     columns: dict[str, Column] = {}
     for key, dtype in ((key, feature["dtype"]) for key, feature in features.items()):
         if dtype not in ("image", "video", "language"):
