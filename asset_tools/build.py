@@ -82,14 +82,7 @@ def _build_object(source: ObjectSource, folder: Path) -> ObjectAsset:
     moments, axes = principal_inertia(closed, source.mass)
     inertia = np.array(moments_of(moments))
     solid = Solid(hulls, source.mass, center, inertia, np.array(axes), source.friction)
-    rest = resting_poses(
-        hulls,
-        mass=source.mass,
-        center_of_mass=center,
-        inertia=inertia,
-        inertia_wxyz=axes,
-        friction=source.friction,
-    )
+    rest = resting_poses(solid)
     grasps, reason = source.grasps, ""
     if grasps is None:
         grasps = sample_grasps(closed, center, np.random.default_rng(zlib.crc32(source.id.encode())), count=GRASPS)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,71 +65,42 @@ class RestingPoses:
 
 @dataclass(frozen=True)
 class _Body:
-    hulls: Sequence[Array]
+    solid: Solid
     points: Array  # (K, 3) corners of the hull of everything
     cooked: Array  # (L, 3) the same of the shapes that the engine makes of it
-    mass: float
-    center_of_mass: Array
-    inertia: Array
-    inertia_wxyz: Array
-    friction: float
 
     def rest(self, up: Array) -> Array:
         """Pose (4, 4) that stands the object on the plane with a direction (3,) of its own frame up."""
         pose = np.eye(4)
         pose[:3, :3] = _turn_up(up)
-        pose[:2, 3] = -(pose[:2, :3] @ self.center_of_mass)
+        pose[:2, 3] = -(pose[:2, :3] @ self.solid.center_of_mass)
         # the engine's shapes touch the plane, but corners it dropped may not reach far below
         pose[2, 3] = max(-(self.cooked @ pose[2, :3]).min(), -(self.points @ pose[2, :3]).min() - BELOW)
         return pose
 
 
-def resting_poses(
-    hulls: list[Array],
-    *,
-    mass: float,
-    center_of_mass: Sequence[float] | Array,
-    inertia: Sequence[float] | Array,
-    inertia_wxyz: Sequence[float] | Array,
-    friction: float = 0.99,
-    minimum_probability: float = 0.02,
-) -> RestingPoses:
+def resting_poses(solid: Solid, minimum_probability: float = 0.02) -> RestingPoses:
     """Find the poses in which an object stays where it is put. The same input gives the same poses.
 
     Args:
-        hulls: vertices (V, 3) of each convex collision piece, m, in the object's frame.
-        mass: kg.
-        center_of_mass: (3,) m, in the object's frame.
-        inertia: (3,) principal moments about the centre of mass, kg m2.
-        inertia_wxyz: (4,) principal axes in the object's frame.
-        friction: of the object; the table's is 0.99.
+        solid: the object; the table's friction is 0.99.
         minimum_probability: rarer poses are left out, unless all are rare. Poses of one height count together: a
             cylinder has many on its side.
 
     Raises:
         AssetError: the hulls are flat, the centre of mass is outside of them, or no pose stays.
     """
-    center = np.asarray(center_of_mass, float)
-    vertices = np.concatenate([np.asarray(hull, float) for hull in hulls])
+    vertices = np.concatenate([np.asarray(hull, float) for hull in solid.hulls])
     try:
         points = vertices[ConvexHull(vertices).vertices]
         # the engine drops corners of detailed hulls: what is stable is decided on the shapes it really has
-        hull = ConvexHull(np.concatenate([_cooked(np.asarray(piece, float)) for piece in hulls]))
+        hull = ConvexHull(np.concatenate([_cooked(np.asarray(piece, float)) for piece in solid.hulls]))
     except (QhullError, ValueError, RuntimeError) as error:
         raise AssetError("the convex hulls enclose no volume", found=str(error).split("\n")[0]) from error
-    directions, probabilities, heights = stable_directions(hull, center)
+    directions, probabilities, heights = stable_directions(hull, solid.center_of_mass)
     kept = select_poses(directions, probabilities, heights, minimum_probability)
     probabilities = pool_probabilities(directions, probabilities, kept)
-    body = _Body(
-        hulls,
-        points,
-        hull.points[hull.vertices],
-        float(mass),
-        center,
-        np.asarray(inertia, float),
-        np.asarray(inertia_wxyz, float),
-        friction,
-    )
+    body = _Body(solid, points, hull.points[hull.vertices])
     settled, which = _settle(body, directions[kept])
     settled, which = _firm(body, settled, which)
     if not which:
@@ -162,7 +132,7 @@ def _settle(body: _Body, directions: Array) -> tuple[Array, list[int]]:
         the up directions (M, 3) that stay, and which of the given ones led there.
     """
     waiting, ups, found = list(range(len(directions))), directions.copy(), {}
-    points = np.stack([body.center_of_mass, np.zeros(3)])
+    points = np.stack([body.solid.center_of_mass, np.zeros(3)])
     for _ in range(ROUNDS):
         placed = np.array([turn @ body.rest(ups[i]) for i in waiting for turn in TURNS])
         ends = _simulate(body, placed + LIFT)
@@ -190,15 +160,14 @@ def _firm(body: _Body, directions: Array, which: list[int]) -> tuple[Array, list
     """Leave out poses that a touch would topple, unless there are no others; arguments and result as of `_settle`."""
     if len(directions) == 0:
         return directions, which
-    margins = np.array([toppling_angle(body.cooked, body.center_of_mass, up) for up in directions])
-    rocks = np.array([only_rocks(body.cooked - body.center_of_mass, up) for up in directions])
+    margins = np.array([toppling_angle(body.cooked, body.solid.center_of_mass, up) for up in directions])
+    rocks = np.array([only_rocks(body.cooked - body.solid.center_of_mass, up) for up in directions])
     firm = np.flatnonzero((margins >= min(MIN_TOPPLING_DEG, margins.max())) | rocks)
     return directions[firm], [which[i] for i in firm]
 
 
 def _simulate(body: _Body, starts: Array) -> Array:
     """Poses (N, 4, 4) one second after the object was put down in each of the poses (N, 4, 4), one object each."""
-    solid = Solid(body.hulls, body.mass, body.center_of_mass, body.inertia, body.inertia_wxyz, body.friction)
     offsets = places(len(starts))
     with engine_settings():
         scene = new_scene()
@@ -207,7 +176,7 @@ def _simulate(body: _Body, starts: Array) -> Array:
             add_ground(scene, offset)
             pose = start.copy()
             pose[:3, 3] += offset
-            objects.append(add_body(scene, solid, pose))
+            objects.append(add_body(scene, body.solid, pose))
         for _ in range(STEPS):
             scene.step()
         ends = np.array([pose_matrix(free) for free in objects])

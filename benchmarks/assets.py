@@ -59,12 +59,11 @@ def main(cfg: Benchmark) -> None:
             hulls = list(shape.pieces) or decompose(closed).hulls
         center = np.asarray(closed.center_mass)
         inertia, axes = principal_inertia(closed, spec.mass)
-        facts = {"mass": spec.mass, "center_of_mass": center, "inertia": inertia, "inertia_wxyz": np.array(axes)}
+        solid = Solid(hulls, spec.mass, center, np.array(inertia), np.array(axes))
         with timed("resting poses"):
-            rest = resting_poses(hulls, **facts)
+            rest = resting_poses(solid)
         with timed("grasps"):
             grasps = sample_grasps(closed, center, np.random.default_rng(0), count=800)
-        solid = Solid(hulls, **facts)
         with timed("quality"):
             hull_quality(closed, hulls, hollow=spec.hollow)
             drop_test(solid, rest.poses)

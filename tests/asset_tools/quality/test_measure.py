@@ -30,8 +30,7 @@ def but(**change):
 
 
 def annotate(mesh, solid, count=60):
-    facts = dict(mass=solid.mass, center_of_mass=solid.center_of_mass)
-    rest = resting_poses(list(solid.hulls), **facts, inertia=solid.inertia, inertia_wxyz=solid.inertia_wxyz)
+    rest = resting_poses(solid)
     grasps = sample_grasps(mesh, solid.center_of_mass, np.random.default_rng(0), count=count)
     return Annotations(
         resting_poses=rest.poses,

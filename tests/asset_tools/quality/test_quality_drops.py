@@ -12,8 +12,7 @@ IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 def listed(solid):
-    facts = dict(mass=solid.mass, center_of_mass=solid.center_of_mass)
-    return resting_poses(solid.hulls, **facts, inertia=solid.inertia, inertia_wxyz=solid.inertia_wxyz).poses
+    return resting_poses(solid).poses
 
 
 def standing(height):
