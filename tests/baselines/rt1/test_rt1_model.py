@@ -9,23 +9,9 @@ from hypothesis import strategies as st
 
 from robocas_ms3.baselines.rt1 import BASELINE
 from robocas_ms3.baselines.rt1.config import RT1Config
-from robocas_ms3.baselines.rt1.model import ActionBins, attention_mask, likeliest_tokens
+from robocas_ms3.baselines.rt1.model import ActionBins, likeliest_tokens
 from robocas_ms3.core.errors import TrainingError
 from robocas_ms3.core.strict import parse
-
-
-def test_the_attention_mask():
-    """Two frames of two image tokens and two predicted ones; tokens attend to image tokens before them."""
-    assert attention_mask(2, 2, 2).int().tolist() == [
-        [1, 0, 0, 0, 0, 0, 0, 0],
-        [1, 1, 0, 0, 0, 0, 0, 0],
-        [1, 1, 0, 0, 0, 0, 0, 0],
-        [1, 1, 0, 0, 0, 0, 0, 0],
-        [1, 1, 0, 0, 1, 0, 0, 0],
-        [1, 1, 0, 0, 1, 1, 0, 0],
-        [1, 1, 0, 0, 1, 1, 0, 0],
-        [1, 1, 0, 0, 1, 1, 0, 0],
-    ]
 
 
 @pytest.mark.parametrize("frame", [0, 3, 5])
