@@ -118,10 +118,6 @@ class Bar:
         elif done != self._done:
             self._show(done)
 
-    def next_of(self, count: int) -> None:
-        """Count one more item of ``count`` as done."""
-        self.at(self._done + 1, count)
-
     def _show(self, done: int) -> None:
         self._done = done
         about = speed(done, self._count, self._there, time.monotonic() - self._start)

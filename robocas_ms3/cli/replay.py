@@ -23,7 +23,7 @@ def main(settings: ReplaySettings) -> int:
     with Bar("episodes replayed") as shown:
         for result in replayed:
             done.append(result)
-            shown.next_of(total)
+            shown.at(len(done), total)
     for result in done:
         if not result.success:
             say(f"episode {result.episode_id} (seed {result.seed}): not successful")

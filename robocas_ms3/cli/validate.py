@@ -84,7 +84,7 @@ def _replay(root: Path, pack: str | None) -> ReplayReport:
 
     use_one_torch_thread()
     with Bar("episodes replayed", transient=True) as shown:
-        return replay_dataset(root, pack=pack, on_episode=lambda _, count: shown.next_of(count))
+        return replay_dataset(root, pack=pack, on_episode=shown.at)
 
 
 def _lines(report: ReplayReport) -> Iterator[str]:

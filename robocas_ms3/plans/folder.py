@@ -28,6 +28,7 @@ from robocas_ms3.core.strict import parse, validate_json
 from robocas_ms3.datasets.schema import episode_folder
 from robocas_ms3.demos.recordings.entries import versions
 from robocas_ms3.plans.plan import Plan
+from robocas_ms3.robots.cameras import STANDARD_NAMES
 
 PLAN, REPORT, UNITS = "plan.json", "report.json", "units"
 LAYOUTS, DEMOS, DATASETS, STATISTICS = "layouts", "demos", "datasets", "statistics"
@@ -124,7 +125,12 @@ class Unit:
 def _settings_of(record: dict[str, Any]) -> dict[str, Any]:
     """Return what must not change of the content of `plan.json`."""
     plan = record["plan"]
-    return {**record, "plan": {k: v for k, v in plan.items() if k not in FREE} if isinstance(plan, dict) else plan}
+    if isinstance(plan, dict):
+        plan = {key: value for key, value in plan.items() if key not in FREE}
+        pictures = plan.get("pictures")
+        if isinstance(pictures, dict) and pictures.get("cameras") is None:  # of an older version
+            plan["pictures"] = {**pictures, "cameras": list(STANDARD_NAMES)}
+    return {**record, "plan": plan}
 
 
 _KIND = FolderKind("robocas plan run", (PLAN,), "plan", upgrade=_settings_of)

@@ -59,7 +59,7 @@ class PicturesConfig(StrictModel):
 
     def chosen(self) -> Pictures:
         """Return the settings as dataset writers take them."""
-        cameras = STANDARD_NAMES if self.cameras is None else tuple(self.cameras)
+        cameras = STANDARD_NAMES if self.cameras is None else tuple(self.cameras)  # None: a plan of an older version
         return Pictures(cameras=cameras, size=self.size, depth=self.depth, image_format=self.image_format)
 
 

@@ -25,8 +25,8 @@ with Bar("counted") as shown:
     say("one")
     shown.at(2, 2)
 with Bar("replayed", transient=True) as shown:
-    shown.next_of(3)
-    shown.next_of(3)
+    shown.at(1, 3)
+    shown.at(2, 3)
 with Bar("none") as shown:
     shown.start(0)
 with Bar("never begun") as shown:
@@ -90,7 +90,7 @@ def test_items_done_before_do_not_count_in_the_rate(clock, capsys):
         shown.at(90, 100)
         clock[0] += 40
         shown.at(91, 100)
-        shown.next_of(100)
+        shown.at(92, 100)
         raise KeyboardInterrupt
     assert capsys.readouterr().err.splitlines() == [
         "layouts: 90 of 100",

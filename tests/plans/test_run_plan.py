@@ -31,6 +31,7 @@ from robocas_ms3.plans.run import join_plan, run_shard
 from robocas_ms3.plans.stages import Recorder
 from robocas_ms3.plans.status import read_status
 from robocas_ms3.plans.worker import UnitWorker
+from robocas_ms3.robots.cameras import STANDARD_NAMES
 
 SUPPORT = Path(__file__).resolve().parents[1] / "support"
 
@@ -197,7 +198,8 @@ def test_another_plan_is_refused_unless_it_is_to_overwrite_but_limits_and_descri
         with pytest.raises(RobocasError, match="block: 3 -> 4"):
             start(out, other)
     limits = PLAN.limits.model_copy(update={"memory_gb": 3.0})
-    run_here(out, PLAN.model_copy(update={"limits": limits, "description": "another"}))
+    pictures = PLAN.pictures.model_copy(update={"cameras": list(STANDARD_NAMES)})  # none are in older plans
+    run_here(out, PLAN.model_copy(update={"limits": limits, "description": "another", "pictures": pictures}))
     assert_same(undisturbed, out)
     assert json.loads((out / "plan.json").read_text())["plan"]["limits"]["memory_gb"] == 3.0
     before = (out / "report.json").stat().st_mtime_ns

@@ -77,14 +77,14 @@ def replay_dataset(
     root: str | Path,
     *,
     pack: str | Path | None = None,
-    on_episode: Callable[[EpisodeReplay, int], None] = lambda episode, count: None,
+    on_episode: Callable[[int, int], None] = lambda done, count: None,
 ) -> ReplayReport:
     """Replay the 7-D actions of a RoboCAS folder with ``pd_ee_delta_pose`` at the rate of the dataset.
 
     Args:
         root: folder of the dataset.
         pack: name or folder of the object pack, instead of the recorded one.
-        on_episode: called with each outcome and the number of episodes.
+        on_episode: called with (done, all) after each episode.
 
     Raises:
         DatasetError: there is no dataset, or actions can't be replayed at its rate.
@@ -100,7 +100,7 @@ def replay_dataset(
                 replays.append(player.play(number, task, scene, episode.arrays))
             except (RobocasError, ValueError, TypeError, KeyError, IndexError, AttributeError, OSError) as error:
                 replays.append(EpisodeReplay(number, task, None, skipped=one_line(error)))
-            on_episode(replays[-1], len(dataset.numbers))
+            on_episode(len(replays), len(dataset.numbers))
     return ReplayReport(replays)
 
 
