@@ -17,8 +17,7 @@ from collections.abc import Callable
 import numpy as np
 
 from robocas_ms3.core.errors import PlanningFailed
-from robocas_ms3.planning.chain import ArmChain
-from robocas_ms3.planning.kinematics import Reachability
+from robocas_ms3.planning.kinematics import ArmChain, Reachability
 from robocas_ms3.planning.protocol import Array
 from robocas_ms3.planning.rrt_connect import RRTConnectPlanner
 from robocas_ms3.robots.description import MOBILE_PANDA

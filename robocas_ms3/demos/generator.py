@@ -22,10 +22,9 @@ from robocas_ms3.demos.recordings.environment import RecordedEnv
 from robocas_ms3.demos.recordings.subgoals import SubGoal
 from robocas_ms3.demos.recordings.writing import EpisodeRecorder
 from robocas_ms3.demos.settings import EpisodeSettings
-from robocas_ms3.planning.chain import ArmChain
 from robocas_ms3.planning.decisions import Decisions, StraightDecisions
 from robocas_ms3.planning.executor import Executor
-from robocas_ms3.planning.kinematics import Reachability
+from robocas_ms3.planning.kinematics import ArmChain, Reachability
 from robocas_ms3.planning.protocol import Planner
 from robocas_ms3.planning.rrt_connect import make_planner
 from robocas_ms3.planning.skills.arm import Arm, back_out

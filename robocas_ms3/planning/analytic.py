@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.planning.chain import ArmChain
+from robocas_ms3.planning.kinematics import ArmChain
 from robocas_ms3.planning.protocol import Array
 
 UPRIGHT = 1 - 1e-9  # cosine between the upper arm and the vertical beyond which joints 1 and 3 turn about one axis

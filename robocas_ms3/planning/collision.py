@@ -14,8 +14,8 @@ import fcl
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.planning.chain import ArmChain
 from robocas_ms3.planning.collision_geometry import BASE, TCP, read_collision_parts, read_link_pairs
+from robocas_ms3.planning.kinematics import ArmChain
 from robocas_ms3.planning.protocol import Array, AttachedBody, Obstacle
 from robocas_ms3.planning.shapes import CollisionShapes, Pieces
 from robocas_ms3.robots.description import RobotDescription

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import RobotDescriptionError
 from robocas_ms3.core.words import error_line
-from robocas_ms3.planning.chain import ArmChain
+from robocas_ms3.planning.kinematics import ArmChain
 from robocas_ms3.planning.protocol import Array
 from robocas_ms3.planning.shapes import convex_hull, fcl_convex
 from robocas_ms3.robots.description_file import DescriptionFile, Joint

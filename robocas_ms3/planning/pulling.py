@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
-from robocas_ms3.planning.chain import ArmChain
+from robocas_ms3.planning.kinematics import ArmChain
 from robocas_ms3.planning.protocol import Array
 
 MAX_SLIP = np.deg2rad(50)  # of the gripper about the bar, from straight in; further on the palm meets the front

@@ -12,9 +12,8 @@ import numpy as np
 
 from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.core.extensions import Registry
-from robocas_ms3.planning.chain import turn_between
 from robocas_ms3.planning.collision import FclWorld
-from robocas_ms3.planning.kinematics import Reachability, follow_line
+from robocas_ms3.planning.kinematics import Reachability, follow_line, turn_between
 from robocas_ms3.planning.path_search import PathSearch
 from robocas_ms3.planning.protocol import Array, Planner, Trajectory
 from robocas_ms3.planning.timing import JointPath, blended, rounded, stopping, thinned, through, timed

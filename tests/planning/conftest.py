@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 from planning_scenes import Checker
 
-from robocas_ms3.planning.chain import ArmChain
-from robocas_ms3.planning.kinematics import Reachability
+from robocas_ms3.planning.kinematics import ArmChain, Reachability
 from robocas_ms3.planning.rrt_connect import RRTConnectPlanner
 from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.urdf import RobotFiles, robot_files

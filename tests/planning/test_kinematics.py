@@ -8,8 +8,7 @@ from planning_scenes import REST, pose_error, top_down
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import PlanningFailed
-from robocas_ms3.planning.chain import ArmChain
-from robocas_ms3.planning.kinematics import Reachability, follow_line, newton_step, rotation_vector
+from robocas_ms3.planning.kinematics import ArmChain, Reachability, follow_line, newton_step, rotation_vector
 from robocas_ms3.robots.description import MOBILE_PANDA
 
 

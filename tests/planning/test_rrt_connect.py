@@ -7,7 +7,7 @@ import pytest
 from planning_scenes import REST, Box, cloud, corners, pose_error, table_scene, top_down
 
 from robocas_ms3.core.errors import ExtensionError, PlanningFailed
-from robocas_ms3.planning.chain import ArmChain
+from robocas_ms3.planning.kinematics import ArmChain
 from robocas_ms3.planning.protocol import AttachedBody, Planner, Trajectory
 from robocas_ms3.planning.rrt_connect import TCP_SPEED_LIMIT
 from robocas_ms3.planning.rrt_connect import make_planner as make_planner_of

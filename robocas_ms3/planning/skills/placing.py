@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.core.poses import from_wxyz, inverse, transform
-from robocas_ms3.planning.chain import turn_between
+from robocas_ms3.planning.kinematics import turn_between
 from robocas_ms3.planning.protocol import Array, AttachedBody, Trajectory
 from robocas_ms3.planning.skills.arm import CARRYING_ROOM, Arm, first_plan, moved_back, plan_step_back, raised
 
