@@ -125,8 +125,7 @@ def clutter(points: Tensor, present: Tensor, target: Tensor, eye: Tensor) -> Clu
     outline = seen[env, target]
     middle = (outline.amin(dim=-1) + outline.amax(dim=-1)) / 2
     cells, heights = _cells(seen, middle), points[:, :, 2]
-    others = present.clone()
-    others[env, target] = False
+    others = present.scatter(1, target[:, None], False)  # a number put at indices makes the host wait for a GPU
     others_cells = torch.where(others[..., None], cells, _OUTSIDE).flatten(1)
     top = _height_map(others_cells, heights.flatten(1))
 

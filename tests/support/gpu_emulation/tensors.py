@@ -178,6 +178,10 @@ def _inner(x: Any) -> Any:
     return torch.device("cpu") if isinstance(x, torch.device) and _is_emulated(x) else x
 
 
+def _is_on_host(x: Any) -> bool:
+    return isinstance(x, torch.Tensor) and not isinstance(x, EmulatedTensor)
+
+
 def _check_devices(func: Any, args: Any, tensors: list[torch.Tensor]) -> None:
     """Raise RuntimeError where a GPU build of torch would: CPU tensors of any size but one number do not mix."""
     if func in _TAKES_BOTH_DEVICES:
@@ -210,7 +214,8 @@ def _count(func: Any, args: Any, kwargs: dict[str, Any], to_device: bool) -> Non
         name = "copy to the device" if isinstance(args[0], EmulatedTensor) else "copy to the host"
     elif emulated and func in _INDEXING:
         masks = [x for x in args[1] if isinstance(x, torch.Tensor) and x.dtype in (torch.bool, torch.uint8)]
-        name = "index with a mask" if masks else ""
+        values = args[2:3]  # a number, such as in `x[i, j] = 1.0`, is a tensor on the host
+        name = "index with a mask" if masks else "put a number" if any(map(_is_on_host, values)) else ""
     elif emulated and (func in _SYNCHRONISING or _depends_on_values(func, args, kwargs)):
         name = func._schema.name
     if name:
