@@ -51,6 +51,11 @@ RENDERER_FIX = (
     "root: bash scripts/setup.sh). Without one everything runs state-only."
 )
 
+GPU_PHYSICS_FIX = (
+    "Check the GPU's driver. SAPIEN downloads PhysX's library for GPUs once; offline, copy ~/.sapien/physx/ from "
+    "another machine."
+)
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -70,7 +75,7 @@ def examine() -> list[Finding]:
         lambda: [check_extra(extra) for extra in EXTRAS],
         lambda: [probe("render device", "render", required=False, fix=RENDERER_FIX)],
         lambda: [probe("physics on CPU", "physx_cpu", fix=_reinstall("sapien"))],
-        lambda: [probe("physics on GPU", "physx_cuda", required=False, fix="Check the GPU's driver.")],
+        lambda: [probe("physics on GPU", "physx_cuda", required=False, fix=GPU_PHYSICS_FIX)],
         lambda: [probe("planner", "planner", fix="Fix the failing rows above first, then " + _reinstall("python-fcl"))],
         lambda: [probe("asset packs", "packs", fix="Restore the named pack, or remove its folder.")],
         check_folders,

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from robocas_ms3.assets.pack import VISUALS
 from robocas_ms3.assets.physics import CONTACT_OFFSET
 from robocas_ms3.core.errors import ConfigError, SimulationError, VectorEnvError
+from robocas_ms3.core.words import error_line
 from robocas_ms3.scenes.config import TaskConfig
 from robocas_ms3.scenes.task_specs import SIM_FREQ, STANDARD_FREQ
 
@@ -53,7 +54,7 @@ def check_engine(
     """Check arguments of an environment against what this machine and process can run.
 
     Raises:
-        VectorEnvError: there are several envs, and physics would run on a CPU.
+        VectorEnvError: there are several envs, and physics would run on a CPU, or PhysX does not start on the GPU.
         ConfigError: there is no such level of detail, or images are observed and nothing is to be rendered.
     """
     if visual_level not in VISUALS:
@@ -64,9 +65,23 @@ def check_engine(
         fix = "On a CPU use robocas_ms3.make_vec(env_id, num_envs), which runs them in processes."
         what = "several environments in one process need a GPU"
         raise VectorEnvError(what, where=f"num_envs={num_envs}", found=found, fix=fix)
+    if num_envs > 1 or sim_backend.startswith(("physx_cuda", "cuda", "gpu")):
+        _start_gpu_physics()
     if render_backend == "none" and obs_mode not in {None, "none", "state", "state_dict"}:
         found, fix = f'"none", with obs_mode={obs_mode!r}', "Leave render_backend out."
         raise ConfigError("images need a renderer", where="render_backend", found=found, fix=fix)
+
+
+def _start_gpu_physics() -> None:
+    try:
+        sapien.physx.enable_gpu()
+    except Exception as error:  # requests' for a download, the driver's, or that PhysX runs on a CPU in this process
+        fix = (
+            "SAPIEN downloads PhysX's library for GPUs once; offline, copy ~/.sapien/physx/ from another machine. "
+            'On the CPU: backend="processes" of make_vec, --backend processes of robocas eval.'
+        )
+        what = "PhysX does not start on the GPU"
+        raise VectorEnvError(what, where="sim_backend", found=error_line(error), fix=fix) from error
 
 
 def sim_config(num_envs: int, config: TaskConfig) -> SimConfig:

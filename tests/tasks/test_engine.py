@@ -15,8 +15,8 @@ import pytest
 import torch
 from mani_skill.utils.structs.types import GPUMemoryConfig
 
-from robocas_ms3.core.errors import SimulationError
-from robocas_ms3.tasks.engine import EngineErrors, gpu_memory
+from robocas_ms3.core.errors import SimulationError, VectorEnvError
+from robocas_ms3.tasks.engine import EngineErrors, check_engine, gpu_memory
 
 COMPLAINT = "[2026-01-01 00:00:00.000] [SAPIEN] [error] Contact buffer overflow detected, please increase its size to 9"
 OTHERS = (
@@ -31,6 +31,18 @@ HARMLESS = (
     "[SAPIEN] [warning] the buffer is about to overflow",
     "you may want to increase its size",
 )
+
+
+@pytest.mark.parametrize(("num_envs", "sim_backend"), [(2, "auto"), (1, "physx_cuda"), (1, "gpu")])
+def test_a_library_for_gpus_that_cannot_be_downloaded(monkeypatch, num_envs, sim_backend):
+    def enable() -> None:
+        raise ConnectionError("Failed to resolve 'github.com'")
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr("sapien.physx.enable_gpu", enable)
+    check_engine(1, "full")
+    with pytest.raises(VectorEnvError, match="ConnectionError.*github.*copy ~/.sapien/physx"):
+        check_engine(num_envs, "full", sim_backend)
 
 
 def test_few_envs_take_no_more_than_maniskills():
