@@ -1,15 +1,17 @@
 """Environment steps a second of many envs at once, beside ManiSkill's PickCube-v1 and a bare scene of as many bodies.
 
-Without a GPU only one env of each runs: several are processes there (`benchmarks/vector.py`). Actions are random, time
-is wall-clock time after a warm-up, resets are not in it. Prints JSON.
+Without PhysX on a GPU only one env of each runs: several are processes there (`benchmarks/vector.py`). Actions are
+random, time is wall-clock time after a warm-up, resets are not in it. Prints JSON.
 
-Run: python benchmarks/fps.py [--envs 1 16 256 1024 4096] [--modes state rgb] [--steps 100]
+Run: python benchmarks/fps.py [--envs 1 16 256 1024 4096] [--modes state rgb] [--size 128 128] [--steps 100]
 """
 
 from __future__ import annotations
 
 import json
+import sys
 import time
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -28,14 +30,13 @@ from sapien import physx
 import robocas_ms3.tasks  # noqa: F401
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.assets.physics import CONTACT_OFFSET
+from robocas_ms3.core.words import error_line
 from robocas_ms3.scenes import build
 from robocas_ms3.scenes.cache import layout_source
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.task_specs import TASKS
 from robocas_ms3.tasks.engine import gpu_memory
-
-SIZE = dict(width=128, height=128)
 
 
 @register_env("RoboCASBare-v1", max_episode_steps=10_000)
@@ -69,7 +70,7 @@ class BareEnv(BaseEnv):
     def _default_sensor_configs(self) -> list[CameraConfig]:
         pose = sapien_utils.look_at([0.6, 0, 1.6], [-0.5, 0, 0.6])
         return [
-            CameraConfig(f"camera_{i}", pose, fov=1.5, near=0.01, far=10, shader_pack="minimal", **SIZE)
+            CameraConfig(f"camera_{i}", pose, 128, 128, fov=1.5, near=0.01, far=10, shader_pack="minimal")
             for i in range(3)
         ]
 
@@ -99,9 +100,11 @@ class Args:
     envs: tuple[int, ...] = (1, 16, 64, 256, 1024, 4096)
     """Numbers of envs."""
     modes: tuple[Literal["state", "rgb"], ...] = ("state", "rgb")
-    """Observations: states, or three cameras of 128 x 128 (of PickCube-v1 one)."""
+    """Observations: states, or three cameras (of PickCube-v1 one)."""
     configs: tuple[str, ...] = ("pick_table_scattered", "search_table_stacked")
     """Task configurations."""
+    size: tuple[int, int] = (128, 128)
+    """Width and height of the images in pixels."""
     steps: int = 100
     """Control steps that are timed."""
     seconds: float = 60.0
@@ -110,10 +113,9 @@ class Args:
 
 def main(args: Args) -> None:
     torch.set_num_threads(1)
-    gpu = torch.cuda.is_available()
-    if gpu:
-        physx.enable_gpu()  # which can't be done any more once a CPU env was made
-    report: dict[str, Any] = {"device": torch.cuda.get_device_name() if gpu else "cpu", "steps_per_second": {}}
+    problem = start_physx()  # which can't be done any more once a CPU env was made
+    device = torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu"
+    report: dict[str, Any] = {"device": device, "size": args.size, "steps_per_second": {}}
     failed = 0
     for mode in args.modes:
         cases = {"pick_cube": ("PickCube-v1", {})}
@@ -123,7 +125,7 @@ def main(args: Args) -> None:
         rates: dict[str, dict[int, float | str]] = {name: {} for name in cases}
         for name, (env_id, kwargs) in cases.items():
             for count in args.envs:
-                if count == 1 or gpu:
+                if count == 1 or not problem:
                     try:
                         rates[name][count] = round(rate(env_id, count, mode, args, kwargs), 1)
                     except Exception as error:  # one case that fails, such as for memory, leaves the others
@@ -138,17 +140,30 @@ def main(args: Args) -> None:
             }
             for config in args.configs
         }
-    if not gpu:
-        report["skipped"] = "more than one env: no CUDA device"
+    if problem:
+        report["skipped"] = f"more than one env: {problem}"
     print(json.dumps(report, indent=2))
     if failed:
         raise SystemExit(f"{failed} cases could not be measured")
 
 
+def start_physx() -> str:
+    """Start PhysX on the GPU; return why there is none."""
+    if not torch.cuda.is_available():
+        return "no CUDA device"
+    try:
+        with redirect_stdout(sys.stderr):  # SAPIEN says there that it downloads
+            physx.enable_gpu()
+    except Exception as error:  # such as requests' for a library that cannot be downloaded
+        return f"PhysX does not start on the GPU: {error_line(error)}"
+    return ""
+
+
 def rate(env_id: str, count: int, mode: str, args: Args, kwargs: dict[str, Any]) -> float:
     """Steps of all envs together, a second."""
     kwargs = kwargs if mode == "rgb" else {**kwargs, "render_backend": "none"}
-    kwargs = {**kwargs, "obs_mode": mode, "control_mode": "pd_joint_delta_pos", "sensor_configs": SIZE}
+    sensors = dict(zip(("width", "height"), args.size, strict=True))
+    kwargs = {**kwargs, "obs_mode": mode, "control_mode": "pd_joint_delta_pos", "sensor_configs": sensors}
     env = gym.make(env_id, num_envs=count, **kwargs)
     try:
         env.reset(seed=0)

@@ -55,6 +55,7 @@ def test_images(needs_renderer, task):
         expected, _ = single.reset(seed=env)
         for camera, images in expected["sensor_data"].items():
             for kind, image in images.items():
-                assert torch.equal(observed["sensor_data"][camera][kind][env].cpu(), image[0]), (env, camera, kind)
+                found = observed["sensor_data"][camera][kind][env]
+                assert torch.equal(found.cpu(), image[0].cpu()), (env, camera, kind)
     batch.close()
     single.close()

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from gpu_emulation import has_emulated_tensors
 from gpu_emulation.tensors import EmulatedTensor
 
 BODY = 13  # position, quaternion wxyz, linear and angular velocity
@@ -20,16 +21,27 @@ class Buffer:
     """Stands in for SAPIEN's ``CudaArray``.
 
     Attributes:
-        array: its memory.
+        array: its memory on the host, which the emulated device shares and a CUDA device has a copy of.
     """
 
     def __init__(self, array: NDArray[Any]) -> None:
         self.array = array
-        self._tensor = EmulatedTensor(torch.from_numpy(array))
+        self._host = torch.from_numpy(array)
+        self._tensor = EmulatedTensor(self._host) if has_emulated_tensors() else self._host.to("cuda")
 
     def torch(self) -> torch.Tensor:
-        """Return the tensor that shares the memory."""
+        """Return the tensor on the device."""
         return self._tensor
+
+    def copy_from_device(self) -> None:
+        """Copy the values from a CUDA device to `array`."""
+        if not has_emulated_tensors():
+            self._host.copy_(self._tensor)
+
+    def copy_to_device(self) -> None:
+        """Copy the values of `array` to a CUDA device."""
+        if not has_emulated_tensors():
+            self._tensor.copy_(self._host)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,9 @@ from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.envs.utils.system.backend import BackendInfo, parse_sim_and_render_backend
 from sapien import physx
 
+from gpu_emulation import has_emulated_tensors
 from gpu_emulation.buffers import Buffer
+from gpu_emulation.device_copies import CudaTensorSystem
 from gpu_emulation.physics import EmulatedGpuSystem
 
 _Scene = sapien.Scene
@@ -82,7 +84,7 @@ class EmulatedRenderSystemGroup:
 
 def install() -> None:
     """Replace the GPU parts of SAPIEN and ManiSkill in this process."""
-    physx.PhysxGpuSystem = EmulatedGpuSystem
+    physx.PhysxGpuSystem = EmulatedGpuSystem if has_emulated_tensors() else CudaTensorSystem
     physx.enable_gpu = lambda: None  # SAPIEN's downloads NVIDIA's library
     sapien.Scene = EmulatedScene
     body_row = property(_body_row)
