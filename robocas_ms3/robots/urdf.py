@@ -16,7 +16,6 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
 from robocas_ms3.core.documents import load_json
-from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.core.files import make_folder, open_for_append, replacing_folder
 from robocas_ms3.core.locks import lock_file
 from robocas_ms3.core.paths import cache_dir
@@ -238,15 +237,13 @@ def _parse(path: Path) -> Element:
 
 def _find(root: Element, tag: str, name: str) -> Element:
     element = root.find(f"{tag}[@name='{name}']")
-    if element is None:
-        raise RobocasError(f"mani_skill's Panda has no such {tag}", where=name, fix="Install mani_skill 3.0.1.")
+    assert element is not None, f"{tag} {name} of mani_skill's Panda"
     return element
 
 
 def _origin(root: Element, joint: str) -> Element:
     element = _find(root, "joint", joint).find("origin")
-    if element is None:
-        raise RobocasError("mani_skill's Panda has no origin", where=joint, fix="Install mani_skill 3.0.1.")
+    assert element is not None, f"origin of {joint} of mani_skill's Panda"
     return element
 
 
