@@ -30,13 +30,11 @@ class Merge:
 def main(cfg: Merge) -> int:
     from robocas_ms3.cli.bars import Bar
     from robocas_ms3.cli.terminal import say
-    from robocas_ms3.core.words import count_of
     from robocas_ms3.datasets.manage.copying import CopyOptions
     from robocas_ms3.datasets.manage.merging import merge
 
     with Bar("episodes written") as shown:
         options = CopyOptions(not cfg.copy, cfg.overwrite, shown.start, shown.advance)
         done = merge(cfg.datasets, cfg.out, skip_duplicates=cfg.skip_duplicates, options=options)
-    skipped = f", {count_of(done.skipped, 'duplicate')} left out" if done.skipped else ""
-    say(f"{done.written}{skipped}")
+    say(str(done))
     return 0

@@ -59,14 +59,6 @@ class Format:
             raise DatasetError(f"the {name} of this format can't be imported", where=path, found=error) from error
 
 
-def _is_trajectory(path: Path) -> bool:
-    return path.is_file() or path.suffix in {".h5", ".hdf5"}
-
-
-def _is_lerobot(path: Path) -> bool:
-    return (path / "meta" / "info.json").is_file()
-
-
 def _is_robocas(path: Path) -> bool:
     marked = (path / schema.CONVERSION_FILE).is_file() or (path / schema.DATA_INFO_FILE).is_file()
     return marked or (path.is_dir() and any(path.glob("episode_" + "[0-9]" * 7)))
@@ -74,11 +66,16 @@ def _is_robocas(path: Path) -> bool:
 
 _PACKAGE = "robocas_ms3.datasets"
 _BUILTIN = (
-    Format("trajectory", "trajectory file", _is_trajectory, f"{_PACKAGE}.sources.trajectory:TrajectorySource"),
+    Format(
+        "trajectory",
+        "trajectory file",
+        lambda path: path.is_file() or path.suffix in {".h5", ".hdf5"},
+        f"{_PACKAGE}.sources.trajectory:TrajectorySource",
+    ),
     Format(
         "lerobot",
         "LeRobot dataset",
-        _is_lerobot,
+        lambda path: (path / "meta" / "info.json").is_file(),
         f"{_PACKAGE}.lerobot.reader:open_lerobot",
         f"{_PACKAGE}.lerobot.convert:convert_lerobot",
         f"{_PACKAGE}.lerobot.check:check_lerobot",
@@ -94,23 +91,19 @@ _BUILTIN = (
         ("append", "image_format", "leave_out"),
     ),
 )
-
-
 FORMATS: Registry[Format] = Registry("dataset format", GROUP, Format, {one.name: one for one in _BUILTIN})
-"""All of them by name."""
+"""Formats by name."""
 
 
 def format_of(path: Path) -> Format | None:
-    """Which format lies there; None: none. Those of other packages see their own folders before others do."""
-    return next((FORMATS[name] for name in reversed(list(FORMATS)) if _holds(FORMATS[name], path)), None)
-
-
-def _holds(one: Format, path: Path) -> bool:
-    try:
-        return one.holds(path)
-    except Exception as error:  # another package's, of a path that it did not think of
-        _log.debug("%s: whether it holds %s can't be told: %s", one.name, path, error)
-        return False
+    """Return the format of a path, None if it has none; formats of other packages are asked first."""
+    for name in reversed(list(FORMATS)):
+        try:
+            if FORMATS[name].holds(path):
+                return FORMATS[name]
+        except Exception as error:  # another package's, of a path that it did not think of
+            _log.debug("%s: whether it holds %s can't be told: %s", name, path, error)
+    return None
 
 
 def open_source(path: Path | str, *, rate_hz: float | None = None, include_failed: bool = False) -> EpisodeSource:

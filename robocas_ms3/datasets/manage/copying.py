@@ -111,18 +111,20 @@ class CopyOptions:
 
 @dataclass(frozen=True)
 class CopyResult:
-    """Number of episodes of a new dataset, of those that were there already, and of files linked and copied."""
+    """Number of episodes of a new dataset, of those that were there already, of files, and of duplicates skipped."""
 
     out: Path
     episodes: int
     kept: int
     linked: int
     copied: int
+    skipped: int = 0
 
     def __str__(self) -> str:
         kept = f", {self.kept} of them were there" if self.kept else ""
         linked = f"{count_of(self.linked, 'file')} linked, {self.copied} copied"
-        return f"{self.out}: {count_of(self.episodes, 'episode')}{kept}, {linked}"
+        skipped = f", {count_of(self.skipped, 'duplicate')} left out" if self.skipped else ""
+        return f"{self.out}: {count_of(self.episodes, 'episode')}{kept}, {linked}{skipped}"
 
 
 def copy_episodes(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 from robocas_ms3.core.errors import DatasetError
@@ -20,17 +20,9 @@ from robocas_ms3.datasets.manage.copying import (
 from robocas_ms3.datasets.writing.plan import SETTINGS
 
 
-@dataclass(frozen=True)
-class MergeResult:
-    """The new dataset, and the number of duplicates that were skipped."""
-
-    written: CopyResult
-    skipped: int
-
-
 def merge(
     roots: Sequence[Path], out: Path, *, skip_duplicates: bool = False, options: CopyOptions | None = None
-) -> MergeResult:
+) -> CopyResult:
     """Write a dataset of all episodes of others, in the given order; each keeps its side of the split.
 
     Args:
@@ -45,7 +37,7 @@ def merge(
     """
     if not roots:
         raise DatasetError("nothing to merge", expected="folders of datasets", fix="robocas merge A B --out C")
-    sources = [open_finished(root, name) for root, name in zip(roots, distinct_names(roots), strict=True)]
+    sources = [open_finished(root, name) for root, name in zip(roots, _distinct_names(roots), strict=True)]
     _check_settings(sources)
     members: dict[str, CopiedEpisode] = {}
     duplicates: list[tuple[CopiedEpisode, CopiedEpisode]] = []
@@ -62,10 +54,10 @@ def merge(
         fix = "Pass --skip-duplicates to take each once."
         raise DatasetError("the same recording twice", where=where, found=found, fix=fix)
     (written,) = copy_episodes({out: list(members.values())}, KEEP_RULE, options or CopyOptions())
-    return MergeResult(written, len(duplicates))
+    return replace(written, skipped=len(duplicates))
 
 
-def distinct_names(roots: Sequence[Path]) -> list[str]:
+def _distinct_names(roots: Sequence[Path]) -> list[str]:
     """Return the shortest ends of paths that differ."""
     parts = [root.resolve().parts for root in roots]
     names: list[str] = []

@@ -30,7 +30,7 @@ def test_episodes_follow_each_other_and_keep_their_side(parts, tmp_path):
     a, b = parts
     out = tmp_path / "out"
     done = merge([b, a], out)
-    assert (done.written.episodes, done.skipped, done.written.copied) == (4, 0, 0)
+    assert (done.episodes, done.skipped, done.copied) == (4, 0, 0)
     assert Dataset(out).numbers == [0, 1, 2, 3]
     for number, (source, old) in enumerate([(b, 0), (b, 1), (a, 0), (a, 1)]):
         assert files_of(out / f"episode_{number:07d}") == files_of(source / f"episode_{old:07d}")
@@ -83,7 +83,7 @@ def test_duplicates(parts, tmp_path):
         merge([b, tmp_path / "ab"], tmp_path / "out")
     assert not (tmp_path / "out").exists()
     done = merge([b, tmp_path / "ab"], tmp_path / "out", skip_duplicates=True)
-    assert (done.written.episodes, done.skipped) == (4, 2)
+    assert (done.episodes, done.skipped) == (4, 2)
     seeds = [entry["seed"] for entry in read(tmp_path / "out" / "conversion.json")["episodes"].values()]
     assert seeds == [20, 21, 10, 11]
     assert validate(tmp_path / "out").violations == []
@@ -179,7 +179,7 @@ def test_arrays_that_an_import_could_not_make_may_be_missing(parts, tmp_path):
     with pytest.raises(DatasetError, match="episode_0000001/episode_info.npz, base_pos"):
         merge([part], tmp_path / "out")
     edit(part / "episode_0000001" / "scene.json", lambda s: s["source"].update(missing=["base_pos"]))
-    assert merge([part], tmp_path / "out").written.episodes == 2
+    assert merge([part], tmp_path / "out").episodes == 2
 
 
 def test_the_output(parts, tmp_path):
@@ -190,7 +190,7 @@ def test_the_output(parts, tmp_path):
             merge([a, b], out, options=CopyOptions(overwrite=True))
     assert files_of(a) == before
     merge([a], tmp_path / "out")
-    assert merge([a], tmp_path / "out").written.kept == 2
+    assert merge([a], tmp_path / "out").kept == 2
     with pytest.raises(OutputExistsError) as error:
         merge([a, b], tmp_path / "out")
     assert error.value.where == tmp_path / "out" / "conversion.json"
