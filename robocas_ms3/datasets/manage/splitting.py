@@ -107,13 +107,7 @@ def resplit(root: Path, share: Share | None = None) -> Sides:
     """Rewrite ``data_info.json`` from the episodes on disk, and return the sides; no episode is changed.
 
     Episodes that are not on disk are removed from ``conversion.json``.
-
-    Args:
-        root: folder of the dataset.
-        share: how to split; None: each episode keeps its side, new ones are split by the rule of the writer.
-
-    Raises:
-        DatasetError: there is no dataset, it can't be split so, or arrays of an episode are damaged.
+    Without a share each episode keeps its side, and new ones are split by the rule of the writer.
     """
     with locked_folder(root):
         dataset = Dataset(root)

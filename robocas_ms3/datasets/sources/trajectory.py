@@ -29,17 +29,14 @@ class TrajectorySource(EpisodeSource):
 
     Args:
         path: of the HDF5 file.
-        rate_hz: steps a second; divides the control frequency.
+        rate_hz: steps per second; divides the control frequency.
         include_failed: also episodes without success.
-        pack: name or folder of the object pack, instead of the one that the file names.
+        pack: name or folder of the object pack, instead of the recorded one.
 
     Attributes:
         file: the trajectory file, closed.
         stride: control steps per step.
         index: position of each episode in the file.
-
-    Raises:
-        DatasetError: it can't be read, or the rate does not divide its frequency.
     """
 
     cameras: tuple[str, ...] = ()

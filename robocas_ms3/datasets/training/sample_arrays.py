@@ -60,21 +60,11 @@ def _check_finite(arrays: Mapping[str, NDArray], where: str) -> None:
 def read_episode(
     source: EpisodeSource, number: int, state: Sequence[str], *, embedding: bool, subgoals: bool
 ) -> dict[str, Any]:
-    """Read what the samples of an episode are made of, except images.
-
-    Args:
-        source: it is in.
-        number: of it.
-        state: arrays of the schema that make up the state.
-        embedding: whether the embeddings of the texts are wanted.
-        subgoals: whether sub-goals are.
+    """Read what the samples of an episode are made of, except images; ``state``: arrays that make up the state.
 
     Returns:
         ``action`` (T, 7), ``first_command``, ``instruction``; ``state`` (T, D), ``texts``, ``subgoal_type`` (T,) and
         the embeddings where they are wanted.
-
-    Raises:
-        DatasetError: the file is missing or damaged, an array of another length, or NaN or infinite.
     """
     keys = (*ACTION_ARRAYS, *state, "language_goal")
     keys += ("step_lang_goals", "step_goal_type") * subgoals

@@ -24,16 +24,7 @@ _SAME_PLACE = 1e-3  # m
 
 
 class EnvRenderer:
-    """Renders recorded states in the environment that recorded them.
-
-    Args:
-        env: the recorded environment.
-        control_mode: of the recorded actions.
-        pictures: images to render; None: all.
-
-    Raises:
-        DatasetError: there is no render device, or no such environment.
-    """
+    """Renders recorded states, with all images or some, in the environment that recorded them."""
 
     def __init__(self, env: RecordedEnv, control_mode: str, pictures: Pictures | None = None) -> None:
         sensors = dict(env.kwargs.get("sensor_configs") or {})

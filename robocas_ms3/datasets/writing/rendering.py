@@ -37,18 +37,7 @@ def open_env(env: RecordedEnv, control_mode: str, pictures: Pictures) -> EnvRend
 class RenderedSource(TrajectorySource):
     """A trajectory file whose episodes, failed ones included, are rendered. The environment is made once.
 
-    Args:
-        path: of the HDF5 file.
-        rate_hz: steps per second; None: 5.
-        pictures: images to render.
-        pack: name or folder of the object pack, instead of the recorded one.
-        open_renderer: opens the renderer.
-
-    Attributes:
-        pictures: the same, with the names of its cameras.
-
-    Raises:
-        DatasetError: the file can't be read, a camera is not there, or the rate does not divide its control frequency.
+    Args: see `TrajectorySource`; ``pictures``, which keeps the names of their cameras, are the images to render.
     """
 
     def __init__(
