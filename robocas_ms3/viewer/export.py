@@ -83,6 +83,6 @@ def _write(path: Path, make: Callable[[], EncodedImage]) -> str:
         with readable(path.name):
             image = make()
     except DatasetError as error:
-        return f"pictures: {error.what}"
+        return f"images: {error.what}"
     (make_folder(path.parent) / path.name).write_bytes(image.data)
     return ""

@@ -49,7 +49,7 @@ def thumbnail(image: EncodedImage) -> EncodedImage:
 def decode(image: EncodedImage, flags: int = cv2.IMREAD_COLOR) -> NDArray[np.uint8]:
     pixels = cv2.imdecode(np.frombuffer(image.data, np.uint8), flags) if image.data else None
     if pixels is None:
-        raise DatasetError("this picture is damaged", fix="robocas validate lists all that is wrong.")
+        raise DatasetError("this image is damaged", fix="robocas validate lists all that is wrong.")
     return np.asarray(pixels[..., ::-1], np.uint8)
 
 

@@ -104,7 +104,7 @@ def make_thumbnail(source: PageContent, index: dict[str, Any], number: int) -> E
     """Return the first image of the camera that shows most: the static one if there is one."""
     cameras = index["cameras"]
     if not cameras:
-        raise DatasetError("no pictures", where=source.root)
+        raise DatasetError("no images", where=source.root)
     camera = next((name for name in cameras if "static" in name), cameras[0])
     return images.thumbnail(source.rgb(number, camera, 0))
 

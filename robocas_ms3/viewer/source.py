@@ -27,9 +27,7 @@ from robocas_ms3.viewer.episode import ARM, ROLL_PITCH_YAW, XYZ, Plot, facts_of,
 from robocas_ms3.viewer.images import EncodedImage, check_inside
 
 MEDIA_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".webp": "image/webp"}
-_NO_IMAGES = (
-    "A trajectory file holds states, no pictures: `robocas convert {name} --to robocas --out DIR` renders them."
-)
+_NO_IMAGES = "A trajectory file holds states, no images: `robocas convert {name} --to robocas --out DIR` renders them."
 _STILL = 0.002  # m: an object that moves less is drawn as one point
 _PARKED = 5.0  # m from the arm: objects there take no part
 _AT_ONCE = 8  # images decoded together: a video opens and seeks slowly, and the next step is asked for next
@@ -83,7 +81,7 @@ class FolderContent(PageContent):
             return EncodedImage(MEDIA_TYPES[path.suffix], read_picture_bytes(path))
         except (OSError, ValueError) as error:
             found = getattr(error, "strerror", None) or error
-            raise DatasetError("can't read this picture", where=path, found=found) from error
+            raise DatasetError("can't read this image", where=path, found=found) from error
 
     def depth(self, number: int, camera: str, step: int) -> NDArray[np.uint16]:
         episode = self.dataset.episode(number)

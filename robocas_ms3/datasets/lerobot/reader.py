@@ -204,23 +204,23 @@ class LeRobotEpisode(SourceEpisode):
     ) -> Generator[NDArray, None, None]:
         path, start = self.video(camera, kind)
         count = self.steps - first if count is None else count
-        pictures = read_frames(path, start + first, count, self.dataset.info["fps"])
+        images = read_frames(path, start + first, count, self.dataset.info["fps"])
         feature = self.dataset.depth_feature(camera) if kind == "depth" else None
-        return pictures if feature is None else _depths(pictures, feature["info"])
+        return images if feature is None else _depths(images, feature["info"])
 
     def rgb(self, camera: str, step: int) -> NDArray[np.uint8]:
-        (picture,) = self.frames(camera, "rgb", step, 1)
-        return picture
+        (image,) = self.frames(camera, "rgb", step, 1)
+        return image
 
     def depth(self, camera: str, step: int) -> NDArray[np.uint16]:
-        (picture,) = self.frames(camera, "depth", step, 1)
-        return picture
+        (image,) = self.frames(camera, "depth", step, 1)
+        return image
 
 
 def _depths(levels: Generator[NDArray, None, None], info: dict[str, Any]) -> Generator[NDArray, None, None]:
     with closing(levels):
-        for picture in levels:
-            yield to_depth(picture, info)
+        for image in levels:
+            yield to_depth(image, info)
 
 
 def open_lerobot(root: Path, *, rate_hz: float | None = None, include_failed: bool = False) -> LeRobotDataset:

@@ -40,7 +40,7 @@ class Coding:
 
 
 # A key frame every second one, as LeRobot has it: a random frame costs at most two. No B-frames, so that the order of
-# packets is that of frames and parts join without edit lists. Fixed threads: the same pictures give the same bytes.
+# packets is that of frames and parts join without edit lists. Fixed threads: the same images give the same bytes.
 CODINGS = {
     "h264": Coding(
         "libx264",
@@ -138,10 +138,10 @@ class Encoder:
         finally:
             self._container.close()
 
-    def add(self, picture: NDArray) -> None:
+    def add(self, image: NDArray) -> None:
         """Append (H, W, 3) uint8 RGB or (H, W) uint16."""
-        layout = "rgb24" if picture.ndim == 3 else self._coding.pixels
-        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format=layout)
+        layout = "rgb24" if image.ndim == 3 else self._coding.pixels
+        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format=layout)
         frame.pts, frame.time_base = self.frames, self._time_base
         self._container.mux(self._stream.encode(frame))
         self.frames += 1
