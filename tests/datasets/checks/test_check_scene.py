@@ -1,8 +1,7 @@
 """Each way of spoiling ``scene.json`` and ``conversion.json`` is one violation, by key, what is expected and found."""
 
-import json
-
 import pytest
+from managing import edit
 
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.checks.scene import valid_values
@@ -34,11 +33,6 @@ WHOLE = {
     },
     "versions": {"numpy": "1.26.4"},
 }
-
-
-def change(root, name, **new):
-    path = root / name
-    path.write_text(json.dumps({**json.loads(path.read_text()), **new}))
 
 
 def check_values(scene):
@@ -112,13 +106,13 @@ def test_scenes_that_are_no_objects():
     ],
 )  # fmt: skip
 def test_validate_says_it_once(dataset, name, new, text):
-    change(dataset, name, **new)
+    edit(dataset / name, lambda content: content.update(new))
     (violation,) = validate(dataset).violations
     assert str(violation).startswith(text)
 
 
 def test_a_seed_in_a_list_is_that_seed(dataset):
-    change(dataset, FILE, seed=[5])
+    edit(dataset / FILE, lambda content: content.update(seed=[5]))
     assert validate(dataset).violations == []
 
 

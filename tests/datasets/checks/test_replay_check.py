@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from managing import change, edit
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.cli.main import run
@@ -56,15 +57,11 @@ def player(monkeypatch):
 
 
 def edit_scene(dataset, number, **changes):
-    path = dataset / f"episode_{number:07d}" / "scene.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
+    edit(dataset / f"episode_{number:07d}" / "scene.json", lambda scene: scene.update(changes))
 
 
 def edit_arrays(dataset, number, **changes):
-    path = dataset / f"episode_{number:07d}" / "episode_info.npz"
-    with np.load(path) as arrays:
-        content = {**arrays, **changes}
-    np.savez(path, **content)
+    change(dataset / f"episode_{number:07d}", **changes)
 
 
 def still(dataset, number):

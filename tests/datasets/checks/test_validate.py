@@ -25,13 +25,6 @@ def change(root, **new):
     managing.change(root / "episode_0000001", **new)
 
 
-def change_info(root, edit):
-    path = root / "data_info.json"
-    info = json.loads(path.read_text())
-    edit(info)
-    path.write_text(json.dumps(info))
-
-
 def change_array(path, edit):
     np.save(path, edit(np.load(path)))
 
@@ -285,7 +278,7 @@ def assert_depth(violations, camera):
     ],
 )
 def test_data_info(dataset, edit, text):
-    change_info(dataset, edit)
+    managing.edit(dataset / "data_info.json", edit)
     violations = found(dataset)
     assert any(text in violation for violation in violations), violations
     assert all(violation.startswith("data_info.json") for violation in violations)
@@ -310,19 +303,15 @@ def test_the_ledger_lists_the_episodes_on_disk_each_once(dataset):
     assert "episode_0000002: expected each episode once, found the arrays of episode_0000001" in violations
     assert "conversion.json, episodes.2: expected an entry of every episode, found none" in violations
     path = dataset / "conversion.json"
-    content = json.loads(path.read_text())
-    content["episodes"]["2"] = content["episodes"]["1"]
-    path.write_text(json.dumps(content))
+    managing.edit(path, lambda content: content["episodes"].update({"2": content["episodes"]["1"]}))
     assert "conversion.json, episodes.2: expected each recording once, found that of episode 1" in found(dataset)
     shutil.rmtree(dataset / "episode_0000002")
-    content["episodes"]["2"] = {**content["episodes"]["1"], "recording": "another"}
-    path.write_text(json.dumps(content))
+    managing.edit(path, lambda content: content["episodes"]["2"].update(recording="another"))
     assert_only(dataset, "conversion.json, episodes.2: expected the episodes on disk, found no folder")
 
 
 def test_one_camera_has_none_to_agree_with(dataset):
-    path = dataset / "conversion.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), "cameras": ["static_camera"]}))
+    managing.edit(dataset / "conversion.json", lambda content: content.update(cameras=["static_camera"]))
     for name in ("base_camera", "gripper_camera"):
         for folder in dataset.glob(f"*/{name}"):
             shutil.rmtree(folder)

@@ -16,6 +16,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from managing import arrays_of, change
 from PIL import Image
 from torch.utils.data import DataLoader, WeightedRandomSampler
 
@@ -97,10 +98,7 @@ def test_every_element_is_the_naive_loaders(made, horizon, chunk, padding):
 
 
 def test_what_is_held_is_the_nearest_gripper_command(dataset):
-    file = dataset / "episode_0000001/episode_info.npz"
-    arrays = dict(np.load(file))
-    arrays["gripper_status"] = np.array([False, True, True, True, True, True, True])
-    np.savez(file, **arrays)
+    change(dataset / "episode_0000001", gripper_status=np.array([False] + 6 * [True]))
     data = RoboCASDataset(dataset, SampleOptions(split="all", cameras=(), observation_horizon=3, action_horizon=3))
     assert data[data.index(1, 0)]["action"][:, 6].tolist() == [0, 0, 1, 1, 1]
     assert data[data.index(1, 5)]["action"][:, 6].tolist() == [1, 1, 1, 1, 1]
@@ -377,9 +375,7 @@ def test_damaged_pictures(dataset):
 
 
 def test_arrays_of_another_length(dataset):
-    file = dataset / "episode_0000000/episode_info.npz"
-    arrays = dict(np.load(file))
-    np.savez(file, **{**arrays, "rel_pos": arrays["rel_pos"][:-1]})
+    change(dataset / "episode_0000000", rel_pos=np.zeros((6, 3), np.float32))
     with pytest.raises(DatasetError, match="another length"):
         first_item(dataset, cameras=())
 
@@ -387,13 +383,11 @@ def test_arrays_of_another_length(dataset):
 def test_datasets_made_elsewhere(dataset):
     options = dict(split="all", cameras=(), state=("agv_pose", "gripper_width"))
     before = list(RoboCASDataset(dataset, SampleOptions(**options)))
-    for file in dataset.glob("*/episode_info.npz"):
-        arrays = dict(np.load(file))
-        for key in ("rel_pos", "rel_orn", "agv_pose", "rel_agv_pose"):
-            del arrays[key]  # made of the absolute poses
-        arrays["gripper_status"] = arrays["gripper_status"].astype(np.int64)
-        arrays["gripper_width"] = arrays["gripper_width"].astype(np.float64)[:, None]
-        np.savez(file, **arrays)
+    for episode in dataset.glob("episode_*"):
+        arrays = arrays_of(episode)
+        change(episode, **dict.fromkeys(("rel_pos", "rel_orn", "agv_pose", "rel_agv_pose")))  # made of absolute poses
+        change(episode, gripper_status=arrays["gripper_status"].astype(np.int64))
+        change(episode, gripper_width=arrays["gripper_width"].astype(np.float64)[:, None])
     (dataset / "conversion.json").unlink()
     for one, other in zip(before, RoboCASDataset(dataset, SampleOptions(**options)), strict=True):
         assert torch.allclose(one["action"], other["action"], atol=1e-6)
@@ -402,16 +396,16 @@ def test_datasets_made_elsewhere(dataset):
 
 def test_damaged_overviews(dataset):
     info = json.loads((dataset / "data_info.json").read_text())
-    for change in (dict(ep_length={"0": 7}), dict(ep_length=[7, 7]), dict(step_goals={"0": [{"goal_type": 1}]})):
-        (dataset / "data_info.json").write_text(json.dumps({**info, **change}))
+    for wrong in (dict(ep_length={"0": 7}), dict(ep_length=[7, 7]), dict(step_goals={"0": [{"goal_type": 1}]})):
+        (dataset / "data_info.json").write_text(json.dumps({**info, **wrong}))
         with pytest.raises(DatasetError):
             [RoboCASDataset(dataset, SampleOptions(split=side, cameras=())) for side in ("train", "val")]
     (dataset / "data_info.json").write_text(json.dumps({k: v for k, v in info.items() if k != "step_goals"}))
     with pytest.raises(DatasetError):
         RoboCASDataset(dataset, SampleOptions(cameras=())).weights()
-    for change in ({"rate_hz": 0}, {"rate_hz": -1.0}, {"rate_hz": "fast"}, {"cameras": 3}):
+    for wrong in ({"rate_hz": 0}, {"rate_hz": -1.0}, {"rate_hz": "fast"}, {"cameras": 3}):
         path = dataset / "conversion.json"
-        path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
+        path.write_text(json.dumps({**json.loads(path.read_text()), **wrong}))
         with pytest.raises(DatasetError):
             RoboCASDataset(dataset, SampleOptions(cameras=()))
 
