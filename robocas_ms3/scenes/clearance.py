@@ -24,12 +24,7 @@ _STEP, _ALONG = 0.05, 0.01  # m between places of the base that are tried, and a
 
 @dataclass(frozen=True)
 class Standing:
-    """Something in the scene.
-
-    Attributes:
-        key: of the configuration.
-        hulls: vertices (V, 3) in the world, m, and faces.
-    """
+    """Something in the scene: its key in the configuration, and its hulls in the world, m."""
 
     key: str
     hulls: list[Hull]
@@ -56,8 +51,8 @@ def check_clearance(
         config: the configuration.
         placed: assets and their poses 4x4 in the world, by key: ``furniture.NAME``, ``room``, and ``basket`` if any.
         region: for objects, and 4x4 of its frame in the world, with what has to be opened open.
-        robot_pose: 4x4 in the world, of the robot's root.
-        robot: a robot without an envelope is not checked.
+        robot_pose: 4x4 in the world.
+        robot: not checked where it has no envelope.
 
     Raises:
         ConfigError: naming the two, and by how much.

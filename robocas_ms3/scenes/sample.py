@@ -31,12 +31,7 @@ _log = logging.getLogger(__name__)
 
 
 def object_set(model: SceneModel, objects_seed: int, number: int = 0) -> ObjectIds:
-    """Draw a set of objects, an id per slot: those of the task, then distractors.
-
-    Args:
-        model: the scene's assets.
-        objects_seed: seed of the objects.
-        number: which of the sets that the seed draws one after the other.
+    """Draw the ``number``-th set of objects of a seed, an id per slot: those of the task, then distractors.
 
     Raises:
         LayoutError: no object fits on the surface, or no columns of them do.

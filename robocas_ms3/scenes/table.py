@@ -46,11 +46,7 @@ def good(states: NDArray[np.uint8]) -> NDArray[np.bool_]:
 
 
 class LayoutTable:
-    """Layouts of a table file; see the module.
-
-    Args:
-        path: of the file.
-        names: ids of the object pack's objects, sorted.
+    """Layouts of a table file; ``names`` are the ids of the object pack's objects, sorted.
 
     Attributes:
         rows: (S, L) records, mapped.
@@ -126,11 +122,7 @@ def mark_table(path: Path, names: Sequence[str], states: Mapping[Pair, State]) -
 
 
 class FrozenLayouts:
-    """A `LayoutSource` of frozen layouts; it samples none.
-
-    Args:
-        path: of the file.
-        names: ids of the object pack's objects.
+    """A `LayoutSource` of frozen layouts; ``names`` are the ids of the object pack's objects.
 
     Raises:
         LayoutError: the file is damaged.

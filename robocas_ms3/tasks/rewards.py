@@ -139,11 +139,6 @@ def action_rate(action: Array, before: Array) -> Array:
 class DenseReward:
     """Weighs terms and penalties, and remembers the last action and reward.
 
-    Args:
-        table: weights of the terms.
-        num_envs: N.
-        device: of the results.
-
     Attributes:
         last_action: (N, A), NaN where there was none since the reset; None: none yet.
         last_level: (N,) last normalized reward of the mode ``progress``, NaN where there was none since the reset.

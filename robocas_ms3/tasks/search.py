@@ -187,13 +187,7 @@ def _sample(points: np.ndarray) -> np.ndarray:
 
 
 class PeriodicSchedule:
-    """Counts the control steps of each env since its reset, modulo a period.
-
-    Args:
-        num_envs: N.
-        period: control steps from one measurement of an env to the next.
-        device: where the indices are that `due` returns.
-    """
+    """Counts the control steps of each env since its reset, modulo a period; `due` returns indices on the device."""
 
     def __init__(self, num_envs: int, period: int, device: torch.device | str) -> None:
         self._period, self._device = period, device

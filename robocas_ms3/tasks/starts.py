@@ -60,12 +60,7 @@ class Starts:
 class TabledStarts:
     """Starts of envs that keep their objects: a reset gathers them on the device.
 
-    All layouts of these objects are in its memory, 0.4 kB each with ten objects.
-
-    Args:
-        table: of the engine that runs them.
-        objects_seeds: (N,) of the envs.
-        device: theirs.
+    All layouts of these objects are in its memory, 0.4 kB each with ten objects. ``objects_seeds`` (N,) are the envs'.
     """
 
     def __init__(self, table: LayoutTable, objects_seeds: NDArray[np.int64], device: torch.device | str) -> None:

@@ -1,4 +1,4 @@
-"""The shipped configurations: each finds its assets; select and front-approach ones are laid out and solved."""
+"""Layouts of select and of front approaches, success of select, and its scripted policy."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ import torch
 from mani_skill.utils.structs import Pose
 
 from robocas_ms3.assets.pack import load_pack
-from robocas_ms3.core.errors import AssetError
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.scenes.config import load_task_config
@@ -25,21 +24,6 @@ from robocas_ms3.scenes.sample import sample_layout
 def load(name):
     pack = load_pack("builtin")
     return SceneModel.load(load_task_config(name), pack, pack)
-
-
-@pytest.mark.parametrize("name", sorted(shipped_configs()))
-def test_every_shipped_configuration_finds_its_assets(name):
-    try:
-        model = load(name)
-    except AssetError:
-        asked = [item.asset for item in load_task_config(name).furniture.values()]
-        assert any("/" in asset for asset in asked)  # of a pack that is made from the user's own files
-        return
-    robot, inside = model.robot_pose[:2, 3], model.region
-    middle = np.append(np.add(inside.min_xy, inside.max_xy) / 2, [inside.z, 1.0])
-    target = (model.support_pose @ middle)[:2]
-    assert np.linalg.norm(target - robot) < 1.5  # the robot stands there and looks that way
-    assert model.robot_pose[:2, 0] @ (target - robot) > 0
 
 
 SELECT = sorted(name for name in shipped_configs() if name.startswith("select_"))

@@ -74,10 +74,10 @@ class Composition:
         self.sources: dict[str, str] = {}
 
     def merge(self, changes: Mapping[Any, Any], source: str, *, removes: bool = True) -> None:
-        """Merge a mapping over the present values.
+        """Merge a mapping, which may be incomplete, over the present values.
 
         Args:
-            changes: mapping of the configuration's form; it may be incomplete.
+            changes: the mapping.
             source: file or option that it comes from, for messages.
             removes: whether ``null`` removes a key, see above.
 

@@ -133,15 +133,7 @@ def choose_instruction(
 
 
 def episode_instruction(config: TaskConfig, layout: Layout, seed: int, name: str, names: Iterable[str]) -> Instruction:
-    """Draw the instruction of an episode.
-
-    Args:
-        config: of the task.
-        layout: of the episode.
-        seed: of the layout.
-        name: of the target.
-        names: of all objects in the scene.
-    """
+    """Draw the instruction of an episode by its layout's seed, from the target's name and those of all objects."""
     opening, language = config.opening, config.language
     slots = InstructionSlots(
         config.task,

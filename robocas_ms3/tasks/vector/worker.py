@@ -29,21 +29,13 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class EnvSettings:
-    """What all environments are made with.
-
-    Attributes:
-        env_id: gymnasium's.
-        module: that registers the environment.
-        kwargs: for ``gym.make``.
-        wrappers: put around each environment, the first one first.
-        at_work: file of (num_envs,) bytes, 1 while an env works, for when a process dies.
-    """
+    """What all environments are made with."""
 
     env_id: str
-    module: str
-    kwargs: dict[str, Any]
-    wrappers: tuple[Callable[[gym.Env], gym.Env], ...]
-    at_work: str
+    module: str  # that registers the environment
+    kwargs: dict[str, Any]  # for `gym.make`
+    wrappers: tuple[Callable[[gym.Env], gym.Env], ...]  # the first one is the innermost
+    at_work: str  # file of (num_envs,) bytes, 1 while an env works, for when a process dies
 
 
 class EnvWorker:
