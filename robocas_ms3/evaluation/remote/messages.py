@@ -81,8 +81,8 @@ class Request(BaseModel):
 
     def episode_spec(self, env: int) -> EpisodeSpec:
         """Return the episode that starts, in an env of the policy."""
-        values: dict[str, Any] = self.start.model_dump(exclude_none=True)
-        return EpisodeSpec(env=env, **{"instruction": self.prompt} | values)
+        values: dict[str, Any] = {"instruction": self.prompt, **self.start.model_dump(exclude_none=True)}
+        return EpisodeSpec(env=env, **values)
 
 
 def read_request(message: Mapping[str, Any]) -> Request:
