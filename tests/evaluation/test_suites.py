@@ -29,17 +29,6 @@ def held_out_of(name):
     return [(split, load_task_config(protocol.config_file(config))) for split, config in sorted(pairs)]
 
 
-def standing(name):
-    """Split -> ids of all that stands in its frozen scenes."""
-    protocol, found = suite(name), {}
-    for episode in protocol.episodes:
-        layouts = FrozenLayouts(protocol.layouts_file(episode.config), load_pack("builtin").objects)
-        layout = layouts(episode.seed, episode.seed)
-        here = [identifier for identifier, used in zip(layout.object_ids, layout.present, strict=True) if used]
-        found.setdefault(episode.split, []).append((episode, here))
-    return found
-
-
 @pytest.mark.parametrize("name", SUITES)
 def test_what_is_seen_is_what_is_trained_on(name):
     protocol = suite(name)
@@ -52,7 +41,12 @@ def test_what_is_seen_is_what_is_trained_on(name):
 
 
 def test_objects():
-    found = {split: {one for _, here in scenes for one in here} for split, scenes in standing("objects").items()}
+    protocol, objects, found = suite("objects"), load_pack("builtin").objects, {}
+    layouts = {one.config: FrozenLayouts(protocol.layouts_file(one.config), objects) for one in protocol.episodes}
+    for episode in protocol.episodes:
+        layout = layouts[episode.config](episode.seed, episode.seed)
+        standing = {identifier for identifier, used in zip(layout.object_ids, layout.present, strict=True) if used}
+        found.setdefault(episode.split, set()).update(standing)
     assert set(found) == {"seen", "new", "new_kind"}
     for one, other in combinations(found.values(), 2):
         assert not one & other
@@ -62,14 +56,15 @@ def test_objects():
     for one, other in combinations(ids.values(), 2):
         assert not one & other
     assert all(found[split] <= ids[split] for split in found)
-    objects = load_pack("builtin").objects
     kinds = {split: {objects[one].asset.category for one in ids} for split, ids in found.items()}
     assert kinds["new"] <= kinds["seen"]
     assert not kinds["new_kind"] & (kinds["seen"] | kinds["new"])
 
 
 def test_instructions():
-    splits = {split: [one for one, _ in scenes] for split, scenes in standing("instructions").items()}
+    splits = {}
+    for episode in suite("instructions").episodes:
+        splits.setdefault(episode.split, []).append(episode)
     seen = splits["seen"]
     for split, episodes in splits.items():
         same = [(one.task, one.seed, one.target) for one in episodes]
