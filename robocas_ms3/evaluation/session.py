@@ -8,7 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -76,7 +76,8 @@ class EvaluationSession:
         self.record = self._record(backend)
         self.folder = settings.folder(rules.name)
         self.outcomes: dict[int, Outcome] = {}
-        self._objects = load_pack(rules.pack).objects
+        objects = load_pack(rules.pack).objects
+        self._layouts_of = cache(lambda config: FrozenLayouts(self.protocol.layouts_file(config), objects))
         self._refill = backend != "gpu"
         self._env: Any = None
         self._batch: EpisodeBatch | None = None
@@ -246,7 +247,7 @@ class EvaluationSession:
         return observations
 
     def _outcome(self, ended: Rollout, episode: Episode) -> Outcome:
-        layouts = FrozenLayouts(self.protocol.layouts_file(episode.config), self._objects)
+        layouts = self._layouts_of(episode.config)
         return ended.outcome(episode, layouts(episode.seed, episode.seed).object_ids)
 
     def _make_env(self, episode: Episode, num_envs: int) -> Any:

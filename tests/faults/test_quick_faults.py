@@ -1,6 +1,6 @@
 """Faults in the worker processes of a conversion and a generation, with made-up episodes: the quick set of the suite.
 
-The same for plans is in tests/plans/test_run_plan.py, for evaluation in tests/evaluation/test_run.py, for pools in
+The same for plans is in tests/plans/test_run_plan.py, for evaluation in tests/evaluation/test_session.py, for pools in
 general in tests/core/test_workers.py; all of it with real commands in test_every_fault.py.
 """
 
