@@ -67,7 +67,8 @@ class Quantity(ArraySpec):
         policy: its name in the observations and remote messages of policies; empty: they do not get it.
         recorded: computes it (T, ...) of a motion (`demos.recordings.motion.Motion`), for ``episode_info.npz``; None:
             it is not recorded.
-        feature: LeRobot feature that holds it, next to the others of that feature; empty: none does.
+        feature: LeRobot feature that holds it, next to the others of that feature; empty: none does. An optional
+            quantity has none: LeRobot datasets hold every feature in every episode.
         components: names of its numbers there; default: its own, numbered where it has several.
     """
 
@@ -76,6 +77,10 @@ class Quantity(ArraySpec):
     recorded: Callable[[Any], Any] | None = None
     feature: str = ""
     components: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.optional and self.feature:
+            raise ValueError(f"an optional quantity has no LeRobot feature: {self.name}, {self.feature}")
 
     @property
     def width(self) -> int:
