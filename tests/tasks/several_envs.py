@@ -5,6 +5,7 @@ from unittest.mock import Mock
 
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
+from sapien import physx
 
 from robocas_ms3.tasks import RoboCASPickEnv
 
@@ -30,6 +31,7 @@ def several(folder, monkeypatch, num_envs=4, **arguments) -> tuple[RoboCASPickEn
         env.reset([2022 + i for i in range(num_envs)], {"reconfigure": True})  # as ManiSkill does
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(physx, "enable_gpu", lambda: None)
     monkeypatch.setattr(BaseEnv, "_sim_device", Mock(is_cuda=lambda: True), raising=False)
     monkeypatch.setattr(BaseEnv, "device", torch.device("cpu"), raising=False)
     monkeypatch.setattr(BaseEnv, "__init__", makes)
