@@ -16,12 +16,14 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
 from robocas_ms3.core.documents import load_json
+from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.core.files import make_folder, open_for_append, replacing_folder
 from robocas_ms3.core.locks import lock_file
 from robocas_ms3.core.paths import cache_dir
 from robocas_ms3.robots.description import MOBILE_PANDA as c
 
 LINK_TRIANGLES = 1000
+_INSTALL = "Install it: pip install 'mani_skill>=3.0.1,<3.1'."
 
 # The AGV: a body on the floor (1 cm of air below, so that it never rubs), a deck that carries the pedestal.
 _BODY = ((0.5, 0.4, 0.24), (0.0, 0.0, 0.13 - c.base_link_height), (0.16, 0.17, 0.19))
@@ -56,12 +58,15 @@ class RobotFiles:
 
 
 def robot_files(finger_extension: float = c.finger_extension) -> RobotFiles:
-    """Return the robot's files, generating them where they are missing; raise RobocasError if they can't be written.
+    """Return the robot's files, generating them where they are missing.
 
     The folder's name is a hash of all they are made from, this generator's code included.
 
     Args:
         finger_extension: how much longer than stock the fingers are, m; 0 gives ManiSkill's own fingers.
+
+    Raises:
+        RobocasError: the installed mani_skill has no such Panda, or the cache can't be written to.
     """
     source = _panda_folder()
     folder = cache_dir() / "robots" / _fingerprint(source, finger_extension)
@@ -78,8 +83,12 @@ def robot_files(finger_extension: float = c.finger_extension) -> RobotFiles:
 def _panda_folder() -> Path:
     """Return mani_skill's Panda assets, without importing mani_skill."""
     spec = importlib.util.find_spec("mani_skill")
-    assert spec is not None and spec.submodule_search_locations
-    return Path(spec.submodule_search_locations[0]) / "assets" / "robots" / "panda"
+    if spec is None or not spec.submodule_search_locations:
+        raise RobocasError("mani_skill is not installed", fix=_INSTALL)
+    folder = Path(spec.submodule_search_locations[0]) / "assets" / "robots" / "panda"
+    if not (folder / "panda_v2.urdf").is_file():
+        raise RobocasError("mani_skill's Panda is missing", where=folder / "panda_v2.urdf", fix=_INSTALL)
+    return folder
 
 
 @lru_cache(maxsize=8)
@@ -237,13 +246,15 @@ def _parse(path: Path) -> Element:
 
 def _find(root: Element, tag: str, name: str) -> Element:
     element = root.find(f"{tag}[@name='{name}']")
-    assert element is not None, f"{tag} {name} of mani_skill's Panda"
+    if element is None:
+        raise RobocasError(f"mani_skill's Panda has no such {tag}", where=name, fix=_INSTALL)
     return element
 
 
 def _origin(root: Element, joint: str) -> Element:
     element = _find(root, "joint", joint).find("origin")
-    assert element is not None, f"origin of {joint} of mani_skill's Panda"
+    if element is None:
+        raise RobocasError("mani_skill's Panda has no such origin", where=joint, fix=_INSTALL)
     return element
 
 

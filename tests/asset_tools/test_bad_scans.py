@@ -201,6 +201,35 @@ def test_paths_of_textures(tmp_path, named, texture, repair):
     check_bottle(scan)
 
 
+def test_several_materials(tmp_path):
+    """Each quarter has a texture of its own."""
+    vertices, _, faces = bottle()
+    path = write_obj(tmp_path, texture="")
+    lines = [line for line in path.read_text().splitlines() if not line.startswith(("f ", "usemtl"))]
+    quarter, mtl = quarter_of(vertices[faces].mean(axis=1)), ""
+    for k, color in enumerate(COLORS):
+        lines += [f"usemtl part {k}"]
+        lines += ["f " + " ".join(f"{i + 1}/{i + 1}" for i in face) for face in faces[quarter == k]]
+        mtl += f"newmtl part {k}\nmap_Kd part{k}.png\n"
+        Image.new("RGB", (16, 16), tuple(color.tolist())).save(tmp_path / f"part{k}.png")
+    path.write_text("\n".join(lines))
+    (tmp_path / "scan.mtl").write_text(mtl)
+    check_bottle(prepare(path, up="z"))
+
+
+@pytest.mark.parametrize(("colored", "repair"), [(True, "baked colours into a texture"), (False, "has no colours")])
+def test_scans_without_a_texture(tmp_path, colored, repair):
+    vertices, _, faces = bottle(sections=96)
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    if colored:
+        turned = trimesh.transformations.rotation_matrix(-0.001, [0, 0, 1])[:3, :3]  # no vertex is between two colours
+        mesh.visual.vertex_colors = np.insert(COLORS[quarter_of(vertices @ turned.T)], 3, 255, axis=1).astype(np.uint8)
+    mesh.export(tmp_path / "scan.ply")
+    scan = prepare(tmp_path / "scan.ply", up="z")
+    assert repair in scan.repairs
+    check_bottle(scan, colors=colored, volume=0.01)
+
+
 @pytest.mark.slow
 def test_a_quarter_of_a_million_faces_take_less_than_a_gigabyte(tmp_path):
     model = bottle(sections=350, rows=90)

@@ -1,5 +1,9 @@
 """URDF models as people have them: primitives, scales, odd names, missing and hostile files."""
 
+import os
+import stat
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -263,6 +267,7 @@ def test_paths_out_of_the_model_are_refused(folder, tmp_path, tray, mtl):
 
 def test_a_bad_model_does_not_stop_the_others(folder, tmp_path):
     (folder / "mobility.urdf").write_text(urdf())
+    os.mknod(folder / "other.png", stat.S_IFSOCK | 0o600)  # which the model does not name; a pipe would never end
     bad = tmp_path / "bad"
     bad.mkdir()
     (bad / "mobility.urdf").write_text("<robot>")
@@ -329,6 +334,18 @@ def test_stl_meshes_have_the_colour_of_the_urdf(folder):
 def test_mimic_joints_move_on_their_own(folder):
     source = read(folder, urdf(joint=RANGE + '<mimic joint="other"/>'))
     assert len(source.links) == len(source.repairs) == 1
+
+
+@pytest.mark.parametrize("name", ["../x", "A", "", "a\n"])
+def test_names_that_are_no_folder_of_a_pack_are_refused(folder, name):
+    source = read(folder, urdf())
+    for change in (
+        lambda: replace(source, id=name),
+        lambda: replace(source.links[0], name=name),
+        lambda: replace(source, finishes={"wall": {name: source.mesh}}),
+    ):
+        with pytest.raises(AssetError):
+            change()
 
 
 def test_a_linked_folder_is_the_model_itself(folder, tmp_path):

@@ -12,6 +12,7 @@ import pytest
 import trimesh
 from made_up_assets import furniture_asset
 
+from asset_tools import pipeline
 from asset_tools.pipeline import Job, content_hash, made_of, make_assets, write_pack
 from robocas_ms3.assets.hulls import write_hulls
 from robocas_ms3.assets.pack import HULLS, VISUALS, load_pack, sha256
@@ -180,6 +181,19 @@ def test_a_killed_run_goes_on_where_it_stopped(tmp_path):
     assert len(load_pack(tmp_path / "pack").furniture) == 8
     assert len(made_in(tmp_path / "log")) - before == 8 - finished
     assert len(json.loads((tmp_path / "pack" / "made_from.json").read_text())["content"]) == 8
+
+
+def test_content_counts_code_and_yaml(tmp_path, monkeypatch):
+    monkeypatch.setattr(pipeline, "__file__", str(tmp_path / "pipeline.py"))
+    for folder in ("quality", "reading", "products"):
+        (tmp_path / folder).mkdir()
+    found = []
+    for name, text in (("toys.yaml", "a: 1"), ("toys.yaml", "a: 2"), ("toys.py", "A = 2"), ("notes.txt", "none")):
+        (tmp_path / "products" / name).write_text(text)
+        pipeline._code.cache_clear()
+        found.append(content_hash(packages=["products"]))
+    pipeline._code.cache_clear()
+    assert len(set(found)) == 3 and found[2] == found[3]
 
 
 def test_assets_not_asked_for_in_months_are_forgotten(tmp_path):

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
+from importlib.machinery import ModuleSpec
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from robot_checks import link_poses, numbers
 
 import robocas_ms3.robots
+from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.planning.collision import FclWorld
 from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.urdf import robot_files
@@ -128,6 +130,29 @@ def test_two_processes_at_once(tmp_path):
     assert first == second
     assert Path(first).is_file()
     assert len(list((tmp_path / "robots").iterdir())) == 1
+
+
+def test_a_cache_that_cannot_be_written(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("ROBOCAS_CACHE", str(tmp_path / "file"))
+    with pytest.raises(RobocasError) as caught:
+        robot_files()
+    assert str(caught.value.where).startswith(str(tmp_path / "file"))
+
+
+@pytest.mark.parametrize("urdf", [None, "<robot/>", '<robot><joint name="panda_hand_tcp_joint"/></robot>'])
+def test_a_mani_skill_without_the_panda_that_is_expected(tmp_path, monkeypatch, urdf):
+    monkeypatch.setenv("ROBOCAS_CACHE", str(tmp_path / "cache"))
+    spec = ModuleSpec("mani_skill", None, is_package=True)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: spec if urdf else None)
+    if urdf:
+        spec.submodule_search_locations.append(str(tmp_path))
+        folder = tmp_path / "assets" / "robots" / "panda"
+        folder.mkdir(parents=True)
+        (folder / "panda_v2.urdf").write_text(urdf)
+    with pytest.raises(RobocasError) as caught:
+        robot_files()
+    assert "mani_skill" in caught.value.fix
 
 
 def test_imports_write_nothing_and_the_urdf_needs_no_sapien(tmp_path):

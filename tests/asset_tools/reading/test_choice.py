@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
-from models import box, image_file, write_obj
+from models import Gltf, box, image_file, write_obj
 
 from asset_tools.import_scans import ImportSettings, find_scans, scan_jobs
 from asset_tools.reading.model import read_model
@@ -113,16 +113,19 @@ def test_layouts_that_datasets_have(tmp_path):
     write_obj(tmp_path, "cup", mug())
     mug().export(tmp_path / "cup.stl")
     mug().export(tmp_path / "cup_collision.stl")
+    Gltf(mug()).write(tmp_path / "bowl" / "bowl.glb")
+    image_file(tmp_path / "bowl" / "preview.png")
     (tmp_path / "soft").mkdir()
     (tmp_path / "soft" / "soft.fbx").write_bytes(b"Kaydara")
     found = find_scans(tmp_path)
-    assert sorted(found.models) == ["cup", "shoe", "soft", "ycb"]
+    assert sorted(found.models) == ["bowl", "cup", "shoe", "soft", "ycb"]
     assert not found.errors
     skipped = " ".join(found.skipped)
     assert all(name in skipped for name in ("textures", "photos", "__MACOSX", "cup_collision.stl"))
     for name in ("ycb", "shoe", "cup"):
         model = read_model(list(found.models[name].paths), tmp_path)
         assert len(model.mesh.faces) == 12 and any(path.name == "skin.png" for path in model.files)
+    assert len(read_model(list(found.models["bowl"].paths), tmp_path).mesh.faces) == 12
     with pytest.raises(AssetError) as caught:
         read_model(list(found.models["soft"].paths), tmp_path)
     assert ".fbx" in str(caught.value.found)
@@ -170,6 +173,15 @@ def test_a_collision_mesh_above_the_folder_of_the_visual_one(tmp_path):
     box().export(tmp_path / "collision.obj")
     model = read_model(tmp_path)
     assert any(path.name == "skin.png" for path in model.files) and "ignored collision.obj" in notes_of(model)
+
+
+def test_versions_in_several_folders(tmp_path):
+    write_obj(tmp_path / "meshes", "mug", mug())
+    (tmp_path / "collision").mkdir()
+    for name in ("mug.stl", "collision/a.stl"):
+        mug().export(tmp_path / name)
+    found = notes_of(read_model(tmp_path))
+    assert all(words in found for words in ("used meshes/mug.obj", "ignored mug.stl", "ignored collision/a.stl"))
 
 
 def test_a_textured_label_around_a_can(tmp_path):
