@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 import torch
 from made_up_observations import observe, start
+from made_up_runs import fit
 from synthetic import write_trajectory
 
 from robocas_ms3.baselines import bc_state
 from robocas_ms3.baselines.bc_state import BASELINE, BcStateConfig
 from robocas_ms3.core.errors import DatasetError, EvaluationError
+from robocas_ms3.core.poses import to_wxyz
+from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.demos.recordings.environment import RecordedEnv
 
 
@@ -117,6 +120,27 @@ def test_what_is_no_trajectory_with_successes(simulator, tmp_path):
         with pytest.raises(DatasetError) as caught:
             read(path)
         assert caught.value.where == path
+
+
+def test_samples_are_learned_and_a_policy_sees_the_same(simulator, trajectory):
+    """The loss falls, and the policy does what the network predicts for the sample of a step."""
+    simulator([1.0, 2.0])
+    config = BcStateConfig(width=64, blocks=2, dropout=0, noise=0)
+    samples = read(trajectory)
+    model, losses = fit(BASELINE, config, samples, 60)
+    assert losses[-1] < 0.4 * losses[0]
+    arrays = bc_state.load_states(trajectory, config.rate_hz, lambda done, total: None)
+    policy = BASELINE.policy(config, samples.facts, model)
+    [number] = split_by_seed(dict(enumerate(arrays["seeds"].tolist())))[0]
+    for step in (0, 4):
+        row = slice(number * len(samples) + step, number * len(samples) + step + 1)
+        tcp, width, state = to_wxyz(arrays["poses"][row]), arrays["widths"][row, None], arrays["state"][row]
+        policy.reset([start()])
+        action = policy.act(observe(tcp_in_base=tcp, gripper_width=width, state=state))[0]
+        with torch.inference_mode():
+            chunk = model.act(samples.__getitems__([step])["inputs"])[0]
+        assert action[:3] == pytest.approx(chunk[0, :3].numpy(), abs=1e-5)
+        assert (action[6] > 0.5) == (chunk[0, 9] > 0.5)
 
 
 def test_other_scenes_are_refused():

@@ -45,6 +45,22 @@ def assert_finite(folder):
         assert all(tensor.isfinite().all() for tensor in load_file(folder / f"{name}.safetensors").values())
 
 
+def fit(baseline, config, samples, steps):
+    """Train a network on all samples at once; return it and the loss of each step."""
+    torch.manual_seed(0)
+    model = baseline.model(config, samples.facts).train()
+    batch = samples.__getitems__(list(range(len(samples))))
+    optimizer, losses = torch.optim.AdamW(model.parameters(), lr=8e-3), []
+    for _ in range(steps):
+        loss = model(batch)["loss"]
+        losses.append(loss.item())
+        optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(model.parameters(), config.train.clip_norm)
+        optimizer.step()
+    return model.eval(), losses
+
+
 def change_record(run, **values):
     path = run / "run.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), **values}))

@@ -9,9 +9,15 @@ from hypothesis import strategies as st
 
 from robocas_ms3.baselines.rt1 import BASELINE
 from robocas_ms3.baselines.rt1.config import RT1Config
-from robocas_ms3.baselines.rt1.model import ActionBins, likeliest_tokens
+from robocas_ms3.baselines.rt1.model import ActionBins, attention_mask, likeliest_tokens
 from robocas_ms3.core.errors import TrainingError
 from robocas_ms3.core.strict import parse
+
+
+def test_tokens_attend_to_image_tokens_before_them_and_not_to_predicted_ones():
+    """Two frames of one image token and two predicted ones."""
+    first, second = [1, 0, 0, 0, 0, 0], [1, 0, 0, 1, 0, 0]
+    assert attention_mask(2, 1, 2).int().tolist() == [first] * 3 + [second] * 3
 
 
 @pytest.mark.parametrize("frame", [0, 3, 5])

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from made_up_observations import observe, start
+from made_up_runs import fit
 from rt1_sizes import SIZES
 
 from robocas_ms3.baselines.rt1 import BASELINE
@@ -106,16 +107,5 @@ def test_samples_are_learned(folder):
     sizes = {"picture": (48, 36), "crop_height": 32, "frames": 2, "image_width": 0.1, "token_width": 64, "width": 64}
     config = RT1Config(**{**SIZES, **sizes, "dropout": 0.0, "drop_connect": 0.0})
     samples = BASELINE.data(config, folder, "train", lambda done, total: None)
-    torch.manual_seed(0)
-    model = BASELINE.model(config, samples.facts).train()
-    batch = samples.__getitems__(list(range(len(samples))))
-    optimizer = torch.optim.AdamW(model.parameters(), lr=8e-3)
-    losses = []
-    for _ in range(25):
-        loss = model(batch)["loss"]
-        losses.append(loss.item())
-        optimizer.zero_grad()
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(model.parameters(), config.train.clip_norm)
-        optimizer.step()
+    _, losses = fit(BASELINE, config, samples, 25)
     assert losses[-1] < 0.4 * losses[0]

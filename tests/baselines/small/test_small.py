@@ -1,10 +1,13 @@
 """`small`: its samples of a dataset, that it learns them, how it continues and acts, and datasets that it refuses."""
 
 import shutil
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from made_up_observations import observe, start
+from made_up_runs import fit
 from pydantic import ValidationError
 from small_sizes import TINY, VIEW
 
@@ -29,6 +32,28 @@ def read(folder, split="train", **changes):
 @pytest.fixture(scope="module")
 def samples(folder):
     return read(folder)
+
+
+def test_samples_are_learned_and_a_policy_sees_the_same(samples, folder):
+    """The loss falls, and the policy does what the network predicts for the sample of a step."""
+    model, losses = fit(BASELINE, SmallConfig(**TINY), samples, 30)
+    assert losses[-1] < 0.4 * losses[0]
+    source = open_source(folder)
+    episode, policy = source.episode(source.split("train")[0]), BASELINE.policy(model.config, samples.facts, model)
+    arrays = episode.arrays
+    for step in (0, 4):
+        policy.reset([start()])
+        seen = observe(
+            embeddings=arrays["language_embedding"][None],
+            images={name: episode.rgb(name, step)[None] for name in policy.spec.cameras},
+            tcp_in_base=np.append(arrays["ee_pos"][step], np.roll(arrays["ee_orn"][step], 1))[None],
+            gripper_width=arrays["gripper_width"].reshape(-1, 1)[step : step + 1],
+        )
+        with torch.inference_mode():
+            chunk = model.act(samples.__getitems__([step]))[0]
+        action = policy.act(seen)[0]
+        assert action[:3] == pytest.approx(chunk[0, :3].numpy(), abs=1e-5)
+        assert (action[6] > 0.5) == (chunk[0, 9] > 0.5)
 
 
 def test_every_weight_is_learned(samples):
@@ -198,6 +223,17 @@ def test_datasets_that_do_not_suit(folder, tmp_path, spoil, message):
     spoil(copy)
     with pytest.raises(DatasetError, match=message):
         read(copy)
+
+
+def test_images_have_to_fit_into_memory(folder, monkeypatch):
+    """Each process of `accelerate launch` holds all of them."""
+    fits = 1.5 * 35 * 2 * 3 * VIEW.size[0] * VIEW.size[1] / 0.9  # once, and not twice
+    monkeypatch.setattr(data.psutil, "virtual_memory", lambda: SimpleNamespace(available=fits))
+    read(folder)
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
+    with pytest.raises(DatasetError) as caught:
+        read(folder)
+    assert caught.value.where == folder
 
 
 def test_without_lift_a_camera_may_move(folder, tmp_path):

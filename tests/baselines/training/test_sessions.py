@@ -15,9 +15,13 @@ import made_up_baseline
 import pytest
 import torch
 from made_up_runs import assert_finite, assert_same, change_record, read_log, stop_at, train
+from rt1_sizes import SIZES
 from safetensors.torch import load_file
+from small_sizes import TINY
 
 from robocas_ms3.baselines.policy import RunPolicy
+from robocas_ms3.baselines.rt1.config import RT1Config
+from robocas_ms3.baselines.small.config import SmallConfig
 from robocas_ms3.baselines.training import checkpoints, run_folder
 from robocas_ms3.baselines.training.learner import Learner
 from robocas_ms3.baselines.training.session import Progress, merge_configs
@@ -63,6 +67,25 @@ def test_a_run_that_was_stopped_continues_to_the_bit(whole, data, tmp_path, step
     train("made-up", data, out, progress=Progress(step=lambda done, total: steps.append(done)))
     assert steps[0] == continued_at
     assert_same(whole, out)
+
+
+@pytest.mark.parametrize(
+    ("name", "config"),
+    [
+        ("rt1", RT1Config(**SIZES)),
+        ("small", SmallConfig(**{**TINY, "dropout": 0.1, "shift": 3, "brightness": 0.2})),
+    ],
+    ids=["rt1", "small"],
+)
+def test_a_real_network_continues_to_the_bit(folder, tmp_path, name, config):
+    """With all that is random: crops, shifts, light and dropout."""
+    few = {"steps": 4, "batch_size": 2, "save_every": 2, "log_every": 1, "check_every": 2, "workers": 0}
+    changes = {**config.model_dump(), "train": few}
+    train(name, folder, tmp_path / "whole", changes)
+    with pytest.raises(RuntimeError):
+        train(name, folder, tmp_path / "again", changes, progress=stop_at(3, RuntimeError("gone")))
+    train(name, folder, tmp_path / "again")
+    assert_same(tmp_path / "whole", tmp_path / "again")
 
 
 @pytest.mark.parametrize("damage", [Path.unlink, lambda path: path.write_bytes(b"\xff" * 100)])
