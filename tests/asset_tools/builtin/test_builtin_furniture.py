@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from asset_tools.builtin.furniture import MAKERS
 from asset_tools.builtin.furniture.room import room
 from asset_tools.quality.furniture import examine_furniture
+from robocas_ms3.assets.annotations import GRIPPER_BOXES
 
 JOINTS = [("cabinet", f"{part}_{side}") for part in ("door", "drawer") for side in ("left", "right")]
 JOINTS += [("container", "door"), ("refrigerator", "door"), ("refrigerator", "freezer_door")]
@@ -61,6 +62,23 @@ def test_joints_work_and_surfaces_hold(name):
     assert [key for key, joint in report.joints.items() if not joint.works] == []
     assert [key for key, surface in report.surfaces.items() if not surface.holds] == []
     assert len(report.surfaces) >= 1
+
+
+@pytest.mark.parametrize("name, part", JOINTS)
+def test_the_open_gripper_reaches_around_the_handle(name, part):
+    """The boxes of hand and fingers are free, and the bar is between the fingers, as thick as it says."""
+    handle = made(name).handles[part]
+    tcp, own = pose(handle), bodies(made(name))[part]
+    everything = [piece for pieces in bodies(made(name)).values() for piece in pieces]
+    for low, high in GRIPPER_BOXES:
+        for side in (1, -1):
+            axes = [np.linspace(a, b, 1 + int((b - a) / 0.003)) for a, b in zip(low, high, strict=True)]
+            points = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3) * (1, side, 1)
+            assert not within(everything, points @ tcp[:3, :3].T + tcp[:3, 3]).any()
+    across = np.outer(handle.width / 2 * np.array([0, 0.98, -0.98, 1.02, -1.02]), (0, 1, 0))
+    for along in (-0.01, 0, 0.01):  # m, all along the pads
+        points = (across + (along, 0, 0)) @ tcp[:3, :3].T + tcp[:3, 3]
+        assert within(own, points).tolist() == [True, True, True, False, False]
 
 
 @pytest.mark.parametrize("name, part", JOINTS)
