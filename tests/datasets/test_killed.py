@@ -66,6 +66,10 @@ def test_the_same_command_again_makes_the_same(inputs, tmp_path, monkeypatch, wo
     done = subprocess.run(command, check=False, capture_output=True, text=True)
     assert done.returncode == -signal.SIGKILL, done.stderr
     assert overwrite or not (out / "data_info.json").exists()
+    if (out / "meta/info.json").exists():  # a name that LeRobot opens: all is whole
+        from robocas_ms3.datasets.lerobot.check import check_lerobot
+
+        assert check_lerobot(out).violations == []
     assert run([*words, "--out", str(out)]) == 0
     assert files_of(out) == files_of(whole)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "whole"]

@@ -39,6 +39,13 @@ def test_the_documentation_is_the_schemas():
         assert table in text, f"put this into docs/dataset.md:\n{table}"
 
 
+def test_the_keys_are_those_of_the_paper_and_two_of_the_mobile_base():
+    paper = """rel_pos rel_orn ee_pos ee_orn robot_joints arm_joint_vel base_pos base_orn base_rel_pos base_rel_orn
+    gripper_width gripper_status episode_length language_goal language_embedding step_lang_goals step_goal_embs
+    step_goal_type"""
+    assert {spec.name for spec in schema.EPISODE_INFO} == {*paper.split(), "agv_pose", "rel_agv_pose"}
+
+
 def test_only_folders_of_episodes_have_numbers():
     assert schema.episode_number(schema.episode_folder(12)) == 12
     for other in ("episode_12", "preview", "episode_00000ab", ".episode_0000012.tmp"):

@@ -174,6 +174,12 @@ def test_the_command_tells_it_and_may_ask_for_a_share(dataset, capsys):
     assert report["replay"]["by_task"]["pick"]["share"] == 0.5
 
 
+@pytest.mark.parametrize("words", ["--min-share 0.5", "--replay --min-share 50", "--replay --min-share nan"])
+def test_an_invalid_share_is_refused(dataset, player, capsys, words):
+    assert run(["validate", str(dataset), *words.split()]) == 1
+    assert capsys.readouterr().err.startswith("error: --min-share: ")
+
+
 @pytest.mark.parametrize("json_too", [(), ("--json",)])
 def test_a_share_that_nobody_could_see_is_not_enough(dataset, capsys, json_too):
     """As where the pack is not installed, or for one of two tasks."""

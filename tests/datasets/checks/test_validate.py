@@ -11,6 +11,7 @@ import managing
 import numpy as np
 import pytest
 
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.sources.arrays import load_arrays
 
@@ -60,6 +61,8 @@ def test_an_empty_folder(tmp_path):
         "conversion.json: expected this file (robocas import-robocas writes one), found no file",
         "data_info.json: expected this file, found no file",
     ]
+    with pytest.raises(DatasetError):
+        validate(tmp_path / "no folder")
 
 
 @pytest.mark.parametrize(
@@ -73,6 +76,7 @@ def test_an_empty_folder(tmp_path):
         ("episode_length", np.array(10**9), "expected 1 to 10000 steps, found 1000000000"),
         ("rel_pos", np.array(0, np.float32), "expected shape (7, 3), found shape ()"),
         ("step_goal_type", np.array(["grasp"] * 6), "expected shape (7,), found shape (6,)"),
+        ("step_goal_type", np.array(["dance"] * 7), "expected one of"),
         ("episode_length", np.array(6), "expected 7, as the arrays have, found 6"),
     ],
 )

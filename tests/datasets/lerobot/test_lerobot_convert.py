@@ -127,6 +127,10 @@ def test_an_output_that_exists_is_left_alone(trajectory, tmp_path):
             convert(trajectory, out, **settings)
     with pytest.raises(DatasetError):
         convert(tmp_path / "missing.h5", out, overwrite=True)
+    edit(out / "meta/robocas/conversion.json", lambda settings: settings["made_with"].update(sapien="2.2.2"))
+    with pytest.raises(OutputExistsError, match="made_with.sapien"):
+        convert(trajectory, out)
+    (out / "meta/robocas/conversion.json").write_bytes(before["meta/robocas/conversion.json"])
     done = convert(trajectory, out)
     assert (done.episodes, done.kept) == ([], 2)
     assert files_of(out) == before

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from functools import partial
 
 import numpy as np
 import pytest
@@ -104,7 +105,9 @@ def test_statistics_are_those_of_the_data(versions):
         (stats["action"], np.concatenate(actions)),
         ({key: rows[1][f"stats/action/{key}"] for key in stats["action"]}, actions[1]),
     ):
-        for key, function in (("mean", np.mean), ("std", np.std), ("max", np.max), ("q50", np.median)):
+        quantiles = {f"q{share:02}": partial(np.quantile, q=share / 100) for share in (1, 10, 50, 90, 99)}
+        functions = {"mean": np.mean, "std": np.std, "min": np.min, "max": np.max, **quantiles}
+        for key, function in functions.items():
             np.testing.assert_allclose(found[key], function(values.astype(float), axis=0), atol=1e-6, err_msg=key)
         assert found["count"] == [len(values)]
     assert all(type(value) is int for value in stats["next.success"]["min"] + stats["index"]["max"])

@@ -172,6 +172,18 @@ def test_relative_motion_as_the_paper_writes_it(upstream, made, tmp_path):
     assert any("one step later" in text for text in new.episode(1).scene["source"]["mended"])
 
 
+def test_a_last_motion_becomes_the_identity_and_missing_velocities_are_made(upstream):
+    arrays = arrays_of(upstream / "episode_0000000")
+    motion = arrays["base_rel_pos"]
+    motion[-1] = 1
+    joints = np.arange(7, dtype=np.float32)[:, None] * np.full(7, 0.1, np.float32)
+    change(upstream / "episode_0000000", base_rel_pos=motion)
+    change(upstream / "episode_0000001", robot_joints=joints, arm_joint_vel=None)
+    repaired = {(episode, where): repair for episode, where, _, repair in problems(upstream, "mended")}
+    assert "identity" in repaired[0, f"{NPZ}, base_rel_pos"]
+    np.testing.assert_allclose(Dataset(upstream).episode(1).arrays["arm_joint_vel"], 0.5, atol=1e-5)  # 0.1 rad at 5 Hz
+
+
 def test_quaternions_wxyz(upstream, tmp_path):
     for episode in upstream.glob("episode_*"):
         arrays = arrays_of(episode)

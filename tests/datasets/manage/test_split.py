@@ -190,6 +190,16 @@ def test_wrong_words(six, tmp_path, capsys):
         assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("damage", ["pickles", "cut off"])
+def test_a_damaged_episode_stops_it_before_anything_is_written(six, tmp_path, capsys, damage):
+    root = shutil.copytree(six, tmp_path / "ds")
+    spoil, file = DAMAGES[damage]
+    spoil(root / "episode_0000004")
+    assert run(["split", str(root), "--parts", "0.5", "0.5", "--out", str(tmp_path / "out")]) == 1
+    assert f"{root}/episode_0000004/{file}: " in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize("damage", ["infinite ee_pos", "no archive"])
 def test_in_place_leaves_all_as_it_is_where_arrays_are_damaged(six, tmp_path, damage):
     root = shutil.copytree(six, tmp_path / "ds")

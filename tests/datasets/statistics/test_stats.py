@@ -1,6 +1,7 @@
 """Statistics of a dataset: counts worked out by hand, pictures that are there, bad input."""
 
 import json
+import shutil
 import sys
 
 import managing
@@ -132,6 +133,13 @@ def test_texts_with_dollars_and_control_characters_are_labels(told, tmp_path):
     stats.subgoals[text] = stats.subgoals["move and grasp"]
     names = [path.name for path in write_stats(stats, tmp_path / "out")]
     assert names == ["stats.json", *(f"{name}.png" for name in PICTURES)]
+
+
+def test_the_default_folder_is_next_to_a_trajectory(trajectory, tmp_path):
+    for suffix in (".h5", ".json"):
+        shutil.copy(trajectory.with_suffix(suffix), tmp_path / f"T{suffix}")
+    assert main(Command(tmp_path / "T.h5")) == 0
+    assert (tmp_path / "T_stats/stats.json").is_file()
 
 
 def test_damaged_scene(told):

@@ -6,6 +6,7 @@ Files that Python writes are cut off by half, with the error that a full disk gi
 
 import errno
 import os
+import shutil
 from functools import partial
 from pathlib import Path
 
@@ -107,6 +108,21 @@ def test_a_conversion(trajectory, made_up_pictures, tmp_path, monkeypatch, capsy
     assert run(command) == 0
     assert validate(out).violations == []
     command[3] = str(tmp_path / "whole")
+    assert run(command) == 0
+    assert files_of(out) == files_of(tmp_path / "whole")
+
+
+@pytest.mark.parametrize(("last", "episodes"), [(1, 0), (60, 1)])
+def test_a_merge(made, tmp_path, monkeypatch, capsys, last, episodes):
+    out, source, shown = tmp_path / "out", files_of(made), ["conversion.json", "episode_0000000"]
+    command = ["merge", str(made), "--copy", "--out", str(out)]
+    with monkeypatch.context() as patch:
+        fills_up(patch, shutil, "copyfile", last, lambda source, path: half(Path.write_bytes, path, b"some bytes"))
+        ends_in_one_line(command, capsys)
+    assert (sorted(path.name for path in out.iterdir()) if out.exists() else []) == (shown if episodes else [])
+    assert files_of(made) == source
+    assert run(command) == 0
+    command[-1] = str(tmp_path / "whole")
     assert run(command) == 0
     assert files_of(out) == files_of(tmp_path / "whole")
 
