@@ -3,6 +3,7 @@ import json
 import pytest
 
 from robocas_ms3.cli.list import List, collect, main
+from robocas_ms3.cli.main import run
 from robocas_ms3.core.paths import data_dir
 from robocas_ms3.scenes.config import load_task_config, shipped_configs
 
@@ -42,6 +43,9 @@ def test_a_damaged_pack_does_not_hide_the_others(damaged_pack, capsys):
     assert packs["broken"]["objects"] == []
     assert main(List()) == 0
     assert "damaged" in capsys.readouterr().out
+    assert run(["assets", "list"]) == 0
+    listed = capsys.readouterr().out
+    assert "broken" in listed and "builtin" in listed
 
 
 def test_names_are_whole_in_a_pipe_and_in_a_narrow_terminal(capsys, monkeypatch):

@@ -112,6 +112,15 @@ def test_the_other_workers_go_on_while_a_slow_task_holds_up_results_and_few_of_t
         assert len(taken) < 25
 
 
+def test_after_ctrl_c_a_pool_gives_the_results_of_later_tasks():
+    with WorkerPool(Counter, 1) as pool:
+        pool.run("start")
+        threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
+        with pytest.raises(KeyboardInterrupt):
+            pool.run(1.0)
+        assert pool.run("later")[0] == "later"
+
+
 @pytest.mark.parametrize("num_workers", [0, 1])
 def test_an_error_is_raised_as_it_is_and_the_worker_is_made_again(num_workers):
     with WorkerPool(Counter, num_workers) as pool:

@@ -10,7 +10,14 @@ import torch
 from counting_env import BREAKS, CountingEnv, Dying, play
 
 from robocas_ms3.cli.main import run as cli
-from robocas_ms3.core.errors import DatasetError, EvaluationError, OutputExistsError, RobocasError, WorkerDied
+from robocas_ms3.core.errors import (
+    DatasetError,
+    EvaluationError,
+    OutputExistsError,
+    PolicyFailed,
+    RobocasError,
+    WorkerDied,
+)
 from robocas_ms3.core.locks import locked_folder
 from robocas_ms3.evaluation import results, session
 from robocas_ms3.evaluation.policies import make_policy
@@ -102,6 +109,24 @@ def test_actions_of_another_shape_are_refused_and_one_that_is_not_finite_ends_it
     policy.act = lambda observations: np.zeros((2, 6))
     with pytest.raises(EvaluationError, match=r"expected \(1, 7\) or \(1, chunk, 7\) numbers, found \(2, 6\)"):
         play(CountingEnv(1, None), policy, starts(4), 7)
+
+
+def test_an_episode_in_which_the_policy_fails_ends_alone_and_its_outcome_says_why():
+    policy = Obedient()
+    act = policy.act
+
+    def fail(observations: Observations) -> np.ndarray:
+        actions = act(observations)
+        failed = observations.envs[np.array(observations.instructions) == "count to 4"]
+        if len(failed):
+            raise PolicyFailed({int(env): "no plan" for env in failed}, actions)
+        return actions
+
+    policy.act = fail
+    played = sorted(play(CountingEnv(2, None), policy, starts(4, 5, 3), 7), key=lambda one: one.start.seed)
+    assert [(one.error, one.steps) for one in played] == [("", 3), ("no plan", 0), ("", 5)]
+    outcome = played[1].outcome(SMOKE.episodes[0], ())
+    assert (outcome.success, outcome.failure_stage, outcome.error) == (False, "error", "no plan")
 
 
 def ones(count: int = 1, value: float = 1.0) -> np.ndarray:

@@ -4,6 +4,7 @@ import io
 import json
 import shutil
 import warnings
+import zipfile
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -34,6 +35,7 @@ from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.provenance import recorded_scene, recording_entry
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.trajectory import TrajectorySource
+from robocas_ms3.datasets.statistics.collect import collect
 from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.datasets.writing.plan import DATASET, dataset_settings, plan_episodes
 from robocas_ms3.datasets.writing.settings import ConversionSettings
@@ -262,6 +264,7 @@ TABLE = [  # writer, file, reader, how many kinds of damage, how many of them ar
     (write_recording, "trajectory.json", show_page, 40, 0),
     (write_recording, "trajectory.h5", read_recording, 80, 20),
     (write_recording, "trajectory.json", read_recording, 120, 30),
+    (write_recording, "trajectory.json", lambda root: collect(root / "trajectory.h5"), 20, 0),
     (write_pack, "manifest.json", load_pack, 150, 120),
     (write_pack, "hulls.obj", read_hull_file, 40, 10),
     (write_pack, "annotations.npz", read_annotations, 40, 20),
@@ -433,6 +436,12 @@ def test_ledgers(tmp_path_factory, lines):
     assert ledger.read()[-1] == Try(1)
 
 
+@pytest.mark.parametrize("changes", [{"attempt": -2}, {"seed": 2**62}, {"seconds": 1e308}, {"seconds": True}])
+def test_a_failure_out_of_range_is_no_failure(tmp_path, changes):
+    (tmp_path / "failures.jsonl").write_text(json.dumps({**FAILURE, **changes}) + "\n")
+    assert Ledger(tmp_path / "failures.jsonl", Failure).read() == []
+
+
 def test_arrays_that_unpack_to_more_than_there_may_be(tmp_path, monkeypatch):
     monkeypatch.setattr(documents, "ARRAYS_LIMIT", 2**20)
     path = tmp_path / "annotations.npz"
@@ -441,6 +450,10 @@ def test_arrays_that_unpack_to_more_than_there_may_be(tmp_path, monkeypatch):
     for read, error in ((open_arrays, DocumentError), (Annotations.load, AssetError)):
         with pytest.raises(error):
             read(path)
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("resting_poses.npy", b"\x93NUMPY\x01\x00")  # a header that is cut off
+    with pytest.raises(AssetError):
+        Annotations.load(path)
 
 
 def test_facts_and_checkpoints_of_a_training(folder_of, tmp_path):

@@ -34,6 +34,9 @@ def test_two_jobs_make_what_one_makes(jobs, undisturbed, tmp_path, units_per_job
         pytest.skip("see test_run_plan.py")
     jobs.run(tmp_path / "out", units_per_job=units_per_job)
     assert_same(undisturbed, tmp_path / "out")
+    wait_for(lambda: not jobs.processes(tmp_path / "out"))
+    if jobs.name == "ray":
+        assert list(Path(os.environ["TMPDIR"]).glob("robocas-ray-*")) == []  # folders of tasks
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGUSR2])
@@ -81,6 +84,8 @@ def test_a_unit_that_kills_its_jobs_again_and_again_ends_the_run(jobs, tmp_path)
     with pytest.raises(PlanError, match="the jobs of this unit die") as error:
         jobs.run(out, units_per_job="1")
     assert error.value.where == PlanFolder(PLAN, out).unit_folder(Unit(0, 0))
+    if jobs.name == "slurm":
+        assert any(Path(word.rstrip(";")).is_file() for word in str(error.value.fix).split())  # the job's log
 
 
 def test_an_error_of_all_seeds_ends_the_run(jobs, undisturbed, tmp_path):

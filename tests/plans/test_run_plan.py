@@ -209,12 +209,23 @@ def test_another_plan_is_refused_unless_it_is_to_overwrite_but_limits_and_descri
     assert PlanFolder(other, out).outcomes(Unit(0, 1))[0].seed == 14
 
 
-def test_a_machine_with_other_versions_does_no_unit(tmp_path):
-    out = tmp_path / "out"
-    shard(out, "4/5")
+def record_other_versions(out):
     record = json.loads((out / "plan.json").read_text())
     record["versions"]["sapien"] = "2.2.2"
     (out / "plan.json").write_text(json.dumps(record))
+
+
+def test_a_machine_with_other_versions_joins_nothing(out):
+    record_other_versions(out)
+    with pytest.raises(OutputExistsError, match=r"versions\.sapien: .*2\.2\.2"):
+        join_plan(out)
+    assert not (out / "report.json").exists()
+
+
+def test_a_machine_with_other_versions_does_no_unit(tmp_path):
+    out = tmp_path / "out"
+    shard(out, "4/5")
+    record_other_versions(out)
     worker = UnitWorker(PlanFolder(PLAN, out))
     for start in (lambda: worker.do(Unit(0, 0)), lambda: shard(out, "0/2")):
         with pytest.raises(OutputExistsError, match=r"versions\.sapien: .*2\.2\.2"):

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from synthetic import RayCaster, write_trajectory
 
-from robocas_ms3.core.errors import DatasetError, MissingExtraError, RobocasError
+from robocas_ms3.core.errors import DatasetError, MissingExtraError
 from robocas_ms3.plans import worker
 from robocas_ms3.plans.folder import PlanFolder, Unit
 from robocas_ms3.plans.plan import PartConfig, Plan
@@ -44,8 +44,6 @@ class MadeUp:
             raise ValueError("a bug\nof two lines")
         elif fault == "refuse":
             raise MissingExtraError("nothing to record with")
-        elif fault == "limit":  # as `demos.branches` has it
-            raise RobocasError("can't start another process")
         elif fault == "damaged":
             raise DatasetError("this recording is damaged")
         elif fault == "fail":
