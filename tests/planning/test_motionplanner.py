@@ -191,9 +191,15 @@ def test_unsupported_env_is_an_error_with_a_fix(control_mode, robot, where):
     assert caught.value.fix
 
 
-def test_a_robot_of_this_package():
-    env = gym.make("RoboCASPick-v1", obs_mode="state", control_mode="pd_joint_pos", render_backend="none")
-    env.reset(seed=0)
+@pytest.mark.parametrize("robot", ["panda_wristcam", "robocas_mobile_panda"])
+def test_other_robots_with_a_panda_arm(robot):
+    if robot == "panda_wristcam":
+        env = make(robot=robot)
+        env.reset(seed=0)
+        env.unwrapped.agent.reset(env.unwrapped.agent.keyframes["rest"].qpos)
+    else:
+        env = gym.make("RoboCASPick-v1", obs_mode="state", control_mode="pd_joint_pos", render_backend="none")
+        env.reset(seed=0)
     goal = sapien.Pose([0, 0.05, 0.05]) * tcp(env)
     PandaArmMotionPlanningSolver(env).move_to_pose_with_RRTConnect(goal, refine_steps=10)
     assert distance(tcp(env), goal) < 2e-3

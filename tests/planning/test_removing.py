@@ -21,6 +21,7 @@ from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.planning.skills.clearing import Heap, Move
 from robocas_ms3.planning.skills.pushing import push_away
 from robocas_ms3.planning.skills.removing import blockers, clear_grasps, remove
+from robocas_ms3.planning.solvers import search
 
 pytestmark = pytest.mark.slow
 
@@ -131,6 +132,21 @@ def test_moves_begin_with_pushes_of_what_is_highest_and_looking_changes_nothing(
     in_the_way = np.flatnonzero(heap.env.clutter().obstacles[0].numpy()).tolist()
     if in_the_way:
         assert moves[0] == Move("push", max(in_the_way, key=lambda slot: surface(arm, slot)[:, 2].max()))
+
+
+def test_where_nothing_can_be_moved_the_target_is_grasped_as_it_lies(generator, monkeypatch):
+    arm, *_ = begin(generator, 3)
+    skills = []
+
+    def refuse(*_):
+        raise PlanningFailed("push", "no_room")
+
+    monkeypatch.setattr(Heap, "make", refuse)
+    monkeypatch.setattr(Heap, "visible", True)
+    for name in ("grasp", "hang_clear", "carry_to_basket", "release_into_basket"):
+        monkeypatch.setattr(search, name, lambda *_, name=name, **how: skills.append(name))
+    search.attempt(arm)
+    assert skills == ["grasp", "hang_clear", "carry_to_basket", "release_into_basket"]
 
 
 def test_after_a_push_the_arm_rises_clear_of_furniture_and_basket(generator, monkeypatch):

@@ -51,6 +51,15 @@ def test_objects_that_do_not_stay(model, y, lift, lean):
     assert not run(model, ["drink"], [pose])[1]
 
 
+@pytest.mark.parametrize("heap", [False, True])
+def test_an_object_that_tips_over_may_stay_in_a_heap(model, monkeypatch, heap):
+    tipped = planar(0, 0, 0, 0)[None]
+    tipped[0, 1:3, 1:3] = [[0.8, -0.6], [0.6, 0.8]]  # by 37 deg
+    monkeypatch.setattr(settle_module, "_simulate", lambda *args, **how: (tipped, True))
+    mug = [model.object_pack.objects["mug"]]
+    assert settle(mug, np.eye(4)[None], model, model.basket_pose, heap=heap)[1] == heap
+
+
 def test_what_moves_in_a_check_is_checked_again_from_where_it_came_to(model, monkeypatch):
     start = planar(0, 0, 0, 0)[None]
     places = iter([0.0, 0.01, 0.012])  # x, m, at the end of each simulation

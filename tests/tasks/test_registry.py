@@ -61,6 +61,12 @@ def test_observations_are_finite_and_batched(env):
     assert info["disturbed"].tolist() == [0]
 
 
+def test_observations_of_images_have_no_privileged_state(needs_renderer):
+    env = gym.make("RoboCASPick-v1", obs_mode="rgb", sensor_configs=dict(width=32, height=24))
+    assert list(env.reset(seed=0)[0]["extra"]) == ["tcp_pose"]
+    env.close()
+
+
 def test_same_seed_same_scene_other_seed_other_scene(env):
     states, words = [], []
     for seed in (5, 6, 5):

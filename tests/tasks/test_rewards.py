@@ -1,5 +1,8 @@
 """Terms of the dense rewards against numbers worked out by hand, and how stages and weights make a reward of them."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -116,3 +119,12 @@ def test_tables_are_sound(name):
     assert list(table.weights)[-1] == "success"  # without it the reward stays below 1
     assert 0 < sum(table.penalties.values()) < 0.3
     assert [table.index(stage) for stage in table.stages] == list(range(len(table.stages)))
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_the_documentation_has_each_term_with_its_weight(name):
+    page = (Path(__file__).parents[2] / "docs" / "rl.md").read_text(encoding="utf-8")
+    for term, weight in TABLES[name].weights.items():
+        assert f"| `{term}` | {weight:g} |" in page
+    for penalty, share in TABLES[name].penalties.items():
+        assert re.search(rf"^\| `{penalty}`[^|]* \| {share:g} \|", page, re.M), penalty

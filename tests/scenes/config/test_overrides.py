@@ -91,6 +91,7 @@ def test_show_prints_a_resolved_configuration_that_loads_again(tmp_path, capsys)
     "words",
     [
         ["generate", "pick", "--out", "out"],
+        ["layouts", "build", NAME, "--out", "out"],
         ["eval", "freeze", "plan.yaml", "--out", "out"],
     ],
 )

@@ -3,6 +3,7 @@ import re
 from itertools import combinations
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
@@ -11,11 +12,12 @@ from robocas_ms3.core.paths import builtin_packs_dir
 from robocas_ms3.scenes.language.instructions import (
     SPLITS,
     InstructionSlots,
+    choose_instruction,
     could_mean,
     instruction,
     template_ids,
 )
-from robocas_ms3.scenes.language.templates import subgoal
+from robocas_ms3.scenes.language.templates import SUBGOALS, subgoal
 from robocas_ms3.scenes.language.texts import (
     INSTRUCTIONS_FILE,
     InstructionTexts,
@@ -139,6 +141,21 @@ def test_unknown_keys_are_refused(tmp_path):
     path.write_text("plurals: []\nobjects: {mug: {test: [cup]}}\nsupports: {}\n")
     with pytest.raises(ConfigError, match=r"unknown key 'objects\.mug\.test' .*'held_out', 'train'"):
         read_texts(path, SynonymTexts)
+
+
+def test_the_documentation_has_the_counts_the_subgoals_and_what_the_example_prints():
+    page = (ROOT / "docs" / "language.md").read_text(encoding="utf-8")
+    for task, templates in TEXTS.tasks.items():
+        assert f"| {task} | {' | '.join(str(len(templates.of(split))) for split in SPLITS)} |" in page
+    for kind, groups in (("relations", TEXTS.relations), ("objects", WORDS.objects), ("supports", WORDS.supports)):
+        train, held_out = (sum(len(words.of(split)) for words in groups.values()) for split in ("train", "held_out"))
+        assert f"| {kind} | {len(groups)} | {train} | {held_out} |" in page
+    for goal_type, text in SUBGOALS.items():
+        assert f"| {goal_type} | {text} |" in page
+    printed = choose_instruction(
+        np.random.default_rng(1), InstructionSlots("select", "mug", "shelf", "nearest"), "train"
+    )
+    assert repr(printed) in page.replace("\n#   ", " ")
 
 
 def test_a_subgoal_as_episodes_record_it():

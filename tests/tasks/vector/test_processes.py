@@ -15,6 +15,7 @@ import torch
 from vector_envs import HORIZON, DiesWhenMade, LacksLayouts, Misbehaves, OwnError, Wins, doing, gone, make
 
 from robocas_ms3.core.errors import ConfigError, LayoutError, VectorEnvError, WorkerDied
+from robocas_ms3.core.workers import Limits
 from robocas_ms3.tasks import RoboCASPickEnv
 
 slow = pytest.mark.slow
@@ -133,6 +134,18 @@ def test_a_process_that_is_killed_between_two_steps_is_not_replaced():
             env.step(doing(0, 0))
         assert died.value.envs == (1,)
         assert gone(pids)
+
+
+@slow
+@pytest.mark.parametrize(
+    ("limits", "found"), [(Limits(seconds=5), "too slow"), (Limits(memory_gb=0.3), "too much memory")]
+)
+def test_a_process_that_exceeds_a_limit_is_ended(limits, found):
+    raises = pytest.raises(WorkerDied, match="env 0")
+    with raises as died, closing(make(1, 1, wrappers=[Misbehaves], limits=limits)) as env:
+        env.reset(seed=0)
+        env.step(doing(7))
+    assert died.value.found == found
 
 
 @slow
