@@ -37,7 +37,7 @@ _EXPECTED = {
     "model_type": "a mapping",
     "dict_type": "a mapping",
 }
-_FOUND_LENGTH = 80  # of a wrong value in a message
+_FOUND_LENGTH = 80  # of a wrong value, or of a key, in a message
 _OUT_OF_RANGE = re.compile(rb"NaN|Infinity|\d[eE]\+?\d{3}|\d{19}")  # may be a number that `json_values` refuses
 
 
@@ -188,13 +188,14 @@ def _mistake(key: str, same: list[Any], schema: dict[str, Any], words: Mapping[s
     kind, value, context = details["type"], details["input"], details.get("ctx", {})
     what, expected, found, fix = f"wrong value for {key or '(top level)'!r}", "", "", ""
     if kind == "extra_forbidden":
-        name, known = str(details["loc"][-1]), sorted(_place(details["loc"][:-1], schema)[1].get("properties", {}))
+        *outer, name = details["loc"]
+        name, known = one_line(name, _FOUND_LENGTH), sorted(_place(tuple(outer), schema)[1].get("properties", {}))
         what, expected = f"unknown key {key!r}", f"one of {known}" if known else "no such key"
         found, fix = repr(name), nearest(name, known)
     elif kind in {"union_tag_invalid", "union_tag_not_found"}:
         discriminator = _place(details["loc"], schema)[1]["discriminator"]
         tag, kinds = discriminator["propertyName"], sorted(discriminator["mapping"])
-        name = str(context.get("tag", ""))
+        name = one_line(context.get("tag", ""), _FOUND_LENGTH)
         what, expected = f"wrong value for '{f'{key}.{tag}' if key else tag}'", f"one of {kinds}"
         found, fix = repr(name) if name else "nothing", nearest(name, kinds)
     elif kind == "value_error":
@@ -237,7 +238,7 @@ def _place(location: tuple[int | str, ...], schema: dict[str, Any]) -> tuple[lis
         elif choices:
             node = next((choice for choice in choices if choice.get("type") == "array"), {})
         else:
-            keys.append(one_line(part))
+            keys.append(one_line(part, _FOUND_LENGTH))
             inner = node.get("properties", {}).get(part) or node.get("additionalProperties") or node.get("items")
             node = inner if isinstance(inner, dict) else {}
         node = _resolved(node, schema)

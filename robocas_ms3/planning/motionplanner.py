@@ -153,7 +153,10 @@ class PandaArmMotionPlanningSolver:
 
     def add_collision_pts(self, pts: Array) -> None:
         """Add surface points (P, 3) m, about 5 mm apart, to the obstacles; no points add no obstacle."""
-        points = np.asarray(pts, dtype=np.float64).reshape(-1, 3)
+        points = np.asarray(pts, dtype=np.float64)
+        if points.size and points.shape[-1] != 3:  # by columns it would be other points, without an error
+            raise RobocasError("invalid points", where="add_collision_pts", expected="(P, 3)", found=points.shape)
+        points = points.reshape(-1, 3)
         _require_finite(points, "add_collision_pts", "Remove the points, e.g. pts[np.isfinite(pts).all(axis=1)].")
         if len(points):
             self.add_obstacles([Obstacle("points", Shape(points=points), np.eye(4))])

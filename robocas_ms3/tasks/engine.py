@@ -78,7 +78,7 @@ def _start_gpu_physics() -> None:
     except Exception as error:  # requests' for a download, the driver's, or that PhysX runs on a CPU in this process
         fix = (
             "SAPIEN downloads PhysX's library for GPUs once; offline, copy ~/.sapien/physx/ from another machine. "
-            'On the CPU: backend="processes" of make_vec, --backend processes of robocas eval.'
+            'On the CPU: backend="processes" of make_vec, robocas eval --backend processes, robocas train --device cpu.'
         )
         what = "PhysX does not start on the GPU"
         raise VectorEnvError(what, where="sim_backend", found=error_line(error), fix=fix) from error

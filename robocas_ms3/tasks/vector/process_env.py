@@ -92,9 +92,9 @@ class ProcessEnv(gym.Env):
             try:
                 self._workers = PinnedWorkers([partial(EnvWorker, pickled, share) for share in self._shares], limits)
             except WorkerStartError as error:
-                died = WorkerDied(
-                    "its process died", where=name_envs(range(num_envs)), found=error.found, fix=error.fix
-                )
+                where = name_envs(range(num_envs))
+                died = WorkerDied("its process died", where=where, found=error.found, fix=error.fix)
+                died.envs = tuple(range(num_envs))
                 raise died from error
         self.pids = self._workers.pids
         for name in ("render_mode", "metadata", "single_observation_space", "single_action_space"):

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from robocas_ms3.core.errors import LayoutError
+from robocas_ms3.core.exits import exit_error
 from robocas_ms3.core.remote_errors import RemoteError
 from robocas_ms3.core.workers import use_one_torch_thread
 from robocas_ms3.tasks.base import RoboCASEnv
@@ -97,6 +98,8 @@ class EnvWorker:
             self._at_work[env] = 1
             try:
                 results.append(act(env))
+            except KeyboardInterrupt as error:  # of the code: the process ignores Ctrl-C
+                failed = failed or RemoteError.of(exit_error(error, f"env {env}"), f"env {env}")
             except BaseException as error:  # noqa: BLE001  (raised again in the main process)
                 failed = failed or RemoteError.of(error, f"env {env}")
             self._at_work[env] = 0
@@ -171,8 +174,8 @@ def _are_alike(one: Any, other: Any) -> bool:
 
 
 def _split(piece: Any) -> list[Any]:
-    """Return one entry per env of an array (E, ...), which becomes arrays (1, ...), or of a list."""
-    return [piece[i : i + 1] for i in range(len(piece))] if isinstance(piece, np.ndarray) else list(piece)
+    """Return one entry per env of an array (E, ...), which becomes copies (1, ...), or of a list."""
+    return [piece[i : i + 1].copy() for i in range(len(piece))] if isinstance(piece, np.ndarray) else list(piece)
 
 
 def replace_rows(old: Any, envs: list[int], new: Any) -> Any:

@@ -9,7 +9,7 @@ from vector_envs import STATE_ONLY, with_gpu
 import robocas_ms3
 from robocas_ms3.core.errors import VectorEnvError
 from robocas_ms3.tasks.vector import RoboCASVectorEnv, choose_backend
-from robocas_ms3.tasks.vector.worker import replace_rows
+from robocas_ms3.tasks.vector.worker import join_rows, replace_rows
 
 
 @pytest.mark.parametrize(
@@ -125,6 +125,13 @@ def test_new_rows_of_some_envs_take_the_place_of_old_ones_of_any_kind():
         assert first.dtype == last.dtype == np.float32
     rows = replace_rows([None, None], [0, 1], np.ones((2, 4)))
     assert isinstance(rows, np.ndarray) and rows.shape == (2, 4)
+
+
+def test_rows_that_were_returned_do_not_change_in_a_later_reset():
+    last = np.zeros((2, 1), np.float32)
+    (returned,) = join_rows([(2, {("x",): last}), (1, {})]).values()  # the third env has none
+    replace_rows(last, [0], np.ones((1, 1), np.float32))
+    assert returned[0].tolist() == [[0]] and returned[2] is None
 
 
 def test_calls_reach_through_wrappers():

@@ -14,7 +14,7 @@ import pytest
 import torch
 from vector_envs import HORIZON, DiesWhenMade, LacksLayouts, Misbehaves, OwnError, Wins, doing, gone, make
 
-from robocas_ms3.core.errors import ConfigError, LayoutError, VectorEnvError, WorkerDied
+from robocas_ms3.core.errors import ConfigError, ExtensionError, LayoutError, VectorEnvError, WorkerDied
 from robocas_ms3.core.workers import Limits
 from robocas_ms3.tasks import RoboCASPickEnv
 
@@ -94,6 +94,9 @@ def test_what_goes_wrong_in_a_process(capfd):
         env.reset(seed=0)
         with pytest.raises(TypeError, match="pickle.*lock"):
             env.step(doing(0, 6, 0, 0))
+        env.reset(seed=0)
+        with pytest.raises(ExtensionError, match="env 1: this code tried to end the process"):
+            env.step(doing(0, 8, 0, 0))
         # interrupted in the middle of a step
         env.reset(seed=0)
         threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
@@ -170,6 +173,7 @@ def test_errors_of_making_arrive_as_themselves():
         make(1, 1, config={"lock": threading.Lock()})
     with pytest.raises(WorkerDied) as died:
         make(1, 1, wrappers=[DiesWhenMade])
+    assert died.value.envs == (0,)
     assert died.value.found == "SIGSEGV" and "robocas doctor" in died.value.fix
 
 

@@ -58,7 +58,7 @@ class Unsendable(Exception):
 class Misbehaves(gym.Wrapper):
     """First number of an action: 2 an error, 3 one that can't be sent, 4 the process is killed, 5 takes 3 s.
 
-    6: a lock in the info; 7 takes an hour.
+    6: a lock in the info; 7 takes an hour; 8 ends the process.
     """
 
     def step(self, action):
@@ -69,6 +69,8 @@ class Misbehaves(gym.Wrapper):
             raise Unsendable("lost", "somewhere")
         if what == 4:
             os.kill(os.getpid(), signal.SIGKILL)
+        if what == 8:
+            raise KeyboardInterrupt
         if what in (5, 7):
             time.sleep(3 if what == 5 else 3600)
         *result, info = self.env.step(action)
