@@ -28,6 +28,7 @@ ABANDONED = 86400.0
 """Age in s, since the last change, of files that a killed run left."""
 _SHOWN_KEYS = 8  # of the way to a wrong value, in a message
 _NAME_BYTES = 96  # of stem and of suffix that a temporary name repeats: file systems allow 255 in all
+_TRIES = 5  # to rename a folder onto one that other processes replace
 
 
 @contextmanager
@@ -150,14 +151,20 @@ def remove(path: Path) -> None:
 
 
 def _move_in(tmp: Path, path: Path) -> None:
-    """Rename a folder onto another."""
-    old = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".old", dir=path.parent))
-    try:
-        if path.exists():
-            os.replace(path, old / "old")
-        os.replace(tmp, path)
-    finally:
-        shutil.rmtree(old, ignore_errors=True)
+    """Rename a folder onto another, which other processes may replace at the same time."""
+    for tries_left in reversed(range(_TRIES)):
+        old = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".old", dir=path.parent))
+        try:
+            if path.exists():
+                with suppress(FileNotFoundError):
+                    os.replace(path, old / "old")
+            os.replace(tmp, path)
+            return
+        except OSError as error:
+            if not tries_left or error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                raise
+        finally:
+            shutil.rmtree(old, ignore_errors=True)
 
 
 def _restore_and_sweep(path: Path) -> None:

@@ -118,7 +118,7 @@ class WorkerPool(Generic[Task, Result]):
     def _map_in_processes(self, tasks: Iterable[Task], ordered: bool) -> Generator[Result, None, None]:
         remaining = iter(tasks)
         pending: list[_Job[Task, Result]] = []  # in the order of the tasks
-        finished: SimpleQueue[_Job[Task, Result]] = SimpleQueue()
+        finished: SimpleQueue[None] = SimpleQueue()
         most = (_TASKS_PER_WORKER + _RESULTS_PER_WORKER) * self._num_workers
         try:
             while True:
@@ -131,7 +131,7 @@ class WorkerPool(Generic[Task, Result]):
                     return
                 job = pending[0] if ordered else next((job for job in pending if job.done), pending[0])
                 if not job.done:
-                    self._next(finished)
+                    self._wait(finished)
                     continue
                 pending.remove(job)
                 if job.error is not None:
@@ -151,8 +151,8 @@ class WorkerPool(Generic[Task, Result]):
                 thread.start()
         self._jobs.put(job)
 
-    def _next(self, finished: SimpleQueue[_Job[Task, Result]]) -> _Job[Task, Result]:
-        """Wait for a job.
+    def _wait(self, finished: SimpleQueue[None]) -> None:
+        """Wait until a job is done.
 
         Not by `concurrent.futures`, whose locks stay held after a Ctrl-C at the wrong moment. In steps, since a signal
         that another thread got wakes nobody here.
@@ -161,7 +161,8 @@ class WorkerPool(Generic[Task, Result]):
             if self._stopped:
                 raise CancelledError
             with suppress(Empty), deferred_interrupts():
-                return finished.get(timeout=_POLL_SECONDS)
+                finished.get(timeout=_POLL_SECONDS)
+                return
 
     def _supervise(self) -> None:
         """Run jobs in one process; in a thread of its own."""
@@ -174,7 +175,7 @@ class WorkerPool(Generic[Task, Result]):
                 except BaseException as error:  # noqa: BLE001  (it is raised where the result is waited for)
                     job.error = error
                 job.done = True
-                job.finished.put(job)
+                job.finished.put(None)
         process.leave()
 
     def _run_job(self, process: WorkerProcess[Task, Result], task: Task) -> Result:
@@ -221,9 +222,9 @@ class WorkerPool(Generic[Task, Result]):
 
 
 class _Job(Generic[Task, Result]):
-    """A task, its result, and the queue that it goes to then."""
+    """A task, its result, and a queue that says when it is done; the queue holds no results, which may be large."""
 
-    def __init__(self, task: Task, finished: SimpleQueue[_Job[Task, Result]]) -> None:
+    def __init__(self, task: Task, finished: SimpleQueue[None]) -> None:
         self.task, self.finished = task, finished
         self.cancelled = self.done = False
         self.result: Result | None = None

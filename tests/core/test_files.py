@@ -33,6 +33,25 @@ def test_a_folder_appears_whole_and_replaces_the_old_one(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["pack"]
 
 
+def test_another_process_may_replace_a_folder_at_the_same_time(tmp_path, monkeypatch):
+    """Two commands that import the same asset share its folder in the cache."""
+    path, replace, others = tmp_path / "asset", os.replace, [tmp_path / "other"]
+
+    def replace_after_another(source, target):
+        if target == path and others:
+            other = others.pop()
+            other.mkdir()
+            (other / "theirs").touch()
+            replace(other, path)
+        replace(source, target)
+
+    monkeypatch.setattr(files.os, "replace", replace_after_another)
+    with replacing_folder(path) as tmp:
+        (tmp / "ours").touch()
+    assert [p.name for p in path.iterdir()] == ["ours"]
+    assert [p.name for p in tmp_path.iterdir()] == ["asset"]
+
+
 def test_what_a_killed_run_left_is_swept_up_a_day_later(tmp_path):
     old, young, other = (tmp_path / name for name in (".pack.a.tmp", ".pack.b.tmp", ".spack.c.tmp"))
     for folder in (old, young, other):

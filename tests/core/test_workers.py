@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+import weakref
 from concurrent.futures import CancelledError
 from functools import partial
 from itertools import count
@@ -119,6 +120,22 @@ def test_after_ctrl_c_a_pool_gives_the_results_of_later_tasks():
         with pytest.raises(KeyboardInterrupt):
             pool.run(1.0)
         assert pool.run("later")[0] == "later"
+
+
+class Result:
+    def __init__(self, task):
+        self.task = task
+
+
+@pytest.mark.parametrize("ordered", [True, False])
+def test_results_are_not_kept(ordered):
+    """A caller that is slower than the workers once kept all results in memory."""
+    with WorkerPool(partial(FunctionWorker, Result), 1) as pool:
+        results, given = pool.map(count(), ordered=ordered), []
+        for _ in range(10):
+            given.append(weakref.ref(next(results)))
+            time.sleep(0.05)
+        assert sum(result() is not None for result in given) <= 1
 
 
 @pytest.mark.parametrize("num_workers", [0, 1])

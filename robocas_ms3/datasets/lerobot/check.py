@@ -195,20 +195,26 @@ def _check_lines(dataset: LeRobotDataset) -> Iterator[Violation]:
 
 def _check_our_files(dataset: LeRobotDataset) -> Iterator[Violation]:
     """Check how the dataset was made, and scenes and cameras of the episodes, where the dataset says so."""
-    name = schema.CONVERSION_FILE
+    name, described = schema.SCENES_FILE, {}
     try:
         _ = dataset.split("train"), dataset.split("val")
-        name = schema.SCENES_FILE
-        if dataset.described and dataset.described.keys() != dataset.row_of.keys():
-            found = sorted(dataset.described.keys() ^ dataset.row_of.keys())[:5]
-            yield Violation(name, "episode_index", "the episodes of the dataset", f"{found} more or missing")
-        for number in sorted(dataset.described.keys() & dataset.row_of.keys()):
+    except DatasetError as error:
+        yield Violation(schema.CONVERSION_FILE, "", "valid content", one_line(error))
+    try:
+        described = dataset.described
+    except DatasetError as error:
+        yield Violation(name, "", "valid content", one_line(error))
+    if described and described.keys() != dataset.row_of.keys():
+        found = sorted(described.keys() ^ dataset.row_of.keys())[:5]
+        yield Violation(name, "episode_index", "the episodes of the dataset", f"{found} more or missing")
+    for number in sorted(described.keys() & dataset.row_of.keys()):
+        try:
             episode = dataset.episode(number)
             yield from check_form(SceneRecord, episode.scene, f"{name}, episode {number}")
             for camera in dataset.cameras:
                 episode.intrinsic(camera)
-    except DatasetError as error:
-        yield Violation(name, "", "valid content", one_line(error))
+        except DatasetError as error:
+            yield Violation(name, f"episode {number}", "valid content", one_line(error))
 
 
 def _check_checksums(root: Path) -> Iterator[Violation]:

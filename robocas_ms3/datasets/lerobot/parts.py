@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict
 
 from robocas_ms3.core.documents import JSON_LIMIT, read_text
 from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.files import json_text
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.arrays import frame_columns
 from robocas_ms3.datasets.lerobot.language import (
@@ -118,7 +119,8 @@ class PartWriter(EpisodeWriter):
             levels={key: counted.counts.tolist() for key, counted in levels.items()},
             sizes=_sizes(folder),
         )
-        (folder / EPISODE_FILE).write_text(record.model_dump_json(), encoding="utf-8")
+        text = json_text(record.model_dump(), episode.where, error=DatasetError)
+        (folder / EPISODE_FILE).write_text(text, encoding="utf-8")
 
     def _table(
         self, arrays: dict[str, NDArray], boxes: list[dict[str, Box]], scene: dict[str, Any], fps: int

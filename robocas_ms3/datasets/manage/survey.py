@@ -133,20 +133,20 @@ def survey(
         found = f"{count_of(len(lacking), 'episode')} without"
         wrong = Violation(schema.EPISODE_FILE, "embeddings", "in all episodes or none", found)
         findings.append(Finding(None, wrong, "mended", "not taken"))
-    findings = sorted(_merged(findings, list(taken)), key=lambda f: -1 if f.episode is None else f.episode)
+    findings = sorted(_merged(findings, taken), key=lambda f: -1 if f.episode is None else f.episode)
     lengths = {number: episode.stored.steps for number, episode in taken.items()}
     embedded = bool(taken) and not lacking
     return Survey(root, rate_hz, turn_eef, len(dataset.numbers), lengths, most, embedded, findings)
 
 
-def _merged(findings: Sequence[Finding], taken: Sequence[int]) -> Iterator[Finding]:
+def _merged(findings: Sequence[Finding], taken: Mapping[int, ImportedEpisode]) -> Iterator[Finding]:
     """Yield findings; those that all of several episodes share once, as of the dataset."""
     shared = Counter(_in_dataset(found) for found in findings if found.episode in taken)
     for found in findings:
         count = shared.get(_in_dataset(found), 0) if found.episode in taken else 0
         if count < len(taken) or count < 2:
             yield found
-        elif found.episode == taken[0]:
+        elif found.episode == next(iter(taken)):
             yield _in_dataset(found)
 
 

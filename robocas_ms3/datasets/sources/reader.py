@@ -212,6 +212,10 @@ class Dataset(EpisodeSource):
                 fix = "Run the same robocas convert again."
                 raise DatasetError("this dataset is not finished", where=self.root, fix=fix)
             raise no_dataset(self.root, f"a folder with {schema.DATA_INFO_FILE}, or a trajectory.h5")
+        missing = [key for key in ("ep_length", "train_eps", "val_eps") if key not in self.info]
+        if missing:
+            where, expected = self.root / schema.DATA_INFO_FILE, ", ".join(missing)
+            raise DatasetError("this overview lacks keys", where=where, expected=expected, fix=SEE_VALIDATE)
         return self._value(schema.DATA_INFO_FILE, "ep_length", _LENGTHS, {})
 
     def split(self, side: Side) -> list[int]:

@@ -70,6 +70,13 @@ def test_texts_that_are_wrong(spoiled):
     assert (schema.TASKS_FILE, "") in found(spoiled)
 
 
+def test_scenes_of_all_episodes_are_checked(spoiled):
+    change(spoiled, "cameras", lambda texts: ["{", "{"], schema.SCENES_FILE)
+    edit_json(spoiled, schema.CONVERSION_FILE, lambda made: made.update(val_eps=[7]))
+    wrong = {(schema.CONVERSION_FILE, ""), *((schema.SCENES_FILE, f"episode {number}") for number in (0, 1))}
+    assert wrong <= found(spoiled)
+
+
 def test_rows_that_are_missing(spoiled):
     table = pq.read_table(spoiled / DATA)
     pq.write_table(table.slice(0, 12), spoiled / DATA)

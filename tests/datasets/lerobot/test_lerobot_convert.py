@@ -239,6 +239,15 @@ def test_nan_is_an_error_of_its_episode_and_array(dataset, tmp_path, array, valu
     assert f"{dataset / 'episode_0000001' / 'episode_info.npz'}, {array}" in str(caught.value)
 
 
+def test_nan_in_a_scene_is_an_error(trajectory, tmp_path):
+    class Unknown(RayCaster):
+        def scene(self):
+            return {**super().scene(), "layout": {"robot_pose": [float("nan")] * 7}}
+
+    with pytest.raises(DatasetError, match="robot_pose"):
+        convert_lerobot(ConversionSettings(trajectory, tmp_path / "out", open_renderer=Unknown))
+
+
 def test_a_dataset_of_others_may_have_no_videos(versions, tmp_path):
     other = shutil.copytree(versions / "0.6", tmp_path / "other")
     info = json.loads((other / "meta/info.json").read_text())

@@ -1,5 +1,7 @@
 """What a dataset says of itself, whichever way it is asked."""
 
+import json
+
 import pytest
 
 from robocas_ms3.core.errors import DatasetError
@@ -29,6 +31,16 @@ def test_an_episode_is_found_without_a_search(tmp_path):
 def test_a_dataset_without_a_split(tmp_path):
     (tmp_path / "episode_0000000").mkdir()
     assert Dataset(tmp_path).sides == ([], [])
+
+
+@pytest.mark.parametrize("key", ["ep_length", "train_eps", "val_eps"])
+def test_an_overview_that_lacks_a_key_is_damaged_and_not_empty(tmp_path, key):
+    (tmp_path / "episode_0000000").mkdir()
+    info = {"ep_length": {"0": 7}, "train_eps": [0], "val_eps": []}
+    (tmp_path / "data_info.json").write_text(json.dumps({name: info[name] for name in info if name != key}))
+    with pytest.raises(DatasetError) as error:
+        Dataset(tmp_path).split("all")
+    assert (error.value.where, error.value.expected) == (tmp_path / "data_info.json", key)
 
 
 @pytest.mark.parametrize("ask", [Dataset, collect, validate])
