@@ -30,8 +30,9 @@ _NEAR_MM, _FAR_MM = 30, 5000  # colours of depth
 _PREVIEW_OPTIONS = ("-preset", "veryfast", "-threads", "1")
 
 
-def open_video(path: Path, fps: float, *options: str, quality: float = 8) -> Any:
-    """Open an MP4 (H.264, yuv420p) to append (H, W, 3) RGB to, H and W even; close it, or use ``with``.
+@contextmanager
+def open_video(path: Path, fps: float, *options: str, quality: float = 8) -> Iterator[Any]:
+    """Open an MP4 (H.264, yuv420p) to append (H, W, 3) RGB to, H and W even.
 
     Args:
         path: of the video.
@@ -39,7 +40,7 @@ def open_video(path: Path, fps: float, *options: str, quality: float = 8) -> Any
         options: FFmpeg's, for the output.
         quality: 0 to 10.
     """
-    return imageio.get_writer(
+    writer = imageio.get_writer(
         path,
         fps=fps,
         codec="libx264",
@@ -49,6 +50,8 @@ def open_video(path: Path, fps: float, *options: str, quality: float = 8) -> Any
         ffmpeg_log_level="error",
         output_params=list(options),
     )
+    with closing(writer):  # after an error its own `with` would leave FFmpeg running, which makes the file again
+        yield writer
 
 
 def write_video(

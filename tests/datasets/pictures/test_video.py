@@ -5,8 +5,9 @@ from PIL import Image
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.files import replacing
 from robocas_ms3.datasets.pictures.drawing import THUMBNAIL, EpisodeDrawing
-from robocas_ms3.datasets.pictures.video import PANEL, colour_depth, contact_sheet, write_video
+from robocas_ms3.datasets.pictures.video import PANEL, colour_depth, contact_sheet, open_video, write_video
 from robocas_ms3.datasets.sources.reader import Dataset
 
 
@@ -27,6 +28,15 @@ def test_videos_show_every_step_in_real_time(made, tmp_path):
     assert frames[0].shape == (320 + 64, 3 * 426, 3)
     drawn = video_frame(Dataset(made).episode(1), 6, 1)
     assert np.abs(frames[6].astype(int) - drawn).mean() < 4, "H.264 loses little"
+
+
+def test_a_failed_video_leaves_no_file(tmp_path):
+    """FFmpeg once went on after the error, and made its file again."""
+    with pytest.raises(ZeroDivisionError), replacing(tmp_path / "e.mp4") as tmp, open_video(tmp, 5) as video:
+        video.append_data(np.zeros((16, 16, 3), np.uint8))
+        _ = 1 / 0
+    assert video.closed
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_frame_shows_cameras_and_texts(made):
