@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,13 @@ def vector_stats(values: NDArray) -> Stats:
         "count": [len(values)],
         **{name: row.tolist() for name, row in zip(QUANTILES, quantiles, strict=True)},
     }
+
+
+def joined_stats(episodes: Sequence[NDArray]) -> Stats:
+    """Return the statistics of a feature over episodes, column by column, as a copy of all takes memory."""
+    columns = (np.concatenate([values[:, [n]] for values in episodes]) for n in range(episodes[0].shape[1]))
+    found = [vector_stats(column) for column in columns]
+    return {name: found[0][name] if name == "count" else [one[name][0] for one in found] for name in found[0]}
 
 
 class Levels:

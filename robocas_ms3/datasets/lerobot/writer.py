@@ -22,7 +22,7 @@ from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.language import EVENTS, EVENTS_TYPE, PERSISTENT, PERSISTENT_TYPE, Row
 from robocas_ms3.datasets.lerobot.parts import FRAMES_FILE, SUBGOAL, EpisodeRecord, Part, video_name
 from robocas_ms3.datasets.lerobot.schema import FileLimits
-from robocas_ms3.datasets.lerobot.stats import Levels, Stats, vector_stats
+from robocas_ms3.datasets.lerobot.stats import Levels, Stats, joined_stats, vector_stats
 from robocas_ms3.datasets.lerobot.tables import as_column, numbers, write_texts
 from robocas_ms3.datasets.lerobot.variants import CHUNK_FILES, Variant, find_variant
 from robocas_ms3.datasets.lerobot.video import DEPTH_INFO, Joiner, packet_times
@@ -189,7 +189,7 @@ class LeRobotWriter:
             write_texts(root / schema.TASKS_FILE, "task_index", list(self._tasks))
         if not self._variant.language:
             write_texts(root / schema.SUBTASKS_FILE, schema.SUBTASK_INDEX.key, list(self._subgoals))
-        stats = {key: vector_stats(np.concatenate(episodes)) for key, episodes in self._numbers.items()}
+        stats = {key: joined_stats(episodes) for key, episodes in self._numbers.items()}
         write_json(root / schema.STATS_FILE, stats | {key: found.stats() for key, found in self._levels.items()})
         write_json(root / schema.INFO_FILE, self._info())
         write_json(root / schema.CONVERSION_FILE, self._plan)

@@ -2,6 +2,7 @@
 
 import os
 import re
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import from_xyzw
 from robocas_ms3.datasets.lerobot.arrays import frame_columns, robocas_arrays
 from robocas_ms3.datasets.lerobot.schema import FEATURES, features_json
-from robocas_ms3.datasets.lerobot.stats import Levels
+from robocas_ms3.datasets.lerobot.stats import Levels, joined_stats, vector_stats
 from robocas_ms3.datasets.lerobot.tables import read_rows
 from robocas_ms3.datasets.lerobot.variants import VARIANTS
 from robocas_ms3.datasets.lerobot.video import to_depth
@@ -34,6 +35,20 @@ def made_up(steps, seed):
     qpos, qvel = rng.uniform(-2, 2, (steps, 12)), rng.uniform(-1, 1, (steps, 12))
     goals = [SubGoal.of("move and grasp", "grasp it", 0, 0), SubGoal.of("transfer object", "drop it", 1, steps - 1)]
     return episode_arrays(Motion(qpos, qvel, root, *poses, rng.random(steps) < 0.5), "grasp it and drop it", goals)
+
+
+def test_statistics_of_all_episodes_are_exact_and_copy_one_column_at_a_time():
+    episodes = [np.random.default_rng(seed).normal(size=(200, 16)).astype(np.float32) for seed in range(50)]
+    size = sum(values.nbytes for values in episodes)
+    tracemalloc.start()
+    found = joined_stats(episodes)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < size
+    whole = vector_stats(np.concatenate(episodes))
+    assert found.keys() == whole.keys()
+    for name, values in whole.items():
+        np.testing.assert_allclose(found[name], values, rtol=1e-6, atol=1e-9)
 
 
 @settings(max_examples=25)
