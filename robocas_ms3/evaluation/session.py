@@ -234,6 +234,8 @@ class EvaluationSession:
                 deaths.update([ended.start.episode for ended in lost] or [_NO_EPISODE])
                 if deaths[_NO_EPISODE] == MAX_STARTS:
                     raise
+                if not lost:
+                    _log.warning("environments are made again, without an episode lost: %s", error)
                 for ended in lost:
                     number = ended.start.episode
                     if deaths[number] < MAX_STARTS:

@@ -286,7 +286,7 @@ def test_an_episode_whose_process_dies_runs_again_once_and_then_counts_as_failed
 
 
 @pytest.mark.parametrize("times", [1, 2])
-def test_envs_whose_process_dies_while_they_are_made_are_made_again_once(short, tmp_path, monkeypatch, times):
+def test_envs_whose_process_dies_while_they_are_made_are_made_again_once(short, tmp_path, monkeypatch, caplog, times):
     left = [times]
 
     def make_vec(env_id, count, **_):
@@ -298,6 +298,7 @@ def test_envs_whose_process_dies_while_they_are_made_are_made_again_once(short, 
     monkeypatch.setattr(session, "make_vec", make_vec)
     if times == 1:
         assert len(evaluate(tmp_path / "out", "still", protocol=str(short))) == 8
+        assert "SIGSEGV" in caplog.text
         return
     with pytest.raises(WorkerDied, match="env 0: its process died"):
         evaluate(tmp_path / "out", "still", protocol=str(short))

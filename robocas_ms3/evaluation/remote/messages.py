@@ -15,7 +15,7 @@ from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, PositiveInt, TypeAdapter, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue, PositiveInt, TypeAdapter, ValidationError
 
 from robocas_ms3.core.errors import EvaluationError, WireError
 from robocas_ms3.core.paths import protocols_dir
@@ -31,9 +31,16 @@ DEFAULT_BATCH, LARGEST_BATCH = 64, 256  # envs
 FILE_NAME_PARTS = 3  # of a file's name in messages: folder of the protocol, folder in it, file
 _LARGEST_ACTION = 1e3  # m or rad; physics breaks far below it
 _OTHER_BYTES = 8 * 2**20  # of a request, besides images
+_MAX_DESCRIPTION = 2**20  # characters of JSON: it is in every result
 _POLICY_SPEC = TypeAdapter(PolicySpec)
 _Text = Annotated[str, Field(max_length=10_000)]
 _Number = Annotated[int, Field(ge=0, le=2**32 - 1)]
+
+
+def _short(description: JsonValue) -> JsonValue:
+    if (found := len(json.dumps(description))) > _MAX_DESCRIPTION:
+        raise ValueError(f"expected {_MAX_DESCRIPTION} characters of JSON at most, found {found}")
+    return description
 
 
 class ServerMetadata(BaseModel):
@@ -49,7 +56,7 @@ class ServerMetadata(BaseModel):
     model_config = ConfigDict(strict=True, frozen=True)
 
     spec: Any = Field(default=None, alias="robocas_wants")
-    policy: JsonValue = Field(default=None, alias="robocas_policy")
+    policy: Annotated[JsonValue, AfterValidator(_short)] = Field(default=None, alias="robocas_policy")
     max_batch: PositiveInt | None = Field(default=None, alias="robocas_max_batch")
     answers_pings: bool = Field(default=False, alias="robocas_answers_pings")
 

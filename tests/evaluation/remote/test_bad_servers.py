@@ -104,9 +104,9 @@ WANTS = (
         *(pack({"robocas_wants": wants}) for wants in WANTS),
         *(pack({"robocas_max_batch": value}) for value in (0, -1, True, 1.5, "8", [])),
         pack({"robocas_answers_pings": 1}),
-        pack({"robocas_policy": {"weights": b"no text"}}),
+        *(pack({"robocas_policy": {"weights": weights}}) for weights in (b"no text", "x" * 2**21)),
     ],
-    ids=range(17),
+    ids=range(18),
 )
 def test_bad_metadata_are_an_error_before_anything_is_played(first):
     def talk(socket):
