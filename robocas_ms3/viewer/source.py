@@ -75,6 +75,10 @@ class FolderContent(PageContent):
         notes = wrong_settings, assumed if wrong else "", wrong_info
         super().__init__(dataset, "RoboCAS folder", notes)
 
+    def _sides(self) -> Mapping[int, str]:
+        sides, _ = attempt(lambda: self.dataset.sides, ([], []))  # also of episodes that are not there
+        return {number: side for side, listed in zip(("train", "val"), sides, strict=True) for number in listed}
+
     def rgb(self, number: int, camera: str, step: int) -> EncodedImage:
         path = check_inside(self.dataset.episode(number).image_path(camera, "rgb", step), self.root)
         try:

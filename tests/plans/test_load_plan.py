@@ -149,6 +149,8 @@ def test_the_cameras_are_all_that_the_configurations_declare_or_the_chosen_ones(
     with pytest.raises(PlanError, match="different cameras"):
         load_plan(written(mixed))
     assert load_plan(written(mixed + "pictures: {cameras: [base_camera]}\n")).pictures.cameras == ["base_camera"]
+    without_images = mixed + "stages: [layouts, demonstrations]\nformats: [robocas]\n"
+    assert load_plan(written(without_images)).pictures.cameras == standard
     with pytest.raises(PlanError, match="no such camera"):
         load_plan(written(mixed + "pictures: {cameras: [side_camera]}\n"))
 

@@ -61,6 +61,11 @@ def test_files_that_hold_something_else(spoilt, name, text):
         assert f"`{name}` is damaged" in index["note"]
 
 
+def test_an_episode_that_is_gone_costs_the_others_no_side(spoilt):
+    change(spoilt / "data_info.json", train_eps=[0, 1, 9], val_eps=[2])
+    assert [row["split"] for row in open_source(spoilt).index()["episodes"]][:3] == ["train", "train", "val"]
+
+
 def test_a_rate_of_zero_is_replaced_with_a_note(spoilt):
     change(spoilt / "conversion.json", rate_hz=0)
     index = open_source(spoilt).index()
