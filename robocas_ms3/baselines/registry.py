@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from robocas_ms3.core.errors import MissingExtraError, TrainingError
 from robocas_ms3.core.exits import no_exit
 from robocas_ms3.core.extensions import Registry
+from robocas_ms3.core.words import nearest
 
 if TYPE_CHECKING:
     from robocas_ms3.baselines.baseline import Baseline  # which imports torch
@@ -50,8 +51,6 @@ BASELINES: Registry[Callable[[], Baseline]] = Registry(
 def find_baseline(name: str, *, where: object = "") -> Baseline:
     """Return the baseline of a name."""
     if name not in BASELINES:
-        from robocas_ms3.core.strict import nearest  # imports pydantic, which `robocas --help` does not need
-
         known = list(BASELINES)
         expected = f"one of {', '.join(known)}"
         raise TrainingError("no such baseline", where=where or name, expected=expected, fix=nearest(name, known))

@@ -37,7 +37,7 @@ def main(settings: ConversionSettings) -> int:
 
 def _find_format(settings: ConversionSettings) -> Format:
     """Return the format to write; raise an error if there is none, or an option does not suit it."""
-    from robocas_ms3.core.strict import nearest
+    from robocas_ms3.core.words import nearest
     from robocas_ms3.datasets.formats import FORMATS
 
     writable = [name for name, known in FORMATS.items() if known.writer]

@@ -47,7 +47,7 @@ class Freeze:
 def run(settings: EvaluationSettings) -> int:
     """Run the episodes that the result lacks; return 1 if any episode of the result ended with an error."""
     from robocas_ms3.core.errors import EvaluationError
-    from robocas_ms3.core.strict import nearest
+    from robocas_ms3.core.words import nearest
     from robocas_ms3.scenes.task_specs import TASKS
 
     for word in settings.tasks:  # before the imports below, which take seconds

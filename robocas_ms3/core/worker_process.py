@@ -125,7 +125,7 @@ class WorkerProcess(Generic[Task, Result]):
         """Start the process, which answers None when it reads, before any message."""
         self.end()
         try:
-            connection, theirs = Pipe()
+            self.connection, theirs = Pipe()
             with theirs:
                 program = _PROGRAM.format(path=sys.path, fd=theirs.fileno(), parent=os.getpid())
                 command = [sys.executable, "-c", program]
@@ -133,7 +133,6 @@ class WorkerProcess(Generic[Task, Result]):
         except OSError as error:
             what, fix = "can't start another process", "Use fewer --jobs, or raise the limits (ulimit -u, -n)."
             raise RobocasError(what, found=error.strerror or error, fix=fix) from error
-        self.connection = connection
 
     def send(self, message: object) -> None:
         """Send a message; raises ProcessDied."""

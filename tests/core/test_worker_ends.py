@@ -10,6 +10,9 @@ from pathlib import Path
 import psutil
 import pytest
 
+from robocas_ms3.core import worker_process
+from robocas_ms3.core.worker_process import NO_LIMITS, WorkerProcess
+
 PROGRAM = """
 import ctypes, os, sys, time
 from functools import partial
@@ -111,3 +114,23 @@ def test_a_pool_that_nobody_closed_does_not_keep_its_program(tmp_path):
             assert (program.communicate(timeout=60)[1], program.returncode) == ("", 0)
         finally:
             program.kill()
+
+
+def test_a_process_is_ended_while_another_thread_launches_it(monkeypatch):  # as Ctrl-C does
+    class EndsItself(worker_process.Connection):
+        """The end of the process, which is closed as soon as the process runs."""
+
+        def __exit__(self, *_):
+            self.close()
+            pids.append(process.pid)
+            process.leave()
+
+    def pipe():
+        ours, theirs = connections()
+        return ours, EndsItself(os.dup(theirs.fileno()))
+
+    connections, pids = worker_process.Pipe, []
+    process = WorkerProcess(dict, NO_LIMITS, connections(duplex=False)[0])
+    monkeypatch.setattr(worker_process, "Pipe", pipe)
+    process.launch()
+    assert not psutil.pid_exists(pids[0])
