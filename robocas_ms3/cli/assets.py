@@ -13,6 +13,7 @@ import tyro
 from robocas_ms3.cli import assets_show
 from robocas_ms3.cli.assets_show import mesh_tools
 from robocas_ms3.cli.options import CORES, Jobs, Maybe, Several
+from robocas_ms3.core.checks import check_number
 from robocas_ms3.core.words import count_of
 
 CONTACT_SHEET = "contact_sheet.png"
@@ -29,6 +30,9 @@ class _Making:
     """Leave out models with errors, instead of stopping at the first one."""
     overwrite: bool = False
     """Replace a pack of this name that was made from other files or settings; unchanged assets are reused."""
+
+    def __post_init__(self) -> None:
+        check_number("jobs", self.jobs, 1)
 
 
 @dataclass(kw_only=True)

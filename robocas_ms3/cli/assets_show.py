@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from robocas_ms3.assets.pack import Pack
 
 from robocas_ms3.cli.options import CORES, Jobs, Maybe, Several
+from robocas_ms3.core.checks import check_number
 from robocas_ms3.core.words import count_of, printable
 
 
@@ -143,6 +144,7 @@ def verify(command: Verify) -> int:
     for fault in faults:
         console().print(printable(str(fault)), style="red", soft_wrap=True)
     if command.physics:
+        check_number("jobs", command.jobs, 1)
         return max(_verify_physics(pack, command.jobs, command.json), int(bool(faults)))
     return int(bool(faults))
 

@@ -73,6 +73,8 @@ def test_scans_that_cannot_be_read_can_be_left_out(scans, capsys):
         (("--pack", "../escaped"), "can't be the name of an imported pack"),
         (("--pack", "My.Pack"), "no name for a pack"),
         (("--pack", "mine", "--masses", "lost.yaml"), "lost.yaml"),
+        (("--pack", "mine", "--jobs", "0"), "jobs"),
+        (("--pack", "mine", "--jobs", "-1"), "jobs"),
     ],
 )
 def test_bad_flags_are_refused_before_any_work(scans, tmp_path, capsys, words, message):
