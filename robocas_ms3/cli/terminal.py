@@ -6,7 +6,7 @@ import json
 import sys
 from collections.abc import Collection, Iterable, Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from robocas_ms3.core.words import printable
 
@@ -90,5 +90,8 @@ def _printable_console() -> type[Console]:
         def render(self, *args: Any, **options: Any) -> Iterable[Segment]:
             for one in super().render(*args, **options):  # of a `Text` that was made elsewhere
                 yield one if one.control else Segment(printable(one.text, lines=True), one.style)
+
+        def on_broken_pipe(self) -> NoReturn:  # rich ends the process here
+            raise BrokenPipeError
 
     return PrintableConsole

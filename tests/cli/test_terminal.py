@@ -33,6 +33,15 @@ def test_a_line_is_one_line(capsys):
     assert capsys.readouterr().out == f"one\n{SHOWN}\\u001b\ntwo\n"
 
 
+def test_a_pipe_that_nobody_reads():
+    class Closed(io.StringIO):
+        def write(self, _text):
+            raise BrokenPipeError
+
+    with pytest.raises(BrokenPipeError):
+        console(file=Closed()).print("a line")
+
+
 def test_tables_titles_and_styled_texts():
     file = io.StringIO()
     table = Table(HOSTILE, title=HOSTILE)

@@ -132,8 +132,9 @@ def mean(values: Sequence[float]) -> float:
 
 def _success(result: Result) -> Table:
     def rate(flag: str, outcomes: list[Outcome]) -> Share | None:
-        known = any(flag in outcome.flags for outcome in outcomes)
-        return result.rate(flag, outcomes) if known else None
+        known = [one for one in outcomes if flag in one.flags]  # tasks without obstacles have no stage for them
+        broken_off = [one for one in outcomes if one.error and not one.flags]
+        return result.rate(flag, known + broken_off) if known else None
 
     groups, rows = result.by("config"), []
     for config, outcomes in groups.items() if result.repeats() else _with_all(groups):

@@ -1,5 +1,7 @@
 """Tables of results, with numbers worked out by hand."""
 
+from dataclasses import replace
+
 import pytest
 from made_up_results import outcome, write
 
@@ -32,6 +34,14 @@ def test_successes_failures_and_occlusion(result, tmp_path):
     assert row(markdown(result), "0.2 to 0.4") == ["0.2 to 0.4", "1", "100 % (3 to 100)"]
     assert row(markdown(result), "0.8 to 1") == ["0.8 to 1", "1", "0 % (0 to 98)"]
     assert row(markdown(result), "0 to 0.2") == ["0 to 0.2", "0", ""]
+
+
+def test_stages_are_shares_of_the_episodes_that_have_them(tmp_path):
+    made = outcome(1)
+    cleared = replace(made, config="heap", flags={**made.flags, "obstacles_cleared": 20})
+    broken = replace(outcome(2), config="heap", flags={}, error="out of memory")  # before its first step
+    text = markdown(write(tmp_path / "a", [outcome(0), cleared, broken]))
+    assert [row(text, name)[-3] for name in ("table", "heap", "all together")] == ["", "50 %", "50 %"]
 
 
 def test_splits_are_side_by_side(tmp_path):
