@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import os
 from collections.abc import Callable, Generator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from fractions import Fraction
 from itertools import islice
@@ -135,6 +136,9 @@ class Encoder:
         try:
             if kind is None:
                 self._container.mux(self._stream.encode(None))
+            elif self._stream.codec_context.is_open:  # SVT-AV1 may hang when it is freed before the end of its stream
+                with suppress(FFmpegError):
+                    self._stream.encode(None)
         finally:
             self._container.close()
 

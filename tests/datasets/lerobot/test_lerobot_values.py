@@ -1,5 +1,6 @@
 """The numbers of a LeRobot dataset: features, depth levels, statistics of images, rows of an episode."""
 
+import gc
 import os
 import re
 import tracemalloc
@@ -22,7 +23,7 @@ from robocas_ms3.datasets.lerobot.schema import FEATURES, features_json
 from robocas_ms3.datasets.lerobot.stats import Levels, joined_stats, vector_stats
 from robocas_ms3.datasets.lerobot.tables import read_rows
 from robocas_ms3.datasets.lerobot.variants import VARIANTS
-from robocas_ms3.datasets.lerobot.video import to_depth
+from robocas_ms3.datasets.lerobot.video import CODINGS, Encoder, to_depth
 from robocas_ms3.datasets.sources.arrays import episode_arrays
 from robocas_ms3.demos.recordings.motion import Motion
 from robocas_ms3.demos.recordings.subgoals import SubGoal
@@ -166,3 +167,13 @@ def test_a_file_that_does_not_say_whose_rows_are(tmp_path, other):
     pq.write_table(pa.table(other), tmp_path / "file.parquet")
     with pytest.raises(DatasetError):
         read_rows(tmp_path / "file.parquet", 1)
+
+
+def test_an_encoder_ends_its_stream_where_an_episode_fails(tmp_path, capfd):
+    """SVT-AV1 says so, and may hang, where it is freed before; a run of the tests stood still in the garbage collector."""
+    with pytest.raises(KeyError), Encoder(tmp_path / "a.mp4", CODINGS["av1"], 5, (64, 48)) as encoder:
+        encoder.add(np.zeros((48, 64, 3), np.uint8))
+        raise KeyError
+    del encoder
+    gc.collect()
+    assert "EOS" not in capfd.readouterr().err
