@@ -144,7 +144,7 @@ def test_a_step_is_finished_although_ctrl_c_came_twice_at_once():
         assert process.stdout is not None and process.stdout.readline() == "ready\n"
         for _ in range(5):
             process.send_signal(signal.SIGINT)
-        assert (process.communicate()[0], process.returncode) == ("step done\nhandled\n", 0)
+        assert (process.stdout.read(), process.wait()) == ("step done\nhandled\n", 0)
 
 
 def test_a_file_is_written_although_ctrl_c_came_twice():
@@ -153,12 +153,12 @@ def test_a_file_is_written_although_ctrl_c_came_twice():
         for _ in range(2):
             process.send_signal(signal.SIGINT)
             time.sleep(0.8)
-        assert (process.communicate()[0], process.returncode) == ("written\nhandled\n", 0)
+        assert (process.stdout.read(), process.wait()) == ("written\nhandled\n", 0)
 
 
 def test_a_signal_is_deferred_although_another_thread_gets_it():
     with python(OTHER_THREAD) as process:
-        assert (process.communicate()[0], process.returncode) == ("written\nhandled\n", 0)
+        assert (process.stdout.read(), process.wait()) == ("written\nhandled\n", 0)
 
 
 def test_an_interrupt_that_no_signal_caused_is_an_error_of_its_source():
