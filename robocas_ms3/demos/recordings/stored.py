@@ -181,7 +181,8 @@ def _found(node: Any, deep: int) -> Any:
         return node
     if not deep:
         raise ValueError("groups in groups in groups")
-    return {name: _found(inner, deep - 1) for name, inner in node.items()}
+    # not node.items(): it holds the lock of h5py for as long as the traceback of an error in here lives
+    return {name: _found(node[name], deep - 1) for name in node}
 
 
 def _read(found: Any) -> Any:

@@ -5,6 +5,7 @@ import errno
 import json
 import os
 import resource
+import threading
 from contextlib import contextmanager
 
 import h5py
@@ -192,6 +193,18 @@ def test_a_ring_of_groups_ends(whole):
         file["traj_0/env_states/ring"] = file["traj_0/env_states"]
     refused(by_replay, whole, "damaged")
     assert by_file(whole).control_steps == STEPS  # which reads bodies alone
+
+
+def test_other_threads_read_files_while_an_error_of_a_recording_is_kept(whole):
+    """The iterators of h5py hold its lock: a suite of tests hung where another thread freed the error's traceback."""
+    with h5py.File(whole, "r+") as file:
+        file["traj_0/env_states/ring"] = file["traj_0/env_states"]
+    with pytest.raises(DatasetError) as kept:
+        by_replay(whole)
+    thread = threading.Thread(target=by_file, args=[whole], daemon=True)
+    thread.start()
+    thread.join(timeout=20)
+    assert not thread.is_alive() and kept.tb
 
 
 @pytest.mark.parametrize("name", ["actions", "env_states/actors/object_1"])
