@@ -136,7 +136,7 @@ class Encoder:
         try:
             if kind is None:
                 self._container.mux(self._stream.encode(None))
-            elif self._stream.codec_context.is_open:  # SVT-AV1 may hang when it is freed before the end of its stream
+            elif self._stream.codec_context.is_open:  # else SVT-AV1 prints an error when it is freed
                 with suppress(FFmpegError):
                     self._stream.encode(None)
         finally:

@@ -170,7 +170,6 @@ def test_a_file_that_does_not_say_whose_rows_are(tmp_path, other):
 
 
 def test_an_encoder_ends_its_stream_where_an_episode_fails(tmp_path, capfd):
-    """SVT-AV1 says so where it is freed before; a run of the tests stood still in the garbage collector."""
     with pytest.raises(KeyError), Encoder(tmp_path / "a.mp4", CODINGS["av1"], 5, (64, 48)) as encoder:
         encoder.add(np.zeros((48, 64, 3), np.uint8))
         raise KeyError
