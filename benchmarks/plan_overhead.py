@@ -63,13 +63,13 @@ def main(cfg: Benchmark) -> None:
     )
     worker.Recorder = Wait  # pyright: ignore[reportAttributeAccessIssue]
     with tempfile.TemporaryDirectory() as tmp:
-        folder, begun = PlanFolder(plan, Path(tmp) / "out"), time.time()
+        folder, start = PlanFolder(plan, Path(tmp) / "out"), time.time()
         cpu = time.process_time()
         run_shard(LocalExecutor(folder, cfg.workers), (0, 1))
         cpu = time.process_time() - cpu
         units = [Unit(0, block) for block in range(cfg.units)]
         at = np.sort([one.at for unit in units for one in folder.outcomes(unit) or ()])
-    # from when every worker has begun until the first has nothing left to do
+    # from when every worker has started until the first has nothing left to do
     first, last = 2 * cfg.workers, cfg.units - cfg.workers
     rate = (last - first) / (at[last] - at[first])
     report = {
@@ -79,8 +79,8 @@ def main(cfg: Benchmark) -> None:
         "seconds_a_unit": cfg.seconds,
         "units_a_second": round(float(rate), 2),
         "overhead_percent": round(100 * (cfg.workers / cfg.seconds / float(rate) - 1), 2),
-        "wall_seconds": round(float(at[-1] - begun), 1),
-        "seconds_to_start": round(float(at[cfg.workers - 1] - begun) - cfg.seconds, 1),
+        "wall_seconds": round(float(at[-1] - start), 1),
+        "seconds_to_start": round(float(at[cfg.workers - 1] - start) - cfg.seconds, 1),
         "runner_cpu_ms_a_unit": round(1000 * cpu / cfg.units, 2),
     }
     print(json.dumps(report, indent=2))

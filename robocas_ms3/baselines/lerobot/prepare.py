@@ -91,7 +91,7 @@ def prepare(source: Path, out: Path, embed: Embed | None) -> None:
 
 
 def _open(source: Path) -> LeRobotDataset:
-    what, fix = "no LeRobot dataset of ours", "Make one: robocas convert F.h5 --to lerobot --out DIR"
+    what, fix = "not a LeRobot dataset that this package wrote", "Make one: robocas convert F.h5 --to lerobot --out DIR"
     try:
         dataset = LeRobotDataset(source)
     except DatasetError as error:
