@@ -3,15 +3,44 @@
 from __future__ import annotations
 
 import copy
+import io
 import json
 import random
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
+
 NUMBERS = [-1, 0, 2**62, 2**63, 10**400, -1.5, 1e308, -1e308, 5e-324, float("nan"), float("inf")]
 TEXTS = ["", "x", "../up", "/etc/passwd", "a:b", "\x00", "\x1b[31m", "1", "{0.__class__}"]
 SCALARS = [None, True, *NUMBERS, *TEXTS]
 VALUES = [*SCALARS, [], [[]], {}, {"x": 1}, [None], json.loads("[" * 150 + "]" * 150)]
+
+ARRAYS = (np.zeros(0), np.array("x"), np.full((2, 4, 4), np.nan), np.array(2**63, np.uint64), np.array([True]), None)
+
+
+def damaged(name: str, whole: bytes, seed: int) -> bytes:
+    """Another value in JSON, or in the first line of many; another array; brackets without end; else other bytes."""
+    if seed % 2 and name.endswith(".npz"):
+        return with_another_array(whole, seed)
+    if seed % 2 and name.endswith((".json", ".jsonl")):
+        first, *others = whole.splitlines() if name.endswith("l") else [whole]
+        return b"\n".join([json.dumps(twisted(json.loads(first), seed)).encode(), *others])
+    return b"[" * 100_000 if seed == 0 and name.endswith(".json") else flipped(whole, seed)
+
+
+def with_another_array(whole: bytes, seed: int) -> bytes:
+    """The file with something else in place of an array, or without it."""
+    rng = random.Random(seed)
+    arrays = dict(np.load(io.BytesIO(whole)))
+    name, value = rng.choice(list(arrays)), rng.choice(ARRAYS)
+    if value is None:
+        del arrays[name]
+    else:
+        arrays[name] = value
+    file = io.BytesIO()
+    np.savez(file, **arrays)
+    return file.getvalue()
 
 
 def flipped(whole: bytes, seed: int) -> bytes:
