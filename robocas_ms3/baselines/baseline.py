@@ -92,34 +92,6 @@ class BaselineConfig(StrictModel):
     train: TrainSettings = TrainSettings()
 
 
-class RLSettings(StrictModel):
-    """Settings of reinforcement learning.
-
-    Attributes:
-        steps: of all environments together; rounded up to whole updates.
-        batch_size: steps between updates, of all environments together.
-        learning_rate: of the optimiser.
-        clip_norm: largest norm of the gradient; 0: no clipping.
-        seed: of all random numbers but those of the environments.
-        precision: of the forward pass.
-        save_every: steps between checkpoints.
-    """
-
-    steps: int = Field(default=100_000, ge=1, le=10**9)
-    batch_size: int = Field(default=512, ge=2, le=10**6)
-    learning_rate: float = Field(default=7e-4, gt=0)
-    clip_norm: float = Field(default=0.5, ge=0)
-    seed: int = Field(default=0, ge=0)
-    precision: Literal["fp32"] = "fp32"
-    save_every: int = Field(default=5000, ge=1)
-
-
-class RLConfig(StrictModel):
-    """Base of the configuration of a baseline that learns in simulation."""
-
-    train: RLSettings = RLSettings()
-
-
 class Samples(Protocol):
     """Training samples, as a map-style dataset that returns whole batches.
 
@@ -148,7 +120,7 @@ class Baseline:
     Attributes:
         name: on the command line.
         version: of weights and inputs; runs of other versions can be neither continued nor used.
-        Config: model of its configuration.
+        Config: model of its configuration; its ``train`` has at least ``batch_size``, ``seed`` and ``precision``.
         model: makes the network of a configuration and the facts of its data.
         policy: makes the policy that acts with a configuration, facts and a trained network.
         data: reads the samples of a configuration, a dataset's path and a split, and reports its progress. Raises
@@ -160,7 +132,7 @@ class Baseline:
 
     name: str
     version: int
-    Config: type[BaselineConfig] | type[RLConfig]
+    Config: type[StrictModel]
     model: Callable[[Any, dict[str, Any]], torch.nn.Module]
     policy: Callable[[Any, dict[str, Any], Any], Policy]
     data: Callable[[Any, Path, Split, OnRead], Samples] | None = None

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection
 
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.baselines.baseline import Split, no_episodes
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.manage.repairs import eef_turn
 from robocas_ms3.datasets.sources.protocol import EpisodeSource
@@ -16,58 +16,37 @@ from robocas_ms3.robots.cameras import EE_CAMERA
 _MAX_BASE_MOTION = 0.005  # m or rad; a base that stands trembles by less than a tenth of a mm
 
 
-@dataclass(frozen=True)
-class DatasetNeeds:
-    """What a baseline needs of a dataset.
+def check_dataset(
+    source: EpisodeSource, split: Split, cameras: Collection[str], rate_hz: float, *, language: bool
+) -> list[int]:
+    """Check that a split has what a baseline learns from, and return the numbers of its episodes.
 
-    Attributes:
-        baseline: its name.
-        cameras: whose images it takes.
-        rate_hz: rate of its actions.
-        language: whether it takes embeddings of the instructions.
-        cameras_option: option that chooses other cameras, for messages.
-        language_option: option that does without language; empty: there is none.
+    Checked are cameras, embeddings of the instructions with ``language``, the rate, the frame of the actions, and that
+    the base stands.
+
+    Raises:
+        DatasetError: something of that is missing or another.
+        EmptySplitError: the split has no episodes.
     """
-
-    baseline: str
-    cameras: Sequence[str]
-    rate_hz: float
-    language: bool
-    cameras_option: str
-    language_option: str = ""
-
-
-def check_dataset(source: EpisodeSource, numbers: Sequence[int], needs: DatasetNeeds) -> None:
-    """Check cameras, embeddings, rate, the frame of the actions, and that the base stands in some episodes."""
-    if any(camera not in source.cameras for camera in needs.cameras):
-        raise DatasetError(
-            f"the dataset lacks a camera of {needs.baseline}",
-            where=source.root,
-            expected=", ".join(needs.cameras),
-            found=", ".join(source.cameras) or "none",
-            fix=f"Convert the trajectory with these cameras, or train with {needs.cameras_option}.",
-        )
-    if needs.language and not source.has_embeddings:
-        more = f", or train with {needs.language_option}" * bool(needs.language_option)
-        raise DatasetError(
-            f"{needs.baseline} needs embeddings of the instructions",
-            where=source.root,
-            found="none",
-            fix=f"Convert the trajectory with embeddings{more}; a LeRobot folder has none.",
-        )
-    if source.rate_hz != needs.rate_hz:
-        raise DatasetError(
-            f"the rate of the dataset is not that of {needs.baseline}",
-            where=source.root,
-            expected=f"{needs.rate_hz:g} Hz",
-            found=f"{source.rate_hz:g} Hz",
-            fix=f"Convert with --rate {needs.rate_hz:g}, or train with --set rate_hz={source.rate_hz:g}.",
-        )
-    for number in numbers[:1]:
-        check_tcp_frame(source, number)
+    if any(camera not in source.cameras for camera in cameras):
+        fix = "Convert the trajectory with these cameras, or choose others: --set cameras or --set views."
+        expected, found = ", ".join(cameras), ", ".join(source.cameras) or "none"
+        raise DatasetError("the dataset lacks a camera", where=source.root, expected=expected, found=found, fix=fix)
+    if language and not source.has_embeddings:
+        fix = "Convert the trajectory with embeddings; small can do without: --set language=false."
+        raise DatasetError("the dataset has no embeddings of the instructions", where=source.root, fix=fix)
+    if source.rate_hz != rate_hz:
+        fix = f"Convert with --rate {rate_hz:g}, or train with --set rate_hz={source.rate_hz:g}."
+        expected, found = f"{rate_hz:g} Hz", f"{source.rate_hz:g} Hz"
+        raise DatasetError("the dataset has another rate", where=source.root, expected=expected, found=found, fix=fix)
+    numbers = source.split(split)
+    if not numbers:
+        raise no_episodes(source.root, split)
+    check_tcp_frame(source, numbers[0])
     for number in numbers:
         motion = source.episode(number).read(["rel_agv_pose"])["rel_agv_pose"]
         check_base_stands(motion, f"{source.root}, episode {number}")
+    return numbers
 
 
 def check_base_stands(motion: NDArray[np.floating], where: object) -> None:

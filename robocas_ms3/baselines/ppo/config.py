@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import Field
 
-from robocas_ms3.baselines.baseline import RLConfig, RLSettings
+from robocas_ms3.core.strict import StrictModel
 
 ONE_FRUIT: dict[str, Any] = {  # changes to pick_table_scattered: one small fruit near the gripper
     "description": "A single fruit on a table.",
@@ -17,7 +17,29 @@ ONE_FRUIT: dict[str, Any] = {  # changes to pick_table_scattered: one small frui
 ONE_FRUIT_STEPS = 15  # of 0.2 s per episode
 
 
-class PpoConfig(RLConfig):
+class PpoSettings(StrictModel):
+    """Settings of the training.
+
+    Attributes:
+        steps: of all environments together; rounded up to whole updates.
+        batch_size: steps between updates, of all environments together.
+        learning_rate: of the optimiser.
+        clip_norm: largest norm of the gradient; 0: no clipping.
+        seed: of all random numbers but those of the environments.
+        precision: of the forward pass.
+        save_every: steps between checkpoints.
+    """
+
+    steps: int = Field(default=102_400, ge=1, le=10**9)
+    batch_size: int = Field(default=512, ge=2, le=10**6)
+    learning_rate: float = Field(default=7e-4, gt=0)
+    clip_norm: float = Field(default=0.5, ge=0)
+    seed: int = Field(default=0, ge=0)
+    precision: Literal["fp32"] = "fp32"
+    save_every: int = Field(default=5000, ge=1)
+
+
+class PpoConfig(StrictModel):
     """Configuration of `ppo` (Schulman et al. 2017).
 
     Attributes:
@@ -34,7 +56,7 @@ class PpoConfig(RLConfig):
         entropy: weight of the entropy.
         width: of the two layers.
         trials: test episodes at the end, in other layouts and without noise; 0: none.
-        train: see `RLSettings`.
+        train: see `PpoSettings`.
     """
 
     task: str = "pick"
@@ -51,4 +73,4 @@ class PpoConfig(RLConfig):
     entropy: float = Field(default=1e-3, ge=0)
     width: int = Field(default=128, ge=1, le=16384)
     trials: int = Field(default=50, ge=0)
-    train: RLSettings = RLSettings(steps=102_400, batch_size=512, learning_rate=7e-4, clip_norm=0.5)
+    train: PpoSettings = PpoSettings()

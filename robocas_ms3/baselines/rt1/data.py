@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from robocas_ms3.baselines.baseline import Batch, OnRead, Split
-from robocas_ms3.baselines.dataset_checks import DatasetNeeds, check_dataset
+from robocas_ms3.baselines.dataset_checks import check_dataset
 from robocas_ms3.baselines.rt1.config import RT1Config
 from robocas_ms3.datasets.actions import ActionScale
 from robocas_ms3.datasets.formats import open_source
@@ -39,8 +39,7 @@ class RT1Samples:
 
     def __init__(self, config: RT1Config, folder: Path, split: Split, on_read: OnRead) -> None:
         source = open_source(folder)
-        needs = DatasetNeeds("rt1", config.cameras, config.rate_hz, True, '--set cameras="[base_camera]"')
-        check_dataset(source, source.split(split), needs)
+        check_dataset(source, split, config.cameras, config.rate_hz, language=True)
         self._data = RoboCASDataset(
             folder,
             SampleOptions(

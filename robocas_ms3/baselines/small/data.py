@@ -18,9 +18,9 @@ import psutil
 import torch
 from numpy.typing import NDArray
 
-from robocas_ms3.baselines.baseline import Batch, OnRead, Split, no_episodes
+from robocas_ms3.baselines.baseline import Batch, OnRead, Split
 from robocas_ms3.baselines.chunks import encode, next_keys, spread, state_of
-from robocas_ms3.baselines.dataset_checks import DatasetNeeds, check_dataset
+from robocas_ms3.baselines.dataset_checks import check_dataset
 from robocas_ms3.baselines.small.config import SmallConfig, View
 from robocas_ms3.baselines.small.locating import project_points
 from robocas_ms3.baselines.small.objects import (
@@ -52,12 +52,8 @@ class SmallSamples:
     def __init__(self, config: SmallConfig, path: Path, split: Split, on_read: OnRead) -> None:
         self._config, self._source = config, open_source(path)
         source, views = self._source, config.views
-        numbers = source.split(split)
-        options = "--set views.CAMERA=null", "--set language=false"
-        check_dataset(source, numbers, DatasetNeeds("small", list(views), config.rate_hz, config.language, *options))
+        numbers = check_dataset(source, split, views, config.rate_hz, language=config.language)
         self.episodes = len(numbers)
-        if not numbers:
-            raise no_episodes(path, split)
         first = source.episode(numbers[0])
         shapes = {camera: first.rgb(camera, 0).shape for camera in views}
         sizes = {camera: (shape[1], shape[0]) for camera, shape in shapes.items()}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from robocas_ms3.datasets.sources.arrays import episode_arrays
 from robocas_ms3.demos.recordings.motion import Motion, gripper_open
 from robocas_ms3.robots.description_file import chain
 from robocas_ms3.robots.quantities import ARM_BASE, STATE, columns_of, features
-from robocas_ms3.robots.table import RobotSpec
+from robocas_ms3.robots.table import find_robot
 
 KEYS = {"agent_pos": STATE} | {key.removeprefix("observation."): key for key in features() if key != STATE}
 """Key of an environment's observation -> column of our LeRobot datasets."""
@@ -29,48 +28,33 @@ def depth_key(camera: str) -> str:
     return schema.depth_key(camera).removeprefix("observation.")
 
 
-@dataclass
-class _Robot:
-    """Robot of one episode."""
-
-    spec: RobotSpec
-    root: NDArray[np.float64]  # (4, 4) pose of its root link in the world, which is constant
-    width: float  # of the gripper at the start, m
-    last: dict[str, NDArray[np.float32]] | None = None  # last values of `Proprioception.read`
-
-
 class Proprioception:
-    """Reads the robot state of several envs, step by step."""
+    """Reads the state of the robots of N envs, step by step."""
 
-    def __init__(self) -> None:
-        self._robots: dict[int, _Robot] = {}
+    def __init__(self, robot: str) -> None:
+        self._spec = find_robot(robot)
 
-    def reset(self, env: int, obs: dict[str, Any], spec: RobotSpec) -> None:
-        """Start an episode of a robot with its first observation, whose row is ``env``."""
-        robot = spec.description
-        qpos, tcp_in_base, tcp_in_world = _row(obs, env)
-        base_in_root = chain(spec.files().urdf, robot.root_link, robot.arm_base_link, qpos[:, robot.base_slice])
-        root = from_wxyz(tcp_in_world) @ inverse(from_wxyz(tcp_in_base)) @ inverse(base_in_root)
-        self._robots[env] = _Robot(spec, root, float(qpos[0, robot.finger_slice].sum()))
+    def reset(self, obs: dict[str, Any]) -> None:
+        """Start an episode in each env with its first observation, arrays (N, ...)."""
+        robot, agent = self._spec.description, obs["agent"]
+        poses = (agent["tcp_in_arm_base"], obs["extra"]["tcp_pose"])
+        in_base, in_world = (from_wxyz(np.asarray(pose, np.float64)) for pose in poses)
+        qpos = np.asarray(agent["qpos"], np.float64)
+        base_in_root = chain(self._spec.files().urdf, robot.root_link, robot.arm_base_link, qpos[:, robot.base_slice])
+        self._roots = in_world @ inverse(in_base) @ inverse(base_in_root)  # (N, 4, 4) root links, which stay there
+        self._widths = qpos[:, robot.finger_slice].sum(axis=1)  # m, of the grippers at the start
+        self._last: dict[int, dict[str, NDArray[np.float32]]] = {}  # by env
 
     def read(self, env: int, obs: dict[str, Any], gripper: float | None) -> dict[str, NDArray[np.float32]]:
         """Return the values (D,) of each of `KEYS`; ``gripper``: last command, -1 closed to 1 open, None: none yet."""
-        robot, qpos = self._robots[env], _row(obs, env)[0]
-        qvel = obs["agent"]["qvel"][env][None].astype(np.float64)
-        commands = np.array([] if gripper is None else [gripper])
-        opened = gripper_open(robot.spec.description, commands, np.array([len(commands)]), initial_width=robot.width)
-        motion = Motion.of_joints(robot.spec, robot.root, qpos, qvel, opened)
+        qpos, qvel = (obs["agent"][name][env][None].astype(np.float64) for name in ("qpos", "qvel"))
+        commands, width = np.array([] if gripper is None else [gripper]), float(self._widths[env])
+        opened = gripper_open(self._spec.description, commands, np.array([len(commands)]), initial_width=width)
+        motion = Motion.of_joints(self._spec, self._roots[env][None], qpos, qvel, opened)
         columns = frame_columns(episode_arrays(motion, "", []))
         found = {name: columns[column][0] for name, column in KEYS.items()}
-        robot.last = found if robot.last is None else _continued(robot.last, found)
-        return robot.last
-
-
-def _row(obs: dict[str, Any], env: int) -> tuple[NDArray[np.float64], ...]:
-    """Return joint positions (1, J) and the TCP's poses (1, 7) in the arm's base frame and in the world frame."""
-    agent = obs["agent"]
-    parts = (agent["qpos"], agent["tcp_in_arm_base"], obs["extra"]["tcp_pose"])
-    return tuple(np.asarray(part[env], np.float64)[None] for part in parts)
+        self._last[env] = _continued(self._last[env], found) if env in self._last else found
+        return self._last[env]
 
 
 def _continued(

@@ -20,7 +20,6 @@ from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.policy import CONVENTIONS, ExternalPolicy, PolicySpec
 from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
-from robocas_ms3.robots.table import find_robot
 
 
 class ProtocolVectorEnv(gym.vector.VectorEnv):
@@ -58,7 +57,7 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
                     raise EvaluationError("there is a result already", where=folder, fix="Choose another folder.")
                 self._lock = lock.pop_all()  # held until `close`
         self._convention = CONVENTIONS[spec.convention]
-        self._proprioception = Proprioception()
+        self._proprioception = Proprioception(self._session.protocol.rules.robot)
         self._spec, self._next = spec, 0
         count = self.num_envs = settings.envs
         self.render_mode = "rgb_array"
@@ -93,9 +92,7 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         self.episodes = np.array([episode.episode for episode in episodes], np.int64)
         self._instructions = [episode.instruction for episode in episodes]
         self._grippers = [None] * self.num_envs
-        robot, obs = find_robot(self._session.protocol.rules.robot), self._session.observation
-        for env in range(self.num_envs):
-            self._proprioception.reset(env, obs, robot)
+        self._proprioception.reset(self._session.observation)
         self._obs = cast(dict[str, Any], create_empty_array(self.single_observation_space, self.num_envs))
         self._read(list(range(self.num_envs)))
         return deepcopy(self._obs), self._info(np.zeros(self.num_envs, bool))  # the caller may keep them

@@ -24,7 +24,6 @@ from robocas_ms3.evaluation.protocol import Episode
 from robocas_ms3.evaluation.remote.messages import actions_of, read_policy_spec
 from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
-from robocas_ms3.robots.table import find_robot
 
 # vla-eval's names of rotations
 _ROTATIONS = {
@@ -63,7 +62,7 @@ class RoboCAS:
             self._of_config.setdefault(episode.config, []).append(episode)
         self._episode: Episode | None = None
         self._seen: Observations | None = None
-        self._proprioception = Proprioception()
+        self._proprioception = Proprioception(self._session.protocol.rules.robot)
         self._recorder: Any = None
         self._started = 0.0  # clock time, s
 
@@ -122,8 +121,7 @@ class RoboCAS:
         episode = episodes[number]
         self._episode, self._recorder, self._started = episode, recorder, time.monotonic()
         self._seen = self._session.reset([episode.episode])
-        robot = find_robot(self._session.protocol.rules.robot)
-        self._proprioception.reset(0, self._session.observation, robot)
+        self._proprioception.reset(self._session.observation)
         self._record()
 
     async def apply_action(self, action: Mapping[str, Any]) -> None:

@@ -9,7 +9,7 @@ from robocas_ms3.datasets.sources.arrays import episode_arrays
 from robocas_ms3.demos.recordings.motion import Motion, gripper_open
 from robocas_ms3.evaluation.harness.proprioception import KEYS, WIDTHS, Proprioception
 from robocas_ms3.robots.description import MOBILE_PANDA
-from robocas_ms3.robots.table import PANDA
+from robocas_ms3.robots.table import DEFAULT, PANDA
 
 STEPS = 60
 COMMANDS = np.where(np.arange(STEPS) // 7 % 2, -1.0, 1.0)
@@ -48,9 +48,8 @@ def observed(robots: list[Motion], step: int) -> dict:
 
 
 def test_every_step_of_two_envs_is_what_a_dataset_holds():
-    robots, state = [moving(1), moving(2)], Proprioception()
-    for env in range(2):
-        state.reset(env, observed(robots, 0), PANDA)
+    robots, state = [moving(1), moving(2)], Proprioception(DEFAULT)
+    state.reset(observed(robots, 0))
     read: list[list[dict]] = [[], []]
     for step in range(STEPS):
         for env in range(2):
