@@ -1,39 +1,13 @@
 """What is read: regular files of bounded size below the imported folder, in bounded time and memory."""
 
-import os
-
 import pytest
 from models import image_file, write_obj
 
 from asset_tools.inspection import ModelSource, inspect_models
-from asset_tools.reading.files import LARGEST_FILE, ModelFiles, read_file
+from asset_tools.reading.files import ModelFiles, read_file
 from asset_tools.reading.limits import reading_limits
 from asset_tools.reading.model import read_model
 from robocas_ms3.core.errors import AssetError
-
-
-def special(kind, path):
-    path.unlink(missing_ok=True)
-    if kind == "pipe":
-        os.mkfifo(path)
-    elif kind == "device":
-        path.symlink_to("/dev/zero")
-    elif kind == "folder":
-        path.mkdir()
-    elif kind == "loop":
-        path.symlink_to(path)
-    else:
-        with path.open("wb") as file:
-            file.truncate(LARGEST_FILE + 1)
-
-
-@pytest.mark.parametrize("kind", ["pipe", "device", "folder", "loop", "huge"])
-@pytest.mark.parametrize("name", ["mug.obj", "skin.mtl", "skin.png"])
-def test_only_regular_files_of_bounded_size_are_read(tmp_path, kind, name):
-    path = write_obj(tmp_path)
-    special(kind, tmp_path / name)
-    with pytest.raises(AssetError):
-        read_model(path)
 
 
 def test_a_path_upwards_within_the_imported_folder(tmp_path):
