@@ -31,7 +31,7 @@ _HEADERS = {"rgb": (8, 3), "depth": (16, 1)}
 Sizes = dict[str, tuple[int, int]]
 """Camera -> width and height of its images."""
 ReadHeader = Callable[[Path], PictureHeader | None]
-"""Returns the header of an image, None if only its integrity was checked; raises ValueError or OSError."""
+"""`read_header`, or `check_ends`, which gives none; raises ValueError or OSError."""
 
 
 def check_cameras(folder: Path, pictures: Pictures) -> Iterator[Violation]:

@@ -111,7 +111,9 @@ def convert_lerobot(
 def _plan(given: ConversionInput, codec: str, variant: Variant) -> dict[str, Any]:
     entries, pictures = given.entries(), given.pictures
     place = {entry["source"]: i for i, entry in enumerate(entries)}
-    before_train, before_val = ([place[n] for n in side if n in place] for side in given.source.settled_split())
+    # a dataset keeps its split, a trajectory has none
+    before = [given.source.split(side) if given.sizes else [] for side in ("train", "val")]
+    before_train, before_val = ([place[n] for n in side if n in place] for side in before)
     seeds = [one_seed(entry["seed"]) for entry in entries]
     known = {i: i if seed is None else seed for i, seed in enumerate(seeds)}
     train, val = split_by_seed(known, (before_train, before_val))

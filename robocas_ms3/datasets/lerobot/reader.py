@@ -103,10 +103,6 @@ class LeRobotEpisode(SourceEpisode):
     def cameras(self) -> tuple[str, ...]:
         return self.dataset.cameras
 
-    @property
-    def has_depth(self) -> bool:
-        return self.dataset.has_depth
-
     @cached_property
     def table(self) -> pa.Table:
         path = self.dataset.layout.path_of(self.dataset.root, "data", self.row)

@@ -23,7 +23,7 @@ from robocas_ms3.datasets.checks import arrays as laws
 from robocas_ms3.datasets.checks.pictures import check_cameras, check_images
 from robocas_ms3.datasets.checks.scene import read_settings
 from robocas_ms3.datasets.checks.violation import Violation, read_object
-from robocas_ms3.datasets.pictures.headers import PictureHeader, has_both_ends, read_header
+from robocas_ms3.datasets.pictures.headers import check_ends
 from robocas_ms3.datasets.sources.arrays import arrays_fingerprint, read_arrays
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.records import ConversionRecord
@@ -212,12 +212,11 @@ def _check_episodes(root: Path, numbers: Iterable[int]) -> None:
         source = read_object(folder, schema.SCENE_FILE)[0].get("source")
         missing = source.get("missing") if isinstance(source, dict) else None
         lacking = missing if isinstance(missing, list) else []
-        images = check_images(folder, pictures, stored.steps, {}, _check_ends)
         for wrong in (
             *(wrong for wrong in laws.check_keys(stored) if wrong.key not in lacking),
             *laws.violations_of(stored, (laws.check_file, laws.check_shapes, laws.check_finite)),
             *check_cameras(folder, pictures),
-            *images,
+            *check_images(folder, pictures, stored.steps, {}, check_ends),
         ):
             if wrong.kind != "surplus":
                 raise damaged_episode(root, wrong)
@@ -226,11 +225,6 @@ def _check_episodes(root: Path, numbers: Iterable[int]) -> None:
 def damaged_episode(root: Path, wrong: Violation) -> DatasetError:
     where, fix = root / wrong.where, f"robocas validate {root} lists all."
     return DatasetError("this episode is damaged", where=where, expected=wrong.expected, found=wrong.found, fix=fix)
-
-
-def _check_ends(path: Path) -> PictureHeader | None:
-    """Check both ends of an image; if one is not as it should be, the image is read whole."""
-    return None if has_both_ends(path) else read_header(path) and None
 
 
 @dataclass

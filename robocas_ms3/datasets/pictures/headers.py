@@ -41,8 +41,13 @@ def read_header(path: Path) -> PictureHeader:
     return _read_png(data) if path.suffix == ".png" else _decode(data, _FORMATS[path.suffix])
 
 
-def has_both_ends(path: Path) -> bool:
-    """Return whether a picture begins and ends as its format does, which one that was cut off does not."""
+def check_ends(path: Path) -> None:
+    """Check that a picture begins and ends as its format does, which is quick; read it whole if it does not."""
+    if not _has_both_ends(path):
+        read_header(path)
+
+
+def _has_both_ends(path: Path) -> bool:
     check_regular(path)
     with path.open("rb", buffering=0) as file:
         head, size = file.read(_END), os.fstat(file.fileno()).st_size

@@ -6,12 +6,13 @@ be pickled and forked.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,7 +49,7 @@ class Frame:
     boxes: dict[str, Box] = field(default_factory=dict)
 
 
-class SourceEpisode(Protocol):
+class SourceEpisode(ABC):
     """An episode; what is read raises ``DatasetError`` where it is missing or damaged.
 
     Attributes:
@@ -70,9 +71,9 @@ class SourceEpisode(Protocol):
         return str(self.read(["language_goal"])["language_goal"])
 
     @property
+    @abstractmethod
     def arrays(self) -> dict[str, NDArray]:
         """Arrays of ``schema.EPISODE_INFO`` that are there."""
-        ...
 
     def read(self, keys: Sequence[str]) -> dict[str, NDArray]:
         """Return some of the arrays, which have to be there."""
@@ -163,7 +164,7 @@ def shots(
             yield {camera: next(run) for camera, run in runs.items()}
 
 
-class EpisodeSource(Protocol):
+class EpisodeSource(ABC):
     """Episodes by number; what is read raises ``DatasetError`` where it is missing or damaged.
 
     Attributes:
@@ -195,15 +196,6 @@ class EpisodeSource(Protocol):
         sides = split_by_seed({number: number if seed is None else seed for number, seed in seeds.items()})
         return sides[side == "val"]
 
-    def settled_split(self) -> tuple[list[int], list[int]]:
-        """Return the training and validation episodes that a conversion keeps; both empty where none are settled."""
-        return self.split("train"), self.split("val")
-
-    def texts(self, number: int) -> list[str]:
-        """Return the instruction of an episode and the texts of its sub-goals."""
-        arrays = self.episode(number).read(("language_goal", "step_lang_goals"))
-        return [str(arrays["language_goal"]), *arrays["step_lang_goals"].tolist()]
-
     def entry(self, number: int) -> Mapping[str, Any]:
         """Return the recording of an episode, see ``provenance.recording_entry``; empty where it is not known."""
         return {}
@@ -213,9 +205,9 @@ class EpisodeSource(Protocol):
         parts = [self.episode(number).read(("rel_pos", "rel_orn")) for number in self.numbers]
         return action_space([part["rel_pos"] for part in parts], [part["rel_orn"] for part in parts])
 
+    @abstractmethod
     def episode(self, number: int) -> SourceEpisode:
         """Open an episode."""
-        ...
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027  (most sources keep nothing open)
         """Free what is open."""

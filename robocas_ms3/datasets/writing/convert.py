@@ -19,7 +19,6 @@ from robocas_ms3.core.files import write_json
 from robocas_ms3.core.outputs import OutputFolder, sweep
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.video import FEW, finish_previews, on_sheet
-from robocas_ms3.datasets.sources.protocol import EpisodeSource
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.episode_folder import FolderWriter, find_damaged
 from robocas_ms3.datasets.writing.info import add_failures, write_info
@@ -32,6 +31,7 @@ from robocas_ms3.datasets.writing.plan import (
     planned_sides,
     without_unwritten,
 )
+from robocas_ms3.datasets.writing.rendering import RenderedSource
 from robocas_ms3.datasets.writing.settings import Conversion, ConversionSettings, WrittenEpisode
 from robocas_ms3.datasets.writing.workers import WriteJob, write_episodes
 from robocas_ms3.demos.recordings.entries import versions
@@ -125,7 +125,7 @@ def _split_before(out: Path) -> tuple[list[int], list[int]]:
         raise DatasetError("the split can't be read", where=where, found=error.found, fix=fix) from error
 
 
-def embed_texts(source: EpisodeSource, entries: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def embed_texts(source: RenderedSource, entries: Sequence[dict[str, Any]]) -> dict[str, Any]:
     from robocas_ms3.scenes.language.embed import TextEmbedder
 
     embedder = TextEmbedder()
@@ -137,7 +137,7 @@ def _look_up(vectors: dict[str, Any], texts: list[str]) -> NDArray[np.float32]:
     return np.stack([vectors[text] for text in texts])
 
 
-def _texts(source: EpisodeSource, number: int) -> list[str]:
+def _texts(source: RenderedSource, number: int) -> list[str]:
     """Return the texts of an episode; none if it can't be read, which is an error when it is written."""
     try:
         return source.texts(number)

@@ -13,16 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.core.documents import DAMAGED, DocumentError, load_array, load_json
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import json_text
 from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.checks.pictures import check_cameras, check_images
+from robocas_ms3.datasets.checks.violation import read_object
 from robocas_ms3.datasets.pictures.drawing import EpisodeDrawing
-from robocas_ms3.datasets.pictures.headers import has_both_ends
+from robocas_ms3.datasets.pictures.headers import check_ends
 from robocas_ms3.datasets.pictures.stored import Pictures, write_picture
 from robocas_ms3.datasets.pictures.video import open_preview
 from robocas_ms3.datasets.sources.arrays import read_arrays, with_embeddings
-from robocas_ms3.datasets.sources.files import CAMERA_LIMIT
 from robocas_ms3.datasets.sources.protocol import CameraModel, Frame
 from robocas_ms3.datasets.writing.workers import EpisodeWriter, GivenEpisode
 
@@ -104,34 +104,15 @@ def _encoder(threads: int = ENCODERS) -> Generator[Callable[..., None], None, No
 
 def find_damaged(folder: Path, pictures: Pictures) -> Path | None:
     """Return the first file of an episode that is missing or lacks its end, as one that was cut off does."""
-    length = "episode_length"
-    steps = read_arrays(folder / schema.EPISODE_FILE, (length,)).arrays.get(length)
+    steps = read_arrays(folder / schema.EPISODE_FILE, ("episode_length",)).arrays.get("episode_length")
     if steps is None or steps.ndim:
         return folder / schema.EPISODE_FILE
-    small = [folder / schema.SCENE_FILE]
-    for camera in pictures.cameras:
-        files = (schema.INTRINSIC_FILE, *schema.pose_files(schema.camera_parent(folder / camera)))
-        small += [folder / camera / name for name in files]
-    images = (
-        schema.image_path(folder, camera, kind, step, pictures.image_format)
-        for camera in pictures.cameras
-        for kind in pictures.kinds
-        for step in range(int(steps))
-    )
-    wrong = (path for path in small if not _is_readable(path))
-    return next(wrong, None) or next((path for path in images if not _has_end(path)), None)
-
-
-def _is_readable(path: Path) -> bool:
-    try:
-        load_json(path) if path.suffix == ".json" else load_array(path, CAMERA_LIMIT)
-    except DAMAGED:
-        return False
-    return True
-
-
-def _has_end(path: Path) -> bool:
-    try:
-        return has_both_ends(path)
-    except (OSError, DocumentError):
-        return False
+    root = folder.parent
+    for wrong in (
+        *read_object(root, f"{folder.name}/{schema.SCENE_FILE}")[1],
+        *check_cameras(folder, pictures),
+        *check_images(folder, pictures, int(steps), {}, check_ends),
+    ):
+        if wrong.kind != "surplus" and not (root / wrong.file).is_dir():  # the folder of a camera too many
+            return root / wrong.file
+    return None

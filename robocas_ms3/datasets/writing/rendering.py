@@ -64,9 +64,6 @@ class RenderedSource(TrajectorySource):
                 raise DatasetError("this file is of another environment", where=path, expected=self.root)
         super().__init__(path, rate_hz=self.rate_hz, include_failed=True, pack=self._pack)
 
-    def settled_split(self) -> tuple[list[int], list[int]]:
-        return [], []
-
     def entry(self, number: int) -> dict[str, Any]:
         with self.file.reopened() as file:
             try:
@@ -75,6 +72,7 @@ class RenderedSource(TrajectorySource):
                 return unread_entry(file, number)
 
     def texts(self, number: int) -> list[str]:
+        """Return the instruction of an episode and the texts of its sub-goals."""
         entry = self.info(number)
         return [entry.instruction, *(goal.goal_description for goal in entry.subgoals)]
 

@@ -255,4 +255,4 @@ def test_a_dataset_of_others_may_have_no_videos(versions, tmp_path):
     (other / "meta/info.json").write_text(json.dumps(info))
     shutil.rmtree(other / "videos")
     dataset = LeRobotDataset(other)
-    assert (dataset.cameras, dataset.has_depth, dataset.episode(1).has_depth) == ((), False, False)
+    assert (dataset.cameras, dataset.has_depth) == ((), False)

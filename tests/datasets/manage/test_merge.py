@@ -182,17 +182,6 @@ def test_arrays_that_an_import_could_not_make_may_be_missing(parts, tmp_path):
     assert merge([part], tmp_path / "out").episodes == 2
 
 
-@pytest.mark.parametrize("image_format", ["jpg", "webp"])
-def test_a_cut_off_image_of_another_format_is_found(tmp_path, image_format):
-    part = make(tmp_path, "a", (10,), image_format=image_format)
-    assert merge([part], tmp_path / "out").episodes == 1
-    image = part / f"episode_0000000/base_camera/rgb/0003.{image_format}"
-    image.write_bytes(image.read_bytes()[:-9])
-    with pytest.raises(DatasetError) as error:
-        merge([part], tmp_path / "again")
-    assert error.value.where == image
-
-
 def test_the_output(parts, tmp_path):
     a, b = parts
     before = files_of(a)
