@@ -92,7 +92,7 @@ def run(command: Run) -> int:
     options = dict(_option(word) for word in command.executor_option)
     plan = load_plan(command.plan)
     executor = open_executor(command.executor, PlanFolder(plan, command.out), command.jobs, options)
-    if command.executor == "local" and plan.makes_datasets:
+    if command.executor == "local" and "datasets" in plan.stages:
         from robocas_ms3.datasets.writing.render import require_renderer
 
         require_renderer()

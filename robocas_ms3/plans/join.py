@@ -74,7 +74,7 @@ def join(folder: PlanFolder, chosen: Chosen, *, jobs: int = 1, say: Say = lambda
     if not finished or any(path.is_dir() for path in (out / UNITS).glob("*/*/*")):
         _join_files(folder, files, say)
     if not finished:
-        if plan.makes_datasets and "lerobot" in plan.formats:
+        if "datasets" in plan.stages and "lerobot" in plan.formats:
             say("making the LeRobot dataset")
             _convert_lerobot(plan, out / DATASETS / "robocas", out / DATASETS / "lerobot", jobs)
         if "statistics" in plan.stages:
@@ -91,17 +91,17 @@ def join(folder: PlanFolder, chosen: Chosen, *, jobs: int = 1, say: Say = lambda
 def _join_files(folder: PlanFolder, files: EpisodeFiles, say: Say) -> None:
     plan, out = folder.plan, folder.path
     seeds = {part: [each.seed for each in episodes] for part, episodes in files.items()}
-    for part, episodes in files.items() if plan.makes_layouts else ():
+    for part, episodes in files.items() if "layouts" in plan.stages else ():
         path, layouts = out / LAYOUTS / f"{plan.name_of(part)}.npy", [each.layout for each in episodes]
         sweep(make_folder(path.parent))
         damage, write = partial(_layouts_damage, path, seeds[part]), partial(join_frozen, path, layouts)
         _join_file(path, layouts, damage, write, partial(say, f"joining layouts, {plan.name_of(part)}"))
-    if plan.makes_datasets:
+    if "datasets" in plan.stages:
         root, count = out / DATASETS / "robocas", sum(map(len, files.values()))
         sweep(make_folder(root))
         damage, write = partial(_dataset_damage, root, count), partial(_join_dataset, plan, root, files)
         _join_file(root, _dataset_sources(plan, root, files), damage, write, partial(say, "joining the dataset"))
-    for part, episodes in files.items() if plan.makes_demonstrations else ():
+    for part, episodes in files.items() if "demonstrations" in plan.stages else ():
         path, recordings = out / DEMOS / plan.name_of(part) / TRAJECTORY, [each.recording for each in episodes]
         sweep(make_folder(path.parent))
         damage, write = partial(damage_of, path, seeds[part]), partial(merge, recordings, path)

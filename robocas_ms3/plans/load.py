@@ -87,7 +87,7 @@ def check_plan(plan: Plan) -> None:
 
     for number in range(len(plan.parts)):
         recording_settings(plan, number).check()
-    if plan.makes_datasets:
+    if "datasets" in plan.stages:
         sample_stride(plan.control_freq, plan.rate)
         if plan.embeddings:
             from robocas_ms3.scenes.language.embed import TextEmbedder
@@ -164,7 +164,7 @@ def _cameras(plan: Plan, configs: Sequence[TaskConfig], path: Path) -> list[str]
     declared = [[camera.name for camera in config.cameras_of(robot)] for config in configs]
     common = [name for name in declared[0] if all(name in names for names in declared)]
     if not plan.pictures.cameras:
-        if plan.makes_datasets and any(len(names) > len(common) for names in declared):
+        if "datasets" in plan.stages and any(len(names) > len(common) for names in declared):
             what, fix = "the parts have different cameras", f"Choose some of {', '.join(common)}."
             raise PlanError(what, where=where, found=sorted({*chain(*declared)} - {*common}), fix=fix)
         return common

@@ -108,24 +108,12 @@ class Plan(StrictModel):
         for stage in self.stages:
             if _NEEDS.get(stage, stage) not in self.stages:
                 raise ValueError(f"stages: {stage} needs {_NEEDS[stage]}")
-        if "lerobot" in self.formats and not self.makes_datasets:
+        if "lerobot" in self.formats and "datasets" not in self.stages:
             raise ValueError("formats: lerobot needs the stage datasets")
         free = {part.task for part in self.parts if part.split is None}
         if self.split and self.split.by == "task" and len(free) < 2:
             raise ValueError("split: by task needs parts of two tasks that name no split")
         return self
-
-    @property
-    def makes_layouts(self) -> bool:
-        return "layouts" in self.stages
-
-    @property
-    def makes_demonstrations(self) -> bool:
-        return "demonstrations" in self.stages
-
-    @property
-    def makes_datasets(self) -> bool:
-        return "datasets" in self.stages
 
     def name_of(self, part: int) -> str:
         """Return the name of a part's folders; a loaded plan names all parts."""

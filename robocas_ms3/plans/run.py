@@ -22,7 +22,6 @@ from robocas_ms3.plans.load import check_plan
 from robocas_ms3.plans.progress import Progress, Shard
 from robocas_ms3.plans.status import Status, status_of
 
-_ROUNDS = 3  # how often episodes are made again that a disk has damaged
 _TRIES = 3  # jobs that may end at the same seed of a unit
 _POLL = 0.05  # s between two looks at the jobs
 _LOOK = 1.0  # s between two looks at the folder, at least
@@ -62,15 +61,13 @@ def run_plan(
         output.start(folder.record())
         with executor:
             progress = Progress(folder)
-            for _ in range(_ROUNDS):
-                _do_units(executor, progress, output, show)
-                damaged = progress.forget_damaged()
-                if not damaged:
-                    break
+            _do_units(executor, progress, output, show)
+            if damaged := progress.forget_damaged():
                 say(f"{count_of(sum(map(len, damaged.values())), 'episode')} again: damaged files")
-            else:
+                _do_units(executor, progress, output, show)
+            if damaged := damaged and progress.forget_damaged():
                 unit, seeds = min(damaged.items())
-                found, fix = f"seed {seeds[0]}, made {_ROUNDS} times", "Check the disk; then run the command again."
+                found, fix = f"seed {seeds[0]}, made twice", "Check the disk; then run the command again."
                 what, where = "files don't keep the sizes that they were written with", folder.unit_folder(unit)
                 raise PlanError(what, where=where, found=found, fix=fix)
         return join(folder, progress.chosen(), jobs=executor.jobs, say=say)

@@ -10,7 +10,7 @@ from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import ConfigError, ExtensionError, MissingExtraError, OutputExistsError, PlanError
 from robocas_ms3.plans.folder import PLAN, PlanFolder, SeedFiles
 from robocas_ms3.plans.load import check_plan, load_plan, most_seeds, opening_part, recording_settings, shipped_plans
-from robocas_ms3.plans.stages import Renderer
+from robocas_ms3.plans.worker import Renderer
 from robocas_ms3.scenes.config import load_task_config
 
 GOOD = "parts:\n  - {task: pick, episodes: 3}\n"

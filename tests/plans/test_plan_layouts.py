@@ -8,7 +8,7 @@ from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.plans.folder import LAYOUTS, Outcome, PlanFolder, Unit
 from robocas_ms3.plans.join import join
-from robocas_ms3.plans.stages import Recorder
+from robocas_ms3.plans.worker import Recorder
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.sample import sample_layout

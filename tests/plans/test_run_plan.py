@@ -28,9 +28,8 @@ from robocas_ms3.demos.recordings.reading import TrajectoryFile
 from robocas_ms3.plans.executors import LocalExecutor
 from robocas_ms3.plans.folder import Outcome, PlanFolder, Unit
 from robocas_ms3.plans.run import join_plan, run_shard
-from robocas_ms3.plans.stages import Recorder
 from robocas_ms3.plans.status import read_status
-from robocas_ms3.plans.worker import UnitWorker
+from robocas_ms3.plans.worker import Recorder, UnitWorker
 from robocas_ms3.robots.cameras import STANDARD_NAMES
 
 SUPPORT = Path(__file__).resolve().parents[1] / "support"

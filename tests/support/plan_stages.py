@@ -16,7 +16,7 @@ from robocas_ms3.core.errors import DatasetError, MissingExtraError
 from robocas_ms3.plans import worker
 from robocas_ms3.plans.folder import PlanFolder, Unit
 from robocas_ms3.plans.plan import PartConfig, Plan
-from robocas_ms3.plans.stages import Renderer
+from robocas_ms3.plans.worker import Renderer
 
 SITE = Path(__file__).parent / "fault_site"
 

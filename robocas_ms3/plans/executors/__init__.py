@@ -6,7 +6,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from queue import SimpleQueue
 from typing import Any
 
 from pydantic import ValidationError
@@ -88,19 +87,17 @@ class LocalExecutor(ThreadExecutor):
 
     def __enter__(self) -> LocalExecutor:
         self._workers = [UnitWorker(self.folder) for _ in range(self.jobs)]
-        self._idle: SimpleQueue[UnitWorker] = SimpleQueue()
-        for worker in self._workers:
-            self._idle.put(worker)
+        self._idle = self._workers.copy()
         super().__enter__()
         return self
 
     def run(self, units: Sequence[Unit]) -> None:
-        worker = self._idle.get()
+        worker = self._idle.pop()
         try:
             for unit in units:
                 worker.do(unit)
         finally:
-            self._idle.put(worker)
+            self._idle.append(worker)
 
     def __exit__(self, *error: object) -> None:
         for worker in self._workers:
