@@ -28,12 +28,13 @@ def box(size=(0.06, 0.05, 0.1), at=(0.0, 0.0, 0.0)) -> trimesh.Trimesh:
 
 
 def obj_text(mesh: trimesh.Trimesh, *, head="mtllib skin.mtl", use="usemtl skin", uvs=True) -> str:
-    """An OBJ with one vertex of texture per vertex, all in the middle of the image."""
+    """An OBJ with the texture coordinates (V, 2), or with all of them in the middle of the image, or with none."""
     lines = [head] if head else []
-    lines += [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in mesh.vertices]
-    lines += ["vt 0.5 0.5"] if uvs else []
+    lines += [f"v {x:.8f} {y:.8f} {z:.8f}" for x, y, z in mesh.vertices]
+    lines += [f"vt {u:.6f} {v:.6f}" for u, v in ([[0.5, 0.5]] if isinstance(uvs, bool) else uvs)]
     lines += [use] if use else []
-    lines += ["f " + " ".join(f"{i + 1}/1" if uvs else f"{i + 1}" for i in face) for face in mesh.faces]
+    corner = ("{0}/1" if uvs else "{0}") if isinstance(uvs, bool) else "{0}/{0}"
+    lines += ["f " + " ".join(corner.format(i + 1) for i in face) for face in mesh.faces]
     return "\n".join(lines) + "\n"
 
 

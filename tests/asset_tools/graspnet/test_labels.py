@@ -109,8 +109,9 @@ def test_only_good_labels_are_read(tmp_path):
     assert found.angles == pytest.approx([0, 2.5])
 
 
-@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
-@pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
+@pytest.mark.parametrize(
+    ("dtype", "save"), [(np.float16, np.savez_compressed), (np.float32, np.savez), (np.float64, np.savez_compressed)]
+)
 def test_slices_leave_nothing_out(tmp_path, monkeypatch, dtype, save):
     monkeypatch.setattr("asset_tools.graspnet.labels.SLICE_BYTES", 1)  # one point at a time
     rng = np.random.default_rng(1)

@@ -65,7 +65,9 @@ def test_the_texture_of_another_object_is_not_taken(tmp_path):
 def test_values_that_are_not_finite(tmp_path):
     """Coordinates and colours are left out with a warning; vertices that no face uses do not count."""
     path = write_obj(tmp_path)
-    path.write_text(path.read_text().replace("vt 0.5 0.5", "vt nan 1e300").replace("usemtl", "v nan 0 0\nusemtl"))
+    path.write_text(
+        path.read_text().replace("vt 0.500000 0.500000", "vt nan 1e300").replace("usemtl", "v nan 0 0\nusemtl")
+    )
     model = read_model(path)
     assert (shown_colors(model.mesh) == 255).all() and any(note.startswith("warning:") for note in model.notes)
     gltf = Gltf()

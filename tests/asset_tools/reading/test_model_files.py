@@ -1,7 +1,9 @@
 """What is read: regular files of bounded size below the imported folder, in bounded time and memory."""
 
+import unicodedata
+
 import pytest
-from models import image_file, write_obj
+from models import RED, image_file, shown_colors, write_obj
 
 from asset_tools.inspection import ModelSource, inspect_models
 from asset_tools.reading.files import ModelFiles, read_file
@@ -21,11 +23,20 @@ def test_a_path_upwards_within_the_imported_folder(tmp_path):
 def test_a_name_that_leads_outside_is_searched_below_the_model(tmp_path):
     image_file(tmp_path / "maps" / "skin.png")
     files = ModelFiles(tmp_path, tmp_path)
-    for name in ("../../skin.png", "/etc/skin.png", "C:\\me\\skin.png", "file:///me/skin.png"):
+    for name in ("maps\\skin.png", "../../skin.png", "/etc/skin.png", "C:\\me\\skin.png", "file:///me/skin.png"):
         assert files.find(name, tmp_path) == tmp_path / "maps" / "skin.png"
     assert files.find("nul\0.png", tmp_path) is None
     with pytest.raises(AssetError):
         read_file(tmp_path / "lost", tmp_path)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "cp1252"])
+def test_names_with_accents(tmp_path, encoding):
+    path = write_obj(tmp_path / "Öl", "Flasche", mtl=None, color=None, head="mtllib matériau.mtl", use="usemtl für Öl")
+    path.write_bytes(path.read_text().encode(encoding))
+    (tmp_path / "Öl" / "matériau.mtl").write_bytes("newmtl für Öl\nmap_Kd étiquette n° 1.png\n".encode(encoding))
+    image_file(tmp_path / "Öl" / unicodedata.normalize("NFD", "étiquette n° 1.png"))
+    assert (shown_colors(read_model(path).mesh) == RED).all()
 
 
 def test_reading_is_bounded_in_memory():
