@@ -19,6 +19,7 @@ from mani_skill.agents.base_agent import BaseAgent
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.structs import Pose
 from mani_skill.utils.structs.pose import to_sapien_pose
+from numpy.typing import NDArray
 
 from robocas_ms3.core.checks import check_number
 from robocas_ms3.core.errors import RobocasError
@@ -189,17 +190,23 @@ class PandaArmMotionPlanningSolver:
         return self._arm_qpos, goal
 
     def _move_gripper(self, t: int, gripper_state: float) -> Step:
+        check_number("t", t, 1)
         self.gripper_state = gripper_state
         return self._run(np.tile(self._arm_qpos, (t, 1)), np.zeros((t, 7)))
 
     def _run(self, qpos: Array, qvel: Array) -> Step:
         arm = (qpos, qvel) if self.control_mode == "pd_joint_pos_vel" else (qpos,)
-        gripper, step = np.full((len(qpos), 1), self.gripper_state), None
-        for action in np.hstack([*arm, gripper]).astype(np.float32):
-            step = self.env.step(action)
-            if self.vis:
-                self.base_env.render_human()
-        return cast("Step", step)
+        gripper = np.full((len(qpos), 1), self.gripper_state)
+        *before, last = np.hstack([*arm, gripper]).astype(np.float32)
+        for action in before:
+            self._step(action)
+        return self._step(last)
+
+    def _step(self, action: NDArray[np.float32]) -> Step:
+        step = self.env.step(action)
+        if self.vis:
+            self.base_env.render_human()
+        return step
 
 
 def _matrix(pose: sapien.Pose | Pose, where: str) -> Array:

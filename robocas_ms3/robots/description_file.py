@@ -27,7 +27,7 @@ class Joint:
         name, kind: its ``name`` and ``type``.
         parent, child: names of the links that it connects.
         origin: (4, 4) pose of the joint's frame in the parent link's frame, m.
-        axis: (3,) in the joint's frame; x where the file names none.
+        axis: (3,) of length 1 in the joint's frame; x where the file names none.
         limits: lower and upper limit, rad or m; None where the file does not name both.
     """
 
@@ -112,14 +112,15 @@ class DescriptionFile:
         return found[::-1]
 
     def _joint(self, element: Element) -> Joint:
-        axis = element.find("axis")
+        found = element.find("axis")
+        axis = np.array([1.0, 0.0, 0.0] if found is None else self.numbers(found, "xyz", 3))
         return Joint(
             name=self.attribute(element, "name"),
             kind=self.attribute(element, "type"),
             parent=self._link(element, "parent"),
             child=self._link(element, "child"),
             origin=self.origin(element),
-            axis=np.array([1.0, 0.0, 0.0] if axis is None else self.numbers(axis, "xyz", 3)),
+            axis=axis / np.linalg.norm(axis),
             limits=self._limits(element),
         )
 

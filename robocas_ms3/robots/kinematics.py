@@ -1,4 +1,4 @@
-"""Forward kinematics, Jacobians and inverse kinematics of an arm, for batches of configurations.
+"""Inverse kinematics of an arm near given configurations, for batches.
 
 The same code runs on tensors, where it never waits for the device, and on NumPy's arrays, which are faster on a CPU.
 """
@@ -29,7 +29,8 @@ IK_CONVERGED = 1e-5  # m and rad together below which a configuration is not imp
 class SerialChain:
     """Revolute joints between two links of a robot, with constants read from its URDF.
 
-    Controllers use this class, on either array type; the planner uses ``ArmChain``, whose docstring compares the two.
+    Controllers use this class, on either array type; the planner uses `planning.kinematics.ArmChain`, datasets use
+    `description_file.link_poses`.
 
     All arrays are float64: float32 leaves errors near the tolerance, and TF32 of a GPU's products would exceed it.
 
@@ -65,15 +66,6 @@ class SerialChain:
         if device is not None:
             constants = tuple(torch.tensor(value, dtype=torch.float64, device=device) for value in constants)
         self._angles, self._shift, self._weights, self._constant, self._quotient, self._identity = constants
-
-    def forward(self, qpos: Array) -> tuple[Array, Array]:
-        """Return positions (N, 3), m, and quaternions wxyz (N, 4), of either sign, of the tip at (N, n) rad."""
-        frames = self._frames(qpos)
-        return frames[-1, 0, :, :3, 3], frames[-1, 1, :, :, 0]
-
-    def jacobian(self, qpos: Array) -> Array:
-        """Return the Jacobians (N, 6, n) of the tip at (N, n): m/rad, then rad/rad, in the root's frame."""
-        return _twists(self._frames(qpos)).swapaxes(1, 2)
 
     def inverse(
         self, position: Array, quaternion: Array, qpos: Array, lower: Array, upper: Array
@@ -156,9 +148,8 @@ def _joint_constants(fixed: list[NDArray[np.float64]]) -> tuple[NDArray[np.float
     return angles, shift, weights.reshape(4 * count, -1), constant.reshape(-1)
 
 
-def _frame_about(axis: NDArray[np.float64]) -> NDArray[np.float64]:
+def _frame_about(z: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return a rotation (4, 4) that turns z into an axis."""
-    z = axis / np.linalg.norm(axis)
     x = np.cross([1, 0, 0] if abs(z[1]) > 0.9 else [0, 1, 0], z)
     x /= np.linalg.norm(x)
     pose = np.eye(4)

@@ -140,6 +140,7 @@ def test_the_gripper_moves_while_the_arm_stays_and_vis_shows_each_step(env, monk
         # depth images have NaN where the camera measured nothing
         ("add_collision_pts", (np.array([[0.5, 0, 0.2], [np.nan, 0, 0]]),), "add_collision_pts"),
         ("add_collision_pts", (np.zeros((3, 6)),), "add_collision_pts"),  # a point per column
+        ("open_gripper", (0,), "t"),
     ],
 )
 def test_poses_and_points_that_can_not_be_are_refused_at_the_call(env, method, arguments, where):
