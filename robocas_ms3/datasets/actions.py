@@ -29,11 +29,9 @@ def episode_actions(arrays: Mapping[str, NDArray]) -> NDArray[np.float32]:
 
 
 def action_space(rel_pos: Sequence[NDArray], rel_orn: Sequence[NDArray]) -> dict[str, list[list[float]]]:
-    """Range of the relative motions: 1st and 99th percentile of each axis over all episodes.
+    """Return the range of the relative motion: percentiles 1 and 99 of each axis of (T, 3) and (T, 4) xyzw.
 
-    Args:
-        rel_pos: (T, 3) of each episode; the last row, which is no motion, does not count.
-        rel_orn: (T, 4) xyzw of each episode.
+    The last row of an episode, which is no motion, does not count.
     """
     positions = np.concatenate([rows[:-1] for rows in rel_pos]).astype(np.float64)
     quaternions = np.concatenate([rows[:-1] for rows in rel_orn]).astype(np.float64)
@@ -46,11 +44,7 @@ def action_space(rel_pos: Sequence[NDArray], rel_orn: Sequence[NDArray]) -> dict
 
 @dataclass(frozen=True)
 class ActionScale:
-    """Maps motion within a range to [-1, 1]; the gripper stays 0 or 1.
-
-    Attributes:
-        low, high: (6,) ends of the range, m and rad.
-    """
+    """Maps motion between ``low`` and ``high``, (6,) m and rad, to [-1, 1]; the gripper stays 0 or 1."""
 
     low: NDArray[np.float64]
     high: NDArray[np.float64]

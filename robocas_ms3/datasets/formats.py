@@ -47,7 +47,6 @@ class Format:
     options: tuple[str, ...] = ()
 
     def part(self, name: str) -> Callable[..., Any]:
-        """Import ``reader``, ``writer`` or ``checker``."""
         path: str = getattr(self, name)
         if not path:
             raise DatasetError(f"this format has no {name}", where=self.title)
@@ -109,10 +108,7 @@ def format_of(path: Path) -> Format | None:
 def open_source(path: Path | str, *, rate_hz: float | None = None, include_failed: bool = False) -> EpisodeSource:
     """Open a trajectory file or dataset of any format.
 
-    Args:
-        path: of it.
-        rate_hz: steps a second, for trajectories (default 5); a dataset has its own.
-        include_failed: for trajectories: also episodes without success.
+    ``rate_hz`` (default 5) and ``include_failed`` are for trajectories; a dataset has its own rate.
 
     Raises:
         DatasetError: it can't be read, or the dataset is of another rate.

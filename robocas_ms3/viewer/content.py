@@ -29,12 +29,7 @@ CAMERA_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,79}")
 class PageContent:
     """Episodes as the page shows them, for several threads. Damaged values are left out, and the row says so.
 
-    Subclasses add what a format has beyond `EpisodeSource`.
-
-    Args:
-        source: reader of the episodes.
-        kind: name of its format, for people.
-        notes: remarks on the dataset, for people.
+    Subclasses add what a format, whose name is ``kind``, has beyond `EpisodeSource`.
     """
 
     scene_name = schema.SCENE_FILE

@@ -18,11 +18,7 @@ _WRONG = (*DAMAGED, ArithmeticError, AttributeError, AssertionError, LookupError
 
 @contextmanager
 def readable(where: object) -> Iterator[None]:
-    """Turn any error that damage may raise into one that says where it is.
-
-    Raises:
-        DatasetError: something could not be read.
-    """
+    """Turn any error that damage may raise into a DatasetError that says where it is."""
     try:
         yield
     except _WRONG as error:

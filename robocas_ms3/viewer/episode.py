@@ -33,14 +33,11 @@ def show_arrays(
     actions: list[Plot] | None = None,
     moving: list[dict[str, Any]] | None = None,
 ) -> dict[str, Any]:
-    """Return what is shown of the arrays of an episode.
+    """Return what is shown of the arrays of an episode, by the keys of the schema.
 
-    Args:
-        a: arrays by the keys of the schema.
-        scene: ``scene.json`` without invalid values; empty without such a file.
-        actions: plots of the recorded actions; None: of the motion of the TCP.
-        moving: objects as {name, target, path}, with paths in the world (T, 3), or (1, 3) of one that does not move;
-            None: where they were at the start, according to the scene.
+    ``actions`` are plots of recorded actions; by default the motion of the TCP is plotted. ``moving`` objects are
+    {name, target, path}, with paths in the world (T, 3), or (1, 3) of one that does not move; by default they are where
+    the scene has them at the start.
 
     Raises:
         LookupError: an array is missing.

@@ -26,11 +26,8 @@ def export(
 ) -> tuple[int, dict[int, str]]:
     """Write ``index.html`` and all it needs; an existing folder is replaced, so the caller checks that it may be.
 
-    Returns:
-        The number of episodes, and what is wrong with the damaged ones, which the table of the page says too.
-
-    Raises:
-        DatasetError: an episode that was asked for does not exist.
+    Return the number of episodes, and what is wrong with the damaged ones, which the table of the page says too.
+    Raise DatasetError if an episode that was asked for does not exist.
     """
     index = source.index()
     known = [entry["n"] for entry in index["episodes"] if entry["n"] is not None]

@@ -21,12 +21,9 @@ _POLICY = "default-src 'self'; base-uri 'none'; form-action 'none'; frame-ancest
 
 
 class Viewer(ThreadingHTTPServer):
-    """The server; use it in a ``with`` statement, and ``serve_forever``. Port 0 takes a free one.
+    """The server, for a ``with`` statement and ``serve_forever``; raises RobocasError if the port is taken.
 
     All its threads end with it: the interpreter would crash if it ended one inside OpenCV.
-
-    Raises:
-        RobocasError: the port is taken.
     """
 
     daemon_threads = False

@@ -35,11 +35,7 @@ _CACHE_BYTES = 128e6  # of decoded images
 
 
 def open_source(path: Path | str) -> PageContent:
-    """Open a trajectory file or its folder, a RoboCAS folder, a LeRobot folder, or another package's format.
-
-    Raises:
-        DatasetError: it is none of them, or damaged.
-    """
+    """Open a trajectory file or its folder, a RoboCAS folder, a LeRobot folder, or another package's format."""
     path = Path(path)
     inside = path / "trajectory.h5"
     path = inside if inside.is_file() else path

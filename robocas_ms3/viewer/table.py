@@ -17,12 +17,7 @@ from robocas_ms3.demos.ledger import FAILURES_FILE, Failure
 class Row:
     """A row of the table.
 
-    Attributes:
-        n: episode; None: a seed without an episode.
-        object: name of the target.
-        stages: where attempts failed.
-        attempts: how many there were.
-        damage: what of the episode is damaged and therefore not shown.
+    ``n`` is None for a seed without an episode, ``stages`` are where attempts failed, ``damage`` is what is not shown.
     """
 
     n: int | None
@@ -60,7 +55,6 @@ class Failures:
 
     @classmethod
     def read(cls, folder: Path) -> Failures:
-        """Read the file of a folder; without one there are no failures."""
         try:
             lines = Ledger[FailedAttempt](folder / FAILURES_FILE, FailedAttempt).lines()
         except OSError as error:

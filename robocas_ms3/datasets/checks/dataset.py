@@ -47,11 +47,7 @@ class Report:
 
 
 def validate(root: str | Path, *, on_episode: Callable[[int, int], None] | None = None) -> Report:
-    """Check a dataset.
-
-    Args:
-        root: its folder.
-        on_episode: called with (done, all) after each episode.
+    """Check a dataset; ``on_episode`` is called with (done, all) after each episode.
 
     Raises:
         DatasetError: there is no such folder, or it is something else.
@@ -85,7 +81,6 @@ def validate(root: str | Path, *, on_episode: Callable[[int, int], None] | None 
 
 
 def check_episode(folder: Path, stored: EpisodeArrays, pictures: Pictures, sizes: Sizes) -> list[Violation]:
-    """Check the arrays, cameras and images of an episode; see `check_images`."""
     wrong, values = list(laws.violations_of(stored, laws.FORM)), []
     if not wrong:
         wrong, values = list(laws.check_units(stored)), list(laws.violations_of(stored, laws.CONTENT))

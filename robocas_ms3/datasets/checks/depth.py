@@ -34,14 +34,9 @@ NEAR = 0.15  # m; nearer than this a pixel covers less than the depth's millimet
 
 @dataclass(frozen=True)
 class View:
-    """An image of depth.
+    """Depth (H, W) in mm, 0 = nothing, of a camera with (4,) fx, fy, cx, cy and its OpenCV frame in the world.
 
-    Attributes:
-        camera: name of the camera.
-        depth: (H, W) uint16, mm, 0 = nothing.
-        intrinsic: (4,) fx, fy, cx, cy.
-        camera_in_world: (4, 4), OpenCV frame.
-        on_hand: whether the gripper carries it, which looks into furniture.
+    A camera ``on_hand``, of the gripper, looks into furniture.
     """
 
     camera: str
@@ -75,7 +70,6 @@ class View:
         return (pixels[rows, columns] * seen / self.intrinsic[:2].max())[seen > 0]
 
     def level_points(self) -> Array:
-        """Return the points (N, 3) on level surfaces."""
         grid, known = self._grid()
         across, down = np.diff(grid, axis=1)[:-1], np.diff(grid, axis=0)[:, :-1]
         normals = np.cross(across, down)
@@ -98,11 +92,7 @@ class View:
 
 
 def check(steps: Sequence[Sequence[View]]) -> Iterator[tuple[int, str, str, str]]:
-    """Check the views of some steps of an episode.
-
-    Yields:
-        (index into ``steps``, camera, expected, found), each expectation once per camera.
-    """
+    """Yield (index into ``steps``, camera, expected, found) of broken rules, each rule once per camera."""
     reported: set[tuple[str, str]] = set()
     agreement: dict[str, float] = {}  # of cameras that others may agree with
     for index, views in enumerate(steps):
@@ -150,15 +140,9 @@ def _floor(view: View, points: Array) -> Iterator[tuple[str, str, str]]:
 
 
 def compare(points: Array, view: View, reach: Array) -> tuple[int, float, float]:
-    """Compare points that another camera saw with a view.
+    """Compare points (N, 3) that another camera saw, with their `View.reach` (N,), with a view.
 
-    Args:
-        points: (N, 3) in the world, m.
-        view: of this camera.
-        reach: (N,) m, see `View.reach`; the view may miss surfaces smaller than its pixels.
-
-    Returns:
-        Number of points in the image; fraction that the view looks through; fraction at its depth.
+    Return the number of points in the image, and the fractions that the view looks through and that are at its depth.
     """
     local = (points - view.camera_in_world[:3, 3]) @ inverse(view.camera_in_world)[:3, :3].T
     local, reach = local[local[:, 2] > NEAR], reach[local[:, 2] > NEAR]

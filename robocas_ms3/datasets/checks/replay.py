@@ -26,15 +26,9 @@ _BASE_STILL = 1e-3  # m that the base may move in all: 7-D actions do not move i
 
 @dataclass(frozen=True)
 class EpisodeReplay:
-    """Outcome of one episode.
+    """Outcome of one episode; without ``success`` it was not replayed.
 
-    Attributes:
-        number: of the episode.
-        task: pick, select, ...; empty: unknown.
-        success: whether the task succeeded again; None: the episode was not replayed.
-        mean_error, max_error: distance of the TCP from the recorded one, m.
-        clipped: number of actions that exceed the limits of ``pd_ee_delta_pose``.
-        skipped: why it was not replayed.
+    Errors are distances of the TCP from the recorded one, m; ``clipped`` actions exceed the limits of the controller.
     """
 
     number: int
@@ -79,12 +73,7 @@ def replay_dataset(
     pack: str | Path | None = None,
     on_episode: Callable[[int, int], None] = lambda done, count: None,
 ) -> ReplayReport:
-    """Replay the 7-D actions of a RoboCAS folder with ``pd_ee_delta_pose`` at the rate of the dataset.
-
-    Args:
-        root: folder of the dataset.
-        pack: name or folder of the object pack, instead of the recorded one.
-        on_episode: called with (done, all) after each episode.
+    """Replay the 7-D actions of a RoboCAS folder with ``pd_ee_delta_pose``; ``pack``: instead of the recorded one.
 
     Raises:
         DatasetError: there is no dataset, or actions can't be replayed at its rate.

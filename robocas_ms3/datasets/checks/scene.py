@@ -34,11 +34,7 @@ def _usable(content: Mapping[str, Any], wrong: list[Violation]) -> dict[str, Any
 
 
 def read_settings(root: Path) -> tuple[dict[str, Any], Pictures, list[Violation]]:
-    """Read ``conversion.json``: its usable content, the images that it promises, and what is wrong with it.
-
-    If it does not say which images there are, those of the standard cameras are promised. Nothing of another schema
-    version is used.
-    """
+    """Return what is usable of ``conversion.json``, the images it promises (else all standard ones), and faults."""
     absent = "this file (robocas import-robocas writes one)"
     content, wrong = read_object(root, FILE, absent=absent)
     if wrong:

@@ -20,15 +20,7 @@ _WORDS = {"int_type": "an integer", "string_type": "text", "dict_type": "an obje
 
 @dataclass(frozen=True)
 class Violation:
-    """A difference from the schema.
-
-    Attributes:
-        file: path in the dataset; empty: the dataset as a whole.
-        key: in that file; empty: the file itself.
-        expected: by the schema.
-        found: instead.
-        kind: what a program may have to tell apart: a file or key that is missing, or one too many.
-    """
+    """A difference from the schema in a key of a file; no key: of the file; no file: of the dataset as a whole."""
 
     file: str
     key: str

@@ -32,10 +32,7 @@ def frame_columns(arrays: dict[str, NDArray]) -> dict[str, NDArray]:
 def robocas_arrays(
     columns: dict[str, NDArray], instruction: str, subgoals: list[str], types: list[str]
 ) -> dict[str, NDArray]:
-    """Return the arrays of ``episode_info.npz`` without embeddings; `frame_columns` is the inverse.
-
-    Relative rotations are computed from the absolute ones.
-    """
+    """Return the arrays of ``episode_info.npz`` without embeddings, the inverse of `frame_columns`."""
     values: dict[str, Any] = {
         "rel_pos": columns["action"][:, :3],
         "rel_agv_pose": columns["action.base"],

@@ -31,11 +31,8 @@ def check_lerobot(
 ) -> Report:
     """Check a dataset; datasets made elsewhere are checked as far as they have what ours have.
 
-    Args:
-        root: folder of the dataset.
-        decode: decode every frame; otherwise frames are counted. FFmpeg's decoders conceal damage inside a video, which
-            shows by the checksums that datasets made here have.
-        on_episode: called with the number of episodes done and of all.
+    ``decode`` decodes every frame; otherwise frames are counted. FFmpeg's decoders conceal damage inside a video, which
+    shows by the checksums that datasets made here have.
 
     Raises:
         MissingExtraError: the ``lerobot`` extra is not installed.

@@ -57,20 +57,13 @@ def convert_lerobot(
     on_start: Callable[[int], None] | None = None,
     on_episode: Callable[[WrittenEpisode], None] | None = None,
 ) -> Conversion:
-    """Write a LeRobot dataset.
+    """Write a LeRobot dataset; ``on_start`` is called with the number of episodes to write, ``on_episode`` after each.
 
     Episodes are written one by one into ``out/.parts`` and joined at the end, without encoding again. Called
     again after a kill, it continues, with the same result; until it is done there is no ``meta`` folder.
 
-    Args:
-        settings: what is converted, and how; with ``leave_out`` the dataset is joined without the episodes that can't
-            be written.
-        on_start: called with the number of episodes to write.
-        on_episode: called after each.
-
     Raises:
-        DatasetError: no such version, the input is unusable, nothing to convert, no render device, or a rate
-            that LeRobot does not have.
+        DatasetError: the input is unusable, nothing to convert, no render device, no such version or rate.
         IncompleteError: episodes can't be written; all others are, and the same call tries again.
         OutputExistsError: ``out`` is a dataset of other settings, versions or episodes, or none.
         RobocasError: another conversion is running.

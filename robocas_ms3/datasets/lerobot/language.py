@@ -132,11 +132,7 @@ def box_in(answer: str | None) -> Box | None:
 
 
 def read_rows_of(table: pa.Table, key: str, where: object) -> list[list[Row]]:
-    """Return the rows of a language column, those of each frame.
-
-    Raises:
-        DatasetError: there is no such column, or it is of another type.
-    """
+    """Return the rows of a language column, those of each frame; raise DatasetError if it is not of that type."""
     kind = PERSISTENT_TYPE if key == PERSISTENT else EVENTS_TYPE
     try:
         frames = table.column(key).cast(kind).to_pylist()

@@ -35,12 +35,7 @@ from robocas_ms3.datasets.sources.files import read_json
 
 
 class Metadata:
-    """The ``meta`` folder of a dataset; each file is read at its first use.
-
-    Raises:
-        DatasetError: no LeRobot dataset there, or one of another version.
-        MissingExtraError: pyarrow or av is missing.
-    """
+    """The ``meta`` folder of a dataset; each file is read at its first use."""
 
     def __init__(self, root: Path) -> None:
         schema.require_extra()
@@ -79,7 +74,6 @@ class Metadata:
         return [key for key, feature in self.info["features"].items() if feature["dtype"] == "video"]
 
     def depth_feature(self, camera: str) -> dict[str, Any] | None:
-        """Return the feature of a camera's native depth video, or None."""
         feature = self.info["features"].get(schema.depth_key(camera))
         return feature if feature and feature["dtype"] == "video" and schema.is_depth(feature) else None
 
@@ -102,7 +96,6 @@ class Metadata:
 
     @cached_property
     def rows(self) -> list[dict[str, Any]]:
-        """The rows of ``meta/episodes``, without statistics."""
         where, found = self.root / "meta/episodes", [row for table in self._tables() for row in table.to_pylist()]
         if len({row["episode_index"] for row in found}) < len(found):
             raise DatasetError("two rows of one episode", where=where)

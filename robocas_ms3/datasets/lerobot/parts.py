@@ -44,14 +44,7 @@ SUBGOAL = "subgoal"  # column of texts, which become numbers when parts are join
 
 
 class EpisodeRecord(BaseModel):
-    """``episode.json`` of a part.
-
-    Attributes:
-        depth: whether there are videos of depth.
-        depth_clipped: whether depth was out of the range of a native depth video.
-        levels: counts of the levels of each video feature, see `stats.Levels`.
-        sizes: bytes of the other files of the part.
-    """
+    """``episode.json`` of a part: ``levels`` as in `stats.Levels` per video feature, ``sizes`` bytes of its files."""
 
     model_config = ConfigDict(strict=True)
 

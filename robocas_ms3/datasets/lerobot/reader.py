@@ -119,7 +119,6 @@ class LeRobotEpisode(SourceEpisode):
 
     @cached_property
     def arrays(self) -> dict[str, NDArray]:
-        """Arrays of ``episode_info.npz`` without embeddings."""
         if not self.dataset.is_ours:
             raise DatasetError("not of our columns", where=self.where, expected=", ".join(schema.OUR_KEYS))
         types, texts = self._subgoals()
@@ -151,11 +150,7 @@ class LeRobotEpisode(SourceEpisode):
 
     @cached_property
     def target_boxes(self) -> Sequence[dict[str, Box]]:
-        """Box of the target in each step, by its ``vqa`` rows; empty without language columns.
-
-        Raises:
-            DatasetError: the rows are damaged.
-        """
+        """Box of the target in each step, by its ``vqa`` rows; empty without language columns."""
         if not self.dataset.has_language:
             return []
         return [boxes_of(rows) for rows in read_rows_of(self.table, EVENTS, self.where)]

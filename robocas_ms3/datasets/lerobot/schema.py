@@ -39,12 +39,9 @@ _FILE_LIMIT = 2**34  # bytes
 
 @dataclass(frozen=True)
 class FileLimits:
-    """Sizes beyond which a new file begins; an episode is never divided.
+    """Sizes in 2^20 bytes, LeRobot's own, and seconds beyond which a new file begins; an episode is never divided.
 
-    Attributes:
-        data_mb, video_mb: size of a file, 2^20 bytes; LeRobot's own.
-        video_seconds: length of a video. LeRobot finds frames by float32 seconds to 0.1 ms, which float32 resolves up
-            to 1024 s.
+    LeRobot finds frames by float32 seconds to 0.1 ms, which float32 resolves up to 1024 s.
     """
 
     data_mb: float = 100
@@ -179,12 +176,6 @@ def require_extra() -> None:
 
 
 def checksum(path: Path) -> str:
-    """Return the SHA-256 of a file.
-
-    Raises:
-        DocumentError: the file is not regular or is too large.
-        OSError: the file cannot be read.
-    """
     check_regular(path, _FILE_LIMIT)
     digest = hashlib.sha256()
     with path.open("rb") as file:

@@ -38,13 +38,9 @@ def joined_stats(episodes: Sequence[NDArray]) -> Stats:
 
 
 class Levels:
-    """Counts of the levels of each channel: exact statistics of any number of images.
+    """Counts (channels, levels) of the levels of a number of images: exact statistics, however many they are.
 
     RGB images have 3 channels, with statistics between 0 and 1; depth images have one, with statistics in mm.
-
-    Args:
-        counts: (channels, levels) of the images so far.
-        images: number of these images.
     """
 
     def __init__(self, counts: ArrayLike, images: int = 0) -> None:

@@ -65,9 +65,7 @@ def faults(table: pa.Table, columns: Mapping[str, Column]) -> Iterator[tuple[str
 def open_table(path: Path, *, most_rows: float = np.inf) -> Iterator[pq.ParquetFile]:
     """Open a Parquet file; texts are read as dictionaries, so that a repeated one takes no memory.
 
-    Raises:
-        DatasetError: the file is missing, damaged or has more rows, or two columns have the same name. Errors of Arrow
-            inside of the ``with`` statement are of the same kind.
+    Damage, too many rows, and errors of Arrow inside of the ``with`` statement are raised as DatasetError.
     """
     try:
         check_regular(path)
@@ -100,11 +98,7 @@ def read_columns(
     groups: Sequence[int] | None = None,
     limit: int = _ARRAYS_LIMIT,
 ) -> pa.Table:
-    """Read columns of a file from `open_table`, those that are there; by default all, of all row groups.
-
-    Raises:
-        DatasetError: the values have more bytes than ``limit``.
-    """
+    """Read columns of an open file, by default all, or raise DatasetError if they have more bytes than ``limit``."""
     footer = file.metadata
     groups = range(footer.num_row_groups) if groups is None else groups
     names = file.schema_arrow.names if columns is None else [key for key in file.schema_arrow.names if key in columns]
@@ -217,11 +211,7 @@ def read_texts(path: Path, name: str, most_rows: float = np.inf) -> list[str]:
 
 
 def in_order(places: list[int], texts: list[str], where: str) -> list[str]:
-    """Return texts in the order of their numbers.
-
-    Raises:
-        DatasetError: the numbers are not 0, 1, ..., each once.
-    """
+    """Return texts in the order of their numbers, or raise DatasetError if these are not 0, 1, ..., each once."""
     if sorted(places) != list(range(len(places))):
         expected = f"0 to {len(places) - 1}, each once"
         raise DatasetError("wrong numbers of texts", where=where, expected=expected, fix=SEE_VALIDATE)

@@ -19,14 +19,9 @@ _EPISODE_CHUNK = "chunk-{episode_chunk:03d}"
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the files of a format version are. The patterns are those of ``info.json``.
+    """Where the files of a format version are, by LeRobot's patterns of ``info.json``; LeRobot reads no ``depth``.
 
-    Attributes:
-        codebase_version: LeRobot's name of the format.
-        data: pattern of the tables of frames.
-        video: pattern of the videos.
-        depth: pattern of the depth videos that LeRobot does not read.
-        one_file_per_episode: whether each episode has its own files, and ``meta`` is JSON lines.
+    With ``one_file_per_episode``, ``meta`` is JSON lines.
     """
 
     codebase_version: str
@@ -36,14 +31,7 @@ class Layout:
     one_file_per_episode: bool = False
 
     def path(self, root: Path, prefix: str, chunk: int, file: int) -> Path:
-        """Return the path of a numbered file.
-
-        Args:
-            root: folder of the dataset.
-            prefix: of its columns in ``meta/episodes``: ``data``, ``videos/KEY``, ``depth/CAMERA`` or
-                ``meta/episodes``.
-            chunk, file: numbers of the chunk and of the file in it.
-        """
+        """Return the path of a file; ``prefix``: of its columns in ``meta/episodes``, as ``videos/KEY``."""
         kind, _, name = prefix.partition("/")
         pattern = {"data": self.data, "videos": self.video, "depth": self.depth, "meta": _EPISODES}[kind]
         numbers = {"chunk_index": chunk, "episode_chunk": chunk, "file_index": file}
@@ -51,7 +39,6 @@ class Layout:
         return root / pattern.format(**numbers, video_key=name, camera=name)
 
     def path_of(self, root: Path, prefix: str, row: Mapping[str, Any]) -> Path:
-        """Return the path of a file of an episode, from its row of ``meta/episodes``."""
         return self.path(root, prefix, row[f"{prefix}/chunk_index"], row[f"{prefix}/file_index"])
 
 
@@ -74,12 +61,9 @@ class Variant:
     """What is written for a version of LeRobot.
 
     Attributes:
-        version: of LeRobot.
-        layout: where files are.
-        language: whether sub-goals, paraphrases and boxes are language columns; otherwise sub-goals are
-            ``subtask_index``.
-        native_depth: whether depth is a video feature of LeRobot; otherwise it is an FFV1 video that LeRobot ignores.
-        outcome: whether ``next.reward``, ``next.success`` and ``next.done`` are written.
+        language: sub-goals, paraphrases and boxes are language columns; otherwise sub-goals are ``subtask_index``.
+        native_depth: depth is a video feature of LeRobot; otherwise an FFV1 video that LeRobot ignores.
+        outcome: there are ``next.reward``, ``next.success`` and ``next.done``.
     """
 
     version: Version

@@ -152,14 +152,7 @@ class Encoder:
 
 
 class Joiner:
-    """Copies videos one after the other into numbered files; only the one being written is open.
-
-    Args:
-        path: of a file, from chunk and file number.
-        fps: frames per second.
-        limit_mb: size a file may have, 2^20 bytes.
-        limit_seconds: length it may have.
-    """
+    """Copies videos one after the other into files ``path(chunk, number)``; only the one being written is open."""
 
     def __init__(self, path: Callable[[int, int], Path], fps: int, limit_mb: float, limit_seconds: float) -> None:
         self._path, self._fps = path, fps

@@ -167,10 +167,7 @@ class LeRobotWriter:
         return pa.table(made | {key: as_column(columns[key]) for key in schema.INDICES})
 
     def _stage_rows(self, index: int, persistent: list[Row], events: list[list[Row]], times: list[float]) -> None:
-        """Write language rows where ``lerobot-annotate`` looks for rows to keep; it removes all others.
-
-        Times are s, float32 as in the table: LeRobot compares them exactly.
-        """
+        """Write language rows where ``lerobot-annotate`` looks for rows to keep, at the table's float32 times."""
         folder = self._root / schema.STAGING / f"episode_{index:06d}"
         timed = ({**row, "timestamp": time} for rows, time in zip(events, times, strict=True) for row in rows)
         for name, rows in (("plan", persistent), ("vqa", timed)):
@@ -240,13 +237,9 @@ class _Stream:
 
 
 class RollingTable:
-    """Writes a table to numbered files, row group by row group.
+    """Writes tables to files ``path(chunk, number)``, ``group`` of them to a row group.
 
-    Args:
-        path: of a file, from chunk and file number.
-        limit_mb: size a file may have, 2^20 bytes; 0: each added table has a file of its own.
-        group: number of tables that are written together.
-        compression: of columns.
+    ``limit_mb`` is the size of a file in 2^20 bytes; 0: each table has a file of its own.
     """
 
     def __init__(

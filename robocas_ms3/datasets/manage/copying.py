@@ -93,14 +93,9 @@ class CopiedEpisode:
 
 @dataclass(frozen=True)
 class CopyOptions:
-    """How episodes are copied.
+    """How episodes are copied; ``on_start`` is called with the number of episodes to write, ``on_episode`` with each.
 
-    Attributes:
-        link: use hard links where the file system allows. They share the files with the source: nothing in this
-            package changes a file in place, an editor may.
-        overwrite: start again, and replace a dataset that exists.
-        on_start: called with the number of episodes to write.
-        on_episode: called with the number of each episode that is written.
+    Hard links, where the file system allows, share files with the source, which an editor may change.
     """
 
     link: bool = True
@@ -130,14 +125,9 @@ class CopyResult:
 def copy_episodes(
     outs: Mapping[Path, Sequence[CopiedEpisode]], split_rule: str, options: CopyOptions
 ) -> list[CopyResult]:
-    """Write datasets of copied episodes, numbered from 0 in the given order.
+    """Write datasets of episodes with the same settings, numbered from 0 in the given order; see `CopyOptions`.
 
     Everything is checked before anything is written. Called again after a kill, it continues, with the same result.
-
-    Args:
-        outs: folder of each new dataset -> its episodes, at least one, all with the same settings.
-        split_rule: how the sides were chosen, for ``conversion.json``.
-        options: how to copy.
     """
     numbers: dict[Path, list[int]] = {}
     for member in (member for members in outs.values() for member in members):
@@ -197,7 +187,6 @@ def _settings_of(record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def check_apart(out: Path, inputs: Sequence[Path]) -> None:
-    """Raise DatasetError if an output is an input, is in one, or holds one."""
     target = out.resolve()
     for path in (path.resolve() for path in inputs):
         if path == target or path in target.parents or target in path.parents:

@@ -44,14 +44,8 @@ def import_robocas(
 ) -> int:
     """Write a dataset of the episodes that can be imported; return how many were there already.
 
-    Episodes keep their numbers. Images are copied or linked, arrays and camera files are written; the source is not
-    changed. Called again after a kill, it continues.
-
-    Args:
-        surveyed: from `survey.survey`.
-        out: folder of the new dataset; ``import_report.json`` is written there too.
-        embed: texts -> (N, 384), for episodes without embeddings; None: without, no episode has them.
-        options: how to copy; by default without links.
+    Episodes keep their numbers. Images are copied or linked, arrays, camera files and a report are written; the
+    source is not changed. Called again after a kill, it continues. ``embed`` is for episodes without embeddings.
 
     Raises:
         DatasetError: no episode can be imported, or the output is the input.

@@ -25,14 +25,9 @@ def merge(
 ) -> CopyResult:
     """Write a dataset of all episodes of others, in the given order; each keeps its side of the split.
 
-    Args:
-        roots: folders of the datasets, of the same schema version and settings.
-        out: folder of the new dataset.
-        skip_duplicates: take an episode of several datasets once, instead of an error.
-        options: how to copy.
-
     Raises:
-        DatasetError: the datasets do not fit together or are not finished, or an episode is damaged.
+        DatasetError: the datasets are not finished or have other settings or, without ``skip_duplicates``, the same
+            episodes, or an episode is damaged.
         OutputExistsError: ``out`` is another dataset, or none.
     """
     if not roots:

@@ -71,15 +71,10 @@ def groups_of(dataset: Dataset, by: By) -> dict[int, str]:
 
 
 def cut(groups: Mapping[int, str], shares: Sequence[float], salt: str = "") -> list[list[int]]:
-    """Cut episodes into parts of about these shares without cutting a group.
+    """Cut episodes into parts of about these shares, which sum to 1, without cutting a group; no part is empty.
 
     Groups in the order of their SHA-256 fill the last part first, so the place of a group depends on the groups alone.
-    Each part gets at least one.
-
-    Args:
-        groups: episode number -> its group.
-        shares: of each part; they sum to 1.
-        salt: prefix of the names of groups; another salt gives an independent order.
+    Another salt gives an independent order.
 
     Raises:
         DatasetError: fewer groups than parts, or no shares.

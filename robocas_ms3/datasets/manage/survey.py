@@ -35,18 +35,7 @@ _FULL_SIZE = (640, 480)
 
 @dataclass
 class Survey:
-    """Result of a survey.
-
-    Attributes:
-        root: folder of the dataset.
-        rate_hz: steps per second.
-        turn_eef: whether turned EEF frames are turned back.
-        episodes: number of episodes.
-        taken: number -> T of the episodes that can be imported.
-        pictures: their images; None if there are none.
-        embeddings: whether all of them have embeddings.
-        findings: of all episodes.
-    """
+    """Result of a survey: ``taken`` is number -> T of the episodes that can be imported, ``pictures`` are theirs."""
 
     root: Path
     rate_hz: float
@@ -84,11 +73,8 @@ def survey(
 ) -> Survey:
     """Check each episode: arrays, cameras, and header and checksums of each image.
 
-    Args:
-        root: folder of the dataset.
-        rate_hz: steps per second; None: as in ``conversion.json``, 5 without one.
-        turn_eef: turn the EEF frame to ManiSkill's TCP if the pose of the gripper camera shows that it is turned.
-        on_episode: called with (done, all) after each episode.
+    The rate is that of ``conversion.json`` by default, 5 without one. ``turn_eef`` turns the EEF frame to ManiSkill's
+    TCP if the pose of the gripper camera shows that it is turned. ``on_episode`` is called with (done, all).
 
     Raises:
         DatasetError: there are no episodes, or the rate is not positive.

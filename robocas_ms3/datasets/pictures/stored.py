@@ -28,14 +28,9 @@ Box = tuple[int, int, int, int]
 
 @dataclass(frozen=True)
 class Pictures:
-    """What is rendered and stored.
+    """What is rendered and stored; no cameras: all that there are, no size: the cameras' own.
 
-    Attributes:
-        cameras: names; empty: all that there are. The standard cameras come first, in their order.
-        size: width and height in pixels; None: the cameras' own, 640 x 480.
-        depth: whether depth is stored beside RGB.
-        image_format: of RGB.
-        boxes: whether the box of the target is determined in each image.
+    The standard cameras come first, in their order. ``boxes``: the box of the target is determined in each image.
     """
 
     cameras: tuple[str, ...] = ()

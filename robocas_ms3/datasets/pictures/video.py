@@ -32,14 +32,7 @@ _PREVIEW_OPTIONS = ("-preset", "veryfast", "-threads", "1")
 
 @contextmanager
 def open_video(path: Path, fps: float, *options: str, quality: float = 8) -> Iterator[Any]:
-    """Open an MP4 (H.264, yuv420p) to append (H, W, 3) RGB to, H and W even.
-
-    Args:
-        path: of the video.
-        fps: frames per second.
-        options: FFmpeg's, for the output.
-        quality: 0 to 10.
-    """
+    """Open an MP4 (H.264, yuv420p) to append (H, W, 3) RGB to, H and W even; quality is 0 to 10."""
     writer = imageio.get_writer(
         path,
         fps=fps,
@@ -59,12 +52,7 @@ def write_video(
 ) -> Path:
     """Write an episode as MP4 (H.264, yuv420p): the cameras side by side, instruction and sub-goal below.
 
-    Args:
-        dataset: the dataset.
-        number: of the episode.
-        path: of the video.
-        speed: 1 is real time.
-        kind: ``rgb``, or ``depth`` in colours.
+    A speed of 1 is real time; depth is shown in colours.
 
     Raises:
         DatasetError: no such episode, or no such speed.
@@ -87,14 +75,7 @@ def write_video(
 def contact_sheet(
     dataset: EpisodeSource, out: Path | str, *, episodes: Sequence[int] | None = None, kind: Kind = "rgb"
 ) -> Path:
-    """Write a PNG with a row for each episode and camera, of evenly spaced steps from first to last.
-
-    Args:
-        dataset: the dataset.
-        out: path of the PNG.
-        episodes: numbers; None: the first ten.
-        kind: ``rgb``, or ``depth`` in colours.
-    """
+    """Write a PNG with a row for each episode (default: the first ten) and camera, of evenly spaced steps."""
     numbers = dataset.numbers[:SHEET] if episodes is None else list(episodes)
     return _write_sheet([_row(dataset, number, kind) for number in numbers], out)
 

@@ -32,8 +32,6 @@ class EpisodeArrays:
     """What an ``episode_info.npz`` holds, as far as it could be read.
 
     Attributes:
-        path: of the file.
-        arrays: by key.
         unreadable: key -> why it could not be read; "": the file as a whole.
         derived: key -> what it was made of, see `completed`.
         ignored: keys that were not asked for.

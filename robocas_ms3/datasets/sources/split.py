@@ -14,15 +14,10 @@ SPLIT_RULE = (
 def split_by_seed(
     seeds: Mapping[int, int], before: tuple[Iterable[int], Iterable[int]] = ((), ())
 ) -> tuple[list[int], list[int]]:
-    """Split episodes 90 : 10. A seed's place depends on no order and no generator, only on the other seeds.
+    """Split episodes, number -> seed, 90 : 10; a seed's place depends on no order and no generator.
 
-    Args:
-        seeds: episode number -> seed.
-        before: training and validation episodes so far; they and their seeds keep their side, and of the new seeds as
-            many validate as make up a tenth of all.
-
-    Returns:
-        Training and validation episodes, sorted. At least one seed validates where there are two.
+    Training and validation episodes ``before`` and their seeds keep their side, and of the new seeds as many validate
+    as make up a tenth of all. At least one seed validates where there are two.
     """
     old = [{seeds[number] for number in numbers if number in seeds} for numbers in before]
     ranked = sorted(set(seeds.values()), key=lambda seed: hashlib.sha256(str(seed).encode()).hexdigest())

@@ -27,12 +27,6 @@ from robocas_ms3.scenes.layout import PARKING_HEIGHT
 class TrajectorySource(EpisodeSource):
     """A trajectory file: its episodes as ``robocas convert`` would number and sample them.
 
-    Args:
-        path: of the HDF5 file.
-        rate_hz: steps per second; divides the control frequency.
-        include_failed: also episodes without success.
-        pack: name or folder of the object pack, instead of the recorded one.
-
     Attributes:
         file: the trajectory file, closed.
         stride: control steps per step.

@@ -26,16 +26,13 @@ MARGIN = 0.3  # m around the region that layouts are sampled in; heaps slide out
 
 @dataclass(frozen=True)
 class LayoutMap:
-    """Where objects stood at the beginning of the episodes of one configuration.
+    """Where objects stood at the beginning of the episodes of one configuration, m.
 
     Attributes:
         frame: of the positions: a piece of furniture's, or the world's.
-        region: [min_xy, max_xy] that layouts are sampled in, m; None: not known.
-        x_edges, y_edges: of the cells, m.
+        region: [min_xy, max_xy] that layouts are sampled in; None: not known.
         counts: (nx, ny) objects in each cell.
         outside: objects farther from the region than ``MARGIN``, in no cell.
-        targets: (N, 2) m, of the episodes' targets.
-        episodes: that were counted.
     """
 
     frame: str
@@ -128,7 +125,6 @@ class Stats:
         return sum(map(sum, self.lengths.values()))
 
     def add(self, facts: Facts) -> None:
-        """Count the facts of an episode."""
         self.success[{True: "true", False: "false", None: "unknown"}[facts.success]] += 1
         self.configs[facts.config] += 1
         self.names.update(facts.names)
@@ -197,12 +193,7 @@ class Stats:
 def collect(
     path: Path | str, *, rate_hz: float | None = None, on_episode: Callable[[int, int], None] | None = None
 ) -> Stats:
-    """Read a dataset or a trajectory file (failed episodes too), without images.
-
-    Args:
-        path: of it.
-        rate_hz: of a trajectory's steps; default 5.
-        on_episode: called with how many are done, of how many.
+    """Read a dataset, or a trajectory with failed episodes, without images; ``on_episode`` is called with (done, all).
 
     Raises:
         DatasetError: it can't be read.
@@ -238,7 +229,6 @@ def counted(counter: Mapping[str, int]) -> dict[str, int]:
 
 
 def described(values: Iterable[float] | NDArray) -> dict[str, Any]:
-    """Return count, mean, deviation and percentiles."""
     array = np.asarray(list(values) if not isinstance(values, np.ndarray) else values, dtype=np.float64)
     if not len(array):
         return {"count": 0}

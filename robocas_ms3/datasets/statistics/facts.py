@@ -40,12 +40,7 @@ class Surface:
 class Facts:
     """What an episode was about; empty where it is not known.
 
-    Attributes:
-        success: whether the recording succeeded; None: not known.
-        object_ids: of the objects that took part.
-        names: of objects, by id.
-        positions: (N, 2) of those in the world at the beginning, m.
-        target_index: of the target in ``positions``.
+    ``positions`` are (N, 2) m in the world at the beginning, of the objects that took part.
     """
 
     instruction: str

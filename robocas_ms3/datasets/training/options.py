@@ -71,11 +71,6 @@ class SampleOptions:
     cached_episodes: int = 64
 
     def __post_init__(self) -> None:
-        """Check the options.
-
-        Raises:
-            DatasetError: an unknown choice, a horizon below 1, or no size.
-        """
         choices = [("split", self.split, get_args(Side)), ("padding", self.padding, get_args(Padding))]
         for where, found, known in (*choices, *(("state", key, STATE_KEYS) for key in self.state)):
             if found not in known:

@@ -62,9 +62,8 @@ def read_episode(
 ) -> dict[str, Any]:
     """Read what the samples of an episode are made of, except images; ``state``: arrays that make up the state.
 
-    Returns:
-        ``action`` (T, 7), ``first_command``, ``instruction``; ``state`` (T, D), ``texts``, ``subgoal_type`` (T,) and
-        the embeddings where they are wanted.
+    Return ``action`` (T, 7), ``first_command``, ``instruction``; ``state`` (T, D), ``texts``, ``subgoal_type`` (T,) and
+    the embeddings where they are wanted.
     """
     keys = (*ACTION_ARRAYS, *state, "language_goal")
     keys += ("step_lang_goals", "step_goal_type") * subgoals

@@ -50,12 +50,7 @@ def convert(
 
     Called again after a kill at any moment, it continues, with the same result.
     An episode that can't be written does not end the others: at the end there is a dataset of the others, and an error.
-    Warns if the open-loop check of the actions was made at another rate than that of the dataset.
-
-    Args:
-        settings: what is converted, and how.
-        on_start: called with the number of episodes to write.
-        on_episode: called after each.
+    ``on_start`` is called with the number of episodes to write, ``on_episode`` after each.
 
     Raises:
         DatasetError: the input is unusable, nothing to convert, no render device.

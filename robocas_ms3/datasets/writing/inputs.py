@@ -32,13 +32,9 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ConversionInput:
-    """An open source, and what of it is converted.
+    """An open source, and what of it is converted: ``pictures`` are those that are wanted and there.
 
-    Attributes:
-        source: gives the episodes.
-        pictures: images to convert: those that are wanted and there.
-        include_failed: whether episodes without success are converted too.
-        sizes: width and height of the stored images, by camera; empty: images are rendered.
+    ``sizes`` has width and height of the stored images, by camera; it is empty where images are rendered.
     """
 
     source: EpisodeSource

@@ -60,16 +60,9 @@ def header(settings: Mapping[str, Any], split_rule: str = SPLIT_RULE) -> dict[st
 def plan_episodes(
     output: OutputFolder, entries: Entries, settings: dict[str, Any], *, append: bool
 ) -> tuple[dict[str, Any], list[tuple[int, int]]]:
-    """Number the episodes of a source: as recorded, new ones after those of the dataset.
+    """Number the episodes of a source: as recorded, new ones, which ``append`` allows, after those of the dataset.
 
-    Args:
-        output: folder of the dataset.
-        entries: recordings to convert.
-        settings: of the dataset.
-        append: whether recordings may be new to a dataset that exists.
-
-    Returns:
-        ``conversion.json``, and (number in the dataset, number in the source) of each episode, written or not.
+    Return ``conversion.json``, and (number in the dataset, number in the source) of each episode, written or not.
     """
     path, content = output.path / schema.CONVERSION_FILE, output.recorded
     if content is None:

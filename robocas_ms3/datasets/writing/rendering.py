@@ -35,10 +35,7 @@ def open_env(env: RecordedEnv, control_mode: str, pictures: Pictures) -> EnvRend
 
 
 class RenderedSource(TrajectorySource):
-    """A trajectory file whose episodes, failed ones included, are rendered. The environment is made once.
-
-    Args: see `TrajectorySource`; ``pictures``, which keeps the names of their cameras, are the images to render.
-    """
+    """A trajectory file whose episodes, failed ones included, are rendered. The environment is made once."""
 
     def __init__(
         self,
