@@ -32,7 +32,7 @@ class _Making:
     """Replace a pack of this name that was made from other files or settings; unchanged assets are reused."""
 
     def __post_init__(self) -> None:
-        check_number("jobs", self.jobs, 1)
+        check_number("--jobs", self.jobs, 1)
 
 
 @dataclass(kw_only=True)

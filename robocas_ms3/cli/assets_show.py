@@ -144,7 +144,7 @@ def verify(command: Verify) -> int:
     for fault in faults:
         console().print(printable(str(fault)), style="red", soft_wrap=True)
     if command.physics:
-        check_number("jobs", command.jobs, 1)
+        check_number("--jobs", command.jobs, 1)
         return max(_verify_physics(pack, command.jobs, command.json), int(bool(faults)))
     return int(bool(faults))
 

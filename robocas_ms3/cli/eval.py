@@ -54,7 +54,7 @@ def run(settings: EvaluationSettings) -> int:
         if word not in TASKS:
             expected = f"one of {', '.join(TASKS)}; or {', '.join(COMMANDS)}"
             fix = nearest(word, [*TASKS, *COMMANDS])
-            raise EvaluationError("no such task", where=word, expected=expected, fix=fix)
+            raise EvaluationError("no such task", where="--tasks", expected=expected, found=word, fix=fix)
     from robocas_ms3.cli.bars import Bar
     from robocas_ms3.cli.terminal import say, say_lines
     from robocas_ms3.core.workers import use_one_torch_thread

@@ -145,7 +145,7 @@ def videos(cfg: Videos) -> int:
     from robocas_ms3.core.errors import EvaluationError
     from robocas_ms3.evaluation.policies import POLICIES, open_policy
 
-    check_number("count", cfg.count, 1)
+    check_number("--count", cfg.count, 1)
     result = _read((cfg.folder,))
     protocol, name = _protocol_of(result, cfg.protocol), result.run.policy.name
     if name not in {*POLICIES.builtin, *POLICIES.entry_points} and cfg.policy != name:

@@ -70,7 +70,7 @@ def build(command: Build) -> int:
     from robocas_ms3.core.checks import check_number
     from robocas_ms3.scenes.config import load_task_config
 
-    check_number("jobs", command.jobs, 1)
+    check_number("--jobs", command.jobs, 1)
     objects = None if command.objects is None else parse_seeds(command.objects, "--objects", listed=True)
     seeds = parse_seeds(command.seeds, "--seeds")
     config = load_task_config(command.config, overrides=command.set)

@@ -72,7 +72,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run ``robocas``; return its exit code: 0, 1 for a failure (one line on stderr), 2 for wrong arguments.
+    """Run ``robocas``; return its exit code: 0, 1 for a failure (one line on stderr), 2 for an invalid option.
 
     ``--debug`` among the arguments gives tracebacks.
     """
@@ -99,7 +99,8 @@ def run(argv: Sequence[str]) -> int:
     except RobocasError as error:
         if debug:
             raise
-        return _say(f"error: {' '.join(str(error).split())}", sys.stderr, 1)
+        of_option = str(error.where).startswith("--")
+        return _say(f"error: {' '.join(str(error).split())}", sys.stderr, 2 if of_option else 1)
     except ValueError as error:
         from robocas_ms3.core.documents import (
             DocumentError,  # with YAML, which no command waits for that fails otherwise

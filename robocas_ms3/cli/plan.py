@@ -84,7 +84,7 @@ def run(command: Run) -> int:
     from robocas_ms3.plans.load import load_plan
     from robocas_ms3.plans.run import run_plan, run_shard
 
-    check_number("jobs", command.jobs, 1)
+    check_number("--jobs", command.jobs, 1)
     shard = parse_shard(command.shard, PlanError) if command.shard is not None else None
     if shard and (command.overwrite or command.executor != "local"):
         found = "--overwrite" if command.overwrite else f"--executor {command.executor}"

@@ -44,8 +44,8 @@ def main(cfg: ServePolicy) -> int:
     from robocas_ms3.evaluation.remote.messages import LARGEST_BATCH
     from robocas_ms3.evaluation.remote.server import PolicyServer, ServedFiles, strip_brackets
 
-    check_number("port", cfg.port, 0, 2**16 - 1)
-    check_number("max_batch", cfg.max_batch, 1, LARGEST_BATCH)
+    check_number("--port", cfg.port, 0, 2**16 - 1)
+    check_number("--max-batch", cfg.max_batch, 1, LARGEST_BATCH)
     if not cfg.host:
         raise EvaluationError("no address to listen on", where="--host", expected="such as 127.0.0.1 or ::1")
     packs = [load_protocol(folder).rules.pack for folder in cfg.protocol]

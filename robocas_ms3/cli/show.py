@@ -43,7 +43,7 @@ def main(cfg: Show) -> int:
     from robocas_ms3.core.errors import RobocasError
     from robocas_ms3.scenes.config import load_task_config
 
-    check_number("seed", cfg.seed, 0, GREATEST_SEED)
+    check_number("--seed", cfg.seed, 0, GREATEST_SEED)
     config = load_task_config(cfg.config, overrides=cfg.set)  # before seconds go by for what is imported next
     if cfg.print_config:
         return print_config(config)

@@ -149,6 +149,7 @@ def _default_out(baseline: str, data: Path | None) -> Path:
 def changes_of(cfg: Training) -> dict[str, Any]:
     """Return the configuration values of the file and of the options; options win."""
     from robocas_ms3.baselines.training.session import merge_configs
+    from robocas_ms3.core.checks import check_number
     from robocas_ms3.core.documents import load_yaml
     from robocas_ms3.core.errors import TrainingError
     from robocas_ms3.scenes.config.compose import parse_override
@@ -158,15 +159,16 @@ def changes_of(cfg: Training) -> dict[str, Any]:
         try:
             read = load_yaml(cfg.config)
         except FileNotFoundError:
-            raise TrainingError("no such file", where=f"--config {cfg.config}") from None
+            raise TrainingError("no such file", where=cfg.config) from None
         except (OSError, ValueError) as error:
-            raise TrainingError("can't be read", where=f"--config {cfg.config}", found=error) from error
+            raise TrainingError("can't be read", where=cfg.config, found=error) from error
         if not isinstance(read, dict):
             raise TrainingError("no configuration", where=cfg.config, expected="a mapping", found=type(read).__name__)
         found = read
     for text in cfg.set:
         found = merge_configs(found, parse_override(text, TrainingError, "train.seed=1"))
-    for key in ("steps", "batch_size", "seed"):
+    for key, least in {"steps": 1, "batch_size": 1, "seed": 0}.items():
         if (value := getattr(cfg, key)) is not None:
+            check_number(f"--{key.replace('_', '-')}", value, least)
             found = merge_configs(found, {"train": {key: value}})
     return found

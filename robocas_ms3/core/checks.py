@@ -10,10 +10,11 @@ from robocas_ms3.core.errors import RobocasError
 GREATEST_SEED = 2**32 - 1  # numpy's older generators, which ManiSkill uses, take no greater one
 
 
-def check_number(name: str, value: float, least: float, greatest: int | None = None) -> None:
+def check_number(where: str, value: float, least: float, greatest: int | None = None) -> None:
+    """Raise RobocasError if a number, such as that of an option ``--jobs``, is out of its range."""
     if not least <= value < math.inf or (greatest is not None and value > greatest):
         expected = f"at least {least}" if greatest is None else f"{least} to {greatest}"
-        raise RobocasError("this number is out of range", where=name, expected=expected, found=value)
+        raise RobocasError("this number is out of range", where=where, expected=expected, found=value)
 
 
 def parse_shard(text: str, error: type[RobocasError]) -> tuple[int, int]:

@@ -124,7 +124,7 @@ def replay(settings: ReplaySettings) -> Iterator[Replay]:
     """
     trajectory, save = settings.file, settings.save
     if settings.count is not None:
-        check_number("count", settings.count, 1)
+        check_number("--count", settings.count, 1)
     _check_obs_mode(settings.obs_mode)
     data = read_json(trajectory)
     env = read_env(data["env_info"], trajectory.with_suffix(".json"), pack=settings.pack)

@@ -80,27 +80,27 @@ class EpisodeSettings:
         from robocas_ms3.scenes.model import SceneModel
 
         control, replay = self.control_freq, self.replay_rate or 0
-        check_number("max_attempts", self.max_attempts, 1)
-        check_number("control_freq", control, 1, SIM_FREQ)
+        check_number("--max-attempts", self.max_attempts, 1)
+        check_number("--control-freq", control, 1, SIM_FREQ)
         if SIM_FREQ % control:
             raise RobocasError(
                 "the control rate must divide the rate of physics",
-                where="control_freq",
+                where="--control-freq",
                 expected=f"one of {', '.join(str(f) for f in range(1, SIM_FREQ + 1) if SIM_FREQ % f == 0)}",
                 found=control,
             )
         for name in ("noisy_trials", "noisy_failures", "noise_mm", "noise_deg"):
-            check_number(name, getattr(self, name), 0)
-        check_number("replay_rate", replay, 0, control)
+            check_number(f"--{name.replace('_', '-')}", getattr(self, name), 0)
+        check_number("--replay-rate", replay, 0, control)
         if replay and (control % replay or SIM_FREQ % replay):
             raise RobocasError(
                 "the rate of the open-loop check must divide the control rate and the rate of physics",
-                where="replay_rate",
+                where="--replay-rate",
                 expected=f"a divisor of {control}, or 0 for no check",
                 found=replay,
             )
-        check_number("after_steps", self.after_steps[0], 1)
-        check_number("after_steps", self.after_steps[1], self.after_steps[0])
+        check_number("--after-steps", self.after_steps[0], 1)
+        check_number("--after-steps", self.after_steps[1], self.after_steps[0])
         BACKENDS.find(self.planner, where="planner")
         robot, config = find_robot(self.robot), load_config_of(TASKS[self.task], self.config)
         SceneModel.load(config, load_pack(self.pack), load_pack("builtin"), robot=robot.description)
@@ -158,11 +158,11 @@ class GenerateSettings:
         return replace(self, episode=episode, out=out, set=(), noise=None)
 
     def check(self) -> None:
-        check_number("episodes", self.episodes, 1)
-        check_number("seed", self.seed, 0, GREATEST_SEED)
-        check_number("jobs", self.jobs, 0)
-        check_number("episode_seconds", self.episode_seconds, 1)
-        check_number("memory_gb", self.memory_gb, 0.1)
+        check_number("--episodes", self.episodes, 1)
+        check_number("--seed", self.seed, 0, GREATEST_SEED)
+        check_number("--jobs", self.jobs, 0)
+        check_number("--episode-seconds", self.episode_seconds, 1)
+        check_number("--memory-gb", self.memory_gb, 0.1)
         self.episode.check()
 
 

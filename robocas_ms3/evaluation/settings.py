@@ -62,9 +62,9 @@ class EvaluationSettings:
     def __post_init__(self) -> None:
         for name in ("envs", "episodes", "workers"):
             if (number := getattr(self, name)) is not None:
-                check_number(name, number, 1)
-        check_number("step_seconds", self.step_seconds, 1)
-        check_number("memory_gb", self.memory_gb, 0.1)
+                check_number(f"--{name}", number, 1)
+        check_number("--step-seconds", self.step_seconds, 1)
+        check_number("--memory-gb", self.memory_gb, 0.1)
         parse_shard(self.shard, EvaluationError)
 
     def folder(self, protocol: str) -> Path:

@@ -10,7 +10,6 @@ from made_up_baseline import MADE_UP
 from robocas_ms3.baselines.registry import BASELINES
 from robocas_ms3.cli.main import run
 from robocas_ms3.cli.train import COMMANDS, Other, Training, changes_of, command
-from robocas_ms3.core.errors import TrainingError
 
 
 @pytest.fixture
@@ -29,20 +28,6 @@ def test_options_win_over_the_file_and_later_ones_over_earlier(tmp_path):
         "views": {"gripper_camera": None},
         "train": {"steps": 20, "seed": 3, "ema": 0.5, "learning_rate": 3e-4, "batch_size": 8},
     }
-
-
-@pytest.mark.parametrize(
-    ("text", "value"),
-    [("null", None), ("false", False), ("[1, 2]", [1, 2]), ("3e-4", 3e-4), ("word", "word"), ("b=c", "b=c")],
-)
-def test_a_value_is_yaml(text, value):
-    assert changes_of(Training(set=(f"a={text}",))) == {"a": value}
-
-
-@pytest.mark.parametrize("text", ["steps", "=3", "train.=3", ".a=3", "a=[1"])
-def test_what_is_no_value(text):
-    with pytest.raises(TrainingError, match="--set: invalid override"):
-        changes_of(Training(set=(text,)))
 
 
 @pytest.mark.parametrize(

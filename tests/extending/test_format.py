@@ -96,9 +96,9 @@ def test_what_is_wrong_with_it_is_said(both, capsys):
 
 def test_a_format_that_there_is_not(stranger, tmp_path, capsys):
     file = write_trajectory(tmp_path / "F.h5")
-    assert run(["convert", str(file), "--to", "rlds", "--out", str(tmp_path / "out")]) == 1
+    assert run(["convert", str(file), "--to", "rlds", "--out", str(tmp_path / "out")]) == 2
     assert "expected one of ['lerobot', 'robocas', 'toy']" in capsys.readouterr().err
-    assert run(["convert", str(file), "--to", "toy", "--append", "--out", str(tmp_path / "out")]) == 1
+    assert run(["convert", str(file), "--to", "toy", "--append", "--out", str(tmp_path / "out")]) == 2
     assert "--append: not for toy datasets" in capsys.readouterr().err
 
 

@@ -187,12 +187,12 @@ def test_a_wrong_option_of_an_executor_costs_nothing_that_exists(tmp_path, capsy
     out = tmp_path / "out"
     out.mkdir()
     (out / PLAN).write_text('{"versions": {}, "plan": {}}')
-    assert run(["plan", "run", "tiny", "--out", str(out), "--overwrite", "--executor-option", "partition=cpu"]) == 1
+    assert run(["plan", "run", "tiny", "--out", str(out), "--overwrite", "--executor-option", "partition=cpu"]) == 2
     assert "--executor-option" in capsys.readouterr().err
     assert (out / PLAN).is_file()
 
 
 @pytest.mark.parametrize("words", [["--overwrite"], ["--executor", "ray"]])
 def test_a_shard_only_continues_on_this_machine(tmp_path, words):
-    assert run(["plan", "run", "tiny", "--out", str(tmp_path / "out"), "--shard", "0/2", *words]) == 1
+    assert run(["plan", "run", "tiny", "--out", str(tmp_path / "out"), "--shard", "0/2", *words]) == 2
     assert not (tmp_path / "out").exists()

@@ -92,7 +92,7 @@ class RayExecutor(ThreadExecutor):
             if isinstance(error.cause, RobocasError | OSError):
                 raise error.cause from error
             found, fix = one_line(error)[-300:], "Do all nodes have robocas-ms3, in the same Python?"
-            raise PlanError("a task of Ray failed", where="--executor ray", found=found, fix=fix) from error
+            raise PlanError("a task of Ray failed", where="Ray", found=found, fix=fix) from error
         except ray.exceptions.RayError as error:
             _log.warning("a task of Ray was lost: %s", one_line(error)[-300:])
         finally:

@@ -176,7 +176,7 @@ def test_the_command_tells_it_and_may_ask_for_a_share(dataset, capsys):
 
 @pytest.mark.parametrize("words", ["--min-share 0.5", "--replay --min-share 50", "--replay --min-share nan"])
 def test_an_invalid_share_is_refused(dataset, player, capsys, words):
-    assert run(["validate", str(dataset), *words.split()]) == 1
+    assert run(["validate", str(dataset), *words.split()]) == 2
     assert capsys.readouterr().err.startswith("error: --min-share: ")
 
 

@@ -162,7 +162,7 @@ def test_an_imported_folder_can_be_resumed(dataset, tmp_path):
 
 def test_from_the_command_line(made, tmp_path, capsys):
     command = ["convert", str(made), "--to", "lerobot", "--out", str(tmp_path / "out")]
-    assert main.run([*command, "--append"]) == 1
+    assert main.run([*command, "--append"]) == 2
     assert capsys.readouterr().err == "error: --append: not for LeRobot datasets. Leave it out.\n"
     assert main.run([*command, "--codec", "av1", "--cameras", "static_camera", "--no-depth"]) == 0
     assert "2 episodes, 14 steps" in capsys.readouterr().out

@@ -100,7 +100,7 @@ def test_commands_refuse_a_wrong_key_and_write_nothing(words, tmp_path, monkeypa
     part = {"config": NAME, "count": 1, "first_seed": 0}
     plan = {"rules": {"name": "a", "description": "b", "max_seconds": {"pick": 5}}, "parts": [part]}
     (tmp_path / "plan.yaml").write_text(yaml.safe_dump(plan))
-    assert run([*words, "--set", "objects.cout=3"]) == 1
+    assert run([*words, "--set", "objects.cout=3"]) == 2
     assert capsys.readouterr().err.startswith("error: --set objects.cout=3: unknown key 'objects.cout'")
     assert [path.name for path in tmp_path.iterdir()] == ["plan.yaml"]
 
