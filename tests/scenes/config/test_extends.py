@@ -24,11 +24,32 @@ def error_of(path, **kwargs) -> ConfigError:
     return caught.value
 
 
-def test_keys_of_a_shipped_base_are_changed(tmp_path):
-    path = write(tmp_path, mine={"extends": "pick_table_scattered", "objects": {"count": 6}, "support": "plate"})
-    base, mine = load_task_config("pick_table_scattered"), load_task_config(path)
-    assert (mine.objects.count, mine.support) == (6, "plate")
-    assert mine.model_copy(update={"objects": base.objects, "support": base.support}) == base
+@pytest.mark.parametrize(
+    ("base", "mine", "expected"),  # expected: keys of the block that differ from the shipped ones
+    [
+        ("", "objects: {count: 6}", {"count": 6}),
+        (
+            "target: {max_distance: 0.5}",
+            "target: {relations: [leftmost]}",
+            {"max_distance": 0.5, "relations": ["leftmost"]},
+        ),
+        ("objects: {ids: [14], count: 2}", "objects: {ids: [12, 13]}", {"ids": [12, 13], "count": 2}),
+        ("layout: {min_gap: 0.03}", "layout: {kind: scattered}", {"min_gap": 0.03}),
+        ("lights: {ambient: 1.0}", "lights: {ambient: null}", {"ambient": 0.4}),  # the default
+        ("randomisation: {robot: {yaw_deg: 9}}", "randomisation: {robot: null}", {"robot": None}),
+        ("", "target: {max_visible_share: null}", {"max_visible_share": None}),  # null is its value
+    ],
+)
+def test_mappings_are_merged_other_values_replaced_and_null_removes(tmp_path, base, mine, expected):
+    path = write(tmp_path, mine=f"extends: base.yaml\n{mine}", base=f"extends: pick_table_scattered\n{base}")
+    data = load_task_config("pick_table_scattered").model_dump(mode="json")
+    data[mine.partition(":")[0]] |= expected
+    assert load_task_config(path) == load_task_config(data)
+
+
+def test_a_layout_of_another_kind_replaces_the_bases(tmp_path):
+    path = write(tmp_path, mine={"extends": "pick_table_scattered", "layout": {"kind": "orderly", "copies": 1}})
+    assert load_task_config(path).layout.copies == 1
 
 
 def test_a_path_is_relative_to_the_extending_file(tmp_path, monkeypatch):
@@ -46,34 +67,6 @@ def test_a_base_may_be_incomplete(tmp_path):
     path = write(tmp_path, mine={"extends": "base.yaml", **data}, base=base)
     assert load_task_config(path) == load_task_config("pick_table_scattered")
     assert error_of(tmp_path / "base.yaml").found == "nothing"
-
-
-def test_mappings_are_merged_and_other_values_replaced(tmp_path):
-    target = {"relations": ["nearest"], "max_distance": 0.5}
-    path = write(
-        tmp_path,
-        mine={"extends": "base.yaml", "target": {"relations": ["leftmost"]}, "objects": {"ids": [12, 13]}},
-        base={"extends": "pick_table_scattered", "target": target, "objects": {"ids": [14], "count": 2}},
-    )
-    config = load_task_config(path)
-    assert (config.target.relations, config.target.max_distance) == (["leftmost"], 0.5)
-    assert (config.objects.ids, config.objects.count) == ([12, 13], 2)
-
-
-def test_a_layout_of_another_kind_replaces_the_base_layout(tmp_path):
-    path = write(tmp_path, mine={"extends": "pick_table_scattered", "layout": {"kind": "orderly", "copies": 1}})
-    assert load_task_config(path).layout.copies == 1
-    path = write(tmp_path, mine={"extends": "pick_table_scattered", "layout": {"kind": "scattered"}})
-    assert load_task_config(path).layout == load_task_config("pick_table_scattered").layout
-
-
-def test_null_removes_a_key_or_is_its_value(tmp_path):
-    base = {"extends": "search_table_stacked", "lights": {"ambient": 1.0}, "randomisation": {"robot": {"yaw_deg": 9}}}
-    nulls = {"lights": {"ambient": None}, "randomisation": {"robot": None}, "target": {"max_visible_share": None}}
-    config = load_task_config(write(tmp_path, mine={"extends": "base.yaml", **nulls}, base=base))
-    assert config.lights.ambient == 0.4  # the default
-    assert config.randomisation.robot is None
-    assert config.target.max_visible_share is None
 
 
 def test_null_removes_furniture_and_the_next_name_takes_its_place(tmp_path):
@@ -154,14 +147,10 @@ def test_a_chain_has_a_limit(tmp_path):
     assert error_of(tmp_path / names[0]).expected == f"at most {CHAIN_LIMIT} files"
 
 
-@pytest.mark.parametrize("text", ["- a", ""])
+@pytest.mark.parametrize("text", ["- a", "", "lights: &a {ambient: *a}"])
 def test_a_broken_base_is_named(tmp_path, text):
     path = write(tmp_path, mine={"extends": "base.yaml"}, base=text)
-    assert error_of(path).where == tmp_path / "base.yaml"
-
-
-def test_a_mapping_inside_itself_is_an_error(tmp_path):
-    error_of(write(tmp_path, mine="extends: pick_table_scattered\nlights: &a {ambient: *a}\n"))
+    assert str(error_of(path).where).startswith(str(tmp_path / "base.yaml"))
 
 
 def test_only_files_outside_of_protocols_extend():

@@ -69,10 +69,7 @@ def test_a_mistake_names_the_option(text, words):
         load_task_config(NAME, overrides=["objects.repeats=true", text])
     assert caught.value.where == f"--set {text}"
     assert [word for word in words if word not in str(caught.value)] == []
-
-
-def test_a_mistake_between_keys_names_file_and_options():
-    with pytest.raises(ConfigError) as caught:
+    with pytest.raises(ConfigError) as caught:  # a mistake between keys
         load_task_config(NAME, overrides=["surface.furniture=desk"])
     assert str(caught.value.where).endswith(f"{NAME}.yaml with --set surface.furniture=desk")
 

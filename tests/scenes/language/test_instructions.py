@@ -50,19 +50,6 @@ def test_defaults_are_upstreams_word_for_word(task, text):
 
 
 @pytest.mark.parametrize(
-    ("task", "text"),
-    [
-        ("pick", "pick up the toothpaste from the table and place it in the basket"),
-        ("select", "pick up the nearest toothpaste from the table and place it in the basket"),
-        ("search", "search out the toothpaste from the heap on the table"),
-    ],
-)
-def test_the_papers_own_sentences(task, text):
-    found = instruction(slots(task, "toothpaste"), f"{task}/train/00")
-    assert (found.text, found.split) == (text, "train")
-
-
-@pytest.mark.parametrize(
     ("relation", "phrase"),
     [
         ("nearest", "nearest mug"),
