@@ -2,20 +2,13 @@
 
 import numpy as np
 import pytest
-from managing import change, convert_made_up, edit, files_of, make
+from managing import Bomb, change, convert_made_up, edit, files_of, make
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.manage.merging import merge
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.info import write_info
-
-
-class Bomb:
-    """Unpickling this is noticed."""
-
-    def __reduce__(self):
-        return exec, ("raise SystemExit('unpickled')",)
 
 
 def test_pickles_are_loaded_nowhere(dataset, tmp_path):

@@ -71,18 +71,16 @@ def test_each_key_is_missed():
         ({"layout": {"poses": [POSE[:6]]}}, "layout.poses.0", "7 values", "6"),
         ({"layout": {"poses": [["x"] * 7] * 9}}, "layout.poses.0.0", "a number", '"x"'),
         ({"layout": {"object_ids": ["a"], "poses": []}}, "", "", ""),
+        ({"layout": {"object_ids": ["a"], "poses": [POSE] * 2}}, "layout", None, None),
         ({"objects": [{"slot": -1, "id": "a", "name": "a"}]}, "objects.0.slot", "greater than or equal to 0", "-1"),
         ({"rate_hz": float("inf")}, "rate_hz", "a finite number", "Infinity"),
         ({"recorded": {"recoveries": [RECOVERY | {"range": [3]}]}}, "recorded.recoveries.0.range", "2 values", "1"),
     ],
 )  # fmt: skip
 def test_one_violation_a_fault(new, key, expected, found):
-    assert [said(v) for v in check_values({**WHOLE, **new})] == ([(key, expected, found)] if key else [])
-
-
-def test_a_layout_has_as_many_poses_as_objects():
-    (violation,) = check_values({**WHOLE, "layout": {"object_ids": ["a"], "poses": [POSE] * 2}})
-    assert violation.key == "layout"
+    violations = check_values({**WHOLE, **new})
+    assert [v.key for v in violations] == ([key] if key else [])
+    assert expected is None or [said(v) for v in violations] == ([(key, expected, found)] if key else [])
 
 
 def test_scenes_that_are_no_objects():
@@ -93,7 +91,6 @@ def test_scenes_that_are_no_objects():
 @pytest.mark.parametrize(
     ("name", "new", "text"),
     [
-        (FILE, {"seed": "five"}, f'{FILE}, seed: expected an integer, or a list of one, found "five"'),
         (FILE, {"seed": [99]}, f"{FILE}, seed: expected 5 (conversion.json), found 99"),
         (FILE, {"rate_hz": 10}, f"{FILE}, rate_hz: expected 5.0 (conversion.json), found 10"),
         (FILE, {"recorded": {"facts": {"x": float("nan")}}}, f"{FILE}: expected JSON, found"),
@@ -103,10 +100,16 @@ def test_scenes_that_are_no_objects():
         ("conversion.json", {"cameras": []}, "conversion.json, cameras: expected 1 values, found 0"),
         ("conversion.json", {"episodes": []}, "conversion.json, episodes: expected an object, found []"),
         ("conversion.json", {"episodes": {"0": {}, "1": 3}}, "conversion.json, episodes.1: expected an object"),
+        (FILE, "[1]", f"{FILE}: expected an object, found list"),
+        ("conversion.json", "[]", "conversion.json: expected an object, found list"),
+        ("conversion.json", '{"schema_version": 2', "conversion.json: expected JSON"),
     ],
 )  # fmt: skip
 def test_validate_says_it_once(dataset, name, new, text):
-    edit(dataset / name, lambda content: content.update(new))
+    if isinstance(new, str):
+        (dataset / name).write_text(new)
+    else:
+        edit(dataset / name, lambda content: content.update(new))
     (violation,) = validate(dataset).violations
     assert str(violation).startswith(text)
 
@@ -114,17 +117,3 @@ def test_validate_says_it_once(dataset, name, new, text):
 def test_a_seed_in_a_list_is_that_seed(dataset):
     edit(dataset / FILE, lambda content: content.update(seed=[5]))
     assert validate(dataset).violations == []
-
-
-@pytest.mark.parametrize(
-    ("name", "text", "said"),
-    [
-        (FILE, "[1]", f"{FILE}: expected an object, found list"),
-        ("conversion.json", "[]", "conversion.json: expected an object, found list"),
-        ("conversion.json", '{"schema_version": 2', "conversion.json: expected JSON"),
-    ],
-)
-def test_files_that_hold_something_else(dataset, name, text, said):
-    (dataset / name).write_text(text)
-    (violation,) = validate(dataset).violations
-    assert str(violation).startswith(said)

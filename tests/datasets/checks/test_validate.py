@@ -30,11 +30,6 @@ def change_array(path, edit):
     np.save(path, edit(np.load(path)))
 
 
-def change_depth(root, edit, camera="base_camera"):
-    for path in (root / "episode_0000001" / camera / "depth").iterdir():
-        cv2.imwrite(str(path), edit(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)))
-
-
 def found(root):
     report = validate(root)
     assert report.as_json()["valid"] is (not report.violations)
@@ -208,55 +203,41 @@ def test_camera_files(dataset):
     ]
 
 
-def both_poses(root, camera, parent, edit):
-    for name in (f"cam_pos_wrt_{parent}.npy", f"cam_pose_wrt_{parent}.npy"):
-        change_array(root / "episode_0000001" / camera / name, edit)
-
-
 def turned(pose):
     """By 5 deg about the camera's own x."""
     c, s = np.cos(np.deg2rad(5)), np.sin(np.deg2rad(5))
     return pose @ np.array([[1, 0, 0, 0], [0, c, -s, 0], [0, s, c, 0], [0, 0, 0, 1]])
 
 
-@pytest.mark.parametrize(
-    ("camera", "parent", "edit"),
-    [
-        ("base_camera", "arm_base", turned),
-        ("gripper_camera", "ee", np.linalg.inv),
-        ("static_camera", "world", lambda pose: pose @ np.diag([1.0, -1, -1, 1])),  # OpenGL's camera frame
-        ("base_camera", "arm_base", lambda pose: pose @ np.eye(4)[[1, 2, 0, 3]]),  # other axes
-    ],
-    ids=["turned by 5 deg", "inverted", "OpenGL frame", "permuted axes"],
-)
-def test_wrong_camera_poses_show_in_the_depth(dataset, camera, parent, edit):
-    both_poses(dataset, camera, parent, edit)
-    assert_depth(found(dataset), camera)
+def poses(parent, edit):
+    return lambda folder: [change_array(folder / f"{name}_wrt_{parent}.npy", edit) for name in ("cam_pos", "cam_pose")]
 
 
-@pytest.mark.parametrize(
-    ("camera", "edit"),
-    [
-        ("base_camera", lambda depth: depth // 10),
-        ("base_camera", lambda depth: np.ascontiguousarray(depth[:, ::-1])),
-        ("static_camera", lambda depth: depth * 0),
-    ],
-    ids=["centimetres", "mirrored", "nothing"],
-)
-def test_wrong_depth(dataset, camera, edit):
-    change_depth(dataset, edit, camera)
-    assert_depth(found(dataset), camera)
+def depth(edit):
+    def spoil(folder):
+        for path in (folder / "depth").iterdir():
+            cv2.imwrite(str(path), edit(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)))
+
+    return spoil
 
 
-def test_wrong_intrinsics(dataset):
-    path = dataset / "episode_0000001" / "base_camera" / "intrinsic.npy"
-    change_array(path, lambda intrinsic: intrinsic * [1.1, 1.1, 1, 1])
-    assert_depth(found(dataset), "base_camera")
+WRONG_VIEWS = {
+    "turned by 5 deg": ("base_camera", poses("arm_base", turned)),
+    "inverted": ("gripper_camera", poses("ee", np.linalg.inv)),
+    "OpenGL frame": ("static_camera", poses("world", lambda pose: pose @ np.diag([1.0, -1, -1, 1]))),
+    "permuted axes": ("base_camera", poses("arm_base", lambda pose: pose @ np.eye(4)[[1, 2, 0, 3]])),
+    "zoomed": ("base_camera", lambda folder: change_array(folder / "intrinsic.npy", lambda k: k * [1.1, 1.1, 1, 1])),
+    "centimetres": ("base_camera", depth(lambda pixels: pixels // 10)),
+    "mirrored": ("base_camera", depth(lambda pixels: np.ascontiguousarray(pixels[:, ::-1]))),
+    "nothing": ("static_camera", depth(lambda pixels: pixels * 0)),
+}
 
 
-def assert_depth(violations, camera):
-    """Depth is reported, in this episode only; the camera itself is among those that disagree."""
-    assert violations
+@pytest.mark.parametrize("name", WRONG_VIEWS)
+def test_wrong_poses_intrinsics_and_depth_show_in_the_depth_of_that_episode(dataset, name):
+    camera, spoil = WRONG_VIEWS[name]
+    spoil(dataset / "episode_0000001" / camera)
+    violations = found(dataset)
     assert all(v.startswith("episode_0000001/") and "/depth/" in v for v in violations)
     assert any(camera in v for v in violations)
 

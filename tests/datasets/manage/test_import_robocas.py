@@ -6,7 +6,7 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-from managing import arrays_of, as_upstream, change, edit, files_of, make, read
+from managing import Bomb, arrays_of, as_upstream, change, edit, files_of, make, read
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.cli.main import run
@@ -137,13 +137,6 @@ def test_other_types_and_axes(upstream, made, tmp_path):
     old = arrays_of(made / "episode_0000000")
     for key in ("ee_pos", "gripper_width", "gripper_status", "language_goal", "step_goal_type", "episode_length"):
         np.testing.assert_array_equal(new.episode(0).arrays[key], old[key])
-
-
-class Bomb:
-    """Unpickling this is noticed."""
-
-    def __reduce__(self):
-        return exec, ("raise SystemExit('unpickled')",)
 
 
 def test_pickles_are_never_loaded(upstream, tmp_path):

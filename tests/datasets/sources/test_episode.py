@@ -14,7 +14,6 @@ from robocas_ms3.demos.recordings.motion import (
     Motion,
     gripper_open,
     planar_base,
-    relative_motion,
     sample_states,
     sample_stride,
 )
@@ -34,14 +33,6 @@ def pose_sequences(draw):
 def compose(first, relative):
     """Poses (T, 4, 4) of the first one and the relative motion (T, 4, 4)."""
     return np.stack(list(accumulate(relative[:-1], np.matmul, initial=first)))
-
-
-@settings(max_examples=50, deadline=None)
-@given(pose_sequences())
-def test_relative_motions_from_the_first_pose_give_all_poses_again(poses):
-    motions = relative_motion(poses)
-    np.testing.assert_array_equal(motions[-1], np.eye(4))
-    np.testing.assert_allclose(compose(poses[0], motions), poses, atol=1e-9)
 
 
 @settings(max_examples=50, deadline=None)

@@ -8,20 +8,13 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks import arrays as laws
 from robocas_ms3.datasets.manage.repairs import ImportedEpisode, repair_arrays
-from robocas_ms3.datasets.sources.arrays import EpisodeArrays, load_arrays, motion_arrays, read_arrays
+from robocas_ms3.datasets.sources.arrays import EpisodeArrays, load_arrays, read_arrays
 
 FILE = "episode_0000001/episode_info.npz"
-KEYS = ("ee_pos", "ee_orn", "rel_pos", "rel_orn")
 
 
 def said(violations):
     return [(violation.key, violation.expected, violation.found) for violation in violations]
-
-
-def moved(quaternions, positions):
-    """Two rows, and the motion between them."""
-    arrays = {"ee_pos": np.array(positions, "f4"), "ee_orn": np.array(quaternions, "f4")}
-    return {**arrays, **motion_arrays(arrays, KEYS)}
 
 
 def test_damage_is_noted_and_refused_by_who_needs_it(dataset):
@@ -47,19 +40,6 @@ def test_what_is_not_there(tmp_path):
         stored.needed([])
     with pytest.raises(DatasetError, match="no such file"):
         load_arrays(tmp_path / "episode_info.npz")
-
-
-def test_motion_by_hand(tmp_path):
-    """A quarter turn about z, then 1 m along what was y and is x now."""
-    half = np.sqrt(0.5)
-    arrays = moved([[0, 0, 0, 1], [0, 0, half, half]], [[0, 0, 0], [0, 1, 0]])
-    np.testing.assert_allclose(arrays["rel_pos"], [[0, 1, 0], [0, 0, 0]], atol=1e-7)
-    np.testing.assert_allclose(arrays["rel_orn"], [[0, 0, half, half], [0, 0, 0, 1]], atol=1e-7)
-    stored = EpisodeArrays(tmp_path, arrays)
-    assert said(laws.check_motion(stored)) == []
-    arrays["rel_pos"] = np.array([[0, 1.5, 0], [0, 0, 0]], "f4")
-    expected = "the motion between rows of ee_pos, ee_orn"
-    assert said(laws.check_motion(stored)) == [("rel_pos", expected, "1 of 2 rows off, by 0.5 m in row 0")]
 
 
 def test_what_is_absent_breaks_no_law_but_one(tmp_path):

@@ -10,24 +10,6 @@ from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.statistics.collect import collect
 
 
-class Listed(list):
-    """Numbers that nobody may search through."""
-
-    def __contains__(self, number):
-        raise AssertionError("a search through the list")
-
-
-def test_an_episode_is_found_without_a_search(tmp_path):
-    """All of 10 000 episodes are opened in turn."""
-    for number in (0, 3):
-        (tmp_path / f"episode_{number:07d}").mkdir()
-    dataset = Dataset(tmp_path)
-    dataset.__dict__["numbers"] = Listed(dataset.numbers)
-    assert dataset.episode(3).folder.name == "episode_0000003"
-    with pytest.raises(DatasetError, match="no such episode .expected 0 to 3, found 2"):
-        dataset.episode(2)
-
-
 def test_a_dataset_without_a_split(tmp_path):
     (tmp_path / "episode_0000000").mkdir()
     assert Dataset(tmp_path).sides == ([], [])

@@ -14,11 +14,9 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from managing import arrays_of, change
 from PIL import Image
-from torch.utils.data import DataLoader, WeightedRandomSampler
+from torch.utils.data import DataLoader
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import RoboCASDataset
@@ -95,14 +93,6 @@ def test_every_element_is_the_naive_loaders(made, horizon, chunk, padding):
             assert sample[key].shape == np.shape(value), key
             assert np.abs(sample[key].double().numpy() - np.asarray(value, float)).max() <= tolerance, key
     assert {key for key, value in sample.items() if torch.is_tensor(value)} == set(expected)
-
-
-def test_what_is_held_is_the_nearest_gripper_command(dataset):
-    change(dataset / "episode_0000001", gripper_status=np.array([False] + 6 * [True]))
-    data = RoboCASDataset(dataset, SampleOptions(split="all", cameras=(), observation_horizon=3, action_horizon=3))
-    assert data[data.index(1, 0)]["action"][:, 6].tolist() == [0, 0, 1, 1, 1]
-    assert data[data.index(1, 5)]["action"][:, 6].tolist() == [1, 1, 1, 1, 1]
-    assert data[data.index(1, 5)]["action_mask"].tolist() == [True, True, True, False, False]
 
 
 def test_actions_by_hand():
@@ -189,24 +179,11 @@ def test_index_and_back(made):
             data.index(*place)
 
 
-@given(st.integers(1, 9), st.integers(1, 9), st.integers(1, 30))
-def test_dropped_samples_are_those_with_padding(horizon, chunk, length):
-    whole, padded = (SampleOptions("all", horizon, chunk, padding) for padding in ("drop", "hold"))
-    complete = [
-        step for step in padded.samples(length) if whole.observed(step)[0] >= 0 and whole.acted(step)[-1] <= length - 2
-    ]
-    assert list(whole.samples(length)) == complete
-
-
 def test_weights_draw_all_stages_alike(made):
     data = RoboCASDataset(made, SampleOptions(split="all", cameras=(), observation_horizon=1, subgoals=True))
     weights = data.weights()
     assert data.stages.tolist() == [2, 2, 2, 3, 3, 3] * 2
     assert weights.tolist() == pytest.approx([1 / 12] * 12)
-    generator = torch.Generator().manual_seed(0)
-    sampler = WeightedRandomSampler(weights.tolist(), 400, generator=generator)
-    drawn = torch.cat([batch["subgoal_type"][:, 0] for batch in DataLoader(data, batch_size=100, sampler=sampler)])
-    assert 160 < int((drawn == 2).sum()) < 240
 
 
 def test_split_is_the_overviews(dataset):
@@ -276,13 +253,6 @@ def test_a_lerobot_folder_gives_the_same_samples(made, tmp_path):
     table.write_bytes(table.read_bytes()[:100])
     with pytest.raises(DatasetError, match="file-000.parquet: this table can't be read"):
         RoboCASDataset(tmp_path / "lerobot", SampleOptions(split="all", cameras=()))
-
-
-@pytest.mark.slow
-def test_spawned_workers(trajectory):
-    data = RoboCASDataset(trajectory, SampleOptions(split="all", cameras=()))
-    loader = DataLoader(data, batch_size=4, num_workers=1, multiprocessing_context="spawn")
-    assert torch.equal(torch.cat([batch["action"] for batch in loader]), torch.stack([item["action"] for item in data]))
 
 
 def test_trajectories_give_what_their_conversion_gives(made, trajectory):
