@@ -12,87 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.words import count_of
+from robocas_ms3.core.words import count_of, error_line
+from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.actions import ACTION_ARRAYS, ACTION_NAMES
 from robocas_ms3.datasets.formats import open_source
-from robocas_ms3.datasets.statistics.facts import Array, Facts, facts_of
+from robocas_ms3.datasets.sources.protocol import SourceEpisode
+from robocas_ms3.datasets.sources.provenance import task_of
+from robocas_ms3.datasets.sources.records import Layout, Recorded, SceneRecord, read_scene
+from robocas_ms3.datasets.statistics.layouts import LayoutMap, Placement, layout_map, rounded, surface_of
 from robocas_ms3.datasets.training.sample_arrays import checked_actions
 
 NOOP = (1e-3, np.deg2rad(0.5))  # m and rad per step below which the gripper counts as standing still
 BINS = 41  # of histograms; odd, so that standing still has a bin of its own
-CELL = 0.05  # m
-MARGIN = 0.3  # m around the region that layouts are sampled in; heaps slide out of it
-
-
-@dataclass(frozen=True)
-class LayoutMap:
-    """Where objects stood at the beginning of the episodes of one configuration, m.
-
-    Attributes:
-        frame: of the positions: a piece of furniture's, or the world's.
-        region: [min_xy, max_xy] that layouts are sampled in; None: not known.
-        counts: (nx, ny) objects in each cell.
-        outside: objects farther from the region than ``MARGIN``, in no cell.
-    """
-
-    frame: str
-    region: list[list[float]] | None
-    x_edges: Array
-    y_edges: Array
-    counts: NDArray[np.int64]
-    outside: int
-    targets: Array
-    episodes: int
-
-    @property
-    def coverage(self) -> float | None:
-        """Fraction of the region's cells that an object's centre was ever in; None without a region."""
-        if self.region is None:
-            return None
-        (x0, y0), (x1, y1) = self.region
-        x, y = (self.x_edges[:-1] + self.x_edges[1:]) / 2, (self.y_edges[:-1] + self.y_edges[1:]) / 2
-        inside = np.outer((x > x0) & (x < x1), (y > y0) & (y < y1))
-        return float(np.mean(self.counts[inside] > 0)) if inside.any() else None
-
-    def as_json(self) -> dict[str, Any]:
-        return {
-            "frame": self.frame,
-            "region": self.region,
-            "episodes": self.episodes,
-            "objects": int(self.counts.sum()) + self.outside,
-            "outside": self.outside,
-            "coverage": _rounded(self.coverage),
-            "x_edges": _rounded(self.x_edges),
-            "y_edges": _rounded(self.y_edges),
-            "counts": self.counts.tolist(),
-            "targets": _rounded(self.targets),
-        }
-
-
-def layout_map(parts: list[Facts]) -> LayoutMap:
-    """Return the heat map of one configuration, in the frame of its furniture where that is known for all."""
-    surface = parts[0].surface
-    if surface is None or any(part.surface != surface for part in parts):
-        surface = None
-    placed = [part.positions if surface is None else surface.place(part.positions) for part in parts]
-    points = np.concatenate(placed)
-    targets = [xy[part.target_index] for part, xy in zip(parts, placed, strict=True) if part.target_index is not None]
-    region = surface.region if surface else None
-    low, high = np.asarray(region) if region else (points.min(0), points.max(0))
-    near = points[((points >= low - MARGIN) & (points <= high + MARGIN)).all(axis=1)]
-    x_edges, y_edges = (_edges(low[axis], high[axis], near[:, axis]) for axis in (0, 1))
-    counts = np.histogramdd(near, bins=(x_edges, y_edges))[0].astype(np.int64)
-    frame = surface.label if surface else "world"
-    outside = len(points) - int(counts.sum())
-    return LayoutMap(frame, region, x_edges, y_edges, counts, outside, np.array(targets).reshape(-1, 2), len(parts))
-
-
-def _edges(low: float, high: float, points: Array) -> Array:
-    """Return edges of equal cells of about ``CELL`` that divide [low, high], and as many more as the points need."""
-    cell = (high - low) / max(1, round((high - low) / CELL)) if high - low > CELL / 2 else CELL
-    before = np.ceil((low - points.min(initial=low)) / cell - 1e-9)
-    after = np.ceil((points.max(initial=high) - low) / cell - 1e-9)
-    return low + cell * np.arange(-int(before), max(1, int(after)) + 1, dtype=np.float64)
+UNKNOWN = "unknown"
 
 
 @dataclass
@@ -124,19 +56,36 @@ class Stats:
     def steps(self) -> int:
         return sum(map(sum, self.lengths.values()))
 
-    def add(self, facts: Facts) -> None:
-        self.success[{True: "true", False: "false", None: "unknown"}[facts.success]] += 1
-        self.configs[facts.config] += 1
-        self.names.update(facts.names)
-        self.objects.update(set(facts.object_ids))
-        self.instructions[facts.instruction] += 1
+    def add(self, episode: SourceEpisode, steps: int) -> tuple[str, Placement]:
+        """Count what ``scene.json`` has of an episode; return its configuration, and where its objects stood."""
+        where, fix = f"{episode.where}/{schema.SCENE_FILE}", "robocas validate says what is wrong."
+        scene = read_scene(episode.scene, where)
+        recorded, target, config = scene.recorded or Recorded(), scene.target, _config_name(scene)
+        try:
+            layout, surface = Layout.model_validate(episode.layout), surface_of(scene.config or {})
+        except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
+            what, found = "this description of a scene is damaged", error_line(error, 200)
+            raise DatasetError(what, where=where, found=found, fix=fix) from error
+        slots = [n for n in range(len(layout.object_ids)) if not layout.present or layout.present[n]]
+        poses = np.array(layout.poses, dtype=np.float64).reshape(-1, 7)
+        self.lengths[scene.task or UNKNOWN].append(steps)
+        self.success[{True: "true", False: "false", None: "unknown"}[scene.success]] += 1
+        self.configs[config] += 1
+        self.names.update({target.asset_id: target.name} if target else {})
+        self.names.update({entry.id: entry.name for entry in scene.objects or []})
+        self.objects.update({layout.object_ids[slot] for slot in slots})
+        self.instructions[str(episode.read(["language_goal"])["language_goal"])] += 1
         for counter, value in (
-            (self.targets, facts.target_id),
-            (self.templates, facts.template),
-            (self.relations, facts.relation),
+            (self.targets, target.asset_id if target else ""),
+            (self.templates, recorded.instruction_template),
+            (self.relations, recorded.relation),
         ):
             if value:
                 counter[value] += 1
+        if not len(poses):
+            return config, Placement(np.zeros((0, 2)))
+        index = slots.index(target.slot) if target and target.slot in slots else None
+        return config, Placement(poses[slots, :2], index, surface)
 
     def summary(self) -> str:
         tasks = ", ".join(f"{task} {len(lengths)}" for task, lengths in sorted(self.lengths.items()))
@@ -181,10 +130,10 @@ class Stats:
                 name: {**described(column), **histogram(column)}
                 for name, column in zip(ACTION_NAMES, self.actions.T, strict=True)
             },
-            "still": _rounded(float(noop.mean())) if len(noop) else None,
+            "still": rounded(float(noop.mean())) if len(noop) else None,
             "gripper_changes": described(self.gripper_changes),
             "subgoals": {
-                kind: {**described(np.array(steps) / self.rate_hz), "share": _rounded(sum(steps) / self.steps)}
+                kind: {**described(np.array(steps) / self.rate_hz), "share": rounded(sum(steps) / self.steps)}
                 for kind, steps in sorted(self.subgoals.items())
             },
         }
@@ -204,23 +153,30 @@ def collect(
         raise DatasetError("no episodes to count", where=path)
     stats = Stats(source.root, source.rate_hz, {side: len(source.split(side)) for side in ("train", "val")})
     actions: list[NDArray[np.float32]] = []
-    places: dict[str, list[Facts]] = defaultdict(list)
+    places: dict[str, list[Placement]] = defaultdict(list)
     for done, number in enumerate(numbers, start=1):
         episode = source.episode(number)
-        facts = facts_of(episode)
-        stats.add(facts)
+        config, placement = stats.add(episode, source.lengths[number])
         for goal in episode.goals:
             stats.subgoals[goal.goal_type].append(goal.last - goal.first + 1)
         actions.append(checked_actions(episode.read(ACTION_ARRAYS), f"{source.root}, episode {number}")[:-1])
         stats.gripper_changes.append(int(np.count_nonzero(np.diff(actions[-1][:, 6]))))
-        stats.lengths[facts.task].append(source.lengths[number])
-        if len(facts.positions):
-            places[facts.config].append(facts)
+        if len(placement.positions):
+            places[config].append(placement)
         if on_episode:
             on_episode(done, len(numbers))
     stats.actions = np.concatenate(actions)
     stats.layouts = {config: layout_map(parts) for config, parts in places.items()}
     return stats
+
+
+def _config_name(scene: SceneRecord) -> str:
+    env_id, kwargs = (scene.env_info.env_id, scene.env_info.env_kwargs) if scene.env_info else (None, {})
+    config = kwargs.get("config")
+    if isinstance(config, str):
+        return Path(config).stem
+    name = scene.task or task_of(env_id) or UNKNOWN
+    return f"{name} (own configuration)" if config else name
 
 
 def counted(counter: Mapping[str, int]) -> dict[str, int]:
@@ -234,7 +190,7 @@ def described(values: Iterable[float] | NDArray) -> dict[str, Any]:
         return {"count": 0}
     low, p1, p10, median, p90, p99, high = np.percentile(array, [0, 1, 10, 50, 90, 99, 100])
     found = dict(mean=array.mean(), std=array.std(), min=low, p1=p1, p10=p10, median=median, p90=p90, p99=p99, max=high)
-    return {"count": len(array), **{key: _rounded(float(value)) for key, value in found.items()}}
+    return {"count": len(array), **{key: rounded(float(value)) for key, value in found.items()}}
 
 
 def histogram(values: NDArray) -> dict[str, Any]:
@@ -243,8 +199,4 @@ def histogram(values: NDArray) -> dict[str, Any]:
         return {"edges": [], "counts": []}
     reach = float(np.abs(values).max()) or 1.0
     edges = np.array([-0.5, 0.5, 1.5]) if set(np.unique(values)) <= {0, 1} else np.linspace(-reach, reach, BINS + 1)
-    return {"edges": _rounded(edges), "counts": np.histogram(values, edges)[0].tolist()}
-
-
-def _rounded(value: Any) -> Any:
-    return None if value is None else np.round(value, 6).tolist()
+    return {"edges": rounded(edges), "counts": np.histogram(values, edges)[0].tolist()}

@@ -12,7 +12,8 @@ from robocas_ms3.core.errors import MissingExtraError
 from robocas_ms3.core.files import make_folder, replacing, write_json
 from robocas_ms3.core.words import called, count_of, printable
 from robocas_ms3.datasets.actions import ACTION_NAMES
-from robocas_ms3.datasets.statistics.collect import LayoutMap, Stats, counted, histogram
+from robocas_ms3.datasets.statistics.collect import Stats, counted, histogram
+from robocas_ms3.datasets.statistics.layouts import LayoutMap
 
 DPI = 110
 BLUE, ORANGE, GREY = "#2f6fa8", "#e08a2e", "#9aa3ab"

@@ -13,8 +13,8 @@ from robocas_ms3.cli.stats import Stats as Command
 from robocas_ms3.cli.stats import main
 from robocas_ms3.core.errors import DatasetError, MissingExtraError
 from robocas_ms3.datasets.actions import ACTION_NAMES
-from robocas_ms3.datasets.statistics.collect import collect, described, histogram, layout_map
-from robocas_ms3.datasets.statistics.facts import Facts, Surface
+from robocas_ms3.datasets.statistics.collect import collect, described, histogram
+from robocas_ms3.datasets.statistics.layouts import Placement, Surface, layout_map
 from robocas_ms3.datasets.statistics.plots import PICTURES, write_stats
 
 TABLE = Surface("table, top", x=0.9, y=1.0, yaw=-np.pi / 2, region=[[0.0, -0.1], [0.1, 0.1]])
@@ -81,13 +81,13 @@ def test_trajectories_and_their_conversion_agree(made, trajectory):
 
 def test_far_objects_and_unknown_regions():
     at = np.array([[0.93, 0.99], [0.93, 0.94], [9.0, 9.0]])
-    known = layout_map([Facts("", positions=at, surface=TABLE)])
+    known = layout_map([Placement(at, surface=TABLE)])
     assert (known.counts.sum(), known.outside, known.coverage) == (2, 1, 2 / 8)
-    heap = layout_map([Facts("", positions=at[:2] + [0, -0.2], surface=TABLE)])  # slid off, by less than the margin
+    heap = layout_map([Placement(at[:2] + [0, -0.2], surface=TABLE)])  # slid off, by less than the margin
     assert (heap.counts.sum(), heap.outside, heap.coverage) == (2, 0, 0)
-    world = layout_map([Facts("", positions=at[:2], surface=TABLE), Facts("", positions=at[:1])])
+    world = layout_map([Placement(at[:2], surface=TABLE), Placement(at[:1])])
     assert (world.frame, world.coverage, world.counts.sum()) == ("world", None, 3)
-    one = layout_map([Facts("", positions=at[:1])])
+    one = layout_map([Placement(at[:1])])
     assert one.counts.tolist() == [[1]]
 
 

@@ -1,0 +1,125 @@
+"""Heat maps of where objects stood at the beginning of the episodes of one configuration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+CELL = 0.05  # m
+MARGIN = 0.3  # m around the region that layouts are sampled in; heaps slide out of it
+
+
+@dataclass(frozen=True)
+class Surface:
+    """The surface that objects stand on: pose of its furniture in the world (m, rad), and region there."""
+
+    label: str
+    x: float
+    y: float
+    yaw: float
+    region: list[list[float]] | None
+
+    def place(self, xy: Array) -> Array:
+        """Return positions (N, 2) in the world in the frame of the furniture."""
+        cosine, sine = np.cos(self.yaw), np.sin(self.yaw)
+        return (xy - [self.x, self.y]) @ np.array([[cosine, -sine], [sine, cosine]])
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Positions (N, 2) of the objects in the world at the beginning of an episode, m, and the index of its target."""
+
+    positions: Array
+    target: int | None = None
+    surface: Surface | None = None
+
+
+@dataclass(frozen=True)
+class LayoutMap:
+    """Where objects stood at the beginning of the episodes of one configuration, m.
+
+    Attributes:
+        frame: of the positions: a piece of furniture's, or the world's.
+        region: [min_xy, max_xy] that layouts are sampled in; None: not known.
+        counts: (nx, ny) objects in each cell.
+        outside: objects farther from the region than ``MARGIN``, in no cell.
+    """
+
+    frame: str
+    region: list[list[float]] | None
+    x_edges: Array
+    y_edges: Array
+    counts: NDArray[np.int64]
+    outside: int
+    targets: Array
+    episodes: int
+
+    @property
+    def coverage(self) -> float | None:
+        """Fraction of the region's cells that an object's centre was ever in; None without a region."""
+        if self.region is None:
+            return None
+        (x0, y0), (x1, y1) = self.region
+        x, y = (self.x_edges[:-1] + self.x_edges[1:]) / 2, (self.y_edges[:-1] + self.y_edges[1:]) / 2
+        inside = np.outer((x > x0) & (x < x1), (y > y0) & (y < y1))
+        return float(np.mean(self.counts[inside] > 0)) if inside.any() else None
+
+    def as_json(self) -> dict[str, Any]:
+        return {
+            "frame": self.frame,
+            "region": self.region,
+            "episodes": self.episodes,
+            "objects": int(self.counts.sum()) + self.outside,
+            "outside": self.outside,
+            "coverage": rounded(self.coverage),
+            "x_edges": rounded(self.x_edges),
+            "y_edges": rounded(self.y_edges),
+            "counts": self.counts.tolist(),
+            "targets": rounded(self.targets),
+        }
+
+
+def layout_map(parts: list[Placement]) -> LayoutMap:
+    """Return the heat map of one configuration, in the frame of its furniture where that is known for all."""
+    surface = parts[0].surface
+    if surface is None or any(part.surface != surface for part in parts):
+        surface = None
+    placed = [part.positions if surface is None else surface.place(part.positions) for part in parts]
+    points = np.concatenate(placed)
+    targets = [xy[part.target] for part, xy in zip(parts, placed, strict=True) if part.target is not None]
+    region = surface.region if surface else None
+    low, high = np.asarray(region) if region else (points.min(0), points.max(0))
+    near = points[((points >= low - MARGIN) & (points <= high + MARGIN)).all(axis=1)]
+    x_edges, y_edges = (_edges(low[axis], high[axis], near[:, axis]) for axis in (0, 1))
+    counts = np.histogramdd(near, bins=(x_edges, y_edges))[0].astype(np.int64)
+    frame = surface.label if surface else "world"
+    outside = len(points) - int(counts.sum())
+    return LayoutMap(frame, region, x_edges, y_edges, counts, outside, np.array(targets).reshape(-1, 2), len(parts))
+
+
+def _edges(low: float, high: float, points: Array) -> Array:
+    """Return edges of equal cells of about ``CELL`` that divide [low, high], and as many more as the points need."""
+    cell = (high - low) / max(1, round((high - low) / CELL)) if high - low > CELL / 2 else CELL
+    before = np.ceil((low - points.min(initial=low)) / cell - 1e-9)
+    after = np.ceil((points.max(initial=high) - low) / cell - 1e-9)
+    return low + cell * np.arange(-int(before), max(1, int(after)) + 1, dtype=np.float64)
+
+
+def surface_of(config: dict[str, Any]) -> Surface | None:
+    """Return the surface of a configuration that a file holds; a damaged one raises any error."""
+    surface = config.get("surface")
+    if not surface:
+        return None
+    pose = config["furniture"][surface["furniture"]]["pose"]
+    region = [list(surface[key]) for key in ("min_xy", "max_xy")] if surface.get("min_xy") else None
+    x, y, _ = pose["position"]
+    yaw = float(np.deg2rad(pose.get("yaw_deg", 0.0)))
+    return Surface(f"{surface['furniture']}, {surface['name']}", x, y, yaw, region)
+
+
+def rounded(value: Any) -> Any:
+    return None if value is None else np.round(value, 6).tolist()
