@@ -68,11 +68,7 @@ class BcStateConfig(BaselineConfig):
 
 
 class StateSamples:
-    """Samples of `bc-state`: a batch has ``inputs`` (B, D), ``chunk`` (B, K, 10) and ``key`` (B, 9).
-
-    Raises:
-        DatasetError: it is no trajectory file, its scenes hold different numbers of objects, or its base drives.
-    """
+    """Samples of `bc-state`: a batch has ``inputs`` (B, D), ``chunk`` (B, K, 10) and ``key`` (B, 9)."""
 
     def __init__(self, config: BcStateConfig, path: Path, split: Split, on_read: OnRead) -> None:
         arrays = load_states(path, config.rate_hz, on_read)

@@ -104,9 +104,6 @@ def freeze(plan: ProtocolPlan, folder: Path, overrides: Sequence[str] = ()) -> I
     """Write a protocol into a folder, which appears whole; yield the number of episodes that are chosen, and of all.
 
     ``overrides`` are keys to set in all its configurations, see `load_task_config`.
-
-    Raises:
-        EvaluationError: the rules are invalid, or two parts have the same name and different configurations.
     """
     pack = load_pack(str(plan.rules.get("pack", "builtin")))
     values = {**plan.rules, "pack_hash": sha256(pack.root / MANIFEST)}

@@ -146,11 +146,7 @@ class LoadedProtocol:
         return digest.hexdigest()
 
     def choose(self, settings: EvaluationSettings) -> list[Episode]:
-        """Return the episodes that settings choose, at least one.
-
-        Raises:
-            EvaluationError: there is no such task or split, or no episode is left.
-        """
+        """Return the episodes that settings choose, at least one."""
         splits = (settings.split,) if settings.split else ()
         for kind, names in (("task", settings.tasks), ("split", splits)):
             known = dict.fromkeys(str(getattr(episode, kind)) for episode in self.episodes)

@@ -164,11 +164,7 @@ def append(folder: Path, outcome: Outcome) -> None:
 
 
 def read(*folders: Path) -> Result:
-    """Read a result, or parts of one, which may share episodes if their outcomes are the same.
-
-    Raises:
-        EvaluationError: there is none, the parts were measured with different things, or they disagree.
-    """
+    """Read a result, or parts of one, which may share episodes if their outcomes are the same."""
     parts = [_read(folder) for folder in folders]
     first, outcomes = parts[0], dict[int, Outcome]()
     for part in parts:
@@ -206,12 +202,7 @@ def parts_of(folders: Iterable[Path]) -> list[list[Path]]:
 
 
 def merge(folders: Sequence[Path], out: Path) -> Result:
-    """Write parts of a result as one, into a folder that appears whole.
-
-    Raises:
-        EvaluationError: see `read`.
-        OutputExistsError: ``out`` exists.
-    """
+    """Write parts of a result as one, into a folder that appears whole."""
     result = read(*folders)
     check_replaceable(out)
     with replacing_folder(out) as folder:

@@ -79,11 +79,7 @@ class PolicyStepping(gym.Wrapper):
         return {**info, **self._measures(info)}
 
     def step(self, action: Any) -> tuple[Any, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """Execute one policy step: (A,) or (N, A) of the convention.
-
-        Raises:
-            EvaluationError: a number is not finite.
-        """
+        """Execute one policy step: (A,) or (N, A) of the convention."""
         actions = np.asarray(action.cpu() if isinstance(action, torch.Tensor) else action, np.float64)
         actions = actions.reshape(self._base.num_envs, self._convention.size)
         if not np.isfinite(actions).all():

@@ -59,42 +59,36 @@ def test_states_are_read_once(simulator, trajectory, tmp_path):
     assert len(made) == 2
 
 
+def change_json(path, change):
+    values = json.loads(path.with_suffix(".json").read_text())
+    change(values)
+    path.with_suffix(".json").write_text(json.dumps(values))
+
+
 @pytest.mark.parametrize(
     "change",
     [
         lambda values: values["env_info"]["env_kwargs"].update(config="pick_upstream_eval"),
         lambda values: values["episodes"][0]["reset_kwargs"].update(seed=17),
+        *("robocas-ms3", "mani_skill", "sapien"),  # another version of these
+        *(0, 50, 400),  # bytes that are left of the cache
     ],
 )
-def test_another_json_is_read_again(simulator, trajectory, change):
+def test_other_data_another_version_or_a_damaged_cache_is_read_again(
+    simulator, trajectory, tmp_path, monkeypatch, change
+):
     made = simulator([1.0])
     read(trajectory)
-    path = trajectory.with_suffix(".json")
-    values = json.loads(path.read_text())
-    change(values)
-    path.write_text(json.dumps(values))
-    read(trajectory)
-    assert len(made) == 2
-
-
-@pytest.mark.parametrize("package", ["robocas-ms3", "mani_skill", "sapien"])
-def test_another_version_reads_again(simulator, trajectory, monkeypatch, package):
-    made = simulator([1.0])
-    read(trajectory)
-    monkeypatch.setattr(bc_state, "version", lambda name: "99" if name == package else version(name))
-    read(trajectory)
-    assert len(made) == 2
-
-
-@pytest.mark.parametrize("keep", [0, 50, 400])
-def test_a_damaged_cache_is_written_again(simulator, trajectory, tmp_path, keep):
-    made = simulator([1.0])
-    read(trajectory)
-    [path] = cached(tmp_path)
-    path.write_bytes(path.read_bytes()[:keep])
+    [cache] = cached(tmp_path)
+    if callable(change):
+        change_json(trajectory, change)
+    elif isinstance(change, str):
+        monkeypatch.setattr(bc_state, "version", lambda name: "99" if name == change else version(name))
+    else:
+        cache.write_bytes(cache.read_bytes()[:change])
     read(trajectory)
     read(trajectory)
-    assert len(made) == 2 and cached(tmp_path) == [path]
+    assert len(made) == 2 and len(cached(tmp_path)) == (1 if isinstance(change, int) else 2)
 
 
 @pytest.mark.parametrize(

@@ -44,6 +44,17 @@ def generator():
     made.close()
 
 
+@pytest.fixture(scope="module")
+def taken_over(generator, tmp_path_factory):
+    """A recording that begins after 31 random steps, the state there, and the TCP's position in the arm's base."""
+    folder, player = tmp_path_factory.mktemp("taken_over"), Player(settings("random", (31, 31)))
+    takeover = player.run(2)
+    tcp = player._base.agent.tcp_in_arm_base.p[0].numpy().copy()
+    player.close()
+    assert generator.generate(2, folder, "one", takeover).success
+    return folder / "one.h5", takeover, tcp
+
+
 def numbers(node, name=""):
     if not hasattr(node, "items"):
         return {name: np.asarray(node)}
@@ -92,13 +103,11 @@ def test_there_is_nothing_to_take_over_where_the_policy_succeeded(player, genera
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("player", [("random", (31, 31))], indirect=True)
-def test_the_record_begins_where_the_policy_was(player, generator, tmp_path):
-    takeover = player.run(2)
+def test_the_record_begins_where_the_policy_was(taken_over, generator, tmp_path):
+    one, takeover, _ = taken_over
     assert takeover.gripper == -1.0
-    for name in ("one", "two"):
-        assert generator.generate(2, tmp_path, name, takeover).success
-    one, two = (tmp_path / f"{name}.h5" for name in ("one", "two"))
+    assert generator.generate(2, tmp_path, "two", takeover).success
+    two = tmp_path / "two.h5"
     assert actions_of(one) == actions_of(two)
     with h5py.File(one) as file:
         group = file["traj_0"]
@@ -149,15 +158,13 @@ def test_it_goes_on_with_what_the_gripper_holds(player, generator, tmp_path, sub
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("player", [("random", (31, 31))], indirect=True)
-def test_it_is_converted_from_where_the_policy_was(player, generator, tmp_path, needs_renderer):
-    assert generator.generate(2, tmp_path, "one", player.run(2)).success
+def test_it_is_converted_from_where_the_policy_was(taken_over, tmp_path, needs_renderer):
+    recording, _, tcp = taken_over
     settings = {"cameras": ("base_camera",), "size": (64, 48), "depth": False, "embeddings": False, "video": False}
-    convert(ConversionSettings(tmp_path / "one.h5", tmp_path / "dataset", **settings))
+    convert(ConversionSettings(recording, tmp_path / "dataset", **settings))
     report = replay_dataset(tmp_path / "dataset")
     assert report.episodes[0].success is None
     assert "another policy" in report.episodes[0].skipped
-    tcp = player._base.agent.tcp_in_arm_base.p[0].numpy()  # where the policy stopped
     first = Dataset(tmp_path / "dataset").episode(0).arrays["ee_pos"][0]
     np.testing.assert_allclose(first, tcp, atol=1e-5)
 

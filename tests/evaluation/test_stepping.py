@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import gymnasium as gym
@@ -31,9 +31,13 @@ IMAGES = {
 }
 
 
+@cache
+def pick(convention: str, rate: int) -> gym.Env:
+    return gym.make("RoboCASPick-v1", **env_kwargs(PolicySpec(convention), rate))
+
+
 def made(convention="robocas", reference="tcp", stepping="timed", rate=5) -> PolicyStepping:
-    env = gym.make("RoboCASPick-v1", **env_kwargs(PolicySpec(convention), rate))
-    stepped = PolicyStepping(env, PolicySpec(convention, reference), stepping)
+    stepped = PolicyStepping(pick(convention, rate), PolicySpec(convention, reference), stepping)
     stepped.reset(seed=3)
     return stepped
 
@@ -55,7 +59,6 @@ def test_a_slow_motion_ends_where_it_was_told_to(reference):
         *_, info = env.step(along(0.02))
     assert np.linalg.norm(tcp(env) - before) == pytest.approx(0.1, abs=0.004)
     assert read_sum(info, "path_length") == pytest.approx(0.1, abs=0.004)
-    env.close()
 
 
 def test_from_where_it_is_or_from_where_it_was_sent():
@@ -71,7 +74,6 @@ def test_from_where_it_is_or_from_where_it_was_sent():
         pushed = np.linalg.norm(tcp(env) - sent)
         env.step(along(0.0))
         gone[reference] = np.linalg.norm(tcp(env) - sent) / pushed
-        env.close()
     assert gone["tcp"] > 0.8  # stays where it came to
     assert gone["target"] < 0.2  # goes back
 
@@ -83,7 +85,6 @@ def test_joint_targets_are_taken_as_they_are():
     for _ in range(20):
         env.step(np.append(wanted, 1.0))
     np.testing.assert_allclose(base.agent.robot.get_qpos()[0, 3:10].numpy(), wanted, atol=0.01)
-    env.close()
 
 
 def test_upstreams_step_waits_for_the_gripper_and_for_the_motion():
@@ -105,7 +106,6 @@ def test_upstreams_step_waits_for_the_gripper_and_for_the_motion():
     assert 2 < shutting <= 7
     assert float(base.agent.gripper_width) < 0.01
     assert steps(along(0.0, gripper=0.0)) <= 2  # it stands, though its drives press
-    env.close()
 
 
 def test_what_happened_is_counted_from_the_reset_on():
@@ -136,7 +136,6 @@ def test_what_happened_is_counted_from_the_reset_on():
     *_, info = env.step(along(0.0))
     assert [read_sum(info, name) for name in ("fallen", "disturbed_most", "v0_steps")] == [0, 0, 0]
     assert read_sum(info, "path_length") < 0.002
-    env.close()
 
 
 def test_pictures_are_rendered_when_the_policy_looks(monkeypatch):

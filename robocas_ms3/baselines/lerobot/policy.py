@@ -67,9 +67,6 @@ class LeRobotPolicy:
         inputs: shape by key, as in the checkpoint's configuration; images are (3, H, W).
         rate_hz: actions per second.
         about: what results record about the policy.
-
-    Raises:
-        EvaluationError: the policy needs an input that the socket does not send.
     """
 
     def __init__(

@@ -57,10 +57,6 @@ def prepare(source: Path, out: Path, embed: Embed | None) -> None:
         source: of ``robocas convert --to lerobot``.
         out: to make.
         embed: texts to (N, 384) of unit length; None: no instruction, which policies then do not know.
-
-    Raises:
-        DatasetError: it is no such dataset, holds NaN, or its base drives.
-        OutputExistsError: there is something at ``out``.
     """
     check_replaceable(out)
     dataset = _open(source)

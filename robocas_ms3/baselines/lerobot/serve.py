@@ -28,11 +28,7 @@ INFO = "dataset/meta/info.json"
 
 
 def open_checkpoint(checkpoint: Path, rate_hz: float, device: str, play: int | None) -> LeRobotPolicy:
-    """Load a checkpoint of ``lerobot-train``.
-
-    Raises:
-        EvaluationError: there is none, or it can't play so many actions.
-    """
+    """Load a checkpoint of ``lerobot-train``."""
     if not (checkpoint / "config.json").is_file():
         fix = "Train first: bash scripts/train_lerobot.sh act DATASET RUN"
         raise EvaluationError("no checkpoint of LeRobot", where=checkpoint, expected="config.json", fix=fix)

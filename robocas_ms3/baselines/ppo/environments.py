@@ -72,12 +72,7 @@ def _observation(obs: dict[str, Any]) -> torch.Tensor:
 
 
 class PpoEnvironments:
-    """Environments to train in; see `Environments`. A success does not end an episode, and each env keeps its objects.
-
-    Raises:
-        ConfigError: there is no such task or configuration.
-        TrainingError: the base has to drive.
-    """
+    """Environments to train in. A success does not end an episode, and each env keeps its objects."""
 
     def __init__(self, config: PpoConfig, device: str) -> None:
         scenes = load_scenes(config)

@@ -29,12 +29,6 @@ def train_ppo(run: RunFolder, agent: Agent, config: PpoConfig, environments: Ppo
     A run that continues has the weights, the optimiser, the observation statistics, the last episodes and the random
     states of the last update. Its environments start again, with the layouts after those that were used, so it
     does not repeat an uninterrupted run bit for bit.
-
-    Raises:
-        TrainingError: there are several processes, the loss or the gradient is NaN or infinite, or the checkpoint is
-            of something else.
-        RobocasError: somebody removed the folder.
-        KeyboardInterrupt: Ctrl-C; finished updates are saved.
     """
     if run.accelerator.num_processes > 1:
         found, fix = f"{run.accelerator.num_processes} processes", "Run it without `accelerate launch`."

@@ -31,10 +31,6 @@ class RT1Samples:
     =============  ====================  ===========================================================================
 
     The last action is the one that leads to an episode's last step, T - 2.
-
-    Raises:
-        DatasetError: it lacks embeddings or a camera, is of another rate, has no such split, is damaged, holds NaN, or
-            its base drives.
     """
 
     def __init__(self, config: RT1Config, folder: Path, split: Split, on_read: OnRead) -> None:

@@ -109,12 +109,7 @@ def attention_mask(frames: int, images: int, predicted: int) -> torch.Tensor:
 
 
 class RT1Model(nn.Module):
-    """Predicts the action of each frame.
-
-    Raises:
-        TrainingError: the file ``image_weights`` is not one. A missing file is an error of the training alone: trained
-            weights need none.
-    """
+    """Predicts the action of each frame."""
 
     mean: torch.Tensor
     std: torch.Tensor

@@ -42,12 +42,7 @@ _KEYS = ("ee_pos", "ee_orn", GRIPPER_WIDTH, "gripper_status", "base_pos", "base_
 
 
 class SmallSamples:
-    """Samples of `small`, one of every step.
-
-    Raises:
-        DatasetError: the dataset lacks a camera or embeddings, is of another rate or damaged, its images are smaller
-            than ``rendered``, its cameras move between episodes, or memory is too small for the images.
-    """
+    """Samples of `small`, one of every step."""
 
     def __init__(self, config: SmallConfig, path: Path, split: Split, on_read: OnRead) -> None:
         self._config, self._source = config, open_source(path)

@@ -54,9 +54,6 @@ def locate_objects(
         arrays: its ``base_pos``, ``base_orn`` and ``gripper_status``.
         tcp_in_base: (T, 4, 4).
         projections: by camera, from points (T, N, 3) in its parent to pixels (T, N, 2).
-
-    Raises:
-        DatasetError: the description of the scene is damaged.
     """
     steps = len(tcp_in_base)
     try:

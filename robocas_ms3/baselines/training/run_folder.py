@@ -6,7 +6,6 @@ import ctypes
 import time
 from collections.abc import Mapping
 from contextlib import suppress
-from types import TracebackType
 from typing import Any
 
 import torch
@@ -29,8 +28,6 @@ _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4  # of malloc.h
 class RunFolder:
     """Writes record, metrics, checkpoints and weights of a run; only its main process writes.
 
-    As a context manager it closes the log.
-
     Attributes:
         record: of the run.
         accelerator: that it is trained on.
@@ -47,15 +44,8 @@ class RunFolder:
         is_continued = output.recorded is not None and path.is_file()
         self.checkpoint: Checkpoint | None = checkpoints.load(path, record.metadata) if is_continued else None
 
-    def __enter__(self) -> RunFolder:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._log is None:
-            return
-        with suppress(*([OSError] if error else [])):  # the first error counts
+    def close(self) -> None:
+        if self._log is not None:
             self._log.close()
 
     def start(self, step: int, model: torch.nn.Module, weights: Tensors, size: str) -> None:

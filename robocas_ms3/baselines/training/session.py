@@ -130,7 +130,7 @@ def train_run(options: RunOptions, progress: Progress | None = None) -> RunRecor
             **describe_hardware(accelerator),
             start=initial.name if initial else "",
         )
-        run = stack.enter_context(RunFolder(output, record, accelerator, progress))
+        run = stack.enter_context(closing(RunFolder(output, record, accelerator, progress)))
         model = _make_model(baseline, config, record, initial).to(accelerator.device)
         if data is None:
             baseline.train(run, model, config, source)

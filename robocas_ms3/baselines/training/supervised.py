@@ -22,13 +22,7 @@ from robocas_ms3.core.exits import deferred_interrupts, exit_error
 def train_supervised(
     run: RunFolder, model: torch.nn.Module, settings: TrainSettings, samples: Samples, validation: Samples | None
 ) -> None:
-    """Train a network until all steps are done, from the checkpoint of the run if it has one.
-
-    Raises:
-        TrainingError: the loss or the gradient is NaN or infinite, or the checkpoint is of something else.
-        RobocasError: somebody removed the folder.
-        KeyboardInterrupt: Ctrl-C; the steps done are saved, with several processes up to the last checkpoint.
-    """
+    """Train a network until all steps are done, from the checkpoint of the run if it has one."""
     accelerator, count = run.accelerator, len(samples)
     learner = Learner(run, model, settings)
     run.start(learner.step, model, learner.weights(), f"{count} samples of {samples.episodes} episodes")

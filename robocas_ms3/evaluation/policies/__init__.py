@@ -103,11 +103,7 @@ def make_policy(name: str) -> Policy:
 
 @contextmanager
 def open_policy(name: str) -> Iterator[Policy]:
-    """Make a policy, and close it at the end if it can be closed.
-
-    Raises:
-        ExtensionError: its code tried to end the process, wherever it is called inside.
-    """
+    """Make a policy, and close it at the end if it can be closed."""
     with no_exit(f"policy {name}"):
         policy = make_policy(name)
         try:

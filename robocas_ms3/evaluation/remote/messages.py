@@ -109,11 +109,7 @@ def read_metadata(message: Any, url: str) -> ServerMetadata:
 
 
 def read_policy_spec(message: Any, where: object) -> PolicySpec:
-    """Read a policy's specification; missing fields have the defaults of `PolicySpec`.
-
-    Raises:
-        EvaluationError: it has an unknown field or an invalid value.
-    """
+    """Read a policy's specification; missing fields have the defaults of `PolicySpec`."""
     what = "invalid policy specification"
     try:
         return _POLICY_SPEC.validate_json(json.dumps(message), strict=True)

@@ -135,11 +135,7 @@ class PolicyServer:
         self._connections = 0
 
     def run(self, listening: Callable[[str], object] = lambda url: None) -> None:
-        """Serve until `stop`; ``listening`` is called with the server's address as soon as it can be reached.
-
-        Raises:
-            EvaluationError: it can't listen there.
-        """
+        """Serve until `stop`; ``listening`` is called with the server's address as soon as it can be reached."""
         started: Future[tuple[str, Callable[[], object]]] = Future()
         network = threading.Thread(target=self._serve, args=(started,), name="robocas-server", daemon=True)
         network.start()

@@ -26,11 +26,7 @@ class Row:
 
 
 def comparison(results: Sequence[Result]) -> str:
-    """Return the comparison of two or more results, over the episodes that all have, as Markdown.
-
-    Raises:
-        EvaluationError: they are of different protocols, some are with the weld, or they have no episodes in common.
-    """
+    """Return the comparison of two or more results, over the episodes that all have, as Markdown."""
     first = results[0]
     for other in results[1:]:
         if first.run.protocol_hash != other.run.protocol_hash:
@@ -66,11 +62,7 @@ def comparison(results: Sequence[Result]) -> str:
 
 
 def comparison_of_splits(result: Result, protocol: LoadedProtocol) -> str:
-    """Return the comparison of a result's splits with the same scenes, each with the first one, as Markdown.
-
-    Raises:
-        EvaluationError: no two splits have the same scenes.
-    """
+    """Return the comparison of a result's splits with the same scenes, each with the first one, as Markdown."""
     if (found := result.run.protocol_hash) != protocol.hash:
         raise EvaluationError("it is of another protocol", where=result.folder, expected=protocol.hash, found=found)
     scenes: dict[tuple[str, bytes], list[tuple[str, str]]] = {}  # (split, configuration) of those with the same scenes

@@ -45,10 +45,6 @@ def film(
     """Run episodes again, in processes, and write videos into the result's ``videos``.
 
     Yields each video, and whether the outcome is the same as before.
-
-    Raises:
-        EvaluationError: the result is of another protocol.
-        DatasetError: there is no render device.
     """
     if (expected := result.run.protocol_hash) != (found := protocol.hash):
         raise EvaluationError("it is of another protocol", where=result.folder, expected=expected, found=found)

@@ -24,18 +24,3 @@ def test_an_output_of_another_training_is_refused(tmp_path, begun):
         (tmp_path / "out" / "asked").write_text(begun)
     assert str(tmp_path / "out") in refused(tmp_path, "train_lerobot.sh", "act", "data", "out", "40000")
     assert [path.name for path in (tmp_path / "out").iterdir() if path.name != "asked"] == ["dataset"]
-
-
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [
-        ("train_lerobot.sh", []),
-        ("train_lerobot.sh", ["act", "nowhere", "out"]),
-        ("serve_lerobot.sh", []),
-        ("check_lerobot.sh", ["--version", "0.6", "nowhere"]),
-        ("check_lerobot.sh", ["--version", "0.7", "data"]),
-    ],
-)
-def test_wrong_arguments_are_one_line(tmp_path, name, words):
-    refused(tmp_path, name, *words)
-    assert not list(tmp_path.iterdir())

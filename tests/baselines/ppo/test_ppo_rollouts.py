@@ -10,7 +10,6 @@ from robocas_ms3.baselines.ppo.train import (
     RolloutCollector,
     advantages,
     read_outcomes,
-    steps_per_env,
 )
 
 
@@ -45,10 +44,3 @@ def test_outcomes_are_those_of_the_envs_that_ended():
     }
     info = {"final_info": final, "_final_info": torch.tensor([True, False, True])}
     assert read_outcomes(info).tolist() == [[4.0, 1.0, 1.0, 0.0], [1.0, 1.0, 0.0, 0.0]]
-
-
-def test_steps_are_shared():
-    default = PpoConfig()
-    assert steps_per_env(default) == 512 // 8
-    few = PpoConfig(envs=8, train=default.train.model_copy(update={"batch_size": 4}))
-    assert steps_per_env(few) == 1

@@ -113,8 +113,7 @@ def weights(config):
     return {**made, "classifier.weight": torch.zeros(10, 320)}
 
 
-@pytest.mark.parametrize("prefix", ["efficientnet.", ""])
-@pytest.mark.parametrize("kind", ["safetensors", "bin"])
+@pytest.mark.parametrize(("prefix", "kind"), [("efficientnet.", "safetensors"), ("", "bin")])
 def test_both_encoders_start_from_the_weights_of_a_file(weights, prefix, kind, facts, tmp_path, batch):
     path = tmp_path / f"b3.{kind}"
     named = {name.replace("efficientnet.", prefix): value for name, value in weights.items()}

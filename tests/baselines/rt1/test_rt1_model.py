@@ -20,8 +20,7 @@ def test_tokens_attend_to_image_tokens_before_them_and_not_to_predicted_ones():
     assert attention_mask(2, 1, 2).int().tolist() == [first] * 3 + [second] * 3
 
 
-@pytest.mark.parametrize("frame", [0, 3, 5])
-@pytest.mark.parametrize("view", [0, 1])
+@pytest.mark.parametrize(("frame", "view"), [(0, 0), (3, 1), (5, 0)])
 def test_a_frame_sees_no_later_one(model, batch, frame, view):
     before = model.logits(batch)
     batch["rgb"][:, frame, view] = 255 - batch["rgb"][:, frame, view]

@@ -34,19 +34,12 @@ def cell(point, view=WHOLE, **more):
     return int(cells_of(place(point, view, **more), view))
 
 
-def test_places_by_hand():
+def test_places_and_cells_by_hand():
     assert place([[0.25, -0.125, 2]]).tolist() == [[40, 20]]
     assert place([[-1.0, 0, 1]]).tolist() == [[-32, 24]]  # out of it
     assert place([[0.1, 0, -1]]).isnan().all()  # behind
-
-
-def test_cells_by_hand():
-    assert cell([0.001, 0.001, 1]) == 3 * 8 + 4  # the middle: pixel (32, 24)
-    assert cell([-0.499, -0.374, 1]) == 0
-    assert cell([0.499, 0.374, 1]) == 47
-    assert cell([0.25, 0, 2]) == 3 * 8 + 5  # pixel 40
-    assert cell([0.51, 0, 1]) == NOWHERE
-    assert cell([0.001, 0.001, -1]) == NOWHERE  # behind
+    points = [[0.001, 0.001, 1], [-0.499, -0.374, 1], [0.499, 0.374, 1], [0.25, 0, 2], [0.51, 0, 1], [0.001, 0.001, -1]]
+    assert [cell(point) for point in points] == [3 * 8 + 4, 0, 47, 3 * 8 + 5, NOWHERE, NOWHERE]  # 3 * 8 + 4: the middle
 
 
 def test_cells_of_a_part_of_another_size_or_camera():

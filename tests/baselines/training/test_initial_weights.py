@@ -10,7 +10,7 @@ from made_up_baseline import MADE_UP
 from made_up_runs import assert_same, change_record, stop_at, train
 from safetensors.torch import load_file
 
-from robocas_ms3.baselines.training.session import Progress, combine_facts, load_initial_weights, merge_configs
+from robocas_ms3.baselines.training.session import Progress, combine_facts, load_initial_weights
 from robocas_ms3.core.errors import OutputExistsError, TrainingError
 from robocas_ms3.evaluation.policies import make_policy
 
@@ -141,8 +141,3 @@ def test_other_hardware_is_recorded(whole, data, recorded, changes):
     train("made-up", data, whole, progress=Progress(note=notes.append))
     assert json.loads((whole / "run.json").read_text())["resumed"] == changes
     assert all(any(change in note for note in notes) for change in changes)
-
-
-def test_nested_values():
-    merged = merge_configs({"a": {"b": 1, "c": 2}, "d": 3}, {"a": {"b": 4}, "e": 5})
-    assert merged == {"a": {"b": 4, "c": 2}, "d": 3, "e": 5}

@@ -32,13 +32,14 @@ def test_processes_share_a_batch():
     assert [sorted(one + other) for one, other in zip(*parts, strict=True)] == [sorted(batch) for batch in whole]
 
 
-def test_cosine_by_hand():
+def test_cosine_and_constant_by_hand():
     chosen = settings(steps=110, warmup_steps=10, learning_rate=1.0, min_learning_rate=0.2)
     assert learning_rate(0, 99, chosen) == pytest.approx(0.1)
     assert learning_rate(9, 99, chosen) == pytest.approx(1.0)
     assert learning_rate(10, 99, chosen) == pytest.approx(1.0)
     assert learning_rate(60, 99, chosen) == pytest.approx(0.6)  # half way
     assert learning_rate(110, 99, chosen) == pytest.approx(0.2)
+    assert learning_rate(77, 99, chosen.model_copy(update={"schedule": "constant"})) == 1.0
 
 
 def test_restarts_by_hand():
@@ -56,7 +57,3 @@ def test_restarts_by_hand():
     for step, expected in ((0, 1.0), (5, 0.55), (10, 1.0), (20, 0.55), (30, 1.0), (50, 0.55)):
         assert learning_rate(step, 10, chosen) == pytest.approx(expected)
     assert learning_rate(9, 10, chosen) == pytest.approx(0.1 + 0.9 * (1 + math.cos(0.9 * math.pi)) / 2)
-
-
-def test_constant():
-    assert learning_rate(77, 10, settings(steps=100, schedule="constant", learning_rate=0.3, warmup_steps=5)) == 0.3

@@ -135,7 +135,7 @@ def test_an_env_without_an_answer_fails_alone():
 
 
 def test_a_slow_server_is_not_dropped_and_answers_health_checks(fast_pings):
-    policy = Slow(4.0)  # several times what an answer to a ping may take
+    policy = Slow(2.5)  # twice what an answer to a ping may take
     with serving(policy) as url:
         remote = started(url)
         answers = []

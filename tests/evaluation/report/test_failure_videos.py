@@ -1,5 +1,7 @@
 """Failed episodes are played again and filmed."""
 
+import shutil
+
 import imageio.v2 as imageio
 import numpy as np
 import pytest
@@ -8,9 +10,8 @@ from made_up_results import of_protocol, outcome, write
 from robocas_ms3.cli.eval import run
 from robocas_ms3.cli.eval_results import Videos, videos
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.evaluation.freeze import ProtocolPlan, freeze
 from robocas_ms3.evaluation.policies.plain import RandomPolicy
-from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.protocol import EPISODES, RULES, load_protocol
 from robocas_ms3.evaluation.report.videos import SIZE, failed_of_each_kind, film
 from robocas_ms3.evaluation.settings import EvaluationSettings
 
@@ -51,10 +52,10 @@ def test_a_result_chooses_no_code(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_a_failure_is_filmed_and_linked(tmp_path, needs_renderer, capsys):
-    rules = {"name": "tiny", "description": "Two steps.", "max_steps": 2, "stepping": "upstream"}
-    plan = {"rules": rules, "parts": [{"config": "pick_table_scattered", "count": 1, "first_seed": 110000}]}
-    list(freeze(ProtocolPlan.model_validate(plan), tmp_path / "tiny"))
-    out, protocol = tmp_path / "result", str(tmp_path / "tiny")
+    folder = shutil.copytree(load_protocol("paper-v1").folder, tmp_path / "tiny")
+    (folder / RULES).write_text((folder / RULES).read_text().replace("max_steps: 150", "max_steps: 2"))
+    (folder / EPISODES).write_text((folder / EPISODES).read_text().splitlines()[0])
+    out, protocol = tmp_path / "result", str(folder)
     assert run(EvaluationSettings((), "random", protocol, out, backend="processes", weld=True)) == 0
     assert videos(Videos(out, protocol=protocol)) == 0
     said = capsys.readouterr().out

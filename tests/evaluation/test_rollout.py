@@ -1,0 +1,101 @@
+"""Episodes run with a policy, several envs at a time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from counting_env import CountingEnv, play
+
+from robocas_ms3.core.errors import EvaluationError, PolicyFailed
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
+from robocas_ms3.evaluation.protocol import load_protocol
+
+
+class Obedient:
+    """Does as many as its instruction says, in chunks; keeps what it was told."""
+
+    spec = PolicySpec(state=True)
+
+    def __init__(self, chunk: int = 1) -> None:
+        self.chunk, self.asked = chunk, []
+
+    def reset(self, starts: list[EpisodeSpec]) -> None:
+        pass
+
+    def act(self, observations: Observations) -> np.ndarray:
+        assert observations.state is not None
+        for env, said, seed in zip(observations.envs, observations.instructions, observations.state[:, 0], strict=True):
+            assert said == f"count to {seed:.0f}", env  # the instruction of its own episode
+        self.asked.append(observations.envs.tolist())
+        actions = np.zeros((len(observations.envs), self.chunk, 7))
+        actions[..., 0] = 1
+        return actions[:, 0] if self.chunk == 1 else actions
+
+
+def starts(*seeds: int) -> list[EpisodeSpec]:
+    return [EpisodeSpec(-1, i, "pick", "", "", "", seed, f"count to {seed}") for i, seed in enumerate(seeds)]
+
+
+@pytest.mark.parametrize("count", [1, 2, 4])
+@pytest.mark.parametrize("refill", [True, False])
+def test_every_episode_is_played_once_with_its_own_instruction(count, refill):
+    env, policy = CountingEnv(count, None), Obedient()
+    played = play(env, policy, starts(3, 9, 2, 5, 4, 1), 7, refill=refill)
+    assert sorted(one.start.episode for one in played) == list(range(6))
+    for one in played:
+        seed = one.start.seed
+        assert one.steps == min(seed, 7)
+        assert one.seconds == pytest.approx(0.05 * one.steps)
+        assert one.flags["success"] == (seed if seed <= 7 else None)
+        assert one.at_end["success"] == (seed <= 7)
+        assert one.flags["fail"] is None
+    if not refill and count == 4:
+        assert [len(envs) for envs in env.resets] == [4, 4]  # four, then two, in one reset each
+        assert policy.asked[3] == [1, 3]  # those that are done are masked
+
+
+def test_chunks_are_played_to_their_end_before_the_policy_is_asked_again():
+    policy = Obedient(chunk=3)
+    played = play(CountingEnv(2, None), policy, starts(4, 7), 7)
+    assert {one.start.seed: one.steps for one in played} == {4: 4, 7: 7}
+    assert policy.asked == [[0, 1], [0, 1], [1]]
+
+
+@pytest.mark.parametrize(("chunk", "looks", "fits"), [(6, 3, True), (1, 3, True), (3, 6, False), (6, 4, False)])
+def test_chunks_begin_with_images(chunk, looks, fits):
+    """A policy without chunks takes care of that itself."""
+    policy = Obedient(chunk)
+    policy.spec = PolicySpec(state=True, look_every=looks)
+    if fits:
+        assert [one.steps for one in play(CountingEnv(1, None), policy, starts(4), 7)] == [4]
+    else:
+        with pytest.raises(EvaluationError, match=f"a multiple of {looks} steps"):
+            play(CountingEnv(1, None), policy, starts(4), 7)
+
+
+@pytest.mark.parametrize("fails", [True, False])
+def test_an_episode_whose_policy_fails_or_acts_by_nan_ends_alone(fails):
+    policy = Obedient()
+    act = policy.act
+
+    def sick(observations: Observations) -> np.ndarray:
+        actions, ill = act(observations), np.array(observations.instructions) == "count to 4"
+        actions[ill] = np.nan
+        if fails and ill.any():
+            raise PolicyFailed({int(env): "no plan" for env in observations.envs[ill]}, actions)
+        return actions
+
+    policy.act = sick
+    played = sorted(play(CountingEnv(2, None), policy, starts(4, 5, 3), 7), key=lambda one: one.start.seed)
+    error = "no plan" if fails else "the policy's action is not finite"
+    assert [(one.error, one.steps) for one in played] == [("", 3), (error, 0), ("", 5)]
+    outcome = played[1].outcome(load_protocol("smoke").episodes[0], ())
+    assert (outcome.success, outcome.failure_stage, outcome.error) == (False, "error", error)
+
+
+def test_actions_of_another_shape_are_refused():
+    policy = Obedient()
+    policy.act = lambda observations: np.zeros((2, 6))
+    with pytest.raises(EvaluationError) as error:
+        play(CountingEnv(1, None), policy, starts(4), 7)
+    assert error.value.expected == "(1, 7) or (1, chunk, 7) numbers"
