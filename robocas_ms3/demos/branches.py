@@ -70,7 +70,6 @@ class Child:
             raise ChildGone("crashed") from error
 
     def end(self) -> None:
-        """Kill it, if it is there still."""
         self.pipe.close()
         os.kill(self.pid, signal.SIGKILL)  # it is still ours, if only as a zombie
         os.waitpid(self.pid, 0)
@@ -122,7 +121,7 @@ def say_once(reason: str) -> None:
 
 
 class _Success(Exception):  # noqa: N818
-    """The episode has succeeded, in a child."""
+    pass
 
 
 class ForkedBranches:

@@ -135,7 +135,6 @@ def generate(
 def _results(
     settings: GenerateSettings, run: _Run, players: Callable[[], Worker[int, Takeover]] | None
 ) -> Generator[EpisodeResult, None, None]:
-    """Yield the results of all seeds in order: those of earlier runs, and new ones."""
     missing = (seed for seed in count(settings.seed) if seed not in run.earlier)
     with closing(generate_seeds(settings, missing, run.shards, players)) as new:
         for seed in count(settings.seed):

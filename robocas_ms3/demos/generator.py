@@ -192,7 +192,6 @@ class _Attempts:
                 self.generator.trials.follow(self.recorder.states, gripper, finished=finished, noisy=self._noisy)
 
     def _finish(self, recoveries: list[dict[str, Any]]) -> None:
-        """Write what a policy has done, if it is a demonstration."""
         if len(self.executor.actions) > self.generator.horizon:
             raise EpisodeLost("horizon", "too_long")
         if not self.executor.flag("success"):

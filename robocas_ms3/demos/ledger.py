@@ -81,7 +81,6 @@ class EpisodeResult:
         self.begun = now
 
     def adopt(self, other: EpisodeResult) -> None:
-        """Take over the values that another process sent."""
         vars(self.seconds).update(vars(other.seconds))  # the executor keeps counting in this object
         vars(self).update({key: value for key, value in vars(other).items() if key != "seconds"})
 

@@ -77,7 +77,6 @@ class Recorded:
         return cls(where, seed, options, mode, actions, dict_to_list_of_dicts(states), was_taken_over(episode))
 
     def check_fits(self, env: RoboCASEnv) -> None:
-        """See that an environment, reset for this episode, is such a one as it was recorded in."""
         converted = env.control_mode != self.control_mode
         width = _JOINT_TARGETS if converted else cast(Any, env.single_action_space).shape[0]
         if self.actions.shape[1] != width:

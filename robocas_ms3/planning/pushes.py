@@ -130,7 +130,6 @@ def _ends_on(points: Array, frame: Array, half: Array) -> bool:
 
 
 def _hits(tree: KDTree | None, points: Array, shift: Array) -> bool:
-    """Whether an object that is shifted comes too close, seen from above, to something fixed."""
     if tree is None:
         return False
     ways = [points[::PUSHED_THINNED, :2] + share * shift[:2] for share in (0.5, 1.0)]
@@ -138,6 +137,5 @@ def _hits(tree: KDTree | None, points: Array, shift: Array) -> bool:
 
 
 def _tool_fits(tool: Array, points: Array) -> bool:
-    """Whether the closed fingers at a place, and straight above it, meet no point."""
     above = points[points[:, 2] > tool[2] - TIP_BELOW_TCP - 0.002]
     return not np.any(np.linalg.norm(above[:, :2] - tool[:2], axis=1) < TOOL_RADIUS + 0.003)

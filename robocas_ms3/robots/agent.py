@@ -219,7 +219,6 @@ class MobileManipulator(BaseAgent):
 
     @property
     def tcp_pos(self) -> torch.Tensor:
-        """(N, 3) m, TCP in the world."""
         return self.tcp.pose.p
 
     @property

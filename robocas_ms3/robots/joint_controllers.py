@@ -177,7 +177,6 @@ class RobotController(CombinedController):
 
 
 def _put(values: torch.Tensor, envs: Any, rows: Any) -> torch.Tensor:
-    """Return a copy of values (N, D) with some rows replaced."""
     values = values.clone()
     values[envs] = torch.as_tensor(rows, dtype=values.dtype, device=values.device).reshape(-1, values.shape[1])
     return values

@@ -46,14 +46,12 @@ class ArraySpec:
     optional: bool = False
 
     def shape_for(self, steps: int) -> tuple[int, ...]:
-        """Shape in an episode of ``steps`` steps."""
         return tuple(steps if length == "T" else length for length in self.shape)
 
     def has_dtype(self, array: np.ndarray) -> bool:
         return array.dtype.kind == "U" if self.dtype == "str" else array.dtype == np.dtype(self.dtype)
 
     def cast(self, values: Any) -> np.ndarray:
-        """Values as an array of the declared type."""
         return np.asarray(values, dtype=np.str_ if self.dtype == "str" else self.dtype)
 
 
@@ -88,7 +86,6 @@ class Quantity(ArraySpec):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the numbers."""
         numbered = (self.name,) if self.width == 1 else tuple(f"{self.name}_{i}" for i in range(1, self.width + 1))
         return self.components or numbered
 

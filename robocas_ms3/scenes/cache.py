@@ -164,13 +164,11 @@ class LayoutCache:
             return self.table(engine)
 
     def mark_table(self, engine: Engine, states: Mapping[Pair, State]) -> None:
-        """Write into the table what its engine has found of layouts."""
         with self._locked():
             mark_table(self.table_path(engine), self._names, states)
 
     @contextmanager
     def _locked(self) -> Iterator[None]:
-        """Keep other processes from changing the tables."""
         with open_for_append(make_folder(self.folder) / ".tables.lock") as file:
             lock_file(file, self.folder, wait=True)
             yield
@@ -261,7 +259,6 @@ def count_layouts(folder: Path) -> int:
 
 
 def _about(model: SceneModel) -> dict[str, Any]:
-    """Return everything that layouts depend on besides their seeds."""
     config = model.config.model_dump(mode="json", exclude=_NOT_OF_LAYOUTS)
     config["randomisation"] = {k: v for k, v in config["randomisation"].items() if k not in _LOOKS}
     parts: dict[str, LoadedFurniture] = {**model.furniture, **({"basket": model.basket} if model.basket else {})}

@@ -105,7 +105,6 @@ def _check_relations(pack: Pack, config: TaskConfig, ids: list[str]) -> None:
 
 
 def _most_alike(pack: Pack, ids: list[str], config: TaskConfig, copies: int) -> int:
-    """Return how many objects of one name a layout may have at most."""
     count = config.objects.count
     if config.objects.repeats:
         return count
@@ -135,7 +134,6 @@ def resolve_ids(pack: Pack, wanted: list[str | int] | list[str], *, key: str) ->
 
 
 def find_region(config: SurfaceConfig, furniture: LoadedFurniture) -> Region:
-    """Return the rectangle that objects are placed on, in the furniture's frame."""
     surfaces = furniture.asset.surfaces
     _check_known("surface.name: no such surface", config.name, surfaces)
     whole = surfaces[config.name]

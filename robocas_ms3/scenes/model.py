@@ -115,7 +115,6 @@ class SceneModel:
 
     @property
     def opened_joint(self) -> Joint | None:
-        """Joint that has to be opened, if any."""
         return find_opened_joint(self.config, self.furniture) if self.config.opening else None
 
     @property

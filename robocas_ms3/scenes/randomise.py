@@ -25,7 +25,6 @@ class Lights:
 
 
 def draw_finishes(config: TaskConfig, room: LoadedFurniture, seed: int) -> dict[str, str]:
-    """Draw the finish of each part of the room that has one other than its default."""
     finishes = dict(config.room.finishes)
     rng = np.random.default_rng([seed, _ROOM])
     for part in sorted(config.randomisation.room or ()):
@@ -35,7 +34,6 @@ def draw_finishes(config: TaskConfig, room: LoadedFurniture, seed: int) -> dict[
 
 
 def draw_lights(config: TaskConfig, seed: int) -> Lights:
-    """Draw brightness and direction of the lights."""
     lights, by = config.lights, config.randomisation.lights
     direction = np.array(lights.direction) / np.linalg.norm(lights.direction)
     if by is None:

@@ -158,7 +158,6 @@ def _failure(model: SceneModel, unarranged: list[LayoutError], unsettled: int, u
 
 
 def _kinds_that_fit(rng: np.random.Generator, model: SceneModel, ids: list[str], copies: int) -> list[str]:
-    """Draw kinds until their columns fit on the surface."""
     objects, count = model.object_pack.objects, model.config.objects.count
     failure = LayoutError("no kinds fit", where="objects.ids")
     for attempt in range(_KINDS):

@@ -148,7 +148,6 @@ def falling_order(rng: np.random.Generator, assets: Sequence[LoadedObject], nois
 
 
 def _falling_pose(rng: np.random.Generator, asset: LoadedObject, tumble: float) -> Array:
-    """Draw 4x4 about the object's own centre of mass."""
     notes = asset.annotations
     if rng.uniform() < tumble:
         pose = np.eye(4)
@@ -160,7 +159,6 @@ def _falling_pose(rng: np.random.Generator, asset: LoadedObject, tumble: float) 
 
 
 def _add_walls(scene: sapien.Scene, middle: Array, half: Array, z: float) -> list[sapien.Entity]:
-    """Add four frictionless walls around a rectangle."""
     slippery = physx.PhysxMaterial(0.0, 0.0, 0.0)
     walls = []
     for axis, sign in ((0, -1), (0, 1), (1, -1), (1, 1)):
@@ -176,7 +174,6 @@ def _add_walls(scene: sapien.Scene, middle: Array, half: Array, z: float) -> lis
 
 
 def _run(scene: sapien.Scene, seconds: float, bodies: Sequence[physx.PhysxRigidDynamicComponent]) -> None:
-    """Simulate for a while, or until nothing moves."""
     for step in range(round(seconds / TIME_STEP)):
         scene.step()
         if step >= 2 * _LOOK_EVERY and step % _LOOK_EVERY == 0:

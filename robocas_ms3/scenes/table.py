@@ -77,7 +77,6 @@ class LayoutTable:
         return [*zip(self._sets[rows].tolist(), self._seeds[columns].tolist(), strict=True)]
 
     def stays(self, objects_seed: int) -> bool:
-        """Return whether any layout of a seed's objects is good."""
         return bool(good(self._states[self._sets == objects_seed]).any())
 
     def object_ids(self, objects_seed: int) -> ObjectIds | None:
@@ -173,7 +172,6 @@ def join_frozen(path: Path, parts: Sequence[Path]) -> None:
 def _records(
     names: Sequence[str], layouts: Mapping[Pair, Layout], states: Mapping[Pair, State] = MappingProxyType({})
 ) -> NDArray[np.void]:
-    """Return layouts of equally many slots as records (E,)."""
     slots = len(next(iter(layouts.values())).object_ids)
     words = max(1, *(len(layout.relation) for layout in layouts.values()))
     number = {name: i for i, name in enumerate(names)}
@@ -195,7 +193,6 @@ def _records(
 
 
 def _layout(record: Any, names: Sequence[str]) -> Layout:
-    """Return the layout of a record; LayoutError where it is damaged."""
     try:
         layout = Layout(
             object_ids=tuple(str(names[i]) for i in record["objects"].tolist()),

@@ -138,7 +138,6 @@ def target_rule(task: str) -> TargetRule:
 
 
 def choose_target(rng: np.random.Generator, scene: Arrangement) -> Choice | None:
-    """Choose the target by the task's rule; None where no object qualifies."""
     return target_rule(scene.model.config.task).choose(rng, scene)
 
 

@@ -27,7 +27,7 @@ from robocas_ms3.robots.description import MOBILE_PANDA
 
 pytestmark = pytest.mark.slow
 PICK, SEARCH = EpisodeSettings("pick"), EpisodeSettings("search", "search_table_small_heap")
-SEEDS = 3
+SEEDS = 2
 SEARCH_SEED = 3
 TOO_LONG = "horizon", "too_long"
 

@@ -107,15 +107,6 @@ def test_a_run_without_a_finished_seed_leaves_nothing(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("overwrite", [False, True])
-def test_results_of_an_evaluation_are_not_touched(tmp_path, hopeless, overwrite):
-    """They have a run.json as well, before their first episode nothing else."""
-    (tmp_path / "run.json").write_text(notes := '{"protocol": "smoke", "protocol_hash": "ab"}')
-    with pytest.raises(OutputExistsError):
-        generate(SETTINGS, tmp_path, overwrite=overwrite)
-    assert (tmp_path / "run.json").read_text() == notes
-
-
 def test_a_replay_never_replaces_what_it_replays(recording):
     with pytest.raises(RobocasError, match="the recording itself"):
         replay(ReplaySettings(recording, save=recording, overwrite=True))

@@ -1,15 +1,17 @@
-"""A table scene of known boxes, and the arm's kinematics and shapes, read by code of its own."""
+"""A table scene of known boxes, and the arm's links as its URDF has them."""
 
 from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
+
+from robocas_ms3.robots.description import MOBILE_PANDA
+from robocas_ms3.robots.description_file import DescriptionFile, chain
 
 REST = np.array([0, -1.02, 0, -2.51, 0, 1.35, 0.78])
 
@@ -55,23 +57,12 @@ def cloud(boxes: list[Box], spacing: float = 0.005) -> np.ndarray:
 
 
 class Checker:
-    """Forward kinematics and collision shapes straight from the URDF."""
+    """Poses of links by the URDF, and the collision shapes in it."""
 
     def __init__(self, urdf: Path) -> None:
-        root = ElementTree.parse(urdf).getroot()
-        self._joints = {}
-        for joint in root.iterfind("joint"):
-            axis = joint.find("axis")
-            self._joints[joint.find("child").attrib["link"]] = (
-                joint.attrib["name"],
-                joint.attrib["type"],
-                joint.find("parent").attrib["link"],
-                _origin(joint),
-                np.array([float(v) for v in axis.attrib["xyz"].split()]) if axis is not None else np.zeros(3),
-            )
+        self._file = DescriptionFile(urdf)
         self.parts: list[tuple[str, np.ndarray]] = []  # link, and vertices of a convex part in its frame
-        for link in root.iterfind("link"):
-            name = link.attrib["name"]
+        for link in self._file.root.iterfind("link"):
             for collision in link.iterfind("collision"):
                 shape = collision.find("geometry")
                 box = shape.find("box")
@@ -79,33 +70,16 @@ class Checker:
                     mesh = trimesh.creation.box([float(v) for v in box.attrib["size"].split()])
                 else:
                     mesh = trimesh.load(urdf.parent / f"{shape.find('mesh').attrib['filename']}.convex.stl")
-                mesh.apply_transform(_origin(collision))
-                self.parts.append((name, np.asarray(mesh.vertices)))
+                mesh.apply_transform(self._file.origin(collision))
+                self.parts.append((link.attrib["name"], np.asarray(mesh.vertices)))
 
     def poses(self, link: str, qpos: np.ndarray, finger: float = 0.04) -> np.ndarray:
-        """Poses (T, 4, 4) of a link at configurations (T, 7)."""
-        pose = np.tile(np.eye(4), (len(qpos), 1, 1))
-        if link not in self._joints:
-            return pose
-        name, kind, parent, origin, axis = self._joints[link]
-        if kind == "revolute":
-            pose[:, :3, :3] = Rotation.from_rotvec(qpos[:, int(name[-1]) - 1, None] * axis).as_matrix()
-        elif kind == "prismatic":
-            pose[:, :3, 3] = axis * finger
-        return self.poses(parent, qpos, finger) @ origin @ pose
+        """Poses (T, 4, 4) of a link in the arm's base at configurations (T, 7)."""
+        positions = np.column_stack([qpos, np.full(len(qpos), finger)])
+        return chain(self._file.path, MOBILE_PANDA.arm_base_link, link, positions)
 
     def link_pose(self, link: str, qpos: np.ndarray) -> np.ndarray:
         return self.poses(link, np.asarray(qpos)[None])[0]
-
-
-def _origin(element: ElementTree.Element) -> np.ndarray:
-    pose, origin = np.eye(4), element.find("origin")
-    if origin is not None:
-        pose[:3, :3] = Rotation.from_euler(
-            "xyz", [float(v) for v in origin.attrib.get("rpy", "0 0 0").split()]
-        ).as_matrix()
-        pose[:3, 3] = [float(v) for v in origin.attrib.get("xyz", "0 0 0").split()]
-    return pose
 
 
 def top_down(x: float, y: float, z: float, yaw: float = 0.0) -> np.ndarray:

@@ -5,7 +5,6 @@ import pytest
 from scene_models import load_scene
 
 from robocas_ms3.core.poses import planar
-from robocas_ms3.scenes import settle as settle_module
 from robocas_ms3.scenes.settle import settle
 
 
@@ -49,27 +48,3 @@ def test_objects_that_do_not_stay(model, y, lift, lean):
     turn = np.array([[np.cos(lean), 0, np.sin(lean)], [0, 1, 0], [-np.sin(lean), 0, np.cos(lean)]])
     pose[:3, :3] = turn @ pose[:3, :3]
     assert not run(model, ["drink"], [pose])[1]
-
-
-@pytest.mark.parametrize("heap", [False, True])
-def test_an_object_that_tips_over_may_stay_in_a_heap(model, monkeypatch, heap):
-    tipped = planar(0, 0, 0, 0)[None]
-    tipped[0, 1:3, 1:3] = [[0.8, -0.6], [0.6, 0.8]]  # by 37 deg
-    monkeypatch.setattr(settle_module, "_simulate", lambda *args, **how: (tipped, True))
-    mug = [model.object_pack.objects["mug"]]
-    assert settle(mug, np.eye(4)[None], model, model.basket_pose, heap=heap)[1] == heap
-
-
-def test_what_moves_in_a_check_is_checked_again_from_where_it_came_to(model, monkeypatch):
-    start = planar(0, 0, 0, 0)[None]
-    places = iter([0.0, 0.01, 0.012])  # x, m, at the end of each simulation
-
-    def simulate(assets, poses, *args, **how):
-        pose = start.copy()
-        pose[:, 0, 3] = next(places)
-        return pose, True
-
-    monkeypatch.setattr(settle_module, "_simulate", simulate)
-    settled, stable = settle([model.object_pack.objects["mug"]], start, model, model.basket_pose)
-    assert stable
-    assert settled[0, 0, 3] == 0.01

@@ -83,7 +83,6 @@ def sample_subgoals(subgoals: Sequence[SubGoal], samples: NDArray[np.int64]) -> 
 
 
 def subgoal_runs(types: Sequence[str], texts: Sequence[str]) -> list[SubGoal]:
-    """Return sub-goals of steps that follow each other."""
     goals: list[SubGoal] = []
     for (kind, text), steps in groupby(range(len(types)), key=lambda step: (types[step], texts[step])):
         inside = list(steps)

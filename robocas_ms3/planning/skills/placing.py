@@ -42,7 +42,6 @@ def carry_to_basket(arm: Arm, slot: int) -> None:
 
 
 def release_into_basket(arm: Arm, slot: int) -> None:
-    """Open the gripper, step back and go home until the task has succeeded."""
     start = arm.at
     arm.open_gripper()
     with arm.planning():
@@ -122,7 +121,6 @@ def held_object(arm: Arm, slot: int) -> tuple[Array, Array]:
 
 
 def attach_held(arm: Arm, slot: int) -> None:
-    """Tell the planner what the gripper holds right now."""
     object_in_tcp, vertices = held_object(arm, slot)
     arm.planner.attach(AttachedBody(vertices, object_in_tcp))
     arm.planner.finger_width = float(arm.env.agent.gripper_width[0])

@@ -50,7 +50,6 @@ def remove(arm: Arm, slot: int) -> None:
 
 
 def hang_clear(arm: Arm, slot: int) -> None:
-    """Raise a held object until it touches nothing."""
     attach_held(arm, slot)
     arm.rise_clear(without=slot)
 
@@ -84,7 +83,6 @@ def blockers(arm: Arm, slot: int) -> list[int]:
 
 
 def _grasps_from_above(arm: Arm, slot: int) -> Array:
-    """Return some of an object's grasps (G, 4, 4) that come from above."""
     notes, frame = arm.env.object_assets[0][slot].annotations, arm.scene.object_in_base(slot)
     grasps = frame @ notes.grasps_tcp_in_object
     passed = np.logical_and.reduce(list(directions_ok(grasps, frame[:3, 3]).values()))

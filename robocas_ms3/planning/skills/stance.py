@@ -216,6 +216,5 @@ def _poses_of_some(arm: Arm, frame: Array, grasps: Array, count: int) -> Array:
 
 
 def _from_here(arm: Arm, frame: Array, grasps: Array) -> Array:
-    """Return the grasps (G, 4, 4) that come from the side of the arm's base (4x4, world)."""
     center = grasps[:, :3, 3].mean(axis=0) if len(grasps) else np.zeros(3)
     return grasps[directions_ok(grasps, center - frame[:3, 3], arm.approach)[SIDE]]

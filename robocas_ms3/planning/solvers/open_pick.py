@@ -9,7 +9,6 @@ from robocas_ms3.planning.solvers import pick
 
 
 def attempt(arm: Arm) -> None:
-    """Try once, from wherever the episode stands; returns when the task has succeeded."""
     if not is_opened(arm):
         arm.begin_subgoal("operate the target")
         open_from_reach(arm)

@@ -7,7 +7,6 @@ from robocas_ms3.planning.skills.stance import bring_to_basket, grasp_from_reach
 
 
 def attempt(arm: Arm) -> None:
-    """Try once, from wherever the episode stands; returns when the task has succeeded."""
     arm.begin_subgoal("move and grasp")
     grasp_from_reach(arm, arm.target)
     arm.executor.rehearse()

@@ -22,7 +22,6 @@ GRASPS = 3  # kinds of grasps of the target that are tried
 
 
 def attempt(arm: Arm) -> None:
-    """Try once, from wherever the episode stands; returns when the task has succeeded."""
     slot, heap = arm.target, Heap(arm, arm.target)
     for fact in FACTS:
         arm.executor.facts.setdefault(fact, 0)

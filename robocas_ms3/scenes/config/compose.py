@@ -165,7 +165,6 @@ def _declaration(place: Sequence[str]) -> Literal["nullable", "key", "name", "un
 
 
 def _alternatives(node: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """Yield the schemas that a value may be of, references resolved."""
     if "$ref" in node:
         node = _schema()["$defs"][node["$ref"].rsplit("/", 1)[-1]]
     choices = (*node.get("anyOf", ()), *node.get("oneOf", ()))

@@ -147,7 +147,6 @@ def episode_instruction(config: TaskConfig, layout: Layout, seed: int, name: str
 
 
 def template_ids(task: str, split: Split) -> list[str]:
-    """Return the ids of the templates of a split, in order."""
     return [f"{task}/{split}/{index:02d}" for index in range(len(_templates(task, split)))]
 
 

@@ -115,7 +115,6 @@ def synonym_texts() -> SynonymTexts:
 
 
 def read_texts(path: Path, model: type[_Model]) -> _Model:
-    """Read a file of texts; ConfigError for the first mistake."""
     return parse(model, load_yaml(path), ConfigError, where=path)
 
 
