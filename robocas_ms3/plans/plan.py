@@ -10,6 +10,7 @@ from robocas_ms3.core.checks import GREATEST_SEED
 from robocas_ms3.core.strict import StrictModel
 from robocas_ms3.datasets.lerobot.variants import NEWEST, Version
 from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.schema import ImageFormat
 from robocas_ms3.robots.cameras import STANDARD_NAMES
 
 Side = Literal["train", "val"]
@@ -54,7 +55,7 @@ class PicturesConfig(StrictModel):
 
     size: tuple[Annotated[int, Field(ge=16, le=8192)], Annotated[int, Field(ge=16, le=8192)]] = (640, 480)
     depth: bool = True
-    image_format: Literal["png", "jpg", "webp"] = "png"
+    image_format: ImageFormat = "png"
     cameras: list[str] | None = Field(default=None, description="default: all that the configurations declare")
 
     def chosen(self) -> Pictures:

@@ -128,7 +128,6 @@ def _write(folder: Path, source: Episode, episode: ImportedEpisode, surveyed: Su
 
 def _scene(source: Episode, episode: ImportedEpisode, surveyed: Survey) -> dict[str, Any]:
     """Return the content of ``scene.json``; most is unknown, unless the episode has such a file."""
-    assert source.dataset is not None
     before = source.scene if source.scene.get("schema_version") == schema.SCHEMA_VERSION else {}
     wanted = (spec.name for spec in schema.EPISODE_INFO if not spec.embedding)
     repaired = (found for found in episode.findings if found.outcome == "mended")

@@ -217,7 +217,7 @@ def _check_images(episode: ImportedEpisode, source: Episode) -> None:
     try:
         episode.pictures = replace(pictures, size=size)
     except DatasetError as error:  # too small
-        episode.note(Violation(source.folder.name, "", f"pictures {error.expected}", str(error.found)), "left out")
+        episode.note(Violation(source.folder.name, "", str(error.expected), str(error.found)), "left out")
 
 
 def _describe(pictures: Pictures | None) -> str:

@@ -22,6 +22,8 @@ _QUALITY = {
     "webp": [cv2.IMWRITE_WEBP_QUALITY, 90],
 }
 
+SMALLEST = 16
+"""Pixels per side of an image that shows something."""
 Box = tuple[int, int, int, int]
 """x_min, y_min, x_max, y_max: first and last column and row of the pixels, from 0 at the top left."""
 
@@ -40,24 +42,9 @@ class Pictures:
     boxes: bool = False
 
     def __post_init__(self) -> None:
-        if self.image_format not in schema.IMAGE_FORMATS:
-            raise DatasetError(
-                "no such picture format",
-                where="image_format",
-                expected=f"one of {', '.join(schema.IMAGE_FORMATS)}",
-                found=self.image_format,
-            )
-        if self.size is not None and max(self.size) > LARGEST:
-            raise DatasetError(
-                "no renderer makes pictures this large",
-                where="size",
-                expected=f"<= {LARGEST} x {LARGEST}",
-                found=list(self.size),
-            )
-        if self.size is not None and min(self.size) < 16:
-            raise DatasetError(
-                "pictures this small show nothing", where="size", expected=">= 16 x 16", found=list(self.size)
-            )
+        if self.size is not None and not SMALLEST <= min(self.size) <= max(self.size) <= LARGEST:
+            expected = f"{SMALLEST} to {LARGEST} pixels a side"
+            raise DatasetError("no such size of images", where="size", expected=expected, found=list(self.size))
         names = [*STANDARD_NAMES, *self.cameras]
         object.__setattr__(self, "cameras", tuple(name for name in dict.fromkeys(names) if name in self.cameras))
 

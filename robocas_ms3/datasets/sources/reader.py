@@ -49,14 +49,14 @@ class Episode(SourceEpisode):
     """The folder of an episode; ``dataset`` says what is not in it."""
 
     folder: Path
-    dataset: Dataset | None = field(default=None, repr=False, compare=False)
+    dataset: Dataset = field(repr=False, compare=False)
 
     @cached_property
     def arrays(self) -> dict[str, NDArray]:
         path = self.folder / schema.EPISODE_FILE
         loaded = load_arrays(path)
         if any(spec.name not in loaded.arrays for spec in schema.EPISODE_INFO if not spec.embedding):
-            loaded = completed(loaded, self._said(), self.dataset.rate_hz if self.dataset else DEFAULT_RATE)
+            loaded = completed(loaded, self._said(), self.dataset.rate_hz)
         for key in set(loaded.unreadable) - set(loaded.derived):
             where, found = f"{path}, {key}", loaded.reason(key)
             raise DatasetError("this array can't be read", where=where, found=found, fix=SEE_VALIDATE)
@@ -74,8 +74,6 @@ class Episode(SourceEpisode):
         return read_subgoals(self._said().get("step_goals", []), where)
 
     def _said(self) -> dict[str, Any]:
-        if self.dataset is None:
-            return {}
         return said_of(self.dataset.info, schema.episode_number(self.folder.name))
 
     @property
@@ -191,19 +189,16 @@ class Dataset(EpisodeSource):
 
     @cached_property
     def cameras(self) -> tuple[str, ...]:
-        return tuple(self._value(schema.CONVERSION_FILE, "cameras", _CAMERAS, self._first.cameras))
+        first = self.episode(self.numbers[0])
+        return tuple(self._value(schema.CONVERSION_FILE, "cameras", _CAMERAS, first.cameras))
 
     @property
     def has_depth(self) -> bool:
-        return bool(self.settings.get("depth", self._first.has_depth))
+        return bool(self.settings.get("depth", self.episode(self.numbers[0]).has_depth))
 
     @property
     def has_embeddings(self) -> bool:
         return bool(self.settings.get("embeddings", True))
-
-    @property
-    def _first(self) -> Episode:
-        return Episode(self.root / schema.episode_folder(self.numbers[0]))
 
     @cached_property
     def lengths(self) -> dict[int, int]:

@@ -106,12 +106,6 @@ class Recorded(_Part):
     seconds: dict[str, Any] | None = None
 
 
-class RateRecord(_Part):
-    """``rate_hz``, which both files have."""
-
-    rate_hz: Rate
-
-
 class EntryRecord(_Part):
     """The recording that an episode is of, in ``conversion.json``; see `provenance.recording_entry`."""
 
@@ -130,12 +124,13 @@ class EpisodesRecord(_Part):
     left_out: dict[EpisodeNumber, EntryRecord] = {}
 
 
-class SettingsRecord(RateRecord):
+class SettingsRecord(_Part):
     """The settings of ``conversion.json``, which all episodes of a dataset share."""
 
+    rate_hz: Rate
     cameras: Annotated[list[CameraName], Field(min_length=1)]
     image_size: Annotated[list[int], Field(min_length=2, max_length=2)] | None
-    image_format: str
+    image_format: schema.ImageFormat
     depth: bool
     embeddings: bool = True
 

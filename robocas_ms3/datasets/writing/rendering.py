@@ -7,9 +7,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.stored import Pictures
@@ -19,7 +16,6 @@ from robocas_ms3.datasets.sources.trajectory import RecordedEpisode, TrajectoryS
 from robocas_ms3.demos.recordings.environment import RecordedEnv
 from robocas_ms3.demos.recordings.motion import sample_states
 from robocas_ms3.demos.recordings.reading import Recording, TrajectoryFile
-from robocas_ms3.robots.cameras import Parent
 
 if TYPE_CHECKING:
     from robocas_ms3.datasets.writing.render import EnvRenderer
@@ -116,11 +112,5 @@ class RenderedEpisode(RecordedEpisode):
     def _models(self) -> dict[str, CameraModel]:
         return self._renderer.cameras()
 
-    def intrinsic(self, camera: str) -> NDArray[np.float64]:
-        return self._models[camera].intrinsic
-
-    def camera_in_parent(self, camera: str) -> NDArray[np.float64]:
-        return self._models[camera].camera_in_parent
-
-    def camera_parent(self, camera: str) -> Parent:
-        return self._models[camera].parent
+    def camera(self, name: str) -> CameraModel:
+        return self._models[name]
