@@ -121,13 +121,10 @@ class FclWorld:
         vertices = pieces.vertices @ pose[:3, :3].T + pose[:3, 3]
         self._closed_bounds[-1] = self._open_bounds[-1] = vertices.min(axis=0), vertices.max(axis=0)
 
-    def free(self, qpos: Array, finger_width: float | None = None, *, obstacles: bool = True) -> NDArray[np.bool_]:
-        """Return which configurations (M, 7) are free of collisions; without ``obstacles`` only of the robot's own."""
+    def free(self, qpos: Array, finger_width: float | None = None) -> NDArray[np.bool_]:
         qpos = np.asarray(qpos, dtype=np.float64).reshape(-1, 7)
         width = self._open_width if finger_width is None else finger_width
-        return np.array(
-            [next(found, None) is None for found in self._pairs_in_contact(qpos, width, obstacles)], dtype=bool
-        )
+        return np.array([next(found, None) is None for found in self._pairs_in_contact(qpos, width, True)], dtype=bool)
 
     def free_until(self, qpos: Array, *, obstacles: bool = True) -> int:
         """Return how many configurations of a path (M, 7) are free before the first one that is not."""

@@ -20,7 +20,7 @@ from robocas_ms3.planning.timing import JointPath, blended, rounded, stopping, t
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.robots.table import RobotSpec
 
-CHECKS_PER_SECOND = 10_000  # turns a planning time into a budget of collision checks, which load can't change
+BUDGET = 20_000  # collision checks of one search, about 2 s; a limit by the clock would depend on the machine's load
 RRT_RANGE = 0.25  # rad, longest extension of a tree
 SPACING = 0.03  # rad between checks while searching
 FINE_SPACING = 0.01  # rad between checks of the final path
@@ -41,25 +41,15 @@ class RRTConnectPlanner(FclWorld):
     Args:
         urdf, srdf, robot: see `FclWorld`.
         dt: seconds between rows of a trajectory.
-        planning_time: budget of one search, in seconds of a quiet core; counted in collision checks, not by the clock.
     """
 
-    def __init__(
-        self,
-        urdf: Path | str,
-        srdf: Path | str,
-        *,
-        robot: RobotDescription,
-        dt: float,
-        planning_time: float = 2.0,
-    ) -> None:
+    def __init__(self, urdf: Path | str, srdf: Path | str, *, robot: RobotDescription, dt: float) -> None:
         import toppra  # noqa: F401  (0.2 s: before this process forks)
 
         super().__init__(urdf, srdf, robot)
         self._reachability = Reachability(self.chain)
         self._dt = dt
         self._limits = {"velocity": robot.arm_velocity_limit, "acceleration": robot.arm_acceleration_limit}
-        self._budget = int(planning_time * CHECKS_PER_SECOND)
         lower, upper = self.chain.lower, self.chain.upper
         self._search = PathSearch(self.free_until, lower, upper, step=RRT_RANGE, spacing=SPACING)
         self._rng = np.random.default_rng(0)
@@ -113,9 +103,9 @@ class RRTConnectPlanner(FclWorld):
         # The nearest goal alone gets a quick try, then all of them the full budget; a path that slips through something
         # between two checks is searched again with the spacing of the final check.
         for roots, budget, spacing in (
-            (free[:1], self._budget // 10, SPACING),
-            (free, self._budget, SPACING),
-            (free, self._budget, FINE_SPACING),
+            (free[:1], BUDGET // 10, SPACING),
+            (free, BUDGET, SPACING),
+            (free, BUDGET, FINE_SPACING),
         ):
             if spacing == FINE_SPACING and reason == "rrt_timeout":
                 break
@@ -123,7 +113,7 @@ class RRTConnectPlanner(FclWorld):
             path = self._search.connect(start, roots, self._rng, max_checks=budget)
             if path is None:
                 continue
-            path = self._search.shorten(path, self._rng, tries=SHORTCUTS, max_checks=self._budget // 4)
+            path = self._search.shorten(path, self._rng, tries=SHORTCUTS, max_checks=BUDGET // 4)
             trajectory = self._finish(path)
             if trajectory is not None:
                 return trajectory

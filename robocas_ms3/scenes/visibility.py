@@ -90,27 +90,22 @@ class Scenery:
     Args:
         meshes: K meshes.
         poses: (K, 4, 4) in the world, rigid.
-        occluders: further meshes with their poses, which only hide.
     """
 
-    def __init__(
-        self, meshes: Sequence[trimesh.Trimesh], poses: Array, occluders: Sequence[tuple[trimesh.Trimesh, Array]] = ()
-    ) -> None:
-        self._placed = [*zip(meshes, poses, strict=True), *occluders]
-        self._count = len(meshes)
+    def __init__(self, meshes: Sequence[trimesh.Trimesh], poses: Array) -> None:
+        self._placed = list(zip(meshes, poses, strict=True))
 
     def visible_shares(self, camera: PinholeCamera) -> Array:
         """Return p_vis = visible / full projected area of each mesh (K,), in 0..1; NaN where it is out of view."""
         ids, full = self.segmentation(camera)
-        visible = np.bincount(ids[ids >= 0], minlength=len(full))[: self._count]
-        full = full[: self._count]
+        visible = np.bincount(ids[ids >= 0], minlength=len(full))
         return visible / np.where(full > 0, full, np.nan)
 
     def segmentation(self, camera: PinholeCamera) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
         """Return what each pixel shows, and the pixels that each mesh would fill alone.
 
         Returns:
-            (height, width) index of a mesh, K and above: occluders, -1: none; number of pixels per mesh and occluder.
+            (height, width) index of a mesh, -1: none; number of pixels per mesh.
         """
         nearest = np.full((camera.height, camera.width), np.inf)
         ids, full = np.full(nearest.shape, -1), np.zeros(len(self._placed), dtype=int)

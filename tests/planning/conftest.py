@@ -23,8 +23,8 @@ def checker(panda_files: RobotFiles) -> Checker:
 
 @pytest.fixture
 def make_planner(panda_files: RobotFiles):
-    def make(dt: float = 0.05, **settings) -> RRTConnectPlanner:
-        return RRTConnectPlanner(panda_files.arm_urdf, panda_files.arm_srdf, robot=MOBILE_PANDA, dt=dt, **settings)
+    def make(dt: float = 0.05) -> RRTConnectPlanner:
+        return RRTConnectPlanner(panda_files.arm_urdf, panda_files.arm_srdf, robot=MOBILE_PANDA, dt=dt)
 
     return make
 

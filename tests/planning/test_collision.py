@@ -74,9 +74,9 @@ def test_points_beyond_the_octree_are_no_obstacles(world):
 def test_self_collisions_are_checked_without_obstacles(world):
     world.set_scene(cloud([Box(tuple(world.tcp(REST)[:3, 3]), (0.09, 0.09, 0.03))]))
     assert not world.free(REST[None])[0]
-    assert world.free(REST[None], obstacles=False)[0]
+    assert world.all_free(REST[None], obstacles=False)
     folded = np.array([0.0, -1.7, 0.0, -3.0, 0.0, 0.0, 0.0])
-    assert not world.free(folded[None], obstacles=False)[0]
+    assert not world.all_free(folded[None], obstacles=False)
     assert len(world.collisions(folded, 0.08)) >= 2
 
 

@@ -7,6 +7,7 @@ import pytest
 from planning_scenes import REST, Box, cloud, corners, pose_error, table_scene, top_down
 
 from robocas_ms3.core.errors import ExtensionError, PlanningFailed
+from robocas_ms3.planning import rrt_connect
 from robocas_ms3.planning.kinematics import ArmChain
 from robocas_ms3.planning.protocol import AttachedBody, Planner, Trajectory
 from robocas_ms3.planning.rrt_connect import TCP_SPEED_LIMIT
@@ -165,7 +166,7 @@ def test_a_planner_is_made_by_its_name():
     assert caught.value.found == "'ompl'"
 
 
-def test_failures_have_reasons(make_planner):
+def test_failures_have_reasons(make_planner, monkeypatch):
     planner = make_planner()
     assert reason_of(planner.plan_to_pose, REST, top_down(1.3, 0, 0.3)) == "no_ik"
     planner.set_scene(cloud([Box((0.5, 0, 0.2), (0.1, 0.1, 0.1))]))
@@ -183,7 +184,8 @@ def test_failures_have_reasons(make_planner):
     folded = np.array([0.0, -1.7, 0.0, -3.0, 0.0, 0.0, 0.0])
     assert reason_of(planner.plan_to_qpos, REST, [outside, folded]) == "goal_in_collision"
 
-    hurried = make_planner(planning_time=0.005)  # 50 checks
+    hurried = make_planner()
+    monkeypatch.setattr(rrt_connect, "BUDGET", 50)
     hurried.set_scene(cloud([WALL]))
     start = hurried.ik(top_down(0.5, 0.25, 0.1), REST)[0]
     assert reason_of(hurried.plan_to_qpos, start, hurried.ik(top_down(0.5, -0.25, 0.1), start)[:1]) == "rrt_timeout"

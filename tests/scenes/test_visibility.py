@@ -20,17 +20,17 @@ def at(*position: float) -> np.ndarray:
     return pose
 
 
-def shares(poses, occluders=(), camera=HIGH) -> np.ndarray:
-    return Scenery([PLATE] * len(poses), np.asarray(poses), occluders).visible_shares(camera)
+def shares(*poses, camera=HIGH) -> np.ndarray:
+    return Scenery([PLATE] * len(poses), np.asarray(poses)).visible_shares(camera)
 
 
 def test_shares_by_hand():
-    assert shares([at(0, 0, 0)], [(PLATE, at(0.05, 0, 0.01))]) == pytest.approx([0.5], abs=0.01)
-    assert shares([at(0, 0, 0), at(0, 0.075, 0.01)]) == pytest.approx([0.75, 1.0], abs=0.01)
-    assert shares([at(0, 0.075, 0.01), at(0, 0, 0)]) == pytest.approx([1.0, 0.75], abs=0.01)
-    assert np.isnan(shares([at(5, 0, 0)])).all()
-    assert np.isnan(shares([at(0, 0, 11)])).all()  # behind the camera
-    assert shares(np.zeros((0, 4, 4))).shape == (0,)
+    assert shares(at(0, 0, 0), at(0.05, 0, 0.01)) == pytest.approx([0.5, 1.0], abs=0.01)
+    assert shares(at(0, 0, 0), at(0, 0.075, 0.01)) == pytest.approx([0.75, 1.0], abs=0.01)
+    assert shares(at(0, 0.075, 0.01), at(0, 0, 0)) == pytest.approx([1.0, 0.75], abs=0.01)
+    assert np.isnan(shares(at(5, 0, 0))).all()
+    assert np.isnan(shares(at(0, 0, 11))).all()  # behind the camera
+    assert shares().shape == (0,)
 
 
 def test_the_share_depends_on_where_the_camera_is():
@@ -57,9 +57,9 @@ def test_the_selection_camera_looks_down_with_the_worlds_x_up():
     np.testing.assert_allclose(camera.pose[:3, 3], [0.3, 0.2, 1.1])
     np.testing.assert_allclose(camera.pose[:3, 0], [0, 0, -1])
     assert camera.focal_length == pytest.approx(256)
-    scenery = Scenery([PLATE, PLATE], np.stack([at(0, 0, 0), at(0, 0.075, 0.01)]), [(PLATE, at(0.05, 0, 0.02))])
+    scenery = Scenery([PLATE] * 3, np.stack([at(0, 0, 0), at(0, 0.075, 0.01), at(0.05, 0, 0.02)]))
     ids = scenery.segmentation(HIGH)[0]
-    # 0.1 m are 85 pixels; the world's x is up, y left: the occluder (2) covers the upper halves of both plates in part
+    # 0.1 m are 85 pixels; the world's x is up, y left: the third plate covers part of the others
     assert [ids[148, 148], ids[148, 64], ids[85, 128], ids[2, 2]] == [0, 1, 2, -1]
 
 
@@ -84,7 +84,7 @@ def test_laws(seed):
     poses[:, :3, :3] = Rotation.random(5, random_state=rng).as_matrix()
     poses[:, :3, 3] = rng.uniform([-0.1, -0.1, 0], [0.1, 0.1, 0.2], (5, 3))
     camera = top_down_camera(np.zeros(2), 0.0, size=128)
-    few, more = shares(poses[:4], camera=camera), shares(poses[:4], [(PLATE, poses[4])], camera)
+    few, more = shares(*poses[:4], camera=camera), shares(*poses, camera=camera)[:4]
     seen = ~np.isnan(few)  # a plate on edge is not seen at all
     np.testing.assert_array_equal(seen, ~np.isnan(more))
     assert ((few[seen] >= 0) & (few[seen] <= 1)).all()
