@@ -101,7 +101,8 @@ class WorkerProcess(Generic[Task, Result]):
                 self.send(self.pickled_worker)
                 self._receive(START_SECONDS)
             except ProcessDied as crash:
-                raise start_error(crash) from crash
+                what, fix = "a worker process died before its first task", "See its output above, and robocas doctor."
+                raise WorkerStartError(what, found=crash.found, fix=fix) from crash
             except BaseException:
                 self.end()
                 raise
@@ -197,10 +198,9 @@ class WorkerProcess(Generic[Task, Result]):
             self.connection = None
 
 
-def start_error(crash: ProcessDied) -> WorkerStartError:
-    """Return the error of a process that died before its first task."""
-    what, fix = "a worker process died before its first task", "See its output above, and robocas doctor."
-    return WorkerStartError(what, found=crash.found, fix=fix)
+def worker_error(error: BaseException, where: str) -> RemoteError:
+    """Return an error of code in a worker, which may not end it: the process ignores Ctrl-C."""
+    return RemoteError.of(exit_error(error, where) if isinstance(error, KeyboardInterrupt) else error, where)
 
 
 def _exceeds_memory(pid: int, memory_gb: float) -> bool:
@@ -271,10 +271,8 @@ def _answer(connection: Connection, function: Callable[[Any], Any]) -> None:
     message = connection.recv_bytes()
     try:
         answer = function(pickle.loads(message))
-    except KeyboardInterrupt as error:  # of the code: the process ignores Ctrl-C
-        answer = RemoteError.of(exit_error(error, "a worker"), "a worker")
     except BaseException as error:  # noqa: BLE001  (it is raised again in the pool's process)
-        answer = RemoteError.of(error, "a worker")
+        answer = worker_error(error, "a worker")
     try:
         connection.send(answer)
     except OSError:

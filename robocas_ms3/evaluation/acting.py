@@ -26,7 +26,7 @@ from robocas_ms3.evaluation.rollout import EndConditions, EpisodeBatch, rollout
 from robocas_ms3.evaluation.stepping import UPSTREAM_HZ, PolicyStepping, env_kwargs
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.task_specs import TASKS
-from robocas_ms3.tasks.vector import NumpyVectorEnv, RoboCASVectorEnv
+from robocas_ms3.tasks.vector import RoboCASVectorEnv
 
 PROTOCOL = "paper-v1"
 _STEPS = 410  # stream of an episode's seed
@@ -65,8 +65,8 @@ class Player:
         )
         self._env = PolicyStepping(env, spec, "upstream")
         self._base: Any = env.unwrapped
-        vector = RoboCASVectorEnv(self._env, auto_reset=False, ignore_terminations=True, record_metrics=False)
-        self._vector = NumpyVectorEnv(vector)
+        options = {"auto_reset": False, "ignore_terminations": True, "record_metrics": False}
+        self._vector = RoboCASVectorEnv(self._env, "numpy", **options)
         folder = self._open.enter_context(tempfile.TemporaryDirectory(prefix="robocas-config-"))
         self._config = Path(folder) / "config.yaml"  # policies get a file
         config = load_task_config(settings.config).model_dump(mode="json")

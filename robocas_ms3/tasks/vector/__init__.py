@@ -21,7 +21,7 @@ from robocas_ms3.tasks.vector.process_env import ProcessEnv
 Backend = Literal["auto", "processes", "gpu"]
 _VECTOR_OPTIONS = ("auto_reset", "ignore_terminations", "record_metrics")
 
-__all__ = ["Backend", "NumpyVectorEnv", "ProcessEnv", "RoboCASVectorEnv", "choose_backend", "make_vec"]
+__all__ = ["Backend", "ProcessEnv", "RoboCASVectorEnv", "choose_backend", "make_vec"]
 
 
 def make_vec(
@@ -71,8 +71,7 @@ def make_vec(
     else:
         workers = min(num_envs, workers or len(os.sched_getaffinity(0)))
         env = ProcessEnv(env_id, num_envs, workers, kwargs, wrappers, limits)
-    vector = RoboCASVectorEnv(env, **options)
-    return vector if arrays == "torch" else NumpyVectorEnv(vector)
+    return RoboCASVectorEnv(env, arrays, **options)
 
 
 def choose_backend(backend: str, sim_backend: str = "auto") -> Literal["processes", "gpu"]:
@@ -113,17 +112,19 @@ class RoboCASVectorEnv(ManiSkillVectorEnv):
 
     Args:
         env: the batched environment.
-        auto_reset: whether an env is reset in the step in which it ends.
-        ignore_terminations: whether an env goes on after success, until its time is up.
-        record_metrics: whether infos have ``episode``.
+        arrays: of observations, rewards, flags and infos, ``torch`` or ``numpy``.
+        auto_reset: whether an env is reset in the step in which it ends; default: True.
+        ignore_terminations: whether an env goes on after success, until its time is up; default: False.
+        record_metrics: whether infos have ``episode``; default: True.
     """
 
-    def __init__(
-        self, env: gym.Env, auto_reset: bool = True, ignore_terminations: bool = False, record_metrics: bool = True
-    ) -> None:
-        super().__init__(
-            env, auto_reset=auto_reset, ignore_terminations=ignore_terminations, record_metrics=record_metrics
-        )
+    def __init__(self, env: gym.Env, arrays: Literal["torch", "numpy"] = "torch", **options: bool) -> None:
+        super().__init__(env, **{"record_metrics": True, **options})
+        self._in_numpy = arrays == "numpy"
+
+    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+        found = super().reset(**kwargs)
+        return _as_numpy(found) if self._in_numpy else found
 
     def step(self, actions: Any) -> tuple[Any, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:  # pyright: ignore[reportIncompatibleMethodOverride]
         obs, reward, terminated, truncated, info = super().step(actions)
@@ -133,7 +134,8 @@ class RoboCASVectorEnv(ManiSkillVectorEnv):
         at_end = info.get("final_info", info)
         if self.record_metrics and "success" in at_end:  # ManiSkill has it with ``ignore_terminations`` only
             at_end["episode"]["success_at_end"] = at_end["success"].clone()
-        return obs, reward, terminated, truncated, info  # pyright: ignore[reportReturnType]
+        found: Any = obs, reward, terminated, truncated, info
+        return _as_numpy(found) if self._in_numpy else found
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> Any:
         """Return the result of a method, or an attribute: in processes a tuple of each env's, on a GPU the batch's."""
@@ -141,16 +143,6 @@ class RoboCASVectorEnv(ManiSkillVectorEnv):
             return self._env.call(name, *args, **kwargs)
         found = self._env.get_wrapper_attr(name)  # ManiSkill's own does not look behind the outermost wrapper
         return found(*args, **kwargs) if callable(found) else found
-
-
-class NumpyVectorEnv(gym.vector.VectorWrapper):
-    """A vector environment whose tensors are NumPy arrays."""
-
-    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        return _as_numpy(self.env.reset(seed=seed, options=options))
-
-    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        return _as_numpy(self.env.step(actions))
 
 
 def _as_numpy(nested: Any) -> Any:

@@ -10,11 +10,12 @@ import threading
 import time
 import weakref
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from multiprocessing import Pipe
 from typing import Any, Generic, TypeVar
 
 from robocas_ms3.core.exits import deferred_interrupts
-from robocas_ms3.core.worker_process import START_SECONDS, Limits, ProcessDied, Worker, WorkerProcess, start_error
+from robocas_ms3.core.worker_process import START_SECONDS, Limits, ProcessDied, Worker, WorkerProcess
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -25,18 +26,15 @@ _POLL_MILLISECONDS = 200  # between two checks of signals and limits
 class PinnedWorkers(Generic[Task, Result]):
     """Worker processes with a worker each, which get a task each; none is replaced.
 
-    Unlike in a `WorkerPool`, the calling thread talks to the processes itself: steps of environments are short.
+    Unlike in a `WorkerPool`, the calling thread talks to the processes itself: steps of environments are short. They
+    start with the first tasks.
 
     Args:
         make_workers: called in a process each; sent by cloudpickle.
         limits: of each task.
 
-    Raises:
-        WorkerStartError: a process died before its worker was made.
-        Exception: whatever making a worker raises.
-
     Attributes:
-        pids: of the processes.
+        pids: of the processes, once they have started.
     """
 
     def __init__(self, make_workers: Sequence[Callable[[], Worker[Task, Result]]], limits: Limits) -> None:
@@ -44,22 +42,14 @@ class PinnedWorkers(Generic[Task, Result]):
         self._processes = [WorkerProcess(make, limits, stop) for make in make_workers]
         self._seconds = limits.seconds
         self._unread: set[int] = set()  # numbers of processes that have not answered yet
-        ended = threading.Event()
-        self._end = weakref.finalize(self, _end, self._processes, self._unread, ended, os.getpid())
-        try:
-            self._launch(ended)
-            self._exchange((), START_SECONDS)
-            self._exchange([process.pickled_worker for process in self._processes], START_SECONDS)
-        except ProcessDied as crash:
-            self.close()
-            raise start_error(crash) from crash
-        except BaseException:
-            self.close()
-            raise
+        self.pids: list[int] = []
+        self._owner, self._ended = os.getpid(), threading.Event()
+        self._end = weakref.finalize(self, _end, self._processes, self._unread, self._ended, self._owner)
 
     @property
     def closed(self) -> bool:
-        return not self._end.alive
+        """Whether the processes were ended, or are those of the process that this one is a fork of."""
+        return not self._end.alive or self._owner != os.getpid()
 
     @property
     def busy(self) -> bool:
@@ -71,8 +61,16 @@ class PinnedWorkers(Generic[Task, Result]):
 
         Raises:
             ProcessDied: a process died, or exceeded a limit.
-            Exception: whatever the first task that failed raised.
+            Exception: whatever making a worker, or the first task that failed, raised.
         """
+        if not self.pids:
+            try:
+                self._launch()
+                self._exchange((), START_SECONDS)
+                self._exchange([process.pickled_worker for process in self._processes], START_SECONDS)
+            except BaseException:
+                self.close()
+                raise
         if self._unread:
             self._exchange((), self._seconds)
         return self._exchange(tasks, self._seconds)
@@ -81,23 +79,10 @@ class PinnedWorkers(Generic[Task, Result]):
         """End the processes; those that are busy are killed. A fork of this process ends none."""
         self._end()
 
-    def _launch(self, ended: threading.Event) -> None:
-        launched, failed = threading.Event(), []
-
-        def launch(processes: list[WorkerProcess[Task, Result]]) -> None:
-            signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # for the processes, until they ignore Ctrl-C
-            try:
-                for process in processes:
-                    process.launch()
-            except BaseException as error:  # noqa: BLE001  (raised below)
-                failed.append(error)
-            launched.set()
-            ended.wait()  # Linux kills a process when the thread that started it ends
-
-        threading.Thread(target=launch, args=(self._processes,), daemon=True).start()
-        launched.wait()
-        if failed:
-            raise failed[0]
+    def _launch(self) -> None:
+        launched = Future[None]()
+        threading.Thread(target=_launch, args=(self._processes, launched, self._ended), daemon=True).start()
+        launched.result()
         self.pids = [process.pid for process in self._processes]
         self._poll = select.poll()
         self._numbers = {process.connection.fileno(): i for i, process in enumerate(self._processes)}
@@ -132,6 +117,17 @@ class PinnedWorkers(Generic[Task, Result]):
         if errors:
             raise errors[min(errors)]
         return answers
+
+
+def _launch(processes: list[WorkerProcess[Any, Any]], launched: Future[None], ended: threading.Event) -> None:
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # for the processes, until they ignore Ctrl-C
+    try:
+        for process in processes:
+            process.launch()
+        launched.set_result(None)
+    except BaseException as error:  # noqa: BLE001  (raised by the future)
+        launched.set_exception(error)
+    ended.wait()  # Linux kills a process when the thread that started it ends
 
 
 def _end(processes: list[WorkerProcess[Any, Any]], busy: set[int], ended: threading.Event, owner: int) -> None:

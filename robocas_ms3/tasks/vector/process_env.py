@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import mmap
-import os
 import pickle
 import tempfile
 from collections.abc import Callable, Sequence
@@ -19,11 +17,11 @@ import torch
 from gymnasium.vector.utils import batch_space
 from mani_skill.utils.registration import REGISTERED_ENVS
 
-from robocas_ms3.core.errors import VectorEnvError, WorkerDied, WorkerStartError
+from robocas_ms3.core.errors import VectorEnvError, WorkerDied
 from robocas_ms3.core.worker_process import NO_LIMITS, Limits, ProcessDied
 from robocas_ms3.tasks.seeds import following_seeds
 from robocas_ms3.tasks.vector.pinned_workers import PinnedWorkers
-from robocas_ms3.tasks.vector.worker import EnvSettings, EnvWorker, Rows, join_rows, replace_rows
+from robocas_ms3.tasks.vector.worker import EnvSettings, EnvWorker, Rows, join_rows, split_rows
 
 
 class ProcessEnv(gym.Env):
@@ -70,7 +68,6 @@ class ProcessEnv(gym.Env):
             self.spec.max_episode_steps = kwargs["max_episode_steps"]
         self._seed_range: tuple[int, int] | None = kwargs.get("seeds")
         self._must_reset: set[int] = set()  # envs that an interrupted or failed call left in an unknown state
-        self._owner = os.getpid()
         self._parts: list[tuple[int, Rows]] = []  # what each worker returned last, with the number of its envs
         self.elapsed_steps = torch.zeros(num_envs, dtype=torch.int32)
         registered = REGISTERED_ENVS.get(self.spec.id)  # ours are there once they are loaded
@@ -81,24 +78,16 @@ class ProcessEnv(gym.Env):
         cuts = [num_envs * worker // workers for worker in range(workers + 1)]
         self._shares = [range(*cut) for cut in zip(cuts, cuts[1:], strict=False)]
         with tempfile.NamedTemporaryFile(prefix="robocas-envs-") as at_work:
-            at_work.write(bytes(num_envs))
-            at_work.flush()
-            self._at_work = mmap.mmap(at_work.fileno(), 0, prot=mmap.PROT_READ)
+            self._at_work = np.memmap(at_work, mode="w+", shape=num_envs)
             settings = EnvSettings(env_id, module, kwargs, tuple(wrappers), at_work.name)
             try:
                 pickled = cloudpickle.dumps(settings)
             except Exception as error:
                 raise VectorEnvError("arguments can't be sent to processes", where=env_id, found=error) from error
-            try:
-                self._workers = PinnedWorkers([partial(EnvWorker, pickled, share) for share in self._shares], limits)
-            except WorkerStartError as error:
-                where = name_envs(range(num_envs))
-                died = WorkerDied("its process died", where=where, found=error.found, fix=error.fix)
-                died.envs = tuple(range(num_envs))
-                raise died from error
+            self._workers = PinnedWorkers([partial(EnvWorker, pickled, share) for share in self._shares], limits)
+            for name in ("render_mode", "metadata", "single_observation_space", "single_action_space"):
+                setattr(self, name, self.call(name)[0])
         self.pids = self._workers.pids
-        for name in ("render_mode", "metadata", "single_observation_space", "single_action_space"):
-            setattr(self, name, self.call(name)[0])
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
@@ -116,20 +105,18 @@ class ProcessEnv(gym.Env):
         """
         options = dict(options or {})
         envs = self._numbers(options.pop("env_idx")) if "env_idx" in options else list(range(self.num_envs))
-        seeds = self._seeds(seed, len(envs))
-        # Of a single seed only the first env's was asked for. Without a seed each env looks for a possible one itself.
-        replaceable = [seed is not None and np.ndim(seed) == 0 and i > 0 for i in range(len(envs))]
-        asked = dict(zip(envs, zip(seeds, replaceable, strict=True), strict=True))
+        seeds = dict(zip(envs, self._seeds(seed, len(envs)), strict=True))
         if not self._parts and len(envs) < self.num_envs:
             raise VectorEnvError("no observation of the other environments yet", fix="Reset all of them first.")
         self._must_reset |= set(envs)
-        shares = [[env for env in share if env in asked] for share in self._shares]
-        answers = self._ask([("reset", {env: asked[env] for env in share}, options) for share in shares])
+        shares = [{env: seeds[env] for env in share if env in seeds} for share in self._shares]
+        new = [row for rows in self._ask([("reset", share, options) for share in shares]) for row in rows]
         self._must_reset -= set(envs)
-        if len(envs) == self.num_envs:
-            self._parts = [(len(share), rows) for share, rows in zip(shares, answers, strict=True)]
-        elif envs:
-            self._replace_rows(shares, answers)
+        if new:
+            paths = dict.fromkeys(path for row in new for path in row)  # what a reset does not return is dropped
+            rows = dict(enumerate(row for part in self._parts for row in split_rows(*part)))
+            rows |= zip(sorted(envs), new, strict=True)
+            self._parts = [(1, {path: rows[i][path] for path in paths if path in rows[i]}) for i in sorted(rows)]
         found = self._batch()
         return found.get("obs", {}), found["info"]
 
@@ -153,7 +140,7 @@ class ProcessEnv(gym.Env):
         self._must_reset = set(range(self.num_envs))
         answers = self._ask([("step", action[share.start : share.stop]) for share in self._shares])
         self._must_reset = set()
-        self._parts = [(len(share), rows) for share, rows in zip(self._shares, answers, strict=True)]
+        self._parts = [*zip(map(len, self._shares), answers, strict=True)]
         found = self._batch()
         return found.get("obs", {}), found["reward"], found["terminated"], found["truncated"], found["info"]
 
@@ -172,7 +159,7 @@ class ProcessEnv(gym.Env):
 
     def close(self) -> None:
         """Close all environments and end their processes; those that are at work are killed."""
-        if self._owner != os.getpid() or self._workers.closed:  # a fork has no say
+        if self._workers.closed:
             return
         try:
             if not self._workers.busy:
@@ -195,9 +182,10 @@ class ProcessEnv(gym.Env):
         try:
             answers = self._workers.ask(commands)
         except ProcessDied as crash:
-            share = self._shares[self.pids.index(crash.pid)]
+            share = self._shares[self._workers.pids.index(crash.pid)]
             envs = [env for env in share if self._at_work[env]] or list(share)
-            died = WorkerDied("its process died", where=name_envs(envs), found=crash.found, fix="Make them again.")
+            fix = "See its output above, and robocas doctor; make the environments again."
+            died = WorkerDied("its process died", where=name_envs(envs), found=crash.found, fix=fix)
             died.envs = tuple(envs)
             self._must_reset.clear()
             self._workers.close()
@@ -206,17 +194,6 @@ class ProcessEnv(gym.Env):
             if failed is not None:
                 failed.reraise()
         return [found for found, _ in answers]
-
-    def _replace_rows(self, shares: list[list[int]], answers: list[Rows]) -> None:
-        """Put new rows of some envs in the place of their last ones; what a reset does not return is dropped."""
-        paths = dict.fromkeys(path for rows in answers for path in rows)
-        for number, (share, rows) in enumerate(zip(shares, answers, strict=True)):
-            count, last = self._parts[number]
-            places = [env - self._shares[number].start for env in share]
-            part = {path: last.get(path, [None] * count) for path in paths}
-            for path in paths if share else ():
-                part[path] = replace_rows(part[path], places, rows.get(path, [None] * len(share)))
-            self._parts[number] = count, part
 
     def _batch(self) -> dict[str, Any]:
         """Return the last rows of all envs as nested dictionaries of tensors (N, ...), or of lists."""
@@ -240,15 +217,16 @@ class ProcessEnv(gym.Env):
             raise VectorEnvError("no such environments", where="env_idx", expected=expected, found=numbers)
         return numbers
 
-    def _seeds(self, seed: Any, count: int) -> list[int | None]:
-        if seed is None:
-            return [None] * count
+    def _seeds(self, seed: Any, count: int) -> list[tuple[int | None, bool]]:
+        """Return seeds, and whether another may be drawn where one has no layout: if only the first was asked for."""
+        if seed is None:  # each env looks for a possible one itself
+            return [(None, False)] * count
         if np.ndim(seed) == 0:
-            return [*following_seeds(int(seed), count, self._seed_range)]
-        seeds = [None if one is None else int(one) for one in seed]
-        if len(seeds) != count:
-            raise VectorEnvError("seeds don't fit", expected=f"{count}, or a single one", found=len(seeds))
-        return seeds
+            seeds = following_seeds(int(seed), count, self._seed_range)
+            return [(one, i > 0) for i, one in enumerate(seeds)]
+        if len(seed) != count:
+            raise VectorEnvError("seeds don't fit", expected=f"{count}, or a single one", found=len(seed))
+        return [(None if one is None else int(one), False) for one in seed]
 
 
 def name_envs(envs: Sequence[int]) -> str:

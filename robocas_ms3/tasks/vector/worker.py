@@ -5,11 +5,11 @@ from __future__ import annotations
 import faulthandler
 import importlib
 import logging
-import mmap
 import os
 import pickle
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 import gymnasium as gym
@@ -17,8 +17,8 @@ import numpy as np
 import torch
 
 from robocas_ms3.core.errors import LayoutError
-from robocas_ms3.core.exits import exit_error
 from robocas_ms3.core.remote_errors import RemoteError
+from robocas_ms3.core.worker_process import worker_error
 from robocas_ms3.core.workers import use_one_torch_thread
 from robocas_ms3.tasks.base import RoboCASEnv
 
@@ -55,8 +55,7 @@ class EnvWorker:
         os.environ.setdefault("LP_NUM_THREADS", "1")  # several processes render in software
         use_one_torch_thread()
         self._settings: EnvSettings = pickle.loads(settings)
-        with open(self._settings.at_work, "r+b") as file:
-            self._at_work = mmap.mmap(file.fileno(), 0)
+        self._at_work = np.memmap(self._settings.at_work, mode="r+")
         self._first, self._envs = envs.start, dict[int, gym.Env]()
         _, failed = self._each(envs, self._make)
         if failed:
@@ -77,10 +76,9 @@ class EnvWorker:
 
     def reset(
         self, seeds: dict[int, tuple[int | None, bool]], options: dict[str, Any]
-    ) -> tuple[Rows, RemoteError | None]:
+    ) -> tuple[list[Rows], RemoteError | None]:
         """Reset some environments: of each its seed or None, and whether another may replace it without a layout."""
-        rows, failed = self._each(seeds, lambda env: self._reset(env, *seeds[env], dict(options)))
-        return join_rows([(1, row) for row in rows]), failed
+        return self._each(seeds, lambda env: self._reset(env, *seeds[env], dict(options)))
 
     def call(self, name: str, args: tuple, kwargs: dict[str, Any]) -> tuple[list[bytes], RemoteError | None]:
         """Call a method of each environment, or read an attribute; the results are pickled."""
@@ -98,10 +96,8 @@ class EnvWorker:
             self._at_work[env] = 1
             try:
                 results.append(act(env))
-            except KeyboardInterrupt as error:  # of the code: the process ignores Ctrl-C
-                failed = failed or RemoteError.of(exit_error(error, f"env {env}"), f"env {env}")
             except BaseException as error:  # noqa: BLE001  (raised again in the main process)
-                failed = failed or RemoteError.of(error, f"env {env}")
+                failed = failed or worker_error(error, f"env {env}")
             self._at_work[env] = 0
         return results, failed
 
@@ -135,23 +131,18 @@ class EnvWorker:
         return as_rows({"obs": obs, "info": info})
 
 
-def as_rows(nested: dict[str, Any]) -> Rows:
+def as_rows(nested: dict[str, Any], path: tuple[str, ...] = ()) -> Rows:
     """Return nested dictionaries of one env as rows; arrays pickle in a thirtieth of the time of tensors."""
-    return {path: _as_row(leaf) for path, leaf in _leaves(nested, ())}
+    rows: Rows = {}
+    for name, value in nested.items():
+        rows |= as_rows(value, (*path, name)) if isinstance(value, dict) else {(*path, name): _as_row(value)}
+    return rows
 
 
 def _as_row(leaf: Any) -> Any:
     if isinstance(leaf, torch.Tensor):
         leaf = (leaf.float() if leaf.dtype == torch.bfloat16 else leaf).detach().cpu().numpy()
     return leaf if isinstance(leaf, np.ndarray) and leaf.shape[:1] == (1,) else [leaf]
-
-
-def _leaves(nested: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:
-    if isinstance(nested, dict):
-        for name, value in nested.items():
-            yield from _leaves(value, (*path, name))
-    else:
-        yield path, nested
 
 
 def join_rows(parts: Sequence[tuple[int, Rows]]) -> Rows:
@@ -162,28 +153,13 @@ def join_rows(parts: Sequence[tuple[int, Rows]]) -> Rows:
 
 def _join(pieces: Sequence[Any]) -> Any:
     """Join pieces into one array, which is a copy; where that is impossible, into a list of an entry per env."""
-    first = pieces[0]
-    if all(_are_alike(piece, first) for piece in pieces):
+    kinds = [isinstance(piece, np.ndarray) and (piece.dtype, piece.shape[1:]) for piece in pieces]
+    if kinds[0] and kinds.count(kinds[0]) == len(kinds):
         return np.concatenate(pieces)
-    return [row for piece in pieces for row in _split(piece)]
+    rows = (np.split(piece.copy(), len(piece)) if isinstance(piece, np.ndarray) else piece for piece in pieces)
+    return [*chain.from_iterable(rows)]
 
 
-def _are_alike(one: Any, other: Any) -> bool:
-    both = isinstance(one, np.ndarray) and isinstance(other, np.ndarray)
-    return both and one.dtype == other.dtype and one.shape[1:] == other.shape[1:]
-
-
-def _split(piece: Any) -> list[Any]:
-    """Return one entry per env of an array (E, ...), which becomes copies (1, ...), or of a list."""
-    return [piece[i : i + 1].copy() for i in range(len(piece))] if isinstance(piece, np.ndarray) else list(piece)
-
-
-def replace_rows(old: Any, envs: list[int], new: Any) -> Any:
-    """Return the piece of all envs of a worker with new entries of some; an array of the same kind is changed."""
-    if _are_alike(old, new):
-        old[envs] = new
-        return old
-    rows = _split(old)
-    for env, row in zip(envs, _split(new), strict=True):
-        rows[env] = row
-    return _join(rows) if all(isinstance(row, np.ndarray) for row in rows) else rows
+def split_rows(count: int, rows: Rows) -> list[Rows]:
+    """Return rows of several envs as rows of each env, which are views."""
+    return [{path: piece[i : i + 1] for path, piece in rows.items()} for i in range(count)]

@@ -9,7 +9,7 @@ from vector_envs import STATE_ONLY, with_gpu
 import robocas_ms3
 from robocas_ms3.core.errors import VectorEnvError
 from robocas_ms3.tasks.vector import RoboCASVectorEnv, choose_backend
-from robocas_ms3.tasks.vector.worker import join_rows, replace_rows
+from robocas_ms3.tasks.vector.worker import join_rows, split_rows
 
 
 @pytest.mark.parametrize(
@@ -116,22 +116,21 @@ def test_an_episode_that_ends_with_success_succeeded_at_its_end():
     assert info["final_info"]["episode"]["success_at_end"].tolist() == [True, False, False]
 
 
-def test_new_rows_of_some_envs_take_the_place_of_old_ones_of_any_kind():
-    old = np.zeros((3, 2), np.float32)
-    assert replace_rows(old, [1], np.ones((1, 2), np.float32)) is old and old.tolist() == [[0, 0], [1, 1], [0, 0]]
-    for other in (np.full((1, 2), 0.1), np.ones((1, 4), np.float32), ["text"]):  # another type, shape, no array
-        first, new, last = replace_rows(np.zeros((3, 2), np.float32), [1], other)
-        assert new is other[0] or np.array_equal(new, other)
-        assert first.dtype == last.dtype == np.float32
-    rows = replace_rows([None, None], [0, 1], np.ones((2, 4)))
-    assert isinstance(rows, np.ndarray) and rows.shape == (2, 4)
+@pytest.mark.parametrize("other", [np.full((1, 2), 0.1), np.ones((1, 4), np.float32), ["text"], None])
+def test_rows_of_some_envs_may_be_of_another_type_or_shape_no_arrays_or_missing(other):
+    zeros = np.zeros((2, 2), np.float32)
+    rows = join_rows([(2, {("x",): zeros}), (1, {} if other is None else {("x",): other})])
+    first, second, last = rows["x",]
+    assert np.array_equal(last, other) if isinstance(other, np.ndarray) else last == (other or [None])[0]
+    for row in (first, second):
+        assert row.dtype == np.float32 and row.tolist() == [[0, 0]] and not np.shares_memory(row, zeros)
 
 
-def test_rows_that_were_returned_do_not_change_in_a_later_reset():
-    last = np.zeros((2, 1), np.float32)
-    (returned,) = join_rows([(2, {("x",): last}), (1, {})]).values()  # the third env has none
-    replace_rows(last, [0], np.ones((1, 1), np.float32))
-    assert returned[0].tolist() == [[0]] and returned[2] is None
+def test_rows_of_one_kind_are_an_array():
+    ones = [{("x",): np.full((1, 2), i)} for i in range(3)]
+    joined = join_rows([(1, row) for row in ones])
+    assert joined["x",].tolist() == [[0, 0], [1, 1], [2, 2]]
+    assert [row["x",].tolist() for row in split_rows(3, joined)] == [[[0, 0]], [[1, 1]], [[2, 2]]]
 
 
 def test_calls_reach_through_wrappers():
