@@ -6,6 +6,9 @@ import shutil
 import numpy as np
 from synthetic import RayCaster, write_trajectory
 
+from robocas_ms3.datasets.manage.importing import import_robocas
+from robocas_ms3.datasets.manage.survey import survey
+from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.datasets.writing.settings import ConversionSettings
 
@@ -94,3 +97,17 @@ def as_upstream(root, pose_name="cam_pos_wrt"):
         if not path.name.startswith(pose_name):
             path.unlink()
     return root
+
+
+def problems(root, *outcomes):
+    """Episode, file and key in its folder, what was found, and what was done, of findings with these outcomes."""
+    return [
+        (f.episode, f.violation.where.removeprefix(f"episode_{f.episode or 0:07d}/"), f.violation.found, f.repair)
+        for f in survey(root).findings
+        if f.outcome in outcomes
+    ]
+
+
+def imported(root, out, **kwargs):
+    import_robocas(survey(root, **kwargs), out)
+    return Dataset(out)

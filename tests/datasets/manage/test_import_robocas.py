@@ -1,12 +1,10 @@
 """Datasets in the format of RoboCAS-v0: made of ours by taking away, renaming and retyping."""
 
 import json
-import shutil
 
-import cv2
 import numpy as np
 import pytest
-from managing import Bomb, arrays_of, as_upstream, change, edit, files_of, make, read
+from managing import Bomb, arrays_of, as_upstream, change, files_of, imported, problems, read
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.cli.main import run
@@ -14,7 +12,6 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.manage.importing import import_robocas
-from robocas_ms3.datasets.manage.repairs import eef_turn
 from robocas_ms3.datasets.manage.survey import survey
 from robocas_ms3.datasets.pictures.video import contact_sheet
 from robocas_ms3.datasets.sources.reader import Dataset
@@ -26,54 +23,6 @@ NPZ = "episode_info.npz"
 @pytest.fixture
 def upstream(dataset):
     return as_upstream(dataset)
-
-
-@pytest.fixture(scope="module")
-def four(tmp_path_factory):
-    """Four episodes as RoboCAS-v0 writes them, that nobody may change."""
-    return as_upstream(make(tmp_path_factory.mktemp("four"), "four", range(4)))
-
-
-@pytest.fixture
-def copy(four, tmp_path):
-    return shutil.copytree(four, tmp_path / "four")
-
-
-def problems(root, *outcomes):
-    """Episode, file and key in its folder, what was found, and what was done, of findings with these outcomes."""
-    return [
-        (f.episode, f.violation.where.removeprefix(f"episode_{f.episode or 0:07d}/"), f.violation.found, f.repair)
-        for f in survey(root).findings
-        if f.outcome in outcomes
-    ]
-
-
-def imported(root, out, **kwargs):
-    import_robocas(survey(root, **kwargs), out)
-    return Dataset(out)
-
-
-def test_what_all_episodes_lack_is_one_finding(copy):
-    assert [(f.episode, f.violation.file, f.outcome) for f in survey(copy).findings] == [
-        (None, "conversion.json", "mended"),
-        (None, NPZ, "mended"),
-        (None, NPZ, "mended"),
-        *(
-            (None, f"{camera}/cam_pose_wrt_{parent}.npy", "mended")
-            for camera, parent in (("base_camera", "arm_base"), ("gripper_camera", "ee"), ("static_camera", "world"))
-        ),
-        (None, "scene.json", "noted"),
-    ]
-    poses = copy / "episode_0000002" / "static_camera"
-    shutil.copy(poses / "cam_pos_wrt_world.npy", poses / "cam_pose_wrt_world.npy")
-    found = [f for f in survey(copy).findings if "static_camera" in f.violation.file]
-    assert [(f.episode, f.violation.file) for f in found] == [
-        (n, f"episode_000000{n}/static_camera/cam_pose_wrt_world.npy") for n in (0, 1, 3)
-    ]
-
-
-def test_a_whole_dataset_of_ours_has_no_findings(made):
-    assert survey(made).findings == []
 
 
 def test_the_output_is_the_input(four, capsys):
@@ -225,30 +174,6 @@ def test_a_turned_eef_frame_is_turned_back(upstream, made, tmp_path):
         np.testing.assert_allclose(*poses, atol=1e-9)
 
 
-def test_a_recorded_episode_is_not_turned_wherever_its_camera_is(dataset):
-    def turned():
-        return [f.episode for f in survey(dataset).findings if "ee_orn" in f.violation.key]
-
-    folder = dataset / schema.episode_folder(1)
-    pose = np.load(folder / "gripper_camera" / "cam_pos_wrt_ee.npy")
-    pose[:2, 3] = 0, 0.05
-    np.save(folder / "gripper_camera" / "cam_pos_wrt_ee.npy", pose)
-    assert turned() == []
-    edit(folder / "scene.json", lambda scene: scene.update(env_info=None))  # as of a dataset made elsewhere
-    assert turned() == [1]
-
-
-def test_the_turn_by_hand():
-    def camera_at(x, y):
-        pose = np.eye(4)
-        pose[:2, 3] = x, y
-        return pose
-
-    assert [eef_turn(camera_at(x, y)) for x, y in ((0.05, 0), (0, 0.05), (-0.05, 0), (0, -0.05))] == [0, 90, 180, -90]
-    assert eef_turn(camera_at(0, 0.2)) == 0  # not the known camera
-    assert eef_turn(camera_at(0.04, 0.04)) == 0
-
-
 @pytest.mark.parametrize(
     ("new", "key", "found"),
     [
@@ -284,86 +209,6 @@ def test_arrays_that_can_not_be_made_are_told(upstream, tmp_path):
     assert new.episode(1).scene["source"]["missing"] == missing
     assert (1, f"{NPZ}, base_pos", "no such key", "it can't be made") in problems(upstream, "noted")
     assert {violation.key for violation in validate(new.root).violations} == set(missing)
-
-
-def test_images_that_are_missing_damaged_or_of_another_kind(copy, tmp_path):
-    rgb = copy / "episode_0000001" / "base_camera" / "rgb"
-    (rgb / "0002.png").unlink()
-    (rgb / "0003.png").write_bytes((rgb / "0003.png").read_bytes()[:99])
-    shutil.rmtree(copy / "episode_0000002" / "static_camera" / "depth")
-    depth = copy / "episode_0000003" / "gripper_camera" / "depth"
-    shutil.copy(depth / "0006.png", depth / "0007.png")
-    for path in (copy / "episode_0000000").glob("*/depth/*.png"):
-        cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(np.uint8))
-    assert problems(copy, "left out") == [
-        *((0, f"{name}_camera/depth/0000.png", "64 x 48, 1 x 8 bit", "and 6 others") for name in NAMES),
-        (1, "base_camera/rgb/0002.png", "no file", "and 1 other"),
-        (2, "static_camera/depth/0000.png", "no file", "and 6 others"),
-    ]
-    assert (3, "gripper_camera/depth/0007.png", "a file beyond them", "") in problems(copy, "noted")
-    new = imported(copy, tmp_path / "out")
-    assert new.numbers == [3]
-    assert validate(new.root).violations == []
-
-
-NAMES = ("base", "gripper", "static")
-
-
-def test_images_of_another_size_and_episodes_twice(copy, tmp_path):
-    shutil.copytree(copy / "episode_0000001", copy / "episode_0000009")
-    shutil.copytree(copy / "episode_0000002", copy / "episode_0000008")
-    for path in (copy / "episode_0000001").glob("*/*/*.png"):
-        cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[:40])
-    size = "base_camera, gripper_camera, static_camera, 64 x 40 png, with depth"
-    assert problems(copy, "left out") == [
-        (1, "episode_0000001", size, ""),
-        (8, "episode_0000008", "the arrays of episode 2", ""),
-    ]
-    assert imported(copy, tmp_path / "out").numbers == [0, 2, 3, 9]
-
-
-def test_cameras(copy, tmp_path):
-    (copy / "episode_0000000" / "base_camera" / "intrinsic.npy").unlink()
-    (copy / "episode_0000001" / "base_camera" / "cam_pos_wrt_arm_base.npy").unlink()
-    np.save(copy / "episode_0000002" / "static_camera" / "cam_pos_wrt_world.npy", np.ones((4, 4)))
-    found = problems(copy, "left out")
-    assert [(episode, file) for episode, file, *_ in found] == [
-        (0, "base_camera"), (1, "base_camera"), (2, "static_camera")
-    ]  # fmt: skip
-    assert [text for *_, text, _ in found[1:]] == ["no pose of this camera", "another matrix"]
-
-
-def test_rgb_alone_and_fewer_cameras(copy, tmp_path):
-    for path in [*copy.glob("*/static_camera"), *copy.glob("*/*/depth")]:
-        shutil.rmtree(path, ignore_errors=True)
-    new = imported(copy, tmp_path / "out")
-    assert (new.settings["cameras"], new.settings["depth"]) == (["base_camera", "gripper_camera"], False)
-    assert validate(new.root).violations == []
-
-
-def test_the_overview(copy, tmp_path):
-    def spoil(info):
-        info.update(train_eps=[0, 7, 0], val_eps=[2])
-        info["ep_length"]["0"] = 9
-        info["language_goal"]["2"] = "dance"
-
-    edit(copy / "data_info.json", spoil)
-    found = [(episode, text) for episode, _, text, _ in problems(copy, "mended") if episode is not None]
-    assert found == [
-        (0, "an episode twice"),
-        (0, "7"),
-        (1, "an episode that is not listed"),
-        (2, "'grasp the cube 2 on the table and move it to the basket'"),
-        (3, "an episode that is not listed"),
-        (7, "an episode without a folder"),
-    ]
-    new = imported(copy, tmp_path / "out")
-    assert 2 in new.info["val_eps"]
-    assert 0 in new.info["train_eps"]
-    assert validate(new.root).violations == []
-    (copy / "data_info.json").write_text("{")
-    assert problems(copy, "mended")[0][:2] == (None, "data_info.json")
-    assert validate(imported(copy, tmp_path / "again").root).violations == []
 
 
 def embed(texts):
