@@ -160,8 +160,8 @@ def check_equals_singles(batch: gym.Env, singles: Sequence[gym.Env], mode: str, 
     _close(found.privileged, expected.privileged, 10 * TOLERANCE, "privileged observations")  # positions over extents
 
 
-def check_partial_reset(batch: gym.Env, some: Sequence[int], mode: str) -> None:
-    """Check that a reset of some envs of a batch leaves the others bit for bit unchanged, then and in later steps.
+def check_partial_reset(batch: gym.Env, some: Sequence[int], mode: str, *, exact: bool) -> None:
+    """Check that a reset of some envs of a batch leaves the others unchanged; if exact, to the bit and in later steps.
 
     Raises:
         AssertionError: another env has changed.
@@ -178,20 +178,20 @@ def check_partial_reset(batch: gym.Env, some: Sequence[int], mode: str) -> None:
     before, targets = base.bodies.read().clone(), base.agent.controller.targets()
     batch.reset(options={"env_idx": torch.tensor(some, device=base.device)})
     after = base.bodies.read()
-    assert torch.equal(after[others], before[others]), "the state of another env has changed"
+    _close(after[others], before[others], 0 if exact else TOLERANCE, "the state of another env")
     assert not torch.equal(after[some], before[some]), "the envs are where they were"
     for name, values in base.agent.controller.targets().items():
         for key, value in values.items():
             assert torch.equal(value[others], targets[name][key][others]), f"{key} of another env has changed"
     assert base.elapsed_steps.tolist() == [0 if env in some else 5 for env in range(count)]
     later = play(batch, actions[5:])
-    for f in fields(Trace):
+    for f in fields(Trace) if exact else ():
         found, expected = getattr(later, f.name), getattr(undisturbed, f.name)[5:]
         assert torch.equal(found[:, others], expected[:, others]), f"{f.name} of another env differs in later steps"
 
 
 def check_state_round_trip(batch: gym.Env, some: Sequence[int], mode: str) -> None:
-    """Check that a state that is set again is the one that was read, in all envs or in some of them alone.
+    """Check that a state that is set again is the one that was read, in all envs or in some, and leads to the same.
 
     Raises:
         AssertionError: a state differs.
@@ -201,7 +201,7 @@ def check_state_round_trip(batch: gym.Env, some: Sequence[int], mode: str) -> No
     actions = smooth_actions(batch, mode, 10)
     play(batch, actions[:5])
     stored, flat = base.get_state_dict(), base.get_state().clone()
-    play(batch, actions[5:])
+    expected = play(batch, actions[5:])
     moved = base.get_state().clone()
     assert not torch.equal(moved, flat)
     index = torch.tensor(some, device=base.device)
@@ -214,6 +214,7 @@ def check_state_round_trip(batch: gym.Env, some: Sequence[int], mode: str) -> No
     for name, values in base.agent.controller.targets().items():
         for key, value in values.items():
             _close(value, stored["controller"][name][key], 1e-6, f"{name}.{key}")
+    _close(play(batch, actions[5:]).qpos, expected.qpos, 1e-4, "qpos after the same actions")
 
 
 def _rows(nested: Any, envs: torch.Tensor) -> Any:
