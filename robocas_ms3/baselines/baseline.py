@@ -105,9 +105,7 @@ class Samples(Protocol):
 
     def __len__(self) -> int: ...
 
-    def __getitems__(self, indices: list[int]) -> Batch:
-        """Return a batch."""
-        ...
+    def __getitems__(self, indices: list[int]) -> Batch: ...
 
 
 @dataclass(frozen=True)

@@ -132,7 +132,6 @@ class RetrievalOrder:
         self._held[some], self._found = False, None
 
     def update(self, moment: Moment) -> None:
-        """Record which objects have moved in a control step."""
         self._held |= moment.held
         now = moment.disturbed & (self._moved_at == 0) & ~self._held[:, None]
         if known_all_false(now):

@@ -65,7 +65,6 @@ class Retrieval:
 
 
 def score_of(moved: Sequence[Move], left: int, held_at: int | None) -> float | None:
-    """Return `Retrieval.score`."""
     if held_at is None:
         return None
     right, total = sum(move.needed and move.in_order for move in moved), len(moved) + left

@@ -107,7 +107,6 @@ def paired_interval(only_a: int, only_b: int, n: int) -> tuple[float, float]:
     middle = (only_a - only_b) / n
 
     def excess(d: float) -> float:
-        """Negative inside the interval."""
         if d == middle:
             return -1.0  # it is 0 there if the variance is, which is no limit of the interval
         # q solves 2 n q^2 + linear q - only_b d (1 - d) = 0

@@ -2,19 +2,15 @@
 
 import os
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
-import yaml
 from made_up_baseline import MADE_UP
 from made_up_dataset import made_up_dataset
 from made_up_runs import train
+from short_protocols import shorten
 
 from robocas_ms3.baselines.registry import BASELINES
-from robocas_ms3.cli.main import run
 from robocas_ms3.cli.train import COMMANDS, Other, command
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture
@@ -32,13 +28,7 @@ def made_up(monkeypatch):
 @pytest.fixture(scope="session")
 def short(tmp_path_factory):
     """A protocol: three episodes of paper-v1, 60 steps each."""
-    made = tmp_path_factory.mktemp("protocol")
-    plan = yaml.safe_load((ROOT / "scripts" / "protocols" / "paper-v1.yaml").read_text())
-    plan["rules"] |= {"name": "short", "max_steps": 60}
-    plan["parts"] = [{"config": "pick_upstream_eval", "count": 3, "first_seed": 130000}]
-    (made / "plan.yaml").write_text(yaml.safe_dump(plan))
-    assert run(["eval", "freeze", str(made / "plan.yaml"), "--out", str(made / "short")]) == 0
-    return str(made / "short")
+    return str(shorten("paper-v1", tmp_path_factory.mktemp("protocol") / "short", 60, episodes=3))
 
 
 @pytest.fixture

@@ -1,13 +1,12 @@
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import pytest
 from counting_env import CountingEnv
+from short_protocols import shorten
 
 from robocas_ms3.evaluation import session
-from robocas_ms3.evaluation.protocol import load_protocol
 
 
 @pytest.fixture
@@ -27,8 +26,4 @@ def made(monkeypatch) -> list[CountingEnv]:
 @pytest.fixture(scope="session")
 def short(tmp_path_factory) -> Path:
     """The protocol smoke with 20 steps per episode."""
-    folder = tmp_path_factory.mktemp("protocols") / "short"
-    shutil.copytree(load_protocol("smoke").folder, folder)
-    rules = folder / "protocol.yaml"
-    rules.write_text(rules.read_text().replace("max_steps: null", "max_steps: 20"))
-    return folder
+    return shorten("smoke", tmp_path_factory.mktemp("protocols") / "short", 20)

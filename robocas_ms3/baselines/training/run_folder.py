@@ -73,7 +73,6 @@ class RunFolder:
         return broadcast_object_list([self._log is not None and self._log.has(step, split)])[0]
 
     def log(self, step: int, split: str, metrics: Mapping[str, float], *, epoch: float, learning_rate: float) -> None:
-        """Log metrics."""
         if self._log is None:
             return
         self._output.check_exists()

@@ -54,13 +54,9 @@ class PoseTrack:
 
     @classmethod
     def of(cls, robot: RobotSpec, robot_states: Array, gripper: Array, stride: int) -> PoseTrack:
-        """Return the track of a recording.
+        """Return the track of a recording, one pose per ``stride`` control steps.
 
-        Args:
-            robot: that was recorded.
-            robot_states: (S + 1, 37) after the reset and after each control step.
-            gripper: (S,) commands in [-1, 1].
-            stride: control steps per policy step.
+        ``robot_states`` (S + 1, 37) after the reset and each control step; ``gripper`` (S,) commands in [-1, 1].
         """
         if not len(gripper):
             return cls(np.zeros((0, 4, 4)), np.zeros(0, dtype=bool))

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from short_protocols import shorten
 
 from robocas_ms3.core.errors import EvaluationError, RobocasError
 from robocas_ms3.core.locks import locked_folder
@@ -159,10 +159,7 @@ def test_real_episodes_have_the_outcomes_and_images_of_robocas_eval(needs_render
             self.seen.append(observations.images["gripper_camera"][:, 0, 0].tolist())
             return np.tile(down, (len(observations.envs), 1))
 
-    shutil.copytree(SMOKE.folder, tmp_path / "short")
-    rules = tmp_path / "short" / "protocol.yaml"
-    rules.write_text(rules.read_text().replace("max_steps: null", "max_steps: 5"))
-    protocol, policy = str(tmp_path / "short"), Down()
+    protocol, policy = str(shorten("smoke", tmp_path / "short", 5)), Down()
     settings = EvaluationSettings(("pick",), "down", protocol, tmp_path / "ours", workers=1, backend="processes")
     list(EvaluationSession(policy, settings).run())
     env = ProtocolVectorEnv(spec, replace(settings, out=tmp_path / "theirs"))

@@ -71,12 +71,12 @@ def test_requests_of_all_envs_are_in_flight_together_or_in_their_order(in_turn):
         arrived.wait(20)  # nobody is answered before all have asked
         assert turn.acquire(blocking=not in_turn)
         asked.append(env)
-        time.sleep(0.1 if in_turn else 0.5)
+        time.sleep(0.1 if in_turn else 0.3)
         turn.release()
         return env
 
     with with_numbers(answer) as url:
-        remote = started(f"{url}?{'max_in_flight=1' if in_turn else 'timeout_s=1.5'}")
+        remote = started(f"{url}?{'max_in_flight=1' if in_turn else 'timeout_s=1.2'}")
         for order in ([0, 1, 2, 3, 4], [3, 0, 4, 2, 1]):  # answers in any order belong to their envs
             assert remote.act(some_observations(*order))[:, 0, 0].tolist() == order
         remote.close()
@@ -107,7 +107,7 @@ def test_connections_are_opened_before_the_server_computes():
     server.start()
     try:
         remote = started(f"ws://127.0.0.1:{ours.recv()}?connect_s=0.6")
-        assert remote.act(some_observations(*range(ENVS)))[:, 0, 0].tolist() == [*range(ENVS)]
+        assert remote.act(some_observations(0, 1, 2))[:, 0, 0].tolist() == [0, 1, 2]
         remote.close()
     finally:
         server.terminate()
@@ -197,7 +197,7 @@ def test_a_dead_network_is_noticed_by_both_ends(fast_pings):
 
 
 def test_a_request_whose_client_is_gone_is_skipped():
-    policy = Slow(1.5)
+    policy = Slow(1.0)
 
     def ask(url):
         client = connect(url, proxy=None, compression=None)

@@ -1,17 +1,16 @@
 """Failed episodes are played again and filmed."""
 
-import shutil
-
 import imageio.v2 as imageio
 import numpy as np
 import pytest
 from made_up_results import of_protocol, outcome, write
+from short_protocols import shorten
 
 from robocas_ms3.cli.eval import run
 from robocas_ms3.cli.eval_results import Videos, videos
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.policies.plain import RandomPolicy
-from robocas_ms3.evaluation.protocol import EPISODES, RULES, load_protocol
+from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.report.videos import SIZE, failed_of_each_kind, film
 from robocas_ms3.evaluation.settings import EvaluationSettings
 
@@ -52,10 +51,7 @@ def test_a_result_chooses_no_code(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_a_failure_is_filmed_and_linked(tmp_path, needs_renderer, capsys):
-    folder = shutil.copytree(load_protocol("paper-v1").folder, tmp_path / "tiny")
-    (folder / RULES).write_text((folder / RULES).read_text().replace("max_steps: 150", "max_steps: 2"))
-    (folder / EPISODES).write_text((folder / EPISODES).read_text().splitlines()[0])
-    out, protocol = tmp_path / "result", str(folder)
+    out, protocol = tmp_path / "result", str(shorten("paper-v1", tmp_path / "tiny", 2, episodes=1))
     assert run(EvaluationSettings((), "random", protocol, out, backend="processes", weld=True)) == 0
     assert videos(Videos(out, protocol=protocol)) == 0
     said = capsys.readouterr().out
