@@ -1,4 +1,4 @@
-"""Forward kinematics straight from the URDF's XML, so that tests do not trust the simulator about itself."""
+"""Motions between poses, and poses straight from the URDF's XML, so that the simulator is not trusted about itself."""
 
 from __future__ import annotations
 
@@ -6,7 +6,18 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import numpy as np
+from mani_skill.utils.structs import Pose
 from scipy.spatial.transform import Rotation
+
+
+def matrix(pose: Pose) -> np.ndarray:
+    return pose.sp.to_transformation_matrix()
+
+
+def moved(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Translation and rotation vector of a motion, in the frame at its start."""
+    relative = np.linalg.inv(start) @ end
+    return relative[:3, 3], Rotation.from_matrix(relative[:3, :3]).as_rotvec()
 
 
 def numbers(text: str) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from mani_skill.agents.controllers import PDJointPosController
-from motions import matrix, moved
+from robot_checks import matrix, moved
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.robots.description import MOBILE_PANDA

@@ -9,6 +9,7 @@ from robocas_ms3.assets.annotations import GRIPPER_BOXES
 from robocas_ms3.core.errors import ExtensionError, RobocasError
 from robocas_ms3.robots.cameras import CameraSpec
 from robocas_ms3.robots.description import MOBILE_PANDA
+from robocas_ms3.robots.quantities import Quantity
 from robocas_ms3.robots.table import DEFAULT, PANDA, ROBOTS, find_robot
 
 
@@ -53,3 +54,8 @@ def test_a_row_by_another_name_is_refused(monkeypatch):
 def test_a_camera_whose_name_datasets_would_not_know(name):
     with pytest.raises(ExtensionError):
         CameraSpec(name)
+
+
+def test_an_optional_quantity_has_no_lerobot_feature():
+    with pytest.raises(ValueError):
+        Quantity("gap", "float32", ("T", 1), "m", "between the pads", feature="observation.gap", optional=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from motions import matrix, moved
+from robot_checks import matrix, moved
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.robots.ee_deltas import ee_delta_target, to_ee_delta_action
@@ -93,23 +93,17 @@ def velocities(agent) -> np.ndarray:
     return agent.robot.drive_velocities[0].numpy()
 
 
-def test_ee_deltas_tell_the_drives_their_velocity_and_other_modes_take_it_back(make_env):
+def test_ee_deltas_tell_the_drives_their_velocity_and_resets_and_other_modes_take_it_back(make_env):
     env, agent = make_env("pd_ee_delta_pose", control_freq=5)
     assert agent.controller.sets_target_qvel  # else a GPU would not hear of it
     env.step(np.array([0, 0, -0.3, 0, 0, 0, 1], np.float32))
     assert np.abs(velocities(agent)).max() > 0.05
     env.step(np.array([0, 0, 0, 0, 0, 0, 1], np.float32))
     assert np.abs(velocities(agent)).max() < 0.02
-    env.step(np.array([0, 0, -0.3, 0, 0, 0, 1], np.float32))
-    agent.set_control_mode("pd_joint_pos")
-    assert not velocities(agent).any()
-
-
-def test_after_a_reset_the_drives_know_of_no_velocity(make_env):
-    env, agent = make_env("pd_ee_delta_pose", control_freq=5)
-    env.step(np.array([0, 0, -0.3, 0, 0, 0, 1], np.float32))
-    agent.reset(agent.robot.qpos)
-    assert not velocities(agent).any()
+    for take_back in (lambda: agent.reset(agent.robot.qpos), lambda: agent.set_control_mode("pd_joint_pos")):
+        env.step(np.array([0, 0, -0.3, 0, 0, 0, 1], np.float32))
+        take_back()
+        assert not velocities(agent).any()
 
 
 def test_ee_deltas_start_where_the_arm_is_after_its_state_was_set(make_env):

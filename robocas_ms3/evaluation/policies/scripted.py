@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.recordings.motion import sample_stride
+from robocas_ms3.demos.recordings.reading import TrajectoryFile
 from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.evaluation.policies.replay import JointTrack, PoseTrack, TrackPolicy
 from robocas_ms3.evaluation.policy import EpisodeSpec, PolicySpec
@@ -51,10 +51,9 @@ class ScriptedPolicy(TrackPolicy):
         generator = self._generator_of(start)
         with tempfile.TemporaryDirectory() as folder:
             if generator.generate(start.seed, Path(folder), "episode").success:
-                with h5py.File(Path(folder) / "episode.h5") as file:
-                    group: Any = file["traj_0"]
-                    actions = np.array(group["actions"])[:, :8]
-                    states = np.array(group["env_states"]["articulations"][start.robot])
+                with TrajectoryFile(Path(folder) / "episode.h5") as file:
+                    recording = file.recording(0, bodies=False)
+                actions, states = recording.actions[:, :8], recording.states["articulations"][start.robot]
         if self.spec.convention == "joint_positions":
             return JointTrack(actions)
         track = PoseTrack.of(find_robot(start.robot), states, actions[:, 7], sample_stride(_FREQ, 5))
