@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.words import one_line
+from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 from robocas_ms3.demos.recordings.motion import stored_actions
 
 ACTION_NAMES = ("x", "y", "z", "roll", "pitch", "yaw", "gripper")
@@ -26,6 +28,22 @@ def episode_actions(arrays: Mapping[str, NDArray]) -> NDArray[np.float32]:
     "xyz", the convention of ``action_space``); the gripper command is ``gripper_status[t + 1]``.
     """
     return stored_actions(arrays["rel_pos"], arrays["rel_orn"], arrays["gripper_status"])
+
+
+def checked_actions(arrays: Mapping[str, NDArray], where: str) -> NDArray[np.float32]:
+    """Return `episode_actions` of arrays that may be damaged, or raise DatasetError."""
+    check_finite(arrays, where)
+    try:
+        return episode_actions(arrays)
+    except ValueError as error:
+        what, found = "these arrays make no actions", one_line(error)
+        raise DatasetError(what, where=where, found=found, fix=SEE_VALIDATE) from error
+
+
+def check_finite(arrays: Mapping[str, NDArray], where: str) -> None:
+    for key, array in arrays.items():
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise DatasetError("not a number", where=f"{where}, {key}", fix=SEE_VALIDATE)
 
 
 def action_space(rel_pos: Sequence[NDArray], rel_orn: Sequence[NDArray]) -> dict[str, list[list[float]]]:

@@ -10,6 +10,7 @@ from robocas_ms3.core.documents import DAMAGED
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.words import error_line
 from robocas_ms3.datasets.checks.scene import valid_values
+from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 
 T = TypeVar("T")
 _WRONG = (*DAMAGED, ArithmeticError, AttributeError, AssertionError, LookupError, RecursionError, TypeError)
@@ -22,8 +23,8 @@ def readable(where: object) -> Iterator[None]:
     try:
         yield
     except _WRONG as error:
-        fix = "robocas validate says what is wrong."
-        raise DatasetError("damaged, can't be shown", where=where, found=error_line(error), fix=fix) from error
+        what, found = "damaged, can't be shown", error_line(error)
+        raise DatasetError(what, where=where, found=found, fix=SEE_VALIDATE) from error
 
 
 def attempt(read: Callable[[], T], otherwise: T) -> tuple[T, str]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.pictures.video import colour_depth
+from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 
 THUMBNAIL = (96, 72)
 """Width and height: twice what the table shows, for dense screens."""
@@ -49,7 +50,7 @@ def thumbnail(image: EncodedImage) -> EncodedImage:
 def decode(image: EncodedImage, flags: int = cv2.IMREAD_COLOR) -> NDArray[np.uint8]:
     pixels = cv2.imdecode(np.frombuffer(image.data, np.uint8), flags) if image.data else None
     if pixels is None:
-        raise DatasetError("this image is damaged", fix="robocas validate lists all that is wrong.")
+        raise DatasetError("this image is damaged", fix=SEE_VALIDATE)
     return np.asarray(pixels[..., ::-1], np.uint8)
 
 

@@ -13,8 +13,7 @@ from robocas_ms3.baselines.rt1.config import RT1Config
 from robocas_ms3.datasets.actions import ActionScale
 from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.datasets.training.options import SampleOptions
-from robocas_ms3.datasets.training.sample_arrays import read_episode
-from robocas_ms3.datasets.training.torch_dataset import RoboCASDataset
+from robocas_ms3.datasets.training.torch_dataset import RoboCASDataset, read_episode
 
 
 class RT1Samples:
@@ -50,7 +49,7 @@ class RT1Samples:
         self.episodes = len(self._data.episodes)
         scale = ActionScale.of(source.action_space(), folder)
         for done, number in enumerate(self._data.episodes, start=1):  # damage is found before hours of training
-            read_episode(source, number, (), embedding=True, subgoals=False)
+            read_episode(source, number, self._data.options)
             on_read(done, self.episodes)
         first = source.episode(self._data.episodes[0])
         self.facts: dict[str, Any] = {

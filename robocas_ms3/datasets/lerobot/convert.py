@@ -35,7 +35,7 @@ from robocas_ms3.datasets.writing.inputs import ConversionInput, open_input
 from robocas_ms3.datasets.writing.plan import LEFT_OUT, with_versions
 from robocas_ms3.datasets.writing.settings import Conversion, ConversionSettings, WrittenEpisode
 from robocas_ms3.datasets.writing.workers import WriteJob, write_episodes
-from robocas_ms3.demos.recordings.entries import one_seed, versions
+from robocas_ms3.demos.recordings.entries import versions
 
 FILE_LIMITS = FileLimits()
 _PARTS, _JOINED = ".parts", ".joined"  # the finished episodes; the dataset that is being made of them
@@ -107,9 +107,7 @@ def _plan(given: ConversionInput, codec: str, variant: Variant) -> dict[str, Any
     # a dataset keeps its split, a trajectory has none
     before = [given.source.split(side) if given.sizes else [] for side in ("train", "val")]
     before_train, before_val = ([place[n] for n in side if n in place] for side in before)
-    seeds = [one_seed(entry["seed"]) for entry in entries]
-    known = {i: i if seed is None else seed for i, seed in enumerate(seeds)}
-    train, val = split_by_seed(known, (before_train, before_val))
+    train, val = split_by_seed({i: entry["seed"] for i, entry in enumerate(entries)}, (before_train, before_val))
     plan = {
         "format": "lerobot",
         "made_with": versions(),

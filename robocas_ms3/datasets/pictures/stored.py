@@ -15,6 +15,7 @@ from robocas_ms3.core.words import one_line
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.headers import LARGEST, read_picture_bytes
 from robocas_ms3.datasets.pictures.png import encode_png
+from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 from robocas_ms3.robots.cameras import STANDARD_NAMES
 
 _QUALITY = {
@@ -82,11 +83,10 @@ def read_picture(path: Path) -> NDArray:
         data = np.frombuffer(read_picture_bytes(path), np.uint8)
     except (OSError, ValueError) as error:
         found = getattr(error, "strerror", None) or error
-        fix = "robocas validate lists all that is wrong."
-        raise DatasetError("can't read this picture", where=path, found=found, fix=fix) from error
+        raise DatasetError("can't read this picture", where=path, found=found, fix=SEE_VALIDATE) from error
     picture = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     if picture is None:
-        raise DatasetError("this picture is damaged", where=path, fix="robocas validate lists all that is wrong.")
+        raise DatasetError("this picture is damaged", where=path, fix=SEE_VALIDATE)
     return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB) if picture.ndim == 3 else picture
 
 

@@ -21,7 +21,6 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.actions import action_space
 from robocas_ms3.datasets.pictures.stored import Box, Pictures
 from robocas_ms3.datasets.sources.split import split_by_seed
-from robocas_ms3.demos.recordings.entries import one_seed
 from robocas_ms3.demos.recordings.subgoals import SubGoal, subgoal_runs
 from robocas_ms3.robots.cameras import Parent, standard_parent
 
@@ -192,9 +191,7 @@ class EpisodeSource(ABC):
         """Return the numbers of the episodes of one side; here by seed, or by number where there is none."""
         if side == "all":
             return self.numbers
-        seeds = {number: one_seed(self.entry(number).get("seed")) for number in self.numbers}
-        sides = split_by_seed({number: number if seed is None else seed for number, seed in seeds.items()})
-        return sides[side == "val"]
+        return split_by_seed({number: self.entry(number).get("seed") for number in self.numbers})[side == "val"]
 
     def entry(self, number: int) -> Mapping[str, Any]:
         """Return the recording of an episode, see ``provenance.recording_entry``; empty where it is not known."""

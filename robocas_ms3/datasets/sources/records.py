@@ -20,6 +20,7 @@ from pydantic import (
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.strict import refusal
 from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 from robocas_ms3.demos.recordings.entries import one_seed
 from robocas_ms3.demos.recordings.subgoals import SubGoal
 from robocas_ms3.robots.cameras import CAMERA_NAME
@@ -210,5 +211,5 @@ def read_scene(scene: Mapping[str, Any], where: object) -> SceneRecord:
     try:
         return SceneRecord.model_validate(with_unknown(scene))
     except ValidationError as problem:
-        about, fix = "this description of a scene is damaged", "robocas validate says what is wrong."
-        raise refusal(problem, SceneRecord, DatasetError, where=where, about=about, fix=fix) from problem
+        about = "this description of a scene is damaged"
+        raise refusal(problem, SceneRecord, DatasetError, where=where, about=about, fix=SEE_VALIDATE) from problem

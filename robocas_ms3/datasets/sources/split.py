@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Mapping
+from typing import Any
+
+from robocas_ms3.demos.recordings.entries import one_seed
 
 SPLIT_RULE = (
     "seeds in the order of sha256(seed), the first tenth validates; episodes of one seed stay together; what is"
@@ -12,13 +15,17 @@ SPLIT_RULE = (
 
 
 def split_by_seed(
-    seeds: Mapping[int, int], before: tuple[Iterable[int], Iterable[int]] = ((), ())
+    seed_of: Mapping[int, Any], before: tuple[Iterable[int], Iterable[int]] = ((), ())
 ) -> tuple[list[int], list[int]]:
-    """Split episodes, number -> seed, 90 : 10; a seed's place depends on no order and no generator.
+    """Split episodes, number -> seed as files have it, 90 : 10; one without a seed has its number in its place.
+
+    The place of a seed depends on no order and no generator.
 
     Training and validation episodes ``before`` and their seeds keep their side, and of the new seeds as many validate
     as make up a tenth of all. At least one seed validates where there are two.
     """
+    known = {number: one_seed(value) for number, value in seed_of.items()}
+    seeds = {number: number if seed is None else seed for number, seed in known.items()}
     old = [{seeds[number] for number in numbers if number in seeds} for numbers in before]
     ranked = sorted(set(seeds.values()), key=lambda seed: hashlib.sha256(str(seed).encode()).hexdigest())
     count = max(1, round(len(ranked) / 10)) if len(ranked) > 1 else 0

@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.words import count_of, error_line
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.actions import ACTION_ARRAYS, ACTION_NAMES
+from robocas_ms3.datasets.actions import ACTION_ARRAYS, ACTION_NAMES, checked_actions
 from robocas_ms3.datasets.formats import open_source
+from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 from robocas_ms3.datasets.sources.protocol import SourceEpisode
 from robocas_ms3.datasets.sources.provenance import task_of
 from robocas_ms3.datasets.sources.records import Layout, Recorded, SceneRecord, read_scene
 from robocas_ms3.datasets.statistics.layouts import LayoutMap, Placement, layout_map, rounded, surface_of
-from robocas_ms3.datasets.training.sample_arrays import checked_actions
 
 NOOP = (1e-3, np.deg2rad(0.5))  # m and rad per step below which the gripper counts as standing still
 BINS = 41  # of histograms; odd, so that standing still has a bin of its own
@@ -58,14 +58,14 @@ class Stats:
 
     def add(self, episode: SourceEpisode, steps: int) -> tuple[str, Placement]:
         """Count what ``scene.json`` has of an episode; return its configuration, and where its objects stood."""
-        where, fix = f"{episode.where}/{schema.SCENE_FILE}", "robocas validate says what is wrong."
+        where = f"{episode.where}/{schema.SCENE_FILE}"
         scene = read_scene(episode.scene, where)
         recorded, target, config = scene.recorded or Recorded(), scene.target, _config_name(scene)
         try:
             layout, surface = Layout.model_validate(episode.layout), surface_of(scene.config or {})
         except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
             what, found = "this description of a scene is damaged", error_line(error, 200)
-            raise DatasetError(what, where=where, found=found, fix=fix) from error
+            raise DatasetError(what, where=where, found=found, fix=SEE_VALIDATE) from error
         slots = [n for n in range(len(layout.object_ids)) if not layout.present or layout.present[n]]
         poses = np.array(layout.poses, dtype=np.float64).reshape(-1, 7)
         self.lengths[scene.task or UNKNOWN].append(steps)

@@ -19,11 +19,13 @@ from torch.utils.data import get_worker_info
 
 from robocas_ms3.core.errors import DatasetError, EmptySplitError
 from robocas_ms3.core.words import count_of
-from robocas_ms3.datasets.actions import ActionScale
+from robocas_ms3.datasets.actions import ACTION_ARRAYS, ActionScale, check_finite, checked_actions
 from robocas_ms3.datasets.formats import open_source
-from robocas_ms3.datasets.sources.protocol import Kind, SourceEpisode
+from robocas_ms3.datasets.sources.protocol import EpisodeSource, Kind, SourceEpisode
 from robocas_ms3.datasets.training.options import SampleOptions
-from robocas_ms3.datasets.training.sample_arrays import check_holds, read_episode, type_index
+from robocas_ms3.scenes.language.templates import GOAL_TYPES
+
+_TYPE_INDEX = {kind: index for index, kind in enumerate(GOAL_TYPES)}
 
 
 class RoboCASDataset(torch.utils.data.Dataset):
@@ -98,7 +100,7 @@ class RoboCASDataset(torch.utils.data.Dataset):
     def _stages_of(self, number: int, steps: range) -> NDArray[np.int8]:
         stages = np.full(self.source.lengths[number], -1, dtype=np.int8)
         for goal in self.source.episode(number).goals:
-            stages[goal.first : goal.last + 1] = type_index(goal.goal_type)
+            stages[goal.first : goal.last + 1] = _TYPE_INDEX.get(goal.goal_type, -1)
         return stages[steps.start : steps.stop]
 
     def __len__(self) -> int:
@@ -174,10 +176,7 @@ class RoboCASDataset(torch.utils.data.Dataset):
 
     def _arrays(self, number: int) -> dict[str, Any]:
         if number not in self._cache:
-            options = self.options
-            self._cache[number] = read_episode(
-                self.source, number, tuple(options.state), embedding=options.embedding, subgoals=options.subgoals
-            )
+            self._cache[number] = read_episode(self.source, number, self.options)
         self._cache.move_to_end(number)
         if len(self._cache) > max(1, self.options.cached_episodes):
             self._cache.popitem(last=False)
@@ -185,6 +184,56 @@ class RoboCASDataset(torch.utils.data.Dataset):
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_cache": OrderedDict()}
+
+
+def check_holds(source: EpisodeSource, options: SampleOptions) -> None:
+    """Raise DatasetError if a source does not hold what samples are made of."""
+    there, cameras = source.cameras, tuple(options.cameras)
+    if set(cameras) - set(there) or len(set(cameras)) < len(cameras):
+        fix = "" if there else "Pass cameras=(), or make images with robocas convert."
+        expected, found = f"some of {', '.join(there) or 'none'}, each once", ", ".join(cameras)
+        raise DatasetError("no such cameras", where=source.root, expected=expected, found=found, fix=fix)
+    if options.depth and not (source.has_depth and cameras):
+        found = "no cameras" if source.has_depth else "no depth"
+        raise DatasetError("there is no depth here", where=source.root, found=found, fix="Pass depth=False.")
+    if options.embedding and not source.has_embeddings:
+        fix = "Pass embedding=False, or convert the trajectory with embeddings."
+        raise DatasetError("there are no embeddings here", where=source.root, fix=fix)
+
+
+def read_episode(source: EpisodeSource, number: int, options: SampleOptions) -> dict[str, Any]:
+    """Read what the samples of an episode are made of, except images.
+
+    Return ``action`` (T, 7), ``first_command``, ``instruction``; ``state`` (T, D), ``texts``, ``subgoal_type`` (T,) and
+    the embeddings where they are wanted.
+    """
+    state, embedding, subgoals = options.state, options.embedding, options.subgoals
+    keys = (*ACTION_ARRAYS, *state, "language_goal")
+    keys += ("step_lang_goals", "step_goal_type") * subgoals
+    keys += ("language_embedding",) * embedding + ("step_goal_embs",) * (embedding and subgoals)
+    arrays = source.episode(number).read(keys)
+    length, where = source.lengths[number], f"{source.root}, episode {number}"
+    for key, array in arrays.items():
+        if key not in {"language_goal", "language_embedding"} and len(array) != length:
+            what = "another length than the overview says"
+            raise DatasetError(what, where=f"{where}, {key}", expected=length, found=len(array))
+    check_finite(arrays, where)
+    made: dict[str, Any] = {
+        "action": checked_actions(arrays, where),
+        "first_command": float(arrays["gripper_status"][0]),
+        "instruction": str(arrays["language_goal"]),
+    }
+    if state:
+        columns = [arrays[key].reshape(length, -1) for key in state]
+        made["state"] = np.concatenate(columns, axis=1).astype(np.float32)
+    if embedding:
+        made["language_embedding"] = arrays["language_embedding"]
+    if subgoals:
+        made["texts"] = arrays["step_lang_goals"].tolist()
+        made["subgoal_type"] = np.array([_TYPE_INDEX.get(kind, -1) for kind in arrays["step_goal_type"].tolist()])
+        if embedding:
+            made["subgoal_embedding"] = arrays["step_goal_embs"]
+    return made
 
 
 def read_images(

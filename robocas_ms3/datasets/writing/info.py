@@ -16,16 +16,15 @@ from robocas_ms3.core.words import one_line
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.actions import action_space
 from robocas_ms3.datasets.sources.arrays import read_arrays
+from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 from robocas_ms3.datasets.sources.provenance import environment_of, task_of
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.records import DataInfoRecord
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.demos.ledger import FAILURES_FILE
-from robocas_ms3.demos.recordings.entries import one_seed
 from robocas_ms3.demos.recordings.subgoals import subgoal_runs
 
 _NEEDED = ("episode_length", "language_goal", "step_goal_type", "step_lang_goals", "rel_pos", "rel_orn")
-_SEE_VALIDATE = "robocas validate says what is wrong."
 
 
 def write_info(root: Path, before: tuple[Iterable[int], Iterable[int]] = ((), ())) -> None:
@@ -34,10 +33,9 @@ def write_info(root: Path, before: tuple[Iterable[int], Iterable[int]] = ((), ()
 
 
 def info_of(root: Path, before: tuple[Iterable[int], Iterable[int]] = ((), ())) -> dict[str, Any]:
-    """Return ``data_info.json``; ``before``: both sides so far. Episodes without a seed count as different seeds."""
+    """Return ``data_info.json``; ``before``: both sides so far, see `split_by_seed`."""
     dataset = Dataset(root)
-    seeds: dict[int, int] = {}
-    lengths, instructions, goals = {}, {}, {}
+    seeds, lengths, instructions, goals = {}, {}, {}, {}
     positions, orientations = [], []
     for number in dataset.numbers:
         episode = dataset.episode(number)
@@ -46,9 +44,8 @@ def info_of(root: Path, before: tuple[Iterable[int], Iterable[int]] = ((), ())) 
         for key in ("rel_pos", "rel_orn"):
             if not np.isfinite(arrays[key]).all():
                 what, expected = "this episode's motion is no numbers", "finite numbers"
-                raise DatasetError(what, where=f"{path}, {key}", expected=expected, fix=_SEE_VALIDATE)
-        seed = one_seed(episode.scene.get("seed"))
-        seeds[number] = number if seed is None else seed
+                raise DatasetError(what, where=f"{path}, {key}", expected=expected, fix=SEE_VALIDATE)
+        seeds[number] = episode.scene.get("seed")
         lengths[str(number)] = int(arrays["episode_length"])
         instructions[str(number)] = str(arrays["language_goal"])
         runs = subgoal_runs(arrays["step_goal_type"].tolist(), arrays["step_lang_goals"].tolist())
@@ -69,7 +66,7 @@ def info_of(root: Path, before: tuple[Iterable[int], Iterable[int]] = ((), ())) 
     except (ValueError, IndexError) as error:  # quaternions of length 0; no episode of two steps
         where = f"{root / schema.DATA_INFO_FILE}, action_space"
         found = one_line(error)
-        raise DatasetError("the motion has no range", where=where, found=found, fix=_SEE_VALIDATE) from error
+        raise DatasetError("the motion has no range", where=where, found=found, fix=SEE_VALIDATE) from error
     return info
 
 

@@ -18,7 +18,7 @@ from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.records import ConversionRecord, SettingsRecord
 from robocas_ms3.datasets.sources.split import SPLIT_RULE, split_by_seed
-from robocas_ms3.demos.recordings.entries import one_seed, versions
+from robocas_ms3.demos.recordings.entries import versions
 
 Entries = Sequence[dict[str, Any]]
 """See `inputs.ConversionInput.entries`."""
@@ -115,8 +115,7 @@ def _place(entry: Mapping[str, Any]) -> str:
 
 def planned_sides(content: Mapping[str, Any], before: tuple[list[int], list[int]]) -> tuple[list[int], list[int]]:
     """Return the split of all planned episodes, so that missing ones change the side of no other."""
-    seeds = {int(number): one_seed(entry.get("seed")) for number, entry in content["episodes"].items()}
-    return split_by_seed({number: number if seed is None else seed for number, seed in seeds.items()}, before)
+    return split_by_seed({int(number): entry.get("seed") for number, entry in content["episodes"].items()}, before)
 
 
 def missing_episodes(out: Path, content: Mapping[str, Any]) -> list[str]:
