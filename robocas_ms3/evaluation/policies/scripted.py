@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.recordings.motion import sample_stride
-from robocas_ms3.demos.recordings.reading import TrajectoryFile
+from robocas_ms3.demos.recordings.stored import open_episode, open_trajectory, read_steps
 from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.evaluation.policies.replay import JointTrack, PoseTrack, TrackPolicy
 from robocas_ms3.evaluation.policy import EpisodeSpec, PolicySpec
@@ -51,9 +51,9 @@ class ScriptedPolicy(TrackPolicy):
         generator = self._generator_of(start)
         with tempfile.TemporaryDirectory() as folder:
             if generator.generate(start.seed, Path(folder), "episode").success:
-                with TrajectoryFile(Path(folder) / "episode.h5") as file:
-                    recording = file.recording(0, bodies=False)
-                actions, states = recording.actions[:, :8], recording.states["articulations"][start.robot]
+                with open_trajectory(Path(folder) / "episode.h5") as file:
+                    actions, found = read_steps(open_episode(file, 0), body=start.robot)
+                actions, states = actions[:, :8], found["articulations"][start.robot]
         if self.spec.convention == "joint_positions":
             return JointTrack(actions)
         track = PoseTrack.of(find_robot(start.robot), states, actions[:, 7], sample_stride(_FREQ, 5))
