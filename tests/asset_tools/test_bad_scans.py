@@ -16,7 +16,7 @@ import zlib
 import numpy as np
 import pytest
 import trimesh
-from models import write_obj
+from models import texels, write_obj
 from PIL import Image
 
 from asset_tools.prepare import prepare
@@ -92,16 +92,13 @@ def check_bottle(scan, *, colors=True, volume=0.005):
     light = to_display(scan.mesh, triangles=1000, texture_size=256)
     # so that each face counts that is seen from outside, and only from there
     points, faces = trimesh.sample.sample_surface(light, 4000, seed=1)[:2]
-    weights = trimesh.triangles.points_to_barycentric(light.triangles[faces], points)
-    uv = np.einsum("nc,ncd->nd", weights, light.visual.uv[light.faces[faces]])
-    pixels = np.asarray(light.visual.material.baseColorTexture.convert("RGB"), dtype=int)
-    row = np.clip(((1 - uv[:, 1]) * len(pixels)).astype(int), 0, len(pixels) - 1)
-    seen = pixels[row, np.clip((uv[:, 0] * pixels.shape[1]).astype(int), 0, pixels.shape[1] - 1)]
+    seen = texels(light, points, faces)
     angle = np.degrees(np.arctan2(points[:, 1], points[:, 0])) % 90
     inner = (np.minimum(angle, 90 - angle) > 12) & (np.abs(light.face_normals[faces, 2]) < 0.8)
     assert inner.sum() > 1500
     wrong = np.abs(seen - COLORS[quarter_of(points)]).max(axis=1) > 40
     assert wrong[inner].mean() < 0.01
+    weights = trimesh.triangles.points_to_barycentric(light.triangles[faces], points)
     shading = np.einsum("nc,nci->ni", weights, light.vertex_normals[light.faces[faces]])
     assert (np.einsum("ni,ni->n", shading, light.face_normals[faces]) > 0).all()
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import sapien
 import trimesh
+from models import texels
 from PIL import Image
 from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
@@ -52,11 +53,7 @@ def seen_colors(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
     """Points inside of each face and the texel shown there."""
     weights = np.array([[0.6, 0.2, 0.2], [0.2, 0.6, 0.2], [0.2, 0.2, 0.6], [1 / 3, 1 / 3, 1 / 3]])
     points = np.einsum("sc,fcd->fsd", weights, mesh.triangles).reshape(-1, 3)
-    uv = np.einsum("sc,fcd->fsd", weights, mesh.visual.uv[mesh.faces]).reshape(-1, 2)
-    pixels = np.asarray(mesh.visual.material.baseColorTexture, dtype=int)
-    height, width = pixels.shape[:2]
-    column = np.clip((uv[:, 0] * width).astype(int), 0, width - 1)
-    return points, pixels[np.clip(((1 - uv[:, 1]) * height).astype(int), 0, height - 1), column]
+    return points, texels(mesh, points, np.repeat(np.arange(len(mesh.faces)), len(weights)))
 
 
 def side_of(points: np.ndarray) -> np.ndarray:
@@ -193,13 +190,7 @@ def test_a_label_close_to_a_bottle_keeps_its_colour(triangles):
     side = np.abs(light.face_normals[faces, 2]) < 0.3
     label = side & (radius > 0.0303) & (np.abs(points[:, 2]) < 0.022)
     bottle = side & (np.abs(points[:, 2]) > 0.028)
-    weights = trimesh.triangles.points_to_barycentric(light.triangles[faces], points)
-    uv = np.einsum("nc,ncd->nd", weights, light.visual.uv[light.faces[faces]])
-    pixels = np.asarray(light.visual.material.baseColorTexture)
-    size = len(pixels)
-    seen = pixels[
-        ((1 - uv[:, 1]) * size).astype(int).clip(0, size - 1), (uv[:, 0] * size).astype(int).clip(0, size - 1)
-    ]
+    seen = texels(light, points, faces)
     assert label.sum() > 200 and bottle.sum() > 200
     assert (seen[label, 1] > 200).mean() > 0.99 and (seen[bottle, 1] < 60).mean() > 0.99
 

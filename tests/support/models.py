@@ -6,6 +6,7 @@ import io
 import json
 import struct
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -193,3 +194,14 @@ def shown_colors(mesh: trimesh.Trimesh) -> np.ndarray:
 
     faces = np.arange(len(mesh.faces))
     return np.rint(Appearance(mesh).at(np.asarray(mesh.faces), faces, np.full((len(faces), 3), 1 / 3)))
+
+
+def texels(mesh: trimesh.Trimesh, points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(N, 3) colours of the texture at points (N, 3) on faces (N,)."""
+    visual: Any = mesh.visual
+    weights = trimesh.triangles.points_to_barycentric(mesh.triangles[faces], points)
+    uv = np.einsum("nc,ncd->nd", weights, visual.uv[mesh.faces[faces]])
+    pixels = np.asarray(visual.material.baseColorTexture.convert("RGB"), int)
+    height, width = pixels.shape[:2]
+    column, row = (uv[:, 0] * width).astype(int), ((1 - uv[:, 1]) * height).astype(int)
+    return pixels[row.clip(0, height - 1), column.clip(0, width - 1)]

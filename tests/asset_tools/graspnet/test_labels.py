@@ -23,9 +23,10 @@ def arrays(points=1, dtype=np.float32):
     }
 
 
-def write(path, changes=(), **options):
-    """A label file with some labels set: index -> (angle, depth, width, score, collision)."""
+def write(path, changes=(), at=(0, 0, 0), **options):
+    """A label file with some labels of a point set: index -> (angle, depth, width, score, collision)."""
     data = arrays(**options)
+    data["points"][0] = at
     for where, (angle, depth, width, score, collision) in changes:
         data["offsets"][where] = angle, depth, width
         data["scores"][where] = score
@@ -51,11 +52,8 @@ def test_a_grasp_worked_out_by_hand(tmp_path, quarters):
     approach = [0.278396, 0.960460, -0.003333]
     closing = [[-0.960465, 0.278398, 0.0], [0.000928, 0.003202, 0.999994]][quarters]
     label = (quarters * np.pi / 2, 0.02, 0.05, 0.2, False)
-    path = write(tmp_path / "000_labels.npz", [((0, 150, 3 * quarters, 1), label)])
-    with np.load(path) as file:
-        data = dict(file)
-    data["points"][0] = (0.01, -0.05, 0.02)  # on the side of the box that looks to -y
-    np.savez_compressed(path, **data)
+    # on the side of the box that looks to -y
+    path = write(tmp_path / "000_labels.npz", [((0, 150, 3 * quarters, 1), label)], at=(0.01, -0.05, 0.02))
 
     pose = tcp_poses(read_labels(path))[0]
     assert pose[:3, 2] == pytest.approx(approach, abs=2e-6)
@@ -71,11 +69,7 @@ def test_the_closing_axis_crosses_the_box_from_side_to_side(tmp_path):
     view = view_directions()[TOP_VIEW]
     azimuth = np.arctan2(-view[0], view[1])
     labels = [((0, TOP_VIEW, i, 2), (azimuth + i * np.pi / 2, 0.03, 0.06, 0.1, False)) for i in (0, 1)]
-    path = write(tmp_path / "000_labels.npz", labels)
-    with np.load(path) as file:
-        data = dict(file)
-    data["points"][0] = (0, 0, 0.03)
-    np.savez_compressed(path, **data)
+    path = write(tmp_path / "000_labels.npz", labels, at=(0, 0, 0.03))
     box = trimesh.creation.box(SIZE)
 
     along, across = tcp_poses(read_labels(path))
