@@ -171,7 +171,7 @@ def test_from_the_command_line(made, tmp_path, capsys):
     assert dataset.info["features"]["observation.images.static_camera"]["info"]["video.codec"] == "av1"
     assert np.abs(dataset.episode(1).rgb("static_camera", 4) - Dataset(made).episode(1).rgb("static_camera", 4)).any()
     other = ["convert", str(made), "--out", str(tmp_path / "other"), "--lerobot-version", "2.1"]
-    assert main.run(other) == 1
+    assert main.run(other) == 2
     assert capsys.readouterr().err == "error: --lerobot-version: not for RoboCAS folders. Leave it out.\n"
 
 
