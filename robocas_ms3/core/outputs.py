@@ -246,15 +246,17 @@ def sweep(folder: Path) -> None:
             remove(leftover)
 
 
-def setting_changes(before: Any, now: Any, path: str) -> list[str]:
-    """Return ``path: before -> now`` for each value that differs."""
+def setting_changes(before: Any, now: Any, path: str, tolerance: float = 0.0) -> list[str]:
+    """Return ``path: before -> now`` for each JSON value that differs, of floats by more than a tolerance."""
     if isinstance(before, dict) and isinstance(now, dict):
-        keys = dict.fromkeys([*before, *now])
-        return [change for key in keys for change in setting_changes(before.get(key), now.get(key), f"{path}.{key}")]
-    if isinstance(before, list) and isinstance(now, list) and len(before) == len(now):
-        pairs = enumerate(zip(before, now, strict=True))
-        return [change for index, (old, new) in pairs for change in setting_changes(old, new, f"{path}.{index}")]
-    return [] if before == now else [f"{path}: {_shortened(before)} -> {_shortened(now)}"]
+        pairs = [(key, before.get(key), now.get(key)) for key in dict.fromkeys([*before, *now])]
+    elif isinstance(before, list) and isinstance(now, list) and len(before) == len(now):
+        pairs = list(zip(range(len(now)), before, now, strict=True))
+    elif isinstance(before, float) and isinstance(now, float) and abs(before - now) <= tolerance:
+        return []
+    else:
+        return [] if before == now else [f"{path}: {_shortened(before)} -> {_shortened(now)}"]
+    return [change for key, old, new in pairs for change in setting_changes(old, new, f"{path}.{key}", tolerance)]
 
 
 def _shortened(value: Any) -> str:

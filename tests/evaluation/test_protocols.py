@@ -66,6 +66,21 @@ def test_bundled_protocols_load_have_each_scene_once_and_the_hash_of_their_files
     assert protocol.hash.startswith(HASHES[name])
 
 
+SUITES = ("objects", "arrangement", "clutter", "instructions", "cameras", "looks", "furniture", "paper-words")
+
+
+@pytest.mark.parametrize("name", SUITES)
+def test_suites_train_on_what_is_seen_and_hold_something_out_of_each_task(name):
+    protocol, configs = load_protocol(f"{name}-v1"), {}
+    for episode in protocol.episodes:
+        configs.setdefault(episode.split == "seen", set()).add(protocol.config_file(episode.config))
+    seen, held_out = ([load_task_config(path) for path in configs[side]] for side in (True, False))
+    train = {config.task: config for config in map(load_task_config, protocol.train_files())}
+    assert {config.task: config for config in seen} == train
+    assert len(seen) == len(protocol.train_files())
+    assert {config.task for config in held_out} == set(train)
+
+
 def test_a_copy_has_the_same_hash_and_a_change_another(folder):
     mine = load_protocol(folder)
     before = load_protocol("smoke").hash

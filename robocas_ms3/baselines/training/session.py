@@ -29,7 +29,7 @@ from robocas_ms3.baselines.training.record import (
 )
 from robocas_ms3.core.errors import EmptySplitError, TrainingError
 from robocas_ms3.core.exits import no_exit
-from robocas_ms3.core.outputs import FolderKind, OutputFolder
+from robocas_ms3.core.outputs import FolderKind, OutputFolder, setting_changes
 from robocas_ms3.core.strict import parse
 
 if TYPE_CHECKING:
@@ -39,7 +39,6 @@ OUTPUT = FolderKind("robocas train", (RUN,), "baseline")
 _INPUTS = ("rate_hz", "pictures", "cameras", "calibration", "observed", "acted")
 """Facts that have to be the same in both runs. Others, such as scales, need the same shape."""
 _TOLERANCE = 1e-3  # of these: camera poses differ in the last bits
-_SHOWN = 8  # values of a list in a message
 
 
 @dataclass(frozen=True)
@@ -178,33 +177,11 @@ def combine_facts(own: dict[str, Any], initial: InitialWeights | None, data: Pat
     scales = () if data is None else (key for key in own if key in others and key not in _INPUTS)
     for key in (*_INPUTS, *scales):
         tolerance = _TOLERANCE if key in _INPUTS else math.inf
-        if (difference := _first_difference(others.get(key), own.get(key), key, tolerance)) is not None:
-            name, expected, found = difference
-            raise TrainingError(
-                f"the run of --start has other {key}",
-                where=f"{data or initial.name}, {name}",
-                expected=expected,
-                found=found,
-                fix="Start from a run with the same inputs, convert the data as for that run, or leave out --start.",
-            )
+        if changes := setting_changes(others.get(key), own.get(key), key, tolerance):
+            what, where = f"the run of --start has other {key}", data or initial.name
+            fix = "Start from a run with the same inputs, convert the data as for that run, or leave out --start."
+            raise TrainingError(what, where=where, found=changes[0], fix=fix)
     return own if data is None else others
-
-
-def _first_difference(one: Any, other: Any, name: str, tolerance: float) -> tuple[str, Any, Any] | None:
-    """Return name and values of the first JSON values that differ, numbers by more than a tolerance."""
-    if isinstance(one, dict) and isinstance(other, dict) and one.keys() == other.keys():
-        found = (_first_difference(one[key], other[key], f"{name}.{key}", tolerance) for key in one)
-        return next(filter(None, found), None)
-    if isinstance(one, list) and isinstance(other, list):
-        if len(one) != len(other):
-            is_short = max(len(one), len(other)) <= _SHOWN
-            return (name, one, other) if is_short else (name, f"{len(one)} values", f"{len(other)} values")
-        pairs = enumerate(zip(one, other, strict=True))
-        found = (_first_difference(*pair, f"{name}[{index}]", tolerance) for index, pair in pairs)
-        return next(filter(None, found), None)
-    if isinstance(one, float) and isinstance(other, float):
-        return (name, float(f"{one:.4g}"), float(f"{other:.4g}")) if abs(one - other) > tolerance else None
-    return (name, one, other) if one != other else None
 
 
 def _check_data(baseline: Baseline, data: Path | None) -> None:
