@@ -190,8 +190,8 @@ def test_threads_that_write_do_not_hold_up_branches(capfd):
         raise PlanningFailed("play", str(number))
 
     def decide(runner):
-        with pytest.raises(PlanningFailed, match="play: 39"):
-            runner.choose(range(40), play)
+        with pytest.raises(PlanningFailed, match="play: 19"):
+            runner.choose(range(20), play)
 
     writers = [threading.Thread(target=write) for _ in range(2)]
     for writer in writers:
@@ -203,7 +203,7 @@ def test_threads_that_write_do_not_hold_up_branches(capfd):
         for writer in writers:
             writer.join()
     assert (ended, notes.texts) == (True, [])
-    assert capfd.readouterr().err.count("in a branch\n") >= 40
+    assert capfd.readouterr().err.count("in a branch\n") >= 20
 
 
 def test_an_error_says_where_in_a_child_it_came_from():

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing import get_context
 
 import numpy as np
 import pytest
 from planning_scenes import REST, Box, cloud, corners, table_scene
+from scipy.spatial.transform import Rotation
 
+from robocas_ms3.core.poses import transform
 from robocas_ms3.planning.collision import FclWorld
 from robocas_ms3.planning.protocol import AttachedBody, Obstacle, Shape
 from robocas_ms3.robots.description import MOBILE_PANDA
@@ -137,3 +140,32 @@ def test_obstacles_that_share_a_shape_are_all_checked(world):
         assert {"near", "also near"} == {name for name in world.collisions(REST, 0.0) if "panda" not in name}
         world.set_scene([Obstacle("near", cube, far), Obstacle("far", cube, near)])
         assert {"far"} == {name for name in world.collisions(REST, 0.0) if "panda" not in name}
+
+
+def test_the_comparison_of_boxes_loses_no_contact(world, monkeypatch):
+    """The verdicts are those of checking every pair of parts, and every part with every obstacle."""
+
+    def everything(self, rotations, positions, width, obstacles):
+        rows, moving = range(rotations.shape[1]), self._moving
+        links = np.array([*itertools.product(rows, range(len(self._pairs)))])
+        return links, np.array([*itertools.product(rows, moving, range(len(self._pieces)))])
+
+    rng = np.random.default_rng(0)
+    samples = [rng.uniform(world.chain.lower, world.chain.upper, (30, 7)), REST + rng.uniform(-0.6, 0.6, (60, 7))]
+    qpos = np.concatenate(samples).clip(world.chain.lower, world.chain.upper)
+    places = rng.uniform((0.2, -0.3, 0.1), (0.6, 0.3, 0.6), (8, 3))
+    world.set_scene([body(Box(tuple(place), (0.1, 0.05, 0.08), yaw)) for yaw, place in enumerate(places)])
+    held, pose = corners(0.04, 0.03, 0.08), np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Rotation.from_euler("xyz", (0.5, 0.3, 0.7)).as_matrix(), (0, 0.01, 0.07)
+
+    def contacts(*attached):
+        world.attach(AttachedBody(*attached))
+        widths = np.resize((0.0, 0.03, 0.08), len(qpos))
+        return [world.collisions(q, width) for q, width in zip(qpos, widths, strict=True)]
+
+    found = contacts(held, pose)
+    assert 20 < sum(map(bool, found)) < 80
+    assert sum("attached" in names for names in found) > 5
+    assert contacts(transform(pose, held), np.eye(4)) == found
+    monkeypatch.setattr(FclWorld, "_broad_phase", everything)
+    assert contacts(held, pose) == found
