@@ -75,10 +75,6 @@ def test_torch_has_one_thread_where_images_are_rendered(job):
     found = [(one.number, one.steps, one.row) for one in written]
     assert found == [(1, 11, (os.getpid(), 1, None)), (2, 12, (os.getpid(), 1, None))]
     assert torch.get_num_threads() == 2
-    others, _ = write(job(Writer(), [1, 2, 3], jobs=2))
-    assert {one.number for one in others} == {1, 2, 3}
-    assert os.getpid() not in {one.row[0] for one in others}
-    assert {one.row[1:] for one in others} == {(1, "1")}
     with pytest.raises(ValueError, match="7"):
         write(job(Writer({7: ValueError(7)}), [7]))
     assert torch.get_num_threads() == 2
@@ -90,15 +86,20 @@ def test_torch_keeps_its_threads_where_images_are_read(job, made):
     assert [one.row for one in write(writing)[0]] == [(os.getpid(), 2, None)]
 
 
-def test_an_episode_that_ends_its_process_is_one_error_after_all_others(job):
-    written, incomplete = write(job(Deadly(), [1, 2, 3], jobs=2, episode_seconds=60, memory_gb=8))
-    assert [one.number for one in written] == [1, 3]
-    assert incomplete.reasons == {"episode_0000002": "episode_0000002: its process died twice: exit code 9"}
+def test_in_other_processes_episodes_that_fail_or_end_their_process_are_one_error_after_all_others(job):
+    writer = Deadly({5: LookupError("5 is odd")})
+    written, incomplete = write(job(writer, [1, 2, 3, 4, 5], jobs=2, episode_seconds=60, memory_gb=8))
+    assert [one.number for one in written] == [1, 3, 4]
+    assert incomplete.reasons == {
+        "episode_0000002": "episode_0000002: its process died twice: exit code 9",
+        "episode_0000005": "LookupError: 5 is odd",
+    }
+    assert os.getpid() not in {one.row[0] for one in written}
+    assert {one.row[1:] for one in written} == {(1, "1")}
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
-def test_an_episode_that_fails_ends_no_other(job, jobs):
-    written, incomplete = write(job(Writer(odd(range(16))), range(16), jobs=jobs))
+def test_an_episode_that_fails_ends_no_other(job):
+    written, incomplete = write(job(Writer(odd(range(16))), range(16)))
     assert [one.number for one in written] == list(range(0, 16, 2))
     reasons = {n: f"{n} is odd. Don't" if n % 3 == 0 else f"LookupError: {n} is odd" for n in range(1, 16, 2)}
     assert incomplete.reasons == {f"episode_{n:07d}": why for n, why in reasons.items()}
