@@ -14,6 +14,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from mani_skill.utils.common import to_numpy
 
 from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.datasets.writing.render import require_renderer
@@ -85,7 +86,7 @@ class Player:
             _log.warning("seed %d: %s", seed, played.error)
         ends = {"policy_failed": played.error, "succeeded": played.at_end["success"], "failed": played.at_end["fail"]}
         refused = next((reason for reason, true in ends.items() if true), "")
-        state = {kind: _of_one_env(of) for kind, of in self._base.get_state_dict().items() if kind != "controller"}
+        state = {kind: to_numpy(of) for kind, of in self._base.get_state_dict().items() if kind != "controller"}
         gripper = 1.0 if self._env.gripper_open else -1.0
         return Takeover(seed, settings.after_policy, played.steps, state, gripper, refused)
 
@@ -97,8 +98,3 @@ class Player:
         settings, text = self._settings, self._base.instruction().text
         files = (str(self._config), settings.layouts, settings.pack)
         return EpisodeSpec(-1, 0, settings.task, *files, seed, text, robot=settings.robot)
-
-
-def _of_one_env(node: Any) -> Any:
-    """Return nested tensors (1, ...) as arrays of the same shape."""
-    return {key: _of_one_env(value) for key, value in node.items()} if isinstance(node, dict) else node.cpu().numpy()
