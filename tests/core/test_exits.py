@@ -143,9 +143,17 @@ def test_the_second_ctrl_c_ends_a_long_native_call(around, call):
             process.kill()
 
 
-def test_a_step_is_finished_although_ctrl_c_came_twice_at_once():
-    with python(STEP) as process:
-        assert (process.communicate()[0], process.returncode) == ("step done\nhandled\n", 0)
+@pytest.mark.parametrize(
+    ("program", "printed"),
+    [
+        pytest.param(STEP, "step done\nhandled\n", id="a step is finished although Ctrl-C comes twice at once"),
+        pytest.param(OTHER_THREAD, "written\nhandled\n", id="a signal is deferred although another thread gets it"),
+        pytest.param(UNSIGNALLED, "policy mine:Policy\n", id="an interrupt without a signal is an error of its source"),
+    ],
+)
+def test_signals_are_handled_once_and_at_their_place(program, printed):
+    with python(program) as process:
+        assert (process.communicate()[0], process.returncode) == (printed, 0)
 
 
 def test_a_file_is_written_although_ctrl_c_came_twice():
@@ -155,16 +163,6 @@ def test_a_file_is_written_although_ctrl_c_came_twice():
             process.send_signal(signal.SIGINT)
             time.sleep(0.8)
         assert (process.stdout.read(), process.wait()) == ("written\nhandled\n", 0)
-
-
-def test_a_signal_is_deferred_although_another_thread_gets_it():
-    with python(OTHER_THREAD) as process:
-        assert (process.stdout.read(), process.wait()) == ("written\nhandled\n", 0)
-
-
-def test_an_interrupt_that_no_signal_caused_is_an_error_of_its_source():
-    with python(UNSIGNALLED) as process:
-        assert process.communicate()[0] == "policy mine:Policy\n"
 
 
 def test_an_exit_is_an_error_of_its_source():

@@ -48,11 +48,3 @@ def test_products_and_turned_vectors_are_maniskills():
     for one, other, vector in ((first, second, vectors), tensors):
         same(rotations.multiply(one, other), products)
         same(rotations.turn(one, vector), turned)
-
-
-def test_a_quarter_turn_about_x_then_the_new_z():
-    half = np.sqrt(0.5)
-    found = rotations.from_euler(np.array([[np.pi / 2, 0, np.pi / 2]], np.float32))[0]
-    assert found == pytest.approx([0.5, 0.5, -0.5, 0.5], abs=1e-6)
-    y = rotations.turn(np.array([[half, half, 0, 0]], np.float32), np.array([[0, 1, 0]], np.float32))
-    assert y[0] == pytest.approx([0, 0, 1], abs=1e-6)

@@ -7,15 +7,9 @@ from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.core.words import called, count_of, error_line, format_ranges, in_markdown, one_line, printable
 
 
-def test_one_is_no_plural():
+def test_counts_ranges_and_names_of_objects():
     assert [count_of(n, "episode") for n in (0, 1, 2)] == ["0 episodes", "1 episode", "2 episodes"]
-
-
-def test_numbers_in_short():
     assert format_ranges([0, 1, 2, 5, 7, 8]) == "0-2, 5, 7-8"
-
-
-def test_an_object_is_called_by_its_name_and_by_an_id_that_says_more():
     assert called("large_elephant", "grey toy elephant") == "grey toy elephant (large elephant)"
     assert called("jam_jar", "jam jar") == called("jam_jar") == called("", "jam jar") == "jam jar"
     assert called("") == ""

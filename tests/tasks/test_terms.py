@@ -15,7 +15,14 @@ UPRIGHT = [1.0, 0, 0, 0]
 def test_rotations_are_scipys(make):
     found = Rotation.random(5, random_state=0)
     quaternions = make(found.as_quat()[:, [3, 0, 1, 2]].astype("float32").reshape(1, 5, 4))
-    assert abs(np.asarray(rotations.rotation(quaternions))[0] - found.as_matrix()).max() < 1e-6
+    vectors = np.random.default_rng(0).uniform(-1, 1, (1, 5, 3)).astype(np.float32)
+    for turned, expected in (
+        (rotations.rotation(quaternions), found.as_matrix()),
+        (rotations.rotate(quaternions, make(vectors)), found.apply(vectors[0])),
+        (rotations.rotate_inverse(quaternions, make(vectors)), found.inv().apply(vectors[0])),
+        (rotations.upward(quaternions), found.apply([0, 0, 1])),
+    ):
+        assert abs(np.asarray(turned)[0] - expected).max() < 1e-6
 
 
 def test_arrays_of_a_cpu_are_numpys_and_share_memory():
@@ -25,13 +32,6 @@ def test_arrays_of_a_cpu_are_numpys_and_share_memory():
     assert arrays.as_tensor(tensor) is tensor
     arrays.as_tensor(arrays.native(tensor))[0] = 1.0
     assert tensor.tolist() == [1, 3]
-
-
-def test_rotate_turns_x_to_y_and_back(make):
-    q = make([YAW_90, YAW_90])
-    x, y = make([[1.0, 0, 0]] * 2), make([[0.0, 1, 0]] * 2)
-    assert abs(rotations.rotate(q, x) - y).max() < 1e-6
-    assert abs(rotations.rotate_inverse(q, y) - x).max() < 1e-6
 
 
 def test_inside_box_follows_the_frame(make):
@@ -60,16 +60,10 @@ def test_another_of_its_kind_is_neither_the_target_nor_of_another_kind(make):
 
 def test_finger_grasps_needs_both_fingers_pressed_apart(make):
     closing = make([[0.0, 1, 0]])
-    left = make([[[0, 2.0, 0], [0, 2.0, 0], [0, 0.4, 0], [0, -2.0, 0]]])
-    right = make([[[0, -2.0, 0], [0, 0.0, 0], [0, -2.0, 0], [0, 2.0, 0]]])
-    # held; one finger only; too weak on the left; pulled inwards
-    assert terms.finger_grasps(left, right, closing).tolist() == [[True, False, False, False]]
-
-
-def test_finger_grasps_refuses_a_force_across_the_closing_axis(make):
-    closing = make([[0.0, 1, 0]])
-    across = make([[[3.0, 0.1, 0]]])  # 88 degrees off
-    assert not terms.finger_grasps(across, -across, closing).any()
+    left = make([[[0, 2.0, 0], [0, 2.0, 0], [0, 0.4, 0], [0, -2.0, 0], [3.0, 0.1, 0]]])
+    right = make([[[0, -2.0, 0], [0, 0.0, 0], [0, -2.0, 0], [0, 2.0, 0], [-3.0, -0.1, 0]]])
+    # held; one finger only; too weak on the left; pulled inwards; 88 degrees off the closing axis
+    assert terms.finger_grasps(left, right, closing).tolist() == [[True, False, False, False, False]]
 
 
 def test_pressed_asks_for_both_fingers_but_no_direction(make):
@@ -133,9 +127,6 @@ def test_basket_stands_up_to_20_degrees(make, degrees):
     half = math.radians(degrees) / 2
     tilted = make([[math.cos(half), math.sin(half), 0, 0]])
     upright, origin = make([UPRIGHT]), make([[0.0, 0, 0]])
-    # tilted about x, the vertical axis leans towards -y
-    lean = [0, -math.sin(2 * half), math.cos(2 * half)]
-    assert rotations.upward(tilted)[0].tolist() == pytest.approx(lean, abs=1e-6)
     assert terms.stands(origin, tilted, origin, upright).item() is (degrees <= 20)
 
 
