@@ -22,7 +22,7 @@ from robocas_ms3.core.errors import DatasetError, RobocasError
 from robocas_ms3.core.files import make_folder
 from robocas_ms3.core.outputs import check_replaceable
 from robocas_ms3.core.poses import from_wxyz, inverse
-from robocas_ms3.demos.recordings.entries import read_json, read_reset, was_taken_over
+from robocas_ms3.demos.recordings.entries import read_begin, read_json, was_taken_over
 from robocas_ms3.demos.recordings.environment import RecordedEnv, read_env
 from robocas_ms3.demos.recordings.stored import (
     BODIES,
@@ -66,15 +66,10 @@ class Recorded:
     @classmethod
     def read(cls, trajectory: Path, episode: dict[str, Any]) -> Recorded:
         where = f"{trajectory}, traj_{episode['episode_id']}"
-        seed, options = read_reset(episode, where)
-        mode = episode.get("control_mode")
-        if not isinstance(mode, str):
-            found = str(mode)[:40]
-            raise DatasetError("no such control mode", where=f"{where}, control_mode", expected="text", found=found)
+        begin = read_begin(episode, where)
         with open_trajectory(trajectory) as file:
-            group = open_episode(file, episode["episode_id"])
-            actions, states = read_steps(group, extras=True)
-        return cls(where, seed, options, mode, actions, dict_to_list_of_dicts(states), was_taken_over(episode))
+            actions, states = read_steps(open_episode(file, episode["episode_id"]), extras=True)
+        return cls(where, *begin, actions, dict_to_list_of_dicts(states), was_taken_over(episode))
 
     def check_fits(self, env: RoboCASEnv) -> None:
         converted = env.control_mode != self.control_mode

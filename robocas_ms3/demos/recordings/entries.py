@@ -60,6 +60,7 @@ class BeginRecord(_Record):
     episode_id: int
     episode_seed: Seed
     reset_kwargs: ResetRecord | None = None
+    control_mode: str
 
 
 class TaskRecord(SubGoals):
@@ -71,7 +72,6 @@ class TaskRecord(SubGoals):
 class EpisodeRecord(BeginRecord):
     """An episode that ``robocas generate`` recorded."""
 
-    control_mode: str
     elapsed_steps: NonNegativeInt | None = None
     robocas: TaskRecord
 
@@ -141,15 +141,15 @@ def read_entry(episode: Mapping[str, Any], where: object) -> Entry:
 
 
 def was_taken_over(episode: Mapping[str, Any]) -> bool:
-    """Whether an episode begins where another policy was, by the JSON's entry or ``scene.json``'s ``recorded``."""
-    recorded = episode.get("robocas", episode.get("recorded"))
+    """Whether an episode begins where another policy was."""
+    recorded = episode.get("robocas")
     return isinstance(recorded, Mapping) and recorded.get("takeover") is not None
 
 
-def read_reset(episode: Mapping[str, Any], where: object) -> tuple[int, dict[str, Any]]:
-    """Return seed and options of ``env.reset`` that an episode begins with."""
+def read_begin(episode: Mapping[str, Any], where: object) -> tuple[int, dict[str, Any], str]:
+    """Return seed and options of ``env.reset`` that an episode begins with, and the control mode of its actions."""
     found = parse(BeginRecord, episode, DatasetError, where=where, about=_ENTRY)
-    return found.episode_seed, _options(found.reset_kwargs)
+    return found.episode_seed, _options(found.reset_kwargs), found.control_mode
 
 
 def read_reset_options(options: Any, where: object) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.demos.recordings.entries import read_json, read_reset, was_taken_over
+from robocas_ms3.demos.recordings.entries import read_begin, read_json, was_taken_over
 from robocas_ms3.demos.recordings.environment import read_env
 from robocas_ms3.demos.recordings.motion import Motion, sample_states
 from robocas_ms3.demos.recordings.stored import open_episode, open_trajectory, read_actions
@@ -114,7 +114,7 @@ class ReplayPolicy(TrackPolicy):
             what, fix = "episodes that begin where another policy was", "Use robocas replay, which begins there too."
             raise EvaluationError(what, where=trajectory, expected="episodes that begin with a reset", fix=fix)
         self._episodes = {
-            read_reset(one, f"{trajectory}, traj_{one['episode_id']}")[0]: one["episode_id"] for one in data["episodes"]
+            read_begin(one, f"{trajectory}, traj_{one['episode_id']}")[0]: one["episode_id"] for one in data["episodes"]
         }
         rate = env.kwargs.get("sim_config", {}).get("control_freq", 20)
         self.spec = PolicySpec(convention="joint_positions", rate_hz=rate, language="none")
