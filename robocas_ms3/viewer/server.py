@@ -44,7 +44,6 @@ class Viewer(ThreadingHTTPServer):
         return f"http://{HOST}:{self.server_port}/"
 
     def warm_up(self) -> None:
-        """Make the index while the browser is still starting."""
         self._warming.start()
 
     def process_request(self, request: Any, client_address: Any) -> None:

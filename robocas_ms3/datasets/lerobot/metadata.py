@@ -158,7 +158,6 @@ class Metadata:
 
     @cached_property
     def subtasks(self) -> list[str]:
-        """Texts of sub-goals, by ``subtask_index``."""
         return read_texts(self.root / schema.SUBTASKS_FILE, "subtask_index", self.info["total_frames"])
 
     @cached_property

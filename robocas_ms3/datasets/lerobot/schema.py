@@ -153,7 +153,6 @@ def modality_json(cameras: Sequence[str]) -> dict[str, Any]:
 
 
 def whole_rate(rate_hz: float) -> int:
-    """Return the frames per second of LeRobot, or raise DatasetError if the rate is not a whole number."""
     if rate_hz < 1 or abs(rate_hz - round(rate_hz)) > 1e-9:
         what, expected = "LeRobot takes a whole number of frames a second", "1, 2, 4, 5, ..."
         raise DatasetError(what, where="rate", expected=expected, found=rate_hz)
@@ -161,14 +160,12 @@ def whole_rate(rate_hz: float) -> int:
 
 
 def check_video_size(size: tuple[int, int] | None) -> None:
-    """Raise DatasetError for an odd width or height, which the codecs can't encode; None is the cameras' size."""
     if size is not None and (size[0] % 2 or size[1] % 2):
         expected, found = "even width and height", f"{size[0]} x {size[1]}"
         raise DatasetError("videos need even sizes", where="size", expected=expected, found=found)
 
 
 def require_extra() -> None:
-    """Raise MissingExtraError unless pyarrow and PyAV are installed."""
     missing = [name for name in ("pyarrow", "av") if importlib.util.find_spec(name) is None]
     if missing:
         fix = 'In the clone: pip install -e ".[lerobot]"'

@@ -127,7 +127,6 @@ def read_objects(path: Path, columns: Mapping[str, Column], *, most_rows: float 
 
 
 def check_columns(table: pa.Table, columns: Mapping[str, Column], path: Path) -> None:
-    """Raise DatasetError for the first column that is missing or holds other values than declared."""
     for key, expected, found in faults(table, columns):
         what = "wrong column of a table"
         raise DatasetError(what, where=f"{path}, {key}", expected=expected, found=found, fix=SEE_VALIDATE)

@@ -261,7 +261,6 @@ def _describe(stream: Any) -> dict[str, Any]:
 
 
 def to_levels(depth: NDArray[np.uint16]) -> NDArray[np.uint16]:
-    """Return the levels (H, W) of a depth image in mm."""
     return np.minimum(depth, np.uint16(MAX_DEPTH_MM))
 
 

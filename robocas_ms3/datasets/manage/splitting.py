@@ -147,7 +147,6 @@ def split_by_value(dataset: Dataset, by: By, share: Share | None) -> dict[str, S
 
 
 def folder_names(values: Iterable[str]) -> dict[str, str]:
-    """Return a distinct and safe name of a folder for each value."""
     plain = {value: re.sub(r"[^\w.-]+", "_", value).strip(".")[:40] or "_" for value in values}
     shared = Counter(plain.values())
     return {

@@ -106,7 +106,6 @@ def open_preview(root: Path, drawing: EpisodeDrawing, *, row: bool) -> Iterator[
 
 
 def on_sheet(numbers: Iterable[int]) -> tuple[int, ...]:
-    """Return the episodes of a dataset that are on its contact sheet."""
     return tuple(sorted(numbers)[:SHEET])
 
 

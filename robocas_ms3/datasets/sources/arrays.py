@@ -54,7 +54,6 @@ class EpisodeArrays:
         return lengths.get("ee_pos", most[0][0] if most else 0)
 
     def reason(self, key: str = "") -> str:
-        """Return why a key could not be read."""
         error = self.unreadable[key]
         text = getattr(error, "strerror", None) or one_line(error)
         pickled = PICKLED if key else f"another file, or {PICKLED}"
@@ -132,7 +131,6 @@ def cast(spec: schema.ArraySpec, array: NDArray) -> NDArray:
 
 
 def is_declared(key: str, array: NDArray) -> bool:
-    """Return whether an array has the schema's type and number of axes."""
     return SPECS[key].has_dtype(array) and array.ndim == len(SPECS[key].shape)
 
 

@@ -143,7 +143,6 @@ class SourceEpisode(ABC):
         return standard_parent(camera)
 
     def camera(self, name: str) -> CameraModel:
-        """Return the model of a camera."""
         return CameraModel(self.intrinsic(name), self.camera_in_parent(name), self.camera_parent(name))
 
 

@@ -59,7 +59,6 @@ class TrajectorySource(EpisodeSource):
         return found
 
     def objects(self, number: int) -> list[Any]:
-        """Return the assets of an episode by slot, as the JSON has them."""
         return list(self.file.episodes[self.index[number]]["robocas"].get("objects") or ())
 
     def steps(self, number: int) -> int:

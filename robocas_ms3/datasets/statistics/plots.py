@@ -76,7 +76,6 @@ def _whole_numbers(axis: Any) -> None:
 
 
 def draw_lengths(stats: Stats) -> Any:
-    """Histogram of episode lengths, a panel a task."""
     rows, columns = _shape(len(stats.lengths), 2)
     figure = _figure(4.6 * columns + 0.4, 2.7 * rows + 0.3)
     panels = _axes(figure, rows, columns, len(stats.lengths))
@@ -95,7 +94,6 @@ def draw_lengths(stats: Stats) -> Any:
 
 
 def draw_objects(stats: Stats) -> Any:
-    """Bars: in how many episodes each object took part, and of how many it was the target."""
     if not stats.objects and not stats.targets:
         return None
     everything = counted(stats.objects | stats.targets)
@@ -161,7 +159,6 @@ def _draw_layout(figure: Any, axes: Any, name: str, layout: LayoutMap) -> None:
 
 
 def draw_instructions(stats: Stats) -> Any:
-    """Bars of instructions, and of templates and relations where they are known."""
     tables = {
         f"Instructions, {len(stats.instructions)} different": stats.instructions,
         f"Templates, {len(stats.templates)} different": stats.templates,
@@ -184,7 +181,6 @@ def draw_instructions(stats: Stats) -> Any:
 
 
 def draw_actions(stats: Stats) -> Any:
-    """Histograms of the seven numbers of the action; dashed: 1st and 99th percentile."""
     if not len(stats.actions):
         return None
     figure = _figure(11, 5.2)
@@ -209,7 +205,6 @@ def draw_actions(stats: Stats) -> Any:
 
 
 def draw_subgoals(stats: Stats) -> Any:
-    """Box plots of how long the sub-goals of each type took."""
     if not stats.subgoals:
         return None
     kinds = sorted(stats.subgoals, key=lambda kind: -len(stats.subgoals[kind]))

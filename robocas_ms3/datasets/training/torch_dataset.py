@@ -187,7 +187,6 @@ class RoboCASDataset(torch.utils.data.Dataset):
 
 
 def check_holds(source: EpisodeSource, options: SampleOptions) -> None:
-    """Raise DatasetError if a source does not hold what samples are made of."""
     there, cameras = source.cameras, tuple(options.cameras)
     if set(cameras) - set(there) or len(set(cameras)) < len(cameras):
         fix = "" if there else "Pass cameras=(), or make images with robocas convert."

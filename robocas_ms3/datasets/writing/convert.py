@@ -109,7 +109,6 @@ def convert(
 
 
 def _split_before(out: Path) -> tuple[list[int], list[int]]:
-    """Return the training and validation episodes of the dataset in ``out``, if there is one."""
     if not (out / schema.DATA_INFO_FILE).is_file():
         return [], []
     try:

@@ -28,7 +28,6 @@ _NEEDED = ("episode_length", "language_goal", "step_goal_type", "step_lang_goals
 
 
 def write_info(root: Path, before: tuple[Iterable[int], Iterable[int]] = ((), ())) -> None:
-    """Write ``data_info.json`` from the episodes on disk; see `info_of`."""
     write_json(root / schema.DATA_INFO_FILE, info_of(root, before))
 
 

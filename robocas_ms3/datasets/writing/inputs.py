@@ -96,7 +96,6 @@ class ConversionInput:
 
 
 def open_input(settings: ConversionSettings) -> ConversionInput:
-    """Open the trajectory file or dataset that settings name."""
     if settings.is_trajectory:
         rendered = open_trajectory(settings)
         return ConversionInput(rendered, rendered.pictures, settings.include_failed)
@@ -158,7 +157,6 @@ def _distinct(source: EpisodeSource, entries: list[dict[str, Any]]) -> list[dict
 
 
 def _warn_of_other_rates(source: RenderedSource, entries: list[dict[str, Any]]) -> None:
-    """Warn if the open-loop check of the actions was made at another rate than that of the dataset."""
     recorded = [source.file.episodes[entry["source"]].get("robocas") for entry in entries]
     checked = [one.get("replay_rate") for one in recorded if isinstance(one, dict)]
     rates = {float(rate) for rate in checked if isinstance(rate, int | float) and rate}  # others are not checked

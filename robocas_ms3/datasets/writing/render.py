@@ -51,7 +51,6 @@ class EnvRenderer:
         self._check_scene(recording)
 
     def _check_scene(self, recording: Recording) -> None:
-        """Raise DatasetError if the rebuilt scene is not the recorded one."""
 
         def refuse(name: str, expected: object, found: object) -> None:
             where = f"episode {recording.episode_id}, seed {recording.seed}{f', {name}' if name else ''}"
@@ -140,7 +139,6 @@ def _numbers(pose: NDArray[np.float64]) -> list[float]:
 
 
 def require_renderer() -> None:
-    """Raise DatasetError if SAPIEN finds no device to render with."""
     import sapien
 
     try:

@@ -95,7 +95,6 @@ class ConversionSettings:
 
     @property
     def pictures(self) -> Pictures:
-        """Images that are wanted."""
         from robocas_ms3.datasets.pictures.stored import Pictures
 
         return Pictures(self.cameras, self.size, self.depth, self.image_format, self.boxes)
@@ -121,7 +120,6 @@ class ConversionSettings:
         return self.open_renderer is None and self.is_trajectory
 
     def check_device(self) -> None:
-        """Raise DatasetError if a render device is needed and there is none."""
         if self.needs_device:
             from robocas_ms3.datasets.writing.render import require_renderer
 

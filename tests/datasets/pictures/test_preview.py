@@ -3,6 +3,7 @@
 import imageio.v2 as imageio
 import numpy as np
 import pytest
+from managing import files_of
 from PIL import Image
 from synthetic import RayCaster, render_by, write_trajectory
 
@@ -30,12 +31,13 @@ def shown(out):
     return sorted(path.name for path in (out / "preview").iterdir()) if (out / "preview").is_dir() else []
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
-def test_shows_what_the_dataset_holds(trajectory, tmp_path, monkeypatch, jobs):
-    out = tmp_path / "out"
+def test_shows_what_the_dataset_holds(trajectory, tmp_path, monkeypatch):
+    out, settings = tmp_path / "out", {"embeddings": False, "open_renderer": RayCaster}
     with monkeypatch.context() as patch:
         patch.delattr("robocas_ms3.datasets.sources.reader.read_picture")  # no image is read back
-        conversion.convert(ConversionSettings(trajectory, out, embeddings=False, jobs=jobs, open_renderer=RayCaster))
+        conversion.convert(ConversionSettings(trajectory, out, **settings))
+        conversion.convert(ConversionSettings(trajectory, tmp_path / "by processes", jobs=2, **settings))
+    assert files_of(tmp_path / "by processes") == files_of(out)
     assert shown(out) == ["contact_sheet.png", "episode_0000000.mp4", "episode_0000001.mp4"]
     dataset = Dataset(out)
     for number in dataset.numbers:

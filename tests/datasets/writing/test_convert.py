@@ -106,13 +106,6 @@ def test_without_embeddings_and_at_another_rate(trajectory, tmp_path):
         assert len(arrays["rel_pos"]) == STEPS // 2 + 1
 
 
-def test_processes_write_the_same(trajectory, tmp_path):
-    out = tmp_path / "out"
-    run(trajectory, out, jobs=2)
-    run(trajectory, tmp_path / "one", jobs=1)
-    assert files_of(out) == files_of(tmp_path / "one")
-
-
 def test_resume_keeps_what_is_there(trajectory, tmp_path):
     out = tmp_path / "out"
     run(trajectory, out)
