@@ -18,30 +18,30 @@ def notes_of(model):
     return " | ".join(model.notes)
 
 
-@pytest.mark.parametrize(
-    "name", ["collision", "a_col", "a_vhacd", "a_hull", "a_coll", "a_collision_0", "a_coacd", "convex_3"]
-)
-def test_a_collision_mesh_is_ignored_and_reported(tmp_path, name):
-    write_obj(tmp_path, "model", mug())
-    trimesh.creation.icosphere(subdivisions=3, radius=0.07).export(tmp_path / f"{name}.obj")
-    model = read_model(tmp_path)
-    assert len(model.mesh.faces) == 12
-    assert f"ignored {name}.obj" in notes_of(model) and "used model.obj" in notes_of(model)
+BODY = box((0.07, 0.08, 0.1))
+FINE, MILLIMETRES, Y_UP = BODY.subdivide(), BODY.subdivide().apply_scale(1000), BODY.copy()
+Y_UP.vertices = 100 * Y_UP.vertices[:, [0, 2, 1]] * [1, 1, -1]
+BALL = trimesh.creation.icosphere(subdivisions=3, radius=0.07)
+COLLISION = ("collision", "a_col", "a_vhacd", "a_hull", "a_coll", "a_collision_0", "a_coacd", "convex_3")
 
 
 @pytest.mark.parametrize(
-    ("others", "used"),
+    ("used", "others"),
     [
-        (["mug.stl", "nontextured.ply"], "mug.obj"),
-        (["mug_low.glb"], "mug.obj"),
-        (["a_millimetres.stl"], "mug.obj"),
+        ("mug.obj", {"mug.stl": FINE, "nontextured.ply": FINE}),
+        ("mug.obj", {"mug_low.glb": FINE}),
+        ("mug.obj", {"a_millimetres.stl": MILLIMETRES}),
+        ("mug.obj", {"mug.glb": Y_UP}),
+        ("meshes/mug.obj", {"mug.stl": BODY, "collision/a.stl": BODY}),
+        ("visual/mug.obj", {"collision.obj": box()}),
+        *(("model.obj", {f"{name}.obj": BALL}) for name in COLLISION),
     ],
 )
-def test_of_several_versions_the_textured_one_is_taken(tmp_path, others, used):
-    write_obj(tmp_path, "mug", mug())
-    for name in others:
-        mesh = mug().subdivide()
-        mesh.apply_scale(1000 if "milli" in name else 1)
+def test_the_textured_version_is_taken_and_others_are_reported(tmp_path, used, others):
+    path = tmp_path / used
+    write_obj(path.parent, path.stem, BODY)
+    for name, mesh in others.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
         mesh.export(tmp_path / name)
     model = read_model(tmp_path)
     assert len(model.mesh.faces) == 12 and f"used {used}" in notes_of(model)
@@ -168,22 +168,6 @@ def test_of_versions_without_texture_the_most_detailed_one_is_taken(tmp_path):
     assert len(read_model(tmp_path).mesh.faces) == 48
 
 
-def test_a_collision_mesh_above_the_folder_of_the_visual_one(tmp_path):
-    write_obj(tmp_path / "visual", "mug", mug())
-    box().export(tmp_path / "collision.obj")
-    model = read_model(tmp_path)
-    assert any(path.name == "skin.png" for path in model.files) and "ignored collision.obj" in notes_of(model)
-
-
-def test_versions_in_several_folders(tmp_path):
-    write_obj(tmp_path / "meshes", "mug", mug())
-    (tmp_path / "collision").mkdir()
-    for name in ("mug.stl", "collision/a.stl"):
-        mug().export(tmp_path / name)
-    found = notes_of(read_model(tmp_path))
-    assert all(words in found for words in ("used meshes/mug.obj", "ignored mug.stl", "ignored collision/a.stl"))
-
-
 def test_a_textured_label_around_a_can(tmp_path):
     trimesh.creation.cylinder(0.03, 0.1, sections=48).export(tmp_path / "can.ply")
     wall = trimesh.creation.cylinder(0.03, 0.1, sections=48)
@@ -197,12 +181,3 @@ def test_only_a_folder_of_collision_meshes(tmp_path):
     (tmp_path / "collision").mkdir()
     mug().export(tmp_path / "collision" / "a.stl")
     assert len(read_model(tmp_path).mesh.faces) == 12
-
-
-def test_versions_with_other_units_and_axes(tmp_path):
-    write_obj(tmp_path, "mug", box((0.05, 0.06, 0.1), (0, 0, 0.05)))
-    turned = box((0.05, 0.06, 0.1), (0, 0, 0.05))
-    turned.vertices = 100 * turned.vertices[:, [0, 2, 1]] * [1, 1, -1]
-    turned.export(tmp_path / "mug.glb")
-    model = read_model(tmp_path)
-    assert "used mug.obj" in notes_of(model) and "ignored mug.glb: another version" in notes_of(model)
