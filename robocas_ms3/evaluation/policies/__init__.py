@@ -117,16 +117,14 @@ def _make_own(name: str, module: str, attribute: str) -> Policy:
         sys.path.append(os.getcwd())  # last: a file in the folder must not hide an installed module
     try:
         make: Any = getattr(importlib.import_module(module), attribute)
-    except ModuleNotFoundError as error:
-        if error.name == module.partition(".")[0] or module.endswith(".py"):
-            fix = "Run in its folder, or install it, or put its folder on PYTHONPATH."
-            if module.endswith(".py"):
-                fix = f"Leave the .py out: {module[:-3]}:{attribute}"
-            raise EvaluationError("no such policy", where=name, found=error, fix=fix) from error
-        raise EvaluationError("this policy's module can't be imported", where=module, found=error) from error
     except AttributeError as error:
         raise EvaluationError("no such policy", where=name, found=error) from error
-    except Exception as error:
+    except Exception as error:  # code of the user may raise anything
+        is_file = module.endswith(".py")
+        if isinstance(error, ModuleNotFoundError) and (is_file or error.name == module.partition(".")[0]):
+            fix = "Run in its folder, or install it, or put its folder on PYTHONPATH."
+            fix = f"Leave the .py out: {module[:-3]}:{attribute}" if is_file else fix
+            raise EvaluationError("no such policy", where=name, found=error, fix=fix) from error
         what, found = "this policy's module can't be imported", f"{type(error).__name__}: {error}"
         raise EvaluationError(what, where=module, found=found) from error
     return _call(name, make)

@@ -131,11 +131,12 @@ def test_an_option_that_is_newer_than_the_run_has_its_default(whole, data):
     ("recorded", "changes"),
     [
         ({"device": "cuda"}, ["from step 40 by device cpu"]),
-        ({"threads": 99}, [f"from step 40 by threads {torch.get_num_threads()}"]),
+        ({"threads": 99}, ["from step 40 by threads {threads}"]),
         ({"threads": 0}, []),  # not known
     ],
 )
 def test_other_hardware_is_recorded(whole, data, recorded, changes):
+    changes = [change.format(threads=torch.get_num_threads()) for change in changes]  # other tests change it
     change_record(whole, **recorded)
     notes = []
     train("made-up", data, whole, progress=Progress(note=notes.append))
