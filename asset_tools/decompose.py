@@ -16,7 +16,7 @@ from asset_tools.solids import to_mesh, to_solid
 from robocas_ms3.assets.cooking import OBLONG, SHRINKAGE, cook_hulls
 from robocas_ms3.assets.hulls import box_of, center_of, slenderness
 from robocas_ms3.assets.physics import cook
-from robocas_ms3.core.errors import AssetError, MissingExtraError
+from robocas_ms3.core.errors import AssetError
 
 Array = NDArray[np.float64]
 
@@ -60,7 +60,6 @@ def decompose(closed: trimesh.Trimesh) -> Decomposition:
 
     Raises:
         AssetError: the mesh isn't closed, or CoACD makes nothing of it.
-        MissingExtraError: CoACD is not installed.
     """
     if not closed.is_watertight or closed.volume <= 0:
         raise AssetError("can't decompose a mesh that isn't closed", expected="watertight, volume > 0")
@@ -234,10 +233,8 @@ def _smoothed(closed: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def _run_coacd(body: trimesh.Trimesh, threshold: float) -> list[Array]:
-    try:
-        import coacd
-    except ImportError as error:
-        raise MissingExtraError("CoACD is not installed", fix="In the clone: pip install -e '.[assets]'") from error
+    import coacd
+
     coacd.set_log_level("error")
     least = SLIVER * float(body.volume)
     vertices: Any = np.asarray(body.vertices)

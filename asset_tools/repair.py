@@ -15,7 +15,7 @@ from trimesh.visual.texture import TextureVisuals
 
 from asset_tools.clean import clean
 from asset_tools.solids import to_mesh, to_solid
-from robocas_ms3.core.errors import AssetError, MissingExtraError
+from robocas_ms3.core.errors import AssetError
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -205,12 +205,8 @@ def _union_of_pieces(mesh: trimesh.Trimesh, repairs: list[str]) -> Manifold | No
 
 def _remeshed(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """Zero level of the distance to the surface, signed by the winding number, on a grid."""
-    try:
-        from skimage.measure import marching_cubes
-    except ImportError as error:
-        raise MissingExtraError(
-            "scikit-image is not installed", fix="In the clone: pip install -e '.[assets]'"
-        ) from error
+    from skimage.measure import marching_cubes
+
     pitch = float(mesh.extents.max()) / CELLS
     low = mesh.bounds[0] - 2 * pitch
     shape = np.ceil(mesh.extents / pitch).astype(int) + 5

@@ -4,13 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import trimesh
-
-from robocas_ms3.core.errors import MissingExtraError
-
-try:
-    from manifold3d import Error, Manifold, Mesh64
-except ImportError as error:
-    raise MissingExtraError("manifold3d is not installed", fix="In the clone: pip install -e '.[assets]'") from error
+from manifold3d import Error, Manifold, Mesh64
 
 
 def to_solid(mesh: trimesh.Trimesh) -> Manifold | None:

@@ -17,7 +17,7 @@ from trimesh.visual.texture import TextureVisuals
 from asset_tools.glb import rgba_of, roughness_of
 from asset_tools.reading.surface import TEXTURE, TINT, Textures, decode_srgb, encode_srgb
 from asset_tools.simplify import outward, simplified, welded
-from robocas_ms3.core.errors import AssetError, MissingExtraError
+from robocas_ms3.core.errors import AssetError
 
 Array = NDArray[np.float64]
 
@@ -44,7 +44,6 @@ def to_display(mesh: trimesh.Trimesh, *, triangles: int = 1500, texture_size: in
 
     Raises:
         AssetError: the mesh has no faces, or is not finite.
-        MissingExtraError: xatlas is not installed.
     """
     if len(mesh.faces) == 0 or not np.isfinite(mesh.vertices).all():
         raise AssetError(
@@ -207,10 +206,8 @@ def _crease_normals(body: trimesh.Trimesh) -> Array:
 
 def _unwrapped(body: trimesh.Trimesh, size: int) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     """The vertex that each UV vertex comes from, faces of UV vertices and (V, 2) UVs in 0 to 1, without overlaps."""
-    try:
-        import xatlas
-    except ImportError as error:
-        raise MissingExtraError("xatlas is not installed", fix="In the clone: pip install -e '.[assets]'") from error
+    import xatlas
+
     scaled = (np.asarray(body.vertices) - body.bounds[0]) / np.linalg.norm(body.extents)
     atlas = xatlas.Atlas()
     atlas.add_mesh(scaled.astype(np.float32), np.asarray(body.faces, dtype=np.uint32))

@@ -9,7 +9,6 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,7 @@ from asset_tools.reading.files import LARGEST_FILE, ModelFiles
 from asset_tools.reading.images import open_texture
 from asset_tools.reading.obj import MOST_FACES, MOST_VERTICES, decode_text
 from asset_tools.reading.surface import Material, Part, decode_srgb
-from robocas_ms3.core.errors import AssetError, MissingExtraError
+from robocas_ms3.core.errors import AssetError, require_extra
 from robocas_ms3.core.words import error_line
 
 TEXTURE_COMMENT = re.compile(rb"comment\s+TextureFile\s+(.*)", re.IGNORECASE)
@@ -46,10 +45,8 @@ def read_exchange(path: Path, files: ModelFiles) -> list[Part]:
         MissingExtraError: COLLADA, without pycollada.
     """
     data, suffix = files.read(path), path.suffix.lower()[1:]
-    if suffix == "dae" and find_spec("collada") is None:
-        raise MissingExtraError(
-            "pycollada is not installed", where=path, fix="In the clone: pip install -e '.[assets]'"
-        )
+    if suffix == "dae":
+        require_extra("assets", "COLLADA files", "collada")
     if suffix == "3mf":
         _check_archive(data, path, files)
     textures, faces = _Textures(path, files), 0

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from robocas_ms3.core.errors import MissingExtraError, TrainingError
+from robocas_ms3.core.errors import TrainingError, require_extra
 from robocas_ms3.core.exits import no_exit
 from robocas_ms3.core.extensions import Registry
 from robocas_ms3.core.words import nearest
@@ -54,16 +54,6 @@ def find_baseline(name: str, *, where: object = "") -> Baseline:
         known = list(BASELINES)
         expected = f"one of {', '.join(known)}"
         raise TrainingError("no such baseline", where=where or name, expected=expected, fix=nearest(name, known))
-    need_extra("safetensors")
+    require_extra("train", "baselines", "safetensors")
     with no_exit(f"baseline {name}"):
         return BASELINES[name]()
-
-
-def need_extra(*modules: str) -> None:
-    """Check that modules of the ``train`` extra are installed."""
-    for module in modules:
-        try:
-            import_module(module)
-        except ModuleNotFoundError as error:
-            fix = 'In the clone: pip install -e ".[train]"'
-            raise MissingExtraError("baselines need an extra", found=f"no {error.name}", fix=fix) from error

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from robocas_ms3.cli import assets_show
-from robocas_ms3.cli.assets_show import mesh_tools
+from robocas_ms3.cli.assets_show import require_mesh_tools
 from robocas_ms3.cli.options import CORES, Jobs, Maybe, Several
 from robocas_ms3.core.checks import check_number
 from robocas_ms3.core.words import count_of
@@ -127,8 +127,9 @@ class Build:
 
 
 def import_scans(command: ImportScans) -> int:
-    with mesh_tools():
-        from asset_tools.import_scans import ImportSettings, scan_jobs
+    require_mesh_tools()
+    from asset_tools.import_scans import ImportSettings, scan_jobs
+
     out, masses = _target(command.pack), _masses(command.masses)
     settings = ImportSettings(command.units, command.up, masses, command.licence, command.attribution)
     from robocas_ms3.cli.terminal import say
@@ -138,16 +139,18 @@ def import_scans(command: ImportScans) -> int:
 
 
 def import_graspnet(command: ImportGraspNet) -> int:
-    with mesh_tools():
-        from asset_tools.graspnet.importer import graspnet_jobs
+    require_mesh_tools()
+    from asset_tools.graspnet.importer import graspnet_jobs
+
     out = _target(command.pack)
     jobs = graspnet_jobs(command.root, command.ids, partial(_inspect, command))
     return _make(jobs, command, out, "GraspNet object")
 
 
 def import_ycb(command: ImportYCB) -> int:
-    with mesh_tools():
-        from asset_tools.import_ycb import ycb_jobs
+    require_mesh_tools()
+    from asset_tools.import_ycb import ycb_jobs
+
     out = _target(command.pack)
     jobs = ycb_jobs(command.root, command.ids, partial(_inspect, command))
     return _make(jobs, command, out, "YCB object")
@@ -156,9 +159,10 @@ def import_ycb(command: ImportYCB) -> int:
 def import_partnet(command: ImportPartNet) -> int:
     from robocas_ms3.core.errors import AssetError
 
-    with mesh_tools():
-        from asset_tools.partnet.importer import partnet_jobs
-        from asset_tools.partnet.template import template
+    require_mesh_tools()
+    from asset_tools.partnet.importer import partnet_jobs
+    from asset_tools.partnet.template import template
+
     if not command.models:
         raise AssetError("no model given", expected="folders with a mobility.urdf", fix="Give at least one.")
     if command.template:
@@ -174,8 +178,8 @@ def build(command: Build) -> int:
     from robocas_ms3.core.paths import builtin_packs_dir
 
     try:
-        with mesh_tools():
-            from asset_tools.builtin.build import DESCRIPTION, FORMULAS_HASH, NAME, builtin_jobs, formulas_hash
+        require_mesh_tools()
+        from asset_tools.builtin.build import DESCRIPTION, FORMULAS_HASH, NAME, builtin_jobs, formulas_hash
     except ModuleNotFoundError as error:
         if error.name != "asset_tools.builtin":
             raise
@@ -196,7 +200,6 @@ def build(command: Build) -> int:
 
 
 def _inspect(command: _Making, models: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Inspect models before they are imported, with a progress bar."""
     from asset_tools.inspection import inspect_models
     from robocas_ms3.cli.bars import Bar
 
@@ -281,7 +284,6 @@ def _write(jobs: list[Job], command: _Making, out: Path, description: str, *, re
 
 
 def _draw_sheet(folder: Path) -> None:
-    """Draw the contact sheet of a new pack into its folder, if there is a renderer."""
     from asset_tools.sheet import contact_sheet
     from robocas_ms3.assets.pack import load_pack
     from robocas_ms3.cli.bars import working

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -150,8 +148,8 @@ def verify(command: Verify) -> int:
 
 
 def sheet(command: Sheet) -> int:
-    with mesh_tools():
-        from asset_tools.sheet import contact_sheet
+    require_mesh_tools()
+    from asset_tools.sheet import contact_sheet
     from robocas_ms3.assets.pack import load_pack
     from robocas_ms3.cli.bars import working
     from robocas_ms3.cli.terminal import say
@@ -168,9 +166,9 @@ def sheet(command: Sheet) -> int:
 
 
 def _verify_physics(pack: Pack, jobs: int, out: Path | None) -> int:
-    with mesh_tools():
-        from asset_tools.quality.measure import HEADER, differences, judge, rows
-        from asset_tools.quality.packs import FURNITURE_HEADER, furniture_rows, judge_furniture, remeasure_pack
+    require_mesh_tools()
+    from asset_tools.quality.measure import HEADER, differences, judge, rows
+    from asset_tools.quality.packs import FURNITURE_HEADER, furniture_rows, judge_furniture, remeasure_pack
     from robocas_ms3.cli.bars import Bar
     from robocas_ms3.cli.terminal import print_table, table_console
     from robocas_ms3.core.files import write_json
@@ -201,15 +199,7 @@ def _verify_physics(pack: Pack, jobs: int, out: Path | None) -> int:
     return 1 if violations else 0
 
 
-@contextmanager
-def mesh_tools() -> Iterator[None]:
-    """Say which extra to install where the mesh tools are missing."""
-    from robocas_ms3.core.errors import MissingExtraError
+def require_mesh_tools() -> None:
+    from robocas_ms3.core.errors import require_extra
 
-    try:
-        yield
-    except ImportError as error:
-        if (error.name or "").partition(".")[0] in ("asset_tools", "robocas_ms3"):
-            raise  # a fault of ours, no missing package
-        what, fix = "mesh tools are not installed", "In the clone: pip install -e '.[assets]'"
-        raise MissingExtraError(what, found=error.name or error, fix=fix) from error
+    require_extra("assets", "mesh tools", "coacd", "manifold3d", "skimage", "xatlas")

@@ -138,7 +138,6 @@ def verify(cfg: Verify) -> int:
 
 
 def videos(cfg: Videos) -> int:
-    """Run ``videos``."""
     from robocas_ms3.cli.bars import Bar
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.core.checks import check_number

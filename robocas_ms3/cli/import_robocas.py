@@ -78,7 +78,6 @@ def main(cfg: ImportRobocas) -> int:
 
 
 def _table(found: Survey) -> None:
-    """Print what is wrong, the same fault of several episodes in one line."""
     from robocas_ms3.cli.terminal import print_table, say
     from robocas_ms3.core.words import count_of, format_ranges
 

@@ -80,7 +80,6 @@ def main(cfg: Split) -> int:
 
 
 def _check(cfg: Split) -> None:
-    """Check that exactly one way of splitting was chosen, with all of its options."""
     from robocas_ms3.core.errors import DatasetError
 
     sides = cfg.out_train is not None or cfg.out_val is not None

@@ -68,7 +68,6 @@ def say_lines(text: str) -> None:
 
 
 def say_json(values: object) -> None:
-    """Print values as JSON on stdout."""
     say_lines(json.dumps(values, indent=2, ensure_ascii=False))
 
 

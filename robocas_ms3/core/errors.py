@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Mapping
 from typing import Any
 
@@ -71,6 +72,13 @@ class PlanError(RobocasError):
 
 class MissingExtraError(RobocasError):
     """An optional dependency is needed; the message names its extra."""
+
+
+def require_extra(extra: str, purpose: str, *modules: str, fix: str = "") -> None:
+    """Raise MissingExtraError if modules that an extra brings are not installed; ``fix`` is another way out."""
+    if missing := [module for module in modules if importlib.util.find_spec(module) is None]:
+        what, install = f"missing for {purpose}: {', '.join(missing)}", f'In the clone: pip install -e ".[{extra}]".'
+        raise MissingExtraError(what, fix=f"{install} {fix}".rstrip())
 
 
 class WorkerCrashed(RobocasError):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from typing import Any
 from robocas_ms3.assets.pack import MANIFEST, pack_folders, sha256
 from robocas_ms3.core.checks import GREATEST_SEED
 from robocas_ms3.core.documents import DocumentError, load_yaml
-from robocas_ms3.core.errors import MissingExtraError, PlanError
+from robocas_ms3.core.errors import MissingExtraError, PlanError, require_extra
 from robocas_ms3.core.paths import plans_dir
 from robocas_ms3.core.strict import parse
 from robocas_ms3.core.words import error_line, nearest
@@ -94,14 +93,13 @@ def check_plan(plan: Plan) -> None:
 
             TextEmbedder()  # raises if something is missing; loads nothing
         if "lerobot" in plan.formats:
-            from robocas_ms3.datasets.lerobot.schema import check_video_size, require_extra, whole_rate
+            from robocas_ms3.datasets.lerobot.schema import check_video_size, require_lerobot, whole_rate
 
-            require_extra()
+            require_lerobot()
             whole_rate(plan.rate)
             check_video_size(plan.pictures.size)
-    if "statistics" in plan.stages and find_spec("matplotlib") is None:
-        fix = 'In the clone: pip install -e ".[plots]", or leave the stage out.'
-        raise MissingExtraError("statistics are drawn with matplotlib", fix=fix)
+    if "statistics" in plan.stages:
+        require_extra("plots", "statistics", "matplotlib", fix="Or leave the stage out.")
 
 
 def recording_settings(plan: Plan, part: int) -> EpisodeSettings:

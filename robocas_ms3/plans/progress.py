@@ -33,7 +33,6 @@ class Progress:
         self.read()
 
     def read(self) -> None:
-        """Read the outcomes of units that are not complete."""
         for unit in self.folder.started_units():
             self.add(unit)
 

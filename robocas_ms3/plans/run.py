@@ -154,7 +154,6 @@ def _do_units(
 
 
 def _ended(running: dict[Any, Sequence[Unit]], until: float) -> list[Any]:
-    """Wait for a job to end, at most until some time."""
     while True:
         with deferred_interrupts():  # Ctrl-C inside could leave a lock of a future held
             ended = [job for job in running if job.done()]

@@ -263,5 +263,4 @@ def _is_of_a_seed(error: Exception) -> bool:
 
 
 def _cpu_seconds() -> float:
-    """Return the CPU time of this process and of its forked branches."""
     return sum(os.times()[:4])

@@ -10,9 +10,8 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from robocas_ms3.baselines.registry import need_extra
 from robocas_ms3.baselines.rt1.config import RT1Config
-from robocas_ms3.core.errors import TrainingError
+from robocas_ms3.core.errors import TrainingError, require_extra
 from robocas_ms3.scenes.language.embed import DIMENSIONS
 
 _SQUARE_PADDED = (5, 18)
@@ -130,7 +129,7 @@ def _read_weights(path: Path) -> dict[str, Any]:
 
 def efficientnet(config: RT1Config) -> Any:
     """Return EfficientNetModel of transformers with random weights: B3 by default, with 10.7 M parameters."""
-    need_extra("transformers")
+    require_extra("train", "rt1", "transformers")
     from transformers import EfficientNetConfig, EfficientNetModel
 
     net = EfficientNetModel(

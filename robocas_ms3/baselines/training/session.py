@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from robocas_ms3.baselines.baseline import Baseline, OnRead, Precision, Progress, Samples, Split
-from robocas_ms3.baselines.registry import find_baseline, need_extra
+from robocas_ms3.baselines.registry import find_baseline
 from robocas_ms3.baselines.training.record import (
     CHECKPOINT,
     RUN,
@@ -27,7 +27,7 @@ from robocas_ms3.baselines.training.record import (
     package_versions,
     read_run,
 )
-from robocas_ms3.core.errors import EmptySplitError, TrainingError
+from robocas_ms3.core.errors import EmptySplitError, TrainingError, require_extra
 from robocas_ms3.core.exits import no_exit
 from robocas_ms3.core.outputs import FolderKind, OutputFolder, setting_changes
 from robocas_ms3.core.strict import parse
@@ -88,7 +88,7 @@ def train_run(options: RunOptions, progress: Progress | None = None) -> RunRecor
         OutputExistsError: the folder is a run with other settings, versions or data, or no run.
         KeyboardInterrupt: Ctrl-C; the run can be continued.
     """
-    need_extra("accelerate", "safetensors", "tensorboard", "transformers")
+    require_extra("train", "baselines", "accelerate", "safetensors", "tensorboard", "transformers")
     from robocas_ms3.baselines.training.run_folder import RunFolder, describe_hardware, make_accelerator
     from robocas_ms3.baselines.training.supervised import train_supervised
 

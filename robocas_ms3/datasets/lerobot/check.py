@@ -37,7 +37,7 @@ def check_lerobot(
     Raises:
         MissingExtraError: the ``lerobot`` extra is not installed.
     """
-    schema.require_extra()
+    schema.require_lerobot()
     root = Path(root)
     info, wrong = read_object(root, schema.INFO_FILE, InfoRecord, absent="JSON")
     features = {} if wrong else info["features"]

@@ -25,7 +25,7 @@ from robocas_ms3.datasets.lerobot.schema import (
     STAGING,
     FileLimits,
     check_video_size,
-    require_extra,
+    require_lerobot,
     whole_rate,
 )
 from robocas_ms3.datasets.lerobot.variants import Variant, find_variant
@@ -69,7 +69,7 @@ def convert_lerobot(
         RobocasError: another conversion is running.
         MissingExtraError: the ``lerobot`` extra is not installed.
     """
-    require_extra()
+    require_lerobot()
     check_video_size(settings.pictures.size)
     start, variant, out = time.perf_counter(), find_variant(settings.lerobot_version), settings.out
     settings = replace(settings, boxes=variant.language)

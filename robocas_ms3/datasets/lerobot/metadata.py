@@ -38,7 +38,7 @@ class Metadata:
     """The ``meta`` folder of a dataset; each file is read at its first use."""
 
     def __init__(self, root: Path) -> None:
-        schema.require_extra()
+        schema.require_lerobot()
         self.root = root
         _ = self.info
 

@@ -6,14 +6,13 @@ Writer, reader, checks, documentation and tests read it. Metres and radians; qua
 from __future__ import annotations
 
 import hashlib
-import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from robocas_ms3.core.documents import check_regular
-from robocas_ms3.core.errors import DatasetError, MissingExtraError
+from robocas_ms3.core.errors import DatasetError, require_extra
 from robocas_ms3.datasets.lerobot.variants import Variant
 from robocas_ms3.robots.quantities import STATE, columns_of
 from robocas_ms3.robots.quantities import features as quantities_of_features
@@ -165,11 +164,8 @@ def check_video_size(size: tuple[int, int] | None) -> None:
         raise DatasetError("videos need even sizes", where="size", expected=expected, found=found)
 
 
-def require_extra() -> None:
-    missing = [name for name in ("pyarrow", "av") if importlib.util.find_spec(name) is None]
-    if missing:
-        fix = 'In the clone: pip install -e ".[lerobot]"'
-        raise MissingExtraError(f"LeRobot datasets need {' and '.join(missing)}", fix=fix)
+def require_lerobot() -> None:
+    require_extra("lerobot", "LeRobot datasets", "pyarrow", "av")
 
 
 def checksum(path: Path) -> str:

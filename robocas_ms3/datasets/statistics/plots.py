@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from robocas_ms3.core.errors import MissingExtraError
+from robocas_ms3.core.errors import require_extra
 from robocas_ms3.core.files import make_folder, replacing, write_json
 from robocas_ms3.core.words import called, count_of, printable
 from robocas_ms3.datasets.actions import ACTION_NAMES
@@ -23,11 +23,7 @@ _TEXT = 84  # letters of a label
 
 def write_stats(stats: Stats, out: Path) -> list[Path]:
     """Write ``stats.json`` and a PNG of each kind into a folder; return their paths."""
-    try:
-        import matplotlib  # noqa: F401  (before anything is written)
-    except ImportError as error:
-        fix = 'In the clone: pip install -e ".[plots]"'
-        raise MissingExtraError("statistics are drawn with matplotlib, which is not installed", fix=fix) from error
+    require_extra("plots", "statistics", "matplotlib")
     make_folder(out)
     paths = [out / "stats.json"]
     write_json(paths[0], stats.as_json())

@@ -4,13 +4,6 @@
 docs/remote_policies.md describes.
 """
 
-from robocas_ms3.core.errors import MissingExtraError
+from robocas_ms3.core.errors import require_extra
 
-try:
-    import msgpack  # noqa: F401
-    import websockets  # noqa: F401
-except ImportError as error:
-    raise MissingExtraError(
-        f"remote policies need {error.name or 'websockets and msgpack'}, which is not installed",
-        fix='In the clone: pip install -e ".[remote]"',
-    ) from error
+require_extra("remote", "remote policies", "msgpack", "websockets")

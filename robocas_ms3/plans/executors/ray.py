@@ -18,7 +18,7 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from robocas_ms3.core.errors import MissingExtraError, PlanError, RobocasError
+from robocas_ms3.core.errors import PlanError, RobocasError, require_extra
 from robocas_ms3.core.exits import deferred_interrupts
 from robocas_ms3.core.files import ABANDONED, make_folder, write_json
 from robocas_ms3.core.strict import StrictModel
@@ -28,12 +28,8 @@ from robocas_ms3.plans.folder import OUTCOME, PLAN, Outcome, PlanFolder, SeedFil
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.worker import UnitWorker
 
-try:
-    ray: Any = import_module("ray")
-except ImportError as missing:
-    raise MissingExtraError(
-        "plans on Ray need ray, which is not installed", fix='In the clone: pip install -e ".[ray]"'
-    ) from missing
+require_extra("ray", "plans on Ray", "ray")
+ray: Any = import_module("ray")
 
 RETRIES = 2
 """How often Ray starts a task again whose worker or node dies."""

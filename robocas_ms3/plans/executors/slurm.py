@@ -18,11 +18,12 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, create_model
 
-from robocas_ms3.core.errors import MissingExtraError, PlanError
+from robocas_ms3.core.errors import PlanError, require_extra
 from robocas_ms3.core.files import make_folder
 from robocas_ms3.core.remote_errors import RemoteError
 from robocas_ms3.core.strict import StrictModel
@@ -30,15 +31,8 @@ from robocas_ms3.plans.executors import Executor
 from robocas_ms3.plans.folder import PlanFolder, Unit
 from robocas_ms3.plans.worker import UnitWorker
 
-try:
-    from submitit import LocalExecutor  # pyright: ignore[reportMissingImports]
-    from submitit import SlurmExecutor as SubmititExecutor  # pyright: ignore[reportMissingImports]
-    from submitit.core.utils import pickle_load  # pyright: ignore[reportMissingImports]
-    from submitit.helpers import DelayedSubmission  # pyright: ignore[reportMissingImports]
-except ImportError as error:
-    raise MissingExtraError(
-        "plans on Slurm need submitit, which is not installed", fix='In the clone: pip install -e ".[slurm]"'
-    ) from error
+require_extra("slurm", "plans on Slurm", "submitit")
+submitit: Any = import_module("submitit")
 
 LOGS = "slurm"
 """In the plan's folder: logs of the jobs, and what submitit writes."""
@@ -75,7 +69,7 @@ class SlurmExecutor(Executor):
     def __init__(self, folder: PlanFolder, jobs: int = 1, options: Mapping[str, str] | None = None) -> None:
         super().__init__(folder, jobs, options)
         self._local = self.options.cluster == "local"
-        if not self._local and SubmititExecutor.affinity() < 0:
+        if not self._local and submitit.SlurmExecutor.affinity() < 0:
             fix = "Run this where sbatch and srun are, or try --executor-option cluster=local."
             raise PlanError("there is no Slurm here", where="--executor slurm", expected="srun", fix=fix)
 
@@ -88,10 +82,10 @@ class SlurmExecutor(Executor):
         self._jobs: list[_Job] = []
         folder, requeues = make_folder(self.folder.path / LOGS), self.options.requeues
         if self._local:
-            self._submitit = LocalExecutor(folder, max_num_timeout=requeues)
+            self._submitit = submitit.LocalExecutor(folder, max_num_timeout=requeues)
             self._submitit.update_parameters(timeout_min=self.options.time, stderr_to_stdout=True)
         else:
-            self._submitit = SubmititExecutor(folder, max_num_timeout=requeues)
+            self._submitit = submitit.SlurmExecutor(folder, max_num_timeout=requeues)
             self._submitit.update_parameters(**self._parameters())
         self._cancel(_ANSWER)  # the jobs of a run that was killed: two at a unit are harmless, but one is enough
         return self
@@ -184,7 +178,7 @@ class _Job:
 
     def result(self) -> None:
         with suppress(OSError, EOFError):  # a job that was killed has no result
-            outcome, error = pickle_load(self.handle.paths.result_pickle)
+            outcome, error = submitit.core.utils.pickle_load(self.handle.paths.result_pickle)
             if outcome == "success" and error is not None:
                 error.reraise()
 
@@ -215,7 +209,7 @@ class DoUnits:
 
     def checkpoint(self) -> Any:
         """Return what submitit runs once the time is up: the same job."""
-        return DelayedSubmission(self)
+        return submitit.helpers.DelayedSubmission(self)
 
 
 def _exit(number: int, frame: object) -> None:

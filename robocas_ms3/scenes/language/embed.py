@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.core.errors import MissingExtraError, RobocasError
+from robocas_ms3.core.errors import RobocasError, require_extra
 from robocas_ms3.core.words import one_line
 
 MODEL_NAME = "sentence-transformers/all-MiniLM-L6-v2"
@@ -42,11 +42,8 @@ class TextEmbedder:
     """
 
     def __init__(self) -> None:
-        if importlib.util.find_spec("sentence_transformers") is None:
-            raise MissingExtraError(
-                "sentence embeddings need sentence-transformers",
-                fix='In the clone: pip install -e ".[language]"; robocas convert --no-embeddings does not need it.',
-            )
+        fix = "robocas convert --no-embeddings does not need it."
+        require_extra("language", "sentence embeddings", "sentence_transformers", fix=fix)
         self._model = None
         self._cache: dict[str, NDArray[np.float32]] = {}
 

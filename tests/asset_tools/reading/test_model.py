@@ -14,7 +14,7 @@ from robocas_ms3.core.errors import AssetError, RobocasError
 
 def test_collada_without_pycollada_names_the_extra(tmp_path, monkeypatch):
     (tmp_path / "mug.dae").write_text("<COLLADA/>")
-    monkeypatch.setattr("asset_tools.reading.exchange.find_spec", lambda name: None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(RobocasError) as caught:
         read_model(tmp_path / "mug.dae")
     assert ".[assets]" in caught.value.fix
