@@ -4,9 +4,8 @@ import hashlib
 
 import numpy as np
 import pytest
-import sapien
 import trimesh
-from sapien import physx
+from models import ball_dropped_into
 from scipy.spatial import KDTree
 
 from asset_tools.builtin.build import build_asset, builtin_jobs
@@ -86,25 +85,10 @@ def test_visuals_are_textured_at_both_levels(pack, id_):
     assert faces["fast"] <= 1500 and faces["fast"] <= faces["full"]
 
 
-def sphere_dropped_into(loaded, start, radius):
-    """Where a sphere comes to rest that is let go above a container held in place; container's frame, m."""
-    scene = sapien.Scene([physx.PhysxCpuSystem()])
-    builder = scene.create_actor_builder()
-    builder.add_multiple_convex_collisions_from_file(str(loaded.hulls_path))
-    builder.build_kinematic("container")
-    builder = scene.create_actor_builder()
-    builder.add_sphere_collision(radius=radius)
-    builder.initial_pose = sapien.Pose(start)
-    ball = builder.build("ball")
-    for _ in range(150):
-        scene.step()
-    return ball.pose.p
-
-
 @pytest.mark.parametrize("x, y", [(0.0, 0.0), (0.09, -0.09), (-0.1, 0.05)])
 def test_basket_is_hollow(pack, x, y):
     basket = pack.furniture["basket"]
-    end = sphere_dropped_into(basket, [x, y, 0.2], 0.03)
+    end = ball_dropped_into(basket.hulls_path, [x, y, 0.2], 0.03)
     inner = basket.asset.inner
     assert end[2] == pytest.approx(inner.min[2] + 0.03, abs=2e-3)
     assert (np.abs(end[:2]) < inner.max[0]).all()

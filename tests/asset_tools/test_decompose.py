@@ -5,9 +5,8 @@
 
 import numpy as np
 import pytest
-import sapien
 import trimesh
-from sapien import physx
+from models import ball_dropped_into
 
 from asset_tools.decompose import GPU_LIMIT, MAX_VERTICES, decompose, few_vertices, flat_faces
 from asset_tools.prepare import prepare
@@ -25,27 +24,6 @@ def cup(radius=0.04, height=0.1, wall=0.004, sections=64):
     return trimesh.creation.revolve(np.array(profile), sections=sections)
 
 
-def ball_dropped_into(hulls, start):
-    """Where a ball comes to rest that is let go above a container held in place."""
-    scene = sapien.Scene([physx.PhysxCpuSystem()])
-    container = physx.PhysxRigidStaticComponent()
-    for hull in hulls:
-        shape = physx.PhysxCollisionShapeConvexMesh(
-            np.asarray(hull, np.float32), [1, 1, 1], physx.PhysxMaterial(0.5, 0.5, 0)
-        )
-        container.attach(shape)
-    entity = sapien.Entity()
-    entity.add_component(container)
-    scene.add_entity(entity)
-    builder = scene.create_actor_builder()
-    builder.add_sphere_collision(radius=BALL)
-    builder.initial_pose = sapien.Pose(start)
-    ball = builder.build("ball")
-    for _ in range(200):
-        scene.step()
-    return ball.pose.p
-
-
 def test_a_scanned_cup_stays_hollow(tmp_path):
     mesh = cup()
     mesh.visual.vertex_colors = [200, 60, 40, 255]
@@ -61,7 +39,7 @@ def test_a_scanned_cup_stays_hollow(tmp_path):
     write_hulls(tmp_path / "asset" / HULLS, found.hulls)
     assert cooking_faults(tmp_path) == []
     for x, y in ((0, 0), (0.02, 0), (-0.012, 0.012)):
-        end = ball_dropped_into(found.hulls, [x, y, 0.13])
+        end = ball_dropped_into(tmp_path / "asset" / HULLS, [x, y, 0.13], BALL)
         assert end[2] == pytest.approx(0.004 + BALL, abs=2e-3)
         assert np.hypot(*end[:2]) < 0.04 - BALL
 

@@ -10,8 +10,10 @@ from typing import Any
 from urllib.parse import quote
 
 import numpy as np
+import sapien
 import trimesh
 from PIL import Image
+from sapien import physx
 
 RED, GREEN, BLUE = (200, 30, 30), (30, 180, 40), (40, 60, 210)
 
@@ -205,3 +207,18 @@ def texels(mesh: trimesh.Trimesh, points: np.ndarray, faces: np.ndarray) -> np.n
     height, width = pixels.shape[:2]
     column, row = (uv[:, 0] * width).astype(int), ((1 - uv[:, 1]) * height).astype(int)
     return pixels[row.clip(0, height - 1), column.clip(0, width - 1)]
+
+
+def ball_dropped_into(hulls: Path, start: list[float], radius: float) -> np.ndarray:
+    """Where a ball comes to rest that is let go above a container held in place; the container's frame, m."""
+    scene = sapien.Scene([physx.PhysxCpuSystem()])
+    builder = scene.create_actor_builder()
+    builder.add_multiple_convex_collisions_from_file(str(hulls))
+    builder.build_kinematic("container")
+    builder = scene.create_actor_builder()
+    builder.add_sphere_collision(radius=radius)
+    builder.initial_pose = sapien.Pose(start)
+    ball = builder.build("ball")
+    for _ in range(200):
+        scene.step()
+    return ball.pose.p
