@@ -47,7 +47,9 @@ def test_a_drawer_slides_along_its_axis_and_no_farther_than_its_limit(scene, cab
     (joint,) = built.active_joints
     assert joint.friction.tolist() == pytest.approx([0.05]) and joint.damping.tolist() == pytest.approx([2.0])
     body = built.links_map["drawer"]._bodies[0]
-    assert body.mass == pytest.approx(1.5)
+    assert body.mass == pytest.approx(1.5) and len(body.collision_shapes) == 1
+    np.testing.assert_allclose(body.inertia, [0.006, 0.006, 0.01], rtol=1e-6)
+    np.testing.assert_allclose(body.cmass_local_pose.p, [0.1, 0.1, 0.065], rtol=1e-6)
     for _ in range(100):
         body.add_force_at_point([0, 6.0, 0], body.entity_pose.p + [0, 0, 0.05])
         scene.sub_scenes[0].step()
@@ -80,14 +82,6 @@ def test_hulls_are_built_as_boxes_where_they_are_boxes_and_each_in_its_place(sce
         assert isinstance(shape, PhysxCollisionShapeConvexMesh)
         np.testing.assert_allclose(shape.vertices.min(axis=0), [shift, 0, 0], atol=1e-6)
         np.testing.assert_allclose(shape.vertices.max(axis=0), [shift + 0.1, 0.1, 0.1], atol=1e-6)
-
-
-def test_a_body_keeps_its_mass_and_all_its_shapes(scene, cabinet):
-    built = spawn_articulation(scene, cabinet, name="cabinet", pose=sapien.Pose())
-    body = built.links_map["drawer"]._bodies[0]
-    assert body.mass == pytest.approx(1.5) and len(body.collision_shapes) == 1
-    np.testing.assert_allclose(body.inertia, [0.006, 0.006, 0.01], rtol=1e-6)
-    np.testing.assert_allclose(body.cmass_local_pose.p, [0.1, 0.1, 0.065], rtol=1e-6)
 
 
 def test_an_unknown_finish_is_named(cabinet):
