@@ -86,7 +86,8 @@ class Player:
             _log.warning("seed %d: %s", seed, played.error)
         ends = {"policy_failed": played.error, "succeeded": played.at_end["success"], "failed": played.at_end["fail"]}
         refused = next((reason for reason, true in ends.items() if true), "")
-        state = {kind: to_numpy(of) for kind, of in self._base.get_state_dict().items() if kind != "controller"}
+        state: dict[str, Any] = self._base.get_state_dict()
+        state = {kind: to_numpy(of) for kind, of in state.items() if kind != "controller"}
         gripper = 1.0 if self._env.gripper_open else -1.0
         return Takeover(seed, settings.after_policy, played.steps, state, gripper, refused)
 
