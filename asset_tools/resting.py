@@ -39,6 +39,7 @@ YAWS = tuple(np.arange(8) * 0.8)  # rad: it must stay however it is turned, for 
 DROP = 0.0005  # m above the plane at the start: scenes leave a gap as well
 MIN_TOPPLING_DEG = 3.0  # a pose that gives way to less is no pose to put things down in, unless it only rocks
 STEPS = 100  # of TIME_STEP
+RAREST = 0.02  # probability of a pose
 
 LIFT = np.zeros((4, 4))
 LIFT[2, 3] = DROP
@@ -79,13 +80,14 @@ class _Body:
         return pose
 
 
-def resting_poses(solid: Solid, minimum_probability: float = 0.02) -> RestingPoses:
+def resting_poses(solid: Solid) -> RestingPoses:
     """Find the poses in which an object stays where it is put. The same input gives the same poses.
+
+    Poses of less than 2 % are left out, unless all are rare. Those of one height count together: a cylinder has many
+    on its side.
 
     Args:
         solid: the object; the table's friction is 0.99.
-        minimum_probability: rarer poses are left out, unless all are rare. Poses of one height count together: a
-            cylinder has many on its side.
 
     Raises:
         AssetError: the hulls are flat, the centre of mass is outside of them, or no pose stays.
@@ -98,7 +100,7 @@ def resting_poses(solid: Solid, minimum_probability: float = 0.02) -> RestingPos
     except (QhullError, ValueError, RuntimeError) as error:
         raise AssetError("the convex hulls enclose no volume", found=str(error).split("\n")[0]) from error
     directions, probabilities, heights = stable_directions(hull, solid.center_of_mass)
-    kept = select_poses(directions, probabilities, heights, minimum_probability)
+    kept = select_poses(directions, probabilities, heights, RAREST)
     probabilities = pool_probabilities(directions, probabilities, kept)
     body = _Body(solid, points, hull.points[hull.vertices])
     settled, which = _settle(body, directions[kept])

@@ -126,7 +126,7 @@ def label_checksums(path: Path) -> tuple[tuple[str, int, int], ...]:
         return ((path.name, path.stat().st_size, 0),)
 
 
-def read_labels(path: Path, rng: np.random.Generator | None = None, *, limit: int = CANDIDATES) -> Labels:
+def read_labels(path: Path, rng: np.random.Generator) -> Labels:
     """Read the labels of good grasps: friction 0 < f <= 0.3, at most 0.08 m wide, not in collision.
 
     RoboCAS lets 0 pass as well, but that isn't a friction coefficient: labels of grasps that hold start at 0.1, and
@@ -134,8 +134,7 @@ def read_labels(path: Path, rng: np.random.Generator | None = None, *, limit: in
 
     Args:
         path: ``NNN_labels.npz``.
-        rng: chooses evenly among the good ones where there are more than ``limit``.
-        limit: how many at most.
+        rng: chooses evenly among the good ones where there are more than 20 000.
 
     Returns:
         In the order of the file.
@@ -143,7 +142,6 @@ def read_labels(path: Path, rng: np.random.Generator | None = None, *, limit: in
     Raises:
         AssetError: the file is missing, damaged or not of this format.
     """
-    rng = rng or np.random.default_rng(0)
     kept = np.empty((0, 8))  # draw, place in the file, number of the point, of the view, angle, depth, width, friction
     place = start = 0
     points = _read_points(path)
@@ -156,8 +154,8 @@ def read_labels(path: Path, rng: np.random.Generator | None = None, *, limit: in
         columns = [rng.random(count), place + np.arange(count), point, view]
         columns += [values[where].astype(np.float64) for values in (angles, depths, widths, scores)]
         kept = np.concatenate([kept, np.column_stack(columns)])
-        if len(kept) > limit:
-            kept = kept[np.argpartition(kept[:, 0], limit)[:limit]]
+        if len(kept) > CANDIDATES:
+            kept = kept[np.argpartition(kept[:, 0], CANDIDATES)[:CANDIDATES]]
         place += count
         start += len(offsets)
     kept = kept[np.argsort(kept[:, 1])]

@@ -10,6 +10,7 @@ from robocas_ms3.core.errors import AssetError
 
 TOP_VIEW = 299  # the last of the lattice, 4.7 deg off +z
 SIZE = (0.04, 0.10, 0.06)  # of the box, m
+RNG = np.random.default_rng(0)
 
 
 def arrays(points=1, dtype=np.float32):
@@ -55,7 +56,7 @@ def test_a_grasp_worked_out_by_hand(tmp_path, quarters):
     # on the side of the box that looks to -y
     path = write(tmp_path / "000_labels.npz", [((0, 150, 3 * quarters, 1), label)], at=(0.01, -0.05, 0.02))
 
-    pose = tcp_poses(read_labels(path))[0]
+    pose = tcp_poses(read_labels(path, RNG))[0]
     assert pose[:3, 2] == pytest.approx(approach, abs=2e-6)
     assert pose[:3, 1] == pytest.approx(closing, abs=2e-6)
     assert np.linalg.det(pose[:3, :3]) == pytest.approx(1)
@@ -72,7 +73,7 @@ def test_the_closing_axis_crosses_the_box_from_side_to_side(tmp_path):
     path = write(tmp_path / "000_labels.npz", labels, at=(0, 0, 0.03))
     box = trimesh.creation.box(SIZE)
 
-    along, across = tcp_poses(read_labels(path))
+    along, across = tcp_poses(read_labels(path, RNG))
     assert abs(along[0, 1]) > 0.99  # closes along x
     assert abs(across[1, 1]) > 0.99  # closes along y
     hits = box.ray.intersects_location([along[:3, 3]] * 2, [along[:3, 1], -along[:3, 1]])[0]
@@ -95,7 +96,7 @@ def test_only_good_labels_are_read(tmp_path):
         (0, 1, 0, 0): (0, 0.01, 0.05, 0.0, False),  # no grasp
         (1, 299, 11, 3): (2.5, 0.04, 0.08, 0.1, False),
     }
-    found = read_labels(write(tmp_path / "000_labels.npz", labels.items(), points=2, dtype=np.float32))
+    found = read_labels(write(tmp_path / "000_labels.npz", labels.items(), points=2, dtype=np.float32), RNG)
     assert found.frictions == pytest.approx([0.3, 0.1])
     assert found.views.tolist() == [0, 299]
     assert found.widths == pytest.approx([0.05, 0.08])
@@ -117,14 +118,15 @@ def test_slices_leave_nothing_out(tmp_path, monkeypatch, dtype, save):
     save(tmp_path / "000_labels.npz", **data)
     good = (data["scores"] > 0) & (data["scores"] < 0.35) & ~data["collision"] & (data["offsets"][..., 2] <= 0.08)
 
-    everything = read_labels(tmp_path / "000_labels.npz", limit=100_000)
+    everything = read_labels(tmp_path / "000_labels.npz", RNG)
     assert len(everything) == good.sum()
     assert everything.widths == pytest.approx(data["offsets"][good][:, 2])
     assert everything.points == pytest.approx(data["points"][np.nonzero(good)[0]])
-    few = read_labels(tmp_path / "000_labels.npz", np.random.default_rng(7), limit=1000)
+    monkeypatch.setattr("asset_tools.graspnet.labels.CANDIDATES", 1000)
+    few = read_labels(tmp_path / "000_labels.npz", np.random.default_rng(7))
     assert len(few) == 1000
     assert np.bincount(np.searchsorted([0.15, 0.25], few.frictions)) == pytest.approx([333, 333, 333], abs=60)
-    again = read_labels(tmp_path / "000_labels.npz", np.random.default_rng(7), limit=1000)
+    again = read_labels(tmp_path / "000_labels.npz", np.random.default_rng(7))
     assert np.array_equal(few.angles, again.angles)
 
 
@@ -161,7 +163,7 @@ def test_a_damaged_file_is_one_error_that_names_it(tmp_path, damage, words):
     np.savez_compressed(path, **arrays() | {"offsets": noise})
     damage(path)
     with pytest.raises(AssetError, match=words) as error:
-        read_labels(path)
+        read_labels(path, RNG)
     assert "000_labels.npz" in str(error.value)
 
 
@@ -178,9 +180,11 @@ def test_checksums_tell_label_files_apart(tmp_path):
 MEASURE = """
 import resource, sys
 from pathlib import Path
+import numpy as np
 from asset_tools.graspnet.labels import read_labels
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-print(len(read_labels(Path(sys.argv[1]))), (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024)
+count = len(read_labels(Path(sys.argv[1]), np.random.default_rng(0)))
+print(count, (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024)
 """
 
 
