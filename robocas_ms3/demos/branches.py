@@ -97,6 +97,7 @@ def set_up_child(parent: int) -> None:
     """Set up a child before anything else; the system kills it when the process ``parent`` ends."""
     die_with_parent(parent)
     gc.freeze()  # a collection that walks all objects would copy all of the parent's memory
+    torch.set_num_threads(1)  # the parent's threads are not here, and a parallel loop would wait for them forever
     # Threads that are not here may hold the locks of the parent's streams. A line is written as soon as it ends, since
     # a child ends without ado. Where there is no stream, as in a service, none is opened.
     sys.stdout, sys.stderr = (
