@@ -43,9 +43,9 @@ def run(*arguments: str) -> int:
 
 @pytest.mark.slow
 def test_contracts_of_four_envs():
-    assert run("-m", "gpu and not emulated_gpu_full") > 70
+    assert run("-m", "gpu and not emulated_gpu_full") > 78
 
 
 @pytest.mark.emulated_gpu_full
 def test_everything_with_ten_envs():
-    assert run("-m", "gpu or emulated_gpu_full", "--emulated-envs", "10") > 70
+    assert run("-m", "gpu or emulated_gpu_full", "--emulated-envs", "10") > 78
