@@ -17,7 +17,7 @@ from asset_tools.inertia import moments_of, piece_inertia, principal_inertia, tr
 from asset_tools.quality.furniture import measure_furniture
 from asset_tools.quality.hulls import volume_iou
 from asset_tools.quality.measure import measure_object
-from asset_tools.resting import resting_poses
+from asset_tools.resting_poses import resting_poses
 from asset_tools.sources import FurnitureSource, ObjectSource
 from asset_tools.visual import to_display
 from robocas_ms3.assets.annotations import Annotations, footprints

@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from asset_tools.quality.hulls import hull_quality, volume_iou
 from asset_tools.solids import to_mesh, to_solid
-from robocas_ms3.assets.cooking import OBLONG, SHRINKAGE, cook_hulls
+from robocas_ms3.assets.cooked_hulls import OBLONG, SHRINKAGE, cook_hulls
 from robocas_ms3.assets.hulls import box_of, center_of, slenderness
 from robocas_ms3.assets.physics import cook
 from robocas_ms3.core.errors import AssetError

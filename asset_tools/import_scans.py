@@ -17,8 +17,8 @@ from asset_tools.build import build_object
 from asset_tools.inspection import Inspect, ModelSource, inspect_models
 from asset_tools.pipeline import Job, content_hash, failing_job
 from asset_tools.prepare import prepare
-from asset_tools.reading.choice import is_collision, is_mesh
-from asset_tools.reading.files import files_below
+from asset_tools.readers.choice import is_collision, is_mesh
+from asset_tools.readers.files import files_below
 from asset_tools.scan import Unit, Up, guess_unit, guess_units
 from asset_tools.sources import ObjectSource
 from robocas_ms3.assets.manifest import ObjectAsset

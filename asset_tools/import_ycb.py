@@ -23,7 +23,7 @@ from asset_tools.sources import ObjectSource
 from robocas_ms3.assets.manifest import ObjectAsset
 from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import AssetError
-from robocas_ms3.core.strict import check_name
+from robocas_ms3.core.strict_model import check_name
 
 INFO, MODELS = "info_pick_v0.json", "models"
 DOWNLOAD = "Run `python -m mani_skill.utils.download_asset ycb`, or give the folder that holds it."

@@ -9,8 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import TypeAlias
 
-from asset_tools.reading.limits import SECONDS, reading_limits
-from asset_tools.reading.model import read_model
+from asset_tools.readers.limits import SECONDS, reading_limits
+from asset_tools.readers.model import read_model
 from robocas_ms3.core.errors import AssetError, RobocasError
 from robocas_ms3.core.workers import FunctionWorker, Limits, WorkerPool
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
-from robocas_ms3.assets.cooking import cooking_faults
+from robocas_ms3.assets.cooked_hulls import cooking_faults
 from robocas_ms3.assets.manifest import (
     SCHEMA_VERSION,
     Asset,
@@ -28,8 +28,8 @@ from robocas_ms3.assets.pack import MANIFEST, sha256
 from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import AssetError, RobocasError
 from robocas_ms3.core.files import replacing_folder, write_json
-from robocas_ms3.core.outputs import check_replaceable
-from robocas_ms3.core.strict import validate_json
+from robocas_ms3.core.output_folder import check_replaceable
+from robocas_ms3.core.strict_model import validate_json
 from robocas_ms3.core.workers import FunctionWorker, WorkerPool
 
 MADE_FROM = "made_from.json"  # of a pack: asset id -> hash of what it was made from

@@ -12,8 +12,8 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from asset_tools.reading.model import read_model
-from asset_tools.reading.surface import Textures
+from asset_tools.readers.model import read_model
+from asset_tools.readers.surface import Textures
 from asset_tools.repair import close
 from asset_tools.scan import METRES, PLAUSIBLE, Unit, Up, guess_unit, guess_up, upright
 from asset_tools.solids import to_mesh, to_solid

@@ -15,7 +15,7 @@ from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
 from asset_tools.glb import rgba_of, roughness_of
-from asset_tools.reading.surface import TEXTURE, TINT, Textures, decode_srgb, encode_srgb
+from asset_tools.readers.surface import TEXTURE, TINT, Textures, decode_srgb, encode_srgb
 from asset_tools.simplify import outward, simplified, welded
 from robocas_ms3.core.errors import AssetError
 

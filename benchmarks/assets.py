@@ -23,9 +23,9 @@ from asset_tools.decompose import decompose
 from asset_tools.grasps import sample_grasps
 from asset_tools.inertia import principal_inertia
 from asset_tools.quality.drops import drop_test
-from asset_tools.quality.holding import hold_test
+from asset_tools.quality.grasp_hold import hold_test
 from asset_tools.quality.hulls import hull_quality
-from asset_tools.resting import resting_poses
+from asset_tools.resting_poses import resting_poses
 from robocas_ms3.assets.physics import Solid
 
 

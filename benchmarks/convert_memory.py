@@ -64,7 +64,7 @@ class StandIn:
 
     def frames(self, _recording: Any, samples: np.ndarray) -> Iterator[Any]:
         """A ramp that moves."""
-        from robocas_ms3.datasets.sources.protocol import Frame
+        from robocas_ms3.datasets.sources.episode_source import Frame
 
         for sample in samples:
             rgb = {name: np.roll(self.rgb, sample, 1) for name in self.pictures.cameras}
@@ -73,7 +73,7 @@ class StandIn:
 
     def cameras(self) -> dict[str, Any]:
         """All in one place."""
-        from robocas_ms3.datasets.sources.protocol import CameraModel
+        from robocas_ms3.datasets.sources.episode_source import CameraModel
 
         model = CameraModel(np.array([24.0, 24.0, 32.0, 24.0]), np.eye(4), "world")
         return dict.fromkeys(self.pictures.cameras, model)
@@ -117,8 +117,8 @@ def repeated(source: Path, count: int, target: Path) -> Path:
 
 def measure(cfg: Benchmark, trajectory: Path, to: str, out: Path) -> dict[str, Any]:
     """One conversion, in the process that this is called in."""
-    from robocas_ms3.datasets.writing.convert import convert
-    from robocas_ms3.datasets.writing.settings import ConversionSettings
+    from robocas_ms3.datasets.conversion.convert import convert
+    from robocas_ms3.datasets.conversion.settings import ConversionSettings
 
     peaks: list[int] = []
     common: dict[str, Any] = {

@@ -31,10 +31,10 @@ import tyro
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.open_loop import draw_noise
 from robocas_ms3.demos.recordings.motion import Motion, sample_states, sample_stride
-from robocas_ms3.demos.recordings.stored import open_trajectory
+from robocas_ms3.demos.recordings.trajectory_hdf5 import open_trajectory
 from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.robots.description import MOBILE_PANDA
-from robocas_ms3.robots.table import PANDA
+from robocas_ms3.robots.registry import PANDA
 from robocas_ms3.scenes.config import load_task_config
 
 FRESH = 1000  # first number of the noise drawn here; trials while generating have smaller ones

@@ -30,7 +30,7 @@ from sapien import physx
 import robocas_ms3.tasks  # noqa: F401
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.assets.physics import CONTACT_OFFSET
-from robocas_ms3.core.words import error_line
+from robocas_ms3.core.text import error_line
 from robocas_ms3.scenes import build
 from robocas_ms3.scenes.cache import layout_source
 from robocas_ms3.scenes.config import load_task_config

@@ -21,7 +21,7 @@ import tyro
 from mani_skill.envs.tasks import PickCubeEnv  # noqa: F401  (registers it)
 
 import robocas_ms3.tasks  # noqa: F401
-from robocas_ms3.demos.recordings.writing import EpisodeRecorder
+from robocas_ms3.demos.recordings.episode_recorder import EpisodeRecorder
 from robocas_ms3.robots.description import MOBILE_PANDA
 
 CUBE_REST = (0.0, np.pi / 8, 0.0, -np.pi * 5 / 8, 0.0, np.pi * 3 / 4, np.pi / 4)

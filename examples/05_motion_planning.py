@@ -22,8 +22,8 @@ from robocas_ms3.planning.grasp_choice import filter_grasps, grip_margins
 from robocas_ms3.planning.motionplanner import PandaArmMotionPlanningSolver
 from robocas_ms3.planning.protocol import AttachedBody
 from robocas_ms3.planning.scene import SPACING, PlanningScene
-from robocas_ms3.planning.skills.placing import Inside, overhangs, sample_drops
-from robocas_ms3.scenes.grasping import gripper_is_clear
+from robocas_ms3.planning.skills.place import Inside, overhangs, sample_drops
+from robocas_ms3.scenes.grasp_checks import gripper_is_clear
 
 
 def solve_pick_cube(env, seed=None, debug=False, vis=False):

@@ -43,7 +43,7 @@ SIMULATOR_FREE = (
     "planning.protocol",
     "scenes.language",
 )
-BARE_PHYSX = {"robocas_ms3.assets.physics", "robocas_ms3.assets.cooking"}  # without a renderer
+BARE_PHYSX = {"robocas_ms3.assets.physics", "robocas_ms3.assets.cooked_hulls"}  # without a renderer
 SIMULATORS = {"sapien", "mani_skill"}
 
 

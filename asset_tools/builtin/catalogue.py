@@ -19,7 +19,7 @@ from asset_tools.builtin.models import Model
 from robocas_ms3.assets.manifest import Name, Positive, Share
 from robocas_ms3.core.documents import DocumentError, load_yaml
 from robocas_ms3.core.errors import AssetError
-from robocas_ms3.core.strict import StrictModel, parse
+from robocas_ms3.core.strict_model import StrictModel, parse
 
 FOLDER = Path(__file__).parent / "products"
 

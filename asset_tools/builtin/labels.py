@@ -11,7 +11,7 @@ from pydantic import AfterValidator
 from asset_tools.builtin.mesh import Shape
 from asset_tools.builtin.motifs import MOTIFS
 from asset_tools.builtin.textures import Box, Canvas, Colour, Painter
-from robocas_ms3.core.strict import StrictModel
+from robocas_ms3.core.strict_model import StrictModel
 
 METAL = (186, 190, 194)
 PLATED = ("stripes", "diagonal", "dots")  # styles too busy to print on: words stand on a plate of the base colour

@@ -10,7 +10,7 @@ from pydantic import Field
 from robocas_ms3.assets.manifest import Name, NotNegative, Positive, Quaternion, Surface, Vec3
 from robocas_ms3.core.documents import DocumentError, load_yaml
 from robocas_ms3.core.errors import AssetError
-from robocas_ms3.core.strict import StrictModel, parse
+from robocas_ms3.core.strict_model import StrictModel, parse
 
 SHIPPED = Path(__file__).parent / "annotations"
 LARGEST = 100.0

@@ -13,7 +13,7 @@ from shapely.geometry import MultiPolygon, Polygon
 
 from asset_tools.decompose import few_vertices
 from asset_tools.repair import close
-from robocas_ms3.assets.cooking import OBLONG
+from robocas_ms3.assets.cooked_hulls import OBLONG
 from robocas_ms3.assets.hulls import box_of, slenderness
 from robocas_ms3.core.errors import AssetError
 

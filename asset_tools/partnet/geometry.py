@@ -12,8 +12,8 @@ import trimesh
 
 from asset_tools.partnet.obj import GREY, Faces, Material, has_area, read_obj
 from asset_tools.partnet.urdf import SIZES, URDF, Shape, Visual
-from asset_tools.reading.exchange import read_exchange
-from asset_tools.reading.files import ModelFiles
+from asset_tools.readers.exchange import read_exchange
+from asset_tools.readers.files import ModelFiles
 from robocas_ms3.core.errors import AssetError
 
 Array = np.ndarray

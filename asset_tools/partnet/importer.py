@@ -16,12 +16,12 @@ from asset_tools.partnet.annotation import LARGEST, Annotation, JointNote, find_
 from asset_tools.partnet.clearance import trimmed
 from asset_tools.partnet.collision import Part, for_gpu, pieces_of
 from asset_tools.partnet.geometry import Geometry
-from asset_tools.partnet.looks import merged
 from asset_tools.partnet.obj import Faces
+from asset_tools.partnet.textures import merged
 from asset_tools.partnet.urdf import URDF, Mobility, MovingLink, Visual, read_urdf, urdf_of
 from asset_tools.pipeline import Job, content_hash, failing_job
-from asset_tools.reading.files import LARGEST_FILE, files_below
-from asset_tools.reading.limits import reading_limits
+from asset_tools.readers.files import LARGEST_FILE, files_below
+from asset_tools.readers.limits import reading_limits
 from asset_tools.sources import FurnitureSource, LinkSource
 from robocas_ms3.assets.manifest import BODY, FurnitureAsset, Handle, Joint, Surface
 from robocas_ms3.core.errors import AssetError

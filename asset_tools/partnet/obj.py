@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from asset_tools.reading.files import ModelFiles, check_inside
-from asset_tools.reading.obj import MtlMaterial, ObjMesh, decode_text, find_material, parse_mtl, parse_obj
+from asset_tools.readers.files import ModelFiles, check_inside
+from asset_tools.readers.obj import MtlMaterial, ObjMesh, decode_text, find_material, parse_mtl, parse_obj
 from robocas_ms3.core.errors import AssetError
 
 Array = np.ndarray

@@ -14,9 +14,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from asset_tools.partnet.annotation import LARGEST, JointNote
-from asset_tools.reading.files import read_file
+from asset_tools.readers.files import read_file
 from robocas_ms3.core.errors import AssetError
-from robocas_ms3.core.strict import check_name
+from robocas_ms3.core.strict_model import check_name
 
 Array = np.ndarray
 

@@ -9,8 +9,8 @@ import numpy as np
 import sapien
 from sapien import physx
 
+from asset_tools.quality.furniture_scene import Model, Stage, model_of
 from asset_tools.quality.overlap import convex, deepest, distances
-from asset_tools.quality.stage import Model, Stage, model_of
 from asset_tools.quality.surfaces import BLOCKED, Probe, clearances, probes
 from asset_tools.sources import FurnitureSource
 from robocas_ms3.assets.hulls import convex_faces

@@ -11,7 +11,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from asset_tools.quality.drops import DropReport, drop_test
-from asset_tools.quality.holding import hold_test
+from asset_tools.quality.grasp_hold import hold_test
 from asset_tools.quality.hulls import hull_quality
 from robocas_ms3.assets.annotations import Annotations
 from robocas_ms3.assets.manifest import ObjectAsset, ObjectQuality

@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from robocas_ms3.core.documents import read_text
 from robocas_ms3.core.errors import AssetError
-from robocas_ms3.core.words import count_of
+from robocas_ms3.core.text import count_of
 
 Array = NDArray[np.float64]
 

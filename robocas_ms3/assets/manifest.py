@@ -24,7 +24,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from robocas_ms3.core.errors import AssetError
-from robocas_ms3.core.strict import LONGEST_NAME, StrictModel
+from robocas_ms3.core.strict_model import LONGEST_NAME, StrictModel
 
 SCHEMA_VERSION = 2
 

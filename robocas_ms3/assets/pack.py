@@ -21,7 +21,7 @@ from robocas_ms3.core.documents import JSON_LIMIT, DocumentError, check_regular,
 from robocas_ms3.core.errors import AssetError
 from robocas_ms3.core.paths import builtin_packs_dir, data_dir
 from robocas_ms3.core.poses import transform
-from robocas_ms3.core.strict import refusal, validate_json
+from robocas_ms3.core.strict_model import refusal, validate_json
 
 VisualLevel = Literal["fast", "full"]
 

@@ -116,7 +116,7 @@ def shape_of(vertices: Array, material: physx.PhysxMaterial) -> physx.PhysxColli
 
 
 def cook(vertices: Array, material: physx.PhysxMaterial) -> physx.PhysxCollisionShapeConvexMesh:
-    """Return the engine's convex mesh of points (V, 3); it may leave some out (`cooking`)."""
+    """Return the engine's convex mesh of points (V, 3); it may leave some out (`cooked_hulls`)."""
     return physx.PhysxCollisionShapeConvexMesh(
         vertices=np.asarray(vertices, np.float32), scale=[1, 1, 1], material=material
     )

@@ -11,7 +11,7 @@ import torch
 from pydantic import Field
 
 from robocas_ms3.core.errors import EmptySplitError
-from robocas_ms3.core.strict import StrictModel
+from robocas_ms3.core.strict_model import StrictModel
 from robocas_ms3.evaluation.policy import Policy
 
 Precision = Literal["auto", "fp32", "bf16"]

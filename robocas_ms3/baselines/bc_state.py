@@ -25,7 +25,7 @@ from robocas_ms3.core.paths import cache_dir
 from robocas_ms3.core.poses import from_wxyz
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.demos.recordings.motion import sample_states, sample_stride
-from robocas_ms3.demos.recordings.reading import TrajectoryFile
+from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
 from robocas_ms3.evaluation.policy import Observations, PolicySpec, privileged
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.robots.quantities import GRIPPER_WIDTH

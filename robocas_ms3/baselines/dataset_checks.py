@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from robocas_ms3.baselines.baseline import Split, no_episodes
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.manage.repairs import eef_turn
-from robocas_ms3.datasets.sources.protocol import EpisodeSource
+from robocas_ms3.datasets.sources.episode_source import EpisodeSource
 from robocas_ms3.robots.cameras import EE_CAMERA
 
 _MAX_BASE_MOTION = 0.005  # m or rad; a base that stands trembles by less than a tenth of a mm

@@ -10,8 +10,8 @@ from typing import Any
 from robocas_ms3.baselines.registry import find_baseline
 from robocas_ms3.baselines.training.record import BUNDLED, RUN, WEIGHTS, hash_weights, read_run
 from robocas_ms3.core.errors import TrainingError
-from robocas_ms3.core.strict import parse
-from robocas_ms3.core.words import error_line
+from robocas_ms3.core.strict_model import parse
+from robocas_ms3.core.text import error_line
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, Policy, PolicySpec
 
 

@@ -8,9 +8,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 from robocas_ms3.core.errors import TrainingError, require_extra
-from robocas_ms3.core.exits import no_exit
 from robocas_ms3.core.extensions import Registry
-from robocas_ms3.core.words import nearest
+from robocas_ms3.core.signals import no_exit
+from robocas_ms3.core.text import nearest
 
 if TYPE_CHECKING:
     from robocas_ms3.baselines.baseline import Baseline  # which imports torch

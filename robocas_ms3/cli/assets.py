@@ -14,7 +14,7 @@ from robocas_ms3.cli import assets_show
 from robocas_ms3.cli.assets_show import require_mesh_tools
 from robocas_ms3.cli.options import CORES, Jobs, Maybe, Several
 from robocas_ms3.core.checks import check_number
-from robocas_ms3.core.words import count_of
+from robocas_ms3.core.text import count_of
 
 CONTACT_SHEET = "contact_sheet.png"
 SHEET = 60  # assets on the contact sheet of an import
@@ -201,7 +201,7 @@ def build(command: Build) -> int:
 
 def _inspect(command: _Making, models: Mapping[str, Any]) -> Mapping[str, Any]:
     from asset_tools.inspection import inspect_models
-    from robocas_ms3.cli.bars import Bar
+    from robocas_ms3.cli.progress import Bar
 
     with Bar("models read", transient=True) as shown:
         shown.start(len(models))
@@ -248,7 +248,7 @@ def _make(jobs: list[Job], command: _Making, out: Path, what: str) -> int:
 
 def _write(jobs: list[Job], command: _Making, out: Path, description: str, *, record: bool = True) -> int:
     from asset_tools.pipeline import JobResult, write_pack
-    from robocas_ms3.cli.bars import Bar
+    from robocas_ms3.cli.progress import Bar
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.core.paths import cache_dir
 
@@ -284,9 +284,9 @@ def _write(jobs: list[Job], command: _Making, out: Path, description: str, *, re
 
 
 def _draw_sheet(folder: Path) -> None:
-    from asset_tools.sheet import contact_sheet
+    from asset_tools.contact_sheet import contact_sheet
     from robocas_ms3.assets.pack import load_pack
-    from robocas_ms3.cli.bars import working
+    from robocas_ms3.cli.progress import working
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.core.errors import AssetError
 

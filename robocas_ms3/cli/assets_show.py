@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 from robocas_ms3.cli.options import CORES, Jobs, Maybe, Several
 from robocas_ms3.core.checks import check_number
-from robocas_ms3.core.words import count_of, printable
+from robocas_ms3.core.text import count_of, printable
 
 
 @dataclass
@@ -130,7 +130,7 @@ def info(command: Info) -> int:
 
 def verify(command: Verify) -> int:
     """Run ``verify``; 1 where an asset falls short of what is asked of packs."""
-    from robocas_ms3.assets.cooking import cooking_faults
+    from robocas_ms3.assets.cooked_hulls import cooking_faults
     from robocas_ms3.assets.pack import load_pack
     from robocas_ms3.cli.terminal import console, say
 
@@ -149,9 +149,9 @@ def verify(command: Verify) -> int:
 
 def sheet(command: Sheet) -> int:
     require_mesh_tools()
-    from asset_tools.sheet import contact_sheet
+    from asset_tools.contact_sheet import contact_sheet
     from robocas_ms3.assets.pack import load_pack
-    from robocas_ms3.cli.bars import working
+    from robocas_ms3.cli.progress import working
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.core.errors import AssetError
 
@@ -169,7 +169,7 @@ def _verify_physics(pack: Pack, jobs: int, out: Path | None) -> int:
     require_mesh_tools()
     from asset_tools.quality.measure import HEADER, differences, judge, rows
     from asset_tools.quality.packs import FURNITURE_HEADER, furniture_rows, judge_furniture, remeasure_pack
-    from robocas_ms3.cli.bars import Bar
+    from robocas_ms3.cli.progress import Bar
     from robocas_ms3.cli.terminal import print_table, table_console
     from robocas_ms3.core.files import write_json
 

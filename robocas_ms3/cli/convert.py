@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 from robocas_ms3.cli.options import resumable
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.words import count_of
-from robocas_ms3.datasets.writing.settings import Conversion, ConversionSettings
+from robocas_ms3.core.text import count_of
+from robocas_ms3.datasets.conversion.settings import Conversion, ConversionSettings
 
 if TYPE_CHECKING:
     from robocas_ms3.datasets.formats import Format
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @resumable
 def main(settings: ConversionSettings) -> int:
-    from robocas_ms3.cli.bars import Bar
+    from robocas_ms3.cli.progress import Bar
     from robocas_ms3.cli.terminal import say
 
     write: Callable[..., Conversion] = _find_format(settings).part("writer")
@@ -37,7 +37,7 @@ def main(settings: ConversionSettings) -> int:
 
 def _find_format(settings: ConversionSettings) -> Format:
     """Return the format to write; raise an error if there is none, or an option does not suit it."""
-    from robocas_ms3.core.words import nearest
+    from robocas_ms3.core.text import nearest
     from robocas_ms3.datasets.formats import FORMATS
 
     writable = [name for name, known in FORMATS.items() if known.writer]

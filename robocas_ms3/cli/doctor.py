@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
-from robocas_ms3.core.words import count_of
+from robocas_ms3.core.text import count_of
 
 if TYPE_CHECKING:
     from robocas_ms3.doctor.checks import Finding
@@ -23,7 +23,7 @@ class Doctor:
 
 
 def main(cfg: Doctor) -> int:
-    from robocas_ms3.cli.bars import working
+    from robocas_ms3.cli.progress import working
     from robocas_ms3.cli.terminal import say_json
     from robocas_ms3.doctor.checks import examine
 

@@ -10,7 +10,7 @@ import tyro
 
 from robocas_ms3.cli import eval_results
 from robocas_ms3.cli.options import Repeated, resumable
-from robocas_ms3.core.words import count_of
+from robocas_ms3.core.text import count_of
 from robocas_ms3.evaluation.settings import EvaluationSettings
 
 DESCRIPTION = """Measure a policy by a protocol, and work with results.
@@ -47,7 +47,7 @@ class Freeze:
 def run(settings: EvaluationSettings) -> int:
     """Run the episodes that the result lacks; return 1 if any episode of the result ended with an error."""
     from robocas_ms3.core.errors import EvaluationError
-    from robocas_ms3.core.words import nearest
+    from robocas_ms3.core.text import nearest
     from robocas_ms3.scenes.task_specs import TASKS
 
     for word in settings.tasks:  # before the imports below, which take seconds
@@ -55,7 +55,7 @@ def run(settings: EvaluationSettings) -> int:
             expected = f"one of {', '.join(TASKS)}; or {', '.join(COMMANDS)}"
             fix = nearest(word, [*TASKS, *COMMANDS])
             raise EvaluationError("no such task", where="--tasks", expected=expected, found=word, fix=fix)
-    from robocas_ms3.cli.bars import Bar
+    from robocas_ms3.cli.progress import Bar
     from robocas_ms3.cli.terminal import say, say_lines
     from robocas_ms3.core.workers import use_one_torch_thread
     from robocas_ms3.evaluation.policies import find_policy, open_policy
@@ -98,9 +98,9 @@ def list_protocols(cfg: Protocols) -> int:
 
 
 def freeze(cfg: Freeze) -> int:
-    from robocas_ms3.cli.bars import Bar
+    from robocas_ms3.cli.progress import Bar
     from robocas_ms3.cli.terminal import say
-    from robocas_ms3.core.outputs import check_replaceable
+    from robocas_ms3.core.output_folder import check_replaceable
     from robocas_ms3.evaluation.freeze import freeze as make
     from robocas_ms3.evaluation.freeze import read_plan
     from robocas_ms3.evaluation.protocol import load_protocol

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from robocas_ms3.cli.options import Folders, Maybe
-from robocas_ms3.core.words import count_of
+from robocas_ms3.core.text import count_of
 
 if TYPE_CHECKING:
     from robocas_ms3.evaluation.protocol import LoadedProtocol
@@ -138,7 +138,7 @@ def verify(cfg: Verify) -> int:
 
 
 def videos(cfg: Videos) -> int:
-    from robocas_ms3.cli.bars import Bar
+    from robocas_ms3.cli.progress import Bar
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.core.checks import check_number
     from robocas_ms3.core.errors import EvaluationError

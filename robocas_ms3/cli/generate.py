@@ -6,23 +6,23 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from robocas_ms3.cli.options import resumable
-from robocas_ms3.core.words import count_of
+from robocas_ms3.core.text import count_of
 from robocas_ms3.demos.settings import GenerateSettings
 
 if TYPE_CHECKING:
-    from robocas_ms3.demos.ledger import EpisodeResult
+    from robocas_ms3.demos.failures import EpisodeResult
 
 
 @resumable
 def main(settings: GenerateSettings) -> int:
     settings = settings.resolve()  # an invalid configuration is an error before the imports below, which take seconds
-    from robocas_ms3.cli.bars import Bar
+    from robocas_ms3.cli.progress import Bar
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.demos.generate import generate
 
     players, weights = None, ""
     if settings.episode.after_policy:
-        from robocas_ms3.evaluation.acting import Player, check_acting
+        from robocas_ms3.evaluation.policy_rollin import Player, check_acting
 
         weights = check_acting(settings.episode)
         players = partial(Player, settings.episode)

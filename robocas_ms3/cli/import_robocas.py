@@ -44,14 +44,14 @@ class ImportRobocas:
 
 
 def main(cfg: ImportRobocas) -> int:
-    from robocas_ms3.cli.bars import Bar
+    from robocas_ms3.cli.progress import Bar
     from robocas_ms3.cli.terminal import say, say_json
-    from robocas_ms3.core.outputs import OutputFolder
-    from robocas_ms3.core.words import count_of
-    from robocas_ms3.datasets.manage.copying import CopyOptions, check_apart
-    from robocas_ms3.datasets.manage.importing import import_robocas
+    from robocas_ms3.core.output_folder import OutputFolder
+    from robocas_ms3.core.text import count_of
+    from robocas_ms3.datasets.conversion.episode_plan import DATASET
+    from robocas_ms3.datasets.manage.copy_episodes import CopyOptions, check_apart
+    from robocas_ms3.datasets.manage.import_robocas import import_robocas
     from robocas_ms3.datasets.manage.survey import survey
-    from robocas_ms3.datasets.writing.plan import DATASET
 
     if cfg.out is not None:
         check_apart(cfg.out, [cfg.dataset])
@@ -79,7 +79,7 @@ def main(cfg: ImportRobocas) -> int:
 
 def _table(found: Survey) -> None:
     from robocas_ms3.cli.terminal import print_table, say
-    from robocas_ms3.core.words import count_of, format_ranges
+    from robocas_ms3.core.text import count_of, format_ranges
 
     rows: dict[tuple[str, str, str], list[int]] = defaultdict(list)
     for finding in found.findings:

@@ -11,10 +11,10 @@ import tyro
 
 if TYPE_CHECKING:
     from robocas_ms3.scenes.cache import LayoutCache
-    from robocas_ms3.scenes.table import Engine, Pair
+    from robocas_ms3.scenes.layout_table import Engine, Pair
 
 from robocas_ms3.cli.options import CORES, Jobs, Maybe, Repeated
-from robocas_ms3.core.words import count_of
+from robocas_ms3.core.text import count_of
 
 
 @dataclass
@@ -65,7 +65,7 @@ class Info:
 
 def build(command: Build) -> int:
     from robocas_ms3.assets.pack import load_pack
-    from robocas_ms3.cli.bars import Bar
+    from robocas_ms3.cli.progress import Bar
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.core.checks import check_number
     from robocas_ms3.scenes.config import load_task_config
@@ -122,9 +122,9 @@ def choose_engine(wanted: Literal["auto", "cpu", "gpu"]) -> Engine:
 
 def try_all(cache: LayoutCache, engine: Engine, **packs: str) -> int:
     """Let the engine try layouts in state `UNTRIED`; return how many layouts of the table it moves."""
-    from robocas_ms3.cli.bars import Bar
-    from robocas_ms3.scenes.table import State
-    from robocas_ms3.tasks.trial import judged, try_layouts, untried
+    from robocas_ms3.cli.progress import Bar
+    from robocas_ms3.scenes.layout_table import State
+    from robocas_ms3.tasks.layout_stability import judged, try_layouts, untried
 
     seeds = untried(cache, engine)
     if seeds:

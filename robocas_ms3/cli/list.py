@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from robocas_ms3.core.words import count_of
+from robocas_ms3.core.text import count_of
 
 
 @dataclass
@@ -41,7 +41,7 @@ def collect() -> dict[str, list[dict[str, Any]]]:
     from robocas_ms3.core.errors import AssetError
     from robocas_ms3.core.extensions import package_of
     from robocas_ms3.evaluation.policies import POLICIES
-    from robocas_ms3.robots.table import ROBOTS
+    from robocas_ms3.robots.registry import ROBOTS
     from robocas_ms3.scenes.config import load_task_config, shipped_configs
     from robocas_ms3.scenes.task_specs import TASKS
 

@@ -22,10 +22,10 @@ import tyro
 from robocas_ms3 import __version__
 from robocas_ms3.cli.options import with_absolute_paths
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.core.exits import INTERRUPTED, heed_ctrl_c, leave, no_exit
 from robocas_ms3.core.files import FULL
 from robocas_ms3.core.paths import ensure_home, is_writable, temporary_cache, variable_of
-from robocas_ms3.core.words import escape_log_lines, escape_tracebacks, printable
+from robocas_ms3.core.signals import INTERRUPTED, heed_ctrl_c, leave, no_exit
+from robocas_ms3.core.text import escape_log_lines, escape_tracebacks, printable
 
 # Each is a module next to this one (import-robocas: import_robocas.py) with a function `main(cfg: Settings) -> int`. A
 # command with commands of its own has instead `COMMANDS`, such functions by name, `DESCRIPTION` and perhaps `DEFAULT`.

@@ -28,10 +28,10 @@ class Merge:
 
 
 def main(cfg: Merge) -> int:
-    from robocas_ms3.cli.bars import Bar
+    from robocas_ms3.cli.progress import Bar
     from robocas_ms3.cli.terminal import say
-    from robocas_ms3.datasets.manage.copying import CopyOptions
-    from robocas_ms3.datasets.manage.merging import merge
+    from robocas_ms3.datasets.manage.copy_episodes import CopyOptions
+    from robocas_ms3.datasets.manage.merge import merge
 
     with Bar("episodes written") as shown:
         options = CopyOptions(not cfg.copy, cfg.overwrite, shown.start, shown.advance)

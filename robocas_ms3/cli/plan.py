@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from robocas_ms3.cli.options import CORES, Jobs, Maybe, Repeated, resumable
-from robocas_ms3.core.words import count_of
+from robocas_ms3.core.text import count_of
 
 
 @dataclass
@@ -75,7 +75,7 @@ class List:
 
 @resumable
 def run(command: Run) -> int:
-    from robocas_ms3.cli.bars import Display, show_plan
+    from robocas_ms3.cli.progress import Display, show_plan
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.core.checks import check_number, parse_shard
     from robocas_ms3.core.errors import PlanError
@@ -93,7 +93,7 @@ def run(command: Run) -> int:
     plan = load_plan(command.plan)
     executor = open_executor(command.executor, PlanFolder(plan, command.out), command.jobs, options)
     if command.executor == "local" and "datasets" in plan.stages:
-        from robocas_ms3.datasets.writing.render import require_renderer
+        from robocas_ms3.datasets.conversion.env_renderer import require_renderer
 
         require_renderer()
     with closing(Display()) as display:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from robocas_ms3.core.words import count_of
+from robocas_ms3.core.text import count_of
 from robocas_ms3.demos.settings import ReplaySettings
 
 
 def main(settings: ReplaySettings) -> int:
     import numpy as np
 
-    from robocas_ms3.cli.bars import Bar
+    from robocas_ms3.cli.progress import Bar
     from robocas_ms3.cli.terminal import say
-    from robocas_ms3.demos.recordings.entries import read_json
+    from robocas_ms3.demos.recordings.trajectory_json import read_json
 
     total = len(read_json(settings.file)["episodes"][: settings.count])  # an error before the imports below
     from robocas_ms3.core.workers import use_one_torch_thread

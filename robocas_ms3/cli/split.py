@@ -46,34 +46,34 @@ class Split:
 
 
 def main(cfg: Split) -> int:
-    from robocas_ms3.cli.bars import Bar
+    from robocas_ms3.cli.progress import Bar
     from robocas_ms3.cli.terminal import say
-    from robocas_ms3.core.words import count_of
-    from robocas_ms3.datasets.manage import splitting
-    from robocas_ms3.datasets.manage.copying import CopyOptions, open_finished
+    from robocas_ms3.core.text import count_of
+    from robocas_ms3.datasets.manage import split
+    from robocas_ms3.datasets.manage.copy_episodes import CopyOptions, open_finished
 
     _check(cfg)
     by = cfg.by or "seed"
     whole = cfg.out is not None and not cfg.parts  # each part is one task or target, which can't be cut by itself
-    share = None if cfg.val_share is None else splitting.Share(cfg.val_share, "seed" if whole else by)
+    share = None if cfg.val_share is None else split.Share(cfg.val_share, "seed" if whole else by)
     if cfg.in_place:
-        train, val = splitting.resplit(cfg.dataset, share)
+        train, val = split.resplit(cfg.dataset, share)
         say(f"{cfg.dataset}: {count_of(len(train), 'episode')} for training, {len(val)} for validation")
         return 0
     source = open_finished(cfg.dataset)
     if cfg.out_train and cfg.out_val:
-        pieces = splitting.split_by_side(source, share, cfg.out_train, cfg.out_val)
+        pieces = split.split_by_side(source, share, cfg.out_train, cfg.out_val)
     else:
         assert cfg.out is not None
         named = (
-            splitting.split_by_fractions(source.dataset, cfg.parts, by, share)
+            split.split_by_fractions(source.dataset, cfg.parts, by, share)
             if cfg.parts
-            else splitting.split_by_value(source.dataset, by, share)
+            else split.split_by_value(source.dataset, by, share)
         )
         pieces = {cfg.out / name: sides for name, sides in named.items()}
     with Bar("episodes written") as shown:
         options = CopyOptions(not cfg.copy, cfg.overwrite, shown.start, shown.advance)
-        done = splitting.write_split(source, pieces, share, options)
+        done = split.write_split(source, pieces, share, options)
     for written in done:
         say(str(written))
     return 0

@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from robocas_ms3.cli.options import Maybe
-from robocas_ms3.core.words import count_of
+from robocas_ms3.core.text import count_of
 
 
 @dataclass
@@ -30,7 +30,7 @@ class Stats:
 
 
 def main(cfg: Stats) -> int:
-    from robocas_ms3.cli.bars import Bar
+    from robocas_ms3.cli.progress import Bar
     from robocas_ms3.cli.terminal import say, say_json
     from robocas_ms3.datasets.schema import PREVIEW_FOLDER
     from robocas_ms3.datasets.statistics.collect import collect

@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterable, Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from robocas_ms3.core.words import printable
+from robocas_ms3.core.text import printable
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -117,7 +117,7 @@ DEFAULT = "small"
 def train(baseline: str, cfg: Training) -> int:
     from robocas_ms3.baselines.training.record import find_run
     from robocas_ms3.baselines.training.session import Progress, RunOptions, train_run
-    from robocas_ms3.cli.bars import Bar
+    from robocas_ms3.cli.progress import Bar
     from robocas_ms3.cli.terminal import say
 
     data = getattr(cfg, "data", None)

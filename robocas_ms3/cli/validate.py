@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from robocas_ms3.cli.bars import Bar
 from robocas_ms3.cli.options import Maybe
+from robocas_ms3.cli.progress import Bar
 from robocas_ms3.cli.terminal import say, say_json
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.words import count_of
+from robocas_ms3.core.text import count_of
 
 if TYPE_CHECKING:
     from robocas_ms3.datasets.checks.dataset import Report

@@ -31,10 +31,10 @@ class Video:
 
 
 def main(cfg: Video) -> int:
-    from robocas_ms3.cli.bars import Bar
+    from robocas_ms3.cli.progress import Bar
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.datasets.formats import open_source
-    from robocas_ms3.datasets.pictures.video import contact_sheet, write_video
+    from robocas_ms3.datasets.images.video import contact_sheet, write_video
     from robocas_ms3.datasets.schema import PREVIEW_FOLDER, episode_folder
 
     dataset = open_source(cfg.dataset)

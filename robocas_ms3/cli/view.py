@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from robocas_ms3.cli.options import Maybe, Several
-from robocas_ms3.core.words import count_of
+from robocas_ms3.core.text import count_of
 
 
 @dataclass
@@ -65,9 +65,9 @@ def main(cfg: View) -> int:
 
 
 def _write(cfg: View, out: Path, source) -> int:
-    from robocas_ms3.cli.bars import Bar
+    from robocas_ms3.cli.progress import Bar
     from robocas_ms3.cli.terminal import say
-    from robocas_ms3.core.outputs import check_replaceable
+    from robocas_ms3.core.output_folder import check_replaceable
     from robocas_ms3.viewer.export import export
 
     check_replaceable(out, overwrite=cfg.overwrite, marks=("data/index.js",))

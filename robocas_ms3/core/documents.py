@@ -20,7 +20,7 @@ from typing import Any
 
 import yaml
 
-from robocas_ms3.core.words import one_line
+from robocas_ms3.core.text import one_line
 
 JSON_LIMIT = 256 * 2**20
 """Bytes: a hundred thousand recordings have 230 MB of it."""

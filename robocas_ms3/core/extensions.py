@@ -10,8 +10,8 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
 from robocas_ms3.core.errors import ExtensionError
-from robocas_ms3.core.exits import no_exit
-from robocas_ms3.core.words import error_line, nearest
+from robocas_ms3.core.signals import no_exit
+from robocas_ms3.core.text import error_line, nearest
 
 _log = logging.getLogger(__name__)
 T = TypeVar("T")

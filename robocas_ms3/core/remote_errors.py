@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from traceback import format_exception
 from typing import NoReturn
 
-from robocas_ms3.core.exits import exit_error
+from robocas_ms3.core.signals import exit_error
 
 
 @dataclass(frozen=True)

@@ -23,9 +23,9 @@ import psutil
 from tqdm import tqdm
 
 from robocas_ms3.core.errors import RobocasError, WorkerCrashed, WorkerStartError
-from robocas_ms3.core.exits import die_with_parent, end_process, exit_error
 from robocas_ms3.core.remote_errors import RemoteError
-from robocas_ms3.core.words import escape_log_lines, escape_tracebacks
+from robocas_ms3.core.signals import die_with_parent, end_process, exit_error
+from robocas_ms3.core.text import escape_log_lines, escape_tracebacks
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")

@@ -28,7 +28,7 @@ from queue import Empty, SimpleQueue
 from typing import Any, Generic, TypeVar
 
 from robocas_ms3.core.errors import WorkerCrashed, WorkerStartError
-from robocas_ms3.core.exits import deferred_interrupts
+from robocas_ms3.core.signals import deferred_interrupts
 from robocas_ms3.core.worker_process import NO_LIMITS, Limits, ProcessDied, Worker, WorkerProcess
 
 Task = TypeVar("Task")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.words import one_line
+from robocas_ms3.core.text import one_line
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 from robocas_ms3.demos.recordings.motion import stored_actions
 

@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.exits import no_exit
 from robocas_ms3.core.extensions import Registry
+from robocas_ms3.core.signals import no_exit
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.sources.protocol import EpisodeSource
+from robocas_ms3.datasets.sources.episode_source import EpisodeSource
 
 GROUP = "robocas_ms3.formats"
 _log = logging.getLogger(__name__)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Generator, Iterable
 from typing import TypeVar
 
 from robocas_ms3.core.errors import PlanningFailed
-from robocas_ms3.demos.ledger import EpisodeResult
+from robocas_ms3.demos.failures import EpisodeResult
 from robocas_ms3.planning.decisions import ONE_BY_ONE, Effort
 
 T = TypeVar("T")

@@ -27,10 +27,10 @@ from typing import Any, NoReturn, TypeVar, cast
 import torch
 
 from robocas_ms3.core.errors import PlanningFailed, RobocasError
-from robocas_ms3.core.exits import die_with_parent
 from robocas_ms3.core.remote_errors import RemoteError
+from robocas_ms3.core.signals import die_with_parent
 from robocas_ms3.demos.backtracking import DeadEnd, turns
-from robocas_ms3.demos.ledger import EpisodeResult
+from robocas_ms3.demos.failures import EpisodeResult
 from robocas_ms3.planning.decisions import ONE_BY_ONE, Effort
 
 T = TypeVar("T")

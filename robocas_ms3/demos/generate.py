@@ -17,13 +17,13 @@ import numpy as np
 
 from robocas_ms3.core.errors import DatasetError, RobocasError
 from robocas_ms3.core.files import flush_to_disk, make_folder, write_json
-from robocas_ms3.core.ledger import Ledger
-from robocas_ms3.core.outputs import FolderKind, OutputFolder
-from robocas_ms3.core.words import one_line
+from robocas_ms3.core.json_lines import Ledger
+from robocas_ms3.core.output_folder import FolderKind, OutputFolder
+from robocas_ms3.core.text import one_line
 from robocas_ms3.core.workers import Limits, Worker, WorkerPool, use_one_torch_thread
-from robocas_ms3.demos.ledger import FAILURES_FILE, EpisodeResult, Failure, Takeover, count_by_stage, failed_attempts
-from robocas_ms3.demos.recordings.entries import read_json, versions
-from robocas_ms3.demos.recordings.stored import merge, open_trajectory
+from robocas_ms3.demos.failures import FAILURES_FILE, EpisodeResult, Failure, Takeover, count_by_stage, failed_attempts
+from robocas_ms3.demos.recordings.trajectory_hdf5 import merge, open_trajectory
+from robocas_ms3.demos.recordings.trajectory_json import read_json, versions
 from robocas_ms3.demos.settings import EpisodeSettings, GenerateSettings
 from robocas_ms3.planning.decisions import Seconds
 

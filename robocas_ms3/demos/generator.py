@@ -15,12 +15,12 @@ from robocas_ms3.core.errors import EpisodeLost, LayoutError, PlanningFailed
 from robocas_ms3.core.extensions import load
 from robocas_ms3.demos.backtracking import Resimulation
 from robocas_ms3.demos.branches import ForkedBranches, say_once, why_not_fork
-from robocas_ms3.demos.completing import complete
-from robocas_ms3.demos.ledger import EpisodeResult, Takeover
+from robocas_ms3.demos.failures import EpisodeResult, Takeover
+from robocas_ms3.demos.interventions import complete
 from robocas_ms3.demos.open_loop import OpenLoop, Trials
 from robocas_ms3.demos.recordings.environment import RecordedEnv
+from robocas_ms3.demos.recordings.episode_recorder import EpisodeRecorder
 from robocas_ms3.demos.recordings.subgoals import SubGoal
-from robocas_ms3.demos.recordings.writing import EpisodeRecorder
 from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.planning.decisions import Decisions, StraightDecisions
 from robocas_ms3.planning.executor import Executor
@@ -28,7 +28,7 @@ from robocas_ms3.planning.kinematics import ArmChain, Reachability
 from robocas_ms3.planning.protocol import Planner
 from robocas_ms3.planning.rrt_connect import make_planner
 from robocas_ms3.planning.skills.arm import Arm, back_out
-from robocas_ms3.robots.table import DEFAULT, find_robot
+from robocas_ms3.robots.registry import DEFAULT, find_robot
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.task_specs import TASKS
 from robocas_ms3.tasks.base import RoboCASEnv

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.core.errors import DatasetError, EpisodeLost
-from robocas_ms3.demos.ledger import NOISY, Takeover
+from robocas_ms3.demos.failures import NOISY, Takeover
 from robocas_ms3.demos.recordings.environment import RecordedEnv
 from robocas_ms3.demos.recordings.motion import Array, Motion, sample_states, sample_stride
 from robocas_ms3.demos.settings import EpisodeSettings

@@ -20,11 +20,11 @@ from scipy.spatial.transform import Rotation
 from robocas_ms3.core.checks import check_number
 from robocas_ms3.core.errors import DatasetError, RobocasError
 from robocas_ms3.core.files import make_folder
-from robocas_ms3.core.outputs import check_replaceable
+from robocas_ms3.core.output_folder import check_replaceable
 from robocas_ms3.core.poses import from_wxyz, inverse
-from robocas_ms3.demos.recordings.entries import read_begin, read_json, was_taken_over
 from robocas_ms3.demos.recordings.environment import RecordedEnv, read_env
-from robocas_ms3.demos.recordings.stored import (
+from robocas_ms3.demos.recordings.episode_recorder import EpisodeRecorder
+from robocas_ms3.demos.recordings.trajectory_hdf5 import (
     BODIES,
     merge,
     named_arrays,
@@ -32,7 +32,7 @@ from robocas_ms3.demos.recordings.stored import (
     open_trajectory,
     read_steps,
 )
-from robocas_ms3.demos.recordings.writing import EpisodeRecorder
+from robocas_ms3.demos.recordings.trajectory_json import read_begin, read_json, was_taken_over
 from robocas_ms3.demos.settings import ReplaySettings
 from robocas_ms3.robots.description_file import chain
 from robocas_ms3.robots.ee_controller import RoboCASEEPoseController

@@ -68,7 +68,7 @@ def planner() -> str:
     import numpy as np
 
     from robocas_ms3.planning.rrt_connect import RRTConnectPlanner
-    from robocas_ms3.robots.table import find_robot
+    from robocas_ms3.robots.registry import find_robot
 
     robot = find_robot(None)
     files = robot.files()
@@ -80,7 +80,7 @@ def planner() -> str:
 
 def packs() -> str:
     from robocas_ms3.assets.pack import load_pack, pack_folders
-    from robocas_ms3.core.words import count_of
+    from robocas_ms3.core.text import count_of
 
     loaded = [load_pack(name) for name in pack_folders()]
     if not any(pack.name == "builtin" for pack in loaded):
@@ -114,7 +114,7 @@ def _main() -> int:
         sys.stderr.write(f"{error}\n")
         return ABSENT
     except Exception as error:  # whatever the trial meets is its answer
-        from robocas_ms3.core.words import printable
+        from robocas_ms3.core.text import printable
 
         sys.stderr.write(printable(f"{type(error).__name__}: {' '.join(str(error).split())}") + "\n")
         return 1
@@ -125,6 +125,6 @@ def _main() -> int:
 
 if __name__ == "__main__":
     exit_code = _main()
-    from robocas_ms3.core.exits import end_process
+    from robocas_ms3.core.signals import end_process
 
     end_process(exit_code)  # a library that crashes while it is torn down has worked nevertheless

@@ -17,7 +17,7 @@ from robocas_ms3.assets.pack import MANIFEST, load_pack, sha256
 from robocas_ms3.core.documents import DocumentError, load_yaml
 from robocas_ms3.core.errors import EvaluationError, LayoutError
 from robocas_ms3.core.files import make_folder, replacing, replacing_folder
-from robocas_ms3.core.strict import LONGEST_NAME, StrictModel, parse
+from robocas_ms3.core.strict_model import LONGEST_NAME, StrictModel, parse
 from robocas_ms3.evaluation.protocol import (
     CONFIG_NAME,
     CONFIGS,
@@ -29,10 +29,10 @@ from robocas_ms3.evaluation.protocol import (
     Episode,
     Protocol,
 )
-from robocas_ms3.robots.table import DEFAULT
+from robocas_ms3.robots.registry import DEFAULT
 from robocas_ms3.scenes.config import TaskConfig, load_task_config, shipped_configs
 from robocas_ms3.scenes.layout import Layout
-from robocas_ms3.scenes.table import write_frozen
+from robocas_ms3.scenes.layout_table import write_frozen
 from robocas_ms3.scenes.task_specs import TASKS
 from robocas_ms3.tasks.base import RoboCASEnv
 

@@ -16,11 +16,11 @@ from pydantic import ConfigDict, Field
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.core.exits import no_exit
 from robocas_ms3.core.files import json_text
+from robocas_ms3.core.signals import no_exit
 from robocas_ms3.robots.cameras import CAMERA_NAME
 from robocas_ms3.robots.quantities import QUANTITIES
-from robocas_ms3.robots.table import DEFAULT
+from robocas_ms3.robots.registry import DEFAULT
 
 ROBOT = {quantity.policy: quantity for quantity in QUANTITIES if quantity.policy}
 """Quantities of the robot that policies observe, by their names there."""

@@ -5,7 +5,7 @@
     protocol.yaml            the rules, see `Protocol`
     episodes.jsonl           an episode per line, see `Episode`
     configs/NAME.yaml        the configurations that episodes name, whole
-    layouts/NAME.npy         the scenes of a configuration's episodes (`scenes.table.FrozenLayouts`)
+    layouts/NAME.npy         the scenes of a configuration's episodes (`scenes.layout_table.FrozenLayouts`)
     train/NAME.yaml          of a suite that holds something out: configurations without it, to train on
 
 Results of one hash were measured by the same files.
@@ -27,11 +27,11 @@ from robocas_ms3.core.checks import GREATEST_SEED, parse_shard
 from robocas_ms3.core.documents import ARRAYS_LIMIT, JSON_LIMIT, DocumentError, load_yaml, read_bytes, read_text
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.paths import protocols_dir
-from robocas_ms3.core.strict import LONGEST_NAME, FileName, StrictModel, nearest, parse, parse_json
+from robocas_ms3.core.strict_model import LONGEST_NAME, FileName, StrictModel, nearest, parse, parse_json
 from robocas_ms3.evaluation.policy import CONVENTIONS, PolicySpec
 from robocas_ms3.evaluation.settings import EvaluationSettings
-from robocas_ms3.robots.table import DEFAULT as DEFAULT_ROBOT
-from robocas_ms3.robots.table import find_robot
+from robocas_ms3.robots.registry import DEFAULT as DEFAULT_ROBOT
+from robocas_ms3.robots.registry import find_robot
 from robocas_ms3.scenes.config.load import check_no_base, load_task_config
 from robocas_ms3.scenes.task_specs import TASKS
 

@@ -22,9 +22,9 @@ from pydantic import BaseModel, ConfigDict
 from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.files import replacing_folder, write_json
-from robocas_ms3.core.ledger import Ledger
-from robocas_ms3.core.outputs import FolderKind, OutputFolder, check_replaceable, setting_changes
-from robocas_ms3.core.strict import parse
+from robocas_ms3.core.json_lines import Ledger
+from robocas_ms3.core.output_folder import FolderKind, OutputFolder, check_replaceable, setting_changes
+from robocas_ms3.core.strict_model import parse
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.statistics import Share, share
 

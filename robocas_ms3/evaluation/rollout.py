@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import EvaluationError, PolicyFailed
-from robocas_ms3.core.words import printable
+from robocas_ms3.core.text import printable
 from robocas_ms3.evaluation.metrics import MEASURES, read_sum
 from robocas_ms3.evaluation.outcomes import Outcome, Retrieval, failure_stage
 from robocas_ms3.evaluation.policy import (
@@ -30,7 +30,7 @@ from robocas_ms3.scenes.language.embed import TextEmbedder
 from robocas_ms3.scenes.task_specs import TASKS
 
 NOT_FINITE = "the policy's action is not finite"
-_WELDS = "welds"  # in an info, where objects are welded (`stepping.Weld`)
+_WELDS = "welds"  # in an info, where objects are welded (`action_wrapper.Weld`)
 
 
 @dataclass
@@ -101,7 +101,7 @@ class EpisodeBatch:
     """Run one episode in each of several envs; the caller chooses the action of every step.
 
     Args:
-        env: vector environment (`make_vec`, NumPy arrays, no automatic resets) of `stepping.PolicyStepping` envs.
+        env: vector environment (`make_vec`, NumPy arrays, no automatic resets) of `action_wrapper.PolicyStepping` envs.
         control_dt: simulated time of a control step, s.
         refill: whether an env can be reset while others run. In a GPU's batch all envs are reset together.
 

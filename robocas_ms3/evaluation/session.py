@@ -17,15 +17,15 @@ from numpy.typing import ArrayLike
 from robocas_ms3.assets.pack import MANIFEST, load_pack, sha256
 from robocas_ms3.core.errors import EvaluationError, WorkerDied
 from robocas_ms3.core.workers import Limits
-from robocas_ms3.datasets.writing.render import require_renderer
+from robocas_ms3.datasets.conversion.env_renderer import require_renderer
 from robocas_ms3.evaluation import results
+from robocas_ms3.evaluation.action_wrapper import UPSTREAM_HZ, PolicyStepping, check_weld, env_kwargs
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, Policy, as_chunks, describe
 from robocas_ms3.evaluation.protocol import Episode, load_protocol
 from robocas_ms3.evaluation.rollout import NOT_FINITE, EndConditions, EpisodeBatch, Rollout, rollout
 from robocas_ms3.evaluation.settings import EvaluationSettings
-from robocas_ms3.evaluation.stepping import UPSTREAM_HZ, PolicyStepping, check_weld, env_kwargs
-from robocas_ms3.scenes.table import FrozenLayouts
+from robocas_ms3.scenes.layout_table import FrozenLayouts
 from robocas_ms3.scenes.task_specs import TASKS
 from robocas_ms3.tasks.vector import choose_backend, make_vec
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from robocas_ms3.core.words import count_of
+from robocas_ms3.core.text import count_of
 from robocas_ms3.evaluation.outcomes import Outcome, failure_stage, score_of
 from robocas_ms3.evaluation.protocol import DEFAULT_HZ, Episode, LoadedProtocol
 from robocas_ms3.evaluation.results import Result, RunRecord

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import RobotDescriptionError
-from robocas_ms3.core.words import error_line
+from robocas_ms3.core.text import error_line
 from robocas_ms3.planning.kinematics import ArmChain
 from robocas_ms3.planning.protocol import Array
 from robocas_ms3.planning.shapes import convex_hull, fcl_convex

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.assets.annotations import Annotations
-from robocas_ms3.scenes.grasping import (
+from robocas_ms3.scenes.grasp_checks import (
     HALF_TURN,
     MAX_WIDTH,
     TESTED_AT_ONCE,

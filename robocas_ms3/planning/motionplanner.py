@@ -29,7 +29,7 @@ from robocas_ms3.planning.rrt_connect import DEFAULT, make_planner
 from robocas_ms3.planning.scene import seen_from
 from robocas_ms3.robots.agent import MobileManipulator
 from robocas_ms3.robots.description import MOBILE_PANDA
-from robocas_ms3.robots.table import RobotSpec
+from robocas_ms3.robots.registry import RobotSpec
 from robocas_ms3.robots.urdf import RobotFiles
 
 CONTROL_MODES = ("pd_joint_pos", "pd_joint_pos_vel")

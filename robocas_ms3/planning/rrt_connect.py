@@ -16,9 +16,9 @@ from robocas_ms3.planning.collision import FclWorld
 from robocas_ms3.planning.kinematics import Reachability, follow_line, turn_between
 from robocas_ms3.planning.path_search import PathSearch
 from robocas_ms3.planning.protocol import Array, Planner, Trajectory
-from robocas_ms3.planning.timing import JointPath, blended, rounded, stopping, thinned, through, timed
+from robocas_ms3.planning.time_parameterization import JointPath, blended, rounded, stopping, thinned, through, timed
 from robocas_ms3.robots.description import RobotDescription
-from robocas_ms3.robots.table import RobotSpec
+from robocas_ms3.robots.registry import RobotSpec
 
 BUDGET = 20_000  # collision checks of one search, about 2 s; a limit by the clock would depend on the machine's load
 RRT_RANGE = 0.25  # rad, longest extension of a tree

@@ -22,11 +22,11 @@ from robocas_ms3.core.checks import GREATEST_SEED
 from robocas_ms3.core.documents import JSON_LIMIT, DocumentError, load_json, read_bytes
 from robocas_ms3.core.errors import PlanError
 from robocas_ms3.core.files import flush_to_disk, make_folder
-from robocas_ms3.core.ledger import Ledger
-from robocas_ms3.core.outputs import FolderKind, OutputFolder
-from robocas_ms3.core.strict import parse, validate_json
+from robocas_ms3.core.json_lines import Ledger
+from robocas_ms3.core.output_folder import FolderKind, OutputFolder
+from robocas_ms3.core.strict_model import parse, validate_json
 from robocas_ms3.datasets.schema import episode_folder
-from robocas_ms3.demos.recordings.entries import versions
+from robocas_ms3.demos.recordings.trajectory_json import versions
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.robots.cameras import STANDARD_NAMES
 

@@ -16,17 +16,17 @@ from typing import Any
 from robocas_ms3.core.documents import DAMAGED, load_array, load_json
 from robocas_ms3.core.errors import PlanError
 from robocas_ms3.core.files import flush_to_disk, json_text, make_folder, replacing, write_json
-from robocas_ms3.core.outputs import sweep
-from robocas_ms3.core.words import count_of, one_line
+from robocas_ms3.core.output_folder import sweep
+from robocas_ms3.core.text import count_of, one_line
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.manage.splitting import Share, cut, groups_of
+from robocas_ms3.datasets.conversion.data_info import write_info
+from robocas_ms3.datasets.conversion.episode_plan import dataset_settings, header
+from robocas_ms3.datasets.manage.split import Share, cut, groups_of
 from robocas_ms3.datasets.sources.provenance import recording_entry
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.split import SPLIT_RULE, split_by_seed
-from robocas_ms3.datasets.writing.info import write_info
-from robocas_ms3.datasets.writing.plan import dataset_settings, header
-from robocas_ms3.demos.recordings.reading import TrajectoryFile
-from robocas_ms3.demos.recordings.stored import damage_of, merge
+from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
+from robocas_ms3.demos.recordings.trajectory_hdf5 import damage_of, merge
 from robocas_ms3.plans.folder import (
     DATASETS,
     DEMOS,
@@ -40,7 +40,7 @@ from robocas_ms3.plans.folder import (
     Unit,
 )
 from robocas_ms3.plans.plan import Plan
-from robocas_ms3.scenes.table import join_frozen
+from robocas_ms3.scenes.layout_table import join_frozen
 
 TRAJECTORY = "trajectory.h5"
 Chosen = Mapping[int, Sequence[tuple[Unit, Outcome]]]
@@ -213,8 +213,8 @@ def split_of(plan: Plan, root: Path) -> tuple[list[int], list[int]]:
 
 
 def _convert_lerobot(plan: Plan, robocas: Path, out: Path, jobs: int) -> None:
+    from robocas_ms3.datasets.conversion.settings import ConversionSettings
     from robocas_ms3.datasets.lerobot.convert import convert_lerobot
-    from robocas_ms3.datasets.writing.settings import ConversionSettings
 
     seconds, memory_gb = plan.limits.render_seconds, plan.limits.memory_gb
     jobs = min(jobs, os.cpu_count() or 1)  # those of a plan may be a cluster's

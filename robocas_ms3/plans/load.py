@@ -14,11 +14,11 @@ from robocas_ms3.core.checks import GREATEST_SEED
 from robocas_ms3.core.documents import DocumentError, load_yaml
 from robocas_ms3.core.errors import MissingExtraError, PlanError, require_extra
 from robocas_ms3.core.paths import plans_dir
-from robocas_ms3.core.strict import parse
-from robocas_ms3.core.words import error_line, nearest
+from robocas_ms3.core.strict_model import parse
+from robocas_ms3.core.text import error_line, nearest
 from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.plans.plan import PartConfig, Plan
-from robocas_ms3.robots.table import find_robot
+from robocas_ms3.robots.registry import find_robot
 from robocas_ms3.scenes.config import TaskConfig, load_config_of, shipped_configs
 from robocas_ms3.scenes.task_specs import TASKS
 

@@ -7,9 +7,9 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from robocas_ms3.core.checks import GREATEST_SEED
-from robocas_ms3.core.strict import StrictModel
+from robocas_ms3.core.strict_model import StrictModel
+from robocas_ms3.datasets.images.image_files import Pictures
 from robocas_ms3.datasets.lerobot.variants import NEWEST, Version
-from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.schema import ImageFormat
 from robocas_ms3.robots.cameras import STANDARD_NAMES
 

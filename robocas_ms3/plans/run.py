@@ -12,9 +12,9 @@ from threading import Event
 from typing import Any
 
 from robocas_ms3.core.errors import PlanError
-from robocas_ms3.core.exits import deferred_interrupts
-from robocas_ms3.core.outputs import OutputFolder
-from robocas_ms3.core.words import count_of
+from robocas_ms3.core.output_folder import OutputFolder
+from robocas_ms3.core.signals import deferred_interrupts
+from robocas_ms3.core.text import count_of
 from robocas_ms3.plans.executors import Executor
 from robocas_ms3.plans.folder import Unit, read_plan
 from robocas_ms3.plans.join import join

@@ -27,26 +27,26 @@ from robocas_ms3.core.errors import (
     WorkerStartError,
 )
 from robocas_ms3.core.files import remove, write_json
-from robocas_ms3.core.outputs import sweep
-from robocas_ms3.core.words import error_line
+from robocas_ms3.core.output_folder import sweep
+from robocas_ms3.core.text import error_line
 from robocas_ms3.core.workers import Limits, WorkerPool, use_one_torch_thread
-from robocas_ms3.datasets.pictures.stored import Pictures
-from robocas_ms3.datasets.writing import rendering
-from robocas_ms3.datasets.writing.episode_folder import FolderWriter
-from robocas_ms3.datasets.writing.inputs import ConversionInput
-from robocas_ms3.demos.recordings.entries import read_json
+from robocas_ms3.datasets.conversion import rendered_source
+from robocas_ms3.datasets.conversion.conversion_input import ConversionInput
+from robocas_ms3.datasets.conversion.episode_folder import FolderWriter
+from robocas_ms3.datasets.images.image_files import Pictures
 from robocas_ms3.demos.recordings.environment import RecordedEnv
+from robocas_ms3.demos.recordings.trajectory_json import read_json
 from robocas_ms3.plans.folder import Outcome, PlanFolder, SeedFiles, Unit
 from robocas_ms3.plans.load import opening_part, recording_settings
 from robocas_ms3.plans.plan import Plan
-from robocas_ms3.robots.table import find_robot
+from robocas_ms3.robots.registry import find_robot
 from robocas_ms3.scenes.config import load_config_of
+from robocas_ms3.scenes.layout_table import write_frozen
 from robocas_ms3.scenes.model import SceneModel
-from robocas_ms3.scenes.table import write_frozen
 from robocas_ms3.scenes.task_specs import TASKS
 
 if TYPE_CHECKING:
-    from robocas_ms3.datasets.writing.render import EnvRenderer
+    from robocas_ms3.datasets.conversion.env_renderer import EnvRenderer
     from robocas_ms3.demos.generator import EpisodeGenerator
 
 TRIES = 2
@@ -128,7 +128,7 @@ class Renderer:
         os.environ.setdefault("LP_NUM_THREADS", "1")  # one process per core renders
         self._plan = plan
         self._part: int | None = None
-        self._source: rendering.RenderedSource | None = None
+        self._source: rendered_source.RenderedSource | None = None
         self._embedder: Any = None
 
     def run(self, files: SeedFiles) -> dict[str, Any]:
@@ -143,13 +143,13 @@ class Renderer:
     def open_env(self, env: RecordedEnv, control_mode: str, pictures: Pictures) -> EnvRenderer:
         """Open the environment that recorded an episode."""
         use_one_torch_thread()
-        return rendering.open_env(env, control_mode, pictures)
+        return rendered_source.open_env(env, control_mode, pictures)
 
-    def _source_of(self, files: SeedFiles) -> rendering.RenderedSource:
+    def _source_of(self, files: SeedFiles) -> rendered_source.RenderedSource:
         if self._source is None or self._part != files.part:
             self.close()
             self._part = files.part
-            self._source = rendering.RenderedSource(
+            self._source = rendered_source.RenderedSource(
                 files.recording,
                 rate_hz=self._plan.rate,
                 pictures=self._plan.pictures.chosen(),

@@ -29,7 +29,7 @@ from robocas_ms3.robots.joint_controllers import (
     SmoothJointPosControllerConfig,
 )
 from robocas_ms3.robots.quantities import QUANTITIES
-from robocas_ms3.robots.table import PANDA, STOCK_FINGERS, RobotSpec
+from robocas_ms3.robots.registry import PANDA, STOCK_FINGERS, RobotSpec
 
 Drive = dict[str, Any]
 """Stiffness, damping and force limit of joints, in ManiSkill's units."""

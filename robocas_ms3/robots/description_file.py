@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import RobotDescriptionError
-from robocas_ms3.robots.table import RobotSpec
+from robocas_ms3.robots.registry import RobotSpec
 
 Array = NDArray[np.float64]
 FIX = "Correct the file, or export it again."

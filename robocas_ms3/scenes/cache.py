@@ -23,9 +23,9 @@ from robocas_ms3.core.locks import lock_file
 from robocas_ms3.core.paths import cache_dir
 from robocas_ms3.core.workers import FunctionWorker, WorkerPool
 from robocas_ms3.scenes.layout import Layout, LayoutSource, ObjectIds, read_layout, write_layout
+from robocas_ms3.scenes.layout_table import Engine, FrozenLayouts, LayoutTable, Pair, State, mark_table, write_table
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.sample import sample_layout
-from robocas_ms3.scenes.table import Engine, FrozenLayouts, LayoutTable, Pair, State, mark_table, write_table
 
 LAYOUT_FORMAT = 14  # raised when the same seed gives another layout, or the files change
 ABOUT = "about.json"  # in the folder of a cache: all that its layouts depend on

@@ -45,7 +45,7 @@ def check_clearance(
 ) -> None:
     """Check that furniture, basket and robot don't overlap, and that basket and objects are within the arm's reach.
 
-    What a seed moves is checked where it is drawn (`standing`), and reach includes what that may give.
+    What a seed moves is checked where it is drawn (`robot_placement`), and reach includes what that may give.
 
     Args:
         config: the configuration.

@@ -11,7 +11,7 @@ from robocas_ms3.assets.manifest import Joint
 from robocas_ms3.assets.pack import LoadedFurniture, Pack, load_pack
 from robocas_ms3.core.errors import ConfigError
 from robocas_ms3.core.poses import planar
-from robocas_ms3.core.strict import nearest
+from robocas_ms3.core.strict_model import nearest
 from robocas_ms3.scenes.config.task import OrderlyLayout, PlacedConfig, PoseConfig, SurfaceConfig, TaskConfig
 from robocas_ms3.scenes.placement import Array, Region
 from robocas_ms3.scenes.relations import NEED_THREE, RELATIONS

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.core.poses import planar
-from robocas_ms3.core.words import count_of
+from robocas_ms3.core.text import count_of
 from robocas_ms3.scenes.config.task import OrderlyLayout, ScatteredLayout
 
 Array = NDArray[np.float64]

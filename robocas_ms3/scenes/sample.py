@@ -12,13 +12,13 @@ from robocas_ms3.assets.pack import LoadedFurniture, LoadedObject
 from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.core.poses import planar, transform
 from robocas_ms3.scenes.config.task import OrderlyLayout, ScatteredLayout, StackedLayout
+from robocas_ms3.scenes.heap import drop_heap
 from robocas_ms3.scenes.layout import PARKING_HEIGHT, Layout, ObjectIds
 from robocas_ms3.scenes.lookup import resolve_ids
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.placement import Array, PlaceableObject, choose_objects, sample_orderly, sample_scattered
+from robocas_ms3.scenes.robot_placement import place_basket, place_robot
 from robocas_ms3.scenes.settle import settle
-from robocas_ms3.scenes.stacked import drop_heap
-from robocas_ms3.scenes.standing import place_basket, place_robot
 from robocas_ms3.scenes.targets import Arrangement, choose_target, target_rule
 from robocas_ms3.scenes.task_specs import TASKS
 

@@ -13,7 +13,7 @@ from robocas_ms3.assets.annotations import GRIPPER_RADIUS
 from robocas_ms3.assets.pack import LoadedObject
 from robocas_ms3.core.extensions import load
 from robocas_ms3.core.poses import transform
-from robocas_ms3.scenes.grasping import PREGRASP_DISTANCE, has_free_grasps
+from robocas_ms3.scenes.grasp_checks import PREGRASP_DISTANCE, has_free_grasps
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.placement import Array
 from robocas_ms3.scenes.relations import related

@@ -6,7 +6,7 @@ from typing import Any
 from mani_skill.utils.registration import REGISTERED_ENVS, register
 
 from robocas_ms3.core.extensions import load
-from robocas_ms3.robots.table import ROBOTS
+from robocas_ms3.robots.registry import ROBOTS
 from robocas_ms3.scenes.task_specs import TASKS, TaskSpec
 from robocas_ms3.tasks.open_pick import RoboCASOpenPickEnv
 from robocas_ms3.tasks.pick import RoboCASPickEnv

@@ -20,7 +20,7 @@ from robocas_ms3.core.arrays import Array, as_tensor
 from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.core.extensions import load
 from robocas_ms3.robots.agent import MobileManipulator
-from robocas_ms3.robots.table import DEFAULT, find_robot
+from robocas_ms3.robots.registry import DEFAULT, find_robot
 from robocas_ms3.scenes import build
 from robocas_ms3.scenes.cache import layout_source
 from robocas_ms3.scenes.config import TaskConfig, load_config_of
@@ -31,10 +31,10 @@ from robocas_ms3.scenes.task_specs import TaskSpec
 from robocas_ms3.tasks import engine
 from robocas_ms3.tasks.bodies import Bodies, Contacts, link_poses
 from robocas_ms3.tasks.goals import Goal, InBasket
+from robocas_ms3.tasks.initial_states import place
 from robocas_ms3.tasks.observations import over_the_shoulder, place_camera, privileged_observations
 from robocas_ms3.tasks.rewards import DENSE, TRANSFER, DenseReward, RewardTable, count_share
 from robocas_ms3.tasks.seeds import EpisodeSeeds, check_reset_options
-from robocas_ms3.tasks.starts import place
 from robocas_ms3.tasks.success import SuccessCheck
 
 STAGES = ("reached_any", "picked_any", "reached_target", "target_grasped", "target_lifted", "target_in_basket")
@@ -53,7 +53,7 @@ class RoboCASEnv(BaseEnv):
         visual_level: ``fast`` or ``full`` meshes to render.
         layouts: where layouts come from; see `scenes.cache.layout_source`.
         seeds: least and greatest seed that unseeded resets draw from; see `EpisodeSeeds`.
-        robot_uids: name of the robot in `robots.table`.
+        robot_uids: name of the robot in `robots.registry`.
         kwargs: passed to ``BaseEnv``; ``reconfiguration_freq`` is 1 for one env, 0 for several, unless it is given.
 
     Raises:

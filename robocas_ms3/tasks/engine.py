@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from robocas_ms3.assets.pack import VISUALS
 from robocas_ms3.assets.physics import CONTACT_OFFSET
 from robocas_ms3.core.errors import ConfigError, SimulationError, VectorEnvError
-from robocas_ms3.core.words import error_line
+from robocas_ms3.core.text import error_line
 from robocas_ms3.scenes.config import TaskConfig
 from robocas_ms3.scenes.task_specs import SIM_FREQ, STANDARD_FREQ
 

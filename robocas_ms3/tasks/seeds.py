@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from robocas_ms3.core.errors import ConfigError, LayoutError, RobocasError
 from robocas_ms3.scenes.cache import LayoutCache
 from robocas_ms3.scenes.layout import Layout, LayoutSource, ObjectIds
-from robocas_ms3.scenes.table import FrozenLayouts, LayoutTable, Pair, State
-from robocas_ms3.tasks.starts import Starts, TabledStarts
+from robocas_ms3.scenes.layout_table import FrozenLayouts, LayoutTable, Pair, State
+from robocas_ms3.tasks.initial_states import Starts, TabledStarts
 
 SEVERAL_ENVS_SEEDS = (0, 99)  # least and greatest seed of several envs' unseeded resets
 _OTHER_SEEDS = 20  # tried where a seed has no layout

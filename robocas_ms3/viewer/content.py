@@ -12,15 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.words import called
+from robocas_ms3.core.text import called
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.sources.protocol import EpisodeSource, Kind
-from robocas_ms3.demos.ledger import Failure
-from robocas_ms3.demos.recordings.entries import one_seed
+from robocas_ms3.datasets.sources.episode_source import EpisodeSource, Kind
+from robocas_ms3.demos.failures import Failure
+from robocas_ms3.demos.recordings.trajectory_json import one_seed
 from robocas_ms3.viewer.damage import attempt, join_reasons, read_scene, readable
 from robocas_ms3.viewer.episode import facts_of, rounded, show_arrays
+from robocas_ms3.viewer.episode_table import Failures, Row, describe, stages
 from robocas_ms3.viewer.images import EncodedImage, encode_jpeg
-from robocas_ms3.viewer.table import Failures, Row, describe, stages
 
 CAMERA_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,79}")
 """Names of cameras that are shown: names become addresses and folders."""

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 from robocas_ms3.core.documents import DAMAGED
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.words import error_line
+from robocas_ms3.core.text import error_line
 from robocas_ms3.datasets.checks.scene import valid_values
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.poses import from_xyzw
-from robocas_ms3.core.words import called
+from robocas_ms3.core.text import called
 from robocas_ms3.demos.recordings.subgoals import subgoal_runs
 from robocas_ms3.robots.quantities import GRIPPER_WIDTH
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.datasets.pictures.video import colour_depth
+from robocas_ms3.datasets.images.video import colour_depth
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 
 THUMBNAIL = (96, 72)

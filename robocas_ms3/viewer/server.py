@@ -11,7 +11,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.core.words import print_traceback, printable
+from robocas_ms3.core.text import print_traceback, printable
 from robocas_ms3.viewer.content import PageContent
 from robocas_ms3.viewer.routes import Response, Routes
 

@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import from_xyzw, inverse, transform
-from robocas_ms3.core.words import called
+from robocas_ms3.core.text import called
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.formats import format_of
-from robocas_ms3.datasets.pictures.headers import read_picture_bytes
-from robocas_ms3.datasets.sources.protocol import Kind
+from robocas_ms3.datasets.images.image_headers import read_picture_bytes
+from robocas_ms3.datasets.sources.episode_source import Kind
 from robocas_ms3.datasets.sources.provenance import task_of, unread_entry
 from robocas_ms3.datasets.sources.reader import DEFAULT_RATE, Dataset
 from robocas_ms3.datasets.sources.trajectory import TrajectorySource
-from robocas_ms3.demos.recordings.reading import Recording, TrajectoryFile
+from robocas_ms3.demos.recordings.trajectory_file import Recording, TrajectoryFile
 from robocas_ms3.viewer.content import PageContent
 from robocas_ms3.viewer.damage import attempt, read_object, readable
 from robocas_ms3.viewer.episode import ARM, ROLL_PITCH_YAW, XYZ, Plot, facts_of, plot, show_arrays

@@ -11,7 +11,7 @@ from models import ball_dropped_into
 from asset_tools.decompose import GPU_LIMIT, MAX_VERTICES, decompose, few_vertices, flat_faces
 from asset_tools.prepare import prepare
 from asset_tools.quality.hulls import hull_quality
-from robocas_ms3.assets.cooking import cooking_faults
+from robocas_ms3.assets.cooked_hulls import cooking_faults
 from robocas_ms3.assets.hulls import write_hulls
 from robocas_ms3.assets.pack import HULLS
 

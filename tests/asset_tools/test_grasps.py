@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from asset_tools.grasps import sample_grasps
-from robocas_ms3.scenes.grasping import gripper_is_clear
+from robocas_ms3.scenes.grasp_checks import gripper_is_clear
 
 
 def cup():

@@ -17,7 +17,7 @@ from asset_tools.repair import close
 from asset_tools.simplify import simplified
 from asset_tools.sources import ObjectSource
 from asset_tools.visual import to_display
-from robocas_ms3.assets.cooking import OBLONG, SHRINKAGE, cook_hulls, cooking_faults
+from robocas_ms3.assets.cooked_hulls import OBLONG, SHRINKAGE, cook_hulls, cooking_faults
 
 
 def moved(mesh, *by):

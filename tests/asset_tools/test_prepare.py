@@ -7,7 +7,7 @@ import trimesh
 from asset_tools.decompose import decompose
 from asset_tools.inertia import principal_inertia
 from asset_tools.prepare import level_base, prepare
-from asset_tools.resting import resting_poses
+from asset_tools.resting_poses import resting_poses
 from robocas_ms3.assets.physics import Solid
 from robocas_ms3.core.errors import AssetError
 

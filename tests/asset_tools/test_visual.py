@@ -18,7 +18,7 @@ from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
 from asset_tools.glb import write_glb
-from asset_tools.reading.surface import Material, Part, to_mesh
+from asset_tools.readers.surface import Material, Part, to_mesh
 from asset_tools.simplify import simplified
 from asset_tools.visual import to_display
 

@@ -8,8 +8,8 @@ import pytest
 from rich.table import Table
 from rich.text import Text
 
-from robocas_ms3.cli import bars
 from robocas_ms3.cli import main as cli
+from robocas_ms3.cli import progress
 from robocas_ms3.cli.list import List
 from robocas_ms3.cli.terminal import console, say, say_lines, tell
 from robocas_ms3.core.documents import DocumentError
@@ -56,8 +56,8 @@ def test_tables_titles_and_styled_texts():
 def test_bars_and_their_notes(monkeypatch):
     file = io.StringIO()
     made = console(file=file, force_terminal=True, width=200, color_system=None)
-    monkeypatch.setattr(bars, "terminal_of_stderr", lambda: made)
-    with bars.Bar(HOSTILE) as shown:
+    monkeypatch.setattr(progress, "terminal_of_stderr", lambda: made)
+    with progress.Bar(HOSTILE) as shown:
         shown.start(2)
         shown.note(HOSTILE)
         shown.advance()
@@ -80,7 +80,7 @@ def test_an_error_is_one_line(monkeypatch, capsys, error):
 
 def test_tracebacks():
     script = (
-        "import threading; from robocas_ms3.core.words import escape_tracebacks; escape_tracebacks()\n"
+        "import threading; from robocas_ms3.core.text import escape_tracebacks; escape_tracebacks()\n"
         f"def fail(*_): raise ValueError({HOSTILE!r})\n"
         "threading.Thread(target=fail).start(); type('Freed', (), {'__del__': fail})(); fail()"
     )

@@ -11,7 +11,7 @@ from robocas_ms3.assets.hulls import read_hulls
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.documents import DocumentError
 from robocas_ms3.core.errors import AssetError, ConfigError, EvaluationError, PlanError
-from robocas_ms3.core.ledger import Ledger
+from robocas_ms3.core.json_lines import Ledger
 from robocas_ms3.core.paths import builtin_packs_dir
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols

@@ -17,7 +17,7 @@ PROGRAM = """
 import ctypes, os, sys, time
 from functools import partial
 from pathlib import Path
-from robocas_ms3.core.exits import die_with_parent
+from robocas_ms3.core.signals import die_with_parent
 from robocas_ms3.core.workers import FunctionWorker, WorkerPool
 
 folder, kind = Path(sys.argv[1]), sys.argv[2]

@@ -6,11 +6,11 @@ import shutil
 import numpy as np
 from synthetic import RayCaster, write_trajectory
 
-from robocas_ms3.datasets.manage.importing import import_robocas
+from robocas_ms3.datasets.conversion.convert import convert
+from robocas_ms3.datasets.conversion.settings import ConversionSettings
+from robocas_ms3.datasets.manage.import_robocas import import_robocas
 from robocas_ms3.datasets.manage.survey import survey
 from robocas_ms3.datasets.sources.reader import Dataset
-from robocas_ms3.datasets.writing.convert import convert
-from robocas_ms3.datasets.writing.settings import ConversionSettings
 
 
 class Bomb:

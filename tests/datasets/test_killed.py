@@ -12,7 +12,7 @@ from managing import as_upstream, files_of, make
 from synthetic import RayCaster, render_by
 
 from robocas_ms3.cli.main import run
-from robocas_ms3.datasets.writing import convert as conversion
+from robocas_ms3.datasets.conversion import convert as conversion
 
 DYING = Path(__file__).parents[1] / "support" / "dying.py"
 CONVERT = ("convert", "F.h5", "--no-embeddings")

@@ -4,8 +4,8 @@ import pytest
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.sources.file_models import DataInfoRecord, SceneRecord
 from robocas_ms3.datasets.sources.provenance import task_of
-from robocas_ms3.datasets.sources.records import DataInfoRecord, SceneRecord
 from robocas_ms3.robots.cameras import PARENT_FRAMES, STANDARD_CAMERAS
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "dataset.md"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from robocas_ms3.demos.ledger import EpisodeResult
+from robocas_ms3.demos.failures import EpisodeResult
 
 
 @dataclass

@@ -18,7 +18,7 @@ from robocas_ms3.demos.branches import Child
 from robocas_ms3.demos.generate import generate
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.open_loop import Trials
-from robocas_ms3.demos.recordings.entries import read_json
+from robocas_ms3.demos.recordings.trajectory_json import read_json
 from robocas_ms3.demos.replay import replay
 from robocas_ms3.demos.settings import EpisodeSettings, GenerateSettings, ReplaySettings
 from robocas_ms3.planning.executor import Executor

@@ -8,11 +8,11 @@ import h5py
 import pytest
 
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.core.ledger import Ledger
+from robocas_ms3.core.json_lines import Ledger
 from robocas_ms3.demos import generate as module
+from robocas_ms3.demos.failures import FAILURES_FILE, EpisodeResult, Failure
 from robocas_ms3.demos.generate import shard_name
-from robocas_ms3.demos.ledger import FAILURES_FILE, EpisodeResult, Failure
-from robocas_ms3.demos.recordings.entries import read_json
+from robocas_ms3.demos.recordings.trajectory_json import read_json
 from robocas_ms3.demos.settings import EpisodeSettings, GenerateSettings
 
 SETTINGS = EpisodeSettings("pick")

@@ -9,8 +9,8 @@ from robocas_ms3.datasets.sources.arrays import episode_arrays
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.open_loop import OpenLoop
 from robocas_ms3.demos.recordings.motion import sample_states
-from robocas_ms3.demos.recordings.reading import TrajectoryFile
 from robocas_ms3.demos.recordings.subgoals import sample_subgoals
+from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
 from robocas_ms3.demos.settings import EpisodeSettings
 
 pytestmark = pytest.mark.slow

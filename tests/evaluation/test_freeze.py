@@ -9,7 +9,7 @@ from robocas_ms3.core.errors import EvaluationError, OutputExistsError, RobocasE
 from robocas_ms3.evaluation.freeze import ProtocolPlan, freeze, read_plan
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.scenes.config import load_task_config
-from robocas_ms3.scenes.table import FrozenLayouts
+from robocas_ms3.scenes.layout_table import FrozenLayouts
 
 PLAN = {
     "rules": {"name": "tiny", "description": "One episode.", "max_seconds": {"pick": 5}},

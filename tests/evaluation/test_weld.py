@@ -12,13 +12,13 @@ import torch
 
 import robocas_ms3  # noqa: F401
 from robocas_ms3.evaluation import results
+from robocas_ms3.evaluation.action_wrapper import PolicyStepping, env_kwargs
 from robocas_ms3.evaluation.metrics import read_sum
 from robocas_ms3.evaluation.policies import make_policy
 from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
-from robocas_ms3.evaluation.stepping import PolicyStepping, env_kwargs
 from robocas_ms3.evaluation.verify import problems
 from robocas_ms3.robots.description import MOBILE_PANDA
 

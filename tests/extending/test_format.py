@@ -13,11 +13,11 @@ from synthetic import RayCaster, write_trajectory
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.extensions import Registry
 from robocas_ms3.datasets import RoboCASDataset, formats
+from robocas_ms3.datasets.conversion import convert as conversion
+from robocas_ms3.datasets.conversion.settings import ConversionSettings
 from robocas_ms3.datasets.formats import format_of, open_source
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.training.options import SampleOptions
-from robocas_ms3.datasets.writing import convert as conversion
-from robocas_ms3.datasets.writing.settings import ConversionSettings
 
 
 @pytest.fixture
@@ -25,7 +25,7 @@ def stranger(tmp_path, monkeypatch):
     """Its package is installed; nothing of it is left behind."""
     folder = install("A dataset format", tmp_path / "site")
     monkeypatch.syspath_prepend(folder)
-    monkeypatch.setattr("robocas_ms3.datasets.writing.render.EnvRenderer", RayCaster)
+    monkeypatch.setattr("robocas_ms3.datasets.conversion.env_renderer.EnvRenderer", RayCaster)
     table = Registry("dataset format", formats.GROUP, formats.Format, formats.FORMATS.builtin)
     monkeypatch.setattr(formats, "FORMATS", table)  # as if the process had begun now
     yield folder

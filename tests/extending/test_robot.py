@@ -11,7 +11,7 @@ import pytest
 from strangers import PAGE, fresh_python, install, python, robocas
 
 SUPPORT = Path(__file__).resolve().parents[1] / "support"
-TWIN = "import sys; from robocas_ms3.robots.table import find_robot; twin = find_robot('twin')\n"
+TWIN = "import sys; from robocas_ms3.robots.registry import find_robot; twin = find_robot('twin')\n"
 
 
 @pytest.fixture(scope="module")
@@ -119,12 +119,12 @@ import numpy as np
 from synthetic import RayCaster
 from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
-from robocas_ms3.datasets.writing.convert import convert
-from robocas_ms3.datasets.writing.settings import ConversionSettings
+from robocas_ms3.datasets.conversion.convert import convert
+from robocas_ms3.datasets.conversion.settings import ConversionSettings
 from robocas_ms3.demos.open_loop import OpenLoop
 from robocas_ms3.core.poses import from_wxyz, inverse
 from robocas_ms3.demos.recordings.motion import sample_states, stored_actions
-from robocas_ms3.demos.recordings.reading import TrajectoryFile
+from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
 file, out = Path({str(recorded)!r}), Path({str(tmp_path)!r})
 convert(ConversionSettings(file, out / "folder", embeddings=False, video=False, open_renderer=RayCaster))
 convert_lerobot(ConversionSettings(out / "folder", out / "lerobot"))

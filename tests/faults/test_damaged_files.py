@@ -18,9 +18,9 @@ from robocas_ms3.cli.layouts import Info, info
 from robocas_ms3.core import documents
 from robocas_ms3.core.documents import DocumentError, open_arrays
 from robocas_ms3.core.errors import AssetError, DatasetError, TrainingError
-from robocas_ms3.core.ledger import Ledger
+from robocas_ms3.core.json_lines import Ledger
 from robocas_ms3.core.poses import planar
-from robocas_ms3.demos.ledger import Failure
+from robocas_ms3.demos.failures import Failure
 from robocas_ms3.scenes.cache import ABOUT, LayoutCache
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.layout import Layout

@@ -18,24 +18,24 @@ from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.baselines.training.record import BUNDLED, read_run
 from robocas_ms3.core.documents import DocumentError
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.core.ledger import Ledger
-from robocas_ms3.core.outputs import OutputFolder
+from robocas_ms3.core.json_lines import Ledger
+from robocas_ms3.core.output_folder import OutputFolder
 from robocas_ms3.core.paths import builtin_packs_dir
 from robocas_ms3.core.poses import planar
 from robocas_ms3.datasets.checks.dataset import validate
+from robocas_ms3.datasets.conversion.convert import convert
+from robocas_ms3.datasets.conversion.episode_plan import DATASET, dataset_settings, plan_episodes
+from robocas_ms3.datasets.conversion.settings import ConversionSettings
+from robocas_ms3.datasets.images.image_files import Pictures
 from robocas_ms3.datasets.lerobot.check import check_lerobot
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
-from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.provenance import recorded_scene, recording_entry
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.trajectory import TrajectorySource
 from robocas_ms3.datasets.statistics.collect import collect
-from robocas_ms3.datasets.writing.convert import convert
-from robocas_ms3.datasets.writing.plan import DATASET, dataset_settings, plan_episodes
-from robocas_ms3.datasets.writing.settings import ConversionSettings
+from robocas_ms3.demos.failures import Failure, count_by_stage
 from robocas_ms3.demos.generate import OUTPUT
-from robocas_ms3.demos.ledger import Failure, count_by_stage
-from robocas_ms3.demos.recordings.reading import TrajectoryFile
+from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
 from robocas_ms3.demos.replay import Recorded
 from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.evaluation import results
@@ -48,7 +48,7 @@ from robocas_ms3.plans.load import load_plan, shipped_plans
 from robocas_ms3.plans.status import read_status
 from robocas_ms3.robots.cameras import STANDARD_NAMES
 from robocas_ms3.scenes.layout import Layout
-from robocas_ms3.scenes.table import FrozenLayouts, LayoutTable, write_frozen, write_table
+from robocas_ms3.scenes.layout_table import FrozenLayouts, LayoutTable, write_frozen, write_table
 from robocas_ms3.viewer.routes import Routes
 from robocas_ms3.viewer.source import open_source as open_page
 

@@ -13,8 +13,8 @@ from synthetic import RayCaster, write_trajectory
 
 from robocas_ms3.core.errors import IncompleteError
 from robocas_ms3.datasets.checks.dataset import validate
-from robocas_ms3.datasets.writing.convert import convert
-from robocas_ms3.datasets.writing.settings import ConversionSettings
+from robocas_ms3.datasets.conversion.convert import convert
+from robocas_ms3.datasets.conversion.settings import ConversionSettings
 from robocas_ms3.demos.generate import generate
 from robocas_ms3.demos.settings import EpisodeSettings, GenerateSettings
 

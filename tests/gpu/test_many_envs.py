@@ -13,9 +13,9 @@ from gpu_emulation import emulated_envs
 
 import robocas_ms3  # noqa: F401
 from robocas_ms3.cli.layouts import Build, build
-from robocas_ms3.scenes.table import State
+from robocas_ms3.scenes.layout_table import State
 from robocas_ms3.tasks import TASKS
-from robocas_ms3.tasks.starts import Starts
+from robocas_ms3.tasks.initial_states import Starts
 
 pytestmark = [
     pytest.mark.gpu,

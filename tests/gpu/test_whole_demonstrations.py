@@ -14,7 +14,7 @@ import torch
 from gpu_emulation import emulated_envs
 from gpu_emulation.physics import EmulatedGpuSystem
 
-from robocas_ms3.demos.recordings.reading import Recording, TrajectoryFile
+from robocas_ms3.demos.recordings.trajectory_file import Recording, TrajectoryFile
 from robocas_ms3.tasks import TASKS
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from robocas_ms3.planning.skills.placing import Inside, overhangs, sample_drops
+from robocas_ms3.planning.skills.place import Inside, overhangs, sample_drops
 
 CONTAINER = np.array([[0, -1, 0, 0.6], [1, 0, 0, 0.2], [0, 0, 1, 0.1], [0, 0, 0, 1.0]])  # turned by 90 degrees
 INSIDE = Inside(CONTAINER, np.array([-0.2, -0.1, -0.1]), np.array([0.2, 0.1, 0.1]))

@@ -11,7 +11,7 @@ from grasp_poses import BASE, CENTER, grasp
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.poses import inverse
 from robocas_ms3.planning.grasp_choice import draw_order, filter_grasps, score_grasps
-from robocas_ms3.scenes.grasping import SIDE_CLEARANCE, gripper_is_clear, has_free_grasps
+from robocas_ms3.scenes.grasp_checks import SIDE_CLEARANCE, gripper_is_clear, has_free_grasps
 
 OBJECT = np.eye(4)
 OBJECT[:3, 3] = CENTER

@@ -13,8 +13,8 @@ from robocas_ms3.assets.kinematics import joint_motion
 from robocas_ms3.assets.manifest import Handle, Joint
 from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.planning.protocol import AttachedBody, Obstacle, Shape
-from robocas_ms3.planning.pulling import MAX_SLIP, reached, track
-from robocas_ms3.planning.skills.driving import Surroundings, free_route
+from robocas_ms3.planning.pull_path import MAX_SLIP, reached, track
+from robocas_ms3.planning.skills.drive import Surroundings, free_route
 from robocas_ms3.planning.skills.handles import Part
 from robocas_ms3.robots.description import MOBILE_PANDA
 

@@ -7,7 +7,7 @@ import pytest
 import robocas_ms3.tasks  # noqa: F401
 from robocas_ms3.planning.scene import PlanningScene
 from robocas_ms3.planning.skills.arm import Arm
-from robocas_ms3.planning.skills.looking import _shift, camera_in_base
+from robocas_ms3.planning.skills.look import _shift, camera_in_base
 from robocas_ms3.scenes.config import load_task_config
 
 pytestmark = pytest.mark.slow

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.poses import transform
 from robocas_ms3.planning import pushes as pushing
-from robocas_ms3.planning.skills.looking import sample_views
-from robocas_ms3.planning.skills.removing import free_places, turn_to_stand
+from robocas_ms3.planning.skills.look import sample_views
+from robocas_ms3.planning.skills.remove import free_places, turn_to_stand
 
 SURFACE = 0.1  # height of the table, in the arm's base frame
 TABLE = np.eye(4)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.planning.analytic import PandaGeometry
 from robocas_ms3.planning.kinematics import DISTINCT, ArmChain, Reachability, turn_between
-from robocas_ms3.planning.pulling import twist
+from robocas_ms3.planning.pull_path import twist
 from robocas_ms3.robots.description import MOBILE_PANDA
 
 

@@ -16,11 +16,11 @@ from robocas_ms3.planning.decisions import StraightDecisions
 from robocas_ms3.planning.executor import Executor
 from robocas_ms3.planning.protocol import Obstacle, Shape
 from robocas_ms3.planning.pushes import push_direction
-from robocas_ms3.planning.skills import clearing, pushing
+from robocas_ms3.planning.skills import push
 from robocas_ms3.planning.skills.arm import Arm
-from robocas_ms3.planning.skills.clearing import Heap, Move
-from robocas_ms3.planning.skills.pushing import push_away
-from robocas_ms3.planning.skills.removing import blockers, clear_grasps, remove
+from robocas_ms3.planning.skills.heap import Heap, Move
+from robocas_ms3.planning.skills.push import push_away
+from robocas_ms3.planning.skills.remove import blockers, clear_grasps, remove
 from robocas_ms3.planning.solvers import search
 
 pytestmark = pytest.mark.slow
@@ -106,7 +106,7 @@ def test_push_that_moves_nothing_is_a_failure(generator, monkeypatch):
             assert turn_deg == 30
             pushed.set_pose(Pose.create_from_pq(pushed.pose.p + torch.tensor([[by, 0.0, 0.0]]), pushed.pose.q))
 
-        monkeypatch.setattr(clearing, "push_away", move)
+        monkeypatch.setattr(heap, "push_away", move)
         heap.make(Move("push", slots[0], 30))
 
     with pytest.raises(PlanningFailed, match="in_vain"):
@@ -114,7 +114,7 @@ def test_push_that_moves_nothing_is_a_failure(generator, monkeypatch):
     assert facts == {"pushes": 0, "removals": 0}
     push(0.025)
     assert facts == {"pushes": 1, "removals": 0}
-    facts["removals"] = clearing.MOVES - 1
+    facts["removals"] = heap.MOVES - 1
     with pytest.raises(EpisodeLost, match="too_many_obstacles"):
         next(heap.moves())
 
@@ -151,26 +151,26 @@ def test_where_nothing_can_be_moved_the_target_is_grasped_as_it_lies(generator, 
 
 def test_after_a_push_the_arm_rises_clear_of_furniture_and_basket(generator, monkeypatch):
     arm, target, slots = begin(generator, 3)
-    pushed = first_that_works(lambda slot: pushing.plan_push(arm, slot, target), slots)
+    pushed = first_that_works(lambda slot: push.plan_push(arm, slot, target), slots)
     assert pushed is not None
-    fixed, width = pushing._fixed_bodies, arm.planner.finger_width
+    fixed, width = push._fixed_bodies, arm.planner.finger_width
     corners = np.array(list(itertools.product((0.2, 1.2), (-0.5, 0.5), (-0.005, 0.005))))
 
     def board_at(height):  # in the arm's base frame
         pose = np.eye(4)
         pose[2, 3] = height
         board = Obstacle("board", Shape((corners,)), pose)
-        monkeypatch.setattr(pushing, "_fixed_bodies", lambda arm: [*fixed(arm), board])
+        monkeypatch.setattr(push, "_fixed_bodies", lambda arm: [*fixed(arm), board])
 
-    board_at(pushing.surface_in_base(arm)[0][2, 3] + 0.3)  # across hand or wrist
+    board_at(push.surface_in_base(arm)[0][2, 3] + 0.3)  # across hand or wrist
     with pytest.raises(PlanningFailed, match="push"):
-        pushing.plan_push(arm, pushed, target)
+        push.plan_push(arm, pushed, target)
     board_at(arm.scene.tcp_in_base[2, 3] + 0.12)
     with pytest.raises(PlanningFailed, match="push"):  # where a push was cut short
-        pushing._plan_lift(arm, np.array([1.0, 0, 0]))
+        push._plan_lift(arm, np.array([1.0, 0, 0]))
     assert arm.planner.finger_width == width
-    monkeypatch.setattr(pushing, "_fixed_bodies", fixed)
-    pushing._plan_lift(arm, np.array([1.0, 0, 0]))
+    monkeypatch.setattr(push, "_fixed_bodies", fixed)
+    push._plan_lift(arm, np.array([1.0, 0, 0]))
 
 
 @pytest.mark.parametrize("which", ["target", "another"])

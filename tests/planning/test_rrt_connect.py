@@ -13,7 +13,7 @@ from robocas_ms3.planning.protocol import AttachedBody, Planner, Trajectory
 from robocas_ms3.planning.rrt_connect import TCP_SPEED_LIMIT
 from robocas_ms3.planning.rrt_connect import make_planner as make_planner_of
 from robocas_ms3.robots.description import MOBILE_PANDA
-from robocas_ms3.robots.table import PANDA
+from robocas_ms3.robots.registry import PANDA
 
 WALL = Box((0.55, 0.0, 0.15), (0.4, 0.03, 0.4))
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from planning_scenes import REST
 
-from robocas_ms3.planning.skills import stance
-from robocas_ms3.planning.skills.driving import arm_base_in_world
+from robocas_ms3.planning.skills import base_placement
+from robocas_ms3.planning.skills.drive import arm_base_in_world
 from robocas_ms3.robots.description import MOBILE_PANDA
 
 
@@ -47,30 +47,30 @@ def grasps_in_world(arm) -> np.ndarray:
 
 def test_thorough_check_finds_a_free_configuration_besides_the_nearest(arm):
     grasps, here = grasps_in_world(arm), np.zeros(3)
-    assert stance.reach_share(arm, here, grasps, []) == 1.0
-    assert stance.reach_share(arm, here, grasps, [], thorough=True) == 1.0
-    poses = stance._poses_of_some(arm, arm_base_in_world(arm, here), grasps, len(grasps))
+    assert base_placement.reach_share(arm, here, grasps, []) == 1.0
+    assert base_placement.reach_share(arm, here, grasps, [], thorough=True) == 1.0
+    poses = base_placement._poses_of_some(arm, arm_base_in_world(arm, here), grasps, len(grasps))
     solved, nearest = arm.reachability.reachable(poses, REST)
     assert solved.all()
     arm.planner.blocked = nearest
-    assert stance.reach_share(arm, here, grasps, []) == 0.0
-    assert stance.reach_share(arm, here, grasps, [], thorough=True) == 1.0
+    assert base_placement.reach_share(arm, here, grasps, []) == 0.0
+    assert base_placement.reach_share(arm, here, grasps, [], thorough=True) == 1.0
 
 
 def test_a_grasp_counts_only_with_its_pregrasp(arm):
     grasps, here = grasps_in_world(arm), np.zeros(3)
-    poses = stance._poses_of_some(arm, arm_base_in_world(arm, here), grasps, len(grasps))
+    poses = base_placement._poses_of_some(arm, arm_base_in_world(arm, here), grasps, len(grasps))
     half = len(poses) // 2
     everything, of_pose = arm.reachability.everything(poses, REST)
     arm.planner.blocked = everything[of_pose >= half]  # each way in
-    assert stance.reach_share(arm, here, grasps, [], thorough=True) == 0.0
+    assert base_placement.reach_share(arm, here, grasps, [], thorough=True) == 0.0
     one_and_its_twin = np.isin(of_pose, [half, half + len(grasps)])
     arm.planner.blocked = everything[one_and_its_twin]
-    assert stance.reach_share(arm, here, grasps, [], thorough=True) == pytest.approx(7 / 8)
+    assert base_placement.reach_share(arm, here, grasps, [], thorough=True) == pytest.approx(7 / 8)
 
 
 def test_unreachable_grasps_and_no_grasps_score_zero(arm):
     grasps = grasps_in_world(arm)
     for far in (grasps + np.array([[0, 0, 0, 2.0]] + [[0, 0, 0, 0]] * 3), grasps[:0]):
-        assert stance.reach_share(arm, np.zeros(3), far, []) == 0.0
-        assert stance.reach_share(arm, np.zeros(3), far, [], thorough=True) == 0.0
+        assert base_placement.reach_share(arm, np.zeros(3), far, []) == 0.0
+        assert base_placement.reach_share(arm, np.zeros(3), far, [], thorough=True) == 0.0

@@ -10,9 +10,9 @@ from robocas_ms3.plans.folder import LAYOUTS, Outcome, PlanFolder, Unit
 from robocas_ms3.plans.join import join
 from robocas_ms3.plans.worker import Recorder
 from robocas_ms3.scenes.config import load_task_config
+from robocas_ms3.scenes.layout_table import FrozenLayouts
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.sample import sample_layout
-from robocas_ms3.scenes.table import FrozenLayouts
 
 ALONE = PLAN.model_copy(update={"stages": ["layouts"], "parts": PLAN.parts[:1]})
 

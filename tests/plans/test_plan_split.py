@@ -5,7 +5,7 @@ import json
 import pytest
 from plan_stages import PLAN
 
-from robocas_ms3.datasets.manage import splitting
+from robocas_ms3.datasets.manage import split
 from robocas_ms3.datasets.sources.split import SPLIT_RULE
 from robocas_ms3.plans import join as splits
 from robocas_ms3.plans.plan import Plan
@@ -57,7 +57,7 @@ def test_other_parts_go_by_the_rule(of):
     assert set(range(20, 25)) < set(val)
     free = set(val) - set(range(20, 25))
     assert {n % 4 for n in free}.isdisjoint({n % 4 for n in train})  # a target is on one side
-    assert splits.rule_of(plan) == f"b: val; {splitting.Share(0.2, 'target').rule}"
+    assert splits.rule_of(plan) == f"b: val; {split.Share(0.2, 'target').rule}"
 
 
 def test_all_of_one_kind_train(of, caplog):

@@ -23,8 +23,8 @@ from robocas_ms3.core.checks import parse_shard
 from robocas_ms3.core.errors import OutputExistsError, PlanError, RobocasError
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.sources.reader import Dataset
-from robocas_ms3.demos.recordings.entries import versions
-from robocas_ms3.demos.recordings.reading import TrajectoryFile
+from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
+from robocas_ms3.demos.recordings.trajectory_json import versions
 from robocas_ms3.plans.executors import LocalExecutor
 from robocas_ms3.plans.folder import Outcome, PlanFolder, Unit
 from robocas_ms3.plans.run import join_plan, run_shard

@@ -10,7 +10,7 @@ from robocas_ms3.core.errors import ExtensionError, RobocasError
 from robocas_ms3.robots.cameras import CameraSpec
 from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.quantities import Quantity
-from robocas_ms3.robots.table import DEFAULT, PANDA, ROBOTS, find_robot
+from robocas_ms3.robots.registry import DEFAULT, PANDA, ROBOTS, find_robot
 
 
 def test_positions_are_where_the_slices_say():

@@ -20,8 +20,8 @@ from robocas_ms3.core.errors import SimulationError
 from robocas_ms3.scenes import cache as cache_module
 from robocas_ms3.scenes.cache import LayoutCache, Sampler, count_layouts, layout_source, pairs_of
 from robocas_ms3.scenes.layout import Layout
+from robocas_ms3.scenes.layout_table import State
 from robocas_ms3.scenes.sample import sample_layout
-from robocas_ms3.scenes.table import State
 
 NO_TARGET = {"target": {"max_distance": 0.1}, "objects": {"ids": "all", "count": 2}}
 

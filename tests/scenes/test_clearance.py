@@ -12,7 +12,7 @@ from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.errors import ConfigError
 from robocas_ms3.core.paths import protocols_dir
 from robocas_ms3.robots.description_file import chain
-from robocas_ms3.robots.table import PANDA
+from robocas_ms3.robots.registry import PANDA
 from robocas_ms3.scenes.clearance import overlap
 from robocas_ms3.scenes.config import load_task_config, shipped_configs
 from robocas_ms3.scenes.model import SceneModel

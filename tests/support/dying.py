@@ -9,17 +9,17 @@ from synthetic import RayCaster, render_by
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.core import files
-from robocas_ms3.datasets.manage import copying, importing
-from robocas_ms3.datasets.writing import convert, episode_folder
+from robocas_ms3.datasets.conversion import convert, episode_folder
+from robocas_ms3.datasets.manage import copy_episodes, import_robocas
 
 PLACES = {  # moment -> (module, function, which call is the last)
     "picture": (episode_folder, "write_picture", 50),  # in the second episode
     "arrays": (episode_folder, "write_episode_files", 2),
-    "file": (copying.FilePlacer, "place", 70),  # in the second episode
+    "file": (copy_episodes.FilePlacer, "place", 70),  # in the second episode
     "rename": (files, "_move_in", 2),
     "convert overview": (convert, "write_info", 1),
-    "merge overview": (copying, "write_info", 1),
-    "import overview": (importing, "write_info", 1),
+    "merge overview": (copy_episodes, "write_info", 1),
+    "import overview": (import_robocas, "write_info", 1),
     "rmtree": (os, "rmdir", 3),  # --overwrite, with two folders of the old one gone
 }
 

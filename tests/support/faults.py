@@ -18,13 +18,13 @@ import h5py
 import numpy as np
 import psutil
 
-from robocas_ms3.core.ledger import Ledger
-from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.core.json_lines import Ledger
+from robocas_ms3.datasets.conversion.episode_folder import find_damaged
+from robocas_ms3.datasets.images.image_files import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
-from robocas_ms3.datasets.writing.episode_folder import find_damaged
-from robocas_ms3.demos.ledger import FAILURES_FILE, Failure
-from robocas_ms3.demos.recordings.reading import TrajectoryFile
-from robocas_ms3.demos.recordings.stored import open_trajectory
+from robocas_ms3.demos.failures import FAILURES_FILE, Failure
+from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
+from robocas_ms3.demos.recordings.trajectory_hdf5 import open_trajectory
 from robocas_ms3.evaluation import results
 from robocas_ms3.robots.cameras import STANDARD_NAMES
 

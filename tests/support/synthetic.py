@@ -9,8 +9,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from robocas_ms3.datasets.pictures.stored import Pictures, box_of
-from robocas_ms3.datasets.sources.protocol import CameraModel, Frame
+from robocas_ms3.datasets.images.image_files import Pictures, box_of
+from robocas_ms3.datasets.sources.episode_source import CameraModel, Frame
 from robocas_ms3.robots.cameras import STANDARD_NAMES, standard_parent
 from robocas_ms3.robots.description import MOBILE_PANDA
 

@@ -14,15 +14,15 @@ from robocas_ms3.datasets.sources.arrays import episode_arrays
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.open_loop import Trials
 from robocas_ms3.demos.recordings.motion import sample_states
-from robocas_ms3.demos.recordings.reading import TrajectoryFile
 from robocas_ms3.demos.recordings.subgoals import sample_subgoals
+from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
 from robocas_ms3.demos.replay import replay
 from robocas_ms3.demos.settings import EpisodeSettings, ReplaySettings
 from robocas_ms3.planning.executor import Executor
-from robocas_ms3.planning.skills.driving import base_at, drive
-from robocas_ms3.planning.skills.grasping import plan_grasp
+from robocas_ms3.planning.skills.base_placement import drive_to_handle
+from robocas_ms3.planning.skills.drive import base_at, drive
+from robocas_ms3.planning.skills.grasp import plan_grasp
 from robocas_ms3.planning.skills.handles import Part, open_part, pull_share
-from robocas_ms3.planning.skills.stance import drive_to_handle
 from robocas_ms3.scenes.config import load_task_config, shipped_configs
 from robocas_ms3.scenes.language.templates import subgoal
 

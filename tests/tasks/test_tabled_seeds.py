@@ -14,8 +14,8 @@ from robocas_ms3.cli.layouts import Build, build
 from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.scenes import cache
 from robocas_ms3.scenes.layout import read_layout
-from robocas_ms3.scenes.table import State
-from robocas_ms3.tasks.starts import Starts
+from robocas_ms3.scenes.layout_table import State
+from robocas_ms3.tasks.initial_states import Starts
 
 STATE_ONLY = {"render_backend": "none", "control_mode": "pd_joint_pos", "obs_mode": "none"}
 

@@ -28,8 +28,8 @@ def run_folder(tmp_path_factory):
 @pytest.fixture(scope="session")
 def folder(run_folder, tmp_path_factory):
     """The same as a RoboCAS folder of all three, small pictures, nobody may change it."""
-    from robocas_ms3.datasets.writing.convert import convert
-    from robocas_ms3.datasets.writing.settings import ConversionSettings
+    from robocas_ms3.datasets.conversion.convert import convert
+    from robocas_ms3.datasets.conversion.settings import ConversionSettings
 
     out = tmp_path_factory.mktemp("folder") / "dataset"
     settings = {"open_renderer": RayCaster, "embeddings": False, "video": False, "include_failed": True}
@@ -43,8 +43,8 @@ def lerobot(folder, tmp_path_factory):
     """The folder as a LeRobot dataset."""
     pytest.importorskip("av", reason="needs the extra 'lerobot'")
     pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
+    from robocas_ms3.datasets.conversion.settings import ConversionSettings
     from robocas_ms3.datasets.lerobot.convert import convert_lerobot
-    from robocas_ms3.datasets.writing.settings import ConversionSettings
 
     out = tmp_path_factory.mktemp("lerobot") / "dataset"
     convert_lerobot(ConversionSettings(folder, out, include_failed=True))

@@ -8,9 +8,9 @@ import pytest
 
 from robocas_ms3.cli.view import View, main
 from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.viewer.episode_table import Failures
 from robocas_ms3.viewer.routes import Routes, script
 from robocas_ms3.viewer.source import open_source
-from robocas_ms3.viewer.table import Failures
 
 
 def shown(source, numbers=(0, 1, 2)):

@@ -8,9 +8,9 @@ import pytest
 from synthetic import STEPS, RayCaster, make_states, write_trajectory
 
 from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.datasets.conversion.convert import convert
+from robocas_ms3.datasets.conversion.settings import ConversionSettings
 from robocas_ms3.datasets.sources.reader import Dataset
-from robocas_ms3.datasets.writing.convert import convert
-from robocas_ms3.datasets.writing.settings import ConversionSettings
 from robocas_ms3.viewer.episode import base_plot, continuous, plot, rounded
 from robocas_ms3.viewer.source import open_source
 

@@ -35,8 +35,8 @@ from robocas_ms3.baselines.lerobot.policy import (
 )
 from robocas_ms3.core.errors import DatasetError, RobocasError
 from robocas_ms3.core.files import replacing_folder, write_json
-from robocas_ms3.core.outputs import check_replaceable
-from robocas_ms3.core.words import printable
+from robocas_ms3.core.output_folder import check_replaceable
+from robocas_ms3.core.text import printable
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset, LeRobotEpisode
 from robocas_ms3.datasets.lerobot.schema import INDICES, INFO_FILE, STAGING, STATS_FILE, image_key, is_depth
 from robocas_ms3.datasets.lerobot.stats import vector_stats

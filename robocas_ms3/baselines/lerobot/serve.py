@@ -18,7 +18,7 @@ from typing import Any
 from robocas_ms3.baselines.lerobot.policy import LeRobotPolicy
 from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import EvaluationError, RobocasError
-from robocas_ms3.core.words import escape_log_lines, escape_tracebacks, printable
+from robocas_ms3.core.text import escape_log_lines, escape_tracebacks, printable
 from robocas_ms3.datasets.lerobot.schema import checksum
 from robocas_ms3.evaluation.remote.server import PolicyServer
 

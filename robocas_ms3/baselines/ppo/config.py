@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from robocas_ms3.core.strict import StrictModel
+from robocas_ms3.core.strict_model import StrictModel
 
 ONE_FRUIT: dict[str, Any] = {  # changes to pick_table_scattered: one small fruit near the gripper
     "description": "A single fruit on a table.",

@@ -17,7 +17,7 @@ from robocas_ms3.baselines.ppo.environments import FIRST_TEST_SEED, PpoEnvironme
 from robocas_ms3.baselines.training.checkpoints import Checkpoint, join_parts, optimizer_tensors
 from robocas_ms3.baselines.training.run_folder import RunFolder
 from robocas_ms3.core.errors import TrainingError
-from robocas_ms3.core.exits import deferred_interrupts
+from robocas_ms3.core.signals import deferred_interrupts
 
 OUTCOMES = ("return", "held", "lifted", "success")  # of an episode; all but the return at its end
 _LAST_EPISODES = 100  # that are averaged in the log

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 from pydantic import AfterValidator, Field, model_validator
 
 from robocas_ms3.baselines.baseline import BaselineConfig, TrainSettings
-from robocas_ms3.core.strict import StrictModel
+from robocas_ms3.core.strict_model import StrictModel
 
 
 class View(StrictModel):
@@ -60,9 +60,9 @@ class SmallConfig(BaselineConfig):
         gripper_weight: weight of the loss of the gripper commands.
         near: distance in m at which a pose has half the weight of one that is reached, see `chunk_losses`; 0: no
             weights.
-        point_weight: weight, per camera, of the loss of where the next key pose is in the image (`locating`).
+        point_weight: weight, per camera, of the loss of where the next key pose is in the image (`localization`).
         name_weight: weight, per camera, of the loss of where objects of other instructions are.
-        lift: whether points are located in space by the calibration of the cameras (`locating.Lift`).
+        lift: whether points are located in space by the calibration of the cameras (`localization.Lift`).
         lift_weight: weight of the loss of that, per camera.
         shift: largest random shift of the images in training, in pixels.
         brightness: largest random change of brightness and contrast in training, as a fraction.

@@ -22,7 +22,7 @@ from robocas_ms3.baselines.baseline import Batch, OnRead, Split
 from robocas_ms3.baselines.chunks import encode, next_keys, spread, state_of
 from robocas_ms3.baselines.dataset_checks import check_dataset
 from robocas_ms3.baselines.small.config import SmallConfig, View
-from robocas_ms3.baselines.small.locating import project_points
+from robocas_ms3.baselines.small.localization import project_points
 from robocas_ms3.baselines.small.objects import (
     SceneObjects,
     calibration,

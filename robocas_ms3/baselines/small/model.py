@@ -17,7 +17,7 @@ from torch.nn import functional as F
 from robocas_ms3.baselines.baseline import Batch
 from robocas_ms3.baselines.chunks import ROW, Scale, chunk_losses
 from robocas_ms3.baselines.small.config import SmallConfig, View
-from robocas_ms3.baselines.small.locating import (
+from robocas_ms3.baselines.small.localization import (
     CELL,
     NOWHERE,
     POINT_FEATURES,

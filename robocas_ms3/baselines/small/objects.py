@@ -16,7 +16,7 @@ from robocas_ms3.baselines.small.config import View
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import Array, from_xyzw, inverse, transform
 from robocas_ms3.datasets.schema import SCENE_FILE
-from robocas_ms3.datasets.sources.protocol import SourceEpisode
+from robocas_ms3.datasets.sources.episode_source import SourceEpisode
 from robocas_ms3.robots.cameras import Parent
 
 _TOLERANCES = {"mount": 1e-3, "intrinsic": 1e-2}  # m or 1; pixels
@@ -83,7 +83,7 @@ def locate_objects(
 def calibration(
     episode: SourceEpisode, camera: str, arrays: Mapping[str, NDArray[Any]], stored: tuple[int, int], view: View
 ) -> dict[str, Any]:
-    """Return the ``camera`` of `locating.Lift`; a camera in the world is seen from the first pose of the arm's base."""
+    """Return the ``camera`` of `localization.Lift`; a world camera is relative to the arm's first base pose."""
     mount, parent = episode.camera_in_parent(camera), episode.camera_parent(camera)
     if parent == "world":
         mount = inverse(_base(arrays))[0] @ mount

@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import TrainingError
-from robocas_ms3.core.strict import StrictModel, parse
+from robocas_ms3.core.strict_model import StrictModel, parse
 
 RUN, METRICS, TENSORBOARD = "run.json", "metrics.csv", "tensorboard"
 CHECKPOINT, WEIGHTS = "checkpoint.safetensors", "weights.safetensors"

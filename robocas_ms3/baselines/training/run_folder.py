@@ -19,8 +19,8 @@ from robocas_ms3.baselines.training.checkpoints import Checkpoint, Tensors
 from robocas_ms3.baselines.training.metrics import MetricsLog
 from robocas_ms3.baselines.training.record import CHECKPOINT, WEIGHTS, RunRecord
 from robocas_ms3.core.errors import TrainingError
-from robocas_ms3.core.exits import deferred_interrupts
-from robocas_ms3.core.outputs import OutputFolder
+from robocas_ms3.core.output_folder import OutputFolder
+from robocas_ms3.core.signals import deferred_interrupts
 
 _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4  # of malloc.h
 

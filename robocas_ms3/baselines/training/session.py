@@ -28,9 +28,9 @@ from robocas_ms3.baselines.training.record import (
     read_run,
 )
 from robocas_ms3.core.errors import EmptySplitError, TrainingError, require_extra
-from robocas_ms3.core.exits import no_exit
-from robocas_ms3.core.outputs import FolderKind, OutputFolder, setting_changes
-from robocas_ms3.core.strict import parse
+from robocas_ms3.core.output_folder import FolderKind, OutputFolder, setting_changes
+from robocas_ms3.core.signals import no_exit
+from robocas_ms3.core.strict_model import parse
 
 if TYPE_CHECKING:
     from robocas_ms3.baselines.training.checkpoints import Checkpoint

@@ -16,7 +16,7 @@ from robocas_ms3.baselines.baseline import Batch, Samples, TrainSettings
 from robocas_ms3.baselines.training.learner import Learner
 from robocas_ms3.baselines.training.run_folder import RunFolder
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.core.exits import deferred_interrupts, exit_error
+from robocas_ms3.core.signals import deferred_interrupts, exit_error
 
 
 def train_supervised(

@@ -14,14 +14,14 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.actions import action_space
 from robocas_ms3.datasets.checks import arrays as laws
-from robocas_ms3.datasets.checks.pictures import Sizes, check_cameras, check_depth, check_images
+from robocas_ms3.datasets.checks.images import Sizes, check_cameras, check_depth, check_images
 from robocas_ms3.datasets.checks.scene import check_ledger, read_settings
 from robocas_ms3.datasets.checks.violation import Violation, read_object
-from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.conversion.episode_plan import MARKS
+from robocas_ms3.datasets.images.image_files import Pictures
 from robocas_ms3.datasets.sources.arrays import SPECS, EpisodeArrays, is_declared, read_arrays
+from robocas_ms3.datasets.sources.file_models import DataInfoRecord, SceneRecord
 from robocas_ms3.datasets.sources.files import no_dataset
-from robocas_ms3.datasets.sources.records import DataInfoRecord, SceneRecord
-from robocas_ms3.datasets.writing.plan import MARKS
 
 INFO = schema.DATA_INFO_FILE
 _EMBEDDINGS = {spec.name for spec in schema.EPISODE_INFO if spec.embedding}

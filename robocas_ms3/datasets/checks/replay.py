@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.core.words import one_line
+from robocas_ms3.core.text import one_line
 from robocas_ms3.datasets.actions import episode_actions
+from robocas_ms3.datasets.sources.file_models import EnvInfo, Layout, SceneRecord, read_scene
 from robocas_ms3.datasets.sources.reader import Dataset
-from robocas_ms3.datasets.sources.records import EnvInfo, Layout, SceneRecord, read_scene
 from robocas_ms3.demos.open_loop import OpenLoop
-from robocas_ms3.demos.recordings.entries import one_seed, read_reset_options
 from robocas_ms3.demos.recordings.environment import read_env
+from robocas_ms3.demos.recordings.trajectory_json import one_seed, read_reset_options
 
 _SAME_PLACE = 1e-3  # m
 _BASE_STILL = 1e-3  # m that the base may move in all: 7-D actions do not move it

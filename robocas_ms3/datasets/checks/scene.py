@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.words import one_line
+from robocas_ms3.core.text import one_line
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.violation import Violation, check_form, read_object, shorten
-from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.images.image_files import Pictures
 from robocas_ms3.datasets.sources.arrays import EpisodeArrays, arrays_fingerprint
-from robocas_ms3.datasets.sources.records import ConversionRecord, SceneRecord, with_unknown
-from robocas_ms3.demos.recordings.entries import one_seed
+from robocas_ms3.datasets.sources.file_models import ConversionRecord, SceneRecord, with_unknown
+from robocas_ms3.demos.recordings.trajectory_json import one_seed
 from robocas_ms3.robots.cameras import STANDARD_NAMES
 
 FILE = schema.CONVERSION_FILE

@@ -11,8 +11,8 @@ from typing import Any, Literal
 from pydantic import BaseModel, ValidationError
 
 from robocas_ms3.core.documents import load_json
-from robocas_ms3.core.strict import mistakes
-from robocas_ms3.core.words import one_line
+from robocas_ms3.core.strict_model import mistakes
+from robocas_ms3.core.text import one_line
 
 NO_FILE = "no file"
 _WORDS = {"int_type": "an integer", "string_type": "text", "dict_type": "an object", "model_type": "an object"}

@@ -10,16 +10,16 @@ import numpy as np
 
 from robocas_ms3.core.documents import DocumentError
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.words import one_line
+from robocas_ms3.core.text import one_line
 from robocas_ms3.datasets.checks.dataset import Report
 from robocas_ms3.datasets.checks.violation import Violation, check_form, read_object
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check_frames import TOLERANCE, Fault, Ranges, check_data, surplus_files
+from robocas_ms3.datasets.lerobot.file_models import MAX_EPISODES, MAX_FRAMES, InfoRecord, StatsLine, read_lines
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
-from robocas_ms3.datasets.lerobot.records import MAX_EPISODES, MAX_FRAMES, InfoRecord, StatsLine, read_lines
 from robocas_ms3.datasets.lerobot.stats import QUANTILES
 from robocas_ms3.datasets.lerobot.video import packet_times, read_frames
-from robocas_ms3.datasets.sources.records import SceneRecord
+from robocas_ms3.datasets.sources.file_models import SceneRecord
 
 _MILLISECONDS = 0.6e-3  # Matroska rounds to them
 _STATISTICS = ("min", "max", "mean", "std", "count")

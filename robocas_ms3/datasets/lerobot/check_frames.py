@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.words import count_of, one_line
+from robocas_ms3.core.text import count_of, one_line
 from robocas_ms3.datasets.checks import arrays as laws
 from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.arrays import frame_columns, robocas_arrays
+from robocas_ms3.datasets.lerobot.file_models import declared_columns
 from robocas_ms3.datasets.lerobot.language import EVENTS, PERSISTENT, Row, box_in, read_rows_of
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
-from robocas_ms3.datasets.lerobot.records import declared_columns
 from robocas_ms3.datasets.lerobot.tables import faults, numbers, open_table, read_rows
 from robocas_ms3.datasets.sources.arrays import EpisodeArrays
 

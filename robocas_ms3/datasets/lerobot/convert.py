@@ -15,9 +15,13 @@ from typing import Any
 
 from robocas_ms3.core.errors import DatasetError, IncompleteError, OutputExistsError
 from robocas_ms3.core.files import flush_to_disk, make_folder, naming, remove
-from robocas_ms3.core.outputs import FolderKind, OutputFolder, sweep
-from robocas_ms3.core.strict import parse
-from robocas_ms3.core.words import count_of
+from robocas_ms3.core.output_folder import FolderKind, OutputFolder, sweep
+from robocas_ms3.core.strict_model import parse
+from robocas_ms3.core.text import count_of
+from robocas_ms3.datasets.conversion.conversion_input import ConversionInput, open_input
+from robocas_ms3.datasets.conversion.episode_plan import LEFT_OUT, with_versions
+from robocas_ms3.datasets.conversion.settings import Conversion, ConversionSettings, WrittenEpisode
+from robocas_ms3.datasets.conversion.workers import WriteJob, write_episodes
 from robocas_ms3.datasets.lerobot.schema import (
     CONTENT,
     CONVERSION_FILE,
@@ -31,11 +35,7 @@ from robocas_ms3.datasets.lerobot.schema import (
 from robocas_ms3.datasets.lerobot.variants import Variant, find_variant
 from robocas_ms3.datasets.schema import episode_folder
 from robocas_ms3.datasets.sources.split import split_by_seed
-from robocas_ms3.datasets.writing.inputs import ConversionInput, open_input
-from robocas_ms3.datasets.writing.plan import LEFT_OUT, with_versions
-from robocas_ms3.datasets.writing.settings import Conversion, ConversionSettings, WrittenEpisode
-from robocas_ms3.datasets.writing.workers import WriteJob, write_episodes
-from robocas_ms3.demos.recordings.entries import versions
+from robocas_ms3.demos.recordings.trajectory_json import versions
 
 FILE_LIMITS = FileLimits()
 _PARTS, _JOINED = ".parts", ".joined"  # the finished episodes; the dataset that is being made of them
@@ -128,7 +128,7 @@ def _plan(given: ConversionInput, codec: str, variant: Variant) -> dict[str, Any
 
 def _check_episodes(output: OutputFolder, plan: Mapping[str, Any]) -> None:
     """Check that a dataset that is continued is of the same episodes; recordings may have been repaired."""
-    from robocas_ms3.datasets.lerobot.records import ConversionRecord
+    from robocas_ms3.datasets.lerobot.file_models import ConversionRecord
 
     if output.recorded is None:
         return

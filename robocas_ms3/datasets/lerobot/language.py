@@ -23,11 +23,11 @@ import pyarrow as pa
 from pydantic import BaseModel, ValidationError
 
 from robocas_ms3.core.errors import DatasetError, RobocasError
-from robocas_ms3.core.strict import validate_json
-from robocas_ms3.core.words import one_line
+from robocas_ms3.core.strict_model import validate_json
+from robocas_ms3.core.text import one_line
 from robocas_ms3.datasets.checks.scene import valid_values
+from robocas_ms3.datasets.images.image_files import Box
 from robocas_ms3.datasets.lerobot import schema
-from robocas_ms3.datasets.pictures.stored import Box
 from robocas_ms3.demos.recordings.subgoals import SubGoal
 from robocas_ms3.scenes.language.instructions import InstructionSlots, instruction, is_plural, part_name, template_ids
 

@@ -10,9 +10,9 @@ from typing import Any
 import pyarrow as pa
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.strict import parse
+from robocas_ms3.core.strict_model import parse
 from robocas_ms3.datasets.lerobot import schema
-from robocas_ms3.datasets.lerobot.records import (
+from robocas_ms3.datasets.lerobot.file_models import (
     SCENES,
     ConversionRecord,
     EpisodeLine,

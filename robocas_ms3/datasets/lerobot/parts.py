@@ -18,8 +18,11 @@ from pydantic import BaseModel, ConfigDict
 from robocas_ms3.core.documents import JSON_LIMIT, read_text
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import json_text
+from robocas_ms3.datasets.conversion.workers import EpisodeWriter, GivenEpisode
+from robocas_ms3.datasets.images.image_files import Box
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.arrays import frame_columns
+from robocas_ms3.datasets.lerobot.file_models import CameraRecord
 from robocas_ms3.datasets.lerobot.language import (
     EVENTS,
     EVENTS_TYPE,
@@ -28,15 +31,12 @@ from robocas_ms3.datasets.lerobot.language import (
     paraphrases,
     persistent_rows,
 )
-from robocas_ms3.datasets.lerobot.records import CameraRecord
 from robocas_ms3.datasets.lerobot.stats import Levels
 from robocas_ms3.datasets.lerobot.tables import as_column
 from robocas_ms3.datasets.lerobot.variants import Variant
 from robocas_ms3.datasets.lerobot.video import Encoder, coding_of, to_levels
-from robocas_ms3.datasets.pictures.stored import Box
 from robocas_ms3.datasets.schema import episode_folder
-from robocas_ms3.datasets.sources.protocol import Frame, Kind
-from robocas_ms3.datasets.writing.workers import EpisodeWriter, GivenEpisode
+from robocas_ms3.datasets.sources.episode_source import Frame, Kind
 from robocas_ms3.demos.recordings.subgoals import subgoal_runs
 
 FRAMES_FILE, EPISODE_FILE = "frames.parquet", "episode.json"

@@ -14,18 +14,18 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.strict import parse_json
-from robocas_ms3.core.words import one_line
+from robocas_ms3.core.strict_model import parse_json
+from robocas_ms3.core.text import one_line
+from robocas_ms3.datasets.images.image_files import Box
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.arrays import robocas_arrays
+from robocas_ms3.datasets.lerobot.file_models import CameraRecord, CamerasText, SceneText, declared_columns
 from robocas_ms3.datasets.lerobot.language import EVENTS, PERSISTENT, boxes_of, goals_of, read_rows_of
 from robocas_ms3.datasets.lerobot.metadata import Metadata
-from robocas_ms3.datasets.lerobot.records import CameraRecord, CamerasText, SceneText, declared_columns
 from robocas_ms3.datasets.lerobot.tables import INTEGER, Column, check_columns, is_numeric, numbers, read_rows
 from robocas_ms3.datasets.lerobot.video import read_frames, to_depth
-from robocas_ms3.datasets.pictures.stored import Box
+from robocas_ms3.datasets.sources.episode_source import EpisodeSource, Kind, Side, SourceEpisode
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
-from robocas_ms3.datasets.sources.protocol import EpisodeSource, Kind, Side, SourceEpisode
 from robocas_ms3.datasets.sources.reader import check_rate
 from robocas_ms3.demos.recordings.subgoals import SubGoal, subgoal_runs
 from robocas_ms3.robots.cameras import Parent, standard_parent

@@ -16,7 +16,7 @@ from robocas_ms3.core.errors import DatasetError, require_extra
 from robocas_ms3.datasets.lerobot.variants import Variant
 from robocas_ms3.robots.quantities import STATE, columns_of
 from robocas_ms3.robots.quantities import features as quantities_of_features
-from robocas_ms3.robots.table import DEFAULT
+from robocas_ms3.robots.registry import DEFAULT
 
 ROBOT_TYPE = "mobile_panda"  # of the default robot; another one's is its name
 INFO_FILE = "meta/info.json"

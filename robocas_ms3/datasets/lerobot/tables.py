@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.documents import check_regular
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.words import one_line
+from robocas_ms3.core.text import one_line
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 
 _ARRAYS_LIMIT = 2**29  # bytes of arrays that are read at once: 40 million equal rows are a file of 1 MB

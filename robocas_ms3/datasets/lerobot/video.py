@@ -24,10 +24,10 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from robocas_ms3.core.documents import DocumentError, check_regular
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.strict import parse
+from robocas_ms3.core.strict_model import parse
 from robocas_ms3.datasets.lerobot.schema import MAX_DEPTH_MM, check_video_size
 from robocas_ms3.datasets.lerobot.variants import CHUNK_FILES, Variant
-from robocas_ms3.datasets.sources.protocol import Kind
+from robocas_ms3.datasets.sources.episode_source import Kind
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from robocas_ms3.core.files import write_json
-from robocas_ms3.core.words import count_of
+from robocas_ms3.core.text import count_of
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.language import EVENTS, EVENTS_TYPE, PERSISTENT, PERSISTENT_TYPE, Row
 from robocas_ms3.datasets.lerobot.parts import FRAMES_FILE, SUBGOAL, EpisodeRecord, Part, video_name
@@ -26,7 +26,7 @@ from robocas_ms3.datasets.lerobot.stats import Levels, Stats, joined_stats, vect
 from robocas_ms3.datasets.lerobot.tables import as_column, numbers, write_texts
 from robocas_ms3.datasets.lerobot.variants import CHUNK_FILES, Variant, find_variant
 from robocas_ms3.datasets.lerobot.video import DEPTH_INFO, Joiner, packet_times
-from robocas_ms3.datasets.sources.protocol import Kind
+from robocas_ms3.datasets.sources.episode_source import Kind
 
 _GROUP = 64  # episodes per row group of the tables about episodes
 _log = logging.getLogger(__name__)

@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.words import count_of
+from robocas_ms3.core.text import count_of
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.checks.pictures import Sizes, check_camera_file, check_images
+from robocas_ms3.datasets.checks.images import Sizes, check_camera_file, check_images
 from robocas_ms3.datasets.checks.violation import NO_FILE, Violation
+from robocas_ms3.datasets.images.image_files import Pictures
 from robocas_ms3.datasets.manage.repairs import (
     EMBEDDINGS,
     Finding,
@@ -24,7 +25,6 @@ from robocas_ms3.datasets.manage.repairs import (
     repair_arrays,
     turn_eef_frame,
 )
-from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.arrays import EpisodeArrays, arrays_fingerprint, completed, load_arrays
 from robocas_ms3.datasets.sources.files import said_of
 from robocas_ms3.datasets.sources.reader import Dataset, Episode

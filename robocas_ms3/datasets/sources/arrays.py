@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from robocas_ms3.core.documents import DAMAGED, open_arrays
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import from_xyzw
-from robocas_ms3.core.words import one_line
+from robocas_ms3.core.text import one_line
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 from robocas_ms3.demos.recordings.motion import Motion, planar_motion, stored_motion

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.documents import DAMAGED, load_array, load_json
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.words import one_line
+from robocas_ms3.core.text import one_line
 from robocas_ms3.datasets import schema
 
 CAMERA_LIMIT = 2**22

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.sources.records import SCENE_KEYS
-from robocas_ms3.demos.recordings.reading import Recording, TrajectoryFile
+from robocas_ms3.datasets.sources.file_models import SCENE_KEYS
+from robocas_ms3.demos.recordings.trajectory_file import Recording, TrajectoryFile
 
 
 def fingerprint(recording: Recording) -> str:

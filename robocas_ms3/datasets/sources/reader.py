@@ -19,11 +19,11 @@ from pydantic import BeforeValidator, TypeAdapter, ValidationError
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.pictures.stored import read_picture
+from robocas_ms3.datasets.images.image_files import read_picture
 from robocas_ms3.datasets.sources.arrays import completed, is_declared, load_arrays, read_arrays
+from robocas_ms3.datasets.sources.episode_source import EpisodeSource, Side, SourceEpisode
+from robocas_ms3.datasets.sources.file_models import CameraName, Rate
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE, no_dataset, read_array, read_json, said_of
-from robocas_ms3.datasets.sources.protocol import EpisodeSource, Side, SourceEpisode
-from robocas_ms3.datasets.sources.records import CameraName, Rate
 from robocas_ms3.demos.recordings.subgoals import SubGoal, read_subgoals
 from robocas_ms3.robots.cameras import Parent
 

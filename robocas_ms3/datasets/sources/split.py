@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from robocas_ms3.demos.recordings.entries import one_seed
+from robocas_ms3.demos.recordings.trajectory_json import one_seed
 
 SPLIT_RULE = (
     "seeds in the order of sha256(seed), the first tenth validates; episodes of one seed stay together; what is"

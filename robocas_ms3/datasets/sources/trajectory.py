@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from robocas_ms3.assets.pack import load_pack, pack_folders
 from robocas_ms3.core.errors import AssetError, DatasetError, RobocasError
 from robocas_ms3.datasets.sources.arrays import episode_arrays
-from robocas_ms3.datasets.sources.protocol import EpisodeSource, Side, SourceEpisode
+from robocas_ms3.datasets.sources.episode_source import EpisodeSource, Side, SourceEpisode
 from robocas_ms3.datasets.sources.provenance import recorded_scene, recording_entry, succeeded
 from robocas_ms3.datasets.sources.reader import DEFAULT_RATE
 from robocas_ms3.datasets.sources.split import split_by_seed
-from robocas_ms3.demos.recordings.entries import Entry
 from robocas_ms3.demos.recordings.motion import sample_states, sample_stride
-from robocas_ms3.demos.recordings.reading import Recording, TrajectoryFile
 from robocas_ms3.demos.recordings.subgoals import SubGoal, sample_subgoals
+from robocas_ms3.demos.recordings.trajectory_file import Recording, TrajectoryFile
+from robocas_ms3.demos.recordings.trajectory_json import Entry
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.layout import PARKING_HEIGHT
 

@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.words import count_of, error_line
+from robocas_ms3.core.text import count_of, error_line
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.actions import ACTION_ARRAYS, ACTION_NAMES, checked_actions
 from robocas_ms3.datasets.formats import open_source
+from robocas_ms3.datasets.sources.episode_source import SourceEpisode
+from robocas_ms3.datasets.sources.file_models import Layout, Recorded, SceneRecord, read_scene
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
-from robocas_ms3.datasets.sources.protocol import SourceEpisode
 from robocas_ms3.datasets.sources.provenance import task_of
-from robocas_ms3.datasets.sources.records import Layout, Recorded, SceneRecord, read_scene
 from robocas_ms3.datasets.statistics.layouts import LayoutMap, Placement, layout_map, rounded, surface_of
 
 NOOP = (1e-3, np.deg2rad(0.5))  # m and rad per step below which the gripper counts as standing still

@@ -10,7 +10,7 @@ import numpy as np
 
 from robocas_ms3.core.errors import require_extra
 from robocas_ms3.core.files import make_folder, replacing, write_json
-from robocas_ms3.core.words import called, count_of, printable
+from robocas_ms3.core.text import called, count_of, printable
 from robocas_ms3.datasets.actions import ACTION_NAMES
 from robocas_ms3.datasets.statistics.collect import Stats, counted, histogram
 from robocas_ms3.datasets.statistics.layouts import LayoutMap

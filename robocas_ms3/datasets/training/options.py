@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.sources.protocol import Side
+from robocas_ms3.datasets.sources.episode_source import Side
 
 Steps = NDArray[np.int64]
 Padding = Literal["hold", "zero", "drop"]

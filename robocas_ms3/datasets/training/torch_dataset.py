@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from torch.utils.data import get_worker_info
 
 from robocas_ms3.core.errors import DatasetError, EmptySplitError
-from robocas_ms3.core.words import count_of
+from robocas_ms3.core.text import count_of
 from robocas_ms3.datasets.actions import ACTION_ARRAYS, ActionScale, check_finite, checked_actions
 from robocas_ms3.datasets.formats import open_source
-from robocas_ms3.datasets.sources.protocol import EpisodeSource, Kind, SourceEpisode
+from robocas_ms3.datasets.sources.episode_source import EpisodeSource, Kind, SourceEpisode
 from robocas_ms3.datasets.training.options import SampleOptions
 from robocas_ms3.scenes.language.templates import GOAL_TYPES
 

@@ -17,9 +17,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from robocas_ms3.assets.pack import pack_folders
 from robocas_ms3.core.errors import DatasetError, ExtensionError
-from robocas_ms3.core.strict import StrictModel, mistakes
+from robocas_ms3.core.strict_model import StrictModel, mistakes
 from robocas_ms3.robots.cameras import CameraSpec
-from robocas_ms3.robots.table import RobotSpec, find_robot
+from robocas_ms3.robots.registry import RobotSpec, find_robot
 from robocas_ms3.scenes.config.load import load_config_of, shipped_configs
 from robocas_ms3.scenes.task_specs import TASKS, TaskSpec
 

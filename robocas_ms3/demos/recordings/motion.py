@@ -18,7 +18,7 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import from_wxyz, inverse
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.robots.description_file import link_poses
-from robocas_ms3.robots.table import RobotSpec
+from robocas_ms3.robots.registry import RobotSpec
 
 Array = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, model_validator
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.strict import parse
+from robocas_ms3.core.strict_model import parse
 
 
 class SubGoal(BaseModel):

@@ -14,7 +14,7 @@ from robocas_ms3.datasets.sources.arrays import episode_arrays
 from robocas_ms3.demos.recordings.motion import Motion, gripper_open
 from robocas_ms3.robots.description_file import chain
 from robocas_ms3.robots.quantities import ARM_BASE, STATE, columns_of, features
-from robocas_ms3.robots.table import find_robot
+from robocas_ms3.robots.registry import find_robot
 
 KEYS = {"agent_pos": STATE} | {key.removeprefix("observation."): key for key in features() if key != STATE}
 """Key of an environment's observation -> column of our LeRobot datasets."""

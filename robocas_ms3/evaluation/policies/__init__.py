@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.core.exits import no_exit
 from robocas_ms3.core.extensions import Registry
-from robocas_ms3.core.strict import nearest
+from robocas_ms3.core.signals import no_exit
+from robocas_ms3.core.strict_model import nearest
 from robocas_ms3.evaluation.policies.plain import RandomPolicy, StillPolicy
 from robocas_ms3.evaluation.policy import Policy, PolicySpec
 

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.demos.recordings.entries import read_begin, read_json, was_taken_over
 from robocas_ms3.demos.recordings.environment import read_env
 from robocas_ms3.demos.recordings.motion import Motion, sample_states
-from robocas_ms3.demos.recordings.stored import open_episode, open_trajectory, read_actions
+from robocas_ms3.demos.recordings.trajectory_hdf5 import open_episode, open_trajectory, read_actions
+from robocas_ms3.demos.recordings.trajectory_json import read_begin, read_json, was_taken_over
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.robots.description import RobotDescription
-from robocas_ms3.robots.table import RobotSpec
+from robocas_ms3.robots.registry import RobotSpec
 
 Array = NDArray[np.floating]
 

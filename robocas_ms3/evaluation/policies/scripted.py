@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.recordings.motion import sample_stride
-from robocas_ms3.demos.recordings.stored import open_episode, open_trajectory, read_steps
+from robocas_ms3.demos.recordings.trajectory_hdf5 import open_episode, open_trajectory, read_steps
 from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.evaluation.policies.replay import JointTrack, PoseTrack, TrackPolicy
 from robocas_ms3.evaluation.policy import EpisodeSpec, PolicySpec
-from robocas_ms3.robots.table import find_robot
+from robocas_ms3.robots.registry import find_robot
 from robocas_ms3.scenes.task_specs import TASKS
 
 OFFSETS = (0.01, 0.05)  # m sideways, least and most: a finger on top of the target, or of an object next to it

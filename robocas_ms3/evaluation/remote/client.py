@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from websockets.asyncio.client import ClientConnection
 
 from robocas_ms3.core.errors import EvaluationError, PolicyFailed, WireError
-from robocas_ms3.core.words import one_line
+from robocas_ms3.core.text import one_line
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.evaluation.remote.connection import (
     LOST,

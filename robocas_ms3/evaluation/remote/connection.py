@@ -18,8 +18,8 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import WebSocketException
 
 from robocas_ms3.core.errors import EvaluationError, WireError
-from robocas_ms3.core.strict import refusal
-from robocas_ms3.core.words import one_line
+from robocas_ms3.core.strict_model import refusal
+from robocas_ms3.core.text import one_line
 from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.remote.messages import ServerMetadata, read_metadata
 from robocas_ms3.evaluation.remote.wire import unpack

@@ -19,11 +19,11 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue, Po
 
 from robocas_ms3.core.errors import EvaluationError, WireError
 from robocas_ms3.core.paths import protocols_dir
-from robocas_ms3.core.strict import refusal
-from robocas_ms3.core.words import one_line
+from robocas_ms3.core.strict_model import refusal
+from robocas_ms3.core.text import one_line
 from robocas_ms3.evaluation.policy import CONVENTIONS, ROBOT, EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.evaluation.remote.wire import MAX_BYTES
-from robocas_ms3.robots.table import DEFAULT
+from robocas_ms3.robots.registry import DEFAULT
 
 ENV, RESET, START, PROMPT, ACTIONS, BATCH, ERROR = "env_id", "reset", "start", "prompt", "actions", "batch", "error"
 PREFIX = "observation/"

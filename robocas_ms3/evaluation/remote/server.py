@@ -23,7 +23,7 @@ from websockets.http11 import Request, Response
 from robocas_ms3 import __version__
 from robocas_ms3.core.errors import EvaluationError, PolicyFailed, RobocasError, WireError
 from robocas_ms3.core.paths import builtin_packs_dir, data_dir, protocols_dir
-from robocas_ms3.core.words import error_line, one_line
+from robocas_ms3.core.text import error_line, one_line
 from robocas_ms3.evaluation.policy import (
     EpisodeSpec,
     Observations,

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import WireError
-from robocas_ms3.core.words import one_line
+from robocas_ms3.core.text import one_line
 
 MAX_BYTES = 64 * 2**20  # of a message
 MAX_DEPTH = 16  # of nested maps and lists

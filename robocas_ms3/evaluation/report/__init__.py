@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from robocas_ms3.core.files import make_folder, replacing
-from robocas_ms3.core.words import printable
+from robocas_ms3.core.text import printable
 from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.report.page import page
 from robocas_ms3.evaluation.report.tables import markdown

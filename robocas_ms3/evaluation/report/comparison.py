@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import combinations
 
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.core.words import count_of, in_markdown
+from robocas_ms3.core.text import count_of, in_markdown
 from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.results import Result
 from robocas_ms3.evaluation.statistics import Comparison, compare, holm, too_few

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from robocas_ms3.core.words import count_of
+from robocas_ms3.core.text import count_of
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.report.tables import WELDED, Cell, Fraction, Table, failure_name, mean, stages_of, tables

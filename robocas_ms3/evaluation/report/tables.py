@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from robocas_ms3.core.words import count_of, in_markdown
+from robocas_ms3.core.text import count_of, in_markdown
 from robocas_ms3.evaluation.outcomes import STAGES, Outcome
 from robocas_ms3.evaluation.results import Result
 from robocas_ms3.evaluation.statistics import Share, success_by

@@ -12,8 +12,8 @@ import torch
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.files import make_folder, replacing
-from robocas_ms3.datasets.pictures.video import open_video
-from robocas_ms3.datasets.writing.render import require_renderer
+from robocas_ms3.datasets.conversion.env_renderer import require_renderer
+from robocas_ms3.datasets.images.video import open_video
 from robocas_ms3.evaluation.policy import Policy
 from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.report.page import VIDEOS, video_name

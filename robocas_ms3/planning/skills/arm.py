@@ -15,7 +15,7 @@ from robocas_ms3.planning.kinematics import Reachability
 from robocas_ms3.planning.protocol import Array, Planner, Trajectory
 from robocas_ms3.planning.scene import PlanningScene
 from robocas_ms3.robots.description import RobotDescription
-from robocas_ms3.scenes.grasping import Approach
+from robocas_ms3.scenes.grasp_checks import Approach
 from robocas_ms3.scenes.language.templates import subgoal
 from robocas_ms3.tasks.base import RoboCASEnv
 

@@ -17,12 +17,12 @@ from robocas_ms3.assets.manifest import Handle, Joint
 from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.core.poses import inverse, transform
 from robocas_ms3.planning.protocol import Array, Obstacle, Shape, Trajectory
-from robocas_ms3.planning.pulling import reached, track, turned_about_bar
+from robocas_ms3.planning.pull_path import reached, track, turned_about_bar
 from robocas_ms3.planning.scene import SPACING, shape_of
 from robocas_ms3.planning.skills.arm import Arm, first_plan, moved_back, plan_step_back
-from robocas_ms3.planning.timing import through, timed
+from robocas_ms3.planning.time_parameterization import through, timed
 from robocas_ms3.robots.description import RobotDescription
-from robocas_ms3.scenes.grasping import HALF_TURN
+from robocas_ms3.scenes.grasp_checks import HALF_TURN
 from robocas_ms3.scenes.lookup import OPENED_AT_MOST
 from robocas_ms3.tasks import terms
 from robocas_ms3.tasks.bodies import contact_forces

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from robocas_ms3.planning.skills.arm import Arm
+from robocas_ms3.planning.skills.base_placement import open_from_reach
 from robocas_ms3.planning.skills.handles import is_opened
-from robocas_ms3.planning.skills.stance import open_from_reach
 from robocas_ms3.planning.solvers import pick
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from robocas_ms3.planning.skills.arm import Arm
-from robocas_ms3.planning.skills.stance import bring_to_basket, grasp_from_reach
+from robocas_ms3.planning.skills.base_placement import bring_to_basket, grasp_from_reach
 
 
 def attempt(arm: Arm) -> None:

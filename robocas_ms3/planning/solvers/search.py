@@ -9,11 +9,11 @@ from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.planning.decisions import Effort
 from robocas_ms3.planning.executor import OPEN
 from robocas_ms3.planning.skills.arm import Arm
-from robocas_ms3.planning.skills.clearing import FACTS, Heap
-from robocas_ms3.planning.skills.grasping import grasp
-from robocas_ms3.planning.skills.looking import FAR, NEAR, look_at, prepare_looks
-from robocas_ms3.planning.skills.placing import carry_to_basket, release_into_basket
-from robocas_ms3.planning.skills.removing import hang_clear
+from robocas_ms3.planning.skills.grasp import grasp
+from robocas_ms3.planning.skills.heap import FACTS, Heap
+from robocas_ms3.planning.skills.look import FAR, NEAR, look_at, prepare_looks
+from robocas_ms3.planning.skills.place import carry_to_basket, release_into_basket
+from robocas_ms3.planning.skills.remove import hang_clear
 
 LIFT_HEIGHT = 0.15  # m, upstream's
 AHEAD = 3  # moves that are compared

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from robocas_ms3.core.errors import PlanError
 from robocas_ms3.core.extensions import load
-from robocas_ms3.core.strict import StrictModel, refusal
+from robocas_ms3.core.strict_model import StrictModel, refusal
 from robocas_ms3.plans.folder import PlanFolder, Unit
 from robocas_ms3.plans.worker import UnitWorker
 

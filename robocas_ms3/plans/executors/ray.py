@@ -19,10 +19,10 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from robocas_ms3.core.errors import PlanError, RobocasError, require_extra
-from robocas_ms3.core.exits import deferred_interrupts
 from robocas_ms3.core.files import ABANDONED, make_folder, write_json
-from robocas_ms3.core.strict import StrictModel
-from robocas_ms3.core.words import one_line
+from robocas_ms3.core.signals import deferred_interrupts
+from robocas_ms3.core.strict_model import StrictModel
+from robocas_ms3.core.text import one_line
 from robocas_ms3.plans.executors import ThreadExecutor
 from robocas_ms3.plans.folder import OUTCOME, PLAN, Outcome, PlanFolder, SeedFiles, Unit
 from robocas_ms3.plans.plan import Plan

@@ -26,7 +26,7 @@ from pydantic import Field, create_model
 from robocas_ms3.core.errors import PlanError, require_extra
 from robocas_ms3.core.files import make_folder
 from robocas_ms3.core.remote_errors import RemoteError
-from robocas_ms3.core.strict import StrictModel
+from robocas_ms3.core.strict_model import StrictModel
 from robocas_ms3.plans.executors import Executor
 from robocas_ms3.plans.folder import PlanFolder, Unit
 from robocas_ms3.plans.worker import UnitWorker

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
 from robocas_ms3.core.errors import ConfigError
-from robocas_ms3.core.strict import StrictModel, nearest
+from robocas_ms3.core.strict_model import StrictModel, nearest
 from robocas_ms3.robots.cameras import CAMERA_NAME, CameraSpec, Mount
 
 _Coordinate = Annotated[float, Field(ge=-100, le=100)]

@@ -16,7 +16,7 @@ import yaml
 
 from robocas_ms3.core.documents import YAML_DEPTH
 from robocas_ms3.core.errors import ConfigError, RobocasError
-from robocas_ms3.core.strict import nearest
+from robocas_ms3.core.strict_model import nearest
 from robocas_ms3.scenes.config.task import TaskConfig
 
 EXTENDS = "extends"

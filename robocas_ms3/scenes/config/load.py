@@ -12,7 +12,7 @@ from typing import Any
 from robocas_ms3.core.documents import YAML_LIMIT, DocumentError, load_yaml, read_text
 from robocas_ms3.core.errors import ConfigError
 from robocas_ms3.core.paths import task_configs_dir
-from robocas_ms3.core.strict import nearest, parse
+from robocas_ms3.core.strict_model import nearest, parse
 from robocas_ms3.scenes.config.compose import EXTENDS, Composition, parse_override
 from robocas_ms3.scenes.config.task import TaskConfig
 from robocas_ms3.scenes.language.texts import synonym_texts

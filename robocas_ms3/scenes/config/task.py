@@ -8,7 +8,7 @@ from pydantic import AfterValidator, Field, StrictInt, model_validator
 
 from robocas_ms3.core.errors import ConfigError, ExtensionError
 from robocas_ms3.core.extensions import load
-from robocas_ms3.core.strict import StrictModel
+from robocas_ms3.core.strict_model import StrictModel
 from robocas_ms3.robots.cameras import CameraSpec
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.scenes.config.cameras import CameraConfig, CamerasConfig, changed_cameras

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import RobocasError, require_extra
-from robocas_ms3.core.words import one_line
+from robocas_ms3.core.text import one_line
 
 MODEL_NAME = "sentence-transformers/all-MiniLM-L6-v2"
 DIMENSIONS = 384

@@ -11,8 +11,8 @@ from pydantic import Field, model_validator
 
 from robocas_ms3.core.documents import load_yaml
 from robocas_ms3.core.errors import ConfigError
-from robocas_ms3.core.strict import StrictModel, parse
-from robocas_ms3.core.words import one_line
+from robocas_ms3.core.strict_model import StrictModel, parse
+from robocas_ms3.core.text import one_line
 from robocas_ms3.scenes.relations import Relation
 from robocas_ms3.scenes.task_specs import TASKS, TaskSpec
 

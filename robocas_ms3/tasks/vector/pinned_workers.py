@@ -14,7 +14,7 @@ from concurrent.futures import Future
 from multiprocessing import Pipe
 from typing import Any, Generic, TypeVar
 
-from robocas_ms3.core.exits import deferred_interrupts
+from robocas_ms3.core.signals import deferred_interrupts
 from robocas_ms3.core.worker_process import START_SECONDS, Limits, ProcessDied, Worker, WorkerProcess
 
 Task = TypeVar("Task")

@@ -10,7 +10,7 @@ from asset_tools.grasps import sample_grasps
 from asset_tools.quality import measure
 from asset_tools.quality.drops import DropReport
 from asset_tools.quality.measure import differences, judge, measure_object, rows
-from asset_tools.resting import resting_poses
+from asset_tools.resting_poses import resting_poses
 from robocas_ms3.assets.annotations import Annotations, footprints
 from robocas_ms3.assets.pack import LoadedObject
 

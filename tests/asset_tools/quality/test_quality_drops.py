@@ -5,7 +5,7 @@ from sapien import physx
 
 from asset_tools.quality import drops
 from asset_tools.quality.drops import drop_test
-from asset_tools.resting import resting_poses
+from asset_tools.resting_poses import resting_poses
 from robocas_ms3.assets.physics import Solid
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])

@@ -1,7 +1,7 @@
 import numpy as np
 
-from asset_tools.quality import holding
-from asset_tools.quality.holding import hold_test
+from asset_tools.quality import grasp_hold
+from asset_tools.quality.grasp_hold import hold_test
 
 
 def grasps(*places):
@@ -43,5 +43,5 @@ def test_each_grasp_is_for_itself(block):
 def test_a_slippery_block_slips_through(block, monkeypatch):
     # With slippery fingers as well (the engine takes the mean of both), 2 * 0.05 * 35 N = 3.5 N carry 0.36 kg at rest.
     assert hold_test(block(0.05, 0.05, 0.05, mass=0.5), grasps(CENTRE)).all()
-    monkeypatch.setattr(holding, "FINGER_FRICTION", 0.05)
+    monkeypatch.setattr(grasp_hold, "FINGER_FRICTION", 0.05)
     assert not hold_test(block(0.05, 0.05, 0.05, mass=0.5, friction=0.05), grasps(CENTRE)).any()

@@ -17,8 +17,8 @@ from robocas_ms3.baselines.lerobot import prepare as module
 from robocas_ms3.baselines.lerobot.policy import EMBEDDING, STATE_NAMES
 from robocas_ms3.baselines.lerobot.prepare import main, prepare
 from robocas_ms3.core.errors import DatasetError, OutputExistsError
+from robocas_ms3.datasets.conversion.settings import ConversionSettings
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
-from robocas_ms3.datasets.writing.settings import ConversionSettings
 from robocas_ms3.robots.quantities import STATE
 
 DATA = "data/chunk-000/file-000.parquet"

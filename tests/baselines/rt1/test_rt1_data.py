@@ -10,7 +10,7 @@ from rt1_sizes import SIZES
 from robocas_ms3.baselines.rt1 import BASELINE
 from robocas_ms3.baselines.rt1.config import RT1Config
 from robocas_ms3.core.errors import TrainingError
-from robocas_ms3.core.strict import parse
+from robocas_ms3.core.strict_model import parse
 from robocas_ms3.datasets.formats import open_source
 
 

@@ -11,7 +11,7 @@ from robocas_ms3.baselines.rt1 import BASELINE
 from robocas_ms3.baselines.rt1.config import RT1Config
 from robocas_ms3.baselines.rt1.model import ActionBins, attention_mask, likeliest_tokens
 from robocas_ms3.core.errors import TrainingError
-from robocas_ms3.core.strict import parse
+from robocas_ms3.core.strict_model import parse
 
 
 def test_tokens_attend_to_image_tokens_before_them_and_not_to_predicted_ones():

@@ -15,13 +15,13 @@ from robocas_ms3.baselines.chunks import decode
 from robocas_ms3.baselines.small import BASELINE, data
 from robocas_ms3.baselines.small.config import SmallConfig, View
 from robocas_ms3.baselines.small.data import crop_image
-from robocas_ms3.baselines.small.locating import CELL, NOWHERE, pointing_losses
+from robocas_ms3.baselines.small.localization import CELL, NOWHERE, pointing_losses
 from robocas_ms3.baselines.small.model import shift_images
 from robocas_ms3.baselines.small.objects import SceneObjects
 from robocas_ms3.baselines.training.session import merge_configs
 from robocas_ms3.core.errors import DatasetError, TrainingError
 from robocas_ms3.core.poses import to_wxyz
-from robocas_ms3.core.strict import parse
+from robocas_ms3.core.strict_model import parse
 from robocas_ms3.datasets.formats import open_source
 
 

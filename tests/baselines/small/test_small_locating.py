@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.baselines.small.config import View
-from robocas_ms3.baselines.small.locating import (
+from robocas_ms3.baselines.small.localization import (
     NOWHERE,
     POINT_FEATURES,
     Lift,

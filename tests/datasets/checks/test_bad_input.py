@@ -6,9 +6,9 @@ from managing import Bomb, change, convert_made_up, edit, files_of, make
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.checks.dataset import validate
-from robocas_ms3.datasets.manage.merging import merge
+from robocas_ms3.datasets.conversion.data_info import write_info
+from robocas_ms3.datasets.manage.merge import merge
 from robocas_ms3.datasets.sources.reader import Dataset
-from robocas_ms3.datasets.writing.info import write_info
 
 
 def test_pickles_are_loaded_nowhere(dataset, tmp_path):

@@ -6,7 +6,7 @@ from managing import edit
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.checks.scene import valid_values
 from robocas_ms3.datasets.checks.violation import check_form
-from robocas_ms3.datasets.sources.records import SCENE_KEYS, SceneRecord
+from robocas_ms3.datasets.sources.file_models import SCENE_KEYS, SceneRecord
 
 FILE = "episode_0000001/scene.json"
 POSE = [0.5, 0.8, 0.6, 1.0, 0.0, 0.0, 0.0]

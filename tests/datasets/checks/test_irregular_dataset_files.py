@@ -12,12 +12,12 @@ from irregular import KINDS, replace_file
 from robocas_ms3.core.documents import DocumentError
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.checks.dataset import validate
-from robocas_ms3.datasets.manage.copying import FilePlacer
-from robocas_ms3.datasets.pictures.headers import LARGEST, read_header
-from robocas_ms3.datasets.pictures.stored import Pictures, read_picture
+from robocas_ms3.datasets.conversion.episode_folder import find_damaged
+from robocas_ms3.datasets.images.image_files import Pictures, read_picture
+from robocas_ms3.datasets.images.image_headers import LARGEST, read_header
+from robocas_ms3.datasets.manage.copy_episodes import FilePlacer
 from robocas_ms3.datasets.sources.reader import Dataset
-from robocas_ms3.datasets.writing.episode_folder import find_damaged
-from robocas_ms3.demos.recordings.stored import open_trajectory
+from robocas_ms3.demos.recordings.trajectory_hdf5 import open_trajectory
 from robocas_ms3.robots.cameras import STANDARD_NAMES
 from robocas_ms3.viewer.source import open_source
 

@@ -12,8 +12,8 @@ DEPTH = "depth/base_camera/chunk-000/file-000.mkv"
 
 def convert(source, out, on_episode=None, **settings):
     """Convert with made-up images."""
+    from robocas_ms3.datasets.conversion.settings import ConversionSettings
     from robocas_ms3.datasets.lerobot.convert import convert_lerobot  # needs the extra 'lerobot'
-    from robocas_ms3.datasets.writing.settings import ConversionSettings
 
     settings = ConversionSettings(source, out, open_renderer=RayCaster, **settings)
     return convert_lerobot(settings, on_episode=on_episode)

@@ -16,17 +16,17 @@ pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
 
 from robocas_ms3.cli import main
 from robocas_ms3.core.errors import DatasetError, IncompleteError, OutputExistsError, RobocasError
+from robocas_ms3.datasets.conversion.settings import ConversionSettings
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check import check_lerobot
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
-from robocas_ms3.datasets.manage.importing import import_robocas
-from robocas_ms3.datasets.manage.splitting import Share, resplit
+from robocas_ms3.datasets.manage.import_robocas import import_robocas
+from robocas_ms3.datasets.manage.split import Share, resplit
 from robocas_ms3.datasets.manage.survey import survey
 from robocas_ms3.datasets.sources.arrays import arrays_fingerprint
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.split import split_by_seed
-from robocas_ms3.datasets.writing.settings import ConversionSettings
 
 
 def test_from_a_folder_as_from_the_trajectory(trajectory, made, tmp_path):

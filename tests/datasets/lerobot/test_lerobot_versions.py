@@ -14,13 +14,13 @@ pq = pytest.importorskip("pyarrow.parquet", reason="needs the extra 'lerobot'")
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import inverse
 from robocas_ms3.datasets.formats import open_source
+from robocas_ms3.datasets.images.image_files import box_of
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check import check_lerobot
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.variants import VARIANTS
-from robocas_ms3.datasets.pictures.stored import box_of
 from robocas_ms3.datasets.sources.reader import Dataset
-from robocas_ms3.demos.recordings.reading import TrajectoryFile
+from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
 
 
 @pytest.fixture(params=VARIANTS)

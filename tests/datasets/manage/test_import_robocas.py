@@ -11,11 +11,11 @@ from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.dataset import validate
-from robocas_ms3.datasets.manage.importing import import_robocas
+from robocas_ms3.datasets.images.video import contact_sheet
+from robocas_ms3.datasets.manage.import_robocas import import_robocas
 from robocas_ms3.datasets.manage.survey import survey
-from robocas_ms3.datasets.pictures.video import contact_sheet
+from robocas_ms3.datasets.sources.file_models import SCENE_KEYS
 from robocas_ms3.datasets.sources.reader import Dataset
-from robocas_ms3.datasets.sources.records import SCENE_KEYS
 
 NPZ = "episode_info.npz"
 

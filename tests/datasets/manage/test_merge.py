@@ -9,9 +9,9 @@ from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import DatasetError, OutputExistsError, RobocasError
 from robocas_ms3.core.locks import locked_folder
 from robocas_ms3.datasets.checks.dataset import validate
-from robocas_ms3.datasets.manage.copying import CopyOptions, FilePlacer
-from robocas_ms3.datasets.manage.merging import merge
-from robocas_ms3.datasets.manage.splitting import Share, resplit
+from robocas_ms3.datasets.manage.copy_episodes import CopyOptions, FilePlacer
+from robocas_ms3.datasets.manage.merge import merge
+from robocas_ms3.datasets.manage.split import Share, resplit
 from robocas_ms3.datasets.sources.reader import Dataset
 
 

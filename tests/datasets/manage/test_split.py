@@ -9,9 +9,9 @@ from managing import DAMAGES, edit, files_of, make, read
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.checks.dataset import validate
-from robocas_ms3.datasets.manage import splitting
-from robocas_ms3.datasets.manage.merging import merge
-from robocas_ms3.datasets.manage.splitting import Share, cut, folder_names, groups_of, resplit, split_by_fractions
+from robocas_ms3.datasets.manage import split
+from robocas_ms3.datasets.manage.merge import merge
+from robocas_ms3.datasets.manage.split import Share, cut, folder_names, groups_of, resplit, split_by_fractions
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.split import split_by_seed
 
@@ -51,7 +51,7 @@ def test_parts_have_some_of_both_sides():
     seeds = {number: 510000 + number for number in range(800)}
     dataset = SimpleNamespace(sides=split_by_seed(seeds))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(splitting, "groups_of", lambda dataset, by: {n: str(seed) for n, seed in seeds.items()})
+        patch.setattr(split, "groups_of", lambda dataset, by: {n: str(seed) for n, seed in seeds.items()})
         for share in (0.5, 0.25, 0.0625):
             for train, val in split_by_fractions(dataset, [share, 1 - share], "seed", None).values():
                 assert 0.04 < len(val) / (len(train) + len(val)) < 0.2

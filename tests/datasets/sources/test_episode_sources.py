@@ -13,11 +13,11 @@ pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
 import pyarrow.parquet as pq
 
 from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.datasets.conversion.convert import convert
+from robocas_ms3.datasets.conversion.settings import ConversionSettings
 from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.sources.trajectory import TrajectorySource
-from robocas_ms3.datasets.writing.convert import convert
-from robocas_ms3.datasets.writing.settings import ConversionSettings
 
 
 @pytest.fixture(scope="module")

@@ -11,11 +11,11 @@ from synthetic import RayCaster
 pytest.importorskip("av", reason="needs the extra 'lerobot'")
 pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
 
+from robocas_ms3.datasets.conversion.settings import ConversionSettings
 from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.datasets.lerobot import reader, video
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
-from robocas_ms3.datasets.sources.protocol import shots
-from robocas_ms3.datasets.writing.settings import ConversionSettings
+from robocas_ms3.datasets.sources.episode_source import shots
 
 CAMERAS = ("base_camera", "gripper_camera", "static_camera")
 STEPS = 7

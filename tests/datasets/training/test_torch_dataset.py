@@ -222,8 +222,8 @@ def test_workers_see_what_one_process_sees(made):
 
 def test_a_lerobot_folder_gives_the_same_samples(made, tmp_path):
     pytest.importorskip("av")
+    from robocas_ms3.datasets.conversion.settings import ConversionSettings
     from robocas_ms3.datasets.lerobot.convert import convert_lerobot
-    from robocas_ms3.datasets.writing.settings import ConversionSettings
 
     convert_lerobot(ConversionSettings(made, tmp_path / "lerobot"))
     state = ("ee_pos", "robot_joints")

@@ -9,7 +9,7 @@ from robocas_ms3.datasets.sources.arrays import episode_arrays
 from robocas_ms3.demos.recordings.motion import Motion, gripper_open
 from robocas_ms3.evaluation.harness.proprioception import KEYS, WIDTHS, Proprioception
 from robocas_ms3.robots.description import MOBILE_PANDA
-from robocas_ms3.robots.table import DEFAULT, PANDA
+from robocas_ms3.robots.registry import DEFAULT, PANDA
 
 STEPS = 60
 COMMANDS = np.where(np.arange(STEPS) // 7 % 2, -1.0, 1.0)

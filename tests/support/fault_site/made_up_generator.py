@@ -4,7 +4,7 @@ import json
 
 import h5py
 
-from robocas_ms3.demos.ledger import EpisodeResult
+from robocas_ms3.demos.failures import EpisodeResult
 
 
 class EpisodeGenerator:

@@ -1,0 +1,237 @@
+"""Contact sheets: every asset of a pack in one PNG, looks, hulls, resting poses, grasps, surfaces, joints."""
+
+from __future__ import annotations
+
+import colorsys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from asset_tools.quality.measure import top_grasps
+from asset_tools.renderer import PAPER, Body, Colour, Studio, box_faces
+from robocas_ms3.assets.annotations import Annotations
+from robocas_ms3.assets.hulls import Hull
+from robocas_ms3.assets.kinematics import link_poses
+from robocas_ms3.assets.manifest import FurnitureAsset, ObjectAsset
+from robocas_ms3.assets.pack import LoadedFurniture, LoadedObject, Pack
+from robocas_ms3.core.errors import AssetError
+from robocas_ms3.core.poses import from_wxyz
+
+Array = NDArray[np.float64]
+Picture = tuple[str, Image.Image]
+
+CELLS = 5  # pictures of an asset, side by side
+LARGE, SMALL = 220, 154  # px, a picture's side: of packs with few and with many assets
+FEW = 16
+GAP, CAPTION, LABEL = 6, 33, 14  # px between assets, of the text above the pictures, of that below
+POSES = 4
+GROUND, GREY, RED = (0.80, 0.80, 0.78), (0.55, 0.55, 0.55), (0.9, 0.1, 0.1)
+INK, FAINT = (25, 25, 25), (120, 120, 120)
+FINGER = 0.003  # m, thickness of drawn grippers
+
+
+def contact_sheet(pack: Pack, path: Path, ids: Sequence[str] | None = None) -> None:
+    """Draw a pack, furniture last.
+
+    Args:
+        pack: what to draw.
+        path: of the PNG.
+        ids: only these assets, in this order; none: all.
+
+    Raises:
+        AssetError: no such asset, or there is nothing to render with.
+    """
+    assets: dict[str, LoadedObject | LoadedFurniture] = {**pack.objects, **pack.furniture}
+    unknown = [id_ for id_ in ids or () if id_ not in assets]
+    if unknown:
+        raise AssetError("no such assets in the pack", where=pack.name, found=", ".join(unknown))
+    chosen = [assets[id_] for id_ in ids or assets]
+    size, columns = (LARGE, 2) if len(chosen) <= FEW else (SMALL, 3)
+    columns = min(columns, len(chosen))
+    studio = Studio(size)
+    width, height = CELLS * size, CAPTION + size + LABEL
+    rows = -(-len(chosen) // columns)
+    sheet = Image.new("RGB", (columns * (width + GAP) + GAP, rows * (height + GAP) + GAP), "white")
+    for i, asset in enumerate(chosen):
+        strip = _strip(studio, asset)
+        sheet.paste(strip, (GAP + i % columns * (width + GAP), GAP + i // columns * (height + GAP)))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    sheet.save(path)
+
+
+def _strip(studio: Studio, asset: LoadedObject | LoadedFurniture) -> Image.Image:
+    if isinstance(asset, LoadedObject):
+        title, line, pictures = asset.asset.id, _object_line(asset.asset), _object_pictures(studio, asset)
+        if asset.asset.graspnet_id is not None:
+            title += f"  ({asset.asset.graspnet_id})"
+    else:
+        title, line, pictures = asset.asset.id, _furniture_line(asset), _furniture_pictures(studio, asset)
+    size = studio.size
+    strip = Image.new("RGB", (CELLS * size, CAPTION + size + LABEL), PAPER)
+    draw = ImageDraw.Draw(strip)
+    draw.text((4, 0), title, INK, _font(15))
+    draw.text((4, 17), line, INK, _font(12))
+    for i, (label, picture) in enumerate(pictures):
+        strip.paste(picture, (i * size, CAPTION))
+        draw.text((i * size + 4, CAPTION + size), label, FAINT, _font(11))
+    return strip
+
+
+def _object_line(asset: ObjectAsset) -> str:
+    quality = asset.quality
+    size = " x ".join(f"{1000 * value:.0f}" for value in asset.extents)
+    fit = f"IoU {quality.volume_iou:.2f}" if quality.compact else f"p95 {1000 * quality.surface_p95:.1f} mm"
+    rest = f"{quality.rest_share:.0%} rest"
+    held = f"{quality.grasps_held:.0%} hold" if quality.grasps_tried else "none tried"
+    hulls = _count(quality.hull_count, "hull")
+    return f"{size} mm, {1000 * asset.mass:.0f} g, {hulls}, {fit}, {rest}, {asset.grasp_count} grasps, {held}"
+
+
+def _furniture_line(furniture: LoadedFurniture) -> str:
+    asset: FurnitureAsset = furniture.asset
+    size = " x ".join(f"{value:.2f}" for value in asset.extents)
+    parts = [f"{size} m", "fixed" if asset.mass is None else f"{asset.mass:.2f} kg"]
+    parts += [_count(asset.quality.hull_count, "hull"), _count(len(asset.surfaces), "surface")]
+    parts += [_count(len(asset.links), "joint"), _count(len(asset.handles), "handle")] if asset.links else []
+    parts += [f"{len(names)} {part} finishes" for part, names in asset.finishes.items()]
+    return ", ".join(parts)
+
+
+def _object_pictures(studio: Studio, asset: LoadedObject) -> list[Picture]:
+    notes = asset.annotations
+    points, tried = np.concatenate(asset.hulls), top_grasps(notes)
+    fast = Body(points, file=asset.visual("fast"))
+    grippers = [
+        _solid(gripper_faces(float(width)), _tone(float(quality)), pose)
+        for pose, width, quality in zip(
+            *(values[tried] for values in (notes.grasps_tcp_in_object, notes.grasp_widths, notes.grasp_qualities)),
+            strict=True,
+        )
+    ]
+    best = _shown_poses(notes)
+    chances = " ".join(f"{notes.resting_probabilities[i]:.0%}" for i in best)
+    return [
+        ("fast", studio.picture([fast], -60, 25)),
+        ("full, from behind", studio.picture([Body(points, file=asset.visual("full"))], 120, 25)),
+        ("hulls", studio.picture(hull_bodies(asset.hull_meshes), -60, 25)),
+        (f"rests {chances}", studio.picture(standing(fast, notes.resting_poses[best]), -60, 30)),
+        (f"best {len(grippers)} of {len(notes.grasp_widths)} grasps", studio.picture([fast, *grippers], -60, 30)),
+    ]
+
+
+def _shown_poses(notes: Annotations) -> list[int]:
+    """The likeliest resting poses, the upright one first, however rare it is."""
+    order = [int(i) for i in np.argsort(-notes.resting_probabilities, kind="stable")]
+    if notes.display_pose >= 0:
+        order = [notes.display_pose, *(i for i in order if i != notes.display_pose)]
+    return order[:POSES]
+
+
+def _furniture_pictures(studio: Studio, furniture: LoadedFurniture) -> list[Picture]:
+    asset = furniture.asset
+    parts = {"": furniture, **furniture.links}
+    wide = {link.joint.name: max(link.joint.limits, key=abs) for link in asset.links}
+    shut, open_ = ({"": np.eye(4), **link_poses(asset.links, at)} for at in ({}, wide))
+
+    def looks(poses: dict[str, Array]) -> list[Body]:
+        bodies = [
+            Body(np.concatenate(part.hulls), file=part.visual("fast"), pose=poses[name]) for name, part in parts.items()
+        ]
+        finishes = [furniture.finish(part, names[0]) for part, names in asset.finishes.items()]
+        return bodies + [Body(np.empty((0, 3)), file=path) for path in finishes]
+
+    hulls = [
+        body
+        for i, (name, part) in enumerate(parts.items())
+        for body in hull_bodies(part.hull_meshes, pose=open_[name], first_colour=i)
+    ]
+    thick = 0.004 * max(asset.extents)
+    marks = []
+    for i, surface in enumerate(asset.surfaces.values()):
+        faces = box_faces((*surface.min_xy, surface.z), (*surface.max_xy, surface.z + thick))
+        marks.append(_solid(faces, _hue(i), open_[surface.link]))
+    for handle in asset.handles.values():
+        grasp = from_wxyz(np.array([*handle.position, *handle.wxyz]))
+        marks.append(_solid(gripper_faces(handle.width, thick), RED, open_[handle.link] @ grasp))
+    points = np.concatenate([body.points for body in looks(shut)])
+    edges = _solid(frame_faces(points.min(axis=0), points.max(axis=0), thick / 2), GREY)
+    front, behind = ("closed", "open") if asset.links else ("front", "behind")
+    return [
+        (front, studio.picture(looks(shut), 30, 25)),
+        (behind, studio.picture(looks(open_), 30 if asset.links else 210, 25)),
+        ("hulls", studio.picture(hulls, 30, 25)),
+        ("surfaces, handles", studio.picture([edges, *marks], 30, 25)),
+        ("from above", studio.picture([*looks(open_), *marks], 30, 70)),
+    ]
+
+
+def hull_bodies(hulls: Sequence[Hull], *, pose: Array | None = None, first_colour: int = 0) -> list[Body]:
+    """Hulls in colours of their own, each drawn a little smaller than it is, so that all are seen."""
+    bodies = []
+    for i, hull in enumerate(hulls):
+        middle = hull.vertices.mean(axis=0)
+        small = middle + 0.97 * (hull.vertices - middle)
+        colour = _hue(i + first_colour)
+        bodies.append(
+            Body(hull.vertices, faces=small[hull.faces], colour=colour, pose=np.eye(4) if pose is None else pose)
+        )
+    return bodies
+
+
+def standing(body: Body, poses: Array) -> list[Body]:
+    """Copies of a body in resting poses, side by side on a slab."""
+    turned = [body.points @ pose[:3, :3].T + pose[:3, 3] for pose in poses]
+    step = 1.12 * np.max([np.ptp(points[:, :2], axis=0) for points in turned], axis=0) + 0.01
+    bodies = []
+    for i, (pose, points) in enumerate(zip(poses, turned, strict=True)):
+        moved = np.array(pose, dtype=float)
+        moved[:2, 3] += (i % 2, i // 2) * step - (points[:, :2].min(axis=0) + points[:, :2].max(axis=0)) / 2
+        bodies.append(Body(body.points, file=body.file, pose=moved))
+    places = np.array([(i % 2, i // 2) for i in range(len(poses))])
+    slab = box_faces((*(-0.5 * step), -0.004), (*((places.max(axis=0) + 0.5) * step), 0.0))
+    return [*bodies, _solid(slab, GROUND)]
+
+
+def gripper_faces(width: float, thick: float = FINGER) -> Array:
+    """Triangles (F, 3, 3) of a gripper of thin boxes, open by so much (m), in the TCP's frame."""
+    half, t = width / 2, thick / 2
+    fingers = [((-t, y - t, -0.04), (t, y + t, 0.0085)) for y in (-half - t, half + t)]
+    palm = ((-t, -half - thick, -0.04 - thick), (t, half + thick, -0.04))
+    stem = ((-t, -t, -0.08), (t, t, -0.04 - thick))
+    return np.concatenate([box_faces(low, high) for low, high in (*fingers, palm, stem)])
+
+
+def frame_faces(low: Array, high: Array, half: float) -> Array:
+    """Triangles (F, 3, 3) of bars along the edges of a box."""
+    bars = []
+    for a, b in ((1, 2), (0, 2), (0, 1)):
+        for i, j in np.ndindex(2, 2):
+            start, end = low.copy(), high.copy()
+            start[[a, b]] = end[[a, b]] = (low, high)[i][a], (low, high)[j][b]
+            bars.append(box_faces(start - half, end + half))
+    return np.concatenate(bars)
+
+
+def _solid(faces: Array, colour: Colour, pose: Array | None = None) -> Body:
+    return Body(faces.reshape(-1, 3), faces=faces, colour=colour, pose=np.eye(4) if pose is None else pose)
+
+
+def _count(number: int, thing: str) -> str:
+    return f"{number} {thing}{'' if number == 1 else 's'}"
+
+
+def _hue(i: int) -> Colour:
+    """Colours that differ much from one to the next."""
+    return colorsys.hsv_to_rgb(0.07 + i * 0.618034 % 1, 0.62, 0.9 - 0.25 * (i % 3 == 2))
+
+
+def _tone(friction: float) -> Colour:
+    """Green for grasps that need no friction to speak of, red for those that need 0.8."""
+    return colorsys.hsv_to_rgb(max(0.0, 0.33 * (1 - friction / 0.8)), 0.9, 0.8)
+
+
+def _font(size: int) -> ImageFont.ImageFont | ImageFont.FreeTypeFont:
+    return ImageFont.load_default(size)

@@ -1,0 +1,272 @@
+"""Which files of a folder are the object: of several versions the best one, of several parts all of them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, KDTree, QhullError
+
+from asset_tools.readers.files import TEXTURE_FOLDERS
+from asset_tools.readers.surface import Part
+from robocas_ms3.core.errors import AssetError
+
+Array = NDArray[np.float64]
+
+FORMATS = (".obj", ".glb", ".gltf", ".ply", ".stl", ".off", ".dae", ".3mf")  # the better first
+_WORD = r"(^|[^a-z])({})([^a-z]|$)"
+COLLISION = re.compile(_WORD.format("collisions?|collider|coll?|vhacd|coacd|ucx|ubx|usp|cvx|decomp|decomposed"))
+HULL = re.compile(_WORD.format("convex|hulls?|physics|phys"))  # or a part of a boat
+# what tells versions of one mesh apart
+QUALIFIERS = re.compile(
+    r"[^a-z0-9]*(non[^a-z0-9]*textured|untextured|textured?|tex|visual|lod[^a-z]*\d*|low|high|simplified)$"
+)
+PREFERRED_FOLDER = "google_16k"  # of the YCB set; its other folders hold the same mesh, larger or from other methods
+COLLISION_FOLDERS = {"collision", "collisions", "coacd", "vhacd"}
+DEPTH = 3  # folders below the object's in which meshes are looked for
+MOST_FILES = 64
+ENOUGH_FACES = 20_000  # more detail is no reason to prefer a mesh
+SAME = 0.02  # of the diagonal: distance of surfaces, and difference of boxes, that show the same
+COVERED = 0.9  # share of a surface that has to be on another one for that to show it
+APART = 0.05  # of the diagonal: gap between parts of one object at most
+INSIDE = 0.05  # share of a part inside of another's hull, above which they are two objects around one axis
+MOST_OF = 0.6  # of a hull's diagonal that other meshes have to reach
+SCALES = (1.0, 10.0, 100.0, 1000.0, 25.4, 2.54, 39.37, 0.3937)  # between units
+SAMPLES, TRIED = 20_000, 500  # points on a surface, and how many of them are compared with another surface
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A mesh file that may be the object, or a part of it.
+
+    Attributes:
+        path: of the file.
+        parts: what it holds.
+    """
+
+    path: Path
+    parts: list[Part]
+
+    @cached_property
+    def bounds(self) -> Array:
+        """(2, 3) of all faces."""
+        return np.array([self.samples.min(axis=0), self.samples.max(axis=0)])
+
+    @cached_property
+    def diagonal(self) -> float:
+        """Length of the bounding box's diagonal."""
+        return float(np.linalg.norm(self.bounds[1] - self.bounds[0]))
+
+    @cached_property
+    def textured(self) -> bool:
+        """Whether an image is shown."""
+        return any(part.uvs is not None and part.material.image is not None for part in self.parts)
+
+    @property
+    def rank(self) -> tuple[bool, bool, int, int, str]:
+        """Sort key, the best first: textured, coloured, detailed, of a better format, by name."""
+        coloured = any(part.colors is not None or part.material.color != (1.0, 1.0, 1.0) for part in self.parts)
+        faces, suffix = sum(len(part.faces) for part in self.parts), self.path.suffix.lower()
+        return not self.textured, not coloured, -min(faces, ENOUGH_FACES), FORMATS.index(suffix), self.path.name
+
+    @cached_property
+    def samples(self) -> Array:
+        """(N, 3) corners and points spread over the surface."""
+        offsets = np.cumsum([0] + [len(part.vertices) for part in self.parts[:-1]])
+        vertices = np.concatenate([part.vertices for part in self.parts])
+        faces = np.concatenate([part.faces + offset for part, offset in zip(self.parts, offsets, strict=True)])
+        mesh = trimesh.Trimesh(vertices, faces, process=False)
+        spread = np.asarray(trimesh.sample.sample_surface(mesh, SAMPLES, seed=0)[0])
+        used = vertices[np.unique(faces)]
+        ends = np.concatenate([used[used.argmin(axis=0)], used[used.argmax(axis=0)]])
+        return np.concatenate([spread, ends])
+
+    @cached_property
+    def tree(self) -> KDTree:
+        """Of the samples."""
+        return KDTree(self.samples)
+
+    def shows(self, points: Array) -> bool:
+        """Return whether points (N, 3) are on the surface, nearly all of them."""
+        reach = SAME * self.diagonal
+        near = ((points >= self.bounds[0] - reach) & (points <= self.bounds[1] + reach)).all(axis=1)
+        if near.mean() < COVERED:
+            return False
+        return bool((self.tree.query(points, distance_upper_bound=reach)[0] <= reach).mean() >= COVERED)
+
+
+def mesh_files(folder: Path) -> list[Path]:
+    """Return the mesh files of an object's folder and of the folders in it, by name.
+
+    Raises:
+        AssetError: there are none, or more than 64 apart from collision meshes.
+    """
+    found = _meshes_below(folder, DEPTH)
+    if not found:
+        others = sorted({path.suffix.lower() for path in folder.iterdir() if path.is_file()} - {""})
+        fix = f"Export the mesh in one of {', '.join(FORMATS)}."
+        raise AssetError("no mesh in this folder", where=folder, found=", ".join(others), fix=fix)
+    shown = [path for path in found if not is_collision(path, folder)]
+    if len(shown) > MOST_FILES:
+        fix, expected = "Give each object a folder of its own, or its parts in one file.", f"at most {MOST_FILES}"
+        raise AssetError("too many mesh files", where=folder, expected=expected, found=len(shown), fix=fix)
+    return found if shown else found[:MOST_FILES]
+
+
+def is_mesh(path: Path) -> bool:
+    """Return whether a file has the suffix of a mesh format; hidden files have not."""
+    return path.suffix.lower() in FORMATS and not path.name.startswith(".") and not path.is_dir()
+
+
+def is_collision(path: Path, folder: Path) -> bool:
+    """Return whether the name of a file, or of its folder below ``folder``, says that it is for collision checking."""
+    folders = {part.lower() for part in path.relative_to(folder).parts[:-1]}
+    return COLLISION.search(path.stem.lower()) is not None or bool(folders & COLLISION_FOLDERS)
+
+
+def choose(candidates: Sequence[Candidate], folder: Path, notes: list[str]) -> list[Candidate]:
+    """Return the candidates that together are the object.
+
+    What another mesh shows is left out: another version of it, or a part of it. Of versions the textured and most
+    detailed one stays. What remains has to look like parts of one object, which touch each other.
+
+    Args:
+        candidates: all with faces; no collision meshes, unless there are no others.
+        folder: that holds them.
+        notes: gets a line that says which files were used, and one per file that was ignored.
+
+    Raises:
+        AssetError: several files that do not look like parts of one object, all named.
+    """
+    ignored: dict[Path, str] = {}
+    left = _without_hulls(sorted(candidates, key=lambda one: one.rank), ignored)
+    best: list[Candidate] = []
+    for candidate in left:
+        other = next((kept for kept in best if _are_versions(kept, candidate)), None)
+        if other is None:
+            best.append(candidate)
+        else:
+            ignored[candidate.path] = f"another version of {_name(other, folder)}"
+    for candidate in list(best):
+        points = candidate.samples[:TRIED]
+        for other in best:
+            if other is not candidate and (other.textured or not candidate.textured) and other.shows(points):
+                ignored[candidate.path] = f"{_name(other, folder)} shows it"
+                best.remove(candidate)
+                break
+    if len(best) > 1:
+        _check_parts(best, folder)
+        notes.append(f"joined the parts {', '.join(_name(part, folder) for part in best)}")
+    elif ignored:
+        notes.append(f"used {_name(best[0], folder)}")
+    notes.extend(f"ignored {path.relative_to(folder).as_posix()}: {why}" for path, why in ignored.items())
+    return best
+
+
+def _meshes_below(folder: Path, depth: int) -> list[Path]:
+    entries = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
+    folders = [path for path in entries if path.is_dir() and path.name.lower() not in {"__macosx", *TEXTURE_FOLDERS}]
+    preferred = [path for path in folders if path.name.lower() == PREFERRED_FOLDER]
+    found = [path for path in entries if is_mesh(path)]
+    for path in preferred or folders:
+        found += _meshes_below(path, depth - 1) if depth else []
+    return found
+
+
+def _without_hulls(candidates: list[Candidate], ignored: dict[Path, str]) -> list[Candidate]:
+    """Return candidates without those called hulls, if the others are about as large."""
+    hulls = [one for one in candidates if HULL.search(one.path.stem.lower())]
+    others = [one for one in candidates if one not in hulls]
+    if not hulls or not others:
+        return candidates
+    box = np.array([one.bounds for one in others])
+    size = float(np.linalg.norm(box[:, 1].max(axis=0) - box[:, 0].min(axis=0)))
+    small = [one for one in hulls if MOST_OF * one.diagonal <= size]
+    ignored |= {one.path: "a collision mesh" for one in small}
+    return [one for one in candidates if one not in small]
+
+
+def _are_versions(first: Candidate, second: Candidate) -> bool:
+    """Return whether two files hold one mesh, which may be in another unit, or have another axis up."""
+    one, other = (_version_name(candidate.path) for candidate in (first, second))
+    alike = one == other and first.path.parent == second.path.parent
+    if alike and np.abs(first.bounds - second.bounds).max() <= SAME * first.diagonal:
+        return True
+    ratio = first.diagonal / max(second.diagonal, 1e-300)
+    scale = next((s for s in (*SCALES, *(1 / s for s in SCALES)) if abs(np.log(ratio / s)) < SAME), None)
+    if scale is None:
+        return False
+    turns = [np.eye(3)]
+    if alike:  # y up in one and z up in the other
+        turns += [np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]), np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])]
+    return any(_same_surface(first, second, scale * turn) for turn in turns)
+
+
+def _same_surface(first: Candidate, second: Candidate, transform: Array) -> bool:
+    """Return whether a surface, transformed (3x3), is another one."""
+    if not first.shows(second.samples[:TRIED] @ transform.T):
+        return False
+    return second.shows(first.samples[:TRIED] @ np.linalg.inv(transform).T)
+
+
+def _version_name(path: Path) -> str:
+    stem = path.stem.lower()
+    return QUALIFIERS.sub("", stem) or stem
+
+
+def _check_parts(parts: Sequence[Candidate], folder: Path) -> None:
+    """Check that files look like parts of one object.
+
+    Raises:
+        AssetError: they do not touch, or are around one axis and inside of each other, as separate objects are.
+    """
+    bounds = np.array([part.bounds for part in parts])
+    diagonal = float(np.linalg.norm(bounds[:, 1].max(axis=0) - bounds[:, 0].min(axis=0)))
+    joined, queue = {0}, [0]
+    while queue:
+        tree = parts[queue.pop()].tree
+        for index in set(range(len(parts))) - joined:
+            # parts touch along small areas: all samples of the smaller one count
+            if tree.query(parts[index].samples, distance_upper_bound=APART * diagonal)[0].min() < np.inf:
+                joined.add(index)
+                queue.append(index)
+    if len(joined) < len(parts) or (_around_one_axis(bounds, SAME * diagonal) and _inside(parts)):
+        raise AssetError(
+            "several mesh files that do not look like parts of one object",
+            where=folder,
+            expected="parts that touch each other, each in its place",
+            found=", ".join(_name(part, folder) for part in parts),
+            fix="Give each object a folder of its own, or join the parts into one file.",
+        )
+
+
+def _around_one_axis(bounds: Array, tolerance: float) -> bool:
+    """Return whether boxes (N, 2, 3) have one middle, or stand on one plane around one axis."""
+    middles = bounds.mean(axis=1)
+    apart = np.ptp(middles, axis=0) > tolerance
+    bases_apart = np.ptp(bounds[:, 0], axis=0) > tolerance
+    return not apart.any() or any(not bases_apart[axis] and not np.delete(apart, axis).any() for axis in range(3))
+
+
+def _inside(parts: Sequence[Candidate]) -> bool:
+    """Return whether much of a part is inside of the convex hull of another one."""
+    for one in parts:
+        try:
+            planes = ConvexHull(one.samples).equations
+        except QhullError:
+            continue
+        for other in parts:
+            heights = (other.samples[:TRIED] @ planes[:, :3].T + planes[:, 3]).max(axis=1)
+            if other is not one and (heights < -SAME * one.diagonal / 2).mean() > INSIDE:
+                return True
+    return False
+
+
+def _name(candidate: Candidate, folder: Path) -> str:
+    return candidate.path.relative_to(folder).as_posix()

@@ -1,0 +1,245 @@
+"""Formats that trimesh reads: PLY, STL, OFF, COLLADA and 3MF."""
+
+from __future__ import annotations
+
+import io
+import logging
+import re
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from PIL import Image
+from trimesh.resolvers import Resolver
+from trimesh.visual.material import PBRMaterial
+
+from asset_tools.readers.files import LARGEST_FILE, ModelFiles
+from asset_tools.readers.images import open_texture
+from asset_tools.readers.obj import MOST_FACES, MOST_VERTICES, decode_text
+from asset_tools.readers.surface import Material, Part, decode_srgb
+from robocas_ms3.core.errors import AssetError, require_extra
+from robocas_ms3.core.text import error_line
+
+TEXTURE_COMMENT = re.compile(rb"comment\s+TextureFile\s+(.*)", re.IGNORECASE)
+PLY_UVS = {b"s", b"t", b"u", b"v", b"texture_u", b"texture_v", b"texcoord"}
+PLY_COLORS = {b"diffuse_red": b"red", b"diffuse_green": b"green", b"diffuse_blue": b"blue"}
+LONGEST_HEADER = 65536  # bytes of a PLY file
+BLACK = 0.02  # linear
+
+
+def read_exchange(path: Path, files: ModelFiles) -> list[Part]:
+    """Read a file of one of these formats.
+
+    Args:
+        path: the file.
+        files: reads it and what it names; gets the warnings.
+
+    Raises:
+        AssetError: the file is damaged, too large, or names a texture that is missing.
+        MissingExtraError: COLLADA, without pycollada.
+    """
+    data, suffix = files.read(path), path.suffix.lower()[1:]
+    if suffix == "dae":
+        require_extra("assets", "COLLADA files", "collada")
+    if suffix == "3mf":
+        _check_archive(data, path, files)
+    textures, faces = _Textures(path, files), 0
+    if suffix == "ply":
+        data, faces = _ply_checked(data, path, textures)
+    elif suffix == "off":
+        faces = _off_faces(data, path, files)
+    try:
+        with _quiet():
+            scene = trimesh.load_scene(io.BytesIO(data), suffix, resolver=textures, process=False)
+        parts = [part for part in _parts(scene, textures) if len(part.faces)]
+    except AssetError:
+        raise
+    except Exception as error:  # whatever trimesh's parsers trip over
+        found = error_line(error, 200)
+        raise AssetError("can't read this mesh", where=path, found=found, fix="Export it again.") from error
+    if textures.error is not None:
+        raise textures.error
+    count = sum(len(part.faces) for part in parts)
+    if count < faces:
+        found, fix = f"{count} faces", "Copy or export it again."
+        raise AssetError("the file is cut short", where=path, expected=f"{faces} faces", found=found, fix=fix)
+    if count > MOST_FACES:
+        expected = f"at most {MOST_FACES:,}"
+        raise AssetError("the mesh has too many faces", where=path, expected=expected, fix="Reduce it.")
+    return parts
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep trimesh's log lines, with tracebacks, from the terminal: what is wrong is said by errors and notes."""
+    logger = logging.getLogger("trimesh")
+    disabled, logger.disabled = logger.disabled, True
+    try:
+        yield
+    finally:
+        logger.disabled = disabled
+
+
+class _Textures(Resolver):
+    """Gives trimesh the textures that a file names, wherever they are below the model's folder."""
+
+    def __init__(self, path: Path, files: ModelFiles) -> None:
+        self._path, self._files = path, files
+        self._images: dict[bytes, Image.Image] = {}
+        self.error: AssetError | None = None
+
+    def note(self, text: str) -> None:
+        """Add a warning."""
+        self._files.notes.append(text)
+
+    def get(self, name: str) -> bytes:
+        """Return the image as BMP, 8 bits a channel."""
+        try:
+            file = self._files.find(name, self._path.parent)
+            if file is None:
+                where, fix = self._path.parent / name, "Put it next to the mesh."
+                raise AssetError("a texture that the mesh names is missing", where=where, fix=fix)
+            image = open_texture(self._files.read(file), file, self._files.notes)
+        except AssetError as error:
+            self.error, image = self.error or error, Image.new("RGB", (1, 1))  # raised when trimesh is done
+        stream = io.BytesIO()
+        image.save(stream, format="BMP")  # no time is lost by compressing it
+        return stream.getvalue()
+
+    def keys(self) -> list[str]:
+        """Return no names: none is known before it is asked for."""
+        return []
+
+    def namespaced(self, namespace: str) -> _Textures:
+        """Return itself: names are those in the file."""
+        return self
+
+    def write(self, name: str, data: Any) -> None:
+        """Refuse to write."""
+        raise NotImplementedError
+
+    def shared(self, image: Image.Image) -> Image.Image:
+        """Return the same object for images of the same content."""
+        image = image.convert("RGB")
+        return self._images.setdefault(image.tobytes(), image)
+
+
+def _check_archive(data: bytes, path: Path, files: ModelFiles) -> None:
+    """Check what a 3MF unpacks to before it is unpacked; warn about colours, which are not read."""
+    try:
+        archive = zipfile.ZipFile(io.BytesIO(data))
+        size = sum(info.file_size for info in archive.infolist())
+        if size > LARGEST_FILE:
+            expected, found = f"at most {LARGEST_FILE >> 20} MB unpacked", f"{size >> 20} MB"
+            raise AssetError(
+                "the file is too large", where=path, expected=expected, found=found, fix="Reduce the mesh."
+            )
+        models = [archive.read(info) for info in archive.infolist() if info.filename.lower().endswith(".model")]
+    except (zipfile.BadZipFile, zlib.error, ValueError, OSError, RuntimeError, EOFError) as error:
+        raise AssetError("can't read this mesh", where=path, found=error, fix="Export it again.") from error
+    if any(b"basematerials" in model or b"colorgroup" in model for model in models):
+        files.notes.append(f"warning: {path.name}: ignored the colours of a 3MF file")
+
+
+def _ply_checked(data: bytes, path: Path, textures: _Textures) -> tuple[bytes, int]:
+    """Return a PLY file with bounded counts, whose header is as trimesh reads it, and its number of faces."""
+    end = data.find(b"end_header", 0, LONGEST_HEADER)
+    if end < 0:
+        raise AssetError("can't read this mesh", where=path, expected="a PLY header", fix="Export it again.")
+    lines = [line.strip() for line in data[:end].splitlines()]
+    names = [decode_text(match[1]).strip('"') for line in lines if (match := TEXTURE_COMMENT.match(line))]
+    if len(names) > 1:
+        textures.note(f"warning: {path.name}: ignored textures after the first, of {len(names)}")
+    header = [b"ply", *[line for line in lines if line.startswith(b"format")][:1]]
+    header += [f"comment TextureFile {name}".encode() for name in names[:1]]
+    faces = 0
+    for line in lines:
+        words = line.split()
+        if words[:1] == [b"element"]:
+            kind, count = [*words[1:], b"", b""][:2]
+            limit = MOST_FACES if kind == b"face" else MOST_VERTICES
+            if not (count.isdigit() and len(count) < 12 and int(count) <= limit):
+                what = f"the mesh has too many elements {decode_text(kind)[:20]!r}"
+                found = decode_text(count)[:20]
+                raise AssetError(what, where=path, expected=f"at most {limit:,}", found=found, fix="Reduce it.")
+            faces = int(count) if kind == b"face" else faces
+            header.append(line)
+        elif words[:1] == [b"property"]:
+            name = words[-1]
+            # trimesh shows coordinates without an image in grey, and drops the colours
+            name = PLY_COLORS.get(name, name) if names or name not in PLY_UVS else b"unused_" + name
+            header.append(b" ".join([*words[:-1], name]))
+    return b"\n".join([*header, data[end:]]), faces
+
+
+def _off_faces(data: bytes, path: Path, files: ModelFiles) -> int:
+    """Return the number of faces in the header of an OFF file; warn about colours, which are not read."""
+    words = re.sub(rb"#[^\n]*", b"", data[:LONGEST_HEADER]).split()
+    if words and words[0].upper().startswith(b"C"):
+        files.notes.append(f"warning: {path.name}: ignored vertex colours of an OFF file")
+    counts = words[1:3] if words and words[0].upper().endswith(b"OFF") else words[:2]
+    if len(counts) < 2 or not all(count.isdigit() and len(count) < 12 for count in counts):
+        raise AssetError("can't read this mesh", where=path, expected="an OFF header", fix="Export it again.")
+    if int(counts[0]) > MOST_VERTICES or int(counts[1]) > MOST_FACES:
+        expected = f"at most {MOST_FACES:,} faces"
+        raise AssetError("the mesh has too many faces or vertices", where=path, expected=expected, fix="Reduce it.")
+    return int(counts[1])
+
+
+def _parts(scene: trimesh.Scene, textures: _Textures) -> Iterator[Part]:
+    for node in scene.graph.nodes_geometry:
+        pose, name = scene.graph[node]
+        mesh = scene.geometry[name]
+        if isinstance(mesh, trimesh.Trimesh):
+            part = _part(mesh, textures)
+            part.vertices = part.vertices @ pose[:3, :3].T + pose[:3, 3]
+            if not np.array_equal(pose, np.eye(4)):
+                part.normals = None
+            if np.linalg.det(pose[:3, :3]) < 0:
+                part.faces = part.faces[:, ::-1]
+            yield part
+
+
+def _part(mesh: trimesh.Trimesh, textures: _Textures) -> Part:
+    vertices, faces = np.array(mesh.vertices, float), np.array(mesh.faces, np.int64)
+    normals = mesh._cache.cache.get("vertex_normals")  # those of the file, no computed ones
+    visual: Any = mesh.visual
+    if visual.kind == "face":
+        colors = np.repeat(decode_srgb(np.asarray(visual.face_colors)[:, :3]), 3, axis=0)
+        return Part(vertices[faces.reshape(-1)], np.arange(3 * len(faces)).reshape(-1, 3), colors=colors)
+    if visual.kind == "vertex":
+        return Part(vertices, faces, None, decode_srgb(np.asarray(visual.vertex_colors)[:, :3]), normals)
+    if visual.kind != "texture":
+        return Part(vertices, faces, normals=normals)
+    material, uvs = visual.material, visual.uv
+    image = getattr(material, "image", None)
+    if isinstance(material, PBRMaterial):
+        image = material.baseColorTexture
+    if image is None or uvs is None or len(uvs) != len(vertices):
+        colors = mesh.vertex_attributes.get("color")
+        if colors is not None and len(colors) == len(vertices):
+            return Part(vertices, faces, None, decode_srgb(_bytes(colors)[:, :3]), normals)
+        return Part(vertices, faces, normals=normals, material=Material(_plain(material)))
+    return Part(vertices, faces, np.array(uvs, float), None, normals, Material(image=textures.shared(image)))
+
+
+def _plain(material: Any) -> tuple[float, float, float]:
+    """Return the linear colour of a COLLADA material; white for those of a PLY, which have none."""
+    if not isinstance(material, PBRMaterial) or material.baseColorFactor is None:
+        return 1.0, 1.0, 1.0
+    red, green, blue = (float(value) for value in decode_srgb(np.asarray(material.baseColorFactor)[:3]))
+    glow = material.emissiveFactor
+    if glow is not None and max(red, green, blue) < BLACK:
+        red, green, blue = (float(value) for value in decode_srgb(255 * np.clip(glow, 0, 1)))
+    return red, green, blue
+
+
+def _bytes(colors: NDArray) -> NDArray:
+    values = np.asarray(colors)
+    return values * 255 if values.dtype.kind == "f" and len(values) and values.max() <= 1 else values

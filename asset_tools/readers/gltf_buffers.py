@@ -1,0 +1,142 @@
+"""The binary data of a glTF file: buffers, views of them, and the typed arrays in these."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TypeVar
+from urllib.parse import unquote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asset_tools.readers import gltf_schema as schema
+from asset_tools.readers.files import LARGEST_FILE, ModelFiles
+from robocas_ms3.core.errors import AssetError
+
+Array = NDArray[np.float64]
+Item = TypeVar("Item")
+
+DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+
+
+class Buffers:
+    """Decoded data of a glTF file.
+
+    Args:
+        model: the JSON.
+        blob: the binary chunk of a GLB; empty: none.
+        path: the file.
+        files: reads what the file names.
+    """
+
+    def __init__(self, model: schema.Gltf, blob: bytes, path: Path, files: ModelFiles) -> None:
+        self._model, self._blob, self._path, self._files = model, blob, path, files
+        self._buffers: dict[int, bytes] = {}
+        self._quantised = "KHR_mesh_quantization" in model.extensionsUsed
+
+    def content(self, uri: str) -> tuple[bytes, Path]:
+        """Return what a URI stands for, and the file that holds it."""
+        if uri.startswith("data:"):
+            try:
+                return base64.b64decode(unquote(uri.partition(",")[2]), validate=True), self._path
+            except binascii.Error as error:
+                raise ValueError(f"a data URI that can't be read: {error}") from error
+        file = self._files.find(unquote(uri), self._path.parent)
+        if file is None:
+            where, fix = self._path.parent / unquote(uri), "Put it next to the mesh."
+            raise AssetError("a file this mesh names is missing", where=where, fix=fix)
+        return self._files.read(file), file
+
+    def view(self, index: int) -> tuple[bytes, schema.BufferView]:
+        """Return the bytes of a buffer view, and its entry."""
+        view = entry(self._model.bufferViews, index, "bufferViews")
+        if any("meshopt" in name for name in view.extensions):
+            raise ValueError("its data is compressed (meshopt)")
+        if view.buffer not in self._buffers:
+            buffer = entry(self._model.buffers, view.buffer, "buffers")
+            self._buffers[view.buffer] = self._blob if buffer.uri is None else self.content(buffer.uri)[0]
+            if sum(map(len, self._buffers.values())) > 2 * LARGEST_FILE:
+                raise ValueError(f"more than {2 * LARGEST_FILE >> 20} MB of buffers")
+        data = self._buffers[view.buffer][view.byteOffset : view.byteOffset + view.byteLength]
+        if len(data) < view.byteLength:
+            raise ValueError(f"bufferViews.{index} has {len(data)} of {view.byteLength} bytes")
+        return data, view
+
+    def values(self, index: int) -> NDArray:
+        """Return the values of an accessor, (count, width); normalised integers as floats, -1 or 0 to 1."""
+        accessor = entry(self._model.accessors, index, "accessors")
+        dtype, width = np.dtype(DTYPES[accessor.componentType]), WIDTHS[accessor.type]
+        if accessor.bufferView is None:
+            values = np.zeros((accessor.count, width), dtype)
+        else:
+            data, view = self.view(accessor.bufferView)
+            values = _rows(data, accessor.byteOffset, view.byteStride, dtype, width, accessor.count)
+        sparse = accessor.sparse
+        if sparse is not None:
+            at, kind = sparse.indices, np.dtype(DTYPES[sparse.indices.componentType])
+            where = _rows(self.view(at.bufferView)[0], at.byteOffset, None, kind, 1, sparse.count)
+            new_data, new_offset = self.view(sparse.values.bufferView)[0], sparse.values.byteOffset
+            values = values.copy()
+            values[where.reshape(-1).astype(np.int64)] = _rows(new_data, new_offset, None, dtype, width, sparse.count)
+        return _normalised(values) if accessor.normalized else values
+
+    def has_data(self, index: int) -> bool:
+        """Return whether an accessor has values of its own, not only zeros for an extension to fill."""
+        accessor = entry(self._model.accessors, index, "accessors")
+        return accessor.bufferView is not None or accessor.sparse is not None
+
+    def vectors(self, index: int, width: int) -> Array:
+        """Return the (V, width) vectors of an accessor.
+
+        Raises:
+            ValueError: the vectors are of another width.
+        """
+        values = self.values(index)
+        if values.shape[1] != width:
+            raise ValueError(f"accessors.{index} has {values.shape[1]} components, expected {width}")
+        return values.astype(float)
+
+    def coordinates(self, index: int) -> Array:
+        """Return (V, 2) texture coordinates, v downward; integers are normalised unless the file is quantised."""
+        values = self.values(index)
+        if values.shape[1] != 2:
+            raise ValueError(f"accessors.{index} has {values.shape[1]} components, expected 2")
+        return (values if self._quantised else _normalised(values)).astype(float)
+
+    def colors(self, index: int) -> Array:
+        """Return (V, 3) linear vertex colours, which may be NaN; integers are always normalised."""
+        values = self.values(index)
+        if values.shape[1] not in (3, 4):
+            raise ValueError(f"accessors.{index} has {values.shape[1]} components, expected 3 or 4")
+        return np.clip(_normalised(values)[:, :3].astype(float), 0, 1)
+
+
+def entry(items: Sequence[Item], index: int | None, name: str) -> Item:
+    """Return an entry of a list of the file.
+
+    Raises:
+        ValueError: there is no such entry.
+    """
+    if index is None or not 0 <= index < len(items):
+        raise ValueError(f"{name} has no entry {index}, of {len(items)}")
+    return items[index]
+
+
+def _normalised(values: NDArray) -> NDArray:
+    """Return integers as shares of the largest; floats as they are."""
+    if values.dtype.kind == "f":
+        return values
+    return np.maximum(values.astype(float) / np.iinfo(values.dtype).max, -1.0)
+
+
+def _rows(data: bytes, offset: int, stride: int | None, dtype: np.dtype, width: int, count: int) -> NDArray:
+    """Return (count, width) values that are ``stride`` bytes apart; None: one after the other."""
+    size = dtype.itemsize * width
+    stride = stride or size
+    if count and offset + stride * (count - 1) + size > len(data):
+        raise ValueError(f"an accessor of {count} elements in {len(data)} bytes")
+    return np.ndarray((count, width), dtype, data, offset, (stride, dtype.itemsize))

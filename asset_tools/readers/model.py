@@ -1,0 +1,162 @@
+"""A model's files as one mesh."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import trimesh
+
+from asset_tools.readers.choice import FORMATS, Candidate, choose, is_collision, is_mesh, mesh_files
+from asset_tools.readers.exchange import read_exchange
+from asset_tools.readers.files import ModelFiles
+from asset_tools.readers.gltf import read_gltf
+from asset_tools.readers.obj import MOST_FACES
+from asset_tools.readers.obj_model import read_obj
+from asset_tools.readers.surface import Part, to_mesh
+from robocas_ms3.core.errors import AssetError, RobocasError
+
+READERS: dict[str, Callable[[Path, ModelFiles], list[Part]]] = {
+    ".obj": read_obj,
+    ".glb": read_gltf,
+    ".gltf": read_gltf,
+}  # the others are trimesh's
+
+
+LARGEST_UV = 1e4  # an image that repeats more often is an error of the file
+UPS: dict[bytes, Literal["x", "y", "z"]] = {b"X": "x", b"Y": "y", b"Z": "z"}
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """What was read of a model.
+
+    Attributes:
+        mesh: of all its triangles, in the unit and frame of the file.
+        up: axis that points up by the format's rules; None: the format has none.
+        files: all that were read, for a content hash.
+        notes: files used and ignored, substitutions, and warnings; a line each.
+    """
+
+    mesh: trimesh.Trimesh
+    up: Literal["x", "y", "z"] | None
+    files: tuple[Path, ...]
+    notes: tuple[str, ...]
+
+
+def read_model(path: Path | list[Path], root: Path | None = None) -> Model:
+    """Read a model: a mesh file, a folder with its files, or several files of which some may be versions.
+
+    Args:
+        path: of the model.
+        root: the imported folder, outside of which nothing is read; None: the model's own folder.
+
+    Raises:
+        AssetError: a file is missing, damaged, too large or outside of ``root``; the mesh is empty, of no size or not
+            finite; or a folder holds several objects.
+    """
+    paths = [Path(os.path.abspath(one)) for one in (path if isinstance(path, list) else [path])]
+    is_folder = paths[0].is_dir()
+    home = paths[0] if is_folder else paths[0].parent
+    files = ModelFiles(Path(os.path.abspath(root or home)), home, None if is_folder else paths[0].stem)
+    if len(paths) == 1 and not is_folder:
+        chosen = [_candidate(paths[0], files)]
+    else:
+        chosen = _chosen(mesh_files(home) if is_folder else paths, files)
+    mesh = to_mesh([part for candidate in chosen for part in candidate.parts])
+    _check(mesh, paths[0])
+    return Model(mesh, _up(chosen[0].path, files), tuple(files.used), tuple(dict.fromkeys(files.notes)))
+
+
+def _chosen(paths: list[Path], files: ModelFiles) -> list[Candidate]:
+    """Return the candidates that are the object; notes are those of the files that are used."""
+    collision = [path for path in paths if is_collision(path, files.home)]
+    if len(collision) == len(paths):
+        collision = []
+    shown = [path for path in paths if path not in collision]
+    candidates: list[tuple[Candidate, ModelFiles]] = []
+    errors: dict[Path, RobocasError] = {}
+    for path in shown:
+        own = ModelFiles(files.root, files.home, files.stem)
+        try:
+            candidates.append((_candidate(path, own), own))
+        except RobocasError as error:
+            errors[path] = error
+    if not candidates:
+        raise next(iter(errors.values()))
+    chosen = choose([candidate for candidate, _ in candidates], files.home, files.notes)
+    names = {path: path.relative_to(files.home).as_posix() for path in paths}
+    if not files.notes and len(paths) > 1:
+        files.notes.append(f"used {names[chosen[0].path]}")
+    files.notes.extend(f"ignored {names[path]}: a collision mesh" for path in collision)
+    files.notes.extend(f"warning: ignored {names[path]}: {error}" for path, error in errors.items())
+    for candidate, own in candidates:
+        # those that were not chosen count too: without them the notes would be others
+        files.used.extend(path for path in own.used if path not in files.used)
+        if candidate in chosen:
+            files.notes.extend(own.notes)
+    return chosen
+
+
+def _candidate(path: Path, files: ModelFiles) -> Candidate:
+    if not os.path.lexists(path):
+        raise AssetError("there is no such mesh", where=path)
+    if not is_mesh(path):
+        raise AssetError("not a mesh file", where=path, expected=f"one of {', '.join(FORMATS)}", found=path.suffix)
+    parts = READERS.get(path.suffix.lower(), read_exchange)(path, files)
+    parts = [_clean(part, path, files) for part in parts if len(part.faces)]
+    if not parts:
+        fix = "Export it again, with its faces."
+        raise AssetError("the mesh is empty", where=path, expected="triangles", found="none", fix=fix)
+    return Candidate(path, parts)
+
+
+def _clean(part: Part, path: Path, files: ModelFiles) -> Part:
+    """Return a part without unused vertices, and without coordinates and colours that are not finite.
+
+    Raises:
+        AssetError: the faces have vertices that are not finite.
+    """
+    used, faces = np.unique(part.faces, return_inverse=True)
+    vertices, uvs, colors, normals = (
+        None if values is None else values[used] for values in (part.vertices, part.uvs, part.colors, part.normals)
+    )
+    assert vertices is not None
+    if not np.isfinite(vertices).all():
+        found = f"{int((~np.isfinite(vertices).all(axis=1)).sum())} of {len(vertices)}"
+        fix = "Export it again."
+        raise AssetError("the mesh has vertices that are not finite", where=path, found=found, fix=fix)
+    if uvs is not None and not (np.abs(uvs) < LARGEST_UV).all():
+        files.notes.append(f"warning: {path.name}: left out a texture, whose coordinates are not finite")
+        uvs = None
+    if colors is not None and not np.isfinite(colors).all():
+        files.notes.append(f"warning: {path.name}: left out vertex colours that are not finite")
+        colors = None
+    if normals is not None and not (np.isfinite(normals).all() and (np.abs(normals) <= 1.01).all()):
+        normals = None
+    return Part(vertices, faces.reshape(-1, 3), uvs, colors, normals, part.material)
+
+
+def _check(mesh: trimesh.Trimesh, path: Path) -> None:
+    if len(mesh.faces) > MOST_FACES:
+        expected = f"at most {MOST_FACES:,}"
+        raise AssetError("the mesh has too many faces", where=path, expected=expected, fix="Reduce it.")
+    size, fix = float(mesh.extents.max()), "Export it again, in metres."
+    if not 1e-9 < size < 1e9:
+        expected, found = "1e-9 to 1e9 units", f"{size:g}"
+        raise AssetError("the mesh has no usable size", where=path, expected=expected, found=found, fix=fix)
+
+
+def _up(path: Path, files: ModelFiles) -> Literal["x", "y", "z"] | None:
+    suffix = path.suffix.lower()
+    if suffix in (".glb", ".gltf"):
+        return "y"
+    if suffix == ".dae":
+        found = re.search(rb"<up_axis>\s*([XYZ])_UP", files.read(path))
+        return UPS[found[1]] if found else "y"  # which is the format's default
+    return None

@@ -1,0 +1,197 @@
+"""OBJ files with their materials and textures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from asset_tools.readers.files import ModelFiles, missing_path
+from asset_tools.readers.images import open_texture
+from asset_tools.readers.obj import MtlMaterial, ObjMesh, decode_text, find_material, parse_mtl, parse_obj
+from asset_tools.readers.surface import WHITE, Material, Part, decode_srgb
+from robocas_ms3.core.errors import AssetError
+
+Ints = NDArray[np.int64]
+
+IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tga", ".tif", ".tiff", ".webp")
+BLACK = 0.02  # linear
+COLOURED = 0.05  # difference of the channels of a colour that is no grey
+MOST_MATERIALS = 1000
+
+
+def read_obj(path: Path, files: ModelFiles) -> list[Part]:
+    """Read an OBJ file: one part per material.
+
+    Faces without a material, or of one that no MTL file has, get the only textured material there is; where there is
+    none or several, they are white.
+
+    Args:
+        path: the file.
+        files: reads it and what it names; gets a line per substitution.
+
+    Raises:
+        AssetError: the file is damaged, or a material file or texture that its faces need is missing.
+    """
+    mesh = parse_obj(decode_text(files.read(path)), path)
+    if len(mesh.faces) == 0:
+        return []
+    materials = _libraries(mesh, path, files)
+    images: dict[str, Image.Image] = {}
+    parts = []
+    order = np.argsort(mesh.face_materials, kind="stable")
+    used, starts = np.unique(mesh.face_materials[order], return_index=True)
+    if len(used) > MOST_MATERIALS:
+        expected = f"at most {MOST_MATERIALS}"
+        fix = "Bake its materials into one texture."
+        raise AssetError("the mesh has too many materials", where=path, expected=expected, found=len(used), fix=fix)
+    for index, rows in zip(used.tolist(), np.split(order, starts[1:]), strict=True):
+        name = mesh.material_names[index] if index >= 0 else ""
+        has_uvs = bool((mesh.face_uvs[rows] >= 0).any())
+        found = _material(name, materials, has_uvs, path, files)
+        with_uvs = (mesh.face_uvs[rows] >= 0).all(axis=1)
+        if found is not None and (found[0].image or found[0].emission_image) and not with_uvs.all() and with_uvs.any():
+            parts.append(_part(mesh, rows[~with_uvs], MtlMaterial(name, found[0].color), found[1], images, files))
+            rows = rows[with_uvs]  # noqa: PLW2901
+        parts.append(_part(mesh, rows, *(found or (None, path)), images, files))
+    return parts
+
+
+def _libraries(mesh: ObjMesh, path: Path, files: ModelFiles) -> dict[str, tuple[MtlMaterial, Path]]:
+    """Return the materials of all MTL files that a mesh names, each with the file that has it."""
+    places: list[Path] = []
+    missing: list[str] = []
+    for line in mesh.libraries:
+        whole = files.find(line, path.parent)
+        for name in [line] if whole is not None else line.split():
+            file = files.find(name, path.parent)
+            if file is not None:
+                places.append(file)
+            else:
+                missing.append(name if len(line.split()) == 1 else line)
+    if not places and (missing or mesh.material_names or (not mesh.libraries and len(mesh.uvs))):
+        beside = _beside(path, (".mtl",)) or _only_library(mesh, path, files)
+        if beside is not None:
+            places.append(beside)
+            files.notes.append(f"took {beside.name} for {missing[0] if missing else 'the material file'}")
+        elif missing and (len(mesh.uvs) or mesh.material_names):
+            what, fix = "the material file that the mesh names is missing", "Put it next to the mesh."
+            raise AssetError(what, where=path.parent / missing[0], fix=fix)
+    found: dict[str, tuple[MtlMaterial, Path]] = {}
+    for place in dict.fromkeys(places):
+        materials = parse_mtl(decode_text(files.read(place)))
+        found |= {name: (material, place) for name, material in materials.items() if name not in found}
+    return found
+
+
+def _beside(path: Path, suffixes: tuple[str, ...]) -> Path | None:
+    """Return the file next to another one that has its name, in whatever letter case, and one of some suffixes."""
+    alike = {file.suffix.lower(): file for file in path.parent.iterdir() if file.stem.lower() == path.stem.lower()}
+    return next((alike[suffix] for suffix in suffixes if suffix in alike), None)
+
+
+def _only_library(mesh: ObjMesh, path: Path, files: ModelFiles) -> Path | None:
+    """Return the only MTL file next to an OBJ, if it has all materials of its faces."""
+    found = [file for file in path.parent.iterdir() if file.suffix.lower() == ".mtl"]
+    if len(found) != 1 or not mesh.material_names:
+        return None
+    materials = parse_mtl(decode_text(files.read(found[0])))
+    return found[0] if all(find_material(name, materials) for name in mesh.material_names) else None
+
+
+def _material(
+    name: str, materials: dict[str, tuple[MtlMaterial, Path]], has_uvs: bool, path: Path, files: ModelFiles
+) -> tuple[MtlMaterial, Path] | None:
+    """Return the material of faces and the file that has it; None: white."""
+    exact = find_material(name, {key: material for key, (material, _) in materials.items()}) if name else None
+    if exact is not None:
+        return materials[exact.name]
+    textured = [entry for entry in materials.values() if entry[0].image]
+    only = textured[0] if len(textured) == 1 else None
+    if only is None and len(materials) == 1:
+        only = next(iter(materials.values()))
+    if only is not None and (has_uvs or not only[0].image):
+        files.notes.append(f"took the material {only[0].name} for faces {f'of {name}' if name else 'without one'}")
+        return only
+    image = _beside(path, IMAGES)
+    if has_uvs and image is not None and not materials:
+        files.notes.append(f"took {image.name} for faces {f'of {name}' if name else 'without a material'}")
+        return MtlMaterial(name, image=image.name), path
+    if materials or (name and has_uvs):
+        known = ", ".join(list(materials)[:5]) or "none"
+        what = f"faces of the material {name}" if name else "faces without a material"
+        files.notes.append(f"warning: {path.name}: {what} are white; known materials: {known}")
+    return None
+
+
+def _part(
+    mesh: ObjMesh,
+    rows: Ints,
+    material: MtlMaterial | None,
+    place: Path,
+    images: dict[str, Image.Image],
+    files: ModelFiles,
+) -> Part:
+    """Return the triangles of one material, a vertex for each different corner."""
+    use_normals = bool((mesh.face_normals[rows] >= 0).all())
+    shown, uv_map = _look(material, place, images, files, bool((mesh.face_uvs[rows] >= 0).all()))
+    columns = [mesh.faces[rows].reshape(-1)]
+    columns.append(mesh.face_uvs[rows].reshape(-1) if shown.image is not None else np.full(3 * len(rows), -1))
+    columns.append(mesh.face_normals[rows].reshape(-1) if use_normals else np.full(3 * len(rows), -1))
+    corners, inverse = np.unique(np.column_stack(columns), axis=0, return_inverse=True)
+    uvs = None
+    if shown.image is not None:
+        scale, offset = uv_map
+        uvs = mesh.uvs[corners[:, 1]] * scale + offset
+    colors = None
+    if mesh.colors is not None:
+        values = mesh.colors[corners[:, 0]]
+        if shown.image is None:
+            colors, shown = decode_srgb(255 * values), Material()  # Kd next to vertex colours is a mere default
+        elif (values != 1).any():
+            files.notes.append("warning: ignored vertex colours next to a texture")
+    normals = mesh.normals[corners[:, 2]] if use_normals else None
+    if normals is not None:
+        normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return Part(mesh.vertices[corners[:, 0]], inverse.reshape(-1, 3), uvs, colors, normals, shown)
+
+
+def _look(
+    material: MtlMaterial | None, place: Path, images: dict[str, Image.Image], files: ModelFiles, has_uvs: bool
+) -> tuple[Material, tuple[tuple[float, float], tuple[float, float]]]:
+    """Return what a material looks like, and scale and offset of its UVs."""
+    plain = (1.0, 1.0), (0.0, 0.0)
+    if material is None:
+        return Material(), plain
+    if material.transparent:
+        files.notes.append("warning: ignored transparency")
+    name = material.image
+    if material.emission_image and (not name or (material.color is not None and max(material.color) < BLACK)):
+        name = material.emission_image
+    if name and has_uvs:
+        if name not in images:
+            file = files.find(name, place.parent)
+            if file is None:
+                where = missing_path(name, place.parent)
+                what, fix = "the texture file that the material names is missing", "Put it next to the mesh."
+                raise AssetError(what, where=where, fix=fix)
+            images[name] = open_texture(files.read(file), file, files.notes)
+        # a grey Kd next to a texture is a mere default: scanners write 0.8, some write 0
+        tinted = material.color is not None and np.ptp(material.color) > COLOURED and name == material.image
+        color = _linear(material.color) if tinted and material.color is not None else WHITE
+        return Material(color, images[name]), (material.uv_scale, material.uv_offset)
+    if name:
+        files.notes.append(f"warning: left out the texture {name}: faces without texture coordinates")
+    color = material.color
+    if color is not None and material.emission is not None and max(color) < BLACK:
+        color = material.emission
+    if color is None:
+        return Material(), plain
+    return Material(_linear(color)), plain
+
+
+def _linear(color: tuple[float, float, float]) -> tuple[float, float, float]:
+    red, green, blue = (float(value) for value in decode_srgb(255 * np.array(color)))
+    return red, green, blue

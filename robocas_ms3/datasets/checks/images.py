@@ -1,0 +1,152 @@
+"""Checks of what the cameras of an episode saw: intrinsics and poses, image files, depth against both."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.core.documents import DAMAGED, load_array
+from robocas_ms3.core.poses import from_xyzw
+from robocas_ms3.core.text import count_of, one_line
+from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.checks import depth as geometry
+from robocas_ms3.datasets.checks.violation import NO_FILE, Violation
+from robocas_ms3.datasets.images.image_files import Pictures
+from robocas_ms3.datasets.images.image_headers import PictureHeader, read_header
+from robocas_ms3.datasets.sources.arrays import EpisodeArrays
+from robocas_ms3.datasets.sources.files import CAMERA_LIMIT
+from robocas_ms3.robots.cameras import Parent
+
+_SURPLUS = "a file beyond them"
+_SOUND = "a sound picture"
+_GEOMETRY_STEPS = 3  # whose depth is decoded
+_READERS = 4  # threads: reading and checksums run outside of Python's lock
+_HEADERS = {"rgb": (8, 3), "depth": (16, 1)}
+Sizes = dict[str, tuple[int, int]]
+"""Camera -> width and height of its images."""
+ReadHeader = Callable[[Path], PictureHeader | None]
+"""`read_header`, or `check_ends`, which gives none; raises ValueError or OSError."""
+
+
+def check_cameras(folder: Path, pictures: Pictures) -> Iterator[Violation]:
+    """Check that each camera has valid intrinsics and its pose under both names, and that there are no others."""
+    for camera in schema.camera_names(folder):
+        if camera not in pictures.cameras:
+            expected = f"the cameras of {schema.CONVERSION_FILE} only"
+            yield Violation(f"{folder.name}/{camera}", "", expected, "another camera")
+    for camera in pictures.cameras:
+        poses: list[NDArray] = []
+        pose_files = schema.pose_files(schema.camera_parent(folder / camera))
+        for name in (schema.INTRINSIC_FILE, *pose_files):
+            file = f"{folder.name}/{camera}/{name}"
+            try:
+                found = load_array(folder / camera / name, CAMERA_LIMIT)
+            except FileNotFoundError:
+                yield Violation(file, "", "this file", NO_FILE, "missing")
+                continue
+            except DAMAGED as error:
+                yield Violation(file, "", "a numpy array", one_line(error))
+                continue
+            wrong = list(check_camera_file(file, found, pose=name in pose_files))
+            yield from wrong
+            poses += [found] if name in pose_files and not wrong else []
+        if len(poses) == 2 and not np.allclose(poses[0], poses[1], atol=1e-6):
+            file = f"{folder.name}/{camera}/{pose_files[1]}"
+            yield Violation(file, "", f"the same as {pose_files[0]}", "another pose")
+
+
+def check_camera_file(file: str, array: NDArray, *, pose: bool) -> Iterator[Violation]:
+    """Check the pose (4, 4) or the intrinsics (4,) of a camera."""
+    shape = (4, 4) if pose else (4,)
+    if array.shape != shape or array.dtype.kind != "f":
+        yield Violation(file, "", f"floats of shape {shape}", f"{array.dtype} of shape {array.shape}")
+    elif pose and not _is_rigid(array):
+        yield Violation(file, "", "a rigid transform", "another matrix")
+    elif not pose and not (np.isfinite(array) & (array > 0)).all():
+        yield Violation(file, "", "fx, fy, cx, cy > 0", str(array.tolist()))
+
+
+def _is_rigid(matrix: NDArray) -> bool:
+    rotation, last_row = matrix[:3, :3], matrix[3]
+    is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) and np.linalg.det(rotation) > 0
+    return bool(np.isfinite(matrix).all() and is_rotation and np.allclose(last_row, [0, 0, 0, 1], atol=1e-6))
+
+
+def check_images(
+    folder: Path, pictures: Pictures, steps: int, sizes: Sizes, read: ReadHeader = read_header
+) -> Iterator[Violation]:
+    """Check that there is an intact image of each step, all of one size (see `Sizes`), and nothing else."""
+    places = [(camera, kind) for camera in pictures.cameras for kind in pictures.kinds]
+    with ThreadPoolExecutor(_READERS) as pool:
+        headers = list(pool.map(partial(_read_headers, folder, pictures.image_format, steps, read), places))
+    for (camera, kind), found in zip(places, headers, strict=True):
+        wanted = [name for name, header in found.items() if header != _SURPLUS]
+        for name, header in found.items():
+            file = f"{folder.name}/{camera}/{kind}/{name}"
+            if header == NO_FILE:
+                yield Violation(file, "", "a picture of every step", NO_FILE, "missing")
+            elif header == _SURPLUS:
+                expected = f"{count_of(len(wanted), 'picture')} from {min(wanted, default='none')}"
+                yield Violation(file, "", expected, _SURPLUS, "surplus")
+            elif isinstance(header, str):
+                yield Violation(file, "", _SOUND, header)
+            elif header is not None:
+                size = sizes.setdefault(camera, (header.width, header.height))
+                expected = PictureHeader(*(pictures.size or size), *_HEADERS[kind])
+                if header != expected:
+                    yield Violation(file, "", str(expected), str(header))
+
+
+def _read_headers(
+    folder: Path, image_format: schema.ImageFormat, steps: int, read: ReadHeader, place: tuple[str, str]
+) -> dict[str, PictureHeader | str | None]:
+    first = schema.image_path(folder, *place, 0, image_format)
+    there = {path.name for path in first.parent.iterdir()} if first.parent.is_dir() else set()
+    wanted = [f"{step:04d}{first.suffix}" for step in range(min(steps, schema.MAX_STEPS))]
+    found: dict[str, PictureHeader | str | None] = {}
+    for name in wanted:
+        try:
+            found[name] = read(first.with_name(name)) if name in there else NO_FILE
+        except (OSError, ValueError) as error:
+            found[name] = getattr(error, "strerror", None) or one_line(error)
+    return {**found, **dict.fromkeys(sorted(there - set(wanted)), _SURPLUS)}
+
+
+def check_depth(folder: Path, stored: EpisodeArrays, pictures: Pictures) -> Iterator[Violation]:
+    """Check depth at a few steps against intrinsics and poses, see `geometry.check`; nothing else may be wrong."""
+    arrays = {key: array.astype(np.float64) for key, array in stored.arrays.items() if array.dtype.kind == "f"}
+    base = from_xyzw(arrays["base_pos"], arrays["base_orn"])
+    ee = base @ from_xyzw(arrays["ee_pos"], arrays["ee_orn"])
+    parent_of: dict[str, Parent] = {camera: schema.camera_parent(folder / camera) for camera in pictures.cameras}
+    cameras = {
+        camera: [
+            np.asarray(load_array(folder / camera / name, CAMERA_LIMIT), np.float64)
+            for name in (schema.INTRINSIC_FILE, schema.pose_files(parent)[0])
+        ]
+        for camera, parent in parent_of.items()
+    }
+    steps = sorted({round(step) for step in np.linspace(0, stored.steps - 1, _GEOMETRY_STEPS)})
+    views: list[list[geometry.View]] = []
+    for step in steps:
+        parents = {"ee": ee[step], "arm_base": base[step], "world": np.eye(4)}
+        views.append([])
+        for camera, parent in parent_of.items():
+            path = schema.image_path(folder, camera, "depth", step)
+            file = f"{folder.name}/{path.relative_to(folder)}"
+            image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)  # `check_images` has checked file and size
+            if image is None:
+                yield Violation(file, "", _SOUND, "damage")
+                return
+            if not image.any():
+                yield Violation(file, "", "depth", "only zeros")
+            intrinsic, pose = cameras[camera]
+            placed = parents[parent] @ pose
+            views[-1].append(geometry.View(camera, image.astype(np.uint16), intrinsic, placed, parent == "ee"))
+    for index, camera_name, expected, found in geometry.check(views):
+        yield Violation(f"{folder.name}/{camera_name}/depth/{steps[index]:04d}.png", "", expected, found)

@@ -1,0 +1,168 @@
+"""Opens what is converted: a trajectory file, which is rendered, or a dataset of any format, whose images are read."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Generator, Mapping
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.core.documents import DAMAGED
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.text import count_of, one_line
+from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.conversion.rendered_source import RenderedSource, open_env
+from robocas_ms3.datasets.conversion.settings import ConversionSettings
+from robocas_ms3.datasets.formats import open_source
+from robocas_ms3.datasets.images.image_files import Pictures
+from robocas_ms3.datasets.sources.arrays import arrays_fingerprint
+from robocas_ms3.datasets.sources.episode_source import EpisodeSource, Frame, SourceEpisode
+from robocas_ms3.datasets.sources.files import SEE_VALIDATE
+
+NEEDED = frozenset(spec.name for spec in schema.EPISODE_INFO if not (spec.embedding or spec.optional)) - {
+    *schema.RELATIVE_PAIRS[1][2:]  # which follow from the base poses
+}
+"""Arrays that an episode must have to be converted."""
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class ConversionInput:
+    """An open source, and what of it is converted: ``pictures`` are those that are wanted and there.
+
+    ``sizes`` has width and height of the stored images, by camera; it is empty where images are rendered.
+    """
+
+    source: EpisodeSource
+    pictures: Pictures
+    include_failed: bool = False
+    sizes: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+
+    def entries(self) -> list[dict[str, Any]]:
+        """Return the recording of each episode to convert, in order, with ``source``, its number in the source."""
+        entries = ((number, self._entry(number)) for number in self.source.numbers)
+        chosen = [{"source": number, **entry} for number, entry in entries if entry is not None]
+        if not chosen:
+            some = bool(self.source.numbers)
+            raise DatasetError(
+                "no successful episodes to convert" if some else "no episodes to convert",
+                where=self.source.root,
+                found=count_of(len(self.source.numbers), "episode"),
+                fix="Pass --include-failed to convert them all the same." if some else "",
+            )
+        if isinstance(self.source, RenderedSource):
+            _warn_of_other_rates(self.source, chosen)
+            return _distinct(self.source, chosen)
+        return chosen
+
+    def _entry(self, number: int) -> dict[str, Any] | None:
+        """Return the recording of an episode, as ``conversion.json`` has it; None if it is not wanted."""
+        known = self.source.entry(number)
+        if isinstance(self.source, RenderedSource):
+            return dict(known) if self.include_failed or known["success"] else None
+        episode = self.source.episode(number)
+        scene = episode.scene
+        success = scene.get("success", known.get("success"))
+        if success is False and not self.include_failed:
+            return None
+        recording = (scene.get("source") or {}).get("recording") or known.get("recording")
+        return {
+            "trajectory": known.get("trajectory"),
+            "trajectory_episode": known.get("trajectory_episode"),
+            "seed": scene.get("seed", known.get("seed")),
+            "success": success,
+            "target": scene.get("target", known.get("target")),
+            "recording": recording or f"arrays {arrays_fingerprint(complete_arrays(episode))}",
+        }
+
+    def frames(self, episode: SourceEpisode) -> Generator[Frame, None, None]:
+        """Yield the images of every step; close the generator unless it is read to the end."""
+        with closing(episode.images(self.pictures)) as frames:
+            for step, frame in enumerate(frames):
+                for kind, images in (("rgb", frame.rgb), ("depth", frame.depth)) if self.sizes else ():
+                    for camera, image in images.items():
+                        expected, found = (f"{w} x {h}" for w, h in (self.sizes[camera], _size(image)))
+                        if found != expected:
+                            what, where = "not of the dataset's size", f"{episode.where}, {camera}/{kind}, step {step}"
+                            raise DatasetError(what, where=where, expected=expected, found=found, fix=SEE_VALIDATE)
+                yield frame
+
+    def close(self) -> None:
+        self.source.close()
+
+
+def open_input(settings: ConversionSettings) -> ConversionInput:
+    if settings.is_trajectory:
+        rendered = open_trajectory(settings)
+        return ConversionInput(rendered, rendered.pictures, settings.include_failed)
+    source, wanted = open_source(settings.source, rate_hz=settings.rate_hz), settings.pictures
+    first = source.episode(source.numbers[0])
+    pictures = wanted.choose(first.cameras, source.root)
+    sizes = {camera: _size(first.rgb(camera, 0)) for camera in pictures.cameras}
+    different = sorted(set(sizes.values()))
+    size = different[0] if len(different) == 1 else None
+    if wanted.size not in (None, size):
+        what, fix = "a dataset keeps the size of its images", "Convert the trajectory with this size."
+        expected = ", ".join(f"{width} x {height}" for width, height in different)
+        raise DatasetError(what, where=source.root, expected=expected, found=list(wanted.size or ()), fix=fix)
+    pictures = replace(pictures, size=size, depth=wanted.depth and source.has_depth)
+    return ConversionInput(source, pictures, settings.include_failed, sizes)
+
+
+def open_trajectory(settings: ConversionSettings) -> RenderedSource:
+    return RenderedSource(
+        settings.source,
+        rate_hz=settings.rate_hz,
+        pictures=settings.pictures,
+        pack=settings.pack,
+        open_renderer=settings.open_renderer or open_env,
+    )
+
+
+def complete_arrays(episode: SourceEpisode) -> dict[str, NDArray]:
+    """Return the arrays of an episode, or raise DatasetError if it lacks any that it must have."""
+    try:
+        arrays = episode.arrays
+    except DAMAGED as error:
+        what, found = "these arrays can't be read", one_line(error)
+        raise DatasetError(what, where=episode.where, found=found, fix=SEE_VALIDATE) from error
+    missing, lengths = sorted(NEEDED - set(arrays)), set()
+    for key in sorted(NEEDED & set(arrays)):
+        if arrays[key].dtype.kind == "f" and not np.isfinite(arrays[key]).all():
+            where = f"{episode.where}/{schema.EPISODE_FILE}, {key}"
+            raise DatasetError("this array holds NaN or infinity", where=where, fix=SEE_VALIDATE)
+        lengths |= {len(arrays[key])} if arrays[key].ndim else set()
+    if missing or lengths != {episode.steps}:
+        found = f"no {', '.join(missing)}" if missing else f"lengths {sorted(lengths)}"
+        raise DatasetError("this episode is not complete", where=episode.where, found=found, fix=SEE_VALIDATE)
+    return arrays
+
+
+def _size(image: NDArray) -> tuple[int, int]:
+    return image.shape[1], image.shape[0]
+
+
+def _distinct(source: EpisodeSource, entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the first entry of each recording; those that can't be read count as different."""
+    first = {entry["recording"]: entry for entry in reversed(entries)}
+    once = [entry for entry in entries if entry["recording"] is None or first[entry["recording"]] is entry]
+    if len(once) < len(entries):
+        again = [str(entry["trajectory_episode"]) for entry in entries if entry not in once]
+        _log.warning("%s: the same recordings again, left out: %s", source.root, ", ".join(again))
+    return once
+
+
+def _warn_of_other_rates(source: RenderedSource, entries: list[dict[str, Any]]) -> None:
+    recorded = [source.file.episodes[entry["source"]].get("robocas") for entry in entries]
+    checked = [one.get("replay_rate") for one in recorded if isinstance(one, dict)]
+    rates = {float(rate) for rate in checked if isinstance(rate, int | float) and rate}  # others are not checked
+    others = sorted(rate for rate in rates if abs(rate - source.rate_hz) > 1e-9)
+    if others:
+        _log.warning(
+            "actions were tried at %s Hz; at %g Hz they were not: robocas validate --replay tells (of RoboCAS folders)",
+            *(" and ".join(f"{rate:g}" for rate in others), source.rate_hz),
+        )

@@ -1,0 +1,139 @@
+"""Convert a ManiSkill trajectory to a RoboCAS dataset."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.files import write_json
+from robocas_ms3.core.output_folder import OutputFolder, sweep
+from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.conversion.conversion_input import ConversionInput, open_trajectory
+from robocas_ms3.datasets.conversion.data_info import add_failures, write_info
+from robocas_ms3.datasets.conversion.episode_folder import FolderWriter, find_damaged
+from robocas_ms3.datasets.conversion.episode_plan import (
+    DATASET,
+    dataset_settings,
+    missing_episodes,
+    plan_episodes,
+    planned_sides,
+    without_unwritten,
+)
+from robocas_ms3.datasets.conversion.rendered_source import RenderedSource
+from robocas_ms3.datasets.conversion.settings import Conversion, ConversionSettings, WrittenEpisode
+from robocas_ms3.datasets.conversion.workers import WriteJob, write_episodes
+from robocas_ms3.datasets.images.video import FEW, finish_previews, on_sheet
+from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.demos.recordings.trajectory_json import versions
+
+_FIX = "The dataset is complete without, and valid; the same command tries again, --leave-out takes it as it is."
+_log = logging.getLogger(__name__)
+
+
+def convert(
+    settings: ConversionSettings,
+    *,
+    on_start: Callable[[int], None] | None = None,
+    on_episode: Callable[[WrittenEpisode], None] | None = None,
+) -> Conversion:
+    """Write a RoboCAS dataset from a trajectory file. A ``failures.jsonl`` in the file's folder is copied.
+
+    Called again after a kill at any moment, it continues, with the same result.
+    An episode that can't be written does not end the others: at the end there is a dataset of the others, and an error.
+    ``on_start`` is called with the number of episodes to write, ``on_episode`` after each.
+
+    Raises:
+        DatasetError: the input is unusable, nothing to convert, no render device.
+        IncompleteError: episodes can't be written; the dataset is complete without, ``left_out`` in its
+            ``conversion.json`` says why, and the same call tries again.
+        OutputExistsError: ``out`` is no dataset, or one of other settings or versions, or, without ``append``, of other
+            recordings.
+        RobocasError: another conversion is running.
+        MissingExtraError: embeddings are wanted and the ``language`` extra is not installed.
+    """
+    start, out = time.perf_counter(), settings.out
+    with ExitStack() as stack:
+        source = stack.enter_context(closing(open_trajectory(settings)))
+        pictures = source.pictures
+        stored = dataset_settings(source.rate_hz, pictures, settings.embeddings)
+        recorded = {**stored, "made_with": versions()}
+        output = stack.enter_context(OutputFolder(out, DATASET, recorded, overwrite=settings.overwrite))
+        # Everything that may fail comes before the output is touched.
+        entries = ConversionInput(source, pictures, settings.include_failed).entries()
+        content, tasks = plan_episodes(output, entries, stored, append=settings.append)
+        settings.check_device()
+        embed = partial(_look_up, embed_texts(source, entries)) if settings.embeddings else None
+        output.start(content)
+        sweep(out / schema.PREVIEW_FOLDER)
+        before = _split_before(out)
+        for folder in (out / schema.episode_folder(number) for number, _ in tasks):
+            if folder.is_dir() and (path := find_damaged(folder, pictures)):
+                _log.warning("%s: cut off, or gone, since it was written; its episode is written again", path)
+                shutil.rmtree(folder)
+        missing = [task for task in tasks if not (out / schema.episode_folder(task[0])).is_dir()]
+        if on_start:
+            on_start(len(missing))
+        sheet = None
+        if settings.video and (settings.all_videos or len(tasks) <= FEW):
+            sheet = on_sheet(map(int, content["episodes"]))
+        job = WriteJob(settings, FolderWriter(out, embed, sheet), missing, len(missing) < len(tasks), _FIX)
+        try:
+            written, incomplete = write_episodes(job, output, on_episode)
+        finally:
+            for folder in (out, out / schema.PREVIEW_FOLDER):
+                sweep(folder)  # left by workers that died; others wrote it again
+        if incomplete:
+            write_json(out / schema.CONVERSION_FILE, without_unwritten(out, content, incomplete.reasons))
+        add_failures(settings.source.parent, out, source.file.env_info)
+        write_info(out, planned_sides(content, before))
+        if sheet is not None:
+            rows = {episode.number: episode.row for episode in written if episode.row is not None}
+            finish_previews(Dataset(out), rows)
+        if incomplete and not settings.leave_out:
+            raise incomplete
+        if incomplete:
+            _log.warning("%s", incomplete)
+        if left := missing_episodes(out, content):
+            _log.warning("%s: %s are still missing: convert that with --append", out, " and ".join(left))
+    return Conversion(written, len(tasks) - len(missing), time.perf_counter() - start, previews=sheet is not None)
+
+
+def _split_before(out: Path) -> tuple[list[int], list[int]]:
+    if not (out / schema.DATA_INFO_FILE).is_file():
+        return [], []
+    try:
+        return Dataset(out).sides
+    except DatasetError as error:
+        fix = "Delete it, and it is made anew; where there was an --append, episodes may change sides."
+        where = out / schema.DATA_INFO_FILE
+        raise DatasetError("the split can't be read", where=where, found=error.found, fix=fix) from error
+
+
+def embed_texts(source: RenderedSource, entries: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    from robocas_ms3.scenes.language.embed import TextEmbedder
+
+    embedder = TextEmbedder()
+    texts = list(dict.fromkeys(text for entry in entries for text in _texts(source, entry["source"])))
+    return dict(zip(texts, embedder(texts), strict=True))
+
+
+def _look_up(vectors: dict[str, Any], texts: list[str]) -> NDArray[np.float32]:
+    return np.stack([vectors[text] for text in texts])
+
+
+def _texts(source: RenderedSource, number: int) -> list[str]:
+    """Return the texts of an episode; none if it can't be read, which is an error when it is written."""
+    try:
+        return source.texts(number)
+    except DatasetError:
+        return []

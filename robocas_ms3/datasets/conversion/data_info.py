@@ -1,0 +1,85 @@
+"""Overviews of a RoboCAS folder: ``data_info.json``, which has the split, and ``failures.jsonl``."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.files import write_json
+from robocas_ms3.core.json_lines import Ledger
+from robocas_ms3.core.text import one_line
+from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.actions import action_space
+from robocas_ms3.datasets.sources.arrays import read_arrays
+from robocas_ms3.datasets.sources.file_models import DataInfoRecord
+from robocas_ms3.datasets.sources.files import SEE_VALIDATE
+from robocas_ms3.datasets.sources.provenance import environment_of, task_of
+from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.datasets.sources.split import split_by_seed
+from robocas_ms3.demos.failures import FAILURES_FILE
+from robocas_ms3.demos.recordings.subgoals import subgoal_runs
+
+_NEEDED = ("episode_length", "language_goal", "step_goal_type", "step_lang_goals", "rel_pos", "rel_orn")
+
+
+def write_info(root: Path, before: tuple[Iterable[int], Iterable[int]] = ((), ())) -> None:
+    write_json(root / schema.DATA_INFO_FILE, info_of(root, before))
+
+
+def info_of(root: Path, before: tuple[Iterable[int], Iterable[int]] = ((), ())) -> dict[str, Any]:
+    """Return ``data_info.json``; ``before``: both sides so far, see `split_by_seed`."""
+    dataset = Dataset(root)
+    seeds, lengths, instructions, goals = {}, {}, {}, {}
+    positions, orientations = [], []
+    for number in dataset.numbers:
+        episode = dataset.episode(number)
+        path = episode.folder / schema.EPISODE_FILE
+        arrays = read_arrays(path, _NEEDED).needed(_NEEDED)
+        for key in ("rel_pos", "rel_orn"):
+            if not np.isfinite(arrays[key]).all():
+                what, expected = "this episode's motion is no numbers", "finite numbers"
+                raise DatasetError(what, where=f"{path}, {key}", expected=expected, fix=SEE_VALIDATE)
+        seeds[number] = episode.scene.get("seed")
+        lengths[str(number)] = int(arrays["episode_length"])
+        instructions[str(number)] = str(arrays["language_goal"])
+        runs = subgoal_runs(arrays["step_goal_type"].tolist(), arrays["step_lang_goals"].tolist())
+        goals[str(number)] = [goal.model_dump() for goal in runs]
+        positions.append(arrays["rel_pos"])
+        orientations.append(arrays["rel_orn"])
+    train, val = split_by_seed(seeds, before)
+    info: dict[str, Any] = {
+        "train_eps": train,
+        "val_eps": val,
+        "ep_length": lengths,
+        "language_goal": instructions,
+        "step_goals": goals,
+    }
+    try:
+        info["action_space"] = action_space(positions, orientations)
+        DataInfoRecord.model_validate(info)
+    except (ValueError, IndexError) as error:  # quaternions of length 0; no episode of two steps
+        where = f"{root / schema.DATA_INFO_FILE}, action_space"
+        found = one_line(error)
+        raise DatasetError("the motion has no range", where=where, found=found, fix=SEE_VALIDATE) from error
+    return info
+
+
+def add_failures(run: Path, out: Path, env_info: Mapping[str, Any]) -> None:
+    """Add the failures of the run in a folder to a dataset, each once, with task and environment."""
+    made_in = {"task": task_of(str(env_info.get("env_id"))), "environment": environment_of(env_info)}
+    there: Ledger[dict[str, Any]] = Ledger(out / FAILURES_FILE, dict[str, Any])
+    failures: Ledger[dict[str, Any]] = Ledger(run / FAILURES_FILE, dict[str, Any])
+    known = {_key(line) for line in there.read()}
+    marked = ((line, {**line, **made_in}) for line in failures.read())
+    new = [line for before, line in marked if not {_key(before), _key(line)} & known]
+    if new:  # rewritten, as the file may be linked from another dataset
+        there.rewrite([*there.read(), *new])
+
+
+def _key(line: Mapping[str, Any]) -> str:
+    return json.dumps(line, sort_keys=True)

@@ -1,0 +1,173 @@
+"""Renders recorded states with ManiSkill's cameras: the scene is rebuilt from its seed, physics never steps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from mani_skill.render.shaders import ShaderConfig
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+import robocas_ms3.tasks  # noqa: F401  (registers the environments)
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.poses import inverse
+from robocas_ms3.datasets.images.image_files import Box, Pictures, box_of
+from robocas_ms3.datasets.sources.episode_source import CameraModel, Frame
+from robocas_ms3.demos.recordings.environment import RecordedEnv
+from robocas_ms3.demos.recordings.trajectory_file import Recording
+
+_SAME_PLACE = 1e-3  # m
+
+
+class EnvRenderer:
+    """Renders recorded states, with all images or some, in the environment that recorded them."""
+
+    def __init__(self, env: RecordedEnv, control_mode: str, pictures: Pictures | None = None) -> None:
+        sensors = dict(env.kwargs.get("sensor_configs") or {})
+        self._pictures = (pictures or Pictures()).choose([camera.name for camera in env.cameras()], env.env_id)
+        if self._pictures.size is not None:
+            sensors["width"], sensors["height"] = self._pictures.size
+        require_renderer()
+        self.env = env.make(
+            obs_mode="+".join([*self._pictures.kinds, *(["segmentation"] if self._pictures.boxes else [])]),
+            control_mode=control_mode,
+            num_envs=1,
+            sim_backend="physx_cpu",
+            sensor_configs=sensors,
+        )
+        self._base: Any = self.env.unwrapped
+
+    def close(self) -> None:
+        self.env.close()
+
+    def load(self, recording: Recording) -> None:
+        self.env.reset(seed=recording.seed, options=dict(recording.reset_options))
+        for name in set(self._base._sensors) - set(self._pictures.cameras):
+            del self._base._sensors[name]  # they are made anew at each reset; what is there is rendered
+        self._check_scene(recording)
+
+    def _check_scene(self, recording: Recording) -> None:
+
+        def refuse(name: str, expected: object, found: object) -> None:
+            where = f"episode {recording.episode_id}, seed {recording.seed}{f', {name}' if name else ''}"
+            what, fix = "the seed builds another scene", "Use the pack, configuration and versions of the recording."
+            raise DatasetError(what, where=where, expected=expected, found=found, fix=fix)
+
+        built = self._base.get_state_dict()
+        for kind in ("actors", "articulations"):
+            mine, theirs = set(built.get(kind, {})), set(recording.states.get(kind, {}))
+            if mine != theirs:
+                refuse("", sorted(theirs), sorted(mine))
+        for name, states in () if recording.taken_over else recording.states.get("actors", {}).items():
+            distance = float(np.linalg.norm(built["actors"][name][0, :3].cpu().numpy() - states[0, :3]))
+            if distance > _SAME_PLACE:
+                refuse(name, "the recorded place", f"{distance * 1000:.1f} mm away")
+        instruction = self._base.get_language_instruction()[0]
+        if instruction != recording.instruction:
+            refuse("", recording.instruction, instruction)
+
+    def frames(self, recording: Recording, samples: NDArray[np.int64]) -> Iterator[Frame]:
+        for index in samples:
+            yield self._frame(recording.state(int(index)))
+
+    def _frame(self, state: dict[str, dict[str, NDArray[np.float32]]]) -> Frame:
+        tensors = {kind: {k: torch.from_numpy(v) for k, v in arrays.items()} for kind, arrays in state.items()}
+        self._base.set_state_dict(tensors)
+        textures = self._base._get_obs_sensor_data(apply_texture_transforms=False)
+        shaders = {name: self._base._sensors[name].config.shader_config for name in self._pictures.cameras}
+        return Frame(
+            rgb={name: _rgb_of(textures[name], shader) for name, shader in shaders.items()},
+            depth={name: _depth_of(textures[name], shader) for name, shader in shaders.items() if self._pictures.depth},
+            boxes=self._boxes(textures, shaders) if self._pictures.boxes else {},
+        )
+
+    def _boxes(self, textures: dict[str, Any], shaders: dict[str, ShaderConfig]) -> dict[str, Box]:
+        """Return the box of the target's visible pixels in the cameras that see it."""
+        slot = int(self._base.target_slot[0])
+        number = int(self._base.scene.actors[f"object_{slot}"].per_scene_id[0])
+        masks = {name: _segmentation_of(textures[name], shader) == number for name, shader in shaders.items()}
+        return {name: box for name, mask in masks.items() if (box := box_of(mask)) is not None}
+
+    def cameras(self) -> dict[str, CameraModel]:
+        agent = self._base.agent
+        parents = {"ee": agent.tcp.pose, "arm_base": agent.arm_base_link.pose}
+        models = {}
+        for spec in self._base.cameras:
+            if spec.name not in self._pictures.cameras:
+                continue
+            camera = self._base.scene.sensors[spec.name].camera
+            world_in_camera = np.vstack([camera.get_extrinsic_matrix()[0].cpu().numpy(), [0, 0, 0, 1]])
+            parent_in_world = _matrix(parents[spec.parent]) if spec.parent in parents else np.eye(4)
+            k = camera.get_intrinsic_matrix()[0].cpu().numpy().astype(np.float64)
+            models[spec.name] = CameraModel(
+                intrinsic=np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2]]),
+                camera_in_parent=inverse(parent_in_world) @ inverse(world_in_camera.astype(np.float64)),
+                parent=spec.parent,
+            )
+        return models
+
+    def scene(self) -> dict[str, Any]:
+        env = self._base
+        layout = env.layout()
+        return {
+            "task": env.SPEC.name,
+            "config": env.task_config.model_dump(mode="json"),
+            "layout": {
+                "object_ids": list(layout.object_ids),
+                "poses": [_numbers(pose) for pose in layout.object_poses],
+                "present": layout.present.tolist(),
+                "robot_pose": _numbers(layout.robot_pose),
+                "basket_pose": None if layout.basket_pose is None else _numbers(layout.basket_pose),
+                "relation": layout.relation,
+            },
+            "objects": [
+                {"slot": slot, "id": asset.asset.id, "name": asset.asset.name}
+                for slot, asset in enumerate(env.object_assets[0])
+                if layout.present[slot]
+            ],
+        }
+
+
+def _numbers(pose: NDArray[np.float64]) -> list[float]:
+    """Return x, y, z, qw, qx, qy, qz of a pose (4, 4)."""
+    quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True)
+    return [round(float(value), 9) for value in (*pose[:3, 3], quaternion[3], *quaternion[:3])]
+
+
+def require_renderer() -> None:
+    import sapien
+
+    try:
+        sapien.render.RenderMaterial()  # the cheapest thing that needs the device
+    except RuntimeError as error:
+        fix = "Run scripts/setup.sh or install a Vulkan driver; robocas doctor says more."
+        raise DatasetError("no render device", fix=fix) from error
+
+
+def _rgb_of(textures: dict[str, torch.Tensor], shader: ShaderConfig) -> NDArray[np.uint8]:
+    """Return an RGB image (H, W, 3), contiguous, from the textures of a camera."""
+    colour = textures["Color"]
+    if colour.dtype == torch.uint8:  # OpenCV takes 0.03 ms to drop alpha at 640 x 480, copying a slice 2
+        return cv2.cvtColor(colour[0].cpu().numpy(), cv2.COLOR_RGBA2RGB).astype(np.uint8, copy=False)
+    return np.ascontiguousarray(shader.texture_transforms["Color"](colour)["rgb"][0].cpu().numpy())
+
+
+def _depth_of(textures: dict[str, torch.Tensor], shader: ShaderConfig) -> NDArray[np.uint16]:
+    """Return depth (H, W) in mm; nothing, or something behind the camera, is 0."""
+    name = next(name for name, kinds in shader.texture_names.items() if "depth" in kinds)
+    depth = shader.texture_transforms[name](textures[name])["depth"][0, ..., 0]  # int16
+    return depth.clamp(min=0).cpu().numpy().astype(np.uint16)
+
+
+def _segmentation_of(textures: dict[str, torch.Tensor], shader: ShaderConfig) -> NDArray[np.int16]:
+    """Return the number of the actor or link in each pixel (H, W), 0 = none."""
+    name = next(name for name, kinds in shader.texture_names.items() if "segmentation" in kinds)
+    return shader.texture_transforms[name](textures[name])["segmentation"][0, ..., 0].cpu().numpy()
+
+
+def _matrix(pose: Any) -> NDArray[np.float64]:
+    return pose.to_transformation_matrix()[0].cpu().numpy().astype(np.float64)

@@ -1,0 +1,118 @@
+"""Writes the folder of an episode: images while they are rendered, the rest at the end."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Generator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.files import json_text
+from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.checks.images import check_cameras, check_images
+from robocas_ms3.datasets.checks.violation import read_object
+from robocas_ms3.datasets.conversion.workers import EpisodeWriter, GivenEpisode
+from robocas_ms3.datasets.images.image_files import Pictures, write_picture
+from robocas_ms3.datasets.images.image_headers import check_ends
+from robocas_ms3.datasets.images.preview_frames import EpisodeDrawing
+from robocas_ms3.datasets.images.video import open_preview
+from robocas_ms3.datasets.sources.arrays import read_arrays, with_embeddings
+from robocas_ms3.datasets.sources.episode_source import CameraModel, Frame
+
+ENCODERS = 2  # threads; ISA-L and OpenCV work outside Python's lock
+_MAX_WAITING = 24  # images, which bounds memory
+
+
+@dataclass(frozen=True)
+class FolderWriter(EpisodeWriter):
+    """Writes episodes of a RoboCAS folder; with a ``sheet`` of episodes also their previews."""
+
+    out: Path
+    embed: Callable[[list[str]], NDArray[np.float32]] | None = None
+    sheet: tuple[int, ...] | None = None
+
+    def folder(self, number: int) -> Path:
+        return self.out / schema.episode_folder(number)
+
+    def write_files(
+        self, folder: Path, wanted: GivenEpisode, frames: Generator[Frame, None, None]
+    ) -> NDArray[np.uint8] | None:
+        episode, pictures, arrays, preview = wanted.episode, wanted.given.pictures, wanted.arrays, None
+        for camera in pictures.cameras:
+            for kind in pictures.kinds:
+                (folder / camera / kind).mkdir(parents=True)
+        with ExitStack() as stack:
+            if self.sheet is not None:
+                drawing = EpisodeDrawing(wanted.number, arrays, wanted.given.source.rate_hz)
+                preview = stack.enter_context(open_preview(self.out, drawing, row=wanted.number in self.sheet))
+            encode = stack.enter_context(_encoder())
+            in_order = stack.enter_context(_encoder(1))  # frames of a video
+            for step, frame in enumerate(frames):
+                for kind in pictures.kinds:
+                    images = frame.rgb if kind == "rgb" else frame.depth
+                    for camera in pictures.cameras:
+                        path = schema.image_path(folder, camera, kind, step, pictures.image_format)
+                        encode(write_picture, path, images[camera])
+                if preview:
+                    in_order(preview.add, step, frame.rgb)
+        cameras = {name: episode.camera(name) for name in pictures.cameras}
+        arrays = with_embeddings(arrays, self.embed) if self.embed else arrays
+        write_episode_files(folder, arrays, cameras, episode.scene)
+        return preview and preview.row
+
+
+def write_episode_files(
+    folder: Path, arrays: dict[str, NDArray], cameras: Mapping[str, CameraModel], scene: Mapping[str, Any]
+) -> None:
+    """Write all of an episode but its images."""
+    for camera, model in cameras.items():
+        np.save(folder / camera / schema.INTRINSIC_FILE, model.intrinsic)
+        for name in schema.pose_files(model.parent):
+            np.save(folder / camera / name, model.camera_in_parent)
+    np.savez(folder / schema.EPISODE_FILE, **arrays)  # pyright: ignore[reportArgumentType]
+    text = json_text(dict(scene), folder, indent=1, error=DatasetError)
+    (folder / schema.SCENE_FILE).write_text(text + "\n", encoding="utf-8")
+
+
+@contextmanager
+def _encoder(threads: int = ENCODERS) -> Generator[Callable[..., None], None, None]:
+    """Give a function that calls others in threads, while the next state renders; it waits if too many are waiting."""
+    waiting: deque[Future[Any]] = deque()
+
+    def collect(limit: int) -> None:
+        while len(waiting) > limit:
+            waiting.popleft().result()
+
+    def submit(*call: Any) -> None:
+        waiting.append(pool.submit(*call))
+        collect(_MAX_WAITING)
+
+    pool = ThreadPoolExecutor(threads)
+    try:
+        yield submit
+        collect(0)
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def find_damaged(folder: Path, pictures: Pictures) -> Path | None:
+    """Return the first file of an episode that is missing or lacks its end, as one that was cut off does."""
+    steps = read_arrays(folder / schema.EPISODE_FILE, ("episode_length",)).arrays.get("episode_length")
+    if steps is None or steps.ndim:
+        return folder / schema.EPISODE_FILE
+    root = folder.parent
+    for wrong in (
+        *read_object(root, f"{folder.name}/{schema.SCENE_FILE}")[1],
+        *check_cameras(folder, pictures),
+        *check_images(folder, pictures, int(steps), {}, check_ends),
+    ):
+        if wrong.kind != "surplus" and not (root / wrong.file).is_dir():  # the folder of a camera too many
+            return root / wrong.file
+    return None

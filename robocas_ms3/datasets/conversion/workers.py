@@ -1,0 +1,189 @@
+"""Writes the episodes of a conversion: a loop, in this process or shared among several."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing, contextmanager, nullcontext
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.core.errors import DatasetError, IncompleteError, MissingExtraError
+from robocas_ms3.core.files import replacing_folder
+from robocas_ms3.core.output_folder import OutputFolder
+from robocas_ms3.core.remote_errors import RemoteError
+from robocas_ms3.core.text import count_of, error_line
+from robocas_ms3.core.workers import NO_LIMITS, WorkerPool, use_one_torch_thread
+from robocas_ms3.datasets.conversion.conversion_input import ConversionInput, complete_arrays, open_input
+from robocas_ms3.datasets.conversion.settings import ConversionSettings, WrittenEpisode
+from robocas_ms3.datasets.schema import episode_folder
+from robocas_ms3.datasets.sources.episode_source import Frame, SourceEpisode
+
+_ENOUGH = 3  # failures before any success: the other episodes would fail too
+_LISTED = 5  # failures that an error lists
+_log = logging.getLogger(__name__)
+
+Task = tuple[int, int]
+"""Number of an episode in the dataset, and in the source."""
+
+
+@dataclass(frozen=True)
+class GivenEpisode:
+    """An episode that is being written: its number in the dataset, and all arrays that it must have."""
+
+    number: int
+    episode: SourceEpisode
+    arrays: dict[str, NDArray]
+    given: ConversionInput
+
+
+class EpisodeWriter(ABC):
+    """Writes the episodes of one format; can be sent to another process."""
+
+    @abstractmethod
+    def folder(self, number: int) -> Path:
+        """Return the folder of an episode, which appears whole."""
+
+    @abstractmethod
+    def write_files(
+        self, folder: Path, wanted: GivenEpisode, frames: Generator[Frame, None, None]
+    ) -> NDArray[np.uint8] | None:
+        """Write an episode into a folder; return its row of the contact sheet, if there is one."""
+
+    def write(self, number: int, given: ConversionInput, source: int) -> WrittenEpisode:
+        """Write episode ``source`` of the input as episode ``number`` of the dataset."""
+        with replacing_folder(self.folder(number), sync=True) as folder:
+            episode = given.source.episode(source)
+            wanted = GivenEpisode(number, episode, complete_arrays(episode), given)
+            with closing(given.frames(episode)) as frames:
+                row = self.write_files(folder, wanted, frames)
+            size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+        return WrittenEpisode(number, int(wanted.arrays["episode_length"]), size, row)
+
+
+@dataclass(frozen=True)
+class WriteJob:
+    """The episodes of a conversion that are missing; ``continued``: whether there are others already."""
+
+    settings: ConversionSettings
+    writer: EpisodeWriter
+    tasks: list[Task]
+    continued: bool
+    fix: str
+
+
+def write_episodes(
+    job: WriteJob, output: OutputFolder, on_episode: Callable[[WrittenEpisode], None] | None
+) -> tuple[list[WrittenEpisode], IncompleteError | None]:
+    """Write episodes; return them by number, and an error that names those that can't be written.
+
+    An episode that fails does not end the others, unless all share its error: the disk, an extra, or the first three.
+    """
+    settings = job.settings
+    renders, processes = settings.is_trajectory, min(settings.jobs, len(job.tasks))
+    apart = settings.limits is not None and settings.needs_device  # a crash of the renderer ends that process alone
+    here = processes <= 1 and not apart
+    threads = _one_torch_thread() if renders and here else nullcontext()
+    open_worker = partial(_EpisodeWorker, job, one_rasterizer_thread=processes > 1, shared=here)
+    pool: WorkerPool[Task, WrittenEpisode | _Failure] = WorkerPool(
+        open_worker, 0 if here else processes, on_crash=_death, limits=settings.limits or NO_LIMITS
+    )
+    written: list[WrittenEpisode] = []
+    failures: list[_Failure] = []
+    with threads, pool, closing(pool.map(job.tasks, ordered=False)) as results:
+        for result in results:
+            if isinstance(result, WrittenEpisode):
+                output.check_exists()
+                written.append(result)
+                if on_episode:
+                    on_episode(result)
+                continue
+            failures.append(result)
+            if written or job.continued:
+                _log.warning("%s could not be written: %s", result.episode, result.reason)
+            elif len(failures) == _ENOUGH:
+                break
+    if failures and not (written or job.continued):
+        raise failures[0].sent.with_traceback()
+    written.sort(key=lambda episode: episode.number)
+    return written, _incomplete(failures, job) if failures else None
+
+
+@dataclass(frozen=True)
+class _Failure:
+    """An episode that could not be written."""
+
+    episode: str
+    sent: RemoteError
+
+    @property
+    def reason(self) -> str:
+        return error_line(self.sent.error).rstrip(".")
+
+
+def _death(task: Task, why: str) -> _Failure:
+    episode = episode_folder(task[0])
+    return _Failure(episode, RemoteError.of(DatasetError(f"its process died twice: {why}", where=episode), "a worker"))
+
+
+def _incomplete(failures: list[_Failure], job: WriteJob) -> IncompleteError:
+    reasons = {one.episode: one.reason for one in sorted(failures, key=lambda one: one.episode)}
+    listed = [why if why.startswith(f"{one}: ") else f"{one}: {why}" for one, why in reasons.items()]
+    more = f"; and {len(listed) - _LISTED} more" if len(listed) > _LISTED else ""
+    what = f"{count_of(len(listed), 'episode')} could not be written"
+    error = IncompleteError(what, where=job.settings.out, found="; ".join(listed[:_LISTED]) + more, fix=job.fix)
+    error.reasons, error.__cause__ = reasons, failures[0].sent.with_traceback()
+    return error
+
+
+class _EpisodeWorker:
+    """Writes the episodes of one process. The source stays open, and is opened again after a failure."""
+
+    def __init__(self, job: WriteJob, *, one_rasterizer_thread: bool, shared: bool) -> None:
+        if job.settings.is_trajectory and not shared:
+            if one_rasterizer_thread:  # processes that render in software on all cores get in each other's way
+                os.environ.setdefault("LP_NUM_THREADS", "1")
+            use_one_torch_thread()
+        self._job = job
+        self._given: ConversionInput | None = open_input(job.settings)
+
+    def run(self, task: Task) -> WrittenEpisode | _Failure:
+        number, source = task
+        try:
+            self._given = self._given or open_input(self._job.settings)
+            return self._job.writer.write(number, self._given, source)
+        except Exception as error:
+            if _is_shared(error):
+                raise
+            self.close()
+            return _Failure(episode_folder(number), RemoteError.of(error, "a worker"))
+
+    def close(self) -> None:
+        given, self._given = self._given, None
+        if given is not None:
+            given.close()
+
+
+def _is_shared(error: Exception) -> bool:
+    """Return whether all episodes share an error: of the system (FFmpeg has other numbers), or of the installation."""
+    return isinstance(error, MissingExtraError) or (isinstance(error, OSError) and error.errno in errno.errorcode)
+
+
+@contextmanager
+def _one_torch_thread() -> Iterator[None]:
+    """Use one thread in torch inside: next to a renderer its other threads spin, which doubles the CPU time."""
+    import torch
+
+    before = torch.get_num_threads()
+    use_one_torch_thread()
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

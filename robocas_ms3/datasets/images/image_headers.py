@@ -1,0 +1,107 @@
+"""Reads a picture's bytes and header within bounds, and checks that it is whole: a PNG without decoding it."""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+
+from PIL import Image, UnidentifiedImageError
+
+from robocas_ms3.core.documents import DocumentError, check_regular, read_bytes
+from robocas_ms3.datasets.images.png import SIGNATURE
+
+LARGEST = 8192
+"""Pixels per side."""
+BYTES_LIMIT = 2**28
+"""Of a file: the largest picture without compression has 200 MB."""
+_END = 32  # bytes
+_FORMATS = {".png": "PNG", ".jpg": "JPEG", ".webp": "WEBP"}
+_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
+
+
+@dataclass(frozen=True)
+class PictureHeader:
+    """Size in pixels, bits a channel, channels."""
+
+    width: int
+    height: int
+    bits: int
+    channels: int
+
+    def __str__(self) -> str:
+        return f"{self.width} x {self.height}, {self.channels} x {self.bits} bit"
+
+
+def read_header(path: Path) -> PictureHeader:
+    data = read_picture_bytes(path)
+    return _read_png(data) if path.suffix == ".png" else _decode(data, _FORMATS[path.suffix])
+
+
+def check_ends(path: Path) -> None:
+    """Check that a picture begins and ends as its format does, which is quick; read it whole if it does not."""
+    if not _has_both_ends(path):
+        read_header(path)
+
+
+def _has_both_ends(path: Path) -> bool:
+    check_regular(path)
+    with path.open("rb", buffering=0) as file:
+        head, size = file.read(_END), os.fstat(file.fileno()).st_size
+        file.seek(max(0, size - _END))
+        tail = file.read()
+    if path.suffix == ".png":
+        return head.startswith(SIGNATURE) and tail.endswith(b"\0\0\0\0IEND\xaeB`\x82")
+    if path.suffix == ".jpg":
+        return head.startswith(b"\xff\xd8\xff") and tail.endswith(b"\xff\xd9")
+    return head.startswith(b"RIFF") and head[8:12] == b"WEBP" and size == 8 + int.from_bytes(head[4:8], "little")
+
+
+def read_picture_bytes(path: Path) -> bytes:
+    """Read a file that a decoder can be given: its picture has at most `LARGEST` pixels per side."""
+    data, wanted = read_bytes(path, BYTES_LIMIT), _FORMATS[path.suffix]
+    try:
+        with Image.open(BytesIO(data), formats=[wanted]) as picture:
+            size = picture.size
+    except Image.DecompressionBombError as error:
+        raise DocumentError(str(error)) from error
+    except (UnidentifiedImageError, SyntaxError) as error:  # the latter of a damaged PNG
+        raise DocumentError(f"not a {wanted}, or damaged") from error
+    if max(size) > LARGEST:
+        raise DocumentError(f"{size[0]} x {size[1]} pixels, more than {LARGEST} per side")
+    return data
+
+
+def _decode(data: bytes, wanted: str) -> PictureHeader:
+    try:
+        with Image.open(BytesIO(data), formats=[wanted]) as picture:
+            picture.load()
+            return PictureHeader(*picture.size, 8, len(picture.getbands()))
+    except OSError as error:
+        raise ValueError(f"damaged {wanted}: {error}") from error
+
+
+def _read_png(data: bytes) -> PictureHeader:
+    if not data.startswith(SIGNATURE):
+        raise ValueError("not a PNG")
+    offset, header, filled = len(SIGNATURE), None, False
+    while offset + 12 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, offset)
+        end = offset + 8 + length
+        if end + 4 > len(data):
+            break
+        if zlib.crc32(data[offset + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
+            raise ValueError("damaged PNG")
+        if kind == b"IHDR":
+            width, height, bits, colour = struct.unpack_from(">IIBB", data, offset + 8)
+            header = PictureHeader(width, height, bits, _CHANNELS.get(colour, 0))
+        filled = filled or (kind == b"IDAT" and length > 0)
+        if kind == b"IEND" and header is not None:
+            if not filled:
+                raise ValueError("PNG without a picture")
+            return header
+        offset = end + 4
+    raise ValueError("PNG cut off")

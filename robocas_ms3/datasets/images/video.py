@@ -1,0 +1,145 @@
+"""Videos and contact sheets of a dataset, for people to look at: of stored images, and of those that are written."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import imageio.v2 as imageio
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.files import make_folder, replacing
+from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.images.png import encode_png
+from robocas_ms3.datasets.images.preview_frames import EpisodeDrawing, Images
+from robocas_ms3.datasets.sources.episode_source import EpisodeSource, Kind, shots
+
+PANEL, PREVIEW_PANEL = (426, 320), (320, 240)
+"""Width and height of one camera's image in a video, and in a preview."""
+SHEET = 10
+"""Episodes on a contact sheet."""
+FEW = 20
+"""Up to so many episodes have previews by default."""
+_NEAR_MM, _FAR_MM = 30, 5000  # colours of depth
+# Of a preview x264's default preset takes three times as long, and its threads get in the renderer's way.
+_PREVIEW_OPTIONS = ("-preset", "veryfast", "-threads", "1")
+
+
+@contextmanager
+def open_video(path: Path, fps: float, *options: str, quality: float = 8) -> Iterator[Any]:
+    """Open an MP4 (H.264, yuv420p) to append (H, W, 3) RGB to, H and W even; quality is 0 to 10."""
+    writer = imageio.get_writer(
+        path,
+        fps=fps,
+        codec="libx264",
+        pixelformat="yuv420p",
+        quality=quality,
+        macro_block_size=2,
+        ffmpeg_log_level="error",
+        output_params=list(options),
+    )
+    with closing(writer):  # after an error its own `with` would leave FFmpeg running, which makes the file again
+        yield writer
+
+
+def write_video(
+    dataset: EpisodeSource, number: int, path: Path | str, *, speed: float = 1.0, kind: Kind = "rgb"
+) -> Path:
+    """Write an episode as MP4 (H.264, yuv420p): the cameras side by side, instruction and sub-goal below.
+
+    A speed of 1 is real time; depth is shown in colours.
+
+    Raises:
+        DatasetError: no such episode, or no such speed.
+    """
+    if not 0 < speed < np.inf:
+        raise DatasetError("no such speed", where="speed", expected="> 0", found=speed)
+    path = Path(path)
+    episode = dataset.episode(number)
+    drawing = EpisodeDrawing(number, episode.arrays, dataset.rate_hz)
+    with (
+        replacing(path) as tmp,
+        open_video(tmp, dataset.rate_hz * speed) as video,
+        closing(shots(episode, episode.cameras, kind)) as run,
+    ):
+        for step, images in enumerate(run):
+            video.append_data(drawing.frame(step, _coloured(images, kind), PANEL))
+    return path
+
+
+def contact_sheet(
+    dataset: EpisodeSource, out: Path | str, *, episodes: Sequence[int] | None = None, kind: Kind = "rgb"
+) -> Path:
+    """Write a PNG with a row for each episode (default: the first ten) and camera, of evenly spaced steps."""
+    numbers = dataset.numbers[:SHEET] if episodes is None else list(episodes)
+    return _write_sheet([_row(dataset, number, kind) for number in numbers], out)
+
+
+class Preview:
+    """Video and row of the contact sheet of an episode that is being written; see `open_preview`."""
+
+    def __init__(self, video: Any, drawing: EpisodeDrawing, *, row: bool) -> None:
+        self.row: NDArray[np.uint8] | None = None
+        """(H, W, 3) RGB, after the last frame, if it is wanted."""
+        self._video, self._drawing, self._wanted = video, drawing, drawing.row_steps if row else []
+        self._shown: dict[int, Images] = {}
+
+    def add(self, step: int, rgb: Images) -> None:
+        self._video.append_data(self._drawing.frame(step, rgb, PREVIEW_PANEL))
+        if step in self._wanted:
+            self._shown[step] = rgb
+            if step == self._wanted[-1]:
+                self.row, self._shown = self._drawing.row(self._shown), {}
+
+
+@contextmanager
+def open_preview(root: Path, drawing: EpisodeDrawing, *, row: bool) -> Iterator[Preview]:
+    """Open the preview of an episode, with a row of the contact sheet or without; the video appears whole."""
+    path = make_folder(root / schema.PREVIEW_FOLDER) / f"{schema.episode_folder(drawing.number)}.mp4"
+    with replacing(path) as tmp, open_video(tmp, drawing.rate_hz, *_PREVIEW_OPTIONS, quality=6) as video:
+        yield Preview(video, drawing, row=row)
+
+
+def on_sheet(numbers: Iterable[int]) -> tuple[int, ...]:
+    return tuple(sorted(numbers)[:SHEET])
+
+
+def finish_previews(dataset: EpisodeSource, rows: dict[int, NDArray[np.uint8]]) -> None:
+    """Write the contact sheet of a dataset, from rows of new episodes and stored images of the others, if it is new."""
+    path = dataset.root / schema.PREVIEW_FOLDER / "contact_sheet.png"
+    if rows or not path.is_file():
+        numbers = on_sheet(dataset.numbers)
+        _write_sheet([rows[number] if number in rows else _row(dataset, number) for number in numbers], path)
+
+
+def _row(dataset: EpisodeSource, number: int, kind: Kind = "rgb") -> NDArray[np.uint8]:
+    episode, shown = dataset.episode(number), {}
+    drawing = EpisodeDrawing(number, episode.arrays, dataset.rate_hz)
+    image = episode.rgb if kind == "rgb" else episode.depth
+    for step in drawing.row_steps:
+        shown[step] = _coloured({camera: image(camera, step) for camera in episode.cameras}, kind)
+    return drawing.row(shown)
+
+
+def _write_sheet(rows: Sequence[NDArray[np.uint8]], path: Path | str) -> Path:
+    with replacing(path) as tmp:
+        tmp.write_bytes(encode_png(np.concatenate(rows)))
+    return Path(path)
+
+
+def colour_depth(depth: NDArray[np.uint16]) -> NDArray[np.uint8]:
+    """Return depth as colours, (H, W, 3) RGB, on a logarithmic scale: near is red, far is blue, nothing is black."""
+    near, far = np.log(_NEAR_MM), np.log(_FAR_MM)
+    share = np.clip((far - np.log(np.maximum(depth, 1))) / (far - near), 0, 1)
+    colours = cv2.applyColorMap((share * 255).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1].copy()
+    colours[depth == 0] = 0
+    return colours.astype(np.uint8)
+
+
+def _coloured(images: Mapping[str, NDArray], kind: Kind) -> Images:
+    return {camera: image if kind == "rgb" else colour_depth(image) for camera, image in images.items()}

@@ -1,0 +1,208 @@
+"""Declared forms of the JSON files and tables of a LeRobot dataset; writer, reader and checks share them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import numpy as np
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    NonNegativeInt,
+    RootModel,
+    StringConstraints,
+    model_validator,
+)
+
+from robocas_ms3.core.documents import JSON_LIMIT, json_values, read_text
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.strict_model import parse
+from robocas_ms3.core.text import one_line
+from robocas_ms3.datasets.lerobot import schema
+from robocas_ms3.datasets.lerobot.tables import INTEGER, INTEGERS, NUMBER, NUMBERS, TEXT, TEXTS, Column
+from robocas_ms3.datasets.lerobot.variants import CHUNK_FILES, LAYOUTS
+from robocas_ms3.datasets.sources.episode_source import CameraModel
+from robocas_ms3.datasets.sources.file_models import EntryRecord
+from robocas_ms3.robots.cameras import Parent, standard_parent
+
+MAX_EPISODES = 10**6
+MAX_FRAMES = 10**9
+_MAX_FILES = 10**6
+_MAX_SECONDS = 1e6  # of a video's timestamps
+
+Name = Annotated[str, StringConstraints(pattern=r"^[^\x00-\x1f\x7f/\\.][^\x00-\x1f\x7f/\\]*$", max_length=200)]
+"""Key of a feature, which is part of paths."""
+Dtype = Annotated[
+    str, StringConstraints(pattern=r"^(video|image|string|language|bool|float(16|32|64)|u?int(8|16|32|64))$")
+]  # fmt: skip
+_Four = Annotated[list[Annotated[float, Field(allow_inf_nan=False)]], Field(min_length=4, max_length=4)]
+
+
+class _Record(BaseModel):
+    """Values of the declared types; keys of other writers are allowed."""
+
+    model_config = ConfigDict(strict=True, extra="allow")
+
+
+class FeatureRecord(_Record):
+    """A feature in ``info.json``."""
+
+    dtype: Dtype
+    shape: Annotated[list[Annotated[int, Field(ge=1, le=2**14)]], Field(min_length=1, max_length=4)]
+    names: list[str] | dict[str, Any] | None = None
+    info: dict[str, Any] | None = None
+
+
+def _check_version(version: str) -> str:
+    if version not in LAYOUTS:
+        raise ValueError(f"expected {' or '.join(LAYOUTS)}, found {version!r}")
+    return version
+
+
+class InfoRecord(_Record):
+    """``meta/info.json``. Paths have LeRobot's own patterns: a pattern of a file could lead anywhere."""
+
+    codebase_version: Annotated[str, AfterValidator(_check_version)]
+    robot_type: str | None = None
+    total_episodes: Annotated[int, Field(ge=0, le=MAX_EPISODES)]
+    total_frames: Annotated[int, Field(ge=0, le=MAX_FRAMES)]
+    total_tasks: Annotated[int, Field(ge=0, le=MAX_EPISODES)]
+    chunks_size: Annotated[int, Field(ge=1, le=MAX_EPISODES)] = CHUNK_FILES
+    data_files_size_in_mb: Annotated[float, Field(gt=0, le=1e6)] = 100
+    video_files_size_in_mb: Annotated[float, Field(gt=0, le=1e6)] = 200
+    fps: Annotated[int, Field(ge=1, le=1000)]
+    splits: dict[str, str]
+    features: dict[Name, FeatureRecord]
+    data_path: str
+    video_path: str | None = None
+
+    @model_validator(mode="after")
+    def _is_whole(self) -> InfoRecord:
+        missing = [key for key in schema.INDICES if key not in self.features]
+        if missing:
+            raise ValueError(f"features: expected {', '.join(schema.INDICES)}, found no {', '.join(missing)}")
+        if self.video_path is None and any(feature.dtype == "video" for feature in self.features.values()):
+            raise ValueError("video_path: expected a pattern, as there are videos")
+        layout = LAYOUTS[self.codebase_version]
+        for key, pattern, own in (
+            ("data_path", self.data_path, layout.data),
+            ("video_path", self.video_path, layout.video),
+        ):
+            if pattern not in (own, None):
+                raise ValueError(f"{key}: expected {own}, found {pattern}")
+        if layout.one_file_per_episode and self.chunks_size != CHUNK_FILES:
+            raise ValueError(f"chunks_size: expected {CHUNK_FILES}, found {self.chunks_size}")
+        return self
+
+
+class EpisodeLine(_Record):
+    """A line of ``meta/episodes.jsonl``."""
+
+    episode_index: Annotated[int, Field(ge=0, lt=MAX_EPISODES)]
+    tasks: list[str]
+    length: Annotated[int, Field(ge=1, le=MAX_FRAMES)]
+
+
+class TaskLine(_Record):
+    """A line of ``meta/tasks.jsonl``."""
+
+    task_index: Annotated[int, Field(ge=0, lt=MAX_EPISODES)]
+    task: str
+
+
+class StatsLine(_Record):
+    """A line of ``meta/episodes_stats.jsonl``."""
+
+    episode_index: Annotated[int, Field(ge=0, lt=MAX_EPISODES)]
+    stats: dict[str, dict[str, Any]]
+
+
+_Line = TypeVar("_Line", bound=_Record)
+
+
+def read_lines(path: Path, form: type[_Line], most: int) -> list[_Line]:
+    """Read a file of at most so many JSON lines."""
+    try:
+        lines = [line for line in read_text(path, JSON_LIMIT).split("\n") if line.strip()]
+        if len(lines) > most:
+            raise DatasetError("too many lines", where=path, expected=f"{most} at most", found=len(lines))
+        values = [json_values(line) for line in lines]
+    except (OSError, ValueError) as error:
+        raise DatasetError("these JSON lines can't be read", where=path, found=one_line(error)) from error
+    return [parse(form, found, DatasetError, where=f"{path}, line {n}") for n, found in enumerate(values, 1)]
+
+
+class SourceEntryRecord(EntryRecord):
+    """Recording of an episode, and its number in the source of the conversion."""
+
+    source: NonNegativeInt | None = None
+
+
+class ConversionRecord(_Record):
+    """``meta/robocas/conversion.json``, and the plan of a conversion that was interrupted."""
+
+    made_with: dict[str, str] = {}
+    settings: dict[str, Any] = {}
+    train_eps: list[NonNegativeInt] = []
+    val_eps: list[NonNegativeInt] = []
+    episodes: list[SourceEntryRecord] = []
+    left_out: list[SourceEntryRecord] = []
+
+
+class CameraRecord(_Record):
+    """A camera of an episode in ``meta/robocas/episodes.parquet``; see `CameraModel`."""
+
+    intrinsic: _Four
+    camera_in_parent: Annotated[list[_Four], Field(min_length=4, max_length=4)]
+    parent: Parent | None = Field(default=None, description="None: that of the standard camera of this name")
+
+    @classmethod
+    def of(cls, name: str, model: CameraModel) -> CameraRecord:
+        intrinsic, pose = (np.asarray(array).tolist() for array in (model.intrinsic, model.camera_in_parent))
+        parent = None if model.parent == standard_parent(name) else model.parent
+        return cls(intrinsic=intrinsic, camera_in_parent=pose, parent=parent)
+
+
+class CamerasText(RootModel[dict[Name, CameraRecord]]):
+    """The cameras of an episode, by name."""
+
+
+class SceneText(RootModel[dict[str, Any]]):
+    """The content of an episode's ``scene.json``."""
+
+
+SCENES: Mapping[str, Column] = {"episode_index": Column(INTEGER), "scene": Column(TEXT), "cameras": Column(TEXT)}
+
+
+def episode_columns(names: Iterable[str], features: Mapping[str, Any]) -> dict[str, Column]:
+    """Return the columns of ``meta/episodes``; those of depth are optional, by the ``names`` that are there."""
+    columns = {
+        "episode_index": Column(INTEGER, greatest=MAX_EPISODES - 1),
+        "tasks": Column(TEXTS),
+        "length": Column(INTEGER, least=1, greatest=MAX_FRAMES),
+        "dataset_from_index": Column(INTEGER, greatest=MAX_FRAMES),
+        "dataset_to_index": Column(INTEGER, greatest=MAX_FRAMES),
+        "data/chunk_index": Column(INTEGER, greatest=_MAX_FILES),
+        "data/file_index": Column(INTEGER, greatest=_MAX_FILES),
+    }
+    videos = [key for key, feature in features.items() if feature["dtype"] == "video"]
+    there = {name.rpartition("/")[0] for name in names}
+    depth = [f"depth/{schema.camera_of(key)}" for key in videos]
+    for prefix in (*(f"videos/{key}" for key in videos), *(name for name in depth if name in there)):
+        for name in ("chunk_index", "file_index"):
+            columns[f"{prefix}/{name}"] = Column(INTEGER, greatest=_MAX_FILES)
+        for name in ("from_timestamp", "to_timestamp"):
+            columns[f"{prefix}/{name}"] = Column(NUMBER, greatest=_MAX_SECONDS)
+    return columns
+
+
+def declared_columns(features: Mapping[str, Any]) -> dict[str, Column]:
+    columns: dict[str, Column] = {}
+    for key, dtype in ((key, feature["dtype"]) for key, feature in features.items()):
+        if dtype not in ("image", "video", "language"):
+            columns[key] = Column(TEXT if dtype == "string" else NUMBERS if dtype.startswith("float") else INTEGERS)
+    return columns | {key: Column(INTEGER, greatest=MAX_FRAMES) for key in schema.INDICES if key != "timestamp"}

@@ -1,0 +1,251 @@
+"""Copies episodes of finished datasets into new ones; merging and splitting are such copies."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import robocas_ms3
+from robocas_ms3.core.documents import check_regular
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.files import replacing_folder
+from robocas_ms3.core.output_folder import OutputFolder
+from robocas_ms3.core.strict_model import parse
+from robocas_ms3.core.text import count_of, format_ranges
+from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.checks import arrays as laws
+from robocas_ms3.datasets.checks.images import check_cameras, check_images
+from robocas_ms3.datasets.checks.scene import read_settings
+from robocas_ms3.datasets.checks.violation import Violation, read_object
+from robocas_ms3.datasets.conversion.data_info import write_info
+from robocas_ms3.datasets.conversion.episode_plan import DATASET, SETTINGS, header
+from robocas_ms3.datasets.images.image_headers import check_ends
+from robocas_ms3.datasets.sources.arrays import arrays_fingerprint, read_arrays
+from robocas_ms3.datasets.sources.file_models import ConversionRecord
+from robocas_ms3.datasets.sources.reader import Dataset
+
+KEEP_RULE = "every episode keeps the side it had in the dataset it is from"
+_NO_LINKS = {errno.EXDEV, errno.EPERM, errno.EACCES, errno.EMLINK, errno.EOPNOTSUPP, errno.ENOSYS}
+
+
+@dataclass(frozen=True)
+class FinishedDataset:
+    """A dataset whose files all list the same episodes, its name, and its recordings; see `open_finished`."""
+
+    dataset: Dataset
+    name: str
+    ledger: Mapping[int, dict[str, Any]]
+
+    @property
+    def root(self) -> Path:
+        return self.dataset.root
+
+    def identity(self, number: int) -> str:
+        """Return the fingerprint of the recording of an episode, or that of its arrays if the recording is unknown."""
+        recording = self.ledger[number].get("recording")
+        return recording or f"arrays {arrays_fingerprint(self.dataset.episode(number).arrays)}"
+
+
+def schema_version(dataset: Dataset) -> object:
+    """Return the schema version of a dataset; 0 is the format of RoboCAS-v0."""
+    return dataset.settings.get("schema_version", 1) if dataset.settings else 0
+
+
+def open_finished(root: Path, name: str = "") -> FinishedDataset:
+    """Open a dataset to copy episodes from, or raise DatasetError if it is unfinished or contradicts itself."""
+    dataset = Dataset(root)
+    schema.check_version(schema_version(dataset), root)
+    if not dataset.info:
+        path, fix = root / schema.DATA_INFO_FILE, "Run the same robocas convert again first."
+        raise DatasetError("this dataset is not finished", where=path, found="no file", fix=fix)
+    listed = [number for side in dataset.sides for number in side]
+    if sorted(listed) != dataset.numbers:
+        found = f"{format_ranges(set(listed) ^ set(dataset.numbers)) or 'some'} missing, twice, or not on disk"
+        fix = "Finish it with robocas convert, or accept what is there with robocas split --in-place."
+        raise DatasetError("not the episodes on disk", where=root / schema.DATA_INFO_FILE, found=found, fix=fix)
+    where = root / schema.CONVERSION_FILE
+    parse(ConversionRecord, dataset.settings, DatasetError, where=where)
+    ledger = {int(number): entry for number, entry in dataset.settings.get("episodes", {}).items()}
+    unlisted = [number for number in dataset.numbers if number not in ledger]
+    if unlisted:
+        raise DatasetError("these episodes are not listed", where=where, found=format_ranges(unlisted))
+    for number in dataset.numbers:
+        episode = dataset.episode(number)
+        found = episode.scene.get("schema_version", 1)
+        schema.check_version(found, episode.folder / schema.SCENE_FILE, "an episode")
+    return FinishedDataset(dataset, name or root.resolve().name, ledger)
+
+
+@dataclass(frozen=True)
+class CopiedEpisode:
+    """An episode of a dataset, and the side of the split on which its copy is."""
+
+    source: FinishedDataset
+    number: int
+    side: Literal["train", "val"]
+
+
+@dataclass(frozen=True)
+class CopyOptions:
+    """How episodes are copied; ``on_start`` is called with the number of episodes to write, ``on_episode`` with each.
+
+    Hard links, where the file system allows, share files with the source, which an editor may change.
+    """
+
+    link: bool = True
+    overwrite: bool = False
+    on_start: Callable[[int], None] | None = None
+    on_episode: Callable[[int], None] | None = None
+
+
+@dataclass(frozen=True)
+class CopyResult:
+    """Number of episodes of a new dataset, of those that were there already, of files, and of duplicates skipped."""
+
+    out: Path
+    episodes: int
+    kept: int
+    linked: int
+    copied: int
+    skipped: int = 0
+
+    def __str__(self) -> str:
+        kept = f", {self.kept} of them were there" if self.kept else ""
+        linked = f"{count_of(self.linked, 'file')} linked, {self.copied} copied"
+        skipped = f", {count_of(self.skipped, 'duplicate')} left out" if self.skipped else ""
+        return f"{self.out}: {count_of(self.episodes, 'episode')}{kept}, {linked}{skipped}"
+
+
+def copy_episodes(
+    outs: Mapping[Path, Sequence[CopiedEpisode]], split_rule: str, options: CopyOptions
+) -> list[CopyResult]:
+    """Write datasets of episodes with the same settings, numbered from 0 in the given order; see `CopyOptions`.
+
+    Everything is checked before anything is written. Called again after a kill, it continues, with the same result.
+    """
+    numbers: dict[Path, list[int]] = {}
+    for member in (member for members in outs.values() for member in members):
+        numbers.setdefault(member.source.root, []).append(member.number)
+    records = {out: _record(members, split_rule) for out, members in outs.items()}
+    for out, record in records.items():
+        check_apart(out, list(numbers))
+        OutputFolder(out, DATASET, _settings_of(record), overwrite=options.overwrite).read()
+    for root, chosen in numbers.items():
+        _check_episodes(root, chosen)
+    if options.on_start:
+        folders = [out / schema.episode_folder(n) for out, members in outs.items() for n in range(len(members))]
+        options.on_start(sum(options.overwrite or not folder.is_dir() for folder in folders))
+    return [_copy(out, members, records[out], options) for out, members in outs.items()]
+
+
+def _copy(out: Path, members: Sequence[CopiedEpisode], record: Mapping[str, Any], options: CopyOptions) -> CopyResult:
+    placer = FilePlacer(options.link)
+    with dataset_output(out, record, options.overwrite):
+        missing = [n for n in range(len(members)) if not (out / schema.episode_folder(n)).is_dir()]
+        for number in missing:
+            member = members[number]
+            with replacing_folder(out / schema.episode_folder(number)) as folder:
+                placer.place_tree(member.source.root / schema.episode_folder(member.number), folder)
+            if options.on_episode:
+                options.on_episode(number)
+        train, val = ([n for n, member in enumerate(members) if member.side == side] for side in ("train", "val"))
+        write_info(out, (train, val))
+    return CopyResult(out, len(members), len(members) - len(missing), placer.linked, placer.copied)
+
+
+def _record(members: Sequence[CopiedEpisode], split_rule: str) -> dict[str, Any]:
+    episodes = {}
+    for number, member in enumerate(members):
+        entry = member.source.ledger[member.number]
+        before = {"from": entry["from"]} if "from" in entry else {}  # of an episode that was copied before
+        episodes[str(number)] = {**entry, "from": {"dataset": member.source.name, "episode": member.number, **before}}
+    settings = members[0].source.dataset.settings
+    return {**copied_header({key: settings[key] for key in SETTINGS}, split_rule), "episodes": episodes}
+
+
+def copied_header(settings: Mapping[str, Any], split_rule: str) -> dict[str, Any]:
+    """Return ``conversion.json`` of a dataset made of others, without the episodes."""
+    return {**header(settings, split_rule), "made_with": {"robocas_ms3": robocas_ms3.__version__}}
+
+
+@contextmanager
+def dataset_output(out: Path, record: Mapping[str, Any], overwrite: bool) -> Iterator[None]:
+    """Start or continue a dataset made of others: its ``conversion.json`` has to match, whatever the versions."""
+    with OutputFolder(out, DATASET, _settings_of(record), overwrite=overwrite) as output:
+        output.start(record)
+        yield
+
+
+def _settings_of(record: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in record.items() if key != "made_with"}
+
+
+def check_apart(out: Path, inputs: Sequence[Path]) -> None:
+    target = out.resolve()
+    for path in (path.resolve() for path in inputs):
+        if path == target or path in target.parents or target in path.parents:
+            raise DatasetError("the output is an input, or one is in the other", where=out, fix="Choose another --out.")
+
+
+def _check_episodes(root: Path, numbers: Iterable[int]) -> None:
+    """Check that episodes have all arrays, cameras and images; arrays that an imported episode lacks may be missing."""
+    _, pictures, _ = read_settings(root)
+    for folder in (root / schema.episode_folder(number) for number in numbers):
+        stored = read_arrays(folder / schema.EPISODE_FILE)
+        source = read_object(folder, schema.SCENE_FILE)[0].get("source")
+        missing = source.get("missing") if isinstance(source, dict) else None
+        lacking = missing if isinstance(missing, list) else []
+        for wrong in (
+            *(wrong for wrong in laws.check_keys(stored) if wrong.key not in lacking),
+            *laws.violations_of(stored, (laws.check_file, laws.check_shapes, laws.check_finite)),
+            *check_cameras(folder, pictures),
+            *check_images(folder, pictures, stored.steps, {}, check_ends),
+        ):
+            if wrong.kind != "surplus":
+                raise damaged_episode(root, wrong)
+
+
+def damaged_episode(root: Path, wrong: Violation) -> DatasetError:
+    where, fix = root / wrong.where, f"robocas validate {root} lists all."
+    return DatasetError("this episode is damaged", where=where, expected=wrong.expected, found=wrong.found, fix=fix)
+
+
+@dataclass
+class FilePlacer:
+    """Links files into a dataset, or copies them where that is not possible or not wanted, and counts both."""
+
+    link: bool
+    linked: int = 0
+    copied: int = 0
+
+    def place(self, source: Path, target: Path) -> None:
+        if self.link and not source.is_symlink():
+            try:
+                os.link(source, target)
+                self.linked += 1
+                return
+            except OSError as error:
+                if error.errno not in _NO_LINKS:
+                    raise
+                self.link = error.errno == errno.EMLINK  # a limit of this file alone
+        check_regular(source)
+        shutil.copyfile(source, target)
+        self.copied += 1
+
+    def place_tree(self, source: Path, target: Path) -> None:
+        """Link or copy the files of a folder into a folder that exists, except hidden files."""
+        with os.scandir(source) as entries:
+            for entry in sorted(entries, key=lambda entry: entry.name):
+                if entry.name.startswith("."):
+                    continue
+                if entry.is_dir():
+                    (target / entry.name).mkdir()
+                    self.place_tree(Path(entry.path), target / entry.name)
+                elif entry.is_file():
+                    self.place(Path(entry.path), target / entry.name)

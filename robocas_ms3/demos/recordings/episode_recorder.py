@@ -1,0 +1,158 @@
+"""Record episodes in ManiSkill's trajectory format, one file per episode; `trajectory_hdf5.merge` makes one of them."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, cast
+
+import gymnasium as gym
+import h5py
+import numpy as np
+from mani_skill.utils import common
+from mani_skill.utils.gym_utils import find_max_episode_steps_value
+from mani_skill.utils.wrappers.record import parse_env_info
+from numpy.typing import NDArray
+
+from robocas_ms3.core.files import replacing, write_json
+from robocas_ms3.demos.recordings.environment import recorded_id
+from robocas_ms3.demos.recordings.trajectory_hdf5 import write_whole
+from robocas_ms3.demos.recordings.trajectory_json import versions
+from robocas_ms3.tasks.base import RoboCASEnv
+
+# Settings of one machine or one run; a trajectory has to replay without them.
+_LOCAL_KWARGS = ("layouts", "render_backend", "render_mode", "sim_backend", "reward_mode")
+_PICTURES = ("rgb", "depth", "seg")
+
+
+class EpisodeRecorder(gym.Wrapper):
+    """Keeps a single episode of one env, and writes it in ManiSkill's format when it is finished.
+
+    Until then there is no file: a step costs little, and the recorder survives a fork of the process. The files are
+    ``<name>.h5`` and ``<name>.json`` in ``folder``.
+    """
+
+    def __init__(self, env: gym.Env, folder: Path, name: str) -> None:
+        super().__init__(env)
+        base_env = env.unwrapped
+        assert isinstance(base_env, RoboCASEnv)
+        self._base_env, self._trajectory = base_env, folder / f"{name}.h5"
+        self._steps = _Steps()
+        self._reset_kwargs: dict[str, Any] = {}
+        versions()  # here, where it is kept, and not in each branch
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._reset_kwargs = copy.deepcopy({"options": options} if seed is None else {"options": options, "seed": seed})
+        self._steps = _Steps()
+        self._keep(observation)
+        return observation, info
+
+    def begin_at(self, state: dict[str, Any]) -> None:
+        """Begin anew from a state of the scene that was reset, as ``set_state_dict`` takes it."""
+        self._base_env.set_state_dict(state)
+        self._steps = _Steps()
+        self._keep(self._base_env.get_obs())
+
+    def step(self, action: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self._steps.actions.append(np.array(action, np.float32).reshape(-1))
+        self._steps.flags.append((bool(terminated), bool(truncated), bool(info["success"]), bool(info["fail"])))
+        self._keep(observation)
+        return observation, reward, terminated, truncated, info
+
+    def _keep(self, observation: Any) -> None:
+        steps = self._steps
+        steps.states.append(self._base_env.bodies.read()[0].cpu().numpy())
+        steps.beside_bodies.append(_of_one_env(self._base_env.state_beside_bodies()))
+        steps.observations.append(_of_one_env(observation))
+
+    @property
+    def states(self) -> dict[str, dict[str, NDArray[np.float32]]]:
+        """ManiSkill's states since the reset: ``{"actors": {name: (S + 1, 13)}, "articulations": {...}}``."""
+        return self._base_env.bodies.split(np.stack(self._steps.states))
+
+    def finish(self, episode: dict[str, Any]) -> None:
+        """Write the episode with its ``robocas`` metadata; the environment stays open."""
+        steps, env = self._steps, self._base_env
+        terminated, truncated, success, fail = np.array(steps.flags, bool).reshape(-1, 4).T
+
+        def fill(file: h5py.File) -> None:
+            group = file.create_group("traj_0", track_order=True)
+            _write(group, "obs", _stacked(steps.observations))
+            group.create_dataset("actions", data=np.stack(steps.actions), dtype=np.float32)
+            flags = {"terminated": terminated, "truncated": truncated, "success": success, "fail": fail}
+            for name, values in flags.items():
+                group.create_dataset(name, data=values, dtype=bool)
+            _write(group, "env_states", {**self.states, **_stacked(steps.beside_bodies)})
+
+        with replacing(self._trajectory, sync=True) as tmp:
+            write_whole(tmp, fill)
+            # the JSON first: an HDF5 file that is there always has its JSON
+            write_json(
+                self._trajectory.with_suffix(".json"),
+                {
+                    "env_info": self._env_info(),
+                    "episodes": [
+                        {
+                            "episode_id": 0,
+                            "episode_seed": int(cast(Any, env._episode_seed)[0]),
+                            "control_mode": env.control_mode,
+                            "elapsed_steps": len(steps.actions),
+                            "reset_kwargs": self._reset_kwargs,
+                            "success": bool(success[-1]),
+                            "fail": bool(fail[-1]),
+                            "robocas": episode,
+                        }
+                    ],
+                    "source_type": "motionplanning",
+                    "source_desc": "scripted policy of robocas_ms3",
+                    "robocas": {"control_freq": env.control_freq, "sim_freq": env.sim_freq, "versions": versions()},
+                },
+                sync=True,
+            )
+
+    def _env_info(self) -> dict[str, Any]:
+        info = parse_env_info(self.env)
+        assert info is not None, "the environment was made by gym.make"
+        kwargs = {key: value for key, value in info["env_kwargs"].items() if key not in _LOCAL_KWARGS}
+        return {
+            "env_id": recorded_id(str(info["env_id"])),
+            "env_kwargs": kwargs,
+            "max_episode_steps": find_max_episode_steps_value(self.env),
+        }
+
+
+@dataclass
+class _Steps:
+    """What was recorded since the reset: S actions and what came of them; of the rest S + 1."""
+
+    actions: list[NDArray[np.float32]] = field(default_factory=list)
+    flags: list[tuple[bool, bool, bool, bool]] = field(default_factory=list)
+    """terminated, truncated, success, fail"""
+    states: list[NDArray[np.float32]] = field(default_factory=list)
+    beside_bodies: list[Any] = field(default_factory=list)
+    observations: list[Any] = field(default_factory=list)
+
+
+def _of_one_env(data: Any) -> Any:
+    if isinstance(data, dict):
+        return {key: _of_one_env(value) for key, value in data.items()}
+    return common.to_numpy(data)[0].copy()
+
+
+def _stacked(steps: list[Any]) -> Any:
+    if isinstance(steps[0], dict):
+        return {key: _stacked([step[key] for step in steps]) for key in steps[0]}
+    return np.stack(steps)
+
+
+def _write(group: h5py.Group, key: str, data: Any) -> None:
+    if isinstance(data, dict):
+        inner = group.create_group(key, track_order=True)
+        for name, value in data.items():
+            _write(inner, name, value)
+        return
+    packing = {"compression": "gzip", "compression_opts": 5} if key in _PICTURES else {}
+    group.create_dataset(key, data=data, dtype=data.dtype, **packing)

@@ -1,0 +1,144 @@
+"""Reads a ManiSkill trajectory, ``F.h5`` with ``F.json`` beside it, as the generator writes it."""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.demos.recordings.environment import read_env
+from robocas_ms3.demos.recordings.motion import Motion, gripper_commands
+from robocas_ms3.demos.recordings.trajectory_hdf5 import (
+    open_episode,
+    open_trajectory,
+    read_steps,
+    readable,
+)
+from robocas_ms3.demos.recordings.trajectory_json import Entry, RunRecord, read_entry, read_json
+from robocas_ms3.robots.description import RobotDescription
+from robocas_ms3.robots.registry import RobotSpec
+
+_STATE_DIM = 13 + 2 * RobotDescription.finger_slice.stop
+
+
+@dataclass(frozen=True)
+class Recording(Entry):
+    """One recorded episode.
+
+    Attributes:
+        actions: (S, A).
+        states: ``{"actors": {name: (S+1, 13)}, "articulations": {name: (S+1, 13 + 2 joints)}}``.
+    """
+
+    actions: NDArray[np.float32]
+    states: dict[str, dict[str, NDArray[np.float32]]]
+    robot: RobotSpec
+
+    def motion(self, samples: NDArray[np.int64]) -> Motion:
+        commands = gripper_commands(self.actions, self.control_mode)
+        return Motion.of(self.robot, self.states["articulations"][self.robot.description.uid], commands, samples)
+
+    def state(self, index: int) -> dict[str, dict[str, NDArray[np.float32]]]:
+        """Return a state as ``set_state_dict`` takes it, each array (1, D)."""
+        return {kind: {n: a[index : index + 1] for n, a in arrays.items()} for kind, arrays in self.states.items()}
+
+
+class TrajectoryFile:
+    """An open trajectory file; use it in a ``with`` statement. ``pack`` (name or folder) replaces the named one.
+
+    Attributes:
+        env_info: ``env_id``, ``env_kwargs``, ... of the JSON.
+        env: the environment it was recorded in.
+        versions: of the packages that it was made with.
+        episodes: the JSON's entries.
+    """
+
+    def __init__(self, path: str | Path, *, pack: str | Path | None = None) -> None:
+        self.path = Path(path)
+        metadata_path = self.path.with_suffix(".json")
+        if self.path.is_dir():
+            inside = self.path / "trajectory.h5"
+            fix = f"Did you mean {inside}?" if inside.is_file() else "Give the .h5 file that robocas generate made."
+            raise DatasetError("this is a folder, not a trajectory file", where=self.path, fix=fix)
+        if not self.path.is_file():
+            raise DatasetError("no such trajectory file", where=self.path, fix="Make one with robocas generate.")
+        metadata = read_json(self.path)
+        self.env_info: dict[str, Any] = metadata["env_info"]
+        self.episodes: list[dict[str, Any]] = metadata["episodes"]
+        self.env = read_env(self.env_info, metadata_path, pack=pack)
+        self.robot = self.env.robot(f"{metadata_path}, env_info.env_kwargs.robot_uids")
+        run = metadata.get("robocas")
+        if run is None:
+            raise DatasetError(
+                "the JSON lacks the instructions and sub-goals",
+                where=metadata_path,
+                expected="key 'robocas'",
+                fix="Convert the file written by robocas generate; replays of it drop them.",
+            )
+        self.control_freq = float(run.get("control_freq", RunRecord().control_freq))
+        self.versions: dict[str, Any] = run.get("versions", {})
+        self._file = open_trajectory(self.path)
+        listed = {f"traj_{episode['episode_id']}" for episode in self.episodes}
+        with readable(self.path, "this file is damaged"):
+            stored = set(self._file)
+        if listed != stored:
+            self.close()
+            raise DatasetError(
+                "HDF5 and JSON do not list the same episodes",
+                where=self.path,
+                expected=f"{len(listed)} of the JSON",
+                found=f"{len(stored)}, {len(listed ^ stored)} of them differ",
+            )
+
+    def __enter__(self) -> TrajectoryFile:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self._file.close()
+
+    def reopened(self) -> TrajectoryFile:
+        """Return the same file, opened again, with its JSON as it was read."""
+        file = copy(self)
+        file._file = open_trajectory(self.path)
+        return file
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave the open file behind, which no other process and no copy can have."""
+        return {**self.__dict__, "_file": None}
+
+    def entry(self, index: int) -> Entry:
+        return read_entry(self.episodes[index], self._where(index))
+
+    def recording(self, index: int, *, bodies: bool = True) -> Recording:
+        """Read an episode by its position in ``episodes``, with the states of all bodies or of the robot only."""
+        where, uid = self._where(index), self.robot.description.uid
+        group = open_episode(self._file, self.episodes[index]["episode_id"])
+        actions, found = read_steps(group, body=None if bodies else uid)
+        states = {
+            kind: {name: rows.astype(np.float32, copy=False) for name, rows in of.items()} for kind, of in found.items()
+        }
+        entry = self.entry(index)
+        if entry.control_steps != len(actions):
+            expected = f"{entry.control_steps} actions, as the JSON says"
+            raise DatasetError("this episode is damaged", where=where, expected=expected, found=len(actions))
+        robot = states.get("articulations", {}).get(uid)
+        width = _STATE_DIM
+        if robot is None or robot.shape[1] != width:
+            raise DatasetError(
+                "states of another robot",
+                where=where,
+                expected=f"{uid} of {width} numbers",
+                found=sorted(states.get("articulations", {})) if robot is None else robot.shape[1],
+            )
+        return Recording(**vars(entry), actions=actions, states=states, robot=self.robot)
+
+    def _where(self, index: int) -> str:
+        return f"{self.path}, traj_{self.episodes[index]['episode_id']}"

@@ -1,0 +1,205 @@
+"""Grasp an object by one of its annotated grasps and take it out of its surroundings.
+
+From above: lift it. From the front: lift it a little, then withdraw straight back, so that neighbours stay standing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import islice
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.poses import inverse
+from robocas_ms3.planning.grasp_choice import draw_order, filter_grasps, grip_margins, score_grasps
+from robocas_ms3.planning.protocol import Array, AttachedBody, Trajectory
+from robocas_ms3.planning.scene import SPACING
+from robocas_ms3.planning.skills.arm import ROOM, Arm, moved_back, raised
+from robocas_ms3.scenes.grasp_checks import NEIGHBOURHOOD, PREGRASP_DISTANCE, gripper_is_clear
+
+GRASPS_CHECKED = 48  # grasps of which a check of collisions says whether to try them early
+CLEARED_AT_ONCE = 12
+ENTRIES = 4  # pre-grasp configurations of one grasp
+WAYS = 6  # pre-grasp configurations that are searched for together
+GRASPS_COMPARED = 96  # of which kinds are told apart
+ALIKE = 0.02, np.deg2rad(30)  # m, rad between two grasps of a kind
+GRASPS_PLANNED = 12  # grasps that motions are planned for before an attempt gives up
+# m; the least makes a stage of the tasks (3 cm), the others go over what stands in front: the first with a way out
+FRONT_LIFTS = (0.04, 0.08, 0.14, 0.2)
+WITHDRAWALS = (0.25, 0.18, 0.12)  # m, straight back; the first one that can be reached
+
+Out = tuple[Trajectory, ...]
+
+
+def grasp(arm: Arm, slot: int, *, lift_height: float = 0.10, other_than: int = 0) -> None:
+    """Plan a grasp of an object, run it, and lift (from the front: lift and withdraw) the object.
+
+    Args:
+        lift_height: when grasping from above, m (RoboCAS-v0: 0.10 when picking, 0.15 when searching).
+        other_than: how many kinds of grasps to leave out, the best first.
+    """
+    with arm.planning():
+        way_in, out = plan_grasp(arm, slot, lift_height, other_than)
+    arm.follow(way_in)
+    arm.close_gripper()
+    if not arm.holds(slot):
+        raise PlanningFailed("grasp", "missed")
+    arm.follow(*out)
+    if not arm.holds(slot):
+        raise PlanningFailed("lift", "slipped")
+
+
+def plan_grasp(arm: Arm, slot: int, lift_height: float, other_than: int = 0) -> tuple[Trajectory, Out]:
+    """Plan from where the arm is to the best grasp that has a way in and out, and out of the object's surroundings."""
+    planner, failure = arm.planner, PlanningFailed("grasp_sampling", "no_feasible_grasp")
+    everything, others = arm.scene.obstacles(), arm.scene.obstacles(without=slot)
+    with_room = arm.scene.obstacles(room=ROOM)
+    ways: list[tuple[Array, Trajectory, Out]] = []  # pre-grasp configuration, way in, way out
+
+    def finished(reach: Trajectory, inward: Trajectory, out: Out) -> tuple[Trajectory, Out]:
+        planner.set_scene(everything)
+        return planner.join(arm.at, reach, inward), out
+
+    def searched() -> tuple[Trajectory, Out]:
+        planner.set_scene(everything)
+        reach = planner.plan_to_qpos(arm.at, [way[0] for way in ways], stage="reach")
+        _, inward, out = min(ways, key=lambda way: float(np.abs(way[0] - reach.qpos[-1]).max()))
+        return finished(reach, inward, out)
+
+    for tcp_in_base in candidates(arm, slot, other_than):
+        # in and out of the target's surroundings, where the target itself is no obstacle; it is one on the way there
+        planner.set_scene(others)
+        starts = planner.ik(moved_back(tcp_in_base, PREGRASP_DISTANCE), arm.at)[:ENTRIES]
+        failure = failure if starts else PlanningFailed("approach", "no_ik")
+        for start in starts:
+            try:
+                planner.set_scene(with_room)
+                reach = planner.plan_to_qpos(arm.at, [start], stage="reach", search=False)
+            except PlanningFailed:
+                reach = None
+            try:
+                planner.set_scene(others)
+                inward, out = _plan_way_in_and_out(arm, slot, start, tcp_in_base, lift_height)
+            except PlanningFailed as error:
+                failure = error
+                continue
+            if reach is not None:
+                return finished(reach, inward, out)
+            ways.append((start, inward, out))
+        # a search for a way round costs as much as all else, and takes several goals at once
+        if len(ways) >= WAYS:
+            try:
+                return searched()
+            except PlanningFailed as error:
+                failure, ways = error, []
+    if ways:
+        return searched()
+    raise failure
+
+
+def candidates(arm: Arm, slot: int, other_than: int) -> Iterator[Array]:
+    """Yield grasps worth planning for, best first, as TCP poses 4x4; without the best few kinds (``other_than``)."""
+    notes = arm.env.object_assets[0][slot].annotations
+    base, object_in_base = arm.scene.arm_base_in_world, arm.scene.object_in_base(slot)
+    kept = filter_grasps(notes, base @ object_in_base, base, arm.approach)
+    tcp_in_base = inverse(base) @ kept.tcp_in_world
+    solved, qpos = arm.reachability.reachable(tcp_in_base, arm.at)
+    solved_before, qpos_before = arm.reachability.reachable(moved_back(tcp_in_base, PREGRASP_DISTANCE), arm.at)
+    reachable = np.flatnonzero(solved & solved_before)
+    if not len(reachable):
+        raise PlanningFailed("grasp_sampling", "unreachable" if len(kept) else "all_filtered")
+    surface = arm.env.object_assets[0][slot].surface_points(SPACING)
+    scores = score_grasps(
+        tcp_in_base[reachable],
+        kept.qualities[reachable],
+        grip_margins(notes.grasps_tcp_in_object[kept.index[reachable]], kept.widths[reachable], surface),
+        np.abs(qpos[reachable] - arm.at).max(axis=1),
+        object_in_base[:3, 3],
+        arm.approach,
+    )
+    ranks = draw_order(arm.rng, scores)
+    near = arm.scene.obstacles_in_base(without=slot, radius=NEIGHBOURHOOD, around=object_in_base[:3, 3])
+    clear = _clear(tcp_in_base, reachable[ranks], near)
+    if arm.approach == "front":  # where it is narrow, first those whose arm is free as inverse kinematics found it
+        looked_at = list(islice(clear, GRASPS_CHECKED))
+        arm.planner.set_scene(arm.scene.obstacles(without=slot))
+        ways = np.stack([qpos_before[looked_at], qpos[looked_at]], axis=1)
+        free = arm.planner.free(ways.reshape(-1, 7)).reshape(-1, 2).all(axis=1)
+        clear = iter([looked_at[i] for i in np.argsort(~free, kind="stable")])
+    if other_than:
+        looked_at = list(islice(clear, GRASPS_COMPARED))
+        clear = (looked_at[i] for i in _of_other_kinds(tcp_in_base[looked_at], other_than))
+    found = False
+    for index in islice(clear, GRASPS_PLANNED):
+        found = True
+        yield tcp_in_base[index]
+    if not found:
+        raise PlanningFailed("grasp_sampling", "all_filtered")
+
+
+def _of_other_kinds(tcp: Array, count: int) -> list[int]:
+    """Return indices of the grasps (N, 4, 4) without the first few kinds; a kind is all ``ALIKE`` its first."""
+    left = np.ones(len(tcp), dtype=bool)
+    for _ in range(count):
+        if not left.any():
+            break
+        first = tcp[int(np.argmax(left))]
+        near = np.linalg.norm(tcp[:, :3, 3] - first[:3, 3], axis=1) <= ALIKE[0]
+        turned = [np.abs(tcp[:, :3, axis] @ first[:3, axis]) for axis in (1, 2)]  # the closing axis has no sign
+        left &= ~(near & (np.min(turned, axis=0) >= np.cos(ALIKE[1])))
+    return np.flatnonzero(left).tolist()
+
+
+def _clear(tcp_in_base: Array, order: NDArray[np.int_], points_in_base: Array) -> Iterator[int]:
+    """Yield the grasps, in their order, whose gripper meets no point on its way in; a few are tested at a time."""
+    for first in range(0, len(order), CLEARED_AT_ONCE):
+        some = order[first : first + CLEARED_AT_ONCE]
+        yield from some[gripper_is_clear(tcp_in_base[some], points_in_base)].tolist()
+
+
+def _plan_way_in_and_out(
+    arm: Arm, slot: int, qpos: Array, tcp_in_base: Array, lift_height: float
+) -> tuple[Trajectory, Out]:
+    inward = arm.planner.plan_straight(qpos, tcp_in_base, stage="approach")
+    if arm.approach == "top":
+        return inward, (arm.first_line(inward.qpos[-1], _ways_up(tcp_in_base, lift_height), stage="lift"),)
+    return inward, _plan_withdrawal(arm, slot, inward.qpos[-1], tcp_in_base)
+
+
+def _plan_withdrawal(arm: Arm, slot: int, start: Array, tcp_in_base: Array) -> tuple[Trajectory, Trajectory]:
+    """Plan straight up, as little as leaves a way out, and from there straight and level back with the object."""
+    failure = PlanningFailed("withdraw", "no_way_out")
+    vertices = np.concatenate(arm.env.object_assets[0][slot].hulls)
+    held = AttachedBody(vertices, inverse(tcp_in_base) @ arm.scene.object_in_base(slot))
+    back = -tcp_in_base[:2, 2] / np.linalg.norm(tcp_in_base[:2, 2])
+    for height in FRONT_LIFTS:
+        try:
+            lift = arm.planner.plan_straight(start, raised(tcp_in_base, height), stage="lift")
+        except PlanningFailed as error:
+            raise error if height == FRONT_LIFTS[0] else failure from error
+        goals = []
+        for distance in WITHDRAWALS:
+            goals.append(raised(tcp_in_base, height))
+            goals[-1][:2, 3] += distance * back
+        arm.planner.attach(held)
+        try:
+            return lift, arm.first_line(lift.qpos[-1], goals, stage="withdraw")
+        except PlanningFailed as error:
+            failure = error
+        finally:
+            arm.planner.attach(None)
+    raise failure
+
+
+def _ways_up(tcp_in_base: Array, lift_height: float) -> list[Array]:
+    """Return where to lift to: straight up, or between that and back the way the gripper came in."""
+    up, back = np.array([0, 0, 1.0]), -tcp_in_base[:3, 2]
+    goals = []
+    for share in (0.0, 0.5, 1.0):
+        direction = (1 - share) * up + share * back
+        if direction[2] > 0.2:
+            goals.append(tcp_in_base.copy())
+            goals[-1][:3, 3] += lift_height / direction[2] * direction
+    return goals

@@ -1,0 +1,203 @@
+"""Lift an object and put it down on a free place of the surface."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.spatial import ConvexHull, KDTree
+from scipy.spatial.transform import Rotation
+
+from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.poses import transform
+from robocas_ms3.planning.protocol import Array, Trajectory
+from robocas_ms3.planning.shapes import convex_hull
+from robocas_ms3.planning.skills.arm import Arm, first_plan, moved_back, plan_step_back, raised
+from robocas_ms3.planning.skills.grasp import grasp
+from robocas_ms3.planning.skills.place import attach_held
+from robocas_ms3.planning.skills.push import surface_in_base
+from robocas_ms3.scenes.grasp_checks import MAX_WIDTH, directions_ok, gripper_is_clear
+
+GRID = 0.04  # m between places tried
+TURNS = 8  # of the object about the vertical
+ROOM = 0.03  # m kept to everything else, seen from above
+EDGE_MARGINS = (0.1, 0.03)  # m kept from the surface's edge, where there is room for it
+RELEASE_HEIGHT = 0.012  # m of the object's lowest point above the surface when let go
+COME_DOWN = 0.06  # m above that, from where it comes straight down
+RETREAT = 0.08  # m
+ARM_REACH = 0.8  # m from its base
+LIFTS = (0.08, 0.2)  # m, least and greatest
+GRASPS_LOOKED_AT = 150
+RIM_SPACING = 0.015  # m
+PLACES_SOLVED, PLACES_PLANNED = 96, 12
+
+
+def remove(arm: Arm, slot: int) -> None:
+    """Grasp an object, put it down on a free place of the surface, step back."""
+    grasp(arm, slot, lift_height=lift_height(arm, slot))
+    hang_clear(arm, slot)
+    with arm.planning():
+        way = plan_place(arm, slot)
+    arm.follow(way)
+    if not arm.holds(slot):
+        raise PlanningFailed("remove", "dropped")
+    arm.open_gripper()
+    with arm.planning():
+        arm.hold_nothing()
+        retreat = plan_step_back(arm, arm.at, _ways_off(arm.planner.tcp(arm.at)))
+    arm.follow(retreat)
+
+
+def hang_clear(arm: Arm, slot: int) -> None:
+    attach_held(arm, slot)
+    arm.rise_clear(without=slot)
+
+
+def lift_height(arm: Arm, slot: int) -> float:
+    """Return how far to lift an object so that it hangs above everything around it, m."""
+    points = transform(arm.scene.object_in_base(slot), np.concatenate(arm.env.object_assets[0][slot].hulls))
+    middle = points.mean(axis=0)
+    radius = float(np.linalg.norm((points - middle)[:, :2], axis=1).max())
+    others = arm.scene.obstacles_in_base(without=slot)
+    near = others[np.linalg.norm((others - middle)[:, :2], axis=1) <= radius + ROOM]
+    return float(np.clip(near[:, 2].max(initial=0.0) + 0.02 - points[:, 2].min(), *LIFTS))
+
+
+def clear_grasps(arm: Arm, slot: int) -> int:
+    """Return how many of an object's (sampled) grasps from above are clear."""
+    grasps = _grasps_from_above(arm, slot)
+    near = arm.scene.obstacles_in_base(without=slot)
+    return int(gripper_is_clear(grasps, near).sum())
+
+
+def blockers(arm: Arm, slot: int) -> list[int]:
+    """Return slots of what blocks an object's grasps from above, those first that alone block most of them."""
+    grasps, in_the_way = _grasps_from_above(arm, slot), {}
+    for other, used in enumerate(arm.env.present[0].tolist()):
+        if used and other != slot:
+            in_the_way[other] = ~gripper_is_clear(grasps, arm.scene.object_surface(other))
+    count = np.sum(list(in_the_way.values()), axis=0)
+    score = {other: float(np.sum(blocked / np.maximum(count, 1) ** 2)) for other, blocked in in_the_way.items()}
+    return sorted((other for other in score if score[other] > 0), key=lambda other: -score[other])
+
+
+def _grasps_from_above(arm: Arm, slot: int) -> Array:
+    notes, frame = arm.env.object_assets[0][slot].annotations, arm.scene.object_in_base(slot)
+    grasps = frame @ notes.grasps_tcp_in_object
+    passed = np.logical_and.reduce(list(directions_ok(grasps, frame[:3, 3]).values()))
+    grasps = grasps[passed & (notes.grasp_widths <= MAX_WIDTH)]
+    # evenly spread, not drawn: a look must not change what comes after it
+    return grasps[np.linspace(0, len(grasps) - 1, min(len(grasps), GRASPS_LOOKED_AT)).astype(int)]
+
+
+def plan_place(arm: Arm, slot: int) -> Trajectory:
+    """Plan to above a free place and down to it.
+
+    In a heap an object leans, and would fall over if put down so. It is turned as little as makes it stand, and put
+    down as it is held only where that can't be done.
+    """
+    scene, asset, held = arm.scene, arm.env.object_assets[0][slot], arm.scene.object_in_base(slot)
+    vertices = transform(held, np.concatenate(asset.hulls))
+    standing = turn_to_stand(vertices, transform(held, np.array([asset.asset.center_of_mass]))[0])
+    others = scene.obstacles_in_base(without=slot)
+    arm.planner.set_scene(scene.obstacles(without=slot))
+    attach_held(arm, slot)
+
+    def free_poses() -> Iterator[Array]:
+        for turn, margin in itertools.product((standing, np.eye(4)), EDGE_MARGINS):
+            motions = free_places(transform(turn, vertices), others, *surface_in_base(arm), margin) @ turn
+            if len(motions):
+                yield motions @ scene.tcp_in_base
+
+    failure = PlanningFailed("remove", "no_free_place")
+    return first_plan(free_poses(), lambda places: _plan_to_one_of(arm, places), failure)
+
+
+def _plan_to_one_of(arm: Arm, places: Array) -> Trajectory:
+    """Plan to above one of several TCP poses (N, 4, 4), in the arm's base frame, and down to it."""
+    start = arm.at
+    nearest = np.argsort(np.linalg.norm(places[:, :2, 3] - arm.scene.tcp_in_base[:2, 3], axis=1), kind="stable")
+    # near and far ones: all of them would take inverse kinematics seconds
+    places = places[nearest[:: max(1, len(places) // PLACES_SOLVED)]]
+    above = raised(places, COME_DOWN)
+    solved, qpos = arm.reachability.reachable(above, start)
+    solved[solved] = arm.reachability.reachable(places[solved], start)[0]
+    places, above, qpos = places[solved], above[solved], qpos[solved]
+
+    def plan(index: int) -> Trajectory:
+        carry = arm.planner.plan_to_pose(start, above[index], stage="remove")
+        down = arm.planner.plan_straight(carry.qpos[-1], places[index], stage="remove")
+        return arm.planner.join(start, carry, down)
+
+    order = np.argsort(np.abs(qpos - start).max(axis=1), kind="stable")[:PLACES_PLANNED]
+    return first_plan(order, plan, PlanningFailed("remove", "unreachable"))
+
+
+def turn_to_stand(vertices: Array, center_of_mass: Array) -> Array:
+    """Return the least turn (4x4) after which a body with vertices (V, 3), z up, stands on level ground and stays."""
+    corners, faces, normals = convex_hull(vertices)
+    a, b, c = corners[faces.T]
+    # it stays on a face that its centre of mass lies above
+    above = [np.einsum("ij,ij->i", np.cross(q - p, center_of_mass - p), normals) for p, q in ((a, b), (b, c), (c, a))]
+    stable = normals[np.all(np.array(above) >= -1e-9, axis=0)]
+    down = stable[np.argmin(stable[:, 2])]
+    axis = np.cross(down, (0, 0, -1))
+    sine = np.linalg.norm(axis)
+    turn = np.eye(4)
+    if sine > 0:
+        turn[:3, :3] = Rotation.from_rotvec(axis / sine * np.arctan2(sine, -down[2])).as_matrix()
+    return turn
+
+
+def free_places(vertices: Array, others: Array, frame: Array, half: Array, margin: float = EDGE_MARGINS[-1]) -> Array:
+    """Return motions (n, 4, 4) that bring a held object above a free place of a surface, turned about the vertical.
+
+    Args:
+        vertices: (V, 3) of the object where it is held, in the arm's base frame, m.
+        others: (P, 3) surfaces of everything else.
+        frame, half: middle (4x4) and half size (2,) of the surface, m.
+        margin: kept from its edge, m.
+    """
+    middle = (vertices.max(axis=0) + vertices.min(axis=0)) / 2
+    outline = (vertices - middle)[:, :2]
+    limit = np.maximum(half - margin, 0)
+    axes = [np.arange(-extent, extent + 1e-9, GRID) for extent in limit]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    spots = grid @ frame[:2, :2].T + frame[:2, 3]
+    spots = spots[np.linalg.norm(spots, axis=1) <= ARM_REACH]
+    standing = others[others[:, 2] > frame[2, 3] + 0.005]
+    tree = KDTree(standing[:, :2])
+    distance, _ = tree.query(spots)
+    spots = spots[distance >= ROOM]  # nothing stands in the middle of the place at least
+    rise = frame[2, 3] + RELEASE_HEIGHT - vertices[:, 2].min()
+    motions = []
+    for turn in np.arange(TURNS) * 2 * np.pi / TURNS:
+        rotation = Rotation.from_euler("z", turn).as_matrix()
+        corners = spots[:, None] + _rim(outline @ rotation[:2, :2].T)  # (n, V, 2)
+        local = (corners - frame[:2, 3]) @ frame[:2, :2]
+        inside = np.all(np.abs(local) <= limit, axis=(1, 2))
+        free = np.zeros(len(spots), dtype=bool)
+        free[inside] = tree.query(corners[inside])[0].min(axis=1) >= ROOM
+        for spot in spots[free]:
+            motion = np.eye(4)
+            motion[:3, :3] = rotation
+            motion[:3, 3] = np.append(spot, middle[2] + rise) - rotation @ middle
+            motions.append(motion)
+    return np.array(motions).reshape(-1, 4, 4)
+
+
+def _rim(outline: Array) -> Array:
+    """Return points (n, 2) along the convex hull of an outline (V, 2), and its middle."""
+    corners = outline[ConvexHull(outline).vertices]
+    points = [np.zeros((1, 2))]
+    for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        points.append(
+            a + np.linspace(0, 1, 1 + int(np.linalg.norm(b - a) / RIM_SPACING), endpoint=False)[:, None] * (b - a)
+        )
+    return np.concatenate(points)
+
+
+def _ways_off(tcp_in_base: Array) -> list[Array]:
+    back = moved_back(tcp_in_base, RETREAT)
+    return [raised(tcp_in_base, RETREAT), raised(back, RETREAT / 2), back, raised(tcp_in_base, RETREAT / 2)]

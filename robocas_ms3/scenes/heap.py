@@ -1,0 +1,183 @@
+"""Heaps: objects dropped one by one between four walls, which are then taken away. Bare PhysX."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import sapien
+from numpy.typing import NDArray
+from sapien import physx
+from scipy.spatial.transform import Rotation
+
+from robocas_ms3.assets.pack import LoadedObject
+from robocas_ms3.assets.physics import (
+    TIME_STEP,
+    add_body,
+    add_component,
+    add_ground,
+    engine_settings,
+    new_scene,
+    pose_matrix,
+    solid_of,
+)
+from robocas_ms3.core.errors import LayoutError
+from robocas_ms3.core.poses import planar, transform
+from robocas_ms3.core.text import count_of
+from robocas_ms3.scenes.config.task import StackedLayout
+from robocas_ms3.scenes.placement import Array, Region
+
+BUCKET_SECONDS = 1.0  # at most, after the last one
+SPREAD_SECONDS, OPEN_SECONDS = 2.0, 0.5  # at most: within a fence along the sides of the region, and without it
+SPREAD = 0.05  # m that centres of mass may lie outside the region in the end
+WALL = 0.05  # m, half its thickness
+_LOOK_EVERY = 10  # steps between two checks whether everything is at rest
+_TRIES = 40
+
+# Evenly spread unit vectors (64, 3), a Fibonacci lattice: an object's extreme points along them make its outline
+_HEIGHTS = 1 - (2 * np.arange(64) + 1) / 64
+_TURNS = np.arange(64) * np.pi * (3 - np.sqrt(5))
+_RADII = np.sqrt(1 - _HEIGHTS**2)
+_DIRECTIONS = np.stack([_RADII * np.cos(_TURNS), _RADII * np.sin(_TURNS), _HEIGHTS], axis=1)
+
+
+def drop_heap(
+    rng: np.random.Generator,
+    assets: Sequence[LoadedObject],
+    region: Region,
+    layout: StackedLayout,
+    *,
+    headroom: float = np.inf,
+) -> Array:
+    """Drop objects into a frictionless bucket on a plane, then take the bucket away (docs/layouts.md).
+
+    They fall as one convex hull each, one soon after the other; the heap then spreads with all hulls of its objects, at
+    first within a fence, which stops what would roll away.
+
+    Args:
+        rng: source of all randomness.
+        assets: K objects.
+        region: of a horizontal plane.
+        layout: how they fall.
+        headroom: that the heap has to stay below, m.
+
+    Returns:
+        (K, 4, 4) objects at rest in the region's frame, in the order of ``assets``.
+
+    Raises:
+        LayoutError: heap after heap fell apart over the region's edges, or was too high.
+    """
+    for _ in range(_TRIES):
+        with engine_settings():
+            poses = _spread(assets, _fill_bucket(rng, assets, region, layout), region)
+        centers = np.stack(
+            [transform(p, np.array([a.asset.center_of_mass]))[0] for a, p in zip(assets, poses, strict=True)]
+        )
+        inside = (centers[:, :2] >= np.array(region.min_xy) - SPREAD) & (
+            centers[:, :2] <= np.array(region.max_xy) + SPREAD
+        )
+        top = max(transform(p, np.concatenate(a.hulls))[:, 2].max() for a, p in zip(assets, poses, strict=True))
+        if inside.all() and top - region.z < headroom:
+            return poses
+    raise LayoutError(
+        f"no heap here of {count_of(len(assets), 'object')}",
+        where="layout",
+        found=f"{_TRIES} heaps fell apart" + (f" or rose above {headroom:.3f} m" if np.isfinite(headroom) else ""),
+        fix="Lower objects.count or enlarge the surface.",
+    )
+
+
+def _fill_bucket(
+    rng: np.random.Generator, assets: Sequence[LoadedObject], region: Region, layout: StackedLayout
+) -> Array:
+    """Return poses (K, 4, 4) of objects that have fallen into the bucket, with their outlines for bodies."""
+    # narrower buckets make higher heaps, which spread when the walls are gone
+    middle, half = _middle(region), layout.bucket * np.subtract(region.max_xy, region.min_xy) / 2
+    scene = new_scene()
+    add_ground(scene, np.array([*middle, region.z]))
+    _add_walls(scene, middle, half, region.z)
+    bodies: dict[int, physx.PhysxRigidDynamicComponent] = {}
+    outlines = [outline(asset) for asset in assets]
+    for index in falling_order(rng, assets, layout.order_noise).tolist():
+        asset = assets[index]
+        pose = _falling_pose(rng, asset, layout.tumble_probability)
+        points = transform(pose, outlines[index])
+        room = np.maximum(half - np.abs(points[:, :2]).max(axis=0), 0)
+        x, y = middle + rng.uniform(-1, 1, 2) * room * layout.drop_spread
+        top = max((transform(pose_matrix(b), outlines[i])[:, 2].max() for i, b in bodies.items()), default=region.z)
+        pose = planar(x, y, top + layout.drop_height - points[:, 2].min(), 0) @ pose
+        bodies[index] = add_body(scene, replace(solid_of(asset), hulls=[outlines[index]]), pose)
+        _run(scene, layout.fall_seconds, list(bodies.values()))
+    _run(scene, BUCKET_SECONDS, list(bodies.values()))
+    return np.stack([pose_matrix(bodies[i]) for i in range(len(assets))])
+
+
+def _spread(assets: Sequence[LoadedObject], poses: Array, region: Region) -> Array:
+    """Return poses (K, 4, 4) of objects after the bucket is gone, and then the fence."""
+    middle = _middle(region)
+    scene = new_scene()
+    add_ground(scene, np.array([*middle, region.z]))
+    fence = _add_walls(scene, middle, np.subtract(region.max_xy, region.min_xy) / 2, region.z)
+    bodies = [add_body(scene, solid_of(asset), pose) for asset, pose in zip(assets, poses, strict=True)]
+    _run(scene, SPREAD_SECONDS, bodies)
+    for wall in fence:
+        wall.remove_from_scene()
+    for body in bodies:
+        body.wake_up()
+    _run(scene, OPEN_SECONDS, bodies)
+    return np.stack([pose_matrix(body) for body in bodies])
+
+
+def outline(asset: LoadedObject) -> Array:
+    """Return points (V, 3), at most 64, whose convex hull is about that of the object, m, in the asset's frame."""
+    points = np.concatenate(asset.hulls)
+    return points[np.unique(np.argmax(points @ _DIRECTIONS.T, axis=0))]
+
+
+def _middle(region: Region) -> Array:
+    return np.add(region.min_xy, region.max_xy) / 2
+
+
+def falling_order(rng: np.random.Generator, assets: Sequence[LoadedObject], noise: float | None) -> NDArray[np.intp]:
+    """Draw the order of falling: by size times a random factor, whose logarithm deviates by ``noise``; None: any."""
+    if noise is None:
+        return rng.permutation(len(assets))
+    sizes = np.array([np.prod(asset.asset.extents) for asset in assets])
+    return np.argsort(np.log(sizes) + rng.normal(scale=noise, size=len(assets)))
+
+
+def _falling_pose(rng: np.random.Generator, asset: LoadedObject, tumble: float) -> Array:
+    notes = asset.annotations
+    if rng.uniform() < tumble:
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_quat(rng.normal(size=4)).as_matrix()
+        pose[:3, 3] = -pose[:3, :3] @ np.array(asset.asset.center_of_mass)
+        return pose
+    choice = int(rng.choice(len(notes.resting_probabilities), p=notes.resting_probabilities))
+    return planar(0, 0, 0, rng.uniform(-np.pi, np.pi)) @ notes.resting_poses[choice]
+
+
+def _add_walls(scene: sapien.Scene, middle: Array, half: Array, z: float) -> list[sapien.Entity]:
+    slippery = physx.PhysxMaterial(0.0, 0.0, 0.0)
+    walls = []
+    for axis, sign in ((0, -1), (0, 1), (1, -1), (1, 1)):
+        size = np.array([*half + 2 * WALL, 1.0])
+        size[axis] = WALL
+        center = np.array([*middle, z + 1.0])
+        center[axis] += sign * (half[axis] + WALL)
+        body = physx.PhysxRigidStaticComponent()
+        body.attach(physx.PhysxCollisionShapeBox(size.tolist(), slippery))
+        add_component(scene, body, sapien.Pose(center))
+        walls.append(body.entity)
+    return walls
+
+
+def _run(scene: sapien.Scene, seconds: float, bodies: Sequence[physx.PhysxRigidDynamicComponent]) -> None:
+    for step in range(round(seconds / TIME_STEP)):
+        scene.step()
+        if step >= 2 * _LOOK_EVERY and step % _LOOK_EVERY == 0:
+            linear, angular = (np.stack([getattr(b, f"{n}_velocity") for b in bodies]) for n in ("linear", "angular"))
+            speeds = np.linalg.norm(linear, axis=1) + 0.05 * np.linalg.norm(angular, axis=1)
+            if speeds.max() < 0.01:
+                return

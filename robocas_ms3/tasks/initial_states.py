@@ -1,0 +1,111 @@
+"""Where everything is at the start of episodes, as tensors: from layouts one by one, or gathered from a table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any, cast
+
+import numpy as np
+import torch
+from mani_skill.utils.structs import Articulation, Pose
+from numpy.typing import NDArray
+
+from robocas_ms3.core.poses import to_wxyz
+from robocas_ms3.scenes.layout import Layout
+from robocas_ms3.scenes.layout_table import LayoutTable, good
+
+
+@dataclass(frozen=True)
+class Starts:
+    """Layouts of E envs. K object slots; world frame, metres, quaternions wxyz; on the envs' device.
+
+    Attributes:
+        object_poses: (E, K, 7) float32.
+        robot_poses: (E, 7) of the robot's root.
+        basket_poses: (E, 7); NaN where there is no basket.
+        targets: (E,) int64, slots.
+        present: (E, K) bool.
+    """
+
+    object_poses: torch.Tensor
+    robot_poses: torch.Tensor
+    basket_poses: torch.Tensor
+    targets: torch.Tensor
+    present: torch.Tensor
+
+    @classmethod
+    def of(cls, layouts: Sequence[Layout], device: torch.device | str) -> Starts:
+
+        def poses(matrices: list[NDArray[np.float64]]) -> torch.Tensor:
+            return torch.from_numpy(to_wxyz(np.stack(matrices)).astype(np.float32)).to(device)
+
+        baskets = [layout.basket_pose for layout in layouts if layout.basket_pose is not None]
+        return cls(
+            poses([layout.object_poses for layout in layouts]),
+            poses([layout.robot_pose for layout in layouts]),
+            poses(baskets) if baskets else torch.full((len(layouts), 7), torch.nan, device=device),
+            torch.tensor([layout.target for layout in layouts], device=device),
+            torch.from_numpy(np.stack([layout.present for layout in layouts])).to(device),
+        )
+
+    def with_rows(self, rows: NDArray[np.bool_], others: Starts) -> Starts:
+        """Return these starts, in their order, where ``rows`` (E,) is True, and others elsewhere."""
+        order = torch.from_numpy(np.argsort(np.argsort(~rows, kind="stable"))).to(self.targets.device)
+        return Starts(
+            **{f.name: torch.cat([getattr(self, f.name), getattr(others, f.name)])[order] for f in fields(Starts)}
+        )
+
+
+class TabledStarts:
+    """Starts of envs that keep their objects: a reset gathers them on the device.
+
+    All layouts of these objects are in its memory, 0.4 kB each with ten objects. ``objects_seeds`` (N,) are the envs'.
+    """
+
+    def __init__(self, table: LayoutTable, objects_seeds: NDArray[np.int64], device: torch.device | str) -> None:
+        self._table, self._objects_seeds, self._device = table, objects_seeds, device
+        there = table.places(objects_seeds, np.zeros_like(objects_seeds))[1]
+        rows, self._row_of_env = np.unique(there, return_inverse=True)
+        taken = table.rows[rows]  # copied: records of any length, which tensors can't be made of
+        names = ("object_poses", "robot_pose", "basket_pose", "target", "present")
+        self._kept = [torch.from_numpy(np.ascontiguousarray(taken[name])).to(device) for name in names]
+
+    def good(self, envs: NDArray[np.int64], seeds: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return which layouts (E,) of some envs, by their seeds (E,), exist and are good, as far as is known."""
+        return good(self._table.places(self._objects_seeds[envs], seeds)[0])
+
+    def gather(self, envs: NDArray[np.int64], seeds: NDArray[np.int64]) -> Starts:
+        """Return the starts of some envs by the seeds (E,) of their layouts, all of which are good."""
+        columns = self._table.places(self._objects_seeds[envs], seeds)[2]
+        row, column = (torch.from_numpy(index).to(self._device) for index in (self._row_of_env[envs], columns))
+        objects, robots, baskets, targets, present = (kept[row, column] for kept in self._kept)
+        return Starts(objects, robots, baskets, targets.long(), present)
+
+
+def place(env: Any, starts: Starts, envs: torch.Tensor) -> None:
+    """Put robot, furniture, basket and objects of some envs (E,) where their episodes start."""
+    with torch.device(env.device):
+        qpos: Any = torch.as_tensor(env.agent.keyframes[env.task_config.robot_start].qpos, dtype=torch.float32)
+        env.agent.reset(qpos.repeat(len(envs), 1))
+        env.agent.controller.reset_only = envs
+        env.agent.robot.set_pose(cast("Any", Pose.create(starts.robot_poses)))
+        for name, furniture in env.fixtures.furniture.items():
+            if isinstance(furniture, Articulation):
+                positions = env.model.joint_positions(name, opened=False)
+                qpos = torch.tensor([positions.get(joint.name, 0.0) for joint in furniture.active_joints])
+                furniture.set_qpos(qpos.repeat(len(envs), 1))
+                furniture.set_qvel(torch.zeros(len(envs), furniture.max_dof))
+        if env.fixtures.basket is not None:
+            basket = Pose.create(starts.basket_poses)
+            env.fixtures.basket.set_pose(basket)
+            env.basket_at_start[envs] = basket.raw_pose
+        if env.gpu_sim_enabled:
+            env.bodies.put_objects(envs, starts.object_poses)
+        else:
+            for slot, actor in enumerate(env.objects):
+                actor.set_pose(Pose.create(starts.object_poses[:, slot]))
+        env.start_poses[envs] = starts.object_poses
+        env.target_slot[envs] = starts.targets
+        env.present[envs] = starts.present
+        env.is_target = torch.nn.functional.one_hot(env.target_slot, len(env.objects)).bool()

@@ -1,0 +1,112 @@
+"""Rows of the table: episodes, and seeds without an episode according to ``failures.jsonl``."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from robocas_ms3.core.json_lines import Ledger
+from robocas_ms3.datasets.sources.provenance import environment_of
+from robocas_ms3.demos.failures import FAILURES_FILE, Failure
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of the table.
+
+    ``n`` is None for a seed without an episode, ``stages`` are where attempts failed, ``damage`` is what is not shown.
+    """
+
+    n: int | None
+    steps: int = 0
+    instruction: str = ""
+    task: str = ""
+    object: str = ""
+    seed: int | None = None
+    success: bool | None = None
+    split: str = ""
+    stages: Sequence[str] = ()
+    attempts: int | None = None
+    damage: str = ""
+
+
+@dataclass(frozen=True)
+class FailedAttempt(Failure):
+    """A line of ``failures.jsonl``, with the task and environment of the run; None: unknown."""
+
+    task: str | None = None
+    environment: str | None = None
+
+    def is_of(self, env_info: Any) -> bool:
+        if not self.environment or not isinstance(env_info, Mapping):
+            return True
+        return environment_of(env_info) in ("", self.environment)
+
+
+@dataclass(frozen=True)
+class Failures:
+    """The lines of ``failures.jsonl`` by seed, and a note on damaged ones."""
+
+    by_seed: Mapping[int, list[FailedAttempt]] = field(default_factory=dict)
+    note: str = ""
+
+    @classmethod
+    def read(cls, folder: Path) -> Failures:
+        try:
+            lines = Ledger[FailedAttempt](folder / FAILURES_FILE, FailedAttempt).lines()
+        except OSError as error:
+            return cls(note=f"`{FAILURES_FILE}` can't be read: {error.strerror}.")
+        found: dict[int, list[FailedAttempt]] = defaultdict(list)
+        for line in lines:
+            if line.record is not None:
+                found[line.record.seed].append(line.record)
+        damaged = [str(line.number) for line in lines if line.record is None]
+        listed = ", ".join(damaged[:5]) + (", ..." if len(damaged) > 5 else "")
+        return cls(dict(found), f"Damaged and left out: line {listed} of `{FAILURES_FILE}`." if damaged else "")
+
+    def of_seed(self, seed: int | None, env_info: Any = None) -> list[FailedAttempt]:
+        """Return the failures of a seed in an environment; none if the seed is unknown."""
+        return [] if seed is None else [failure for failure in self.by_seed.get(seed, []) if failure.is_of(env_info)]
+
+    def given_up(self, rows: Sequence[Row], env_infos: Sequence[Any]) -> list[Row]:
+        """Return rows of the seeds that were given up and have no episode."""
+        environments: dict[int | None, list[Any]] = defaultdict(list)
+        for row, env_info in zip(rows, env_infos, strict=True):
+            environments[row.seed].append(env_info)
+        tasks = {row.task for row in rows}
+        task = tasks.pop() if len(tasks) == 1 else ""  # if the file does not name it
+        lost = []
+        for seed, of_seed in sorted(self.by_seed.items()):
+            runs: dict[str | None, list[FailedAttempt]] = defaultdict(list)
+            for failure in of_seed:
+                runs[failure.environment].append(failure)
+            for of_run in runs.values():
+                recorded = any(of_run[0].is_of(env_info) for env_info in environments[seed])
+                if recorded or not any(failure.gave_up for failure in of_run):
+                    continue
+                tried = [failure for failure in of_run if not failure.gave_up]
+                named = stages(tried, {}) or ["given up"]
+                of_task = of_run[0].task or task
+                lost.append(Row(None, task=of_task, seed=seed, success=False, stages=named, attempts=len(tried)))
+        return lost
+
+
+def stages(failures: Iterable[Failure], recorded: Mapping[str, Any]) -> list[str]:
+    named = {failure.stage for failure in failures if not failure.gave_up}
+    return sorted(named | {recovery["stage"] for recovery in recorded.get("recoveries") or ()})
+
+
+def describe(failures: Iterable[Failure], recorded: Mapping[str, Any]) -> list[dict[str, str]]:
+    lines = [
+        {"stage": f.stage, "reason": f.reason, "text": f"attempt {f.attempt + 1}, {f.seconds:.1f} s, undone"}
+        for f in failures
+        if not f.gave_up
+    ]
+    for recovery in recorded.get("recoveries") or ():
+        first, last = recovery["range"]
+        text = f"recovered from, control steps {first} to {last}"
+        lines.append({"stage": recovery["stage"], "reason": recovery["reason"], "text": text})
+    return lines

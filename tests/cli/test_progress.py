@@ -1,0 +1,154 @@
+"""Bars show on a terminal; elsewhere the first line, one a minute and the last do, plain and with the same numbers."""
+
+import io
+import os
+import re
+import subprocess
+import sys
+
+import pytest
+from plan_stages import PLAN
+
+from robocas_ms3.cli import progress
+from robocas_ms3.cli.terminal import console
+from robocas_ms3.plans.status import PartStatus, Status
+
+SCRIPT = """
+from robocas_ms3.cli.progress import Bar, working
+from robocas_ms3.cli.terminal import say
+with working("looking about"):
+    pass
+with Bar("counted") as shown:
+    shown.start(2)
+    shown.advance()
+    shown.note("[1] is :odd: " + 90 * "x")
+    say("one")
+    shown.at(2, 2)
+with Bar("replayed", transient=True) as shown:
+    shown.at(1, 3)
+    shown.at(2, 3)
+with Bar("none") as shown:
+    shown.start(0)
+with Bar("never begun") as shown:
+    pass
+say("done")
+"""
+
+
+def run(*, forced="", **kwargs):
+    environment = {k: v for k, v in os.environ.items() if k != "FORCE_COLOR"} | ({forced: "1"} if forced else {})
+    command = [sys.executable, "-c", SCRIPT]
+    return subprocess.run(command, check=True, env={**environment, "TERM": "xterm"}, timeout=60, **kwargs)
+
+
+def test_where_stderr_is_no_terminal():
+    done = run(forced="FORCE_COLOR", capture_output=True)
+    assert done.stdout == b"one\ndone\n"
+    noted = b"[1] is :odd: " + 90 * b"x"
+    assert done.stderr.splitlines() == [b"counted: 0 of 2", noted, done.stderr.splitlines()[-1]]
+    assert re.fullmatch(rb"counted: 2 of 2, [0-9.]+ a second", done.stderr.splitlines()[-1])
+    assert b"\r" not in done.stderr and b"\x1b" not in done.stderr
+
+
+@pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs a pseudo-terminal")
+def test_on_a_terminal():
+    terminal, end = os.openpty()
+    try:
+        done = run(stdout=subprocess.PIPE, stderr=end, text=True)
+        os.close(end)
+        shown = os.read(terminal, 1 << 16).decode()
+    finally:
+        os.close(terminal)
+    assert done.stdout == "one\ndone\n"  # not among the bars, which are shown elsewhere
+    for text in ("looking about", "counted", "2/2", "a second", "[1] is :odd: ", "replayed", "2/3"):
+        assert text in shown
+    assert "none" not in shown and "never" not in shown
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    return now
+
+
+def test_a_log_has_the_first_line_one_per_minute_and_the_last(clock, capsys):
+    with progress.Bar("episodes") as shown:
+        shown.start(300)
+        for _ in range(300):
+            clock[0] += 1.5
+            shown.advance()
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[:2] == ["episodes: 0 of 300", "episodes: 40 of 300, 1.5 s each, 6 min left, after 1 min"]
+    assert lines[-1] == "episodes: 300 of 300, 1.5 s each, after 8 min"
+    assert len(lines) == 9
+
+
+def test_items_done_before_do_not_count_in_the_rate(clock, capsys):
+    with pytest.raises(KeyboardInterrupt), progress.Bar("layouts") as shown:
+        clock[0] += 500  # before the first item
+        shown.at(90, 100)
+        clock[0] += 40
+        shown.at(91, 100)
+        shown.at(92, 100)
+        raise KeyboardInterrupt
+    assert capsys.readouterr().err.splitlines() == [
+        "layouts: 90 of 100",
+        "layouts: 92 of 100, 20.0 s each, 3 min left, after 40 s",
+    ]
+
+
+def test_a_transient_bar_writes_nothing_within_a_minute(clock, capsys):
+    with progress.Bar("checked", transient=True) as shown:
+        for done in range(1, 9):
+            shown.at(done, 9)
+            clock[0] += 10
+    assert capsys.readouterr().err.splitlines() == ["checked: 7 of 9, 10.0 s each, 20 s left, after 1 min"]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "said"),
+    [(0, "0 s"), (59.4, "59 s"), (59.6, "1 min"), (3569, "59 min"), (3590, "1 h 0 min"), (99000, "27 h 30 min")],
+)
+def test_spans(seconds, said):
+    assert progress.span(seconds) == said
+
+
+def plan_status(*done):
+    parts = [
+        PartStatus(part.name, part.episodes, count, count, {}, 1.0, 1.0, 0)
+        for part, count in zip(PLAN.parts, done, strict=True)
+    ]
+    return Status(parts, 120.0, 5400.0, 1.0, False)
+
+
+def test_a_plan_in_a_log(clock, capsys):
+    display = progress.Display()
+    for done in ((0, 0), (3, 0), (5, 1)):
+        progress.show_plan(display, plan_status(*done))
+        clock[0] += 31
+    display.flush()  # though it is not time
+    display.note("joining the dataset")
+    progress.show_plan(display, plan_status(5, 2))
+    display.close()
+    speed = "120 episodes per hour, 1 h 30 min left"
+    assert capsys.readouterr().err.splitlines() == [
+        f"0 of 7 episodes, {speed}",
+        f"6 of 7 episodes (b 1 of 2), {speed}, after 1 min",
+        "joining the dataset",
+        f"7 of 7 episodes, {speed}, after 2 min",
+    ]
+
+
+def test_a_plan_on_a_terminal_has_a_bar_per_part_and_one_for_all(monkeypatch, capsys):
+    file = io.StringIO()
+    terminal = console(file=file, force_terminal=True, width=120)
+    monkeypatch.setattr(progress, "terminal_of_stderr", lambda: terminal)
+    display = progress.Display()
+    for done in ((2, 0), (5, 1)):
+        progress.show_plan(display, plan_status(*done))
+    display.note("joining [red]the dataset")
+    display.close()
+    for text in ("5/5", "1/2", "6/7", "120 episodes per hour, 1 h 30 min left", "joining [red]the dataset"):
+        assert text in file.getvalue()
+    assert capsys.readouterr().err == ""

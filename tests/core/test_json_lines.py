@@ -1,0 +1,84 @@
+"""JSON lines that are appended to, cut off by a kill, damaged, and written anew."""
+
+from dataclasses import dataclass, field
+
+import pytest
+
+from robocas_ms3.core.errors import DatasetError, RobocasError
+from robocas_ms3.core.json_lines import Ledger
+
+
+@dataclass(frozen=True)
+class Try:
+    seed: int
+    seconds: float = 0.0
+    words: dict[str, int | None] = field(default_factory=dict)
+
+
+@pytest.fixture
+def ledger(tmp_path) -> Ledger[Try]:
+    return Ledger(tmp_path / "tries.jsonl", Try)
+
+
+def test_what_is_appended_is_read_with_its_types(ledger):
+    assert ledger.read() == ledger.lines() == []
+    ledger.append([])
+    assert not ledger.path.exists()
+    ledger.append([Try(1), Try(2, 1.5, {"a": None})])
+    ledger.append([Try(3, 2)], sync=True)
+    assert ledger.read() == [Try(1), Try(2, 1.5, {"a": None}), Try(3, 2.0)]
+    assert ledger.path.read_text().count("\n") == 3
+    ledger.rewrite([Try(4)])
+    assert ledger.read() == [Try(4)]
+
+
+@pytest.mark.parametrize("kept", range(1, 14))
+def test_a_line_that_was_cut_anywhere_is_no_line_and_is_written_over(ledger, kept):
+    ledger.append([Try(1)])
+    whole = ledger.path.read_bytes()
+    ledger.path.write_bytes(whole + b'{"seed": 23}\n'[:kept])
+    assert ledger.read() == [Try(1), *([Try(23)] if kept >= 12 else [])]
+    ledger.append([Try(3)])
+    assert ledger.read() == [Try(1), *([Try(23)] if kept >= 12 else []), Try(3)]
+    assert all(line.problem is None for line in ledger.lines())
+
+
+def test_damaged_lines_are_told_from_one_that_was_cut_off(ledger):
+    ledger.path.write_bytes(b'{"seed": 1, "new": 0}\n\n{"seed": "1"}\n[]\n\xff\n{"seed": 2}\n{"se')
+    lines = ledger.lines()
+    assert [(line.number, line.record, line.cut_off) for line in lines] == [
+        (1, Try(1), False),
+        (3, None, False),
+        (4, None, False),
+        (5, None, False),
+        (6, Try(2), False),
+        (7, None, True),
+    ]
+    error = ledger.refusal(lines[1], DatasetError, "no try")
+    assert str(error) == (f"{ledger.path}:3: no try: wrong value for 'seed' (expected a whole number, found '1')")
+    ledger.append([Try(3)])
+    assert [line.number for line in ledger.lines() if line.record is None] == [3, 4, 5]
+    assert ledger.read() == [Try(1), Try(2), Try(3)]
+
+
+@pytest.mark.parametrize("number", ["NaN", "-Infinity", "1e999", "9" * 400 + ".5"])
+def test_a_number_that_is_not_finite_damages_its_line(tmp_path, number):
+    ledger: Ledger[Try] = Ledger(tmp_path / "tries.jsonl", Try)
+    ledger.path.write_text(f'{{"seed": 1, "seconds": {number}}}\n{{"seed": 2}}\n{{"seed": 3, "more": [{number}]}}\n')
+    assert [line.record for line in ledger.lines()] == [None, Try(2), None]
+    error = str(ledger.refusal(ledger.lines()[2], DatasetError, "no try"))
+    assert error.startswith(f"{ledger.path}:3: no try: this is not valid JSON (found ")
+    with pytest.raises(RobocasError):
+        ledger.append([Try(4, float("nan"))])
+    assert len(ledger.lines()) == 3
+
+
+def test_lines_of_any_json(tmp_path):
+    plain: Ledger[dict[str, int]] = Ledger(tmp_path / "plain.jsonl", dict[str, int])
+    plain.append([{"a": 1}])
+    assert plain.read() == [{"a": 1}]
+
+
+def test_what_can_not_be_read_is_an_error(tmp_path):
+    with pytest.raises(OSError, match="Is a directory"):
+        Ledger(tmp_path, Try).lines()

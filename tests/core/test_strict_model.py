@@ -1,0 +1,150 @@
+"""What is said of mistakes in data of others, whatever its form: one line, in our words."""
+
+from typing import Annotated, Literal
+
+import pytest
+from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
+
+from robocas_ms3.core.errors import AssetError, ConfigError
+from robocas_ms3.core.strict_model import (
+    FileName,
+    StrictModel,
+    check_name,
+    mistakes,
+    nearest,
+    parse,
+    parse_json,
+    refusal,
+)
+
+
+def _even(number: int) -> int:
+    if number % 2:
+        raise ValueError("an even number")
+    return number
+
+
+class Ball(StrictModel):
+    kind: Literal["ball"] = "ball"
+    radius: Annotated[float, Field(gt=0)]
+
+
+class Crate(StrictModel):
+    kind: Literal["crate"] = "crate"
+    size: tuple[float, float]
+
+
+class Shelf(StrictModel):
+    name: Annotated[str, Field(pattern="^[a-z]+$")]
+    things: list[Annotated[Ball | Crate, Field(discriminator="kind")]] = []
+    names: dict[Annotated[str, Field(pattern="^[a-z]+$")], int] = {}
+    boards: Annotated[int, AfterValidator(_even)] = 2
+
+
+def said(**changes) -> str:
+    with pytest.raises(ConfigError) as caught:
+        parse(Shelf, {"name": "a", **changes}, ConfigError, where="shelf.yaml", about="no shelf")
+    assert "\n" not in str(caught.value)
+    return str(caught.value).removeprefix("shelf.yaml: no shelf: ")
+
+
+@pytest.mark.parametrize(
+    "values", [{"k" * 10**6: 1}, {"names": {"k " * 10**6: 1}}, {"things": [{"kind": "k" * 10**6}]}]
+)
+def test_messages_about_long_keys_are_short(values):  # a client of a policy server may send one of 60 MB
+    with pytest.raises(ConfigError) as error:
+        parse(Shelf, {"name": "a", **values}, ConfigError, where="")
+    assert len(str(error.value)) < 500
+    assert "k" * 3 in str(error.value).replace(" ", "")
+
+
+def test_what_fits_is_read_as_yaml_has_it():
+    shelf = parse(Shelf, {"name": "a", "things": [{"kind": "crate", "size": [1, 2]}]}, ConfigError, where="")
+    assert shelf.things == [Crate(size=(1.0, 2.0))]
+    with pytest.raises(ValidationError):
+        shelf.name = "b"
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"name": "A"}, "wrong value for 'name' (expected a string like ^[a-z]+$, found 'A')"),
+        ({"name": 1, "boards": "2"}, "wrong value for 'name' (expected a string, found 1). 1 more after this one."),
+        ({"boards": 3}, "boards: an even number (found 3)"),
+        (
+            {"boards": 3, "bords": 2},
+            "unknown key 'bords' (expected one of ['boards', 'name', 'names', 'things'], found 'bords'). "
+            "Did you mean boards? 1 more after this one.",
+        ),
+        ({"names": {"x y": 1}}, "wrong value for 'names.x y' (expected a string like ^[a-z]+$, found 'x y')"),
+        (
+            {"names": {"two\nlines": 1}},
+            "wrong value for 'names.two lines' (expected a string like ^[a-z]+$, found 'two\\nlines')",
+        ),
+        (
+            {"things": [{"kind": "ball", "radius": 0}]},
+            "wrong value for 'things.0.radius' (expected greater than 0, found 0)",
+        ),
+        (
+            {"things": [{"kind": "ball", "radius": float("inf")}]},
+            "wrong value for 'things.0.radius' (expected a finite number, found inf)",
+        ),
+        (
+            {"things": [{"kind": "bal"}]},
+            "wrong value for 'things.0.kind' (expected one of ['ball', 'crate'], found 'bal'). Did you mean ball?",
+        ),
+    ],
+)
+def test_mistakes(changes, message):
+    assert said(**changes) == message
+
+
+def test_what_json_has_no_word_for_is_a_mistake_at_its_key():
+    assert said(boards={1, 2}) == "wrong value for 'boards' (expected a whole number, found {'set': '{1, 2}'})"
+    assert "has no place in this file" in said(names={(1, 2): 3})
+
+
+def test_json_itself():
+    with pytest.raises(AssetError, match=r"^f: this is not valid JSON .found EOF while parsing"):
+        parse_json(Shelf, '{"name": ', AssetError, where="f")
+    assert parse_json(Shelf, b'{"name": "a"}', AssetError, where="f").boards == 2
+
+
+def test_other_words_and_other_forms():
+    form = TypeAdapter(dict[str, Ball])
+    with pytest.raises(ValidationError) as caught:
+        form.validate_json('{"a": {"radius": "x"}, "b": 3}', strict=True)
+    first, second = mistakes(caught.value, form, {"float_type": "metres"})
+    assert (first.key, first.expected, first.found, first.value) == ("a.radius", "metres", "'x'", "x")
+    assert (second.key, second.kind) == ("b", "model_type")
+    made = refusal(caught.value, form, AssetError, where="f", fix="Make it again.")
+    assert str(made) == (
+        "f: wrong value for 'a.radius' (expected a number, found 'x'). 1 more after this one. Make it again."
+    )
+
+
+def test_the_nearest_words():
+    assert nearest("shelv", ["table", "shelf"]) == "Did you mean shelf?"
+    assert nearest("sofa", ["table", "shelf"]) == ""
+
+
+class Form(StrictModel):
+    name: FileName
+
+
+@pytest.mark.parametrize("name", ["a", "link_0", "Left Tür 1", "a.b-c", "机器人", "x" * 200])
+def test_plain_names_are_names_of_files(tmp_path, name):
+    assert check_name(name, AssetError, where="file") == name
+    (tmp_path / name).mkdir()
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+@pytest.mark.parametrize(
+    "name", ["", ".", "..", ".hidden", "a/b", "/a", "..\\a", "a\nb", "a\x00", "\x1b[31m", "\ud800", "ü" * 101]
+)
+def test_other_names_are_refused(name):
+    with pytest.raises(AssetError) as raised:
+        check_name(name, AssetError, where="file")
+    assert raised.value.where == "file" and len(str(raised.value)) < 300
+    with pytest.raises(AssetError):
+        parse(Form, {"name": name}, AssetError, where="file")

@@ -1,0 +1,116 @@
+"""What ``robocas convert`` and ``robocas validate`` print."""
+
+import json
+import shutil
+
+import pytest
+from managing import convert_made_up as convert
+from synthetic import RayCaster, render_by, write_trajectory
+
+from robocas_ms3.cli.main import run
+from robocas_ms3.datasets.checks.dataset import validate
+from robocas_ms3.datasets.conversion import convert as conversion
+
+
+@pytest.fixture
+def made_up_pictures(monkeypatch):
+    monkeypatch.setattr(conversion, "convert", render_by(RayCaster, conversion.convert))
+
+
+def test_a_conversion_and_its_repetition(trajectory, made_up_pictures, tmp_path, capsys):
+    command = ["convert", str(trajectory), "--out", str(tmp_path / "out"), "--no-embeddings", "--no-video"]
+    assert run(command) == 0
+    printed = capsys.readouterr()
+    assert printed.out.startswith(f"{tmp_path / 'out'}: 2 episodes, 14 steps, ")
+    assert "episodes written: 2 of 2" in printed.err
+    assert run(command) == 0
+    assert capsys.readouterr().out.endswith(": 0 episodes, 2 kept\n")
+
+
+def tried(path, *rates):
+    """A trajectory whose recordings' actions were tried at these rates."""
+    write_trajectory(path, seeds=tuple(range(len(rates))))
+    content = json.loads(path.with_suffix(".json").read_text())
+    for episode, rate in zip(content["episodes"], rates, strict=True):
+        episode["robocas"]["replay_rate"] = rate
+    path.with_suffix(".json").write_text(json.dumps(content))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("rates", "rate_hz", "said"),
+    [
+        ((5, 5), 5, ""),
+        ((5, 20), 10, "actions were tried at 5 and 20 Hz; at 10 Hz they were not: robocas validate --replay tells"),
+        ((None, 0), 10, ""),  # not tried at any rate: the base drives, or nobody wanted it
+        (([5], "5"), 10, ""),  # not ours
+    ],
+)
+def test_actions_that_were_tried_at_another_rate(tmp_path, caplog, rates, rate_hz, said):
+    trajectory = tried(tmp_path / "F.h5", *rates)
+    convert(trajectory, tmp_path / "out", rate_hz=rate_hz)
+    warnings = [record.getMessage() for record in caplog.records if record.name.startswith("robocas_ms3")]
+    assert len(warnings) == bool(said)
+    assert not said or warnings[0].startswith(said)
+
+
+def test_only_the_recordings_that_are_converted_count(tmp_path, caplog):
+    path = tried(tmp_path / "F.h5", 5, 10)
+    content = json.loads(path.with_suffix(".json").read_text())
+    content["episodes"][0]["success"] = False
+    path.with_suffix(".json").write_text(json.dumps(content))
+    convert(path, tmp_path / "out", rate_hz=10)
+    assert caplog.records == []
+
+
+@pytest.mark.parametrize(
+    ("flags", "code", "said"),
+    [
+        ("--append --overwrite", 1, "expected one of them, found --overwrite --append"),
+        ("--jobs 0", 2, "expected 1 or more, found 0"),
+        ("--cameras base_camera base_camera", 2, "expected each once, found base_camera base_camera"),
+    ],
+)
+def test_flags_that_make_no_sense(made, trajectory, capsys, flags, code, said):
+    assert run(["convert", str(trajectory), "--out", str(made), *flags.split()]) == code
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        ((), "; the same command continues"),
+        (("--overwrite",), "; the same command without --overwrite continues"),
+    ],
+)
+def test_an_interrupted_conversion_says_how_to_go_on(monkeypatch, tmp_path, capsys, flags, said):
+    def interrupted(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(conversion, "convert", interrupted)
+    command = ["convert", "F.h5", "--out", str(tmp_path / "out"), *flags]
+    assert run(command) == 130
+    assert capsys.readouterr().err == f"interrupted{said}\n"
+
+
+def test_what_another_trajectory_left_missing_is_said(tmp_path, caplog):
+    """--append of b was killed; converting a again can't make b's episodes."""
+    a, b = (write_trajectory(tmp_path / f"{n}.h5", seeds=seeds) for n, seeds in (("a", (1, 2)), ("b", (3, 4, 5))))
+    out = tmp_path / "out"
+    convert(a, out)
+    convert(b, out, append=True)
+    for number in (2, 4):
+        shutil.rmtree(out / f"episode_000000{number}")
+    assert caplog.records == []
+    convert(a, out)
+    said = [record.getMessage() for record in caplog.records]
+    assert said == [f"{out}: episodes 2, 4 of b.h5 are still missing: convert that with --append"]
+    hint = "found no folder (convert b.h5 again, or with --append)"
+    assert [str(v) for v in validate(out).violations] == [
+        f"conversion.json, episodes.{number}: expected the episodes on disk, {hint}" for number in (2, 4)
+    ]
+    convert(b, out, append=True)
+    assert len(caplog.records) == 1
+    assert validate(out).violations == []

@@ -1,0 +1,119 @@
+import json
+
+import h5py
+import numpy as np
+import pytest
+from synthetic import STEPS, make_states, write_trajectory
+
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
+
+UID = "robocas_mobile_panda"
+
+
+@pytest.fixture
+def own(tmp_path):
+    return write_trajectory(tmp_path / "F.h5", seeds=(3,))
+
+
+def edit_json(path, change):
+    file = path.with_suffix(".json")
+    data = json.loads(file.read_text())
+    change(data)
+    file.write_text(json.dumps(data))
+
+
+def test_what_was_written_is_read(tmp_path):
+    with TrajectoryFile(write_trajectory(tmp_path / "F.h5", seeds=(3, 4, 5))) as file:
+        assert file.control_freq == 20
+        recording, alone = file.recording(1), file.recording(1, bodies=False)
+    assert (recording.seed, recording.control_steps, recording.control_mode) == (4, STEPS, "pd_joint_pos")
+    assert recording.instruction == "grasp the cube 4 on the table and move it to the basket"
+    assert [(g.first, g.last) for g in recording.subgoals] == [(0, 11), (12, 21)]
+    states = make_states(4)
+    np.testing.assert_array_equal(recording.state(7)["actors"]["object_1"], states["actors"]["object_1"][7:8])
+    motion = recording.motion(np.array([0, STEPS]))
+    robot = states["articulations"][UID]
+    np.testing.assert_array_equal(motion.qpos, robot[[0, STEPS], 13:25])
+    np.testing.assert_array_equal(motion.qvel, robot[[0, STEPS], 25:])
+    # The root is turned by 90 deg: its x axis is the world's y.
+    np.testing.assert_allclose(motion.root_in_world[0, :3, 0], [0, 1, 0], atol=1e-6)
+    np.testing.assert_allclose(motion.root_in_world[0, :3, 3], [0.7, 0.15, 0], atol=1e-6)
+    assert alone.states["actors"] == {}
+    np.testing.assert_array_equal(motion.actions, alone.motion(np.array([0, STEPS])).actions)
+
+
+def test_reconfiguring_is_an_option(own):
+    edit_json(own, lambda data: data["episodes"][0].update(reset_kwargs={"options": {"reconfigure": True}}))
+    with TrajectoryFile(own) as file:
+        assert file.entry(0).reset_options == {"reconfigure": True}
+
+
+def fails(path, *words):
+    with pytest.raises(DatasetError) as caught, TrajectoryFile(path) as file:
+        file.recording(0)
+    assert "\n" not in str(caught.value)
+    assert all(word in str(caught.value) for word in words)
+
+
+def test_files_that_are_missing_or_cut_off(tmp_path, own):
+    fails(tmp_path / "G.h5", "G.h5: no such trajectory file")
+    data, json_file = own.read_bytes(), own.with_suffix(".json")
+    for share in (0.5, 0):
+        own.write_bytes(data[: int(len(data) * share)])
+        fails(own, "F.h5")
+    for text in ('{"env_info": ', "[]"):
+        json_file.write_text(text)
+        fails(own, "F.json")
+    json_file.unlink()
+    fails(own, "F.json: the JSON that belongs to this trajectory is missing")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda data: data.pop("robocas"), "replays of it drop them"),
+        (lambda data: data["robocas"].update(control_freq=0), "control_freq"),
+        (lambda data: data["episodes"].append({**data["episodes"][0], "episode_id": 1}), "same episodes"),
+        (lambda data: data["episodes"][0].update(elapsed_steps=21), "expected 21 actions, as the JSON says, found 22"),
+        (lambda data: data["episodes"][0]["robocas"].pop("subgoals"), "robocas.subgoals"),
+    ],
+)
+def test_a_json_that_does_not_fit(own, change, words):
+    edit_json(own, change)
+    fails(own, words)
+
+
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        ({"episode_seed": "3"}, "episode_seed"),
+        ({"episode_seed": 2**32}, "episode_seed"),
+        ({"episode_seed": [3, 4]}, "episode_seed"),
+        ({"reset_kwargs": {"options": {"reset_to_env_states": {}}}}, "reset_kwargs.options"),
+        ({"reset_kwargs": {"options": {"reconfigure": "yes"}}}, "reset_kwargs.options.reconfigure"),
+        ({"control_mode": 3}, "control_mode"),
+        ({"elapsed_steps": -1}, "elapsed_steps"),
+    ],
+)
+def test_entries_choose_a_seed_and_reconfigure_alone(own, change, key):
+    edit_json(own, lambda data: data["episodes"][0].update(change))
+    fails(own, "traj_0: the JSON's entry: ", key)
+
+
+@pytest.mark.parametrize("values", [np.zeros(23, np.float32), np.array([b"x"] * 23), np.float32(1)])
+@pytest.mark.parametrize("name", ["actors/object_1", f"articulations/{UID}"])
+def test_states_that_are_no_rows_of_numbers(own, name, values):
+    with h5py.File(own, "a") as file:
+        del file[f"traj_0/env_states/{name}"]
+        file[f"traj_0/env_states/{name}"] = values
+    fails(own, "this episode is damaged")
+
+
+def test_states_of_another_robot_or_none(own):
+    with h5py.File(own, "a") as file:
+        file.move(f"traj_0/env_states/articulations/{UID}", "traj_0/env_states/articulations/panda_wristcam")
+    fails(own, f"expected {UID} of 37 numbers, found ['panda_wristcam']")
+    with h5py.File(own, "a") as file:
+        del file["traj_0/env_states"]
+    fails(own, "this episode is damaged")

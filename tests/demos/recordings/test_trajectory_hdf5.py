@@ -1,0 +1,215 @@
+"""HDF5 files of trajectories: a disk that fills up, merged files, and files that name other files."""
+
+# pyright: reportAttributeAccessIssue=false, reportIndexIssue=false, reportArgumentType=false
+import errno
+import json
+import os
+import resource
+import threading
+from contextlib import contextmanager
+
+import h5py
+import numpy as np
+import pytest
+from synthetic import STEPS, write_trajectory
+
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.files import replacing
+from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
+from robocas_ms3.demos.recordings.trajectory_hdf5 import damage_of, merge, reserved, write_whole
+from robocas_ms3.demos.replay import Recorded
+from robocas_ms3.evaluation.policies.replay import ReplayPolicy
+from robocas_ms3.evaluation.policy import EpisodeSpec
+
+DATA = np.arange(50_000, dtype=np.float64)
+CUBE = "traj_0/env_states/actors/object_1"
+SECRET = np.full((STEPS + 1, 13), 7, np.float32)
+SECRET[:, 3:7] = [1, 0, 0, 0]
+
+
+@contextmanager
+def files_of_at_most(size):
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def fill(file):
+    file.create_group("a", track_order=True).create_dataset("b", data=DATA)
+
+
+@pytest.mark.parametrize("size", [1, 10_000_000, None])
+def test_what_was_reserved_and_not_needed_is_given_back(tmp_path, monkeypatch, size):
+    def none(*_):
+        raise OSError(errno.EOPNOTSUPP, "Operation not supported")
+
+    if size is None:  # a file system that reserves nothing
+        monkeypatch.setattr("os.posix_fallocate", none)
+    with reserved(tmp_path / "x.h5", size or 10) as file:
+        fill(file)
+    with h5py.File(tmp_path / "x.h5") as file:
+        np.testing.assert_array_equal(file["a/b"], DATA)
+    assert os.path.getsize(tmp_path / "x.h5") < DATA.nbytes + 10_000
+
+
+def test_no_room_is_an_error_before_anything_is_lost(tmp_path):
+    """No crash when HDF5 frees the file, and nothing is left."""
+    with files_of_at_most(100_000):
+        with pytest.raises(OSError, match="x.h5") as error, replacing(tmp_path / "x.h5") as tmp:
+            write_whole(tmp, fill)
+        assert error.value.errno == errno.EFBIG
+        with pytest.raises(OSError, match="y.h5"), replacing(tmp_path / "y.h5") as tmp, reserved(tmp, 500_000):
+            raise AssertionError("it was opened")
+    assert list(tmp_path.iterdir()) == []
+
+
+def cut_off(path):
+    os.truncate(path, path.stat().st_size - 1)
+
+
+def without_json(path):
+    path.with_suffix(".json").unlink()
+
+
+def without_an_action(path):
+    with h5py.File(path, "r+") as file:
+        actions = file["traj_1/actions"][:-1]
+        del file["traj_1/actions"]
+        file["traj_1/actions"] = actions
+
+
+def without_an_episode(path):
+    with h5py.File(path, "r+") as file:
+        del file["traj_1"]
+
+
+def with_another_number(path):
+    text = path.with_suffix(".json").read_text()
+    path.with_suffix(".json").write_text(text.replace('"episode_id": 0', '"episode_id": 5'))
+
+
+@pytest.mark.parametrize("damage", [cut_off, without_json, without_an_action, without_an_episode, with_another_number])
+def test_damage_of_a_merged_file_is_found(tmp_path, damage):
+    path = tmp_path / "merged.h5"
+    merge([write_trajectory(tmp_path / f"{seed}.h5", seeds=(seed,)) for seed in (7, 3)], path)
+    assert damage_of(path, [7, 3]) == ""
+    assert "other episodes" in damage_of(path, [3, 7])
+    damage(path)
+    assert damage_of(path, [7, 3])
+
+
+@pytest.fixture
+def whole(tmp_path):
+    """A recording, and a file of somebody else beside it."""
+    with h5py.File(tmp_path / "secret.h5", "w") as file:
+        file.create_dataset("states", data=SECRET)
+        file.create_dataset("actions", data=np.zeros((STEPS, 8), np.float32))
+    (tmp_path / "secret.bin").write_bytes(SECRET.tobytes())
+    return write_trajectory(tmp_path / "F.h5", seeds=(3,))
+
+
+def replaced(path, name, fill):
+    with h5py.File(path, "r+") as file:
+        del file[name]
+        fill(file, name)
+
+
+def external_link(file, name):
+    file[name] = h5py.ExternalLink("secret.h5", "actions" if name.endswith("actions") else "states")
+
+
+def soft_link(file, name):
+    file["elsewhere"] = file.create_dataset("traj_0/kept", data=SECRET)
+    file[name] = h5py.SoftLink("/elsewhere")
+
+
+def external_numbers(file, name):
+    file.create_dataset(name, SECRET.shape, np.float32, external=[("secret.bin", 0, SECRET.nbytes)])
+
+
+def virtual(file, name):
+    layout = h5py.VirtualLayout(SECRET.shape, np.float32)
+    layout[:] = h5py.VirtualSource("secret.h5", "states", SECRET.shape)
+    file.create_virtual_dataset(name, layout)
+
+
+def by_file(path):
+    with TrajectoryFile(path) as file:
+        return file.recording(0)
+
+
+def by_merge(path):
+    merge([path], path.with_name("merged.h5"))
+
+
+def by_replay(path):
+    return Recorded.read(path, json.loads(path.with_suffix(".json").read_text())["episodes"][0])
+
+
+def by_policy(path):
+    return ReplayPolicy(path).track(EpisodeSpec(0, 0, "", "", "", "", 3, "")).actions
+
+
+def refused(read, path, *words):
+    with pytest.raises(DatasetError) as caught:
+        read(path)
+    assert "\n" not in str(caught.value)
+    for word in words:
+        assert word in str(caught.value)
+
+
+@pytest.mark.parametrize("fill", [external_link, external_numbers, virtual, soft_link])
+@pytest.mark.parametrize("read", [by_file, by_merge, by_replay])
+def test_states_of_other_files(whole, fill, read):
+    replaced(whole, CUBE, fill)
+    if fill is soft_link:
+        with h5py.File(whole, "r+") as file:
+            del file["elsewhere"]
+            file[CUBE.rpartition("/")[0]].create_dataset("more", data=SECRET)
+    refused(read, whole, "can't choose files", "object_1", "arrays of its own")
+    assert not whole.with_name("merged.h5").exists()
+
+
+@pytest.mark.parametrize("read", [by_file, by_merge, by_replay, by_policy])
+@pytest.mark.parametrize("name", ["traj_0/actions", "traj_0"])
+def test_a_link_in_place_of_actions_or_of_the_episode(whole, read, name):
+    replaced(whole, name, external_link)
+    refused(read, whole, "can't choose files", name.rpartition("/")[2])
+
+
+@pytest.mark.parametrize("read", [by_file, by_replay])
+def test_states_said_to_be_huge(whole, read):
+    """A kilobyte of a file can stand for terabytes: they are not asked for."""
+    huge = {"shape": (2**33, 2**33), "dtype": np.float32, "chunks": (1024, 1024), "compression": "gzip"}
+    replaced(whole, CUBE, lambda file, name: file.create_dataset(name, **huge))
+    refused(read, whole, "MB of numbers")
+
+
+def test_a_ring_of_groups_ends(whole):
+    with h5py.File(whole, "r+") as file:
+        file["traj_0/env_states/ring"] = file["traj_0/env_states"]
+    refused(by_replay, whole, "damaged")
+    assert by_file(whole).control_steps == STEPS  # which reads bodies alone
+
+
+def test_other_threads_read_files_while_an_error_of_a_recording_is_kept(whole):
+    """The iterators of h5py hold its lock: a suite of tests hung where another thread freed the error's traceback."""
+    with h5py.File(whole, "r+") as file:
+        file["traj_0/env_states/ring"] = file["traj_0/env_states"]
+    with pytest.raises(DatasetError) as kept:
+        by_replay(whole)
+    thread = threading.Thread(target=by_file, args=[whole], daemon=True)
+    thread.start()
+    thread.join(timeout=20)
+    assert not thread.is_alive() and kept.tb
+
+
+@pytest.mark.parametrize("name", ["actions", "env_states/actors/object_1"])
+def test_nan_is_not_replayed(whole, name):
+    with h5py.File(whole, "r+") as file:
+        file[f"traj_0/{name}"][4, 2] = np.nan
+    for read in (by_file, by_replay, *([by_policy] if name == "actions" else [])):
+        refused(read, whole, "NaN or infinity", name.rpartition("/")[2], "row 4")

@@ -1,0 +1,190 @@
+"""What an action does in the environment that policies act in."""
+
+from __future__ import annotations
+
+from functools import cache, partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from mani_skill.utils.structs import Pose
+
+import robocas_ms3  # noqa: F401
+from robocas_ms3.core.errors import EvaluationError
+from robocas_ms3.evaluation.action_wrapper import PolicyStepping, env_kwargs
+from robocas_ms3.evaluation.metrics import read_sum
+from robocas_ms3.evaluation.policy import PolicySpec
+from robocas_ms3.tasks.vector import make_vec
+
+needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device: unproven on a GPU")
+
+
+IMAGES = {
+    "obs_mode": "rgb",
+    "reward_mode": "none",
+    "control_mode": "pd_ee_delta_pose",
+    "sim_config": {"control_freq": 5},
+    "sensor_configs": {"width": 32, "height": 24},
+    "max_episode_steps": 10_000,
+}
+
+
+@cache
+def pick(convention: str, rate: int) -> gym.Env:
+    return gym.make("RoboCASPick-v1", **env_kwargs(PolicySpec(convention), rate))
+
+
+def made(convention="robocas", reference="tcp", stepping="timed", rate=5) -> PolicyStepping:
+    stepped = PolicyStepping(pick(convention, rate), PolicySpec(convention, reference), stepping)
+    stepped.reset(seed=3)
+    return stepped
+
+
+def tcp(env: PolicyStepping) -> np.ndarray:
+    base: Any = env.unwrapped
+    return base.agent.tcp_in_arm_base.p[0].numpy().copy()
+
+
+def along(z: float, gripper: float = 1.0) -> np.ndarray:
+    return np.array([0, 0, z, 0, 0, 0, gripper])
+
+
+@pytest.mark.parametrize("reference", ["tcp", "target"])
+def test_a_slow_motion_ends_where_it_was_told_to(reference):
+    env = made(reference=reference)
+    before = tcp(env)
+    for _ in range(5):
+        *_, info = env.step(along(0.02))
+    assert np.linalg.norm(tcp(env) - before) == pytest.approx(0.1, abs=0.004)
+    assert read_sum(info, "path_length") == pytest.approx(0.1, abs=0.004)
+
+
+def test_from_where_it_is_or_from_where_it_was_sent():
+    gone = {}
+    for reference in ("tcp", "target"):
+        env = made(reference=reference)
+        base: Any = env.unwrapped
+        env.step(along(0.02))
+        sent = tcp(env)
+        qpos = base.agent.robot.get_qpos().clone()
+        qpos[0, 4] += 0.03  # something has pushed the arm
+        base.agent.robot.set_qpos(qpos)
+        pushed = np.linalg.norm(tcp(env) - sent)
+        env.step(along(0.0))
+        gone[reference] = np.linalg.norm(tcp(env) - sent) / pushed
+    assert gone["tcp"] > 0.8  # stays where it came to
+    assert gone["target"] < 0.2  # goes back
+
+
+def test_joint_targets_are_taken_as_they_are():
+    env = made("joint_positions", rate=20)
+    base: Any = env.unwrapped
+    wanted = base.agent.robot.get_qpos()[0, 3:10].numpy() + 0.05
+    for _ in range(20):
+        env.step(np.append(wanted, 1.0))
+    np.testing.assert_allclose(base.agent.robot.get_qpos()[0, 3:10].numpy(), wanted, atol=0.01)
+
+
+def test_upstreams_step_waits_for_the_gripper_and_for_the_motion():
+    env = made(stepping="upstream")
+    base: Any = env.unwrapped
+
+    def steps(action: np.ndarray) -> int:
+        before = int(base.elapsed_steps)
+        env.step(action)
+        return int(base.elapsed_steps) - before
+
+    with pytest.raises(EvaluationError, match="not finite"):
+        env.step(np.full(7, np.nan))
+    assert steps(along(0.01)) == 1  # there within the first fifth of a second
+    before = tcp(env)
+    assert steps(along(0.15)) == 2  # no control step goes farther than 10 cm
+    assert np.linalg.norm(tcp(env) - before) == pytest.approx(0.15, abs=0.02)
+    shutting = steps(along(0.0, gripper=0.0))
+    assert 2 < shutting <= 7
+    assert float(base.agent.gripper_width) < 0.01
+    assert steps(along(0.0, gripper=0.0)) <= 2  # it stands, though its drives press
+
+
+def test_what_happened_is_counted_from_the_reset_on():
+    env = made()
+    base: Any = env.unwrapped
+    slot = int(base.target_slot)
+    for _ in range(3):
+        env.step(along(0.02))
+    pose = base.objects[slot].pose.raw_pose.clone()
+    above = torch.cat([base.basket_pose[:, :2], pose[:, 2:3]], dim=1)
+    base.objects[slot].set_pose(Pose.create_from_pq(above, pose[:, 3:]))
+    *_, info = env.step(along(0.0))
+    assert bool(info["success_v0"])  # near the basket in xy, gripper open: upstream's rule asks for no more
+    assert read_sum(info, "v0_steps") == 1
+    assert not bool(info["success"])
+    other = next(i for i in range(len(base.objects)) if i != slot)
+    pose = base.objects[other].pose.raw_pose.clone()
+    base.objects[other].set_pose(Pose.create_from_pq(torch.tensor([[3.0, 3.0, 0.05]]), pose[:, 3:]))
+    *_, info = env.step(along(0.0, gripper=0.0))
+    assert not bool(info["success_v0"])
+    assert read_sum(info, "fallen") == 1
+    assert read_sum(info, "disturbed_most") >= 1
+    base.objects[slot].set_pose(Pose.create_from_pq(torch.tensor([[3.0, 2.0, 0.05]]), pose[:, 3:]))
+    *_, info = env.step(along(0.0))
+    assert bool(info["fail"])
+    assert read_sum(info, "fallen") == 1  # others only
+    env.reset(seed=3)
+    *_, info = env.step(along(0.0))
+    assert [read_sum(info, name) for name in ("fallen", "disturbed_most", "v0_steps")] == [0, 0, 0]
+    assert read_sum(info, "path_length") < 0.002
+
+
+def test_pictures_are_rendered_when_the_policy_looks(monkeypatch):
+    """Once an action of several control steps, and with ``look_every=2`` after every other action; black in between."""
+    env = gym.make("RoboCASPick-v1", **IMAGES)
+    base: Any = env.unwrapped
+    rendered, capture = [], base.capture_sensor_data
+    monkeypatch.setattr(base, "capture_sensor_data", lambda: (rendered.append(1), capture()))
+    for every, looks in ((1, [1, 1, 1]), (2, [0, 1, 0])):
+        stepped = PolicyStepping(env, PolicySpec("robocas", "tcp", look_every=every), "upstream")
+        for _ in range(2):  # a reset begins to count anew
+            obs, _ = stepped.reset(seed=3)
+            assert obs["sensor_data"]["base_camera"]["rgb"].any()
+            for expected in looks:
+                rendered.clear()
+                obs, *_, info = stepped.step(along(0.08))
+                assert len(rendered) == expected
+                seen = {name: pictures["rgb"] for name, pictures in obs["sensor_data"].items()}
+                assert {tuple(rgb.shape) for rgb in seen.values()} == {(1, 24, 32, 3)}
+                assert [bool(rgb.any()) for rgb in seen.values()] == [bool(expected)] * len(seen)
+                now = base.get_obs()["sensor_data"]["base_camera"]["rgb"]
+                assert not expected or torch.equal(seen["base_camera"], now)
+            assert int(info["elapsed_steps"]) > len(looks)
+    env.close()
+
+
+@pytest.mark.gpu
+@needs_cuda
+def test_each_env_of_a_batch_is_looked_at_in_its_own_steps():
+    """The last is reset after a step, and is one behind from there on."""
+    num_envs = 4
+    envs = make_vec(
+        "RoboCASPick-v1",
+        num_envs,
+        auto_reset=False,
+        ignore_terminations=True,
+        record_metrics=False,
+        wrappers=[partial(PolicyStepping, spec=PolicySpec("robocas", "tcp", look_every=3), stepping="upstream")],
+        **IMAGES,
+    )
+
+    def shows(obs: Any) -> list[bool]:
+        return obs["sensor_data"]["base_camera"]["rgb"].flatten(1).any(dim=1).tolist()
+
+    actions = torch.tensor(along(0.02), dtype=torch.float32).repeat(num_envs, 1)
+    assert all(shows(envs.reset(seed=3)[0]))
+    envs.step(actions)
+    envs.reset(options={"env_idx": torch.tensor([num_envs - 1])})
+    found = [shows(envs.step(actions)[0]) for _ in range(4)]
+    assert [one[0] for one in found] == [False, True, False, False]
+    assert [one[-1] for one in found][2:] == [True, False]
+    envs.close()

@@ -1,0 +1,139 @@
+"""Layouts in one file, tables and frozen ones, are those that were written."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from robocas_ms3.core.errors import LayoutError
+from robocas_ms3.scenes.layout import Layout
+from robocas_ms3.scenes.layout_table import (
+    FrozenLayouts,
+    LayoutTable,
+    State,
+    join_frozen,
+    mark_table,
+    write_frozen,
+    write_table,
+)
+
+NAMES = ["five", "one", "three", "two"]
+
+
+def layout(seed: int, objects: tuple[str, ...] | None = None, slots: int = 3) -> Layout:
+    rng = np.random.default_rng(seed)
+    poses = np.tile(np.eye(4), (slots + 2, 1, 1))
+    poses[:, :3, :3] = Rotation.random(slots + 2, random_state=seed).as_matrix()
+    poses[:, :3, 3] = rng.uniform(-1, 1, (slots + 2, 3))
+    return Layout(
+        object_ids=tuple(NAMES[i] for i in rng.permutation(slots)) if objects is None else objects,
+        object_poses=poses[2:],
+        robot_pose=poses[0],
+        basket_pose=poses[1],
+        target=int(rng.integers(slots)),
+        relation=("", "nearest")[seed % 2],
+        present=rng.random(slots) < 0.7,
+        visible_shares=np.array([np.nan, *rng.random(slots - 1)]),
+    )
+
+
+@pytest.fixture
+def layouts() -> dict[tuple[int, int], Layout]:
+    of = {objects: layout(objects).object_ids for objects in (7, 2, 5)}
+    return {(i, seed): layout(101 * i + seed, ids) for i, ids in of.items() for seed in (30, 10, 20, 40)}
+
+
+@pytest.fixture
+def table(layouts, tmp_path) -> LayoutTable:
+    write_table(tmp_path / "table.npy", NAMES, layouts)
+    return LayoutTable(tmp_path / "table.npy", NAMES)
+
+
+def assert_same(found: Layout, wanted: Layout) -> None:
+    assert found.object_ids == wanted.object_ids
+    assert (found.target, found.relation) == (wanted.target, wanted.relation)
+    np.testing.assert_array_equal(found.present, wanted.present)
+    for name in ("object_poses", "robot_pose", "basket_pose", "visible_shares"):
+        np.testing.assert_allclose(getattr(found, name), getattr(wanted, name), atol=1e-6, err_msg=name)
+
+
+def test_layouts_come_back(layouts, table):
+    for pair, wanted in layouts.items():
+        found = table.layout(pair)
+        assert found is not None
+        assert_same(found, wanted)
+    assert table.object_ids(5) == layouts[5, 40].object_ids
+    assert table.pairs() == sorted(layouts)
+
+
+def test_what_it_lacks_it_does_not_make_up(layouts, tmp_path):
+    del layouts[5, 20]
+    path = tmp_path / "table.npy"
+    write_table(path, NAMES, layouts)
+    table = LayoutTable(path, NAMES)
+    for pair in ((5, 20), (5, 50), (5, 15), (8, 10), (3, 10), (0, 0)):
+        assert table.layout(pair) is None
+        assert table.state(pair) == State.LACKING
+    assert [table.object_ids(seed) is None for seed in (1, 2, 3, 5, 9)] == [True, False, True, False, True]
+    states = table.places(np.array([5, 5, 9]), np.array([10, 20, 10]))[0]
+    assert states.tolist() == [State.UNTRIED, State.LACKING, State.LACKING]
+
+
+def test_what_is_found_of_layouts_is_kept(layouts, table, tmp_path):
+    found = {(5, 40): State.MOVES, (2, 10): State.STAYS, (0, 0): State.STAYS, (9, 9): State.MOVES, (5, 15): State.STAYS}
+    mark_table(tmp_path / "table.npy", NAMES, found)  # some of which it lacks
+    marked = LayoutTable(tmp_path / "table.npy", NAMES)
+    assert marked.pairs(State.MOVES) == [(5, 40)]
+    assert marked.pairs(State.STAYS) == [(2, 10)]
+    assert len(marked.pairs(State.UNTRIED)) == len(layouts) - 2
+    assert not table.pairs(State.MOVES)  # that was opened before
+    assert marked.pairs() == sorted(layouts)
+    known = marked.layout((5, 40))
+    assert known is not None
+    assert_same(known, layouts[5, 40])
+    assert marked.stays(5)
+    mark_table(tmp_path / "table.npy", NAMES, dict.fromkeys([pair for pair in layouts if pair[0] == 5], State.MOVES))
+    assert [LayoutTable(tmp_path / "table.npy", NAMES).stays(seed) for seed in (2, 5, 9)] == [True, False, False]
+
+
+def test_a_damaged_one_is_named(tmp_path):
+    path = tmp_path / "table.npy"
+    for content in (b"", b"no table", b"\x93NUMPY"):
+        path.write_bytes(content)
+        with pytest.raises(LayoutError, match=r"table\.npy: no table of layouts.*robocas layouts build"):
+            LayoutTable(path, NAMES)
+    numbers = np.zeros((2, 3), [("objects_seed", "i8"), ("seed", "i8"), ("state", "u1"), ("present", "?", (3,))])
+    for content in (np.zeros((2, 3)), numbers):
+        np.save(path, content)
+        with pytest.raises(LayoutError, match="no table of layouts"):
+            LayoutTable(path, NAMES)
+
+
+def test_frozen_parts_make_the_file_of_the_whole(tmp_path):
+    layouts = {seed: replace(layout(seed), relation=said) for seed, said in ((3, ""), (4, "nearest"), (9, "left"))}
+    write_frozen(tmp_path / "whole.npy", NAMES, layouts)
+    for seed, one in layouts.items():
+        write_frozen(tmp_path / f"{seed}.npy", NAMES, {seed: one})
+    join_frozen(tmp_path / "joined.npy", [tmp_path / f"{seed}.npy" for seed in layouts])
+    assert (tmp_path / "joined.npy").read_bytes() == (tmp_path / "whole.npy").read_bytes()
+    found = FrozenLayouts(tmp_path / "joined.npy", NAMES)
+    assert found.seeds == (3, 4)
+    assert_same(found(9, 9), layouts[9])
+    for pair in ((3, 4), (5, 5)):
+        with pytest.raises(LayoutError):
+            found(*pair)
+
+
+def test_what_can_not_be_joined_is_refused_and_nothing_written(tmp_path):
+    write_frozen(tmp_path / "a.npy", NAMES, {1: layout(1)})
+    write_frozen(tmp_path / "b.npy", NAMES, {2: layout(2, slots=4)})
+    (tmp_path / "c.npy").write_bytes((tmp_path / "a.npy").read_bytes()[:-5])
+    np.save(tmp_path / "d.npy", np.zeros(3))
+    for other in "bcd":
+        with pytest.raises(LayoutError) as caught:
+            join_frozen(tmp_path / "joined.npy", [tmp_path / "a.npy", tmp_path / f"{other}.npy"])
+        assert caught.value.where == tmp_path / f"{other}.npy"
+    assert not (tmp_path / "joined.npy").exists()

@@ -1,0 +1,82 @@
+"""Where basket and robot can stand, and that a seed moves them nowhere else."""
+
+import numpy as np
+import pytest
+from scene_models import load_scene
+
+from robocas_ms3.core.errors import LayoutError
+from robocas_ms3.core.poses import planar
+from robocas_ms3.scenes.model import SceneModel
+from robocas_ms3.scenes.robot_placement import _moved, basket_stands, body_is_free, place_basket, place_robot
+from robocas_ms3.scenes.sample import sample_layout
+
+
+def shifted(pose: np.ndarray, x: float = 0, y: float = 0, z: float = 0) -> np.ndarray:
+    moved = pose.copy()
+    moved[:3, 3] += x, y, z
+    return moved
+
+
+def test_a_basket_stands_where_all_that_lies_in_it_has_something_below():
+    scene = load_scene()
+    table = scene.furniture["table"].asset.surfaces["top"]
+    edge = (scene.support_pose @ [*table.max_xy, 0, 1])[0]  # in x
+    inner = scene.basket.asset.inner.max[0]  # from its middle to its wall
+    at_edge = shifted(scene.basket_pose, x=edge - scene.basket_pose[0, 3])
+    assert basket_stands(scene, scene.basket_pose)
+    assert basket_stands(scene, shifted(at_edge, x=-inner))
+    assert not basket_stands(scene, shifted(at_edge, x=-0.02))  # not with something on the wrong side
+    assert not basket_stands(scene, shifted(at_edge, x=0.05))
+    assert not basket_stands(scene, shifted(scene.basket_pose, z=0.1))  # in the air
+    on_floor = load_scene("pick_side_table_scattered")
+    assert basket_stands(on_floor, on_floor.basket_pose)
+
+
+def test_a_basket_that_would_hang_over_the_edge_is_drawn_again():
+    scene = load_scene(randomisation={"basket": {"position": 0.5, "yaw_deg": 20}})
+    by = scene.config.randomisation.basket
+    redrawn = 0
+    for seed in range(8):
+        first = _moved(scene.basket_pose, by, np.random.default_rng(seed))
+        pose = place_basket(scene, scene.robot_pose, np.random.default_rng(seed))
+        assert basket_stands(scene, pose)
+        redrawn += not np.array_equal(pose, first)
+        if basket_stands(scene, first):
+            np.testing.assert_array_equal(pose, first)
+    assert 0 < redrawn < 8
+    layout = sample_layout(scene, 1, 1)
+    assert basket_stands(scene, layout.basket_pose)
+
+
+def test_a_basket_that_stands_nowhere_says_what_to_change():
+    scene = load_scene(randomisation={"basket": {"position": 0.0}})
+    air = SceneModel(**{**scene.__dict__, "basket_pose": shifted(scene.basket_pose, z=0.5)})
+    with pytest.raises(LayoutError, match=r"randomisation.basket: the basket can't stand.*50 places.*Lower random"):
+        place_basket(air, scene.robot_pose, np.random.default_rng(0))
+
+
+def test_a_robot_that_would_stand_in_furniture_is_drawn_again():
+    scene = load_scene(randomisation={"robot": {"position": 0.5, "yaw_deg": 10}})
+    redrawn = 0
+    for seed in range(30):
+        first = _moved(scene.robot_pose, scene.config.randomisation.robot, np.random.default_rng(seed))
+        pose = place_robot(scene, np.random.default_rng(seed))
+        assert body_is_free(pose, scene.furniture_points)
+        redrawn += not np.array_equal(pose, first)
+    assert 0 < redrawn < 30
+    assert body_is_free(sample_layout(scene, 2, 2).robot_pose, scene.furniture_points)
+
+
+def test_what_nothing_moves_stays_and_draws_nothing():
+    scene, rng = load_scene(), np.random.default_rng(0)
+    assert place_robot(scene, rng) is scene.robot_pose
+    assert place_basket(scene, scene.robot_pose, rng) is scene.basket_pose
+    assert rng.uniform() == np.random.default_rng(0).uniform()
+
+
+def test_the_robots_body_is_low_and_wide_high_and_narrow_and_above_the_floor():
+    root = planar(1.0, 2.0, 0.0, np.pi / 2)  # ahead is +y
+    for hit in ([1.0, 2.27, 0.2], [1.22, 2.0, 0.2], [1.0, 2.14, 0.6]):
+        assert not body_is_free(root, np.array([hit]))
+    for beside in ([1.0, 2.29, 0.2], [1.24, 2.0, 0.2], [1.0, 2.16, 0.6], [1.0, 2.0, 0.65], [1.0, 2.0, -5.0]):
+        assert body_is_free(root, np.array([beside]))
