@@ -21,12 +21,12 @@ from robocas_ms3.core.errors import AssetError
 from robocas_ms3.core.poses import from_wxyz
 
 Array = NDArray[np.float64]
-Picture = tuple[str, Image.Image]
+LabelledImage = tuple[str, Image.Image]
 
-CELLS = 5  # pictures of an asset, side by side
-LARGE, SMALL = 220, 154  # px, a picture's side: of packs with few and with many assets
+CELLS = 5  # images of an asset, side by side
+LARGE, SMALL = 220, 154  # px, an image's side: of packs with few and with many assets
 FEW = 16
-GAP, CAPTION, LABEL = 6, 33, 14  # px between assets, of the text above the pictures, of that below
+GAP, CAPTION, LABEL = 6, 33, 14  # px between assets, of the text above the images, of that below
 POSES = 4
 GROUND, GREY, RED = (0.80, 0.80, 0.78), (0.55, 0.55, 0.55), (0.9, 0.1, 0.1)
 INK, FAINT = (25, 25, 25), (120, 120, 120)
@@ -64,18 +64,18 @@ def contact_sheet(pack: Pack, path: Path, ids: Sequence[str] | None = None) -> N
 
 def _strip(studio: Studio, asset: LoadedObject | LoadedFurniture) -> Image.Image:
     if isinstance(asset, LoadedObject):
-        title, line, pictures = asset.asset.id, _object_line(asset.asset), _object_pictures(studio, asset)
+        title, line, images = asset.asset.id, _object_line(asset.asset), _object_images(studio, asset)
         if asset.asset.graspnet_id is not None:
             title += f"  ({asset.asset.graspnet_id})"
     else:
-        title, line, pictures = asset.asset.id, _furniture_line(asset), _furniture_pictures(studio, asset)
+        title, line, images = asset.asset.id, _furniture_line(asset), _furniture_images(studio, asset)
     size = studio.size
     strip = Image.new("RGB", (CELLS * size, CAPTION + size + LABEL), PAPER)
     draw = ImageDraw.Draw(strip)
     draw.text((4, 0), title, INK, _font(15))
     draw.text((4, 17), line, INK, _font(12))
-    for i, (label, picture) in enumerate(pictures):
-        strip.paste(picture, (i * size, CAPTION))
+    for i, (label, image) in enumerate(images):
+        strip.paste(image, (i * size, CAPTION))
         draw.text((i * size + 4, CAPTION + size), label, FAINT, _font(11))
     return strip
 
@@ -100,7 +100,7 @@ def _furniture_line(furniture: LoadedFurniture) -> str:
     return ", ".join(parts)
 
 
-def _object_pictures(studio: Studio, asset: LoadedObject) -> list[Picture]:
+def _object_images(studio: Studio, asset: LoadedObject) -> list[LabelledImage]:
     notes = asset.annotations
     points, tried = np.concatenate(asset.hulls), top_grasps(notes)
     fast = Body(points, file=asset.visual("fast"))
@@ -114,11 +114,11 @@ def _object_pictures(studio: Studio, asset: LoadedObject) -> list[Picture]:
     best = _shown_poses(notes)
     chances = " ".join(f"{notes.resting_probabilities[i]:.0%}" for i in best)
     return [
-        ("fast", studio.picture([fast], -60, 25)),
-        ("full, from behind", studio.picture([Body(points, file=asset.visual("full"))], 120, 25)),
-        ("hulls", studio.picture(hull_bodies(asset.hull_meshes), -60, 25)),
-        (f"rests {chances}", studio.picture(standing(fast, notes.resting_poses[best]), -60, 30)),
-        (f"best {len(grippers)} of {len(notes.grasp_widths)} grasps", studio.picture([fast, *grippers], -60, 30)),
+        ("fast", studio.image([fast], -60, 25)),
+        ("full, from behind", studio.image([Body(points, file=asset.visual("full"))], 120, 25)),
+        ("hulls", studio.image(hull_bodies(asset.hull_meshes), -60, 25)),
+        (f"rests {chances}", studio.image(standing(fast, notes.resting_poses[best]), -60, 30)),
+        (f"best {len(grippers)} of {len(notes.grasp_widths)} grasps", studio.image([fast, *grippers], -60, 30)),
     ]
 
 
@@ -130,7 +130,7 @@ def _shown_poses(notes: Annotations) -> list[int]:
     return order[:POSES]
 
 
-def _furniture_pictures(studio: Studio, furniture: LoadedFurniture) -> list[Picture]:
+def _furniture_images(studio: Studio, furniture: LoadedFurniture) -> list[LabelledImage]:
     asset = furniture.asset
     parts = {"": furniture, **furniture.links}
     wide = {link.joint.name: max(link.joint.limits, key=abs) for link in asset.links}
@@ -160,11 +160,11 @@ def _furniture_pictures(studio: Studio, furniture: LoadedFurniture) -> list[Pict
     edges = _solid(frame_faces(points.min(axis=0), points.max(axis=0), thick / 2), GREY)
     front, behind = ("closed", "open") if asset.links else ("front", "behind")
     return [
-        (front, studio.picture(looks(shut), 30, 25)),
-        (behind, studio.picture(looks(open_), 30 if asset.links else 210, 25)),
-        ("hulls", studio.picture(hulls, 30, 25)),
-        ("surfaces, handles", studio.picture([edges, *marks], 30, 25)),
-        ("from above", studio.picture([*looks(open_), *marks], 30, 70)),
+        (front, studio.image(looks(shut), 30, 25)),
+        (behind, studio.image(looks(open_), 30 if asset.links else 210, 25)),
+        ("hulls", studio.image(hulls, 30, 25)),
+        ("surfaces, handles", studio.image([edges, *marks], 30, 25)),
+        ("from above", studio.image([*looks(open_), *marks], 30, 70)),
     ]
 
 

@@ -147,7 +147,7 @@ def content_hash(*parts: object, files: Iterable[Path] = (), packages: Sequence[
     digest = hashlib.sha256(repr((SCHEMA_VERSION, parts)).encode())
     for path in files:
         digest.update(f"{path.name} {sha256(path)}".encode())
-    for package in ("", "quality", "reading", *packages):
+    for package in ("", "quality", "readers", *packages):
         digest.update(_code(package).encode())
     return digest.hexdigest()
 

@@ -1,4 +1,4 @@
-"""Small pictures of meshes, rendered with SAPIEN. Metres, z up."""
+"""Small images of meshes, rendered with SAPIEN. Metres, z up."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Body:
     """Something to look at.
 
     Attributes:
-        points: (N, 3) that the picture must hold, in its frame; none: it may stick out.
+        points: (N, 3) that the image must hold, in its frame; none: it may stick out.
         file: of its mesh; or
         faces: (F, 3, 3) corners of its triangles, shaded flat.
         colour: of the faces.
@@ -45,7 +45,7 @@ class Studio:
     """A room with lights and a camera that sees all lines in parallel.
 
     Args:
-        size: of the pictures, pixels.
+        size: of the images, pixels.
 
     Raises:
         AssetError: there is nothing to render with.
@@ -61,13 +61,13 @@ class Studio:
         self._scene.set_ambient_light([0.45, 0.45, 0.45])
         self._sun = self._scene.add_directional_light([0, 0, -1], [1.7, 1.7, 1.7])
         self._fill = self._scene.add_directional_light([0, 0, -1], [0.6, 0.6, 0.6])
-        # By name: environments made in this process set another shader and format of pictures for all cameras.
+        # By name: environments made in this process set another shader and format of images for all cameras.
         self._camera = sapien.render.RenderCameraComponent(size * OVERSAMPLING, size * OVERSAMPLING, _SHADER)
         holder = sapien.Entity()
         holder.add_component(self._camera)
         self._scene.add_entity(holder)
 
-    def picture(self, bodies: Sequence[Body], azimuth: float, elevation: float) -> Image.Image:
+    def image(self, bodies: Sequence[Body], azimuth: float, elevation: float) -> Image.Image:
         """What a camera sees that looks at the bodies from a direction, degrees from +x and above the horizon."""
         entities = [self._entity(body) for body in bodies]
         for entity in entities:

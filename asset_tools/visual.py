@@ -144,12 +144,12 @@ class Appearance:
         if not self.images:
             return np.einsum("nc,ncd->nd", weights, self.colors[face])
         colors = np.empty((len(face), 3))
-        for index, picture in enumerate(self.images):
+        for index, pixels in enumerate(self.images):
             here = np.flatnonzero(self.texture[face] == index)
             own = self.uv[faces[self.texture == index]]
-            spread = _double_area(own).sum() / 2 * picture.width * picture.height / max(1, len(here))
-            scale = min(max(1, round(np.sqrt(spread))), max(picture.size))
-            image = picture.reduce(scale)  # finer detail would only alias
+            spread = _double_area(own).sum() / 2 * pixels.width * pixels.height / max(1, len(here))
+            scale = min(max(1, round(np.sqrt(spread))), max(pixels.size))
+            image = pixels.reduce(scale)  # finer detail would only alias
             spots = np.einsum("nc,ncd->nd", weights[here], self.uv[faces[face[here]]])
             colors[here] = _bilinear(np.asarray(image, dtype=np.float32), spots)
         if self.tints is not None:
@@ -248,12 +248,12 @@ def _baked(
         normals = np.einsum("nc,ncd->nd", weights, corner_normals[face])
         origin_face, origin_weights = _closest(mesh, points, normals, layered=source.layered)
     colors = source.at(np.asarray(mesh.faces), origin_face, origin_weights)
-    picture = np.zeros((size, size, 3), dtype=np.uint8)
+    pixels = np.zeros((size, size, 3), dtype=np.uint8)
     empty = np.ones((size, size), dtype=bool)
-    picture[rows, columns] = np.clip(np.rint(colors), 0, 255)
+    pixels[rows, columns] = np.clip(np.rint(colors), 0, 255)
     empty[rows, columns] = False
     near: Any = distance_transform_edt(empty, return_distances=False, return_indices=True)
-    return Image.fromarray(picture[near[0], near[1]])  # gaps show their neighbours, so that no seam is dark
+    return Image.fromarray(pixels[near[0], near[1]])  # gaps show their neighbours, so that no seam is dark
 
 
 def _rasterised(corner_uv: Array, size: int) -> tuple[NDArray, NDArray, NDArray, Array]:

@@ -1,6 +1,6 @@
 """CPU time of conversions beside that of rendering alone; prints JSON.
 
-The bare loop sets each state, renders the three cameras and fetches their pictures as the shader leaves them, and does
+The bare loop sets each state, renders the three cameras and fetches their images as the shader leaves them, and does
 nothing else: it says what no conversion can be without. Conversions are whole: scenes, environment, files, previews.
 They take turns with the bare loop, over the same recordings; a case's figure is the median of its turns. CPU time is of
 this process and its children together, which other programs disturb less than the wall clock; --jobs is judged by that.
@@ -33,7 +33,7 @@ from convert_memory import repeated
 from robocas_ms3.datasets.conversion.convert import convert
 from robocas_ms3.datasets.conversion.env_renderer import EnvRenderer
 from robocas_ms3.datasets.conversion.settings import ConversionSettings
-from robocas_ms3.datasets.images.image_files import Pictures
+from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.demos.recordings.motion import sample_states, sample_stride
 from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
@@ -59,7 +59,7 @@ class Benchmark:
     cases: tuple[str, ...] = tuple(CASES)
     """Which conversions."""
     size: tuple[int, int] = (640, 480)
-    """Of the pictures."""
+    """Of the images."""
     rate: float = 5.0
     """Steps a second."""
     jobs: int = 0
@@ -95,7 +95,7 @@ def in_turns(cfg: Benchmark, trajectory: Path, work: Path) -> dict[str, Any]:
         steps = sum(
             len(sample_states(file.recording(i).control_steps, _stride(cfg, file))) for i in range(cfg.episodes)
         )
-        with closing(EnvRenderer(file.env, file.recording(0).control_mode, Pictures(size=cfg.size))) as source:
+        with closing(EnvRenderer(file.env, file.recording(0).control_mode, ImageOptions(size=cfg.size))) as source:
             for _ in range(cfg.turns):
                 for depth, spent in bare.items():
                     spent.append(alone(cfg, file, source, TEXTURES[depth]))

@@ -30,7 +30,7 @@ class Benchmark:
 
     Where the trajectory has fewer episodes, its recordings are repeated into a temporary larger one. Each conversion is
     a process of its own, and its peak that of the whole process: Python, torch, PhysX, the renderer and a scene are in
-    it. Full pictures take seconds an episode where rendering is done in software; --size 64 48 shows as well whether
+    it. Full images take seconds an episode where rendering is done in software; --size 64 48 shows as well whether
     memory grows, and so does --stand-in, in a minute.
     """
 
@@ -41,21 +41,21 @@ class Benchmark:
     to: tuple[Literal["robocas", "lerobot"], ...] = ("robocas", "lerobot")
     """Formats."""
     size: tuple[int, int] | None = None
-    """Width and height of the pictures; default: the cameras' own."""
+    """Width and height of the images; default: the cameras' own."""
     rate: float = 5.0
     """Steps a second."""
     jobs: int = 1
     """Processes that render."""
     stand_in: bool = False
-    """Do not render: grey ramps are the pictures. Everything else is done."""
+    """Do not render: grey ramps are the images. Everything else is done."""
 
 
 class StandIn:
     """A ``FrameSource`` of grey ramps."""
 
-    def __init__(self, _env_info: dict[str, Any], _control_mode: str, pictures: Any) -> None:
-        self.pictures = pictures
-        width, height = pictures.size or (640, 480)
+    def __init__(self, _env_info: dict[str, Any], _control_mode: str, image_options: Any) -> None:
+        self.image_options = image_options
+        width, height = image_options.size or (640, 480)
         ramp = np.add.outer(np.arange(height), np.arange(width))
         self.rgb, self.depth = np.repeat(ramp[..., None] % 256, 3, 2).astype(np.uint8), ramp.astype(np.uint16)
 
@@ -67,8 +67,8 @@ class StandIn:
         from robocas_ms3.datasets.sources.episode_source import Frame
 
         for sample in samples:
-            rgb = {name: np.roll(self.rgb, sample, 1) for name in self.pictures.cameras}
-            depth = {name: np.roll(self.depth, sample, 1) for name in self.pictures.cameras}
+            rgb = {name: np.roll(self.rgb, sample, 1) for name in self.image_options.cameras}
+            depth = {name: np.roll(self.depth, sample, 1) for name in self.image_options.cameras}
             yield Frame(rgb, depth)
 
     def cameras(self) -> dict[str, Any]:
@@ -76,7 +76,7 @@ class StandIn:
         from robocas_ms3.datasets.sources.episode_source import CameraModel
 
         model = CameraModel(np.array([24.0, 24.0, 32.0, 24.0]), np.eye(4), "world")
-        return dict.fromkeys(self.pictures.cameras, model)
+        return dict.fromkeys(self.image_options.cameras, model)
 
     def scene(self) -> dict[str, Any]:
         """Nothing is known."""

@@ -46,7 +46,7 @@ class Benchmark:
     out: Path
     """Folder for the datasets; must not exist."""
     size: tuple[int, int] | None = None
-    """Of the pictures; default 640 480."""
+    """Of the images; default 640 480."""
 
 
 def main(cfg: Benchmark) -> None:
@@ -116,21 +116,21 @@ def _compare(ours: Dataset, theirs: LeRobotDataset) -> dict[str, Any]:
                 errors.append(np.abs(rgb.astype(np.int16) - a.rgb(camera, step)).mean())
     return {
         "episodes_changed": wrong,
-        "depth_pictures_changed": depth,
+        "depth_images_changed": depth,
         "rgb_mean_error_levels": round(float(np.mean(errors)), 2),
-        "rgb_worst_picture_levels": round(float(np.max(errors)), 2),
+        "rgb_worst_image_levels": round(float(np.max(errors)), 2),
     }
 
 
 def _different(a: Dataset, b: Dataset) -> int:
-    """How many episodes differ, in the order of their numbers: arrays to 1e-6, files of pictures byte for byte."""
+    """How many episodes differ, in the order of their numbers: arrays to 1e-6, files of images byte for byte."""
     if len(a.numbers) != len(b.numbers):
         return max(len(a.numbers), len(b.numbers))
     wrong = 0
     for one, other in zip(map(a.episode, a.numbers), map(b.episode, b.numbers), strict=True):
-        pictures = {path.relative_to(one.folder) for path in one.folder.rglob("*.png")}
-        same = pictures == {path.relative_to(other.folder) for path in other.folder.rglob("*.png")}
-        same = same and all((one.folder / p).read_bytes() == (other.folder / p).read_bytes() for p in pictures)
+        images = {path.relative_to(one.folder) for path in one.folder.rglob("*.png")}
+        same = images == {path.relative_to(other.folder) for path in other.folder.rglob("*.png")}
+        same = same and all((one.folder / p).read_bytes() == (other.folder / p).read_bytes() for p in images)
         wrong += not same or not _same_arrays(one.arrays, other.arrays)
     return wrong
 

@@ -41,7 +41,7 @@ class Benchmark:
     """Which take turns."""
     turn: int = 10
     """Episodes of a turn."""
-    pictures: bool = True
+    images: bool = True
     """Whether they are rendered: three cameras, RGB-D, 5 Hz."""
     size: tuple[int, int] = (640, 480)
     """Of them; small ones cost little, and memory grows by what scenes hold."""
@@ -85,8 +85,8 @@ def plan_of(cfg: Benchmark) -> dict[str, Any]:
         for turn in range(turns)
         for task in cfg.tasks
     ]
-    stages = ["demonstrations", "datasets"] if cfg.pictures else ["demonstrations"]
-    return {"parts": parts, "stages": stages, "pictures": {"size": list(cfg.size)}, "embeddings": False, "block": 1}
+    stages = ["demonstrations", "datasets"] if cfg.images else ["demonstrations"]
+    return {"parts": parts, "stages": stages, "images": {"size": list(cfg.size)}, "embeddings": False, "block": 1}
 
 
 def watch(process: subprocess.Popen[bytes], until: float) -> dict[int, Memory]:

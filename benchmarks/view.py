@@ -75,7 +75,7 @@ def _made_up(folder: Path) -> Path:
 
 
 def _multiply(source: Path, out: Path, count: int) -> None:
-    """A dataset whose pictures and arrays are links to those of a few episodes; seeds and failures are its own."""
+    """A dataset whose images and arrays are links to those of a few episodes; seeds and failures are its own."""
     settings = json.loads((source / schema.CONVERSION_FILE).read_text())
     info = json.loads((source / schema.DATA_INFO_FILE).read_text())
     numbers = sorted(settings["episodes"], key=int)
@@ -126,7 +126,7 @@ def _page(page: Any, url: str, count: int) -> dict[str, float]:
     table = page.evaluate("performance.now() / 1000")
     assert page.text_content("#count").startswith(f"{count} episodes")
     wait(page, f"{CAMERAS}.length && {CAMERAS}.{LOADED}")
-    pictures = page.evaluate("performance.now() / 1000")
+    images = page.evaluate("performance.now() / 1000")
     wait(page, f"{THUMBNAILS}.slice(0, 12).{LOADED}")
     thumbnails = page.evaluate("performance.now() / 1000")
     paints = page.evaluate("performance.getEntriesByType('paint').map(entry => [entry.name, entry.startTime / 1000])")
@@ -138,16 +138,16 @@ def _page(page: Any, url: str, count: int) -> dict[str, float]:
     page.click(".row[data-episode='5']")
     wait(page, "document.querySelector('#summary').textContent.startsWith('Episode 5 ')")
     opened = time.perf_counter() - begun
-    wait(page, f"{CAMERAS}.every(img => img.src.includes('/pictures/5/')) && {CAMERAS}.{LOADED}")
+    wait(page, f"{CAMERAS}.every(img => img.src.includes('/images/5/')) && {CAMERAS}.{LOADED}")
     return {
         **{name.replace("-", "_"): seconds for name, seconds in paints},
         "table": table,
-        "pictures": pictures,
+        "images": images,
         "thumbnails_in_view": thumbnails,
         "a_thumbnail_median": statistics.median(loads),
         "a_thumbnail_slowest": max(loads),
         "click_to_episode": opened,
-        "click_to_pictures": time.perf_counter() - begun,
+        "click_to_images": time.perf_counter() - begun,
     }
 
 

@@ -1,4 +1,4 @@
-"""Convert a recording and read it as training data: instruction, pictures, actions, as RoboCAS-v0's loader takes them.
+"""Convert a recording and read it as training data: instruction, images, actions, as RoboCAS-v0's loader takes them.
 
 python examples/03_read_dataset.py TRAJECTORY.h5 OUT
 """
@@ -27,9 +27,9 @@ for number in dataset.numbers:
     arrays = episode.arrays
     print(f"{number}: {arrays['language_goal']} ({episode.steps} steps)")
     for step in range(episode.steps - 1):
-        picture = episode.rgb("gripper_camera", step)
+        image = episode.rgb("gripper_camera", step)
         turn = Rotation.from_quat(arrays["rel_orn"][step]).as_euler("xyz")  # xyzw
         open_gripper = arrays["gripper_status"][step + 1]  # the command given between this step and the next
         action = np.concatenate([arrays["rel_pos"][step], turn, [open_gripper]])
         if step % 5 == 0:
-            print(f"{step:4d} {arrays['step_goal_type'][step]:18s} {picture.shape} {np.round(action, 3)}")
+            print(f"{step:4d} {arrays['step_goal_type'][step]:18s} {image.shape} {np.round(action, 3)}")

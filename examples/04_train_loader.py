@@ -1,4 +1,4 @@
-"""Train a tiny policy on a dataset for a few steps: pictures and instruction of two steps in, a chunk of actions out.
+"""Train a tiny policy on a dataset for a few steps: images and instruction of two steps in, a chunk of actions out.
 
 python examples/04_train_loader.py DATASET
 """

@@ -27,7 +27,7 @@ description: pick episodes, to compare executors
 parts:
   - {{task: pick, episodes: {episodes}, seed: {seed}}}
 formats: [robocas, lerobot]
-pictures: {{size: [160, 120]}}
+images: {{size: [160, 120]}}
 embeddings: false
 block: {block}
 """

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# One plan of pick episodes with pictures by each executor: this machine, Slurm, a Ray cluster of two nodes on this machine, the
+# One plan of pick episodes with images by each executor: this machine, Slurm, a Ray cluster of two nodes on this machine, the
 # same with files gathered by the driver. Compares all that the runs made byte for byte, prints a table, ends with 1 on any
 # difference. With --kill each also runs while the processes of a job, or a node, are killed.
 #

@@ -10,7 +10,7 @@ bash scripts/setup.sh
 robocas=${ROBOCAS_VENV:-.venv}/bin/robocas
 "$robocas" generate pick -n 3 --seed 0 --out "$out/demonstrations" --overwrite
 if ! "${robocas%robocas}python" robocas_ms3/doctor/probes.py render >/dev/null 2>&1; then
-    echo "No render device: the demonstrations are recorded, but no pictures can be made of them; see robocas doctor."
+    echo "No render device: the demonstrations are recorded, but no images can be made of them; see robocas doctor."
     echo "demonstrations  $out/demonstrations/trajectory.h5"
     exit 0
 fi

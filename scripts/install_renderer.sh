@@ -13,7 +13,7 @@ export DEBIAN_FRONTEND=noninteractive
 say() { printf 'setup: %s\n' "$*"; }
 renders() { "$python" robocas_ms3/doctor/probes.py render >/dev/null 2>&1; }
 advise() {
-    say "no render device: $1. Until then everything works without pictures (state-only)."
+    say "no render device: $1. Until then everything works without images (state-only)."
     exit 0
 }
 

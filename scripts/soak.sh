@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# An hour of a plan on this machine, all three tasks with pictures, a job a core: what an episode costs, whether processes
+# An hour of a plan on this machine, all three tasks with images, a job a core: what an episode costs, whether processes
 # grow, how fast Ctrl-C ends it. Prints JSON. Arguments go to benchmarks/soak.py: bash scripts/soak.sh --minutes 10 --jobs 1
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."

@@ -26,7 +26,7 @@ LONGEST = {
     "tests/asset_tools/test_bad_scans.py",
     "tests/asset_tools/builtin/test_builtin_furniture.py",
     "tests/asset_tools/builtin/test_builtin_shapes.py",
-    "tests/datasets/writing/test_render.py",
+    "tests/datasets/conversion/test_env_renderer.py",
     "tests/demos/test_generate.py",
     "tests/evaluation/test_weld.py",
     "tests/examples/test_examples.py",

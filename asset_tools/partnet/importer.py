@@ -176,7 +176,7 @@ def _job(name: str, folder: Path, annotations: Path | None) -> Job:
     model, geometry = read_urdf(folder, annotation.joints, annotation.scale), Geometry(folder)
     for link, visuals in _groups(model):
         geometry.check(link, visuals)
-    content = content_hash(name, annotation, files=_files(folder), packages=("partnet", "reading"))
+    content = content_hash(name, annotation, files=_files(folder), packages=("partnet", "readers"))
     return Job(name, partial(_make, folder, annotation), content)
 
 

@@ -1,4 +1,4 @@
-"""One textured mesh of many: what a link's parts show is packed into one picture."""
+"""One textured mesh of many: what a link's parts show is packed into one image."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from robocas_ms3.core.errors import AssetError
 Array = np.ndarray
 
 HEAVY, LIGHT = 500, 200  # triangles of one side of a mesh: more than this many are reduced to this many
-SIDE = 1024  # pixels of the picture at most
+SIDE = 1024  # pixels of the image at most
 DENSITY = 400.0  # pixels a metre at most
 PADDING = 2  # pixels round each tile
 PLAIN = 4  # pixels of a tile of one colour
@@ -100,23 +100,23 @@ def merged(faces: Sequence[Faces]) -> trimesh.Trimesh:
         spots.append(spot)
         which.append(index + len(tiles))
         tiles += found
-    picture, boxes = _packed(tiles)
+    texture_image, boxes = _packed(tiles)
     low, size = boxes[np.concatenate(which)][:, None, :2], boxes[np.concatenate(which)][:, None, 2:]
     spot = np.concatenate(spots)
     spot[..., 1] = 1 - spot[..., 1]
-    uv = (low + spot * size) / picture.size
+    uv = (low + spot * size) / texture_image.size
     uv[..., 1] = 1 - uv[..., 1]
-    return _textured(np.concatenate(corners), uv, picture)
+    return _textured(np.concatenate(corners), uv, texture_image)
 
 
-def _textured(corners: Array, uv: Array, picture: Image.Image) -> trimesh.Trimesh:
+def _textured(corners: Array, uv: Array, texture_image: Image.Image) -> trimesh.Trimesh:
     body = _welded(corners)
     keep = body.nondegenerate_faces()
     body.update_faces(keep)
     normals, points = _crease_normals(body), corners[keep].reshape(-1, 3)
     rows = np.column_stack([body.faces.reshape(-1), np.rint(normals.reshape(-1, 3) * 1e3), uv[keep].reshape(-1, 2)])
     _, first, inverse = np.unique(np.round(rows, 6), axis=0, return_index=True, return_inverse=True)
-    material = PBRMaterial(baseColorTexture=picture, metallicFactor=0.0, roughnessFactor=DEFAULT_ROUGHNESS)
+    material = PBRMaterial(baseColorTexture=texture_image, metallicFactor=0.0, roughnessFactor=DEFAULT_ROUGHNESS)
     visual = TextureVisuals(uv=uv[keep].reshape(-1, 2)[first], material=material)
     return trimesh.Trimesh(
         points[first],
@@ -208,7 +208,7 @@ def _areas(corners: Array) -> Array:
 
 
 def _packed(tiles: Sequence[_Tile]) -> tuple[Image.Image, Array]:
-    """The picture, and (T, 4) left, top, width and height of each tile in it without its padding, pixels."""
+    """The image, and (T, 4) left, top, width and height of each tile in it without its padding, pixels."""
     shrink = 1.0
     while True:
         sizes = np.array([tile.size(shrink) for tile in tiles])
@@ -217,11 +217,11 @@ def _packed(tiles: Sequence[_Tile]) -> tuple[Image.Image, Array]:
             break
         shrink *= 0.9
         if shrink < 0.01:
-            raise AssetError("the textures don't fit into one picture", found=f"{len(tiles)} pieces")
-    picture = Image.new("RGB", (width, height))
+            raise AssetError("the textures don't fit into one image", found=f"{len(tiles)} pieces")
+    texture_image = Image.new("RGB", (width, height))
     for tile, (left, top, across, down) in zip(tiles, boxes.astype(int).tolist(), strict=True):
-        picture.paste(tile.drawn(across, down), (left - PADDING, top - PADDING))
-    return picture, boxes
+        texture_image.paste(tile.drawn(across, down), (left - PADDING, top - PADDING))
+    return texture_image, boxes
 
 
 def _shelves(sizes: Array) -> tuple[Array, int, int]:

@@ -127,8 +127,8 @@ class Materials:
             return Material(_triple(color + glow)), Mapping(0)
         total: Array | float = 0.0
         for mapped, tint in ((base, color), (light, glow)):
-            picture = None if mapped is None else np.asarray(mapped.image.resize(shown.image.size))
-            total = total + (tint if picture is None else decode_srgb(picture) * tint)
+            pixels = None if mapped is None else np.asarray(mapped.image.resize(shown.image.size))
+            total = total + (tint if pixels is None else decode_srgb(pixels) * tint)
         return Material(image=Image.fromarray(encode_srgb(np.asarray(total)))), shown.mapping
 
     def _image(self, info: schema.TextureInfo, uv_sets: frozenset[int]) -> MappedImage | None:

@@ -32,7 +32,7 @@ class Show:
     seed: int = 0
     """Seed of the episode, 0 or more."""
     out: Path = Path("scene")
-    """Folder for the pictures."""
+    """Folder for the images."""
     shader: Literal["minimal", "default", "rt-fast", "rt-med", "rt"] = "default"
     """ManiSkill shader: minimal (fast), default, or ray tracing (rt..., needs a GPU)."""
 
@@ -78,11 +78,11 @@ def main(cfg: Show) -> int:
 
     obs, _ = env.reset(seed=cfg.seed)
     make_folder(cfg.out)
-    pictures = {name: data["rgb"][0] for name, data in obs["sensor_data"].items()}
+    images = {name: data["rgb"][0] for name, data in obs["sensor_data"].items()}
     overview = base_env.render_rgb_array()
     assert overview is not None  # there is a render device, and the environment has a camera for it
-    pictures["overview"] = overview[0]
-    for name, pixels in pictures.items():
+    images["overview"] = overview[0]
+    for name, pixels in images.items():
         path = cfg.out / f"{Path(cfg.config).stem}_seed{cfg.seed}_{name}.png"
         with replacing(path) as tmp:
             Image.fromarray(pixels.cpu().numpy()).save(tmp)
@@ -104,7 +104,7 @@ def print_config(config: TaskConfig) -> int:
 
 
 def _require_gpu(shader: str) -> None:
-    """A software renderer says that it traces rays, and takes hours for a picture."""
+    """A software renderer says that it traces rays, and takes hours for an image."""
     import sapien
 
     from robocas_ms3.core.errors import RobocasError

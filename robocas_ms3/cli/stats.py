@@ -44,6 +44,6 @@ def main(cfg: Stats) -> int:
     if cfg.json:
         say_json(stats.as_json())
         return 0
-    pictures = len(paths) - 1
-    say(f"{cfg.path}: {stats.summary()}; {out}: stats.json and {count_of(pictures, 'picture')}")
+    images = len(paths) - 1
+    say(f"{cfg.path}: {stats.summary()}; {out}: stats.json and {count_of(images, 'image')}")
     return 0

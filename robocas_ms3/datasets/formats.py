@@ -85,7 +85,7 @@ _BUILTIN = (
         "RoboCAS folder",
         _is_robocas,
         f"{_PACKAGE}.sources.reader:open_folder",
-        f"{_PACKAGE}.writing.convert:convert",
+        f"{_PACKAGE}.conversion.convert:convert",
         f"{_PACKAGE}.checks.dataset:validate",
         ("append", "image_format", "leave_out"),
     ),

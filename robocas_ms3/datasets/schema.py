@@ -108,5 +108,5 @@ def episode_number(folder: str) -> int | None:
 
 
 def image_path(episode: Path, camera: str, kind: str, step: int, image_format: ImageFormat = "png") -> Path:
-    """Path of a picture; ``kind`` is ``rgb`` or ``depth``, the format that of RGB."""
+    """Path of an image; ``kind`` is ``rgb`` or ``depth``, the format that of RGB."""
     return episode / camera / kind / f"{step:04d}.{image_format if kind == 'rgb' else 'png'}"

@@ -127,9 +127,9 @@ def _settings_of(record: dict[str, Any]) -> dict[str, Any]:
     plan = record["plan"]
     if isinstance(plan, dict):
         plan = {key: value for key, value in plan.items() if key not in FREE}
-        pictures = plan.get("pictures")
-        if isinstance(pictures, dict) and pictures.get("cameras") is None:  # of an older version
-            plan["pictures"] = {**pictures, "cameras": list(STANDARD_NAMES)}
+        images = plan.get("images")
+        if isinstance(images, dict) and images.get("cameras") is None:  # of an older version
+            plan["images"] = {**images, "cameras": list(STANDARD_NAMES)}
     return {**record, "plan": plan}
 
 

@@ -169,7 +169,7 @@ def _join_dataset(plan: Plan, root: Path, files: EpisodeFiles) -> None:
             with TrajectoryFile(each.recording, pack=plan.parts[part].pack) as file:
                 entry = recording_entry(file, 0)
             entries[str(number)] = {**entry, **trajectory, "trajectory_episode": place}
-    settings = dataset_settings(plan.rate, plan.pictures.chosen(), plan.embeddings)
+    settings = dataset_settings(plan.rate, plan.images.chosen(), plan.embeddings)
     write_json(root / schema.CONVERSION_FILE, {**header(settings, rule_of(plan)), "episodes": entries}, sync=True)
     flush_to_disk(root)  # the episodes, before the file that lists them
     write_info(root, split_of(plan, root))

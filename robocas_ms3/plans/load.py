@@ -58,11 +58,11 @@ def load_plan(plan: str | Path) -> Plan:
         raise PlanError("parts of one name", where=path, found=", ".join(twice), fix="Give them a name each.")
     _check_seeds(parts, [scene for _, scene in completed], loaded.block, path)
     cameras = _cameras(loaded, [config for _, (_, config, _) in completed], path)
-    pictures = loaded.pictures.model_copy(update={"cameras": cameras})
+    images = loaded.images.model_copy(update={"cameras": cameras})
     packs = sorted({_FURNITURE_PACK, *(part.pack for part in parts)})
     found = {pack: digest for pack in packs if (digest := _digest(pack))}
     check_packs(loaded, found)
-    return loaded.model_copy(update={"parts": parts, "packs": found, "pictures": pictures})
+    return loaded.model_copy(update={"parts": parts, "packs": found, "images": images})
 
 
 def most_seeds(episodes: int, block: int) -> int:
@@ -97,7 +97,7 @@ def check_plan(plan: Plan) -> None:
 
             require_lerobot()
             whole_rate(plan.rate)
-            check_video_size(plan.pictures.size)
+            check_video_size(plan.images.size)
     if "statistics" in plan.stages:
         require_extra("plots", "statistics", "matplotlib", fix="Or leave the stage out.")
 
@@ -158,17 +158,17 @@ def _completed(part: PartConfig, number: int, path: Path) -> tuple[PartConfig, A
 
 def _cameras(plan: Plan, configs: Sequence[TaskConfig], path: Path) -> list[str]:
     """Return the cameras of the dataset: the chosen ones, or all that the parts' configurations declare."""
-    robot, where = find_robot(plan.recording.robot).description, f"{path}, pictures.cameras"
+    robot, where = find_robot(plan.recording.robot).description, f"{path}, images.cameras"
     declared = [[camera.name for camera in config.cameras_of(robot)] for config in configs]
     common = [name for name in declared[0] if all(name in names for names in declared)]
-    if not plan.pictures.cameras:
+    if not plan.images.cameras:
         if "datasets" in plan.stages and any(len(names) > len(common) for names in declared):
             what, fix = "the parts have different cameras", f"Choose some of {', '.join(common)}."
             raise PlanError(what, where=where, found=sorted({*chain(*declared)} - {*common}), fix=fix)
         return common
-    if wrong := sorted({*plan.pictures.cameras} - {*common}):
+    if wrong := sorted({*plan.images.cameras} - {*common}):
         raise PlanError("no such camera", where=where, expected=f"some of {', '.join(common)}", found=wrong)
-    return plan.pictures.cameras
+    return plan.images.cameras
 
 
 def _digest(pack: str) -> str:

@@ -8,7 +8,7 @@ from pydantic import Field, field_validator, model_validator
 
 from robocas_ms3.core.checks import GREATEST_SEED
 from robocas_ms3.core.strict_model import StrictModel
-from robocas_ms3.datasets.images.image_files import Pictures
+from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.datasets.lerobot.variants import NEWEST, Version
 from robocas_ms3.datasets.schema import ImageFormat
 from robocas_ms3.robots.cameras import STANDARD_NAMES
@@ -50,7 +50,7 @@ class RecordingConfig(StrictModel):
     noise_deg: Annotated[float, Field(ge=0, le=180)] | None = None
 
 
-class PicturesConfig(StrictModel):
+class ImagesConfig(StrictModel):
     """Images that are rendered."""
 
     size: tuple[Annotated[int, Field(ge=16, le=8192)], Annotated[int, Field(ge=16, le=8192)]] = (640, 480)
@@ -58,10 +58,10 @@ class PicturesConfig(StrictModel):
     image_format: ImageFormat = "png"
     cameras: list[str] | None = Field(default=None, description="default: all that the configurations declare")
 
-    def chosen(self) -> Pictures:
+    def chosen(self) -> ImageOptions:
         """Return the settings as dataset writers take them."""
         cameras = STANDARD_NAMES if self.cameras is None else tuple(self.cameras)  # None: a plan of an older version
-        return Pictures(cameras=cameras, size=self.size, depth=self.depth, image_format=self.image_format)
+        return ImageOptions(cameras=cameras, size=self.size, depth=self.depth, image_format=self.image_format)
 
 
 class LimitsConfig(StrictModel):
@@ -88,7 +88,7 @@ class Plan(StrictModel):
     formats: list[Literal["robocas", "lerobot"]] = ["robocas"]
     lerobot_version: Version = Field(default=NEWEST, description="version of LeRobot that reads the dataset")
     recording: RecordingConfig = RecordingConfig()
-    pictures: PicturesConfig = PicturesConfig()
+    images: ImagesConfig = ImagesConfig()
     rate: Annotated[float, Field(gt=0, le=100)] = Field(default=5.0, description="steps of a dataset per second")
     control_freq: Annotated[int, Field(ge=1, le=100)] = 20
     embeddings: bool = True

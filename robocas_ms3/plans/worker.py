@@ -33,7 +33,7 @@ from robocas_ms3.core.workers import Limits, WorkerPool, use_one_torch_thread
 from robocas_ms3.datasets.conversion import rendered_source
 from robocas_ms3.datasets.conversion.conversion_input import ConversionInput
 from robocas_ms3.datasets.conversion.episode_folder import FolderWriter
-from robocas_ms3.datasets.images.image_files import Pictures
+from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.demos.recordings.environment import RecordedEnv
 from robocas_ms3.demos.recordings.trajectory_json import read_json
 from robocas_ms3.plans.folder import Outcome, PlanFolder, SeedFiles, Unit
@@ -135,15 +135,15 @@ class Renderer:
         """Render the episode of a seed; return fields of its `Outcome`."""
         start = time.process_time()
         if not files.episode.is_dir():  # otherwise its process died after it had written the folder
-            recording = ConversionInput(self._source_of(files), self._plan.pictures.chosen())
+            recording = ConversionInput(self._source_of(files), self._plan.images.chosen())
             embed = self._embed if self._plan.embeddings else None
             FolderWriter(files.folder, embed).write(0, recording, 0)
         return {"render_seconds": round(time.process_time() - start, 2)}
 
-    def open_env(self, env: RecordedEnv, control_mode: str, pictures: Pictures) -> EnvRenderer:
+    def open_env(self, env: RecordedEnv, control_mode: str, image_options: ImageOptions) -> EnvRenderer:
         """Open the environment that recorded an episode."""
         use_one_torch_thread()
-        return rendered_source.open_env(env, control_mode, pictures)
+        return rendered_source.open_env(env, control_mode, image_options)
 
     def _source_of(self, files: SeedFiles) -> rendered_source.RenderedSource:
         if self._source is None or self._part != files.part:
@@ -152,7 +152,7 @@ class Renderer:
             self._source = rendered_source.RenderedSource(
                 files.recording,
                 rate_hz=self._plan.rate,
-                pictures=self._plan.pictures.chosen(),
+                image_options=self._plan.images.chosen(),
                 pack=self._plan.parts[files.part].pack,
                 open_renderer=self._open,
             )
@@ -160,10 +160,10 @@ class Renderer:
             self._source.turn_to(files.recording)
         return self._source
 
-    def _open(self, env: RecordedEnv, control_mode: str, pictures: Pictures) -> EnvRenderer:
+    def _open(self, env: RecordedEnv, control_mode: str, image_options: ImageOptions) -> EnvRenderer:
         assert self._part is not None
         with opening_part(self._plan, self._part):
-            return self.open_env(env, control_mode, pictures)
+            return self.open_env(env, control_mode, image_options)
 
     def _embed(self, texts: list[str]) -> NDArray[np.float32]:
         from robocas_ms3.scenes.language.embed import TextEmbedder

@@ -69,7 +69,7 @@ def _write_episode(source: PageContent, index: dict[str, Any], number: int, fold
     for camera in index["cameras"]:
         for step in range(content["steps"]):
             for kind, image in make.items():
-                path = folder / "pictures" / str(number) / camera / kind / f"{step}.jpg"
+                path = folder / "images" / str(number) / camera / kind / f"{step}.jpg"
                 lost = _write(path, partial(image, camera, step)) or lost
     return lost
 

@@ -5,7 +5,7 @@
     /                                        the page
     /page/NAME                               its scripts and style
     /data/index.js, /data/episode_12.js      robocas.put("index", {...})
-    /pictures/12/base_camera/rgb/30.jpg      an image; depth in colours
+    /images/12/base_camera/rgb/30.jpg      an image; depth in colours
     /thumbnails/12.jpg
 
 Data are scripts, so that the page also works from files, where a browser fetches nothing. The page asks for images with
@@ -38,7 +38,7 @@ PAGE_FILES = {
 }
 _NUMBER = r"(0|[1-9][0-9]{0,8})"
 _EPISODE = re.compile(rf"/data/episode_{_NUMBER}\.js")
-_IMAGE = re.compile(rf"/pictures/{_NUMBER}/({CAMERA_NAME.pattern})/(rgb|depth)/{_NUMBER}\.jpg")
+_IMAGE = re.compile(rf"/images/{_NUMBER}/({CAMERA_NAME.pattern})/(rgb|depth)/{_NUMBER}\.jpg")
 _THUMBNAIL = re.compile(rf"/thumbnails/{_NUMBER}\.jpg")
 _CONTROL = re.compile(  # of `text.printable`, but for surrogates, of which JSON makes emoji
     r"(?<!\\)((?:\\\\)*)\\(u(?:00[01].|007f|00[89].|061c|200[ef]|202[89a-e]|206[6-9]))"

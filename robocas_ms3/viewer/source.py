@@ -15,7 +15,7 @@ from robocas_ms3.core.poses import from_xyzw, inverse, transform
 from robocas_ms3.core.text import called
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.formats import format_of
-from robocas_ms3.datasets.images.image_headers import read_picture_bytes
+from robocas_ms3.datasets.images.image_headers import read_image_bytes
 from robocas_ms3.datasets.sources.episode_source import Kind
 from robocas_ms3.datasets.sources.provenance import task_of, unread_entry
 from robocas_ms3.datasets.sources.reader import DEFAULT_RATE, Dataset
@@ -78,7 +78,7 @@ class FolderContent(PageContent):
     def rgb(self, number: int, camera: str, step: int) -> EncodedImage:
         path = check_inside(self.dataset.episode(number).image_path(camera, "rgb", step), self.root)
         try:
-            return EncodedImage(MEDIA_TYPES[path.suffix], read_picture_bytes(path))
+            return EncodedImage(MEDIA_TYPES[path.suffix], read_image_bytes(path))
         except (OSError, ValueError) as error:
             found = getattr(error, "strerror", None) or error
             raise DatasetError("can't read this image", where=path, found=found) from error

@@ -56,7 +56,7 @@ def bottle(sections=ROUND, rows=1):
 VOLUME = trimesh.Trimesh(bottle()[0], bottle()[2]).volume
 
 
-def picture(size=(64, 64)):
+def pixels(size=(64, 64)):
     """Four columns of colour; a palette image, which is small even if huge."""
     image = Image.fromarray(np.repeat(np.arange(4, dtype=np.uint8)[None], 4, axis=0)).resize(size, Image.Resampling.BOX)
     image = Image.frombytes("P", size, image.tobytes())
@@ -69,7 +69,7 @@ def write_scan(folder, model=None, *, scale=1.0, y_up=False, image=None):
     vertices, uvs, faces = bottle() if model is None else model
     vertices = scale * (vertices[:, [1, 2, 0]] if y_up else vertices)
     path = write_obj(folder, "scan", trimesh.Trimesh(vertices, faces, process=False), uvs=uvs, color=None)
-    (image or picture()).save(folder / "skin.png")
+    (image or pixels()).save(folder / "skin.png")
     return path
 
 
@@ -154,7 +154,7 @@ def test_thousands_of_loose_bits(tmp_path):
 
 
 def test_a_large_texture_is_shrunk(tmp_path):
-    scan = prepare(write_scan(tmp_path, image=picture((4200, 3150))))
+    scan = prepare(write_scan(tmp_path, image=pixels((4200, 3150))))
     assert scan.repairs == ("shrank the texture from 4200 x 3150 to 2100 x 1575",)
     check_bottle(scan)
 

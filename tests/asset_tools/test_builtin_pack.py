@@ -147,6 +147,6 @@ def assert_same_surface(found, shipped):
         corners = KDTree(one.vertices).query(other.vertices)[0]
         assert corners.max() < 1e-5
     if found.suffix == ".glb":
-        pictures = (np.asarray(one.visual.material.baseColorTexture.convert("RGB"), float) for one in (ours, theirs))
-        colours = [picture.mean((0, 1)) for picture in pictures]
+        images = (np.asarray(one.visual.material.baseColorTexture.convert("RGB"), float) for one in (ours, theirs))
+        colours = [pixels.mean((0, 1)) for pixels in images]
         np.testing.assert_allclose(*colours, atol=2)  # where each face lies in it is another matter

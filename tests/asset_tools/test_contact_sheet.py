@@ -16,9 +16,9 @@ def studio(needs_renderer):
     return Studio(64)
 
 
-def share(picture, channel):
-    """Share of the picture in which a colour channel stands out."""
-    values = np.asarray(picture).astype(int)
+def share(image, channel):
+    """Share of the image in which a colour channel stands out."""
+    values = np.asarray(image).astype(int)
     others = np.delete(values, channel, axis=2).max(axis=2)
     return float((values[..., channel] > others + 40).mean())
 
@@ -51,10 +51,10 @@ def test_the_camera_looks_from_where_it_should(studio):
             (box_faces((-0.5, -2, -0.5), (0.5, -1, 0.5)), (0.05, 0.05, 0.9)),
         )
     ]
-    picture = studio.picture(cubes, 0, 0)
-    left, right = picture.crop((0, 0, 32, 64)), picture.crop((32, 0, 64, 64))
+    image = studio.image(cubes, 0, 0)
+    left, right = image.crop((0, 0, 32, 64)), image.crop((32, 0, 64, 64))
     # 4 m and a margin of 6 % across 64 pixels, so that a cube of 1 m is 15 pixels high
     assert share(right, 0) == pytest.approx(0.11, abs=0.02)  # 15 x 15 of 32 x 64 pixels
     assert share(left, 2) == pytest.approx(0.11, abs=0.02)
     assert share(left, 0) == share(right, 2) == 0
-    assert picture.getpixel((32, 2)) == PAPER
+    assert image.getpixel((32, 2)) == PAPER

@@ -52,8 +52,8 @@ def mesh(name, more=""):
 
 
 def colors_of(body):
-    picture = np.asarray(body.visual.material.baseColorTexture)
-    return {tuple(pixel) for pixel in picture.reshape(-1, 3).tolist()}
+    image = np.asarray(body.visual.material.baseColorTexture)
+    return {tuple(pixel) for pixel in image.reshape(-1, 3).tolist()}
 
 
 def test_primitives_have_their_sizes_and_colours(folder):

@@ -185,7 +185,7 @@ def test_a_killed_run_goes_on_where_it_stopped(tmp_path):
 
 def test_content_counts_code_and_yaml(tmp_path, monkeypatch):
     monkeypatch.setattr(pipeline, "__file__", str(tmp_path / "pipeline.py"))
-    for folder in ("quality", "reading", "products"):
+    for folder in ("quality", "readers", "products"):
         (tmp_path / folder).mkdir()
     found = []
     for name, text in (("toys.yaml", "a: 1"), ("toys.yaml", "a: 2"), ("toys.py", "A = 2"), ("notes.txt", "none")):

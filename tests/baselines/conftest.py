@@ -53,5 +53,5 @@ def whole(usual_umask, made_up, data, tmp_path):
 
 @pytest.fixture(scope="session")
 def folder(tmp_path_factory):
-    """A dataset of six episodes of seven steps, 64 x 48 pictures, that nobody may change; five are to train on."""
+    """A dataset of six episodes of seven steps, 64 x 48 images, that nobody may change; five are to train on."""
     return made_up_dataset(tmp_path_factory.mktemp("baselines"))

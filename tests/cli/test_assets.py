@@ -104,6 +104,6 @@ def test_build_never_replaces_what_is_no_pack_nor_a_pack_by_a_part_of_it(scans, 
     assert len(list((builtin_packs_dir() / "builtin").iterdir())) > 50
 
 
-def test_a_sheet_is_a_picture(scans, tmp_path, capsys):
+def test_a_sheet_is_a_image(scans, tmp_path, capsys):
     code, shown = run(capsys, "sheet", "builtin", "--out", tmp_path / "sheet.txt")
     assert code == 1 and ".png" in shown

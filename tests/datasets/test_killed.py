@@ -44,7 +44,7 @@ def made_up_images(monkeypatch):
 @pytest.mark.parametrize(
     ("words", "moment"),
     [
-        (CONVERT, "picture"),  # of the second episode; the preview of the first is whole
+        (CONVERT, "image"),  # of the second episode; the preview of the first is whole
         *(((*CONVERT, "--no-video"), moment) for moment in ("arrays", "rename", "convert overview", "rmtree")),
         *((MERGE, moment) for moment in ("file", "rename", "merge overview")),
         *((LEROBOT, moment) for moment in ("frame", "join", "table", "folders", "joined", "parts")),

@@ -138,7 +138,7 @@ def test_what_happened_is_counted_from_the_reset_on():
     assert read_sum(info, "path_length") < 0.002
 
 
-def test_pictures_are_rendered_when_the_policy_looks(monkeypatch):
+def test_images_are_rendered_when_the_policy_looks(monkeypatch):
     """Once an action of several control steps, and with ``look_every=2`` after every other action; black in between."""
     env = gym.make("RoboCASPick-v1", **IMAGES)
     base: Any = env.unwrapped
@@ -153,7 +153,7 @@ def test_pictures_are_rendered_when_the_policy_looks(monkeypatch):
                 rendered.clear()
                 obs, *_, info = stepped.step(along(0.08))
                 assert len(rendered) == expected
-                seen = {name: pictures["rgb"] for name, pictures in obs["sensor_data"].items()}
+                seen = {name: images["rgb"] for name, images in obs["sensor_data"].items()}
                 assert {tuple(rgb.shape) for rgb in seen.values()} == {(1, 24, 32, 3)}
                 assert [bool(rgb.any()) for rgb in seen.values()] == [bool(expected)] * len(seen)
                 now = base.get_obs()["sensor_data"]["base_camera"]["rgb"]

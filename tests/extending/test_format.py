@@ -46,7 +46,7 @@ def both(stranger, tmp_path, capsys):
 
 def test_it_is_three_files_and_known_by_them(both):
     toy, folder = both
-    assert sorted(path.name for path in toy.iterdir()) == ["about.json", "arrays.npz", "pictures.npz"]
+    assert sorted(path.name for path in toy.iterdir()) == ["about.json", "arrays.npz", "images.npz"]
     assert (format_of(toy).name, format_of(folder).name) == ("toy", "robocas")
 
 

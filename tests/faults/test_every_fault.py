@@ -36,7 +36,7 @@ SEED = int(os.environ.get("ROBOCAS_FAULT_SEED", "0")) or random.SystemRandom().r
 PLAN = """\
 parts: [{task: pick, config: pick_table_scattered, episodes: 4, name: a}]
 stages: [demonstrations, datasets]
-pictures: {size: [64, 48], depth: false}
+images: {size: [64, 48], depth: false}
 embeddings: false
 block: 2
 limits: {record_seconds: 45, render_seconds: 600, memory_gb: 1.5}
@@ -276,7 +276,7 @@ CUT = {
 
 @pytest.mark.parametrize(("name", "pattern"), [(name, pattern) for name, of in CUT.items() for pattern in of])
 def test_a_file_of_a_run_that_was_cut_off(commands, undisturbed, tmp_path, row, name, pattern):
-    """A recording, its JSON, a ledger, a picture, arrays: what they held is done again."""
+    """A recording, its JSON, a ledger, an image, arrays: what they held is done again."""
     command, out = commands[name], tmp_path / "out"
     row.command, row.fault = name, f"cut off: {pattern.rpartition('/')[2]}"
     stopped_half_way(command, out, tmp_path / "log")

@@ -26,7 +26,7 @@ from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.conversion.convert import convert
 from robocas_ms3.datasets.conversion.episode_plan import DATASET, dataset_settings, plan_episodes
 from robocas_ms3.datasets.conversion.settings import ConversionSettings
-from robocas_ms3.datasets.images.image_files import Pictures
+from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.datasets.lerobot.check import check_lerobot
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.sources.provenance import recorded_scene, recording_entry
@@ -65,7 +65,7 @@ LAYOUT = Layout(
 RUN = {"settings": asdict(EpisodeSettings("pick")), "first_seed": 0, "versions": {"a": "1"}}
 FAILURE = {"seed": 1, "attempt": 0, "stage": "a", "reason": "b", "seconds": 1.0}
 ENTRY = {"trajectory": "F.h5", "trajectory_episode": 0, "seed": 3, "success": True, "recording": "ab", "source": 0}
-CONVERSION = dataset_settings(5, Pictures(STANDARD_NAMES), False)
+CONVERSION = dataset_settings(5, ImageOptions(STANDARD_NAMES), False)
 
 
 # What is whole at first: functions that write it into a folder

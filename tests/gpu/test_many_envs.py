@@ -155,7 +155,7 @@ def test_cameras_see_something():
     env = gym.make("RoboCASPick-v1", num_envs=4, obs_mode="rgb", sensor_configs=size)
     observation, _ = env.reset(seed=0)
     for camera in observation["sensor_data"].values():
-        picture = camera["rgb"].float().cpu().numpy()
-        assert picture.shape == (4, 48, 64, 3)
-        assert np.ptp(picture) > 50
+        image = camera["rgb"].float().cpu().numpy()
+        assert image.shape == (4, 48, 64, 3)
+        assert np.ptp(image) > 50
     env.close()

@@ -117,7 +117,7 @@ def test_what_fails_while_a_part_is_opened_ends_the_run(written, tmp_path, error
         (GOOD + "formats: [lerobot]\n", "robocas comes first"),
         (GOOD + "stages: [datasets]\n", "datasets needs demonstrations"),
         (GOOD + "stages: [demonstrations]\nformats: [robocas, lerobot]\n", "lerobot needs the stage datasets"),
-        (GOOD + "pictures: {cameras: [nose]}\n", "no such camera"),
+        (GOOD + "images: {cameras: [nose]}\n", "no such camera"),
         (GOOD + "split: {by: task}\n", "by task needs parts of two tasks"),
         ("parts:\n  - {task: pick, episodes: 1, name: ../up}\n", "parts.0.name"),
         (
@@ -142,17 +142,17 @@ def test_the_cameras_are_all_that_the_configurations_declare_or_the_chosen_ones(
     (tmp_path / "mine.yaml").write_text(f"extends: pick_shelf_scattered\n{camera}")
     four = "parts:\n  - {task: pick, episodes: 3, config: mine.yaml}\n"
     standard = ["base_camera", "gripper_camera", "static_camera"]
-    assert load_plan(written(GOOD)).pictures.cameras == standard
-    assert load_plan(written(four)).pictures.cameras == [*standard, "side_camera"]
-    assert load_plan(written(four + "pictures: {cameras: [side_camera]}\n")).pictures.cameras == ["side_camera"]
+    assert load_plan(written(GOOD)).images.cameras == standard
+    assert load_plan(written(four)).images.cameras == [*standard, "side_camera"]
+    assert load_plan(written(four + "images: {cameras: [side_camera]}\n")).images.cameras == ["side_camera"]
     mixed = four + "  - {task: select, episodes: 3}\n"
     with pytest.raises(PlanError, match="different cameras"):
         load_plan(written(mixed))
-    assert load_plan(written(mixed + "pictures: {cameras: [base_camera]}\n")).pictures.cameras == ["base_camera"]
+    assert load_plan(written(mixed + "images: {cameras: [base_camera]}\n")).images.cameras == ["base_camera"]
     without_images = mixed + "stages: [layouts, demonstrations]\nformats: [robocas]\n"
-    assert load_plan(written(without_images)).pictures.cameras == standard
+    assert load_plan(written(without_images)).images.cameras == standard
     with pytest.raises(PlanError, match="no such camera"):
-        load_plan(written(mixed + "pictures: {cameras: [side_camera]}\n"))
+        load_plan(written(mixed + "images: {cameras: [side_camera]}\n"))
 
 
 def test_a_configuration_of_another_task_is_refused(written):

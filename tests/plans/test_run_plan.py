@@ -164,8 +164,8 @@ def test_hardly_any_success_is_an_error(tmp_path):
 
 def test_episodes_whose_files_were_cut_off_are_made_again(undisturbed, out):
     folders = [PlanFolder(PLAN, out).files(Unit(0, 0), seed).folder for seed in (10, 11, 12)]
-    picture = sorted(folders[1].rglob("*.png"))[0]
-    for path, length in ((folders[0] / "recording.h5", 1000), (picture, 50), (folders[2] / "recording.json", 0)):
+    image = sorted(folders[1].rglob("*.png"))[0]
+    for path, length in ((folders[0] / "recording.h5", 1000), (image, 50), (folders[2] / "recording.json", 0)):
         os.truncate(path, length)
     with pytest.raises(PlanError, match="work units are missing"):
         join_plan(out)
@@ -197,8 +197,8 @@ def test_another_plan_is_refused_unless_it_is_to_overwrite_but_limits_and_descri
         with pytest.raises(RobocasError, match="block: 3 -> 4"):
             start(out, other)
     limits = PLAN.limits.model_copy(update={"memory_gb": 3.0})
-    pictures = PLAN.pictures.model_copy(update={"cameras": list(STANDARD_NAMES)})  # none are in older plans
-    run_here(out, PLAN.model_copy(update={"limits": limits, "description": "another", "pictures": pictures}))
+    images = PLAN.images.model_copy(update={"cameras": list(STANDARD_NAMES)})  # none are in older plans
+    run_here(out, PLAN.model_copy(update={"limits": limits, "description": "another", "images": images}))
     assert_same(undisturbed, out)
     assert json.loads((out / "plan.json").read_text())["plan"]["limits"]["memory_gb"] == 3.0
     before = (out / "report.json").stat().st_mtime_ns

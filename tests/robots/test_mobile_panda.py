@@ -95,10 +95,10 @@ def test_cameras_see_what_they_should():
         agent.robot.set_pose(sapien.Pose([0.7, 0.15, 0], [np.sqrt(0.5), 0, 0, np.sqrt(0.5)]))
         agent.reset(agent.keyframes["evaluation"].qpos)
         observation = env.unwrapped.get_obs()
-        pictures, cameras = observation["sensor_data"], observation["sensor_param"]
-        assert list(pictures) == list(CAMERAS)
-        # The gripper's picture: both fingers, mirrored, in the lower half; the TCP between them.
-        labels = pictures["gripper_camera"]["segmentation"][0, ..., 0].numpy()
+        images, cameras = observation["sensor_data"], observation["sensor_param"]
+        assert list(images) == list(CAMERAS)
+        # The gripper's image: both fingers, mirrored, in the lower half; the TCP between them.
+        labels = images["gripper_camera"]["segmentation"][0, ..., 0].numpy()
         ids = {name: agent.robot.links_map[name].per_scene_id[0].item() for name in MOBILE_PANDA.finger_links}
         columns = {name: np.nonzero(labels == number)[1] for name, number in ids.items()}
         assert all(len(found) > 200 for found in columns.values())
@@ -113,7 +113,7 @@ def test_cameras_see_what_they_should():
         for uid in ("base_camera", "static_camera"):
             u, v = project(cameras[uid], agent.tcp.pose.p[0].numpy())
             assert 0 < u < 160 and 0 < v < 120, uid
-            assert np.isin(pictures[uid]["segmentation"].numpy(), wrist).sum() > 50, uid
+            assert np.isin(images[uid]["segmentation"].numpy(), wrist).sum() > 50, uid
     finally:
         env.close()
 

@@ -46,18 +46,18 @@ def test_articulated_furniture_is_closed_again_after_a_reset():
 
 @pytest.mark.slow
 def test_finishes_and_levels_are_seen(needs_renderer):
-    """The floor's colour is that of the finish; both levels of detail render nearly the same picture."""
-    pictures = {}
+    """The floor's colour is that of the finish; both levels of detail render nearly the same image."""
+    rendered = {}
     for name, floor, level in (("oak", "oak_parquet", "fast"), ("blue", "carpet", "fast"), ("full", "carpet", "full")):
         data = pick_config(room={"asset": "room", "finishes": {"floor": floor}})
         env = gym.make("RoboCASPick-v1", config=data, visual_level=level, render_mode="rgb_array")
         env.reset(seed=0)
-        pictures[name] = env.render()[0].cpu().numpy().astype(float)
+        rendered[name] = env.render()[0].cpu().numpy().astype(float)
         env.close()
     corner = np.s_[380:, :120]  # floor beside the robot
-    oak, blue = pictures["oak"][corner].mean(axis=(0, 1)), pictures["blue"][corner].mean(axis=(0, 1))
+    oak, blue = rendered["oak"][corner].mean(axis=(0, 1)), rendered["blue"][corner].mean(axis=(0, 1))
     assert oak[0] > oak[2] + 20 and blue[2] > blue[0] + 10
-    assert 0 < np.abs(pictures["full"] - pictures["blue"]).mean() < 3
+    assert 0 < np.abs(rendered["full"] - rendered["blue"]).mean() < 3
 
 
 def test_an_unknown_level_of_detail_is_an_error():

@@ -13,7 +13,7 @@ from robocas_ms3.datasets.conversion import convert, episode_folder
 from robocas_ms3.datasets.manage import copy_episodes, import_robocas
 
 PLACES = {  # moment -> (module, function, which call is the last)
-    "picture": (episode_folder, "write_picture", 50),  # in the second episode
+    "image": (episode_folder, "write_image", 50),  # in the second episode
     "arrays": (episode_folder, "write_episode_files", 2),
     "file": (copy_episodes.FilePlacer, "place", 70),  # in the second episode
     "rename": (files, "_move_in", 2),

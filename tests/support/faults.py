@@ -20,7 +20,7 @@ import psutil
 
 from robocas_ms3.core.json_lines import Ledger
 from robocas_ms3.datasets.conversion.episode_folder import find_damaged
-from robocas_ms3.datasets.images.image_files import Pictures
+from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.demos.failures import FAILURES_FILE, Failure
 from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
@@ -116,7 +116,7 @@ def readable(command, out):
         return sum(bool(json.loads(line)) for line in lines if line.endswith(b"\n"))
     folders = sorted(out.glob("episode_*" if command.name == "convert" else "units/*/*/[0-9]*/episode_*"))
     for folder in folders:
-        assert find_damaged(folder, Pictures(STANDARD_NAMES, (64, 48), depth=False)) is None, folder
+        assert find_damaged(folder, ImageOptions(STANDARD_NAMES, (64, 48), depth=False)) is None, folder
     return len(folders)
 
 

@@ -10,7 +10,7 @@ from robocas_ms3.datasets.conversion.settings import ConversionSettings
 
 
 def made_up_dataset(folder: Path) -> Path:
-    """Six episodes of seven steps, 64 x 48 pictures, made-up embeddings; five are to train on."""
+    """Six episodes of seven steps, 64 x 48 images, made-up embeddings; five are to train on."""
     trajectory = write_trajectory(folder / "F.h5", seeds=range(3, 9))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("robocas_ms3.datasets.conversion.convert.embed_texts", made_up_vectors)

@@ -116,7 +116,7 @@ PLAN = Plan.model_validate(
             PartConfig(task="pick", config="pick_shelf_scattered", episodes=2, seed=3, name="b"),
         ],
         "stages": ["demonstrations", "datasets"],
-        "pictures": {"size": [64, 48]},
+        "images": {"size": [64, 48]},
         "embeddings": False,
         "block": 3,
         "limits": {"record_seconds": 60, "render_seconds": 60, "memory_gb": 4},

@@ -3,7 +3,7 @@
 from torch import nn
 
 SIZES = {
-    "picture": (64, 48),
+    "image": (64, 48),
     "crop_height": 40,
     "image_width": 0.25,
     "image_depth": 0.1,
@@ -20,7 +20,7 @@ SIZES = {
 
 
 def settle(network, *seen):
-    """Let the norms of a network take its inputs for what is usual; at first they know no picture, and dim all."""
+    """Let the norms of a network take its inputs for what is usual; at first they know no image, and dim all."""
     norms = [module for module in network.modules() if isinstance(module, nn.BatchNorm2d)]
     before = [module.momentum for module in norms]
     for module in norms:

@@ -9,7 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from robocas_ms3.datasets.images.image_files import Pictures, box_of
+from robocas_ms3.datasets.images.image_files import ImageOptions, box_of
 from robocas_ms3.datasets.sources.episode_source import CameraModel, Frame
 from robocas_ms3.robots.cameras import STANDARD_NAMES, standard_parent
 from robocas_ms3.robots.description import MOBILE_PANDA
@@ -55,9 +55,9 @@ def render_by(renderer, convert):
 class RayCaster:
     """A ``Renderer``: floor, room, table and a cube for each actor."""
 
-    def __init__(self, env_info, control_mode, pictures=None):
-        self.pictures = (pictures or Pictures()).choose(STANDARD_NAMES, "here")
-        self.size = self.pictures.size or SIZE
+    def __init__(self, env_info, control_mode, image_options=None):
+        self.image_options = (image_options or ImageOptions()).choose(STANDARD_NAMES, "here")
+        self.size = self.image_options.size or SIZE
         self.closed = False
 
     def load(self, recording):
@@ -69,7 +69,7 @@ class RayCaster:
     def cameras(self):
         return {
             name: CameraModel(self.intrinsic(), CAMERA_IN_PARENT[name], standard_parent(name))
-            for name in self.pictures.cameras
+            for name in self.image_options.cameras
         }
 
     def scene(self):
@@ -90,10 +90,10 @@ class RayCaster:
             state = recording.state(int(index))
             parents = {"base_camera": base, "gripper_camera": tcp, "static_camera": np.eye(4)}
             boxes = [TABLE] + [(p[0, :3] - HALF, p[0, :3] + HALF) for p in state["actors"].values()]
-            wanted = {n: CAMERA_IN_PARENT[n] for n in self.pictures.cameras}
+            wanted = {n: CAMERA_IN_PARENT[n] for n in self.image_options.cameras}
             shots = {n: self.shoot(parents[n] @ camera, boxes) for n, camera in wanted.items()}
-            depth = {n: p[1] for n, p in shots.items() if self.pictures.depth}
-            masks = {n: p[2] == 2 for n, p in shots.items() if self.pictures.boxes}  # behind the table: the target
+            depth = {n: p[1] for n, p in shots.items() if self.image_options.depth}
+            masks = {n: p[2] == 2 for n, p in shots.items() if self.image_options.boxes}  # behind the table: the target
             found = {n: box for n, mask in masks.items() if (box := box_of(mask))}
             yield Frame({n: p[0] for n, p in shots.items()}, depth, found)
 

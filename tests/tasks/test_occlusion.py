@@ -167,7 +167,7 @@ def test_a_push_of_what_lies_on_top_of_the_target_is_finite():
     assert found[0, 2] == pytest.approx(0.75)
 
 
-def test_what_is_near_in_the_picture_is_near():
+def test_what_is_near_in_the_image_is_near():
     eye, radii = torch.tensor([0.0, 0.0, 1.0]), torch.full((1, 2), 0.02)
 
     def moved(x: float, z: float) -> bool:

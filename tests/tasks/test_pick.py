@@ -148,6 +148,6 @@ def test_the_result_stays_while_nothing_moves(env):
     assert not flags["target_lifted"]
 
 
-def test_pictures_without_a_renderer_are_refused_in_words():
+def test_images_without_a_renderer_are_refused_in_words():
     with pytest.raises(ConfigError, match="render_backend: images need a renderer.*obs_mode='rgb'"):
         gym.make("RoboCASPick-v1", obs_mode="rgb", render_backend="none")

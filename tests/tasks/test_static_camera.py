@@ -23,7 +23,7 @@ def test_what_is_manipulated_is_in_view_and_the_camera_in_front_of_the_furniture
     camera = config.pose.sp.to_transformation_matrix()
     target = base.object_poses[0, int(base.target_slot[0]), :3].numpy()
     forward, left, up = (target - camera[:3, 3]) @ camera[:3, :3]
-    assert max(abs(left), abs(up)) < 0.7 * forward  # of 1, the edge of a picture of 90 deg
+    assert max(abs(left), abs(up)) < 0.7 * forward  # of 1, the edge of an image of 90 deg
     assert 0.5 < forward < 2.0
     if config.pose.p[0].tolist() != pytest.approx([1, 1.5, 1.5]):  # upstream's is across the table
         robot = base.model.robot_pose

@@ -27,7 +27,7 @@ def run_folder(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def folder(run_folder, tmp_path_factory):
-    """The same as a RoboCAS folder of all three, small pictures, nobody may change it."""
+    """The same as a RoboCAS folder of all three, small images, nobody may change it."""
     from robocas_ms3.datasets.conversion.convert import convert
     from robocas_ms3.datasets.conversion.settings import ConversionSettings
 

@@ -147,15 +147,15 @@ def test_a_damaged_lerobot_dataset(lerobot, tmp_path):
 def test_a_static_page_of_a_damaged_dataset(spoilt, tmp_path, capsys):
     change(spoilt / "episode_0000000/scene.json", recorded="x")
     (spoilt / "episode_0000001/episode_info.npz").write_bytes(b"PK\x03\x04 cut")
-    (spoilt / "episode_0000002/base_camera/rgb/0003.png").write_bytes(b"no picture")
+    (spoilt / "episode_0000002/base_camera/rgb/0003.png").write_bytes(b"no image")
     out = tmp_path / "page"
     assert main(View(spoilt, static=out, width=32)) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split(":")[0] for line in lines[:3]] == [f"episode {number} is damaged" for number in range(3)]
     assert (out / "data/episode_0.js").is_file()
     assert not (out / "data/episode_1.js").exists()
-    assert not (out / "pictures/2/base_camera/rgb/3.jpg").exists()
-    assert (out / "pictures/2/base_camera/rgb/4.jpg").is_file()
+    assert not (out / "images/2/base_camera/rgb/3.jpg").exists()
+    assert (out / "images/2/base_camera/rgb/4.jpg").is_file()
     text = (out / "data/index.js").read_text()
     index = json.loads(text.removeprefix('robocas.put("index",').removesuffix(");\n"))
     assert [bool(row["damage"]) for row in index["episodes"]] == [True, True, True, False]

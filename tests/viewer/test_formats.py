@@ -84,7 +84,7 @@ def test_images_are_those_of_that_step(page, folder):
 
 
 def test_there_is_no_such_episode_or_step(page):
-    for address in ("/data/episode_9.js", "/pictures/9/base_camera/rgb/0.jpg", "/pictures/0/base_camera/rgb/9.jpg"):
+    for address in ("/data/episode_9.js", "/images/9/base_camera/rgb/0.jpg", "/images/0/base_camera/rgb/9.jpg"):
         assert Routes(page).respond(address).status == 404
 
 

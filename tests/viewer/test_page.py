@@ -89,7 +89,7 @@ def wait_for_rows(page, rows):
 
 def wait_for_images(page, number, kind, at):
     """Wait until all three cameras show a step."""
-    want = f"pictures/{number}/static_camera/{kind}/{at}.jpg"
+    want = f"images/{number}/static_camera/{kind}/{at}.jpg"
     wait(
         page,
         "[...document.querySelectorAll('#cameras img')].every(img => img.complete && img.naturalWidth > 0 &&"

@@ -64,20 +64,20 @@ def test_data(server, folder):
     assert response.headers["Content-Type"].startswith("text/javascript")
     index = content(data, "index")
     assert [row["n"] for row in index["episodes"]] == [0, 1, 2, None]
-    assert index["version"] != Routes(server.routes.source).version  # of pictures that a browser keeps
+    assert index["version"] != Routes(server.routes.source).version  # of images that a browser keeps
     assert content(get(server, "/data/index.js")[1], "index") == index
     _, data = get(server, "/data/episode_1.js")
     assert content(data, "episode_1")["steps"] == 7
 
 
-def test_pictures(server, folder):
-    response, data = get(server, "/pictures/1/base_camera/rgb/2.jpg")
+def test_images(server, folder):
+    response, data = get(server, "/images/1/base_camera/rgb/2.jpg")
     assert response.headers["Content-Type"] == "image/png"
     assert data == (folder / "episode_0000001/base_camera/rgb/0002.png").read_bytes()
-    response, data = get(server, "/pictures/1/base_camera/depth/2.jpg")
+    response, data = get(server, "/images/1/base_camera/depth/2.jpg")
     assert response.headers["Content-Type"] == "image/jpeg"
     assert pixels(data).shape == (48, 64, 3)
-    assert get(server, "/pictures/1/base_camera/depth/2.jpg?1a2b")[1] == data
+    assert get(server, "/images/1/base_camera/depth/2.jpg?1a2b")[1] == data
     _, data = get(server, "/thumbnails/1.jpg")
     assert pixels(data).shape == (72, 96, 3)
 
@@ -88,10 +88,10 @@ def test_pictures(server, folder):
         "//etc/passwd /etc/passwd /../../../etc/passwd /page/../routes.py /page/..%2froutes.py /page/%2e%2e/routes.py",
         "/conversion.json /failures.jsonl /episode_0000000/episode_info.npz /page/ /page/server.py /data/index.json",
         "/data/episode_../../x.js /data/episode_-1.js /data/episode_01.js /data/episode_9.js /data/episode_%D9%A1.js",
-        "/data/episode_99999999999999999999.js /data/index.js%00 /thumbnails/9.jpg /pictures/9/base_camera/rgb/0.jpg",
-        "/pictures/0/../rgb/0.jpg /pictures/0/..%2f..%2fx/rgb/0.jpg /pictures/0/top_camera/rgb/0.jpg",
-        "/pictures/0/base_camera/mask/0.jpg /pictures/0/base_camera/rgb/7.jpg /pictures/0/base_camera/rgb/0.png",
-        "/pictures/0/base_camera/rgb/0.jpg/",
+        "/data/episode_99999999999999999999.js /data/index.js%00 /thumbnails/9.jpg /images/9/base_camera/rgb/0.jpg",
+        "/images/0/../rgb/0.jpg /images/0/..%2f..%2fx/rgb/0.jpg /images/0/top_camera/rgb/0.jpg",
+        "/images/0/base_camera/mask/0.jpg /images/0/base_camera/rgb/7.jpg /images/0/base_camera/rgb/0.png",
+        "/images/0/base_camera/rgb/0.jpg/",
     ],
 )
 def test_nothing_else_is_served(server, paths):

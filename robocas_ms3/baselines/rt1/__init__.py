@@ -70,7 +70,7 @@ class RT1Policy:
 
     def _encode(self, observations: Observations, row: int) -> torch.Tensor:
         assert observations.embeddings is not None
-        views = [resize(observations.images[name][row], self._config.picture) for name in self._config.cameras]
+        views = [resize(observations.images[name][row], self._config.image) for name in self._config.cameras]
         device = self._model.mean.device
         images = torch.from_numpy(np.stack(views).transpose(0, 3, 1, 2)[None].copy()).to(device)
         with torch.inference_mode():

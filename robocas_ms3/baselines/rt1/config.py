@@ -46,7 +46,7 @@ class RT1Config(BaselineConfig):
 
     Attributes:
         cameras: one encoder each; their tokens are concatenated in this order.
-        picture: width and height in pixels that images are scaled to.
+        image: width and height in pixels that images are scaled to.
         crop_height: rows of an image that are used: any in training, the middle ones when acting.
         rate_hz: steps per second of the data and of the policy.
         frames: number of steps in the history, the present one included.
@@ -68,7 +68,7 @@ class RT1Config(BaselineConfig):
     """
 
     cameras: tuple[str, ...] = ("base_camera", "gripper_camera")
-    picture: tuple[int, int] = (320, 256)
+    image: tuple[int, int] = (320, 256)
     crop_height: int = Field(236, ge=32, le=4096)
     rate_hz: float = Field(5.0, gt=0, le=100)
     frames: int = Field(6, ge=1, le=1000)
@@ -95,10 +95,10 @@ class RT1Config(BaselineConfig):
     def _check(self) -> RT1Config:
         if not self.cameras or len(set(self.cameras)) < len(self.cameras):
             raise ValueError("cameras have to be named, each once")
-        if min(self.picture) < 32:
-            raise ValueError("a picture has to be at least 32 pixels wide and high")
-        if self.crop_height > self.picture[1]:
-            raise ValueError(f"crop_height {self.crop_height} is more than the picture's {self.picture[1]} rows")
+        if min(self.image) < 32:
+            raise ValueError("an image has to be at least 32 pixels wide and high")
+        if self.crop_height > self.image[1]:
+            raise ValueError(f"crop_height {self.crop_height} is more than the image's {self.image[1]} rows")
         if min(self.std) <= 0:
             raise ValueError("image_std has to be above 0")
         return self

@@ -22,7 +22,7 @@ class RT1Samples:
     A batch of B samples of F frames and C cameras holds
 
     =============  ====================  ===========================================================================
-    ``rgb``        (B, F, C, 3, h, w)    uint8, scaled to ``config.picture``; the first one repeated before an episode
+    ``rgb``        (B, F, C, 3, h, w)    uint8, scaled to ``config.image``; the first one repeated before an episode
     ``language``   (B, 384)              float32 embeddings of the instructions
     ``action``     (B, F, 7)             float32, m and rad in the TCP's frame, gripper command (1 = open)
     ``mask``       (B, F)                bool, False = before the episode
@@ -41,7 +41,7 @@ class RT1Samples:
                 split=split,
                 observation_horizon=config.frames,
                 cameras=config.cameras,
-                size=config.picture,
+                size=config.image,
                 embedding=True,
             ),
         )

@@ -18,7 +18,7 @@ from robocas_ms3.datasets.checks.images import Sizes, check_cameras, check_depth
 from robocas_ms3.datasets.checks.scene import check_ledger, read_settings
 from robocas_ms3.datasets.checks.violation import Violation, read_object
 from robocas_ms3.datasets.conversion.episode_plan import MARKS
-from robocas_ms3.datasets.images.image_files import Pictures
+from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.datasets.sources.arrays import SPECS, EpisodeArrays, is_declared, read_arrays
 from robocas_ms3.datasets.sources.file_models import DataInfoRecord, SceneRecord
 from robocas_ms3.datasets.sources.files import no_dataset
@@ -59,14 +59,14 @@ def validate(root: str | Path, *, on_episode: Callable[[int, int], None] | None 
     numbers = {n: folder for folder in sorted(root.iterdir()) if (n := schema.episode_number(folder.name)) is not None}
     if not (numbers or marked) and any(root.iterdir()):
         raise no_dataset(root, "folders episode_0000000, ...")
-    settings, pictures, violations = read_settings(root)
+    settings, image_options, violations = read_settings(root)
     episodes: dict[int, tuple[EpisodeArrays, dict[str, Any]]] = {}
     sizes: Sizes = {}
     embedded: set[bool] = set()
     for done, (number, folder) in enumerate(numbers.items(), start=1):
         stored = read_arrays(folder / schema.EPISODE_FILE)
         scene, wrong = read_object(root, f"{folder.name}/{schema.SCENE_FILE}", SceneRecord)
-        violations += [*wrong, *check_episode(folder, stored, pictures, sizes)]
+        violations += [*wrong, *check_episode(folder, stored, image_options, sizes)]
         embedded |= {"language_embedding" in stored.arrays} if stored.arrays else set()
         small = {key: array for key, array in stored.arrays.items() if key not in _EMBEDDINGS}
         episodes[number] = replace(stored, arrays=small), scene
@@ -80,16 +80,16 @@ def validate(root: str | Path, *, on_episode: Callable[[int, int], None] | None 
     return Report(len(numbers), sum(len(found) for found in positions if found is not None and found.ndim), violations)
 
 
-def check_episode(folder: Path, stored: EpisodeArrays, pictures: Pictures, sizes: Sizes) -> list[Violation]:
+def check_episode(folder: Path, stored: EpisodeArrays, image_options: ImageOptions, sizes: Sizes) -> list[Violation]:
     wrong, values = list(laws.violations_of(stored, laws.FORM)), []
     if not wrong:
         wrong, values = list(laws.check_units(stored)), list(laws.violations_of(stored, laws.CONTENT))
-    wrong += check_cameras(folder, pictures)
+    wrong += check_cameras(folder, image_options)
     if "" in stored.unreadable:
         return wrong  # the number of images is unknown
-    images = list(check_images(folder, pictures, stored.steps, sizes))
-    if pictures.depth and not wrong and all(image.kind == "surplus" for image in images):
-        images += check_depth(folder, stored, pictures)
+    images = list(check_images(folder, image_options, stored.steps, sizes))
+    if image_options.depth and not wrong and all(image.kind == "surplus" for image in images):
+        images += check_depth(folder, stored, image_options)
     return [*wrong, *values, *images]
 
 

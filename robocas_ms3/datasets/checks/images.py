@@ -17,30 +17,30 @@ from robocas_ms3.core.text import count_of, one_line
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks import depth as geometry
 from robocas_ms3.datasets.checks.violation import NO_FILE, Violation
-from robocas_ms3.datasets.images.image_files import Pictures
-from robocas_ms3.datasets.images.image_headers import PictureHeader, read_header
+from robocas_ms3.datasets.images.image_files import ImageOptions
+from robocas_ms3.datasets.images.image_headers import ImageHeader, read_header
 from robocas_ms3.datasets.sources.arrays import EpisodeArrays
 from robocas_ms3.datasets.sources.files import CAMERA_LIMIT
 from robocas_ms3.robots.cameras import Parent
 
 _SURPLUS = "a file beyond them"
-_SOUND = "a sound picture"
+_SOUND = "a sound image"
 _GEOMETRY_STEPS = 3  # whose depth is decoded
 _READERS = 4  # threads: reading and checksums run outside of Python's lock
 _HEADERS = {"rgb": (8, 3), "depth": (16, 1)}
 Sizes = dict[str, tuple[int, int]]
 """Camera -> width and height of its images."""
-ReadHeader = Callable[[Path], PictureHeader | None]
+ReadHeader = Callable[[Path], ImageHeader | None]
 """`read_header`, or `check_ends`, which gives none; raises ValueError or OSError."""
 
 
-def check_cameras(folder: Path, pictures: Pictures) -> Iterator[Violation]:
+def check_cameras(folder: Path, image_options: ImageOptions) -> Iterator[Violation]:
     """Check that each camera has valid intrinsics and its pose under both names, and that there are no others."""
     for camera in schema.camera_names(folder):
-        if camera not in pictures.cameras:
+        if camera not in image_options.cameras:
             expected = f"the cameras of {schema.CONVERSION_FILE} only"
             yield Violation(f"{folder.name}/{camera}", "", expected, "another camera")
-    for camera in pictures.cameras:
+    for camera in image_options.cameras:
         poses: list[NDArray] = []
         pose_files = schema.pose_files(schema.camera_parent(folder / camera))
         for name in (schema.INTRINSIC_FILE, *pose_files):
@@ -79,37 +79,37 @@ def _is_rigid(matrix: NDArray) -> bool:
 
 
 def check_images(
-    folder: Path, pictures: Pictures, steps: int, sizes: Sizes, read: ReadHeader = read_header
+    folder: Path, image_options: ImageOptions, steps: int, sizes: Sizes, read: ReadHeader = read_header
 ) -> Iterator[Violation]:
     """Check that there is an intact image of each step, all of one size (see `Sizes`), and nothing else."""
-    places = [(camera, kind) for camera in pictures.cameras for kind in pictures.kinds]
+    places = [(camera, kind) for camera in image_options.cameras for kind in image_options.kinds]
     with ThreadPoolExecutor(_READERS) as pool:
-        headers = list(pool.map(partial(_read_headers, folder, pictures.image_format, steps, read), places))
+        headers = list(pool.map(partial(_read_headers, folder, image_options.image_format, steps, read), places))
     for (camera, kind), found in zip(places, headers, strict=True):
         wanted = [name for name, header in found.items() if header != _SURPLUS]
         for name, header in found.items():
             file = f"{folder.name}/{camera}/{kind}/{name}"
             if header == NO_FILE:
-                yield Violation(file, "", "a picture of every step", NO_FILE, "missing")
+                yield Violation(file, "", "an image of every step", NO_FILE, "missing")
             elif header == _SURPLUS:
-                expected = f"{count_of(len(wanted), 'picture')} from {min(wanted, default='none')}"
+                expected = f"{count_of(len(wanted), 'image')} from {min(wanted, default='none')}"
                 yield Violation(file, "", expected, _SURPLUS, "surplus")
             elif isinstance(header, str):
                 yield Violation(file, "", _SOUND, header)
             elif header is not None:
                 size = sizes.setdefault(camera, (header.width, header.height))
-                expected = PictureHeader(*(pictures.size or size), *_HEADERS[kind])
+                expected = ImageHeader(*(image_options.size or size), *_HEADERS[kind])
                 if header != expected:
                     yield Violation(file, "", str(expected), str(header))
 
 
 def _read_headers(
     folder: Path, image_format: schema.ImageFormat, steps: int, read: ReadHeader, place: tuple[str, str]
-) -> dict[str, PictureHeader | str | None]:
+) -> dict[str, ImageHeader | str | None]:
     first = schema.image_path(folder, *place, 0, image_format)
     there = {path.name for path in first.parent.iterdir()} if first.parent.is_dir() else set()
     wanted = [f"{step:04d}{first.suffix}" for step in range(min(steps, schema.MAX_STEPS))]
-    found: dict[str, PictureHeader | str | None] = {}
+    found: dict[str, ImageHeader | str | None] = {}
     for name in wanted:
         try:
             found[name] = read(first.with_name(name)) if name in there else NO_FILE
@@ -118,12 +118,12 @@ def _read_headers(
     return {**found, **dict.fromkeys(sorted(there - set(wanted)), _SURPLUS)}
 
 
-def check_depth(folder: Path, stored: EpisodeArrays, pictures: Pictures) -> Iterator[Violation]:
+def check_depth(folder: Path, stored: EpisodeArrays, image_options: ImageOptions) -> Iterator[Violation]:
     """Check depth at a few steps against intrinsics and poses, see `geometry.check`; nothing else may be wrong."""
     arrays = {key: array.astype(np.float64) for key, array in stored.arrays.items() if array.dtype.kind == "f"}
     base = from_xyzw(arrays["base_pos"], arrays["base_orn"])
     ee = base @ from_xyzw(arrays["ee_pos"], arrays["ee_orn"])
-    parent_of: dict[str, Parent] = {camera: schema.camera_parent(folder / camera) for camera in pictures.cameras}
+    parent_of: dict[str, Parent] = {camera: schema.camera_parent(folder / camera) for camera in image_options.cameras}
     cameras = {
         camera: [
             np.asarray(load_array(folder / camera / name, CAMERA_LIMIT), np.float64)

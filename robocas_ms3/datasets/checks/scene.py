@@ -10,14 +10,14 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.text import one_line
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.violation import Violation, check_form, read_object, shorten
-from robocas_ms3.datasets.images.image_files import Pictures
+from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.datasets.sources.arrays import EpisodeArrays, arrays_fingerprint
 from robocas_ms3.datasets.sources.file_models import ConversionRecord, SceneRecord, with_unknown
 from robocas_ms3.demos.recordings.trajectory_json import one_seed
 from robocas_ms3.robots.cameras import STANDARD_NAMES
 
 FILE = schema.CONVERSION_FILE
-STANDARD = Pictures(STANDARD_NAMES)
+STANDARD = ImageOptions(STANDARD_NAMES)
 
 
 def valid_values(scene: Any, file: str = schema.SCENE_FILE) -> tuple[dict[str, Any], str]:
@@ -33,7 +33,7 @@ def _usable(content: Mapping[str, Any], wrong: list[Violation]) -> dict[str, Any
     return {key: value for key, value in content.items() if key not in spoilt}
 
 
-def read_settings(root: Path) -> tuple[dict[str, Any], Pictures, list[Violation]]:
+def read_settings(root: Path) -> tuple[dict[str, Any], ImageOptions, list[Violation]]:
     """Return what is usable of ``conversion.json``, the images it promises (else all standard ones), and faults."""
     absent = "this file (robocas import-robocas writes one)"
     content, wrong = read_object(root, FILE, absent=absent)
@@ -44,11 +44,11 @@ def read_settings(root: Path) -> tuple[dict[str, Any], Pictures, list[Violation]
         expected = f"{schema.SCHEMA_VERSION} (convert it again from its recording)"
         return {}, STANDARD, [Violation(FILE, "schema_version", expected, str(version))]
     wrong = check_form(ConversionRecord, content, FILE)
-    usable, pictures = _usable(content, wrong), STANDARD
+    usable, image_options = _usable(content, wrong), STANDARD
     if usable.keys() >= {"cameras", "image_size", "depth", "image_format"}:
         size = tuple(content["image_size"]) if content["image_size"] else None
         try:
-            pictures = Pictures(tuple(content["cameras"]), size, content["depth"], content["image_format"])
+            image_options = ImageOptions(tuple(content["cameras"]), size, content["depth"], content["image_format"])
         except DatasetError as error:
             wrong.append(Violation(FILE, "", "settings of a dataset", one_line(error)))
     first: dict[str, str] = {}
@@ -56,7 +56,7 @@ def read_settings(root: Path) -> tuple[dict[str, Any], Pictures, list[Violation]
         other = first.setdefault(str(entry.get("recording") or number), number)
         if other != number:
             wrong.append(Violation(FILE, f"episodes.{number}", "each recording once", f"that of episode {other}"))
-    return usable, pictures, wrong
+    return usable, image_options, wrong
 
 
 def check_ledger(

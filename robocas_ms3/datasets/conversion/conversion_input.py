@@ -18,7 +18,7 @@ from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.conversion.rendered_source import RenderedSource, open_env
 from robocas_ms3.datasets.conversion.settings import ConversionSettings
 from robocas_ms3.datasets.formats import open_source
-from robocas_ms3.datasets.images.image_files import Pictures
+from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.datasets.sources.arrays import arrays_fingerprint
 from robocas_ms3.datasets.sources.episode_source import EpisodeSource, Frame, SourceEpisode
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
@@ -32,13 +32,13 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ConversionInput:
-    """An open source, and what of it is converted: ``pictures`` are those that are wanted and there.
+    """An open source, and what of it is converted: ``images`` are those that are wanted and there.
 
     ``sizes`` has width and height of the stored images, by camera; it is empty where images are rendered.
     """
 
     source: EpisodeSource
-    pictures: Pictures
+    image_options: ImageOptions
     include_failed: bool = False
     sizes: Mapping[str, tuple[int, int]] = field(default_factory=dict)
 
@@ -81,7 +81,7 @@ class ConversionInput:
 
     def frames(self, episode: SourceEpisode) -> Generator[Frame, None, None]:
         """Yield the images of every step; close the generator unless it is read to the end."""
-        with closing(episode.images(self.pictures)) as frames:
+        with closing(episode.images(self.image_options)) as frames:
             for step, frame in enumerate(frames):
                 for kind, images in (("rgb", frame.rgb), ("depth", frame.depth)) if self.sizes else ():
                     for camera, image in images.items():
@@ -98,26 +98,26 @@ class ConversionInput:
 def open_input(settings: ConversionSettings) -> ConversionInput:
     if settings.is_trajectory:
         rendered = open_trajectory(settings)
-        return ConversionInput(rendered, rendered.pictures, settings.include_failed)
-    source, wanted = open_source(settings.source, rate_hz=settings.rate_hz), settings.pictures
+        return ConversionInput(rendered, rendered.image_options, settings.include_failed)
+    source, wanted = open_source(settings.source, rate_hz=settings.rate_hz), settings.image_options
     first = source.episode(source.numbers[0])
-    pictures = wanted.choose(first.cameras, source.root)
-    sizes = {camera: _size(first.rgb(camera, 0)) for camera in pictures.cameras}
+    image_options = wanted.choose(first.cameras, source.root)
+    sizes = {camera: _size(first.rgb(camera, 0)) for camera in image_options.cameras}
     different = sorted(set(sizes.values()))
     size = different[0] if len(different) == 1 else None
     if wanted.size not in (None, size):
         what, fix = "a dataset keeps the size of its images", "Convert the trajectory with this size."
         expected = ", ".join(f"{width} x {height}" for width, height in different)
         raise DatasetError(what, where=source.root, expected=expected, found=list(wanted.size or ()), fix=fix)
-    pictures = replace(pictures, size=size, depth=wanted.depth and source.has_depth)
-    return ConversionInput(source, pictures, settings.include_failed, sizes)
+    image_options = replace(image_options, size=size, depth=wanted.depth and source.has_depth)
+    return ConversionInput(source, image_options, settings.include_failed, sizes)
 
 
 def open_trajectory(settings: ConversionSettings) -> RenderedSource:
     return RenderedSource(
         settings.source,
         rate_hz=settings.rate_hz,
-        pictures=settings.pictures,
+        image_options=settings.image_options,
         pack=settings.pack,
         open_renderer=settings.open_renderer or open_env,
     )

@@ -64,12 +64,12 @@ def convert(
     start, out = time.perf_counter(), settings.out
     with ExitStack() as stack:
         source = stack.enter_context(closing(open_trajectory(settings)))
-        pictures = source.pictures
-        stored = dataset_settings(source.rate_hz, pictures, settings.embeddings)
+        image_options = source.image_options
+        stored = dataset_settings(source.rate_hz, image_options, settings.embeddings)
         recorded = {**stored, "made_with": versions()}
         output = stack.enter_context(OutputFolder(out, DATASET, recorded, overwrite=settings.overwrite))
         # Everything that may fail comes before the output is touched.
-        entries = ConversionInput(source, pictures, settings.include_failed).entries()
+        entries = ConversionInput(source, image_options, settings.include_failed).entries()
         content, tasks = plan_episodes(output, entries, stored, append=settings.append)
         settings.check_device()
         embed = partial(_look_up, embed_texts(source, entries)) if settings.embeddings else None
@@ -77,7 +77,7 @@ def convert(
         sweep(out / schema.PREVIEW_FOLDER)
         before = _split_before(out)
         for folder in (out / schema.episode_folder(number) for number, _ in tasks):
-            if folder.is_dir() and (path := find_damaged(folder, pictures)):
+            if folder.is_dir() and (path := find_damaged(folder, image_options)):
                 _log.warning("%s: cut off, or gone, since it was written; its episode is written again", path)
                 shutil.rmtree(folder)
         missing = [task for task in tasks if not (out / schema.episode_folder(task[0])).is_dir()]

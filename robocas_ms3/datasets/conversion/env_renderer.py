@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import inverse
-from robocas_ms3.datasets.images.image_files import Box, Pictures, box_of
+from robocas_ms3.datasets.images.image_files import Box, ImageOptions, box_of
 from robocas_ms3.datasets.sources.episode_source import CameraModel, Frame
 from robocas_ms3.demos.recordings.environment import RecordedEnv
 from robocas_ms3.demos.recordings.trajectory_file import Recording
@@ -26,14 +26,16 @@ _SAME_PLACE = 1e-3  # m
 class EnvRenderer:
     """Renders recorded states, with all images or some, in the environment that recorded them."""
 
-    def __init__(self, env: RecordedEnv, control_mode: str, pictures: Pictures | None = None) -> None:
+    def __init__(self, env: RecordedEnv, control_mode: str, image_options: ImageOptions | None = None) -> None:
         sensors = dict(env.kwargs.get("sensor_configs") or {})
-        self._pictures = (pictures or Pictures()).choose([camera.name for camera in env.cameras()], env.env_id)
-        if self._pictures.size is not None:
-            sensors["width"], sensors["height"] = self._pictures.size
+        self._image_options = (image_options or ImageOptions()).choose(
+            [camera.name for camera in env.cameras()], env.env_id
+        )
+        if self._image_options.size is not None:
+            sensors["width"], sensors["height"] = self._image_options.size
         require_renderer()
         self.env = env.make(
-            obs_mode="+".join([*self._pictures.kinds, *(["segmentation"] if self._pictures.boxes else [])]),
+            obs_mode="+".join([*self._image_options.kinds, *(["segmentation"] if self._image_options.boxes else [])]),
             control_mode=control_mode,
             num_envs=1,
             sim_backend="physx_cpu",
@@ -46,7 +48,7 @@ class EnvRenderer:
 
     def load(self, recording: Recording) -> None:
         self.env.reset(seed=recording.seed, options=dict(recording.reset_options))
-        for name in set(self._base._sensors) - set(self._pictures.cameras):
+        for name in set(self._base._sensors) - set(self._image_options.cameras):
             del self._base._sensors[name]  # they are made anew at each reset; what is there is rendered
         self._check_scene(recording)
 
@@ -78,11 +80,13 @@ class EnvRenderer:
         tensors = {kind: {k: torch.from_numpy(v) for k, v in arrays.items()} for kind, arrays in state.items()}
         self._base.set_state_dict(tensors)
         textures = self._base._get_obs_sensor_data(apply_texture_transforms=False)
-        shaders = {name: self._base._sensors[name].config.shader_config for name in self._pictures.cameras}
+        shaders = {name: self._base._sensors[name].config.shader_config for name in self._image_options.cameras}
         return Frame(
             rgb={name: _rgb_of(textures[name], shader) for name, shader in shaders.items()},
-            depth={name: _depth_of(textures[name], shader) for name, shader in shaders.items() if self._pictures.depth},
-            boxes=self._boxes(textures, shaders) if self._pictures.boxes else {},
+            depth={
+                name: _depth_of(textures[name], shader) for name, shader in shaders.items() if self._image_options.depth
+            },
+            boxes=self._boxes(textures, shaders) if self._image_options.boxes else {},
         )
 
     def _boxes(self, textures: dict[str, Any], shaders: dict[str, ShaderConfig]) -> dict[str, Box]:
@@ -97,7 +101,7 @@ class EnvRenderer:
         parents = {"ee": agent.tcp.pose, "arm_base": agent.arm_base_link.pose}
         models = {}
         for spec in self._base.cameras:
-            if spec.name not in self._pictures.cameras:
+            if spec.name not in self._image_options.cameras:
                 continue
             camera = self._base.scene.sensors[spec.name].camera
             world_in_camera = np.vstack([camera.get_extrinsic_matrix()[0].cpu().numpy(), [0, 0, 0, 1]])

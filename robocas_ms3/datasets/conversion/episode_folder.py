@@ -19,7 +19,7 @@ from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.images import check_cameras, check_images
 from robocas_ms3.datasets.checks.violation import read_object
 from robocas_ms3.datasets.conversion.workers import EpisodeWriter, GivenEpisode
-from robocas_ms3.datasets.images.image_files import Pictures, write_picture
+from robocas_ms3.datasets.images.image_files import ImageOptions, write_image
 from robocas_ms3.datasets.images.image_headers import check_ends
 from robocas_ms3.datasets.images.preview_frames import EpisodeDrawing
 from robocas_ms3.datasets.images.video import open_preview
@@ -44,9 +44,9 @@ class FolderWriter(EpisodeWriter):
     def write_files(
         self, folder: Path, wanted: GivenEpisode, frames: Generator[Frame, None, None]
     ) -> NDArray[np.uint8] | None:
-        episode, pictures, arrays, preview = wanted.episode, wanted.given.pictures, wanted.arrays, None
-        for camera in pictures.cameras:
-            for kind in pictures.kinds:
+        episode, image_options, arrays, preview = wanted.episode, wanted.given.image_options, wanted.arrays, None
+        for camera in image_options.cameras:
+            for kind in image_options.kinds:
                 (folder / camera / kind).mkdir(parents=True)
         with ExitStack() as stack:
             if self.sheet is not None:
@@ -55,14 +55,14 @@ class FolderWriter(EpisodeWriter):
             encode = stack.enter_context(_encoder())
             in_order = stack.enter_context(_encoder(1))  # frames of a video
             for step, frame in enumerate(frames):
-                for kind in pictures.kinds:
+                for kind in image_options.kinds:
                     images = frame.rgb if kind == "rgb" else frame.depth
-                    for camera in pictures.cameras:
-                        path = schema.image_path(folder, camera, kind, step, pictures.image_format)
-                        encode(write_picture, path, images[camera])
+                    for camera in image_options.cameras:
+                        path = schema.image_path(folder, camera, kind, step, image_options.image_format)
+                        encode(write_image, path, images[camera])
                 if preview:
                     in_order(preview.add, step, frame.rgb)
-        cameras = {name: episode.camera(name) for name in pictures.cameras}
+        cameras = {name: episode.camera(name) for name in image_options.cameras}
         arrays = with_embeddings(arrays, self.embed) if self.embed else arrays
         write_episode_files(folder, arrays, cameras, episode.scene)
         return preview and preview.row
@@ -102,7 +102,7 @@ def _encoder(threads: int = ENCODERS) -> Generator[Callable[..., None], None, No
         pool.shutdown(cancel_futures=True)
 
 
-def find_damaged(folder: Path, pictures: Pictures) -> Path | None:
+def find_damaged(folder: Path, image_options: ImageOptions) -> Path | None:
     """Return the first file of an episode that is missing or lacks its end, as one that was cut off does."""
     steps = read_arrays(folder / schema.EPISODE_FILE, ("episode_length",)).arrays.get("episode_length")
     if steps is None or steps.ndim:
@@ -110,8 +110,8 @@ def find_damaged(folder: Path, pictures: Pictures) -> Path | None:
     root = folder.parent
     for wrong in (
         *read_object(root, f"{folder.name}/{schema.SCENE_FILE}")[1],
-        *check_cameras(folder, pictures),
-        *check_images(folder, pictures, int(steps), {}, check_ends),
+        *check_cameras(folder, image_options),
+        *check_images(folder, image_options, int(steps), {}, check_ends),
     ):
         if wrong.kind != "surplus" and not (root / wrong.file).is_dir():  # the folder of a camera too many
             return root / wrong.file

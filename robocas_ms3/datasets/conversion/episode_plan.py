@@ -15,7 +15,7 @@ from robocas_ms3.core.output_folder import FolderKind, OutputFolder
 from robocas_ms3.core.strict_model import parse
 from robocas_ms3.core.text import format_ranges
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.images.image_files import Pictures
+from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.datasets.sources.file_models import ConversionRecord, SettingsRecord
 from robocas_ms3.datasets.sources.split import SPLIT_RULE, split_by_seed
 from robocas_ms3.demos.recordings.trajectory_json import versions
@@ -40,13 +40,13 @@ def with_versions(record: dict[str, Any]) -> dict[str, Any]:
 DATASET = FolderKind("robocas convert", (schema.CONVERSION_FILE,), "rate_hz", marks=MARKS, upgrade=with_versions)
 
 
-def dataset_settings(rate_hz: float, pictures: Pictures, embeddings: bool) -> dict[str, Any]:
+def dataset_settings(rate_hz: float, image_options: ImageOptions, embeddings: bool) -> dict[str, Any]:
     settings = SettingsRecord(
         rate_hz=float(rate_hz),
-        cameras=list(pictures.cameras),
-        image_size=list(pictures.size) if pictures.size else None,
-        image_format=pictures.image_format,
-        depth=pictures.depth,
+        cameras=list(image_options.cameras),
+        image_size=list(image_options.size) if image_options.size else None,
+        image_format=image_options.image_format,
+        depth=image_options.depth,
         embeddings=embeddings,
     )
     return settings.model_dump()

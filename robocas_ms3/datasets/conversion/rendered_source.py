@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.images.image_files import Pictures
+from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.datasets.sources.episode_source import CameraModel, Frame
 from robocas_ms3.datasets.sources.provenance import recording_entry, scene_record, unread_entry
 from robocas_ms3.datasets.sources.trajectory import RecordedEpisode, TrajectorySource
@@ -20,14 +20,14 @@ from robocas_ms3.demos.recordings.trajectory_file import Recording, TrajectoryFi
 if TYPE_CHECKING:
     from robocas_ms3.datasets.conversion.env_renderer import EnvRenderer
 
-OpenRenderer = Callable[[RecordedEnv, str, Pictures], "EnvRenderer"]
+OpenRenderer = Callable[[RecordedEnv, str, ImageOptions], "EnvRenderer"]
 """(environment of the recording, its control mode, images to render) -> renderer."""
 
 
-def open_env(env: RecordedEnv, control_mode: str, pictures: Pictures) -> EnvRenderer:
+def open_env(env: RecordedEnv, control_mode: str, image_options: ImageOptions) -> EnvRenderer:
     from robocas_ms3.datasets.conversion.env_renderer import EnvRenderer
 
-    return EnvRenderer(env, control_mode, pictures)
+    return EnvRenderer(env, control_mode, image_options)
 
 
 class RenderedSource(TrajectorySource):
@@ -38,13 +38,13 @@ class RenderedSource(TrajectorySource):
         path: Path,
         *,
         rate_hz: float | None,
-        pictures: Pictures,
+        image_options: ImageOptions,
         pack: str | Path | None = None,
         open_renderer: OpenRenderer = open_env,
     ) -> None:
         super().__init__(path, rate_hz=rate_hz, include_failed=True, pack=pack)
-        self.pictures = pictures.choose([camera.name for camera in self.file.env.cameras()], path)
-        self.cameras, self.has_depth = self.pictures.cameras, pictures.depth
+        self.image_options = image_options.choose([camera.name for camera in self.file.env.cameras()], path)
+        self.cameras, self.has_depth = self.image_options.cameras, image_options.depth
         self._pack, self._open_renderer = pack, open_renderer
         self._renderer: EnvRenderer | None = None
         self._control_mode = ""
@@ -77,7 +77,7 @@ class RenderedSource(TrajectorySource):
             raise DatasetError("too many steps", where=where, expected=f"<= {schema.MAX_STEPS}", found=len(samples))
         if self._renderer is None or recording.control_mode != self._control_mode:
             self.close()
-            self._renderer = self._open_renderer(self.file.env, recording.control_mode, self.pictures)
+            self._renderer = self._open_renderer(self.file.env, recording.control_mode, self.image_options)
             self._control_mode = recording.control_mode
         self._renderer.load(recording)
         return RenderedEpisode(self, number, recording, self._renderer)
@@ -99,7 +99,7 @@ class RenderedEpisode(RecordedEpisode):
     def recording(self, *, bodies: bool = True) -> Recording:
         return self._recording
 
-    def images(self, pictures: Pictures) -> Generator[Frame, None, None]:
+    def images(self, image_options: ImageOptions) -> Generator[Frame, None, None]:
         samples = sample_states(self._recording.control_steps, self._source.stride)
         yield from self._renderer.frames(self._recording, samples)
 

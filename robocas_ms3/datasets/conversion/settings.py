@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from robocas_ms3.core.workers import Limits
-    from robocas_ms3.datasets.images.image_files import Pictures
+    from robocas_ms3.datasets.images.image_files import ImageOptions
 
 _NO_HINT = tyro.conf.arg(help_behavior_hint="")  # the help text says what the default is
 
@@ -94,10 +94,10 @@ class ConversionSettings:
             raise DatasetError("a camera is named twice", where="--cameras", expected="each once", found=found)
 
     @property
-    def pictures(self) -> Pictures:
-        from robocas_ms3.datasets.images.image_files import Pictures
+    def image_options(self) -> ImageOptions:
+        from robocas_ms3.datasets.images.image_files import ImageOptions
 
-        return Pictures(self.cameras, self.size, self.depth, self.image_format, self.boxes)
+        return ImageOptions(self.cameras, self.size, self.depth, self.image_format, self.boxes)
 
     @property
     def limits(self) -> Limits | None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.text import one_line
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.images.image_headers import LARGEST, read_picture_bytes
+from robocas_ms3.datasets.images.image_headers import LARGEST, read_image_bytes
 from robocas_ms3.datasets.images.png import encode_png
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 from robocas_ms3.robots.cameras import STANDARD_NAMES
@@ -30,7 +30,7 @@ Box = tuple[int, int, int, int]
 
 
 @dataclass(frozen=True)
-class Pictures:
+class ImageOptions:
     """What is rendered and stored; no cameras: all that there are, no size: the cameras' own.
 
     The standard cameras come first, in their order. ``boxes``: the box of the target is determined in each image.
@@ -49,7 +49,7 @@ class Pictures:
         names = [*STANDARD_NAMES, *self.cameras]
         object.__setattr__(self, "cameras", tuple(name for name in dict.fromkeys(names) if name in self.cameras))
 
-    def choose(self, cameras: Sequence[str], where: object) -> Pictures:
+    def choose(self, cameras: Sequence[str], where: object) -> ImageOptions:
         """Return the same of those cameras that there are, in their order; ``where`` they are, for messages."""
         wrong = sorted(set(self.cameras) - set(cameras))
         if wrong:
@@ -61,33 +61,33 @@ class Pictures:
         return schema.IMAGE_KINDS if self.depth else ("rgb",)
 
 
-def write_picture(path: Path, picture: NDArray) -> None:
+def write_image(path: Path, image: NDArray) -> None:
     """Encode (H, W, 3) RGB or (H, W) depth by the file's suffix."""
     try:
-        data = encode_png(picture) if path.suffix == ".png" else _encode(picture, path.suffix)
+        data = encode_png(image) if path.suffix == ".png" else _encode(image, path.suffix)
     except (ValueError, cv2.error) as error:
-        raise DatasetError("can't encode this picture", where=path, found=one_line(error)) from error
+        raise DatasetError("can't encode this image", where=path, found=one_line(error)) from error
     path.write_bytes(data)  # unlike cv2.imwrite this says when the disk is full
 
 
-def _encode(picture: NDArray[np.uint8], suffix: str) -> bytes:
-    encoded, data = cv2.imencode(suffix, cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), _QUALITY[suffix[1:]])
+def _encode(image: NDArray[np.uint8], suffix: str) -> bytes:
+    encoded, data = cv2.imencode(suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR), _QUALITY[suffix[1:]])
     if not encoded:
-        raise ValueError(f"{picture.dtype} {picture.shape}")
+        raise ValueError(f"{image.dtype} {image.shape}")
     return data.tobytes()
 
 
-def read_picture(path: Path) -> NDArray:
-    """Decode a picture: (H, W, 3) RGB uint8 or (H, W) uint16."""
+def read_image(path: Path) -> NDArray:
+    """Decode an image: (H, W, 3) RGB uint8 or (H, W) uint16."""
     try:
-        data = np.frombuffer(read_picture_bytes(path), np.uint8)
+        data = np.frombuffer(read_image_bytes(path), np.uint8)
     except (OSError, ValueError) as error:
         found = getattr(error, "strerror", None) or error
-        raise DatasetError("can't read this picture", where=path, found=found, fix=SEE_VALIDATE) from error
-    picture = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
-    if picture is None:
-        raise DatasetError("this picture is damaged", where=path, fix=SEE_VALIDATE)
-    return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB) if picture.ndim == 3 else picture
+        raise DatasetError("can't read this image", where=path, found=found, fix=SEE_VALIDATE) from error
+    image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise DatasetError("this image is damaged", where=path, fix=SEE_VALIDATE)
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if image.ndim == 3 else image
 
 
 def box_of(mask: NDArray[np.bool_]) -> Box | None:

@@ -1,4 +1,4 @@
-"""Reads a picture's bytes and header within bounds, and checks that it is whole: a PNG without decoding it."""
+"""Reads an image's bytes and header within bounds, and checks that it is whole: a PNG without decoding it."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from robocas_ms3.datasets.images.png import SIGNATURE
 LARGEST = 8192
 """Pixels per side."""
 BYTES_LIMIT = 2**28
-"""Of a file: the largest picture without compression has 200 MB."""
+"""Of a file: the largest image without compression has 200 MB."""
 _END = 32  # bytes
 _FORMATS = {".png": "PNG", ".jpg": "JPEG", ".webp": "WEBP"}
 _CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 
 
 @dataclass(frozen=True)
-class PictureHeader:
+class ImageHeader:
     """Size in pixels, bits a channel, channels."""
 
     width: int
@@ -36,13 +36,13 @@ class PictureHeader:
         return f"{self.width} x {self.height}, {self.channels} x {self.bits} bit"
 
 
-def read_header(path: Path) -> PictureHeader:
-    data = read_picture_bytes(path)
+def read_header(path: Path) -> ImageHeader:
+    data = read_image_bytes(path)
     return _read_png(data) if path.suffix == ".png" else _decode(data, _FORMATS[path.suffix])
 
 
 def check_ends(path: Path) -> None:
-    """Check that a picture begins and ends as its format does, which is quick; read it whole if it does not."""
+    """Check that an image begins and ends as its format does, which is quick; read it whole if it does not."""
     if not _has_both_ends(path):
         read_header(path)
 
@@ -60,12 +60,12 @@ def _has_both_ends(path: Path) -> bool:
     return head.startswith(b"RIFF") and head[8:12] == b"WEBP" and size == 8 + int.from_bytes(head[4:8], "little")
 
 
-def read_picture_bytes(path: Path) -> bytes:
-    """Read a file that a decoder can be given: its picture has at most `LARGEST` pixels per side."""
+def read_image_bytes(path: Path) -> bytes:
+    """Read a file that a decoder can be given: its image has at most `LARGEST` pixels per side."""
     data, wanted = read_bytes(path, BYTES_LIMIT), _FORMATS[path.suffix]
     try:
-        with Image.open(BytesIO(data), formats=[wanted]) as picture:
-            size = picture.size
+        with Image.open(BytesIO(data), formats=[wanted]) as image:
+            size = image.size
     except Image.DecompressionBombError as error:
         raise DocumentError(str(error)) from error
     except (UnidentifiedImageError, SyntaxError) as error:  # the latter of a damaged PNG
@@ -75,16 +75,16 @@ def read_picture_bytes(path: Path) -> bytes:
     return data
 
 
-def _decode(data: bytes, wanted: str) -> PictureHeader:
+def _decode(data: bytes, wanted: str) -> ImageHeader:
     try:
-        with Image.open(BytesIO(data), formats=[wanted]) as picture:
-            picture.load()
-            return PictureHeader(*picture.size, 8, len(picture.getbands()))
+        with Image.open(BytesIO(data), formats=[wanted]) as image:
+            image.load()
+            return ImageHeader(*image.size, 8, len(image.getbands()))
     except OSError as error:
         raise ValueError(f"damaged {wanted}: {error}") from error
 
 
-def _read_png(data: bytes) -> PictureHeader:
+def _read_png(data: bytes) -> ImageHeader:
     if not data.startswith(SIGNATURE):
         raise ValueError("not a PNG")
     offset, header, filled = len(SIGNATURE), None, False
@@ -97,11 +97,11 @@ def _read_png(data: bytes) -> PictureHeader:
             raise ValueError("damaged PNG")
         if kind == b"IHDR":
             width, height, bits, colour = struct.unpack_from(">IIBB", data, offset + 8)
-            header = PictureHeader(width, height, bits, _CHANNELS.get(colour, 0))
+            header = ImageHeader(width, height, bits, _CHANNELS.get(colour, 0))
         filled = filled or (kind == b"IDAT" and length > 0)
         if kind == b"IEND" and header is not None:
             if not filled:
-                raise ValueError("PNG without a picture")
+                raise ValueError("PNG without an image")
             return header
         offset = end + 4
     raise ValueError("PNG cut off")

@@ -70,7 +70,7 @@ def convert_lerobot(
         MissingExtraError: the ``lerobot`` extra is not installed.
     """
     require_lerobot()
-    check_video_size(settings.pictures.size)
+    check_video_size(settings.image_options.size)
     start, variant, out = time.perf_counter(), find_variant(settings.lerobot_version), settings.out
     settings = replace(settings, boxes=variant.language)
     written: list[WrittenEpisode] = []
@@ -102,7 +102,7 @@ def convert_lerobot(
 
 
 def _plan(given: ConversionInput, codec: str, variant: Variant) -> dict[str, Any]:
-    entries, pictures = given.entries(), given.pictures
+    entries, image_options = given.entries(), given.image_options
     place = {entry["source"]: i for i, entry in enumerate(entries)}
     # a dataset keeps its split, a trajectory has none
     before = [given.source.split(side) if given.sizes else [] for side in ("train", "val")]
@@ -114,10 +114,10 @@ def _plan(given: ConversionInput, codec: str, variant: Variant) -> dict[str, Any
         "settings": {
             "lerobot_version": variant.version,
             "rate_hz": whole_rate(given.source.rate_hz),
-            "cameras": list(pictures.cameras),
-            "depth": pictures.depth,
+            "cameras": list(image_options.cameras),
+            "depth": image_options.depth,
             "codec": codec,
-            "size": pictures.size,
+            "size": image_options.size,
         },
         "train_eps": train,
         "val_eps": val,

@@ -77,7 +77,7 @@ class PartWriter(EpisodeWriter):
         return self.parts / episode_folder(number)
 
     def write_files(self, folder: Path, wanted: GivenEpisode, frames: Generator[Frame, None, None]) -> None:
-        episode, arrays, pictures = wanted.episode, wanted.arrays, wanted.given.pictures
+        episode, arrays, image_options = wanted.episode, wanted.arrays, wanted.given.image_options
         fps, steps = schema.whole_rate(wanted.given.source.rate_hz), int(arrays["episode_length"])
         encoders: dict[str, Encoder] = {}  # opened with the first frame
         levels: dict[str, Levels] = {}
@@ -106,8 +106,8 @@ class PartWriter(EpisodeWriter):
         record = EpisodeRecord(
             instruction=str(arrays["language_goal"]),
             scene=scene,
-            cameras={name: CameraRecord.of(name, episode.camera(name)) for name in pictures.cameras},
-            depth=pictures.depth,
+            cameras={name: CameraRecord.of(name, episode.camera(name)) for name in image_options.cameras},
+            depth=image_options.depth,
             depth_clipped=clipped,
             levels={key: counted.counts.tolist() for key, counted in levels.items()},
             sizes=_sizes(folder),

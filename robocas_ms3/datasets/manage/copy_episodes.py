@@ -195,7 +195,7 @@ def check_apart(out: Path, inputs: Sequence[Path]) -> None:
 
 def _check_episodes(root: Path, numbers: Iterable[int]) -> None:
     """Check that episodes have all arrays, cameras and images; arrays that an imported episode lacks may be missing."""
-    _, pictures, _ = read_settings(root)
+    _, image_options, _ = read_settings(root)
     for folder in (root / schema.episode_folder(number) for number in numbers):
         stored = read_arrays(folder / schema.EPISODE_FILE)
         source = read_object(folder, schema.SCENE_FILE)[0].get("source")
@@ -204,8 +204,8 @@ def _check_episodes(root: Path, numbers: Iterable[int]) -> None:
         for wrong in (
             *(wrong for wrong in laws.check_keys(stored) if wrong.key not in lacking),
             *laws.violations_of(stored, (laws.check_file, laws.check_shapes, laws.check_finite)),
-            *check_cameras(folder, pictures),
-            *check_images(folder, pictures, stored.steps, {}, check_ends),
+            *check_cameras(folder, image_options),
+            *check_images(folder, image_options, stored.steps, {}, check_ends),
         ):
             if wrong.kind != "surplus":
                 raise damaged_episode(root, wrong)

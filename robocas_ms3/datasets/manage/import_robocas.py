@@ -51,7 +51,7 @@ def import_robocas(
         DatasetError: no episode can be imported, or the output is the input.
         OutputExistsError: ``out`` is another dataset, or none.
     """
-    if not surveyed.taken or surveyed.pictures is None:
+    if not surveyed.taken or surveyed.image_options is None:
         found = f"{count_of(surveyed.episodes, 'episode')}, nothing whole"
         fix = "robocas import-robocas without --out says what is wrong."
         raise DatasetError("no episode can be taken", where=surveyed.root, found=found, fix=fix)
@@ -80,7 +80,7 @@ def import_robocas(
 
 
 def _record(dataset: Dataset, surveyed: Survey, embedded: bool) -> dict[str, Any]:
-    assert surveyed.pictures is not None
+    assert surveyed.image_options is not None
     unknown = dict.fromkeys(("trajectory", "trajectory_episode", "seed", "success", "target", "recording"))
     parse(EpisodesRecord, dataset.settings, DatasetError, where=dataset.root / schema.CONVERSION_FILE)
     before = dataset.settings.get("episodes", {})
@@ -89,7 +89,7 @@ def _record(dataset: Dataset, surveyed: Survey, embedded: bool) -> dict[str, Any
         str(n): {**unknown, **before.get(str(n), {}), "from": {"dataset": name, "episode": n}} for n in surveyed.taken
     }
     return {
-        **copied_header(dataset_settings(surveyed.rate_hz, surveyed.pictures, embedded), SPLIT_RULE),
+        **copied_header(dataset_settings(surveyed.rate_hz, surveyed.image_options, embedded), SPLIT_RULE),
         "source": {"format": f"robocas v{schema_version(dataset)}", "dataset": name},
         "episodes": episodes,
     }
@@ -107,20 +107,20 @@ def _embedded(episode: ImportedEpisode, wanted: bool, embed: Embed | None) -> Ep
 
 
 def _write(folder: Path, source: Episode, episode: ImportedEpisode, surveyed: Survey, placer: FilePlacer) -> None:
-    pictures, stored = surveyed.pictures, episode.stored
-    assert pictures is not None
+    image_options, stored = surveyed.image_options, episode.stored
+    assert image_options is not None
     cameras: dict[str, CameraModel] = {}
-    for camera in pictures.cameras:
+    for camera in image_options.cameras:
         model = source.camera(camera)
         pose = np.asarray(model.camera_in_parent, dtype=np.float64)
         if model.parent == "ee" and episode.turn_deg:
             back = Rotation.from_euler("z", -episode.turn_deg, degrees=True).as_matrix()
             pose = np.vstack([back @ pose[:3], pose[3]])
         cameras[camera] = CameraModel(np.asarray(model.intrinsic, dtype=np.float64), pose, model.parent)
-        for kind in pictures.kinds:
+        for kind in image_options.kinds:
             (folder / camera / kind).mkdir(parents=True)
             for step in range(stored.steps):
-                target = schema.image_path(folder, camera, kind, step, pictures.image_format)
+                target = schema.image_path(folder, camera, kind, step, image_options.image_format)
                 placer.place(source.image_path(camera, kind, step), target)
     arrays = {key: stored.arrays[key] for key in SPECS if key in stored.arrays}
     write_episode_files(folder, arrays, cameras, _scene(source, episode, surveyed))

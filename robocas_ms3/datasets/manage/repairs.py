@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks import arrays as laws
 from robocas_ms3.datasets.checks.violation import Violation
-from robocas_ms3.datasets.images.image_files import Pictures
+from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.datasets.sources.arrays import SPECS, EpisodeArrays, motion_arrays
 from robocas_ms3.demos.recordings.motion import planar_motion
 from robocas_ms3.robots.quantities import continuous_xyzw
@@ -56,7 +56,7 @@ class ImportedEpisode:
     stored: EpisodeArrays
     findings: list[Finding] = field(default_factory=list)
     turn_deg: int = 0
-    pictures: Pictures | None = None
+    image_options: ImageOptions | None = None
 
     @property
     def usable(self) -> bool:

@@ -15,7 +15,7 @@ from robocas_ms3.core.text import count_of
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.images import Sizes, check_camera_file, check_images
 from robocas_ms3.datasets.checks.violation import NO_FILE, Violation
-from robocas_ms3.datasets.images.image_files import Pictures
+from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.datasets.manage.repairs import (
     EMBEDDINGS,
     Finding,
@@ -35,14 +35,14 @@ _FULL_SIZE = (640, 480)
 
 @dataclass
 class Survey:
-    """Result of a survey: ``taken`` is number -> T of the episodes that can be imported, ``pictures`` are theirs."""
+    """Result of a survey: ``taken`` is number -> T of the episodes that can be imported, ``images`` are theirs."""
 
     root: Path
     rate_hz: float
     turn_eef: bool
     episodes: int
     taken: dict[int, int]
-    pictures: Pictures | None
+    image_options: ImageOptions | None
     embeddings: bool
     findings: list[Finding]
 
@@ -58,7 +58,7 @@ class Survey:
             "taken": len(self.taken),
             "steps": sum(self.taken.values()),
             "left_out": self.left_out,
-            "pictures": asdict(self.pictures) if self.pictures else None,
+            "images": asdict(self.image_options) if self.image_options else None,
             "embeddings": self.embeddings,
             "findings": [found.as_json() for found in self.findings],
         }
@@ -103,12 +103,12 @@ def survey(
             findings += episode.findings
         if on_episode:
             on_episode(done, len(dataset.numbers))
-    most = Counter(episode.pictures for episode in usable).most_common(1)[0][0] if usable else None
+    most = Counter(episode.image_options for episode in usable).most_common(1)[0][0] if usable else None
     first: dict[str, int] = {}
     for episode in usable:
         name = schema.episode_folder(episode.number)
-        if episode.pictures != most:
-            wrong = Violation(name, "", f"{_describe(most)}, as most", _describe(episode.pictures))
+        if episode.image_options != most:
+            wrong = Violation(name, "", f"{_describe(most)}, as most", _describe(episode.image_options))
             episode.note(wrong, "left out")
         elif (other := first.setdefault(fingerprints[episode.number], episode.number)) != episode.number:
             episode.note(Violation(name, "", "each episode once", f"the arrays of episode {other}"), "left out")
@@ -204,10 +204,10 @@ def _check_files(episode: ImportedEpisode, source: Episode) -> None:
 
 def _check_images(episode: ImportedEpisode, source: Episode) -> None:
     """Check the images of an episode; each folder is one finding."""
-    pictures = Pictures(source.cameras, None, source.has_depth, source.image_format)
+    image_options = ImageOptions(source.cameras, None, source.has_depth, source.image_format)
     sizes: Sizes = {}
     folders: dict[tuple[str, bool], list[Violation]] = {}
-    for wrong in check_images(source.folder, pictures, episode.stored.steps, sizes):
+    for wrong in check_images(source.folder, image_options, episode.stored.steps, sizes):
         folders.setdefault((wrong.file.rpartition("/")[0], wrong.kind == "surplus"), []).append(wrong)
     for found in folders.values():
         more = f"and {count_of(len(found) - 1, 'other')}" if len(found) > 1 else ""
@@ -215,16 +215,16 @@ def _check_images(episode: ImportedEpisode, source: Episode) -> None:
     different = set(sizes.values())
     size = None if len(different) != 1 or _FULL_SIZE in different else different.pop()
     try:
-        episode.pictures = replace(pictures, size=size)
+        episode.image_options = replace(image_options, size=size)
     except DatasetError as error:  # too small
         episode.note(Violation(source.folder.name, "", str(error.expected), str(error.found)), "left out")
 
 
-def _describe(pictures: Pictures | None) -> str:
-    assert pictures is not None
-    size = "{} x {}".format(*(pictures.size or _FULL_SIZE))
-    depth = "with" if pictures.depth else "without"
-    return f"{', '.join(pictures.cameras)}, {size} {pictures.image_format}, {depth} depth"
+def _describe(image_options: ImageOptions | None) -> str:
+    assert image_options is not None
+    size = "{} x {}".format(*(image_options.size or _FULL_SIZE))
+    depth = "with" if image_options.depth else "without"
+    return f"{', '.join(image_options.cameras)}, {size} {image_options.image_format}, {depth} depth"
 
 
 def read_info(dataset: Dataset) -> tuple[dict[str, Any], list[Finding]]:

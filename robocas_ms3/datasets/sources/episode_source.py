@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.actions import action_space
-from robocas_ms3.datasets.images.image_files import Box, Pictures
+from robocas_ms3.datasets.images.image_files import Box, ImageOptions
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.demos.recordings.subgoals import SubGoal, subgoal_runs
 from robocas_ms3.robots.cameras import Parent, standard_parent
@@ -27,7 +27,7 @@ from robocas_ms3.robots.cameras import Parent, standard_parent
 Side = Literal["train", "val", "all"]
 """Of the split into training and validation."""
 Kind = Literal["rgb", "depth"]
-"""Of picture."""
+"""Of image."""
 
 
 @dataclass(frozen=True)
@@ -118,15 +118,19 @@ class SourceEpisode(ABC):
 
         Here they are read one by one; a format that is quicker in a run, as a video is, overrides this.
         """
-        picture = self.rgb if kind == "rgb" else self.depth
+        image = self.rgb if kind == "rgb" else self.depth
         for step in range(first, self.steps if count is None else first + count):
-            yield picture(camera, step)
+            yield image(camera, step)
 
-    def images(self, pictures: Pictures) -> Generator[Frame, None, None]:
+    def images(self, image_options: ImageOptions) -> Generator[Frame, None, None]:
         """Yield the images of every step; close the generator unless it is read to the end."""
-        boxes = self.target_boxes if pictures.boxes else []
-        with closing(shots(self, pictures.cameras, "rgb")) as rgb, ExitStack() as stack:
-            depth = stack.enter_context(closing(shots(self, pictures.cameras, "depth"))) if pictures.depth else None
+        boxes = self.target_boxes if image_options.boxes else []
+        with closing(shots(self, image_options.cameras, "rgb")) as rgb, ExitStack() as stack:
+            depth = (
+                stack.enter_context(closing(shots(self, image_options.cameras, "depth")))
+                if image_options.depth
+                else None
+            )
             for step, images in enumerate(rgb):
                 yield Frame(images, next(depth) if depth else {}, boxes[step] if boxes else {})
 

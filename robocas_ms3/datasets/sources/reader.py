@@ -19,7 +19,7 @@ from pydantic import BeforeValidator, TypeAdapter, ValidationError
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.images.image_files import read_picture
+from robocas_ms3.datasets.images.image_files import read_image
 from robocas_ms3.datasets.sources.arrays import completed, is_declared, load_arrays, read_arrays
 from robocas_ms3.datasets.sources.episode_source import EpisodeSource, Side, SourceEpisode
 from robocas_ms3.datasets.sources.file_models import CameraName, Rate
@@ -114,10 +114,10 @@ class Episode(SourceEpisode):
         return schema.image_path(self.folder, camera, kind, step, self.image_format)
 
     def rgb(self, camera: str, step: int) -> NDArray[np.uint8]:
-        return read_picture(self.image_path(camera, "rgb", step))
+        return read_image(self.image_path(camera, "rgb", step))
 
     def depth(self, camera: str, step: int) -> NDArray[np.uint16]:
-        return read_picture(self.image_path(camera, "depth", step))
+        return read_image(self.image_path(camera, "depth", step))
 
     def intrinsic(self, camera: str) -> NDArray[np.float64]:
         array = read_array(self.folder / camera / schema.INTRINSIC_FILE)

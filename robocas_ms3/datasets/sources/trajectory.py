@@ -1,4 +1,4 @@
-"""Episodes of a trajectory file of ``robocas generate``: states, which are no pictures until they are rendered."""
+"""Episodes of a trajectory file of ``robocas generate``: states, which are no images until they are rendered."""
 
 from __future__ import annotations
 

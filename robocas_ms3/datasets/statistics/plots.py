@@ -1,4 +1,4 @@
-"""Pictures of a dataset's statistics, with matplotlib and without a display."""
+"""Images of a dataset's statistics, with matplotlib and without a display."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from robocas_ms3.datasets.statistics.layouts import LayoutMap
 
 DPI = 110
 BLUE, ORANGE, GREY = "#2f6fa8", "#e08a2e", "#9aa3ab"
-MAX_ROWS = 50  # bars of one picture; the rest is in stats.json
+MAX_ROWS = 50  # bars of one image; the rest is in stats.json
 _TEXT = 84  # letters of a label
 
 
@@ -27,7 +27,7 @@ def write_stats(stats: Stats, out: Path) -> list[Path]:
     make_folder(out)
     paths = [out / "stats.json"]
     write_json(paths[0], stats.as_json())
-    for name, draw in PICTURES.items():
+    for name, draw in IMAGES.items():
         figure = draw(stats)
         if figure is None:
             (out / f"{name}.png").unlink(missing_ok=True)  # of an earlier run
@@ -229,7 +229,7 @@ def draw_subgoals(stats: Stats) -> Any:
     return figure
 
 
-PICTURES: dict[str, Callable[[Stats], Any]] = {
+IMAGES: dict[str, Callable[[Stats], Any]] = {
     "lengths": draw_lengths,
     "objects": draw_objects,
     "layouts": draw_layouts,

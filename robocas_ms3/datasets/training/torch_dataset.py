@@ -31,7 +31,7 @@ _TYPE_INDEX = {kind: index for index, kind in enumerate(GOAL_TYPES)}
 class RoboCASDataset(torch.utils.data.Dataset):
     """Samples of a dataset, or of a trajectory file (state and action only).
 
-    Only the overview is read at the beginning; arrays and pictures are read sample by sample, and no file stays open,
+    Only the overview is read at the beginning; arrays and images are read sample by sample, and no file stays open,
     so that workers may be forked or spawned. A sample is a dict; H = ``observation_horizon``, A = ``action_horizon``:
 
     ======================  ==================  ==================================================================

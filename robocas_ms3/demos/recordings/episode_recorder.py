@@ -23,7 +23,7 @@ from robocas_ms3.tasks.base import RoboCASEnv
 
 # Settings of one machine or one run; a trajectory has to replay without them.
 _LOCAL_KWARGS = ("layouts", "render_backend", "render_mode", "sim_backend", "reward_mode")
-_PICTURES = ("rgb", "depth", "seg")
+_IMAGES = ("rgb", "depth", "seg")
 
 
 class EpisodeRecorder(gym.Wrapper):
@@ -154,5 +154,5 @@ def _write(group: h5py.Group, key: str, data: Any) -> None:
         for name, value in data.items():
             _write(inner, name, value)
         return
-    packing = {"compression": "gzip", "compression_opts": 5} if key in _PICTURES else {}
+    packing = {"compression": "gzip", "compression_opts": 5} if key in _IMAGES else {}
     group.create_dataset(key, data=data, dtype=data.dtype, **packing)

@@ -5,7 +5,7 @@ const robocas = (() => {
   const store = new Map();
   const waiting = new Map();
   const KEEP = 12; // episodes in memory
-  let query = ""; // of pictures, which a browser keeps: it must not take them for those of another server
+  let query = ""; // of images, which a browser keeps: it must not take them for those of another server
 
   function put(name, content) {
     store.set(name, content);
@@ -29,7 +29,7 @@ const robocas = (() => {
     return promise;
   }
 
-  const pictureUrl = (episode, camera, kind, step) => `pictures/${episode}/${camera}/${kind}/${step}.jpg${query}`;
+  const imageUrl = (episode, camera, kind, step) => `images/${episode}/${camera}/${kind}/${step}.jpg${query}`;
   const thumbnailUrl = (episode) => `thumbnails/${episode}.jpg${query}`;
   const byId = (id) => document.getElementById(id);
 
@@ -65,5 +65,5 @@ const robocas = (() => {
     return { ctx, width, height };
   }
 
-  return { put, load, pictureUrl, thumbnailUrl, byId, element, colour, seriesColour, context };
+  return { put, load, imageUrl, thumbnailUrl, byId, element, colour, seriesColour, context };
 })();

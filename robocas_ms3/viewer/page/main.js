@@ -21,7 +21,7 @@
     episode.open(number);
   }
 
-  // Browsers refuse an address that changes with every picture: it follows when things rest.
+  // Browsers refuse an address that changes with every image: it follows when things rest.
   function stepped(step) {
     plots.cursor(step);
     space.cursor(step);

@@ -1,9 +1,9 @@
 "use strict";
-// The step that is looked at: pictures, timeline, playing.
+// The step that is looked at: images, timeline, playing.
 
 robocas.player = (() => {
-  const { byId, element, pictureUrl, seriesColour } = robocas;
-  const AHEAD = 3; // pictures fetched ahead while playing
+  const { byId, element, imageUrl, seriesColour } = robocas;
+  const AHEAD = 3; // images fetched ahead while playing
   let index = null;
   let episode = null;
   let step = 0;
@@ -18,7 +18,7 @@ robocas.player = (() => {
     frames = index.cameras.map((camera) => {
       const name = camera.replace(/^observation\.images\./, "").replaceAll("_", " ");
       const img = element("img", { alt: name });
-      const empty = element("span", { class: "faint", textContent: "no picture" });
+      const empty = element("span", { class: "faint", textContent: "no image" });
       const box = element("figure", {}, element("div", { class: "frame" }, img, empty), element("figcaption", { textContent: name }));
       byId("cameras").append(box);
       return { camera, img, empty, wanted: "" };
@@ -75,14 +75,14 @@ robocas.player = (() => {
     byId("goal").title = byId("goal").textContent;
     [...byId("goals").querySelectorAll("button")].forEach((button, number) => button.classList.toggle("now", number === now));
     byId("goals").querySelector("i").style.left = `${((step + 0.5) / episode.steps) * 100}%`;
-    pictures();
+    images();
     onStep(step);
   }
 
-  // A picture is put in once it is decoded, and only if nobody has moved on: no flicker.
-  function pictures() {
+  // An image is put in once it is decoded, and only if nobody has moved on: no flicker.
+  function images() {
     for (const frame of frames) {
-      const url = pictureUrl(episode.n, frame.camera, kind, step);
+      const url = imageUrl(episode.n, frame.camera, kind, step);
       if (frame.wanted === url) continue;
       frame.wanted = url;
       const next = new Image();
@@ -100,7 +100,7 @@ robocas.player = (() => {
     }
     const ahead = playing ? AHEAD : 1;
     for (let by = 1; by <= ahead && step + by < episode.steps; by += 1) {
-      for (const frame of frames) new Image().src = pictureUrl(episode.n, frame.camera, kind, step + by);
+      for (const frame of frames) new Image().src = imageUrl(episode.n, frame.camera, kind, step + by);
     }
   }
 
@@ -109,7 +109,7 @@ robocas.player = (() => {
     kind = wanted;
     byId("v-rgb").setAttribute("aria-pressed", kind === "rgb");
     byId("v-depth").setAttribute("aria-pressed", kind === "depth");
-    if (episode) pictures();
+    if (episode) images();
   }
 
   function toggle() {
@@ -123,7 +123,7 @@ robocas.player = (() => {
     const tick = (now) => {
       if (!playing) return;
       const ready = frames.every((frame) => frame.loaded === frame.wanted);
-      if (ready) time += ((now - before) / 1000) * Number(byId("speed").value); // slow pictures slow the clock
+      if (ready) time += ((now - before) / 1000) * Number(byId("speed").value); // slow images slow the clock
       before = now;
       let to = step;
       while (to < episode.steps - 1 && episode.times[to + 1] <= time) to += 1;

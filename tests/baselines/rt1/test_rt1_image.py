@@ -13,16 +13,16 @@ from robocas_ms3.core.errors import TrainingError
 from robocas_ms3.evaluation.policy import describe
 
 
-def rows_of(pictures):
-    """The number of each row of pictures made by `striped`: (N, h)."""
-    return pictures[:, 0, :, 0]
+def rows_of(images):
+    """The number of each row of images made by `striped`: (N, h)."""
+    return images[:, 0, :, 0]
 
 
 def striped(count, height=256, width=4):
-    """Pictures whose rows hold their own number, and whose last column holds 7."""
-    pictures = torch.arange(height, dtype=torch.uint8)[:, None].repeat(count, 3, 1, width)
-    pictures[..., -1] = 7
-    return pictures
+    """Images whose rows hold their own number, and whose last column holds 7."""
+    images = torch.arange(height, dtype=torch.uint8)[:, None].repeat(count, 3, 1, width)
+    images[..., -1] = 7
+    return images
 
 
 def test_acting_uses_the_middle_rows():
@@ -59,21 +59,21 @@ def test_film_by_hand():
 def test_language_changes_nothing_at_first_and_something_once_learned(config):
     torch.manual_seed(0)
     encoder = ImageEncoder(config)
-    pictures, words = torch.randn(2, 3, 40, 64), torch.randn(2, 384)
+    images, words = torch.randn(2, 3, 40, 64), torch.randn(2, 384)
     with torch.no_grad():
-        settle(encoder, pictures, words)
-        plain = encoder.features(pictures, torch.zeros(2, 384))
-        assert torch.equal(encoder.features(pictures, words), plain)
+        settle(encoder, images, words)
+        plain = encoder.features(images, torch.zeros(2, 384))
+        assert torch.equal(encoder.features(images, words), plain)
         # so it is transformers' EfficientNet, and the convolution after it
-        wanted = encoder.project(encoder.net(pictures).last_hidden_state)
+        wanted = encoder.project(encoder.net(images).last_hidden_state)
         assert torch.allclose(plain, wanted, atol=1e-6)
         for number in (0, len(encoder.films) - 1):
             encoder.films[number].told.weight.normal_(0, 0.1)
-            spoken = encoder.features(pictures, words)
+            spoken = encoder.features(images, words)
             assert not torch.allclose(spoken, plain, rtol=1e-3)
             encoder.films[number].told.weight.zero_()
         encoder.film.told.weight.normal_(0, 0.1)
-        assert not torch.allclose(encoder.features(pictures, words), plain, rtol=1e-3)
+        assert not torch.allclose(encoder.features(images, words), plain, rtol=1e-3)
 
 
 def test_token_learner_weighs_places():

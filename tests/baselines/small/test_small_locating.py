@@ -21,7 +21,7 @@ from robocas_ms3.baselines.small.localization import (
 from robocas_ms3.baselines.training.metrics import mean_of_sum
 from robocas_ms3.core.poses import from_parts, inverse, transform
 
-INTRINSIC = np.array([64.0, 64.0, 32.0, 24.0])  # of 64 x 48 pictures: 0.5 m to the side at 1 m is at the edge
+INTRINSIC = np.array([64.0, 64.0, 32.0, 24.0])  # of 64 x 48 images: 0.5 m to the side at 1 m is at the edge
 WHOLE = View(rendered=(64, 48), size=(64, 48))  # 8 x 6 cells
 
 

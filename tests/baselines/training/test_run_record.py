@@ -17,7 +17,7 @@ def test_a_trajectory_is_both_of_its_files(tmp_path):
     assert len({alone, hash_dataset(path)}) == 2
 
 
-def test_a_folder_is_its_arrays_and_sizes_of_pictures(tmp_path):
+def test_a_folder_is_its_arrays_and_sizes_of_images(tmp_path):
     for name, text in (("data_info.json", "{}"), ("episode_0/rgb/0.png", "abc"), ("preview/0.png", "a")):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)

@@ -10,8 +10,8 @@ def overhead(height, *, depth=None, size=80, shift=0.0):
     pose = np.diag([1.0, -1, -1, 1])
     pose[:3, 3] = shift, 0, height
     depth = height if depth is None else depth
-    picture = np.full((size, size), round(depth * 1000), np.uint16)
-    return View("overhead", picture, np.full(4, size / 2), pose)
+    image = np.full((size, size), round(depth * 1000), np.uint16)
+    return View("overhead", image, np.full(4, size / 2), pose)
 
 
 def test_points_by_hand():

@@ -13,7 +13,7 @@ from robocas_ms3.core.documents import DocumentError
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.conversion.episode_folder import find_damaged
-from robocas_ms3.datasets.images.image_files import Pictures, read_picture
+from robocas_ms3.datasets.images.image_files import ImageOptions, read_image
 from robocas_ms3.datasets.images.image_headers import LARGEST, read_header
 from robocas_ms3.datasets.manage.copy_episodes import FilePlacer
 from robocas_ms3.datasets.sources.reader import Dataset
@@ -22,12 +22,12 @@ from robocas_ms3.robots.cameras import STANDARD_NAMES
 from robocas_ms3.viewer.source import open_source
 
 EPISODE = "episode_0000001"
-PICTURES = ("base_camera/rgb/0002.png", "base_camera/depth/0003.png")
+IMAGES = ("base_camera/rgb/0002.png", "base_camera/depth/0003.png")
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_dataset_is_validated(dataset, kind):
-    names = {f"{EPISODE}/{name}" for name in PICTURES} | {f"{EPISODE}/scene.json"}
+    names = {f"{EPISODE}/{name}" for name in IMAGES} | {f"{EPISODE}/scene.json"}
     for name in names:
         replace_file(dataset / name, kind)
     files = [violation.file for violation in validate(dataset).violations]
@@ -40,8 +40,8 @@ def test_a_dataset_is_validated(dataset, kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_readers_of_pictures(dataset, kind):
-    paths = [replace_file(dataset / EPISODE / name, kind) for name in PICTURES]
+def test_readers_of_images(dataset, kind):
+    paths = [replace_file(dataset / EPISODE / name, kind) for name in IMAGES]
     source, content = Dataset(dataset).episode(1), open_source(dataset)
     for read in (source.rgb, lambda *place: content.rgb(1, *place)):
         with pytest.raises(DatasetError) as error:
@@ -59,8 +59,8 @@ def test_readers_of_other_files(dataset, tmp_path):
             open_trajectory(replace_file(tmp_path / "F.h5", kind))
         with pytest.raises(DocumentError):
             FilePlacer(link=False).place(replace_file(tmp_path / "F.h5", kind), tmp_path / "copy")
-        path = replace_file(dataset / EPISODE / PICTURES[0], kind)
-        assert find_damaged(dataset / EPISODE, Pictures(STANDARD_NAMES)) == path
+        path = replace_file(dataset / EPISODE / IMAGES[0], kind)
+        assert find_damaged(dataset / EPISODE, ImageOptions(STANDARD_NAMES)) == path
         path.unlink()
         shutil.copy(path.with_name("0001.png"), path)
 
@@ -77,20 +77,20 @@ def png_of(width, height):
 
 
 @pytest.mark.parametrize("size", [(LARGEST + 1, 1), (1, LARGEST + 1), (20_000, 20_000), (2**31 - 1, 2**31 - 1)])
-def test_pictures_of_too_many_pixels_are_not_decoded(tmp_path, monkeypatch, size):
+def test_images_of_too_many_pixels_are_not_decoded(tmp_path, monkeypatch, size):
     path = tmp_path / "a.png"
     path.write_bytes(png_of(*size))
-    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("the picture is decoded"))
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("the image is decoded"))
     with pytest.raises(DocumentError):
         read_header(path)
     with pytest.raises(DatasetError) as error:
-        read_picture(path)
+        read_image(path)
     assert error.value.where == path
 
 
-def test_pictures_of_the_greatest_size_are_read(tmp_path):
+def test_images_of_the_greatest_size_are_read(tmp_path):
     for suffix in (".png", ".jpg", ".webp"):
         path = tmp_path / f"a{suffix}"
         cv2.imwrite(str(path), np.zeros((2, LARGEST, 3), np.uint8))
         assert read_header(path).width == LARGEST
-        assert read_picture(path).shape == (2, LARGEST, 3)
+        assert read_image(path).shape == (2, LARGEST, 3)

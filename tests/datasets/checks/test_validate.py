@@ -85,7 +85,7 @@ def test_an_episode_without_steps(dataset):
     change(dataset, episode_length=np.array(0))
     violations = found(dataset)
     assert f"{NPZ}, episode_length: expected 1 to 10000 steps, found 0" in violations
-    assert any("rgb/0000.png: expected 0 pictures" in violation for violation in violations)
+    assert any("rgb/0000.png: expected 0 images" in violation for violation in violations)
 
 
 def damage_member(path):
@@ -108,13 +108,13 @@ def chunk(kind, data=b""):
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
-def test_a_picture_without_pixels(dataset):
+def test_a_image_without_pixels(dataset):
     """Each checksum is right, and there is nothing between header and end."""
     path = dataset / "episode_0000001" / "base_camera" / "depth" / "0000.png"
     head = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", 64, 48, 16, 0, 0, 0, 0))
     path.write_bytes(head + chunk(b"IEND"))
     place = "episode_0000001/base_camera/depth/0000.png"
-    assert found(dataset) == [f"{place}: expected a sound picture, found PNG without a picture"]
+    assert found(dataset) == [f"{place}: expected a sound image, found PNG without an image"]
     pixels = chunk(b"IDAT", b"no deflated data")
     path.write_bytes(head + pixels + chunk(b"IEND"))
     assert any(place in violation for violation in found(dataset))
@@ -168,7 +168,7 @@ def test_embeddings_in_one_episode_only(dataset):
     assert_only(dataset, "language_embedding: expected in all episodes or none, found in some")
 
 
-def test_pictures(dataset):
+def test_images(dataset):
     rgb = dataset / "episode_0000000" / "static_camera" / "rgb"
     depth = dataset / "episode_0000000" / "static_camera" / "depth"
     (rgb / "0002.png").unlink()
@@ -176,17 +176,17 @@ def test_pictures(dataset):
     data = (rgb / "0003.png").read_bytes()
     (rgb / "0003.png").write_bytes(data[:-20])
     (rgb / "0004.png").write_bytes(data[:200] + bytes([data[200] ^ 1]) + data[201:])
-    picture = cv2.imread(str(rgb / "0005.png"))
-    cv2.imwrite(str(rgb / "0005.png"), picture[:40])
+    image = cv2.imread(str(rgb / "0005.png"))
+    cv2.imwrite(str(rgb / "0005.png"), image[:40])
     cv2.imwrite(str(depth / "0006.png"), np.full((48, 64), 200, np.uint8))
     place = "episode_0000000/static_camera"
     assert sorted(found(dataset)) == [
         f"{place}/depth/0006.png: expected 64 x 48, 1 x 16 bit, found 64 x 48, 1 x 8 bit",
-        f"{place}/rgb/0002.png: expected a picture of every step, found no file",
-        f"{place}/rgb/0003.png: expected a sound picture, found PNG cut off",
-        f"{place}/rgb/0004.png: expected a sound picture, found damaged PNG",
+        f"{place}/rgb/0002.png: expected an image of every step, found no file",
+        f"{place}/rgb/0003.png: expected a sound image, found PNG cut off",
+        f"{place}/rgb/0004.png: expected a sound image, found damaged PNG",
         f"{place}/rgb/0005.png: expected 64 x 48, 3 x 8 bit, found 64 x 40, 3 x 8 bit",
-        f"{place}/rgb/0007.png: expected 7 pictures from 0000.png, found a file beyond them",
+        f"{place}/rgb/0007.png: expected 7 images from 0000.png, found a file beyond them",
     ]
 
 

@@ -15,7 +15,7 @@ from robocas_ms3.core.poses import from_xyzw
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.conversion.convert import convert
 from robocas_ms3.datasets.conversion.settings import ConversionSettings
-from robocas_ms3.datasets.images.image_files import Pictures
+from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.datasets.sources.file_models import SCENE_KEYS, DataInfoRecord
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
@@ -69,7 +69,7 @@ def test_arrays_are_those_of_the_sampled_states(made, trajectory):
     np.testing.assert_allclose(ee, motion.tcp_in_world, atol=1e-5)
 
 
-def test_pictures_are_what_was_seen(made, trajectory):
+def test_images_are_what_was_seen(made, trajectory):
     source = RayCaster({}, "pd_joint_pos", None)
     with TrajectoryFile(trajectory) as file:
         frame = list(source.frames(file.recording(2), np.array([0, 4, 8, 12, 16, 20, 22])))[3]
@@ -183,20 +183,20 @@ def test_every_episode_says_how_it_was_made(made, trajectory):
 
 
 @pytest.mark.parametrize("image_format", ["jpg", "webp"])
-def test_fewer_and_smaller_pictures(trajectory, tmp_path, image_format):
+def test_fewer_and_smaller_images(trajectory, tmp_path, image_format):
     out = tmp_path / "out"
-    pictures = Pictures(("static_camera", "base_camera"), (80, 60), depth=False, image_format=image_format)
-    run(trajectory, out, cameras=pictures.cameras, size=(80, 60), depth=False, image_format=image_format)
+    image_options = ImageOptions(("static_camera", "base_camera"), (80, 60), depth=False, image_format=image_format)
+    run(trajectory, out, cameras=image_options.cameras, size=(80, 60), depth=False, image_format=image_format)
     episode = Dataset(out).episode(1)
     assert (episode.cameras, episode.has_depth, episode.image_format) == (
         ("base_camera", "static_camera"),
         False,
         image_format,
     )
-    frame = next(RayCaster({}, "", pictures).frames(recording(trajectory, 2), np.array([8])))
+    frame = next(RayCaster({}, "", image_options).frames(recording(trajectory, 2), np.array([8])))
     difference = episode.rgb("base_camera", 2).astype(int) - frame.rgb["base_camera"]
     assert episode.rgb("base_camera", 2).shape == (60, 80, 3)
-    assert np.abs(difference).mean() < 4  # lossy, but the same picture
+    assert np.abs(difference).mean() < 4  # lossy, but the same image
     assert validate(out).violations == []
 
 

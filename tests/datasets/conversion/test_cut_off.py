@@ -11,7 +11,7 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.conversion.episode_folder import find_damaged
 from robocas_ms3.datasets.conversion.settings import ConversionSettings
-from robocas_ms3.datasets.images.image_files import Pictures
+from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.robots.cameras import STANDARD_NAMES
 
 FILES = (
@@ -44,9 +44,9 @@ def whole(trajectory, tmp_path_factory):
 def test_each_file_is_found(whole, tmp_path, name, left):
     out = shutil.copytree(whole, tmp_path / "out")
     harm(out / "episode_0000001" / name, left)
-    pictures = Pictures(STANDARD_NAMES)
-    assert find_damaged(out / "episode_0000000", pictures) is None
-    assert find_damaged(out / "episode_0000001", pictures) == out / "episode_0000001" / name
+    image_options = ImageOptions(STANDARD_NAMES)
+    assert find_damaged(out / "episode_0000000", image_options) is None
+    assert find_damaged(out / "episode_0000001", image_options) == out / "episode_0000001" / name
     assert any(name.rpartition("/")[2] in str(violation) for violation in validate(out).violations)
 
 
@@ -61,15 +61,15 @@ def test_its_episode_is_written_again(whole, trajectory, tmp_path, caplog):
 
 
 @pytest.mark.parametrize("image_format", ["png", "jpg", "webp"])
-def test_pictures_of_each_format(trajectory, tmp_path, image_format):
-    pictures = Pictures(("base_camera",), image_format=image_format, depth=False)
+def test_images_of_each_format(trajectory, tmp_path, image_format):
+    image_options = ImageOptions(("base_camera",), image_format=image_format, depth=False)
     run(trajectory, tmp_path / "out", cameras=("base_camera",), image_format=image_format, depth=False)
     folder = tmp_path / "out" / "episode_0000000"
-    assert find_damaged(folder, pictures) is None
+    assert find_damaged(folder, image_options) is None
     for left in (0.9, 0):
         path = folder / "base_camera" / "rgb" / f"0002.{image_format}"
         harm(path, left)
-        assert find_damaged(folder, pictures) == path
+        assert find_damaged(folder, image_options) == path
 
 
 def test_a_split_that_is_cut_off_is_made_anew_if_one_wants(whole, trajectory, tmp_path):

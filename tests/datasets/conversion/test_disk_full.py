@@ -74,7 +74,7 @@ def ends_in_one_line(command, capsys):
 
 
 @pytest.fixture
-def made_up_pictures(monkeypatch):
+def made_up_images(monkeypatch):
     monkeypatch.setattr(conversion, "convert", render_by(RayCaster, conversion.convert))
 
 
@@ -88,14 +88,14 @@ PYTHON = {
 @pytest.mark.parametrize(
     ("name", "last", "episodes"),
     [
-        ("write_bytes", 1, 0),  # the first picture
+        ("write_bytes", 1, 0),  # the first image
         ("write_bytes", 60, 1),  # one of the second episode; the first has 42
         ("savez", 2, 1),
         ("write_text", 3, 1),  # scene.json of the second episode
         ("write_text", 4, 2),  # data_info.json
     ],
 )
-def test_a_conversion(trajectory, made_up_pictures, tmp_path, monkeypatch, capsys, name, last, episodes):
+def test_a_conversion(trajectory, made_up_images, tmp_path, monkeypatch, capsys, name, last, episodes):
     out, source = tmp_path / "out", files_of(trajectory.parent)
     command = ["convert", str(trajectory), "--out", str(out), "--no-embeddings", "--no-video"]
     with monkeypatch.context() as patch:

@@ -15,7 +15,7 @@ from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.conversion.convert import convert
 from robocas_ms3.datasets.conversion.env_renderer import EnvRenderer
 from robocas_ms3.datasets.conversion.settings import ConversionSettings
-from robocas_ms3.datasets.images.image_files import Pictures
+from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
 
 ENV_ID = "robocas_ms3:RoboCASPick-v1"
@@ -78,7 +78,7 @@ def recording(recorded):
 @pytest.fixture(scope="module")
 def source(recorded, recording):
     with TrajectoryFile(recorded[0]) as file:
-        frames = EnvRenderer(file.env, "pd_joint_pos", Pictures(size=SIZE))
+        frames = EnvRenderer(file.env, "pd_joint_pos", ImageOptions(size=SIZE))
     frames.load(recording)
     yield frames
     frames.close()
@@ -106,7 +106,7 @@ def test_states_look_as_they_did(source, recording, recorded):
 def test_boxes_hold_the_target(recorded, recording):
     """Where the target's centre is visible in an image, it is in the target's box."""
     with TrajectoryFile(recorded[0]) as file:
-        frames = EnvRenderer(file.env, "pd_joint_pos", Pictures(size=SIZE, boxes=True))
+        frames = EnvRenderer(file.env, "pd_joint_pos", ImageOptions(size=SIZE, boxes=True))
     frames.load(recording)
     frame = shown(frames, recording, 0)
     base, cameras = frames.env.unwrapped, frames.cameras()

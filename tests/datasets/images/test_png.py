@@ -8,14 +8,14 @@ import pytest
 from PIL import Image
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.datasets.images.image_files import read_picture, write_picture
+from robocas_ms3.datasets.images.image_files import read_image, write_image
 from robocas_ms3.datasets.images.image_headers import read_header
 from robocas_ms3.datasets.images.png import encode_png
 
 RGB, DEPTH = (np.uint8, (3,)), (np.uint16, ())
 
 
-def pictures(kind, height, width):
+def arrays(kind, height, width):
     dtype, channels = kind
     top = np.iinfo(dtype).max
     shape = (height, width, *channels)
@@ -29,22 +29,22 @@ def pictures(kind, height, width):
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (3, 1), (1, 5), (16, 16), (17, 31), (120, 161)])
 @pytest.mark.parametrize("kind", [RGB, DEPTH], ids=["rgb", "depth"])
 def test_decodes_to_the_same(kind, height, width, tmp_path):
-    for picture in pictures(kind, height, width):
-        data = encode_png(picture)
+    for pixels in arrays(kind, height, width):
+        data = encode_png(pixels)
         decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-        seen = decoded[..., ::-1] if picture.ndim == 3 else decoded
-        assert seen.dtype == picture.dtype
-        np.testing.assert_array_equal(seen, picture)
+        seen = decoded[..., ::-1] if pixels.ndim == 3 else decoded
+        assert seen.dtype == pixels.dtype
+        np.testing.assert_array_equal(seen, pixels)
         with Image.open(io.BytesIO(data)) as image:
-            np.testing.assert_array_equal(np.asarray(image, picture.dtype), picture)
-        path = tmp_path / "picture.png"
-        write_picture(path, picture)
-        np.testing.assert_array_equal(read_picture(path), picture)
+            np.testing.assert_array_equal(np.asarray(image, pixels.dtype), pixels)
+        path = tmp_path / "image.png"
+        write_image(path, pixels)
+        np.testing.assert_array_equal(read_image(path), pixels)
         header = read_header(path)  # its checksums too
         assert (header.width, header.height, header.bits * header.channels) == (
             width,
             height,
-            24 if picture.ndim == 3 else 16,
+            24 if pixels.ndim == 3 else 16,
         )
 
 
@@ -53,25 +53,25 @@ def test_of_views(tmp_path):
     rgba = np.random.default_rng(0).integers(0, 256, (40, 30, 4), np.uint8)
     depth = np.random.default_rng(0).integers(0, 2**16, (40, 30), np.uint16)
     for view in (rgba[::-1, ::2, :3], depth.T, depth[::2, ::-1]):
-        write_picture(tmp_path / "view.png", view)
-        np.testing.assert_array_equal(read_picture(tmp_path / "view.png"), view)
+        write_image(tmp_path / "view.png", view)
+        np.testing.assert_array_equal(read_image(tmp_path / "view.png"), view)
 
 
 def test_size_is_that_of_opencv():
-    """Of pictures like rendered ones, shaded and grained, at the level and filter that it takes for fast."""
+    """Of images like rendered ones, shaded and grained, at the level and filter that it takes for fast."""
     rng = np.random.default_rng(0)
     shades = cv2.GaussianBlur(rng.normal(128, 2000, (240, 320, 3)), (0, 0), 12)
     rgb = np.clip(shades + rng.normal(0, 2, shades.shape), 0, 255).astype(np.uint8)
     rows, columns = np.mgrid[:240, :320]
     planes = 1 / (0.4 + rows / 500 + columns / 3000), 1 / (0.2 + rows / 9000 + columns / 1000)
     depth = (1000 * np.minimum(*planes)).astype(np.uint16)  # a table before a wall, as seen from aslant
-    for picture in (rgb, depth):
-        opencvs = len(cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1])
-        assert len(encode_png(picture)) < 1.1 * opencvs
+    for pixels in (rgb, depth):
+        opencvs = len(cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1])
+        assert len(encode_png(pixels)) < 1.1 * opencvs
 
 
 @pytest.mark.parametrize(
-    "picture",
+    "pixels",
     [
         np.zeros((4, 5), np.uint8),
         np.zeros((4, 5, 4), np.uint8),
@@ -80,9 +80,9 @@ def test_size_is_that_of_opencv():
         np.zeros((0, 5), np.uint16),
         np.zeros((5, 0, 3), np.uint8),
     ],
-    ids=lambda picture: f"{picture.dtype}{picture.shape}",
+    ids=lambda pixels: f"{pixels.dtype}{pixels.shape}",
 )
-def test_of_other_pictures_there_is_none(picture, tmp_path):
-    with pytest.raises(DatasetError, match="can't encode this picture"):
-        write_picture(tmp_path / "a.png", picture)
+def test_of_other_images_there_is_none(pixels, tmp_path):
+    with pytest.raises(DatasetError, match="can't encode this image"):
+        write_image(tmp_path / "a.png", pixels)
     assert list(tmp_path.iterdir()) == []

@@ -18,7 +18,7 @@ from robocas_ms3.datasets.sources.reader import Dataset
 
 
 @pytest.fixture
-def made_up_pictures(monkeypatch):
+def made_up_images(monkeypatch):
     monkeypatch.setattr(conversion, "convert", render_by(RayCaster, conversion.convert))
 
 
@@ -34,7 +34,7 @@ def shown(out):
 def test_shows_what_the_dataset_holds(trajectory, tmp_path, monkeypatch):
     out, settings = tmp_path / "out", {"embeddings": False, "open_renderer": RayCaster}
     with monkeypatch.context() as patch:
-        patch.delattr("robocas_ms3.datasets.sources.reader.read_picture")  # no image is read back
+        patch.delattr("robocas_ms3.datasets.sources.reader.read_image")  # no image is read back
         conversion.convert(ConversionSettings(trajectory, out, **settings))
         conversion.convert(ConversionSettings(trajectory, tmp_path / "by processes", jobs=2, **settings))
     assert files_of(tmp_path / "by processes") == files_of(out)
@@ -51,12 +51,12 @@ def test_shows_what_the_dataset_holds(trajectory, tmp_path, monkeypatch):
             drawn = EpisodeDrawing(number, episode.arrays, 5).frame(step, images, PREVIEW_PANEL)
             assert frame.shape == drawn.shape == (PREVIEW_PANEL[1] + 64, 3 * PREVIEW_PANEL[0], 3)
             assert np.abs(frame.astype(int) - drawn).mean() < 4, "H.264 loses little"
-    of_pictures = np.asarray(Image.open(contact_sheet(Dataset(out), tmp_path / "sheet.png")))
-    np.testing.assert_array_equal(np.asarray(Image.open(out / "preview" / "contact_sheet.png")), of_pictures)
+    of_images = np.asarray(Image.open(contact_sheet(Dataset(out), tmp_path / "sheet.png")))
+    np.testing.assert_array_equal(np.asarray(Image.open(out / "preview" / "contact_sheet.png")), of_images)
     assert validate(out).violations == []
 
 
-def test_of_what_is_new(made_up_pictures, tmp_path):
+def test_of_what_is_new(made_up_images, tmp_path):
     out, sheets, times = tmp_path / "out", [], []
     for name, seeds, flags in (("a", (1, 2), ()), ("b", (3,), ("--append",)), ("b", (3,), ("--append",))):
         assert converted(tmp_path / f"{name}.h5", out, *flags, seeds=seeds) == 0
@@ -67,11 +67,11 @@ def test_of_what_is_new(made_up_pictures, tmp_path):
     assert times[1][:2] == times[0]
     assert times[2] == times[1]
     assert sheets[1] == sheets[2] == 1.5 * sheets[0]
-    of_pictures = np.asarray(Image.open(contact_sheet(Dataset(out), tmp_path / "sheet.png")))
-    np.testing.assert_array_equal(np.asarray(Image.open(sheet)), of_pictures)
+    of_images = np.asarray(Image.open(contact_sheet(Dataset(out), tmp_path / "sheet.png")))
+    np.testing.assert_array_equal(np.asarray(Image.open(sheet)), of_images)
 
 
-def test_of_many_episodes_on_request(made_up_pictures, tmp_path, monkeypatch, capsys):
+def test_of_many_episodes_on_request(made_up_images, tmp_path, monkeypatch, capsys):
     hint = "no videos of so many episodes: --all-videos"
     monkeypatch.setattr(conversion, "FEW", 2)  # of 20 they take seconds
     monkeypatch.setattr(video, "SHEET", 2)
@@ -89,7 +89,7 @@ def test_of_many_episodes_on_request(made_up_pictures, tmp_path, monkeypatch, ca
     assert shown(tmp_path / "two") == ["contact_sheet.png", *videos[:2]]
 
 
-def test_none_where_they_are_not_wanted(trajectory, made_up_pictures, tmp_path, capsys):
+def test_none_where_they_are_not_wanted(trajectory, made_up_images, tmp_path, capsys):
     assert converted(trajectory, tmp_path / "out", "--no-video") == 0
     assert shown(tmp_path / "out") == []
     assert "video" not in capsys.readouterr().out
@@ -101,15 +101,15 @@ def test_none_where_they_are_not_wanted(trajectory, made_up_pictures, tmp_path, 
 def test_a_failed_episode_has_none(trajectory, tmp_path, monkeypatch):
     from robocas_ms3.datasets.conversion import episode_folder
 
-    done, write = [], episode_folder.write_picture
+    done, write = [], episode_folder.write_image
 
-    def failing(path, picture):
+    def failing(path, image):
         done.append(path)
         if len(done) > 50:  # in the second episode
             raise OSError(28, "No space left on device")
-        return write(path, picture)
+        return write(path, image)
 
-    monkeypatch.setattr(episode_folder, "write_picture", failing)
+    monkeypatch.setattr(episode_folder, "write_image", failing)
     with pytest.raises(OSError, match="No space left"):
         conversion.convert(
             ConversionSettings(trajectory, tmp_path / "out", embeddings=False, all_videos=True, open_renderer=RayCaster)

@@ -83,7 +83,7 @@ def test_files_roll_over_at_their_limits(trajectory, tmp_path, monkeypatch):
         assert check_lerobot(tmp_path / name).violations == []
 
 
-def test_fewer_pictures_and_another_rate(trajectory, tmp_path):
+def test_fewer_images_and_another_rate(trajectory, tmp_path):
     out = tmp_path / "out"
     convert(trajectory, out, rate_hz=10, cameras=("static_camera",), size=(80, 60), depth=False)
     dataset = LeRobotDataset(out)
@@ -182,7 +182,7 @@ def shrink(path, size):
 @pytest.mark.parametrize(
     ("episode", "camera", "kind", "step"), [(0, "base_camera", "rgb", 1), (1, "static_camera", "depth", 6)]
 )
-def test_a_picture_of_another_size(dataset, tmp_path, episode, camera, kind, step):
+def test_a_image_of_another_size(dataset, tmp_path, episode, camera, kind, step):
     """An encoder would scale it without a word; what is not taken is not looked at."""
     folder = dataset / f"episode_{episode:07d}"
     shrink(folder / camera / kind / f"{step:04d}.png", (48, 64))

@@ -268,8 +268,8 @@ def test_command(copy, tmp_path, capsys):
     report = json.loads(capsys.readouterr().out)
     assert report["left_out"] == [2]
     assert report == read(out / "import_report.json")
-    picture = "episode_0000001/base_camera/rgb/0003.png"
-    assert (root / picture).stat().st_ino == (out / picture).stat().st_ino
+    image = "episode_0000001/base_camera/rgb/0003.png"
+    assert (root / image).stat().st_ino == (out / image).stat().st_ino
     assert run(["import-robocas", str(root), "--out", str(out)]) == 0
     assert "3 episodes, 3 kept" in capsys.readouterr().out
     assert run(["import-robocas", str(root), "--out", str(out), "--rate", "10"]) == 1

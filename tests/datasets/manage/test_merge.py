@@ -48,12 +48,12 @@ def test_episodes_follow_each_other_and_keep_their_side(parts, tmp_path):
 
 
 def test_files_are_shared_unless_copied(parts, tmp_path):
-    picture = "episode_0000001/base_camera/rgb/0003.png"
+    pixels = "episode_0000001/base_camera/rgb/0003.png"
     merge([parts[0]], tmp_path / "linked")
     merge([parts[0]], tmp_path / "copied", options=CopyOptions(link=False))
-    inode = (parts[0] / picture).stat().st_ino
-    assert (tmp_path / "linked" / picture).stat().st_ino == inode
-    assert (tmp_path / "copied" / picture).stat().st_ino != inode
+    inode = (parts[0] / pixels).stat().st_ino
+    assert (tmp_path / "linked" / pixels).stat().st_ino == inode
+    assert (tmp_path / "copied" / pixels).stat().st_ino != inode
     assert files_of(tmp_path / "linked") == files_of(tmp_path / "copied")
 
 

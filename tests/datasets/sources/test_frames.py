@@ -1,4 +1,4 @@
-"""Pictures of steps in a run: the same as one by one, and each video closed whatever happens."""
+"""Images of steps in a run: the same as one by one, and each video closed whatever happens."""
 
 import errno
 import inspect
@@ -60,8 +60,8 @@ def test_a_run_is_what_its_steps_are_one_by_one(folders, name, kind):
         for span, steps in (((), range(STEPS)), ((3,), range(3, STEPS)), ((1, 4), range(1, 5)), ((2, 0), ())):
             run = list(episode.frames(camera, kind, *span))
             assert len(run) == len(steps)
-            for picture, step in zip(run, steps, strict=True):
-                np.testing.assert_array_equal(picture, alone[step])
+            for image, step in zip(run, steps, strict=True):
+                np.testing.assert_array_equal(image, alone[step])
 
 
 def test_cameras_in_step_are_closed_with_the_run(lerobot, runs):
@@ -72,19 +72,19 @@ def test_cameras_in_step_are_closed_with_the_run(lerobot, runs):
     assert not all_closed(runs)
     run.close()
     assert all_closed(runs)
-    for step, pictures in enumerate(seen):
-        assert list(pictures) == list(CAMERAS)
+    for step, image_options in enumerate(seen):
+        assert list(image_options) == list(CAMERAS)
         for camera in CAMERAS:
-            np.testing.assert_array_equal(pictures[camera], episode.depth(camera, step))
+            np.testing.assert_array_equal(image_options[camera], episode.depth(camera, step))
 
 
 def test_a_conversion_that_fails_leaves_no_video_open(lerobot, tmp_path, runs, monkeypatch):
     add = video.Encoder.add
 
-    def full(self, picture):
+    def full(self, image):
         if self.frames == 2:
             raise OSError(errno.ENOSPC, "no space left")
-        add(self, picture)
+        add(self, image)
 
     monkeypatch.setattr(video.Encoder, "add", full)
     with pytest.raises(OSError, match="No space left"):
@@ -93,5 +93,5 @@ def test_a_conversion_that_fails_leaves_no_video_open(lerobot, tmp_path, runs, m
     assert all_closed(runs)
 
 
-def test_an_episode_without_cameras_has_steps_without_pictures():
+def test_an_episode_without_cameras_has_steps_without_images():
     assert list(shots(SimpleNamespace(steps=2), ())) == [{}, {}]

@@ -1,4 +1,4 @@
-"""Statistics of a dataset: counts worked out by hand, pictures that are there, bad input."""
+"""Statistics of a dataset: counts worked out by hand, images that are there, bad input."""
 
 import json
 import shutil
@@ -15,7 +15,7 @@ from robocas_ms3.core.errors import DatasetError, MissingExtraError
 from robocas_ms3.datasets.actions import ACTION_NAMES
 from robocas_ms3.datasets.statistics.collect import collect, described, histogram
 from robocas_ms3.datasets.statistics.layouts import Placement, Surface, layout_map
-from robocas_ms3.datasets.statistics.plots import PICTURES, write_stats
+from robocas_ms3.datasets.statistics.plots import IMAGES, write_stats
 
 TABLE = Surface("table, top", x=0.9, y=1.0, yaw=-np.pi / 2, region=[[0.0, -0.1], [0.1, 0.1]])
 CONFIG = {
@@ -109,16 +109,16 @@ def test_datasets_that_do_not_say_how_they_were_made(dataset, tmp_path):
     assert names == ["stats.json", "lengths.png", "instructions.png", "actions.png", "subgoals.png"]
 
 
-def test_pictures_and_json(told, tmp_path, capsys):
+def test_images_and_json(told, tmp_path, capsys):
     out = tmp_path / "out"
     assert main(Command(told, out=out)) == 0
-    assert sorted(path.name for path in out.iterdir()) == sorted(["stats.json", *(f"{name}.png" for name in PICTURES)])
-    for name in PICTURES:
+    assert sorted(path.name for path in out.iterdir()) == sorted(["stats.json", *(f"{name}.png" for name in IMAGES)])
+    for name in IMAGES:
         pixels = np.asarray(Image.open(out / f"{name}.png").convert("L"))
         assert (pixels < 200).mean() > 0.002, f"{name} is blank"
     line = capsys.readouterr().out.strip()
     assert "2 episodes (pick 2), 14 steps" in line
-    assert line.endswith(f"{out}: stats.json and 6 pictures")
+    assert line.endswith(f"{out}: stats.json and 6 images")
     assert main(Command(told, json=True)) == 0
     assert json.loads(capsys.readouterr().out) == json.loads((out / "stats.json").read_text())
     assert not (told / "preview").exists()
@@ -132,7 +132,7 @@ def test_texts_with_dollars_and_control_characters_are_labels(told, tmp_path):
     stats.lengths[text] = stats.lengths["pick"]
     stats.subgoals[text] = stats.subgoals["move and grasp"]
     names = [path.name for path in write_stats(stats, tmp_path / "out")]
-    assert names == ["stats.json", *(f"{name}.png" for name in PICTURES)]
+    assert names == ["stats.json", *(f"{name}.png" for name in IMAGES)]
 
 
 def test_the_default_folder_is_next_to_a_trajectory(trajectory, tmp_path):

@@ -22,7 +22,7 @@ from robocas_ms3.datasets.actions import ActionScale, episode_actions
 from robocas_ms3.datasets.training.options import SampleOptions
 
 CAMERAS = ("base_camera", "gripper_camera")
-SMALL = (32, 24)  # half of the synthetic pictures
+SMALL = (32, 24)  # half of the synthetic images
 
 
 def naive_euler_xyz(x, y, z, w):
@@ -43,13 +43,13 @@ def naive_sample(root, number, t, horizon, chunk, padding):
     folder = root / f"episode_{number:07d}"
     info = np.load(folder / "episode_info.npz")
     length = int(info["episode_length"])
-    pictures, state, observed, actions, acted = [], [], [], [], []
+    image_options, state, observed, actions, acted = [], [], [], [], []
     for step in range(t - horizon + 1, t + chunk):
         if step <= t:
             observed.append(step >= 0)
             blank = step < 0 and padding == "zero"
             files = [folder / camera / "rgb" / f"{max(step, 0):04d}.png" for camera in CAMERAS]
-            pictures.append([naive_halved(file).transpose(2, 0, 1) * (not blank) for file in files])
+            image_options.append([naive_halved(file).transpose(2, 0, 1) * (not blank) for file in files])
             row = [*info["ee_pos"][max(step, 0)], *info["ee_orn"][max(step, 0)], info["gripper_width"][max(step, 0)]]
             state.append([0.0] * 8 if blank else row)
         inside = 0 <= step <= length - 2
@@ -62,7 +62,7 @@ def naive_sample(root, number, t, horizon, chunk, padding):
             actions.append([0.0] * 7)
         else:
             actions.append([0.0] * 6 + [float(info["gripper_status"][0 if step < 0 else length - 1])])
-    return dict(rgb=pictures, state=state, observation_mask=observed, action=actions, action_mask=acted)
+    return dict(rgb=image_options, state=state, observation_mask=observed, action=actions, action_mask=acted)
 
 
 @pytest.mark.parametrize(
@@ -129,7 +129,7 @@ def test_normalised_by_the_overviews_ranges(made):
         np.testing.assert_allclose(seen["action"], scale.encode(raw["action"].numpy()), atol=1e-6)
 
 
-def test_depth_pictures_as_they_are_and_floats(made):
+def test_depth_images_as_they_are_and_floats(made):
     options = dict(split="all", observation_horizon=2, cameras=("static_camera",), depth=True)
     whole = RoboCASDataset(made, SampleOptions(size=None, **options))[3]
     shot = np.asarray(Image.open(made / "episode_0000000/static_camera/depth/0003.png"))
@@ -272,17 +272,17 @@ def first_item(root, **options):
     return RoboCASDataset(root, SampleOptions(split="all", observation_horizon=1, **options))[0]
 
 
-def test_damaged_pictures(dataset):
+def test_damaged_images(dataset):
     shot = dataset / "episode_0000000/base_camera/rgb/0000.png"
     grey = Image.open(shot).convert("L")
     shot.write_bytes(shot.read_bytes()[:100])
-    with pytest.raises(DatasetError, match=r"0000\.png: this picture is damaged"):
+    with pytest.raises(DatasetError, match=r"0000\.png: this image is damaged"):
         first_item(dataset)
     grey.save(shot)
     with pytest.raises(DatasetError, match=r"not an image of this kind.*\(48, 64\) uint8"):
         first_item(dataset)
     shot.unlink()
-    with pytest.raises(DatasetError, match=r"0000\.\w+: can't read this picture"):
+    with pytest.raises(DatasetError, match=r"0000\.\w+: can't read this image"):
         first_item(dataset)
 
 

@@ -55,7 +55,7 @@ def test_files_are_those_of_maniskills_recorder(tmp_path, obs_mode, mode):
     compare(gym.make("RoboCASPick-v1", obs_mode=obs_mode, control_mode=mode, render_backend="none"), mode, tmp_path)
 
 
-def test_pictures_are_those_of_maniskills_recorder(tmp_path, needs_renderer):
+def test_images_are_those_of_maniskills_recorder(tmp_path, needs_renderer):
     small = {"width": 16, "height": 12}
     env = gym.make("RoboCASPick-v1", obs_mode="rgb+depth", control_mode="pd_joint_pos", sensor_configs=small)
     compare(env, "pd_joint_pos", tmp_path)

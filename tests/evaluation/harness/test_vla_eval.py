@@ -20,7 +20,7 @@ ACT = {"actions": np.array([1, 0, 0, 0, 0, 0, 1], np.float32)}
 
 
 class Recorder:
-    """Keeps pictures."""
+    """Keeps images."""
 
     def __init__(self) -> None:
         self.frames: list[Any] = []

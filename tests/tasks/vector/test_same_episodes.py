@@ -118,14 +118,14 @@ def test_envs_that_keep_their_objects_have_those_of_gym_make():
 
 
 @slow
-def test_pictures(needs_renderer):
+def test_images(needs_renderer):
     small = {"obs_mode": "rgb", "render_backend": "cpu", "sensor_configs": {"width": 32, "height": 24}}
     with closing(make(2, 1, **small)) as env:
         obs, _ = env.reset(seed=0)
-        picture = obs["sensor_data"]["static_camera"]["rgb"]
-        assert (picture.shape, picture.dtype) == ((2, 24, 32, 3), torch.uint8)
+        image = obs["sensor_data"]["static_camera"]["rgb"]
+        assert (image.shape, image.dtype) == ((2, 24, 32, 3), torch.uint8)
         plain = gym.make("RoboCASPick-v1", **{**STATE_ONLY, **small})
         for seed in (0, 1):
             alone = plain.reset(seed=seed)[0]["sensor_data"]["static_camera"]["rgb"][0]
-            assert torch.equal(picture[seed], alone)
+            assert torch.equal(image[seed], alone)
         plain.close()
