@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 import robocas_ms3
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
-from robocas_ms3.evaluation.protocol import Episode, load_protocol
+from robocas_ms3.evaluation.protocol import ProtocolEpisode, load_protocol
 from robocas_ms3.evaluation.rollout import rollout
 from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
@@ -123,7 +123,7 @@ def alone(env: Any, seeds: list[int], steps: int) -> float:
     return cpu(env) - before
 
 
-def evaluated(session: EvaluationSession, episodes: list[Episode], steps: int) -> float:
+def evaluated(session: EvaluationSession, episodes: list[ProtocolEpisode], steps: int) -> float:
     """CPU seconds of the evaluation's loop from the first step on."""
     batch = session.open(episodes[0], len(episodes), steps)
     policy = Counting(batch.env)

@@ -136,7 +136,7 @@ def main() -> None:
 def remember(out: Path, kept: Path) -> results.Result:
     """What comes of the episodes in an evaluation of ours; what was seen and done there is kept in a file."""
     policy, protocol, arrays = Remembering(), load_protocol("smoke"), {}
-    settings = EvaluationSettings(tuple(TASKS), "scripted-motions", "smoke", out, envs=1, backend="processes")
+    settings = EvaluationSettings(tuple(TASKS), "scripted-ee-delta", "smoke", out, envs=1, backend="processes")
     for outcome in EvaluationSession(policy, settings).run():
         steps, episode = policy.kept[outcome.episode], protocol.episodes[outcome.episode]
         number = sum(one.config == episode.config for one in protocol.episodes[: episode.episode])

@@ -26,7 +26,7 @@ case $task in
     pick) parts=("100 0 pick pick_upstream_eval") ;;
     select) parts=("30 0 select select_fruits_orderly" "70 0 pick pick_fruits_alike") ;;
     search) # one heap in ten takes half of the time, unless it is given up early
-        parts=("65 0 pick pick_heap" "13 80000 pick pick_heap scripted-beside" "22 10000 search search_upstream_eval")
+        parts=("65 0 pick pick_heap" "13 80000 pick pick_heap scripted-perturbed" "22 10000 search search_upstream_eval")
         played=search attempts=3 count=920 steps=3000 start=small ;;
     *) fail "which task? bash scripts/reproduce_small.sh pick|select|search [FOLDER]" ;;
 esac

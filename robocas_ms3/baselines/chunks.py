@@ -183,7 +183,7 @@ class ChunkPolicy:
         reopen: float = 0.0,
         about: dict[str, Any] | None = None,
     ) -> None:
-        self.spec, self._predict, self._about = replace(spec, look_every=play), predict, about or {}
+        self.spec, self._predict, self._about = replace(spec, observe_every=play), predict, about or {}
         self._play, self._fade, self._reopen = play, fade, reopen
         self._plans: dict[int, list[_Plan]] = {}  # by env, newest first
         self._chunk_start: dict[int, Array] = {}  # by env, (3,) where the TCP was in the arm's base

@@ -22,7 +22,7 @@ class ServePolicy:
     """
 
     policy: Annotated[str, tyro.conf.Positional]
-    """Policy, as in robocas eval: scripted, random, still, replay:TRAJECTORY.h5, a folder of robocas train, or
+    """Policy, as in robocas eval: scripted, random, noop, replay:TRAJECTORY.h5, a folder of robocas train, or
     module:Class of your own."""
     host: str = "127.0.0.1"
     """Address to listen on; 0.0.0.0: all addresses of this machine."""

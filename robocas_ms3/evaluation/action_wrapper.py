@@ -30,7 +30,7 @@ RAISED = 0.03  # m above where it stood (evaluation_v0.md)
 _STIFFNESS, _DAMPING = 1e8, 1e5
 
 
-class PolicyStepping(gym.Wrapper):
+class PolicyActionWrapper(gym.Wrapper):
     """Execute the actions of a policy, and add measures to ``info`` (`metrics`), for one env or a batch.
 
     Args:
@@ -56,7 +56,7 @@ class PolicyStepping(gym.Wrapper):
         self._weld = Weld(self._base) if weld else None
         self._open = np.ones(count, dtype=bool)  # whether the last command of each gripper was to open
         self._width_change = np.zeros(count)  # m in the last control step
-        self._image_period, self._steps = spec.look_every, np.zeros(count, dtype=np.int64)  # steps by env
+        self._image_period, self._steps = spec.observe_every, np.zeros(count, dtype=np.int64)  # steps by env
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         if self._weld:

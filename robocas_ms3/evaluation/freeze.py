@@ -26,8 +26,8 @@ from robocas_ms3.evaluation.protocol import (
     NO_RULES,
     RULES,
     TRAIN,
-    Episode,
     Protocol,
+    ProtocolEpisode,
 )
 from robocas_ms3.robots.registry import DEFAULT
 from robocas_ms3.scenes.config import TaskConfig, load_task_config, shipped_configs
@@ -164,9 +164,9 @@ def _scenes(part: ProtocolPart, config: TaskConfig, pack: str) -> Iterator[tuple
         env.close()
 
 
-def _episode(number: int, part: ProtocolPart, seed: int, layout: Layout, env: RoboCASEnv) -> Episode:
+def _episode(number: int, part: ProtocolPart, seed: int, layout: Layout, env: RoboCASEnv) -> ProtocolEpisode:
     p_vis = float(layout.visible_shares[layout.target])
-    return Episode(
+    return ProtocolEpisode(
         episode=number,
         task=env.SPEC.name,
         config=part.file,

@@ -86,7 +86,7 @@ class PolicySpec:
         depth: whether images come with depth.
         state: whether it observes privileged state (docs/rl.md).
         language: form of the instruction.
-        look_every: number of steps between two images that it looks at, from the first step on; those in between may
+        observe_every: number of steps between two images that it looks at, from the first step on; those in between may
             be black, as rendering is most of the cost of an evaluation. Its chunks have a multiple of this length.
     """
 
@@ -99,7 +99,7 @@ class PolicySpec:
     depth: bool = False
     state: bool = False
     language: Language = "text"
-    look_every: int = 1
+    observe_every: int = 1
 
     def __post_init__(self) -> None:
         wrong_cameras = [name for name in self.cameras if not re.fullmatch(CAMERA_NAME, name)]
@@ -108,7 +108,7 @@ class PolicySpec:
             ("reference", self.reference in get_args(Reference), f"one of {list(get_args(Reference))}"),
             ("language", self.language in get_args(Language), f"one of {list(get_args(Language))}"),
             ("cameras", not wrong_cameras, "names like side_camera"),
-            ("look_every", self.look_every >= 1, "1 or more"),
+            ("observe_every", self.observe_every >= 1, "1 or more"),
         ):
             if not fits:
                 found = repr(wrong_cameras[0] if name == "cameras" else getattr(self, name))
@@ -217,9 +217,9 @@ class ExternalPolicy:
 
 
 def policy_spec_values(spec: PolicySpec) -> dict[str, Any]:
-    """Return JSON values of a specification; ``look_every`` only if it is not 1, which older readers do not know."""
+    """Return JSON values of a specification; ``observe_every`` only if it is not 1, which older readers do not know."""
     values = {**vars(spec), "cameras": {name: list(size) for name, size in spec.cameras.items()}}
-    return {key: value for key, value in values.items() if key != "look_every" or value != 1}
+    return {key: value for key, value in values.items() if key != "observe_every" or value != 1}
 
 
 def describe(policy: Policy) -> dict[str, Any]:
@@ -229,7 +229,7 @@ def describe(policy: Policy) -> dict[str, Any]:
         spec, added = policy_spec_values(policy.spec), getattr(policy, "describe", dict)()
     if not isinstance(added, dict):
         raise EvaluationError("invalid policy description", where=where, expected="a dict", found=type(added).__name__)
-    said = {"class": _class_of(policy), "wants": spec, **added}
+    said = {"class": _class_of(policy), "spec": spec, **added}
     return json.loads(json_text(said, where, error=EvaluationError))
 
 

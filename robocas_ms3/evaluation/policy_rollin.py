@@ -20,7 +20,7 @@ from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.datasets.conversion.env_renderer import require_renderer
 from robocas_ms3.demos.failures import Takeover
 from robocas_ms3.demos.settings import EpisodeSettings
-from robocas_ms3.evaluation.action_wrapper import UPSTREAM_HZ, PolicyStepping, env_kwargs
+from robocas_ms3.evaluation.action_wrapper import UPSTREAM_HZ, PolicyActionWrapper, env_kwargs
 from robocas_ms3.evaluation.policies import open_policy
 from robocas_ms3.evaluation.policy import EpisodeSpec, Policy
 from robocas_ms3.evaluation.protocol import load_protocol
@@ -64,7 +64,7 @@ class Player:
             sim_backend="physx_cpu",
             **env_kwargs(spec, UPSTREAM_HZ),
         )
-        self._env = PolicyStepping(env, spec, "upstream")
+        self._env = PolicyActionWrapper(env, spec, "upstream")
         self._base: Any = env.unwrapped
         options = {"auto_reset": False, "ignore_terminations": True, "record_metrics": False}
         self._vector = RoboCASVectorEnv(self._env, "numpy", **options)

@@ -3,7 +3,7 @@
 ::
 
     protocol.yaml            the rules, see `Protocol`
-    episodes.jsonl           an episode per line, see `Episode`
+    episodes.jsonl           an episode per line, see `ProtocolEpisode`
     configs/NAME.yaml        the configurations that episodes name, whole
     layouts/NAME.npy         the scenes of a configuration's episodes (`scenes.layout_table.FrozenLayouts`)
     train/NAME.yaml          of a suite that holds something out: configurations without it, to train on
@@ -108,7 +108,7 @@ class Protocol(StrictModel):
         return int(rate)
 
 
-class Episode(StrictModel):
+class ProtocolEpisode(StrictModel):
     """One episode of a protocol's list."""
 
     episode: Annotated[int, Field(ge=0, le=10**7)] = Field(description="its number, from 0 on")
@@ -131,7 +131,7 @@ class LoadedProtocol:
 
     folder: Path
     rules: Protocol
-    episodes: tuple[Episode, ...]
+    episodes: tuple[ProtocolEpisode, ...]
 
     @cached_property
     def hash(self) -> str:
@@ -145,7 +145,7 @@ class LoadedProtocol:
             digest.update(f"{path.relative_to(self.folder).as_posix()} {content}\n".encode())
         return digest.hexdigest()
 
-    def choose(self, settings: EvaluationSettings) -> list[Episode]:
+    def choose(self, settings: EvaluationSettings) -> list[ProtocolEpisode]:
         """Return the episodes that settings choose, at least one."""
         splits = (settings.split,) if settings.split else ()
         for kind, names in (("task", settings.tasks), ("split", splits)):
@@ -167,7 +167,7 @@ class LoadedProtocol:
             raise EvaluationError("no episodes in this shard", where=self.rules.name, found=settings.shard)
         return chosen
 
-    def check_cameras(self, spec: PolicySpec, episodes: Sequence[Episode]) -> None:
+    def check_cameras(self, spec: PolicySpec, episodes: Sequence[ProtocolEpisode]) -> None:
         """Check that episodes have the cameras that a policy uses."""
         robot = find_robot(self.rules.robot).description
         for config in dict.fromkeys(episode.config for episode in episodes):
@@ -178,7 +178,7 @@ class LoadedProtocol:
                     fix = nearest(name, known)
                     raise EvaluationError("no such camera", where=where, expected=expected, found=name, fix=fix)
 
-    def check_one_configuration(self, episodes: Sequence[Episode], fix: str = "") -> None:
+    def check_one_configuration(self, episodes: Sequence[ProtocolEpisode], fix: str = "") -> None:
         """Check that episodes can run in one batch."""
         configs = list(dict.fromkeys(episode.config for episode in episodes))
         if len(configs) > 1:
@@ -239,14 +239,14 @@ def load_protocol(name: str | Path) -> LoadedProtocol:
     return loaded
 
 
-def _episodes(path: Path) -> Iterator[Episode]:
+def _episodes(path: Path) -> Iterator[ProtocolEpisode]:
     try:
         lines = read_text(path, JSON_LIMIT).splitlines()
     except (OSError, DocumentError) as error:
         raise EvaluationError("can't read the episodes", where=path, found=error) from error
     for number, line in enumerate(lines):
         where = f"{path}:{number + 1}"
-        episode = parse_json(Episode, line, EvaluationError, where=where, about="no episode")
+        episode = parse_json(ProtocolEpisode, line, EvaluationError, where=where, about="no episode")
         if episode.episode != number:
             raise EvaluationError("episodes are not in order", where=where, expected=number, found=episode.episode)
         yield episode

@@ -26,7 +26,7 @@ from robocas_ms3.core.json_lines import Ledger
 from robocas_ms3.core.output_folder import FolderKind, OutputFolder, check_replaceable, setting_changes
 from robocas_ms3.core.strict_model import parse
 from robocas_ms3.evaluation.outcomes import Outcome
-from robocas_ms3.evaluation.statistics import Share, share
+from robocas_ms3.evaluation.statistics import SuccessRate, success_rate
 
 RUN, OUTCOMES = "run.json", "episodes.jsonl"
 _PACKAGES = ("robocas_ms3", "mani_skill", "sapien", "gymnasium", "numpy", "torch")
@@ -38,14 +38,14 @@ class PolicyRecord(BaseModel):
 
     Attributes:
         name: as the user gave it.
-        wants: the policy's specification, `PolicySpec`.
+        spec: the policy's specification, `PolicySpec`.
         server: description of a policy that is behind a server.
     """
 
     model_config = ConfigDict(strict=True, extra="allow")
 
     name: str
-    wants: dict[str, Any] = {}
+    spec: dict[str, Any] = {}
     server: dict[str, Any] | None = None
 
 
@@ -116,11 +116,11 @@ class Result:
     run: RunRecord
     outcomes: dict[int, Outcome]
 
-    def rate(self, name: str = "success", outcomes: Iterable[Outcome] | None = None) -> Share:
+    def rate(self, name: str = "success", outcomes: Iterable[Outcome] | None = None) -> SuccessRate:
         """Return the share of episodes in which a flag ever held, of all or of some (at least one)."""
         chosen = list(self.outcomes.values() if outcomes is None else outcomes)
         held = [getattr(one, name) if hasattr(one, name) else one.flags.get(name) is not None for one in chosen]
-        return share(sum(held), len(held))
+        return success_rate(sum(held), len(held))
 
     def repeats(self) -> bool:
         """Return whether a scene occurs several times, as in several splits: then episodes must not be pooled."""

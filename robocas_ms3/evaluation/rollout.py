@@ -25,7 +25,7 @@ from robocas_ms3.evaluation.policy import (
     policy_code,
     privileged,
 )
-from robocas_ms3.evaluation.protocol import Episode
+from robocas_ms3.evaluation.protocol import ProtocolEpisode
 from robocas_ms3.scenes.language.embed import TextEmbedder
 from robocas_ms3.scenes.task_specs import TASKS
 
@@ -54,7 +54,7 @@ class Rollout:
     inference_seconds: float = 0.0
     error: str = ""
 
-    def outcome(self, episode: Episode, objects: Sequence[str]) -> Outcome:
+    def outcome(self, episode: ProtocolEpisode, objects: Sequence[str]) -> Outcome:
         """Return the outcome of the episode, in which objects have these ids by slot."""
         flags, order = self.flags, None
         if self.retrieval is not None:
@@ -101,7 +101,7 @@ class EpisodeBatch:
     """Run one episode in each of several envs; the caller chooses the action of every step.
 
     Args:
-        env: vector environment (`make_vec`, NumPy arrays, no automatic resets) of `action_wrapper.PolicyStepping` envs.
+        env: vector environment (`make_vec`, NumPy arrays, no automatic resets) of `PolicyActionWrapper` envs.
         control_dt: simulated time of a control step, s.
         refill: whether an env can be reset while others run. In a GPU's batch all envs are reset together.
 
@@ -251,7 +251,7 @@ def _request_actions(batch: EpisodeBatch, policy: Policy, chunks: dict[int, list
         actions = failed.actions
     seconds = (time.perf_counter() - started) / len(envs)
     new = as_chunks(actions, len(envs), batch.action_size, where=type(policy).__name__)
-    period = policy.spec.look_every
+    period = policy.spec.observe_every
     if new.shape[1] > 1 and new.shape[1] % period:
         raise EvaluationError(
             "the first observation of the next chunk would have no images",

@@ -19,10 +19,10 @@ from robocas_ms3.core.errors import EvaluationError, WorkerDied
 from robocas_ms3.core.workers import Limits
 from robocas_ms3.datasets.conversion.env_renderer import require_renderer
 from robocas_ms3.evaluation import results
-from robocas_ms3.evaluation.action_wrapper import UPSTREAM_HZ, PolicyStepping, check_weld, env_kwargs
+from robocas_ms3.evaluation.action_wrapper import UPSTREAM_HZ, PolicyActionWrapper, check_weld, env_kwargs
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, Policy, as_chunks, describe
-from robocas_ms3.evaluation.protocol import Episode, load_protocol
+from robocas_ms3.evaluation.protocol import ProtocolEpisode, load_protocol
 from robocas_ms3.evaluation.rollout import NOT_FINITE, EndConditions, EpisodeBatch, Rollout, rollout
 from robocas_ms3.evaluation.settings import EvaluationSettings
 from robocas_ms3.scenes.layout_table import FrozenLayouts
@@ -49,7 +49,7 @@ class EvaluationSession:
 
     Attributes:
         episodes: the episodes of the protocol that the settings choose.
-        rate: control steps per second; with RoboCAS-v0's steps, see `PolicyStepping`.
+        rate: control steps per second; with RoboCAS-v0's steps, see `PolicyActionWrapper`.
         outcomes: by env, the outcome of each episode that has ended since the last `reset`.
 
     Raises:
@@ -82,7 +82,7 @@ class EvaluationSession:
         self._env: Any = None
         self._batch: EpisodeBatch | None = None
         self._open_for: tuple[str, int, int] | None = None  # configuration, number of envs and of steps of `_batch`
-        self._current: list[Episode] = []  # by env, of an external loop
+        self._current: list[ProtocolEpisode] = []  # by env, of an external loop
         self._observed = 0.0  # clock time at which the external loop received the last observation, s
 
     def run(self, on_start: Callable[[int], None] = lambda count: None) -> Iterator[Outcome]:
@@ -110,7 +110,7 @@ class EvaluationSession:
         assert steps is not None  # `load_protocol` checks it
         return steps
 
-    def episode_spec(self, episode: Episode) -> EpisodeSpec:
+    def episode_spec(self, episode: ProtocolEpisode) -> EpisodeSpec:
         """Return what a policy gets to know about an episode, before it has an env."""
         return EpisodeSpec(
             env=-1,
@@ -124,7 +124,7 @@ class EvaluationSession:
             robot=self.protocol.rules.robot,
         )
 
-    def play(self, episodes: Sequence[Episode], max_steps: int | None = None) -> Iterator[Outcome]:
+    def play(self, episodes: Sequence[ProtocolEpisode], max_steps: int | None = None) -> Iterator[Outcome]:
         """Run episodes with the policy, configuration by configuration, and yield each outcome as its episode ends.
 
         ``max_steps`` replaces the protocol's maximum number of policy steps per episode.
@@ -200,7 +200,7 @@ class EvaluationSession:
         assert self._batch is not None
         return self._batch.obs
 
-    def open(self, episode: Episode, num_envs: int, max_steps: int | None = None) -> EpisodeBatch:
+    def open(self, episode: ProtocolEpisode, num_envs: int, max_steps: int | None = None) -> EpisodeBatch:
         """Return envs for the episodes of the configuration of an episode; they are opened if needed."""
         steps = self.max_steps(episode.task) if max_steps is None else max_steps
         wanted, rules = (episode.config, num_envs, steps), self.protocol.rules
@@ -220,7 +220,7 @@ class EvaluationSession:
         if env is not None:
             env.close()
 
-    def _play(self, episodes: list[Episode], max_steps: int | None) -> Iterator[Outcome]:
+    def _play(self, episodes: list[ProtocolEpisode], max_steps: int | None) -> Iterator[Outcome]:
         left, deaths = {episode.episode: episode for episode in episodes}, Counter[int]()
         while left:
             batch = None
@@ -248,13 +248,13 @@ class EvaluationSession:
         self._observed = time.perf_counter()
         return observations
 
-    def _outcome(self, ended: Rollout, episode: Episode) -> Outcome:
+    def _outcome(self, ended: Rollout, episode: ProtocolEpisode) -> Outcome:
         layouts = self._layouts_of(episode.config)
         return ended.outcome(episode, layouts(episode.seed, episode.seed).object_ids)
 
-    def _make_env(self, episode: Episode, num_envs: int) -> Any:
+    def _make_env(self, episode: ProtocolEpisode, num_envs: int) -> Any:
         rules, settings = self.protocol.rules, self.settings
-        stepping = partial(PolicyStepping, spec=self.spec, stepping=rules.stepping, weld=settings.weld)
+        stepping = partial(PolicyActionWrapper, spec=self.spec, stepping=rules.stepping, weld=settings.weld)
         render: dict[str, Any] = {}
         if settings.render_size is not None:
             width, height = settings.render_size

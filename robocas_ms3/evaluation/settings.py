@@ -25,8 +25,8 @@ class EvaluationSettings:
     tasks: Annotated[tuple[str, ...], tyro.conf.Positional, _NO_HINT] = ()
     """Only the episodes of these tasks. Default: all."""
     policy: str = "scripted"
-    """Policy: scripted (joint targets), scripted-motions (RoboCAS' 7 numbers), scripted-beside (these, off by some
-    cm), random, still, replay:TRAJECTORY.h5, a folder of `robocas train`, module:Class of your own, one that an
+    """Policy: scripted (joint targets), scripted-ee-delta (RoboCAS' 7 numbers), scripted-perturbed (these, off by some
+    cm), random, noop, replay:TRAJECTORY.h5, a folder of `robocas train`, module:Class of your own, one that an
     installed package brings (`robocas list`), or ws://HOST:PORT, a server's (`robocas serve-policy`)."""
     protocol: str = "ms3-v1"
     """Name of a bundled protocol, or its folder."""

@@ -15,7 +15,7 @@ _POWER = 0.8
 
 
 @dataclass(frozen=True)
-class Share:
+class SuccessRate:
     """A success rate, k of n, and the limits of its 95 % interval, 0..1."""
 
     k: int
@@ -69,7 +69,7 @@ class Comparison:
         return (self.only_a - self.only_b) / self.n
 
 
-def share(k: int, n: int) -> Share:
+def success_rate(k: int, n: int) -> SuccessRate:
     """Return a rate with its exact interval, which holds the true rate in at least 95 % of all evaluations.
 
     Clopper and Pearson, Biometrika 26 (1934) 404-413, by quantiles of beta distributions. At k = 0 the lower limit
@@ -77,7 +77,7 @@ def share(k: int, n: int) -> Share:
     """
     low = float(beta.ppf(_TAIL, k, n - k + 1)) if k else 0.0
     high = float(beta.isf(_TAIL, k + 1, n - k)) if k < n else 1.0
-    return Share(k, n, low, high)
+    return SuccessRate(k, n, low, high)
 
 
 def mcnemar(only_a: int, only_b: int) -> float:
@@ -141,7 +141,7 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return adjusted.tolist()
 
 
-def success_by(values: ArrayLike, successes: ArrayLike, edges: Sequence[float]) -> list[Share | None]:
+def success_by(values: ArrayLike, successes: ArrayLike, edges: Sequence[float]) -> list[SuccessRate | None]:
     """Return success rates over bins of a number that each episode has, such as p_vis; None: an empty bin.
 
     Args:
@@ -152,7 +152,7 @@ def success_by(values: ArrayLike, successes: ArrayLike, edges: Sequence[float]) 
     done, ends = np.asarray(successes, dtype=bool), np.asarray(edges, dtype=float)
     place = np.minimum(np.searchsorted(ends, np.asarray(values), side="right") - 1, len(ends) - 2)
     groups = [done[place == number] for number in range(len(ends) - 1)]
-    return [share(int(group.sum()), group.size) if group.size else None for group in groups]
+    return [success_rate(int(group.sum()), group.size) if group.size else None for group in groups]
 
 
 def mcnemar_power(n: int, difference: float, discordant: float, *, alpha: float = 0.05) -> float:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from robocas_ms3.core.text import count_of
 from robocas_ms3.evaluation.outcomes import Outcome, failure_stage, score_of
-from robocas_ms3.evaluation.protocol import DEFAULT_HZ, Episode, LoadedProtocol
+from robocas_ms3.evaluation.protocol import DEFAULT_HZ, LoadedProtocol, ProtocolEpisode
 from robocas_ms3.evaluation.results import Result, RunRecord
 from robocas_ms3.scenes.task_specs import TASKS
 
@@ -34,14 +34,14 @@ def problems(result: Result, protocol: LoadedProtocol) -> list[str]:
     return found
 
 
-def _problems(outcome: Outcome, episode: Episode, protocol: LoadedProtocol, run: RunRecord) -> Iterator[str]:
+def _problems(outcome: Outcome, episode: ProtocolEpisode, protocol: LoadedProtocol, run: RunRecord) -> Iterator[str]:
     rules, flags, steps = protocol.rules, outcome.flags, count_of(outcome.steps, "step")
     for name in ("task", "config", "seed", "split", "p_vis"):
         if getattr(outcome, name) != getattr(episode, name):
             yield f"{name} is {getattr(outcome, name)}, not {getattr(episode, name)}"
     if ("welds" in outcome.measures) != run.weld:
         yield f"it {'counts no welds' if run.weld else 'counts welds'}, the run says weld: {run.weld}"
-    rate = rules.rate_hz or run.policy.wants.get("rate_hz") or DEFAULT_HZ
+    rate = rules.rate_hz or run.policy.spec.get("rate_hz") or DEFAULT_HZ
     limit = rules.steps(outcome.task, rate)
     if limit is not None and outcome.steps > limit:
         yield f"{steps}, {limit} allowed"

@@ -136,7 +136,7 @@ def test_newer_predictions_weigh_more():
 def test_a_chunk_is_followed_before_the_next():
     """For two of three steps; then the mean of its third row and the first of the next."""
     acting = policy([row(0.1), row(0.2), row(0.3)], [row(0.5), row(), row()], play=2)
-    assert acting.spec.look_every == 2
+    assert acting.spec.observe_every == 2
     assert [act(acting)[0, 0] for _ in range(3)] == pytest.approx([0.1, 0.2, 0.4])
 
 

@@ -37,7 +37,7 @@ def test_bc_state(demos, tmp_path, monkeypatch):
     [outcome] = played(tmp_path / "eval")
     assert outcome["error"] == "" and outcome["steps"] > 0
     said = json.loads((tmp_path / "eval" / "run.json").read_text())["policy"]
-    assert (said["baseline"], said["steps"], said["wants"]["state"]) == ("bc-state", 5, True)
+    assert (said["baseline"], said["steps"], said["spec"]["state"]) == ("bc-state", 5, True)
 
     samples = BASELINE.data(BcStateConfig(), demos, "train", lambda done, total: None)
     batch = samples.__getitems__(list(range(len(samples))))

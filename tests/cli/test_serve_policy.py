@@ -93,11 +93,11 @@ def test_the_size_of_batches_is_announced(tmp_path):
 
     from robocas_ms3.evaluation.remote.wire import unpack
 
-    with serving("still", tmp_path, "--max-batch", "3") as (_, url), connect(url, proxy=None) as client:
+    with serving("noop", tmp_path, "--max-batch", "3") as (_, url), connect(url, proxy=None) as client:
         assert unpack(client.recv())["robocas_max_batch"] == 3
 
 
 @pytest.mark.parametrize(("option", "value"), [("--port", "99999"), ("--max-batch", "0"), ("--max-batch", "257")])
 def test_an_option_out_of_range(capsys, option, value):
-    assert run(["serve-policy", "still", option, value]) == 2
+    assert run(["serve-policy", "noop", option, value]) == 2
     assert capsys.readouterr().err.startswith(f"error: {option}: ")

@@ -13,7 +13,7 @@ from mani_skill.utils.structs import Pose
 
 import robocas_ms3  # noqa: F401
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.evaluation.action_wrapper import PolicyStepping, env_kwargs
+from robocas_ms3.evaluation.action_wrapper import PolicyActionWrapper, env_kwargs
 from robocas_ms3.evaluation.metrics import read_sum
 from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.tasks.vector import make_vec
@@ -36,13 +36,13 @@ def pick(convention: str, rate: int) -> gym.Env:
     return gym.make("RoboCASPick-v1", **env_kwargs(PolicySpec(convention), rate))
 
 
-def made(convention="robocas", reference="tcp", stepping="timed", rate=5) -> PolicyStepping:
-    stepped = PolicyStepping(pick(convention, rate), PolicySpec(convention, reference), stepping)
+def made(convention="robocas", reference="tcp", stepping="timed", rate=5) -> PolicyActionWrapper:
+    stepped = PolicyActionWrapper(pick(convention, rate), PolicySpec(convention, reference), stepping)
     stepped.reset(seed=3)
     return stepped
 
 
-def tcp(env: PolicyStepping) -> np.ndarray:
+def tcp(env: PolicyActionWrapper) -> np.ndarray:
     base: Any = env.unwrapped
     return base.agent.tcp_in_arm_base.p[0].numpy().copy()
 
@@ -138,14 +138,14 @@ def test_what_happened_is_counted_from_the_reset_on():
     assert read_sum(info, "path_length") < 0.002
 
 
-def test_images_are_rendered_when_the_policy_looks(monkeypatch):
-    """Once an action of several control steps, and with ``look_every=2`` after every other action; black in between."""
+def test_images_are_rendered_only_when_the_policy_observes_them(monkeypatch):
+    """Images are rendered once per action, and with ``observe_every=2`` after every other action; others are black."""
     env = gym.make("RoboCASPick-v1", **IMAGES)
     base: Any = env.unwrapped
     rendered, capture = [], base.capture_sensor_data
     monkeypatch.setattr(base, "capture_sensor_data", lambda: (rendered.append(1), capture()))
     for every, looks in ((1, [1, 1, 1]), (2, [0, 1, 0])):
-        stepped = PolicyStepping(env, PolicySpec("robocas", "tcp", look_every=every), "upstream")
+        stepped = PolicyActionWrapper(env, PolicySpec("robocas", "tcp", observe_every=every), "upstream")
         for _ in range(2):  # a reset begins to count anew
             obs, _ = stepped.reset(seed=3)
             assert obs["sensor_data"]["base_camera"]["rgb"].any()
@@ -173,7 +173,9 @@ def test_each_env_of_a_batch_is_looked_at_in_its_own_steps():
         auto_reset=False,
         ignore_terminations=True,
         record_metrics=False,
-        wrappers=[partial(PolicyStepping, spec=PolicySpec("robocas", "tcp", look_every=3), stepping="upstream")],
+        wrappers=[
+            partial(PolicyActionWrapper, spec=PolicySpec("robocas", "tcp", observe_every=3), stepping="upstream")
+        ],
         **IMAGES,
     )
 

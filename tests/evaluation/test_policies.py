@@ -8,7 +8,7 @@ from counting_env import CountingEnv, play
 
 from robocas_ms3.core.errors import EvaluationError, ExtensionError
 from robocas_ms3.evaluation.policies import make_policy, open_policy
-from robocas_ms3.evaluation.policies.plain import StillPolicy
+from robocas_ms3.evaluation.policies.plain import NoopPolicy
 from robocas_ms3.evaluation.policies.scripted import OFFSETS, offset
 from robocas_ms3.evaluation.policy import CONVENTIONS, EpisodeSpec, PolicySpec, describe, policy_spec_values
 
@@ -59,9 +59,9 @@ def here(tmp_path, monkeypatch):
 
 
 def test_specifications():
-    assert "look_every" not in policy_spec_values(PolicySpec())  # for servers and clients of older versions
-    assert policy_spec_values(PolicySpec(look_every=7))["look_every"] == 7
-    for wrong in ({"convention": "words"}, {"language": "loud"}, {"reference": "me"}, {"look_every": 0}):
+    assert "observe_every" not in policy_spec_values(PolicySpec())  # for servers and clients of older versions
+    assert policy_spec_values(PolicySpec(observe_every=7))["observe_every"] == 7
+    for wrong in ({"convention": "words"}, {"language": "loud"}, {"reference": "me"}, {"observe_every": 0}):
         with pytest.raises(EvaluationError) as error:
             PolicySpec(**wrong)
         assert error.value.where == next(iter(wrong))
@@ -70,7 +70,7 @@ def test_specifications():
 def test_a_module_in_the_folder_of_the_command(here):
     assert type(make_policy("own_policy:Mine")).__name__ == "Mine"
     assert sys.path[-1] == str(here)  # and not before what is installed
-    assert isinstance(make_policy("still"), StillPolicy)
+    assert isinstance(make_policy("noop"), NoopPolicy)
 
 
 @pytest.mark.parametrize(

@@ -88,7 +88,7 @@ def test_what_is_left_follows_from_the_seed_alone(player):
     assert not np.array_equal(ours["/actors/object_0"], numbers(other.state)["/actors/object_0"])
 
 
-@pytest.mark.parametrize("player", [("scripted-motions", (90, 90))], indirect=True)
+@pytest.mark.parametrize("player", [("scripted-ee-delta", (90, 90))], indirect=True)
 def test_there_is_nothing_to_take_over_where_the_policy_succeeded(player, generator, tmp_path):
     takeover = player.run(4)
     assert takeover.refused == "succeeded"
@@ -136,12 +136,12 @@ def test_the_record_begins_where_the_policy_was(taken_over, generator, tmp_path)
     ("player", "subgoals", "commands"),
     [
         (
-            ("scripted-motions", (31, 31)),
+            ("scripted-ee-delta", (31, 31)),
             ["transfer object"],
             1,
         ),  # the target is in the hand: it opens above the basket
         # in the same scene beside the target: it opens, closes where the target is, and opens above the basket
-        (("scripted-beside", (31, 31)), ["move and grasp", "transfer object"], 3),
+        (("scripted-perturbed", (31, 31)), ["move and grasp", "transfer object"], 3),
     ],
     indirect=["player"],
 )

@@ -148,7 +148,7 @@ def test_failure_stage(reached, stage):
     assert failure_stage({"reached_any": 5}, "policy died") == "error"
 
 
-SERVED = {"server": {"name": "mine", "class": "m:Mine"}, "play": None, "wants": {}}
+SERVED = {"server": {"name": "mine", "class": "m:Mine"}, "play": None, "spec": {}}
 
 
 def test_where_a_server_was_is_not_who_it_served(tmp_path):

@@ -65,7 +65,7 @@ def test_chunks_are_played_to_their_end_before_the_policy_is_asked_again():
 def test_chunks_begin_with_images(chunk, looks, fits):
     """A policy without chunks takes care of that itself."""
     policy = Obedient(chunk)
-    policy.spec = PolicySpec(state=True, look_every=looks)
+    policy.spec = PolicySpec(state=True, observe_every=looks)
     if fits:
         assert [one.steps for one in play(CountingEnv(1, None), policy, starts(4), 7)] == [4]
     else:

@@ -163,7 +163,7 @@ def test_an_episode_whose_process_dies_runs_again_once_and_then_counts_as_failed
         return made[-1]
 
     monkeypatch.setattr(session, "make_vec", make_vec)
-    found = evaluate(out, "still", protocol=str(short), tasks=("pick", "select"))
+    found = evaluate(out, "noop", protocol=str(short), tasks=("pick", "select"))
     assert sorted(found) == [0, 1, 2, 3]
     assert [number for number, one in found.items() if one["error"]] == ([1] if times == 2 else [])
     assert found[1]["error"] == ("its process died: SIGSEGV" if times == 2 else "")
@@ -174,7 +174,7 @@ def test_an_episode_whose_process_dies_runs_again_once_and_then_counts_as_failed
     ]
     assert all(env.closed for env in made)
     assert not [one for one in problems(results.read(out), protocol) if one.startswith("episode 1:") and times == 2]
-    command = ["eval", "--policy", "still", "--protocol", short, "--backend", "processes", "--out", out]
+    command = ["eval", "--policy", "noop", "--protocol", short, "--backend", "processes", "--out", out]
     assert cli([str(word) for word in command]) == times - 1  # continues, and does not run the failed episode again
     assert results.read(out).broken_off() == times - 1
 
@@ -191,11 +191,11 @@ def test_envs_whose_process_dies_while_they_are_made_are_made_again_once(short, 
 
     monkeypatch.setattr(session, "make_vec", make_vec)
     if times == 1:
-        assert len(evaluate(tmp_path / "out", "still", protocol=str(short))) == 8
+        assert len(evaluate(tmp_path / "out", "noop", protocol=str(short))) == 8
         assert "SIGSEGV" in caplog.text
         return
     with pytest.raises(WorkerDied, match="env 0: its process died"):
-        evaluate(tmp_path / "out", "still", protocol=str(short))
+        evaluate(tmp_path / "out", "noop", protocol=str(short))
 
 
 def test_an_interrupted_command_tells_how_to_continue_and_it_takes_one_thread(tmp_path, monkeypatch, capsys):
@@ -211,7 +211,7 @@ def test_an_interrupted_command_tells_how_to_continue_and_it_takes_one_thread(tm
     try:
         open_session()  # whoever makes a session keeps its threads
         assert torch.get_num_threads() == 2
-        assert cli(["eval", "--protocol", "smoke", "--policy", "still", "--out", str(tmp_path / "out")]) == 130
+        assert cli(["eval", "--protocol", "smoke", "--policy", "noop", "--out", str(tmp_path / "out")]) == 130
     finally:
         torch.set_num_threads(before)
     assert capsys.readouterr().err.splitlines()[-1] == "interrupted; the same command continues"
@@ -244,7 +244,7 @@ def test_a_run_that_was_cut_off_continues_with_other_envs_and_ends_the_same(alon
     path = tmp_path / "episodes.jsonl"
     path.write_text(path.read_text() + path.read_text()[:100])  # and killed while it wrote
     with pytest.raises(OutputExistsError, match="policy.name"):
-        evaluate(tmp_path, "still", protocol=str(short))
+        evaluate(tmp_path, "noop", protocol=str(short))
     assert evaluate(tmp_path, protocol=str(short), **PICK) == alone
 
 

@@ -15,9 +15,9 @@ from robocas_ms3.evaluation.statistics import (
     mcnemar,
     mcnemar_power,
     paired_interval,
-    share,
     smallest_paired_difference,
     success_by,
+    success_rate,
     too_few,
 )
 
@@ -43,7 +43,7 @@ def k_of_n(draw) -> tuple[int, int]:
     ],
 )
 def test_exact_interval_is_the_published_one(k, n, low, high):
-    found = share(k, n)
+    found = success_rate(k, n)
     assert (found.k, found.n, found.rate) == (k, n, k / n)
     assert (found.low, found.high) == pytest.approx((low, high), abs=5e-5)
 
@@ -51,7 +51,7 @@ def test_exact_interval_is_the_published_one(k, n, low, high):
 @given(k_of_n())
 def test_exact_interval_ends_where_half_the_error_is_left(counts):
     k, n = counts
-    found = share(k, n)
+    found = success_rate(k, n)
     assert 0 <= found.low <= k / n <= found.high <= 1
     if k > 0:
         assert binom.sf(k - 1, n, found.low) == pytest.approx(0.025, rel=1e-6)
@@ -136,7 +136,7 @@ def test_bins_hold_their_lower_edge_and_the_last_one_both():
     values = [0.0, 0.2, 0.5, 0.5, 0.9, 1.0]
     successes = [False, True, True, False, True, True]
     found = success_by(values, successes, [0, 0.5, 0.75, 0.8, 1])
-    assert found == [share(1, 2), share(1, 2), None, share(2, 2)]
+    assert found == [success_rate(1, 2), success_rate(1, 2), None, success_rate(2, 2)]
 
 
 @pytest.mark.parametrize(("difference", "discordant"), [(0, 0.4), (0.3, 0.4), (0.4, 0.4), (0.6, 1)])
@@ -178,7 +178,9 @@ def test_another_package_says_the_same():
     for n in (1, 2, 10, 39, 200):
         for k in {0, 1, n // 3, n - 1, n}:
             theirs = robostats.clopper_pearson(k, n)
-            assert (share(k, n).low, share(k, n).high) == pytest.approx((theirs.lower, theirs.upper), abs=1e-12)
+            assert (success_rate(k, n).low, success_rate(k, n).high) == pytest.approx(
+                (theirs.lower, theirs.upper), abs=1e-12
+            )
     for counts in [(20, 8, 5, 7), (59, 6, 16, 80), (0, 12, 0, 0), (9, 0, 0, 4), (3, 0, 6, 1), (0, 4, 4, 0)]:
         table = robostats.PairedResult("a", "b", *counts, tuple(map(str, range(sum(counts)))), 0, 0, ("",), ("",), None)
         theirs, ours = robostats.compare(table), Comparison.of(*counts)

@@ -49,7 +49,7 @@ def test_a_description_that_no_result_can_hold_is_refused(description, key):
         assert error.value.where == f"policy {__name__}:Policy, describe(){key}"
     policy = Policy({})
     policy.spec = PolicySpec(rate_hz=float("nan"))
-    with pytest.raises(EvaluationError, match=r"wants\.rate_hz"):
+    with pytest.raises(EvaluationError, match=r"spec\.rate_hz"):
         describe(policy)
 
 

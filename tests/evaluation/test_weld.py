@@ -12,7 +12,7 @@ import torch
 
 import robocas_ms3  # noqa: F401
 from robocas_ms3.evaluation import results
-from robocas_ms3.evaluation.action_wrapper import PolicyStepping, env_kwargs
+from robocas_ms3.evaluation.action_wrapper import PolicyActionWrapper, env_kwargs
 from robocas_ms3.evaluation.metrics import read_sum
 from robocas_ms3.evaluation.policies import make_policy
 from robocas_ms3.evaluation.policy import PolicySpec
@@ -42,8 +42,8 @@ def pick():
     return make()
 
 
-def welding(env: gym.Env, weld: bool = True) -> PolicyStepping:
-    stepped = PolicyStepping(env, PolicySpec("robocas", "tcp"), "upstream", weld=weld)
+def welding(env: gym.Env, weld: bool = True) -> PolicyActionWrapper:
+    stepped = PolicyActionWrapper(env, PolicySpec("robocas", "tcp"), "upstream", weld=weld)
     stepped.reset(seed=3)
     return stepped
 
@@ -52,12 +52,12 @@ def stay(gripper: float) -> np.ndarray:
     return np.array([0, 0, 0, 0, 0, 0, gripper])
 
 
-def target(env: PolicyStepping) -> Any:
+def target(env: PolicyActionWrapper) -> Any:
     base: Any = env.unwrapped
     return base.objects[int(base.target_slot)]._bodies[0]
 
 
-def grasp(env: PolicyStepping, above: float | None = None) -> dict[str, Any]:
+def grasp(env: PolicyActionWrapper, above: float | None = None) -> dict[str, Any]:
     """Close the fingers on the target, which waits at the TCP, up in the air; ``above``: m that it has been raised."""
     base: Any = env.unwrapped
     body = target(env)
@@ -73,13 +73,13 @@ def grasp(env: PolicyStepping, above: float | None = None) -> dict[str, Any]:
     return info
 
 
-def open_fingers(env: PolicyStepping) -> None:
+def open_fingers(env: PolicyActionWrapper) -> None:
     """Open them without telling whoever welds."""
     for _ in range(3):
         env.env.step(torch.tensor([[0, 0, 0, 0, 0, 0, OPEN]]))
 
 
-def in_hand(env: PolicyStepping) -> sapien.Pose:
+def in_hand(env: PolicyActionWrapper) -> sapien.Pose:
     base: Any = env.unwrapped
     return base.agent.robot.links_map[MOBILE_PANDA.hand_link]._bodies[0].entity_pose.inv() * target(env).entity_pose
 
@@ -178,7 +178,7 @@ def test_where_nothing_is_lifted_it_changes_nothing(pick):
 @pytest.mark.slow
 def test_an_evaluation_with_it_counts_it_and_says_so(tmp_path):
     protocol, folder = load_protocol("paper-v1"), tmp_path / "out"
-    name, settings = "scripted-motions", {"episodes": 1, "envs": 1, "backend": "processes", "weld": True}
+    name, settings = "scripted-ee-delta", {"episodes": 1, "envs": 1, "backend": "processes", "weld": True}
     settings = EvaluationSettings(("pick",), name, str(protocol.folder), folder, **settings)
     (outcome,) = EvaluationSession(make_policy(name), settings).run()
     assert outcome.success and outcome.measures["welds"] == 1

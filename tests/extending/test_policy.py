@@ -33,7 +33,7 @@ def test_it_is_found_and_listed_by_its_name(site):
     assert type(make_policy("descend")).__module__ == "my_policies"
     listed = {row["name"]: row for row in collect()["policies"]}
     assert listed["descend"] == {"name": "descend", "package": "my-policies", "of": "my_policies:Descend"}
-    assert {"scripted", "scripted-motions", "random", "still"} <= listed.keys()
+    assert {"scripted", "scripted-ee-delta", "random", "noop"} <= listed.keys()
     with pytest.raises(EvaluationError, match="no such policy .*Did you mean descend"):
         make_policy("decend")
 

@@ -155,14 +155,14 @@ def measured(site, tmp_path_factory):
 
 @pytest.mark.slow
 def test_a_protocol_of_its_own_is_frozen_and_measured_with(measured):
-    folder, (frozen, scripted, still, verified, compared) = measured
+    folder, (frozen, scripted, noop, verified, compared) = measured
     assert "2 episodes" in frozen
     assert "| push_zone | 2 | 100 % (16 to 100) | 100 % |  | 100 % | 0 % | 100 % |  |" in scripted
-    assert "| configuration | n | failed | an object touched |" in still
-    assert "| push_zone | 2 | 2 | 2 |" in still
+    assert "| configuration | n | failed | an object touched |" in noop
+    assert "| push_zone | 2 | 2 | 2 |" in noop
     assert "2 episodes of push-zone-v1, all well" in verified
     assert "| push_zone | A, B | 2 | 0 | 2 |" in compared
-    page = (folder / "eval" / "still" / "report.html").read_text()
+    page = (folder / "eval" / "noop" / "report.html").read_text()
     assert "target in zone" in page
     assert "target lifted" not in page
 
@@ -186,4 +186,4 @@ ELSEWHERE = r"no such task .*found push_zone\)\. Name a protocol that has it, or
 
 def test_a_protocol_that_has_not_the_task_says_what_to_do(site):
     with pytest.raises(AssertionError, match=ELSEWHERE):
-        robocas(site, "eval", "push_zone", "--policy", "still", "--protocol", "smoke")
+        robocas(site, "eval", "push_zone", "--policy", "noop", "--protocol", "smoke")

@@ -20,7 +20,7 @@ from robocas_ms3.evaluation.harness.proprioception import WIDTHS, Proprioception
 from robocas_ms3.evaluation.metrics import MEASURES
 from robocas_ms3.evaluation.outcomes import STAGES
 from robocas_ms3.evaluation.policy import ExternalPolicy, Observations
-from robocas_ms3.evaluation.protocol import Episode
+from robocas_ms3.evaluation.protocol import ProtocolEpisode
 from robocas_ms3.evaluation.remote.messages import actions_of, read_policy_spec
 from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
@@ -57,10 +57,10 @@ class RoboCAS:
         self._spec = read_policy_spec(said, "params")
         settings = EvaluationSettings(protocol=protocol, envs=1, backend="processes")
         self._session = EvaluationSession(ExternalPolicy(self._spec), settings)
-        self._of_config: dict[str, list[Episode]] = {}
+        self._of_config: dict[str, list[ProtocolEpisode]] = {}
         for episode in self._session.protocol.episodes:
             self._of_config.setdefault(episode.config, []).append(episode)
-        self._episode: Episode | None = None
+        self._episode: ProtocolEpisode | None = None
         self._seen: Observations | None = None
         self._proprioception = Proprioception(self._session.protocol.rules.robot)
         self._recorder: Any = None

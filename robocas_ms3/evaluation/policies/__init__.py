@@ -20,7 +20,7 @@ from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.extensions import Registry
 from robocas_ms3.core.signals import no_exit
 from robocas_ms3.core.strict_model import nearest
-from robocas_ms3.evaluation.policies.plain import RandomPolicy, StillPolicy
+from robocas_ms3.evaluation.policies.plain import NoopPolicy, RandomPolicy
 from robocas_ms3.evaluation.policy import Policy, PolicySpec
 
 GROUP = "robocas_ms3.policies"
@@ -51,10 +51,10 @@ POLICIES: Registry[Callable[[], Policy]] = Registry(
     Callable,
     {
         "scripted": partial(_scripted, "joint_positions"),
-        "scripted-motions": partial(_scripted, "robocas"),
-        "scripted-beside": partial(_scripted, "robocas", perturbed=True),
+        "scripted-ee-delta": partial(_scripted, "robocas"),
+        "scripted-perturbed": partial(_scripted, "robocas", perturbed=True),
         "random": RandomPolicy,
-        "still": StillPolicy,
+        "noop": NoopPolicy,
     },
 )
 """By name, what makes them."""

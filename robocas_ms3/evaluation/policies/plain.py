@@ -11,7 +11,7 @@ _REACH, _TURN = 0.05, 0.2  # largest motion of a random action, m and rad
 _CHANGE = 0.1  # probability that a random action opens or closes the gripper
 
 
-class StillPolicy:
+class NoopPolicy:
     """Do not move, with the gripper open."""
 
     spec = PolicySpec(reference="tcp", language="none")

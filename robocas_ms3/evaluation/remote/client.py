@@ -88,7 +88,7 @@ class RemotePolicy:
             self.close()
             raise
         # With `play` the server is asked before a chunk ends, so each observation needs images.
-        self.spec: PolicySpec = replace(spec, look_every=1) if self._address.play else spec
+        self.spec: PolicySpec = replace(spec, observe_every=1) if self._address.play else spec
 
     def describe(self) -> dict[str, Any]:
         rename = {"rename": self._address.rename} if self._address.rename else {}

@@ -55,7 +55,7 @@ class ServerMetadata(BaseModel):
 
     model_config = ConfigDict(strict=True, frozen=True)
 
-    spec: Any = Field(default=None, alias="robocas_wants")
+    spec: Any = Field(default=None, alias="robocas_spec")
     policy: Annotated[JsonValue, AfterValidator(_short)] = Field(default=None, alias="robocas_policy")
     max_batch: PositiveInt | None = Field(default=None, alias="robocas_max_batch")
     answers_pings: bool = Field(default=False, alias="robocas_answers_pings")

@@ -124,7 +124,7 @@ class PolicyServer:
         max_batch = batch_limit(spec, max_batch)
         self._max_bytes = message_bytes(spec, max_batch)
         metadata = ServerMetadata(
-            robocas_wants=policy_spec_values(spec),
+            robocas_spec=policy_spec_values(spec),
             robocas_policy={**describe(policy), "robocas_ms3": __version__},
             robocas_max_batch=max_batch,
             robocas_answers_pings=True,

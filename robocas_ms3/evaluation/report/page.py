@@ -17,7 +17,7 @@ from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.report.tables import WELDED, Cell, Fraction, Table, failure_name, mean, stages_of, tables
 from robocas_ms3.evaluation.report.tables import title as title_of
 from robocas_ms3.evaluation.results import Result
-from robocas_ms3.evaluation.statistics import Share, share
+from robocas_ms3.evaluation.statistics import SuccessRate, success_rate
 
 VIDEOS = "videos"
 
@@ -72,7 +72,7 @@ def _funnels(result: Result) -> str:
                     f'<div class="row"><span>{escape(name)}</span>{shown}<b>{100 * rate.rate:.0f} %</b></div>\n'
                 )
         cards.append(f"<figure><figcaption>{escape(config)}, n {len(outcomes)}</figcaption>{''.join(rows)}</figure>\n")
-    note = "Share of the episodes that reached each stage, with its interval. An episode may skip a stage."
+    note = "SuccessRate of the episodes that reached each stage, with its interval. An episode may skip a stage."
     return _section("Stages", note, f'<div class="cards">\n{"".join(cards)}</div>\n')
 
 
@@ -103,8 +103,8 @@ def _effort(result: Result) -> Table:
         disturbed, fallen, n = of("disturbed_most"), of("fallen"), len(outcomes)
         rows.append(
             (
-                *(config, share(sum(x > 0 for x in disturbed), n), f"{mean(disturbed):.2f}"),
-                *(share(sum(x > 0 for x in fallen), n), f"{mean(fallen):.2f}", f"{mean(of('path_length')):.2f}"),
+                *(config, success_rate(sum(x > 0 for x in disturbed), n), f"{mean(disturbed):.2f}"),
+                *(success_rate(sum(x > 0 for x in fallen), n), f"{mean(fallen):.2f}", f"{mean(of('path_length')):.2f}"),
                 f"{np.median(of('contact_impulse')):.1f}",
                 f"{mean([outcome.inference_ms for outcome in outcomes]):.1f}",
             )
@@ -223,10 +223,10 @@ def _html_table(heads: Sequence[str], rows: Iterable[Sequence[str]], kind: str =
     return f'<div class="wide"><table{kinds}><thead><tr>{head}</tr></thead>\n<tbody>\n{body}</tbody></table></div>\n'
 
 
-def _bar(share: Share, kind: str = "") -> str:
+def _bar(rate: SuccessRate, kind: str = "") -> str:
     """Return a bar of 0..100 % with its interval."""
-    low, high, here = 100 * share.low, 100 * share.high, 100 * share.rate
-    label = f"{share.k} of {share.n}: {here:.1f} %, {low:.1f} to {high:.1f}"
+    low, high, here = 100 * rate.low, 100 * rate.high, 100 * rate.rate
+    label = f"{rate.k} of {rate.n}: {here:.1f} %, {low:.1f} to {high:.1f}"
     return (
         f'<svg class="bar {kind}" viewBox="0 0 100 16" preserveAspectRatio="none" role="img" aria-label="{label}">'
         f'<title>{label}</title><rect class="track" width="100" height="16"/>'
@@ -267,11 +267,11 @@ def _round_up(value: float) -> float:
 
 def _cells(cell: Cell, head: str) -> list[str]:
     """Return the HTML of a cell: a rate with a bar is two."""
-    if isinstance(cell, Share):
+    if isinstance(cell, SuccessRate):
         rate = f"{100 * cell.rate:.0f} %<small>{100 * cell.low:.0f} to {100 * cell.high:.0f}</small>"
         return [rate, _bar(cell, "good")] if head.endswith("%") else [rate]
     if isinstance(cell, Fraction):
-        return [f'<span class="heat" style="--share: {100 * cell.count / cell.n:.0f}%">{cell.count or ""}</span>']
+        return [f'<span class="heat" style="--fraction: {100 * cell.count / cell.n:.0f}%">{cell.count or ""}</span>']
     if cell is None:
         return ['<span class="faint">none</span>', *([""] if head.endswith("%") else [])]
     return [escape(cell)]

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from robocas_ms3.core.text import count_of, in_markdown
 from robocas_ms3.evaluation.outcomes import STAGES, Outcome
 from robocas_ms3.evaluation.results import Result
-from robocas_ms3.evaluation.statistics import Share, success_by
+from robocas_ms3.evaluation.statistics import SuccessRate, success_by
 from robocas_ms3.scenes.task_specs import STAGES as DEFAULT_STAGES
 from robocas_ms3.scenes.task_specs import TASKS
 
@@ -47,7 +47,7 @@ class Fraction:
     n: int
 
 
-Cell = str | Share | Fraction | None
+Cell = str | SuccessRate | Fraction | None
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def mean(values: Sequence[float]) -> float:
 
 
 def _success(result: Result) -> Table:
-    def rate(flag: str, outcomes: list[Outcome]) -> Share | None:
+    def rate(flag: str, outcomes: list[Outcome]) -> SuccessRate | None:
         known = [one for one in outcomes if flag in one.flags]  # tasks without obstacles have no stage for them
         broken_off = [one for one in outcomes if one.error and not one.flags]
         return result.rate(flag, known + broken_off) if known else None
@@ -141,8 +141,8 @@ def _success(result: Result) -> Table:
         ends = (result.rate("success_at_end", outcomes), rate("success_v0", outcomes))
         stages = (rate(stage, outcomes) for stage in STAGES.values())
         steps, seconds = mean([one.steps for one in outcomes]), mean([one.seconds for one in outcomes])
-        share = result.rate("success", outcomes)
-        rows.append((config, str(share.n), share, *ends, *stages, f"{steps:.0f}", f"{seconds:.1f}"))
+        overall = result.rate("success", outcomes)
+        rows.append((config, str(overall.n), overall, *ends, *stages, f"{steps:.0f}", f"{seconds:.1f}"))
     note = (
         f"Success held at some step; at the last one; upstream's rule at the last one. {_STAGE_NOTE} Intervals are "
         "Clopper and Pearson's, 95 %. Steps and seconds of the scene are means over all episodes"
@@ -182,7 +182,7 @@ def _failures(result: Result) -> Table:
 def _occlusion(hidden: list[Outcome]) -> Table:
     bins = success_by([one.p_vis or 0.0 for one in hidden], [one.success for one in hidden], P_VIS_EDGES)
     edges = zip(P_VIS_EDGES[:-1], P_VIS_EDGES[1:], bins, strict=True)
-    rows = [(f"{low:g} to {high:g}", str(share.n if share else 0), share) for low, high, share in edges]
+    rows = [(f"{low:g} to {high:g}", str(rate.n if rate else 0), rate) for low, high, rate in edges]
     configs = ", ".join(sorted({outcome.config for outcome in hidden}))
     note = f"By p_vis, the share of the target that is visible from above at the start; episodes of {configs}."
     return Table("Success by occlusion", note, ("p_vis", "n#", "success%"), rows)
@@ -216,7 +216,7 @@ def _with_all(groups: dict[str, list[Outcome]]) -> list[tuple[str, list[Outcome]
 
 
 def _markdown_cell(cell: Cell, head: str) -> str:
-    if isinstance(cell, Share):
+    if isinstance(cell, SuccessRate):
         text = f"{100 * cell.rate:.0f} %"
         return f"{text} ({100 * cell.low:.0f} to {100 * cell.high:.0f})" if head.endswith("%") else text
     return in_markdown(str(cell.count or "") if isinstance(cell, Fraction) else cell or "")

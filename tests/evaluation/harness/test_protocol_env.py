@@ -18,7 +18,7 @@ from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
 
 SMOKE = load_protocol("smoke")
-WANTS = PolicySpec(reference="tcp", rate_hz=5, cameras={"base_camera": (6, 4)}, depth=True)
+SPEC = PolicySpec(reference="tcp", rate_hz=5, cameras={"base_camera": (6, 4)}, depth=True)
 
 
 @pytest.fixture
@@ -26,7 +26,7 @@ def make(made):
     """Makes environments without physics, and closes them."""
     opened = []
 
-    def make(num_envs=2, task="pick", spec=WANTS, protocol="smoke", **settings):
+    def make(num_envs=2, task="pick", spec=SPEC, protocol="smoke", **settings):
         settings = {"backend": "processes", **settings}
         settings = EvaluationSettings((task,), "mine", protocol, envs=num_envs, **settings)
         opened.append(ProtocolVectorEnv(spec, settings))

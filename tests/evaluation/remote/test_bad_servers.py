@@ -76,7 +76,7 @@ def test_a_bad_answer_to_a_batch_fails_its_episodes(answer, failed):
     assert all(reason.isprintable() for reason in raised.value.reasons.values())
 
 
-WANTS = (
+SPECS = (
     *({"convention": "telepathy"}, {"cameras": {"base_camera": [0, 10**9]}}, {"rate_hz": float("nan")}),
     *({"depth": 1}, {"more": 1}, np.zeros(3)),
 )
@@ -88,7 +88,7 @@ WANTS = (
         "Traceback: no",
         b"\xc1",
         None,
-        *(pack({"robocas_wants": wants}) for wants in WANTS),
+        *(pack({"robocas_spec": spec}) for spec in SPECS),
         *(pack({"robocas_max_batch": value}) for value in (0, -1, True, 1.5, "8", [])),
         pack({"robocas_answers_pings": 1}),
         *(pack({"robocas_policy": {"weights": weights}}) for weights in (b"no text", "x" * 2**21)),

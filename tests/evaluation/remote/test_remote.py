@@ -135,10 +135,10 @@ def test_batches_are_split_and_failures_end_their_episodes_alone():
 
 
 def test_with_play_each_observation_has_images():
-    with serving(Told(PolicySpec(look_every=3))) as url:
+    with serving(Told(PolicySpec(observe_every=3))) as url:
         for address, looks in ((url, 3), (f"{url}?play=2", 1)):
             remote = RemotePolicy(address)
-            assert remote.spec.look_every == looks
+            assert remote.spec.observe_every == looks
             remote.close()
 
 
@@ -231,7 +231,7 @@ def test_openpis_client_asks_our_server():
     policy = Told()
     with serving(policy) as url:
         client = openpi.WebsocketClientPolicy(host=url)
-        assert client.get_server_metadata()["robocas_wants"]["convention"] == "robocas"
+        assert client.get_server_metadata()["robocas_spec"]["convention"] == "robocas"
         message = observation_message(some_observations(0), 0, None, reset=False)
         for key in ("env_id", "reset"):
             del message[key]

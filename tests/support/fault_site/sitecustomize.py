@@ -24,7 +24,7 @@ POINTS = {  # module -> (class, method, what tells one task from the other)
     "robocas_ms3.demos.generate": ("_EpisodeWorker", "run", lambda seed: seed),
     "robocas_ms3.datasets.conversion.workers": ("_EpisodeWorker", "run", lambda task: task[0]),
     "robocas_ms3.plans.worker": ("Recorder", "run", lambda files: files.seed),
-    "robocas_ms3.evaluation.action_wrapper": ("PolicyStepping", "reset", lambda seed=None, **_: int(seed or 0)),
+    "robocas_ms3.evaluation.action_wrapper": ("PolicyActionWrapper", "reset", lambda seed=None, **_: int(seed or 0)),
 }
 
 
