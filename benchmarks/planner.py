@@ -16,7 +16,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.planning.kinematics import ArmChain, Reachability
 from robocas_ms3.planning.protocol import Array
 from robocas_ms3.planning.rrt_connect import RRTConnectPlanner
@@ -73,7 +73,7 @@ class Stopwatch:
         start = time.perf_counter()
         try:
             result, outcome = call(*args, **kwargs), "ok"
-        except PlanningFailed as error:
+        except PlanningError as error:
             result, outcome = None, error.reason
         self.milliseconds.setdefault(name, []).append((time.perf_counter() - start) * 1e3)
         self.outcomes.setdefault(name, Counter())[outcome] += 1

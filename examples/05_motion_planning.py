@@ -16,7 +16,7 @@ import tyro
 from mani_skill.examples.motionplanning.base_motionplanner.utils import compute_grasp_info_by_obb, get_actor_obb
 
 import robocas_ms3  # noqa: F401  (registers RoboCASPick-v1)
-from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.core.poses import inverse, transform
 from robocas_ms3.planning.grasp_choice import filter_grasps, grip_margins
 from robocas_ms3.planning.motionplanner import PandaArmMotionPlanningSolver
@@ -82,12 +82,12 @@ def solve_pick(env, seed=None, debug=False, vis=False):
 
 def first_that_works(move, poses, debug):
     """Return the first pose to which a motion could be planned."""
-    failure = PlanningFailed("example", "no_pose")
+    failure = PlanningError("example", "no_pose")
     for pose in poses:
         try:
             move(pose)
             return pose
-        except PlanningFailed as error:
+        except PlanningError as error:
             failure = error
             if debug:
                 print(error)
@@ -153,7 +153,7 @@ def main(
             *_, info = SOLUTIONS[env](made, seed=number, debug=debug, vis=vis)
             success = bool(info["success"][0])
             print(f"seed {number}: success {success}, {int(info['elapsed_steps'][0])} steps")
-        except PlanningFailed as error:
+        except PlanningError as error:
             success = False
             print(f"seed {number}: {error}")
         successes += success

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from robocas_ms3.assets.hulls import Array
-from robocas_ms3.core.documents import DAMAGED, open_arrays
+from robocas_ms3.core.documents import DAMAGED_FILE_ERRORS, open_arrays
 from robocas_ms3.core.errors import AssetError
 
 # The open gripper that grasps are annotated for, in the TCP frame (z approach, y closing), one half of it (the other is
@@ -89,7 +89,7 @@ class Annotations:
                 if array.dtype.kind not in "fiu" or (array.ndim == 0) is not (name == "display_pose"):
                     raise ValueError(f"{name} is {array.dtype} of shape {array.shape}")
             return cls(**{**arrays, "display_pose": int(arrays["display_pose"])})
-        except (*DAMAGED, AssetError, KeyError) as error:
+        except (*DAMAGED_FILE_ERRORS, AssetError, KeyError) as error:
             fix = "Make the pack again."
             raise AssetError("can't read the annotations", where=path, found=error, fix=fix) from error
 

@@ -18,7 +18,7 @@ from robocas_ms3.baselines.baseline import Baseline, BaselineConfig, Batch, OnRe
 from robocas_ms3.baselines.chunks import ROW, ChunkPolicy, Scale, chunk_losses, encode, next_keys, spread, state_of
 from robocas_ms3.baselines.dataset_checks import check_base_stands
 from robocas_ms3.baselines.training.record import hash_dataset
-from robocas_ms3.core.documents import DAMAGED
+from robocas_ms3.core.documents import DAMAGED_FILE_ERRORS
 from robocas_ms3.core.errors import DatasetError, EvaluationError
 from robocas_ms3.core.files import replacing
 from robocas_ms3.core.paths import cache_dir
@@ -120,7 +120,7 @@ def load_states(path: Path, rate_hz: float, on_read: OnRead) -> dict[str, NDArra
         raise DatasetError("bc-state learns from recorded states", where=path, expected="a trajectory.h5", fix=fix)
     cached = _cache_path(path, rate_hz)
     if cached.is_file():
-        with suppress(*DAMAGED), np.load(cached) as arrays:
+        with suppress(*DAMAGED_FILE_ERRORS), np.load(cached) as arrays:
             return dict(arrays)
     arrays = read_states(path, rate_hz, on_read)
     with replacing(cached) as tmp:

@@ -38,7 +38,7 @@ _SHOWN_KEYS = 8  # of the way to a wrong value
 _CONTAINERS = (dict, list, tuple)
 _SURROGATE = re.compile(r"[\ud800-\udfff]")  # no encoding has one
 
-DAMAGED = (
+DAMAGED_FILE_ERRORS = (
     *(OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error),
     NotImplementedError,  # damaged flags or method of an archive's member
     *(SyntaxError, tokenize.TokenError),  # an array's header
@@ -124,7 +124,10 @@ def load_yaml(path: Path) -> Any:
 
 
 def open_arrays(path: Path) -> Any:
-    """Open an ``.npz`` file without pickled objects; return NumPy's reader, a context manager. Raises `DAMAGED`."""
+    """Open an ``.npz`` file without pickled objects; return NumPy's reader, a context manager.
+
+    Raises one of `DAMAGED_FILE_ERRORS`.
+    """
     import numpy as np  # not for every command
     from numpy.lib.npyio import NpzFile
 
@@ -139,7 +142,7 @@ def open_arrays(path: Path) -> Any:
 
 
 def load_array(path: Path, limit: int = ARRAYS_LIMIT) -> Any:
-    """Read an ``.npy`` file of at most ``limit`` bytes without pickled objects. Raises `DAMAGED`."""
+    """Read an ``.npy`` file of at most ``limit`` bytes without pickled objects. Raises `DAMAGED_FILE_ERRORS`."""
     import numpy as np  # not for every command
 
     check_regular(path, limit)

@@ -1,4 +1,4 @@
-"""Every failure a user can meet has a type here, and a message of one line: what, where, expected, found, fix."""
+"""Define the error types of the package; each message is one line: where, what, expected, found, fix."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from typing import Any
 
 
 class RobocasError(Exception):
-    """Base of all errors this package raises on purpose; the command line prints them in one line.
+    """Base class of all errors that this package raises; the command line prints them without a traceback.
 
     Args:
         what: what went wrong.
-        where: the file, key, flag or object concerned.
-        expected: what would have been right.
-        found: what was there instead.
-        fix: what to do about it.
+        where: the file, key, option or object that is wrong.
+        expected: which values are valid.
+        found: the value that was found.
+        fix: a sentence that says how to correct it.
     """
 
     def __init__(
@@ -29,91 +29,91 @@ class RobocasError(Exception):
 
 
 class ConfigError(RobocasError):
-    """A task configuration is wrong."""
+    """Invalid task configuration."""
 
 
 class ExtensionError(RobocasError):
-    """A task, planner or the like is not known, or another package's can't be loaded."""
+    """Unknown task, planner or other extension, or an extension that cannot be loaded."""
 
 
 class AssetError(RobocasError):
-    """An asset pack, or a mesh on its way into one, is missing, damaged or unusable."""
+    """Missing, damaged or invalid asset pack or mesh."""
 
 
 class LayoutError(RobocasError):
-    """No arrangement of the objects satisfies the configuration."""
+    """No layout of the objects satisfies the task configuration."""
 
 
 class SimulationError(RobocasError):
-    """The physics engine could not do what it was asked for."""
+    """Failure of the physics engine."""
 
 
 class OutputExistsError(RobocasError):
-    """The output exists and may not be replaced: no flag allows it, or another command wrote it."""
+    """The output exists already and must not be overwritten."""
 
 
 class DatasetError(RobocasError):
-    """A trajectory file or dataset can't be read or written."""
+    """A trajectory file or dataset cannot be read or written."""
 
 
 class EmptySplitError(DatasetError):
-    """A split of a dataset holds no episodes."""
+    """A split of a dataset has no episodes."""
 
 
-class IncompleteError(DatasetError):
-    """Some episodes of a dataset can't be written; ``reasons`` has why, by name of the episode's folder."""
+class IncompleteDatasetError(DatasetError):
+    """Some episodes of a dataset cannot be written; ``reasons`` maps episode folders to reasons."""
 
     reasons: Mapping[str, str] = {}
 
 
 class PlanError(RobocasError):
-    """A plan of datasets is wrong, or what it makes can't be made."""
+    """Invalid plan of datasets, or a dataset that cannot be made from its plan."""
 
 
 class MissingExtraError(RobocasError):
-    """An optional dependency is needed; the message names its extra."""
+    """Missing optional dependency; the message names the extra that installs it."""
 
 
 def require_extra(extra: str, purpose: str, *modules: str, fix: str = "") -> None:
-    """Raise MissingExtraError if modules that an extra brings are not installed; ``fix`` is another way out."""
+    """Raise MissingExtraError if modules of an extra are not installed; ``fix`` is an alternative to installing."""
     if missing := [module for module in modules if importlib.util.find_spec(module) is None]:
         what, install = f"missing for {purpose}: {', '.join(missing)}", f'In the clone: pip install -e ".[{extra}]".'
         raise MissingExtraError(what, fix=f"{install} {fix}".rstrip())
 
 
-class WorkerCrashed(RobocasError):
-    """A worker process crashed, or was killed because its task exceeded a limit; ``found`` is the reason."""
+class WorkerCrashError(RobocasError):
+    """A worker process crashed, or was killed because a task exceeded a limit; ``found`` is the reason."""
 
 
 class WorkerStartError(RobocasError):
-    """A worker process died before its first task."""
+    """A worker process crashed before its first task."""
 
 
 class VectorEnvError(RobocasError):
-    """A vector environment can't be made, or can't continue."""
+    """A vector environment cannot be created or stepped."""
 
 
-class WorkerDied(VectorEnvError):
-    """A worker of a vector environment died; ``envs`` are those that it was stepping, or all that it had."""
+class VectorEnvCrashError(VectorEnvError):
+    """A worker process of a vector environment crashed; ``envs`` are the indices of the affected environments."""
 
     envs: tuple[int, ...] = ()
 
 
 class EvaluationError(RobocasError):
-    """A protocol, policy, result or figure of an evaluation is invalid."""
+    """Invalid protocol, policy, result or figure of an evaluation."""
 
 
 class WireError(EvaluationError):
-    """A message to or from a remote policy can't be written or read."""
+    """A message to or from a remote policy cannot be encoded or decoded."""
 
 
-class PolicyFailed(EvaluationError):
-    """A policy could not act in some envs: their episodes end there, those of others go on.
+class PolicyError(EvaluationError):
+    """A policy could not act in some envs; only the episodes of these envs end.
 
     Args:
-        reasons: why, by number of env.
-        actions: (E, A) or (E, H, A) as `Policy.act` returns them, for all envs that it was asked about; rows of those
-            that failed are ignored. None: all failed.
+        reasons: the reason for each failed env, by index of the env.
+        actions: (E, A) or (E, H, A) as `Policy.act` returns them, for all envs of the request; rows of failed envs are
+            ignored. None: all envs failed.
     """
 
     def __init__(self, reasons: Mapping[int, str], actions: Any = None) -> None:
@@ -122,19 +122,19 @@ class PolicyFailed(EvaluationError):
 
 
 class TrainingError(RobocasError):
-    """A baseline can't be trained: its configuration, run, checkpoint or dataset is wrong."""
+    """A baseline cannot be trained: invalid configuration, run folder, checkpoint or dataset."""
 
 
 class RobotDescriptionError(RobocasError):
-    """A robot's URDF, SRDF or collision mesh is missing or unusable."""
+    """Missing or invalid URDF, SRDF or collision mesh of a robot."""
 
 
-class PlanningFailed(RobocasError):
-    """A scripted policy could not continue.
+class PlanningError(RobocasError):
+    """A scripted policy could not plan or run a motion.
 
     Args:
-        stage: the step of the policy: ``grasp_sampling``, ``reach``, ``approach``, ``grasp``, ``lift``, ...
-        reason: why, in a few words that can be counted.
+        stage: the stage of the task: ``grasp_sampling``, ``reach``, ``approach``, ``grasp``, ``lift``, ...
+        reason: a short fixed text, which reports count.
     """
 
     def __init__(self, stage: str, reason: str) -> None:
@@ -145,5 +145,5 @@ class PlanningFailed(RobocasError):
         return type(self), (self.stage, self.reason)
 
 
-class EpisodeLost(PlanningFailed):
-    """The episode can't succeed any more after what a scripted policy did, which has to be undone."""
+class UnrecoverableError(PlanningError):
+    """The episode cannot succeed from its current state; the scripted policy has to backtrack."""

@@ -38,7 +38,7 @@ class Line(Generic[Record]):
 _form_of = lru_cache(TypeAdapter)
 
 
-class Ledger(Generic[Record]):
+class JsonLinesFile(Generic[Record]):
     """The file.
 
     Args:

@@ -22,7 +22,7 @@ import cloudpickle
 import psutil
 from tqdm import tqdm
 
-from robocas_ms3.core.errors import RobocasError, WorkerCrashed, WorkerStartError
+from robocas_ms3.core.errors import RobocasError, WorkerCrashError, WorkerStartError
 from robocas_ms3.core.remote_errors import RemoteError
 from robocas_ms3.core.signals import die_with_parent, end_process, exit_error
 from robocas_ms3.core.text import escape_log_lines, escape_tracebacks
@@ -52,8 +52,8 @@ class Limits:
 NO_LIMITS = Limits()
 
 
-class ProcessDied(WorkerCrashed):
-    """The process of a task died, which had this ``pid``; other than a `WorkerCrashed` that the task itself raised."""
+class ProcessCrashError(WorkerCrashError):
+    """The worker process ``pid`` died during a task. A task that itself raises `WorkerCrashError` is not meant."""
 
     pid = 0
 
@@ -100,7 +100,7 @@ class WorkerProcess(Generic[Task, Result]):
                 self._receive(START_SECONDS)  # that it reads: nothing below waits for a full pipe
                 self.send(self.pickled_worker)
                 self._receive(START_SECONDS)
-            except ProcessDied as crash:
+            except ProcessCrashError as crash:
                 what, fix = "a worker process died before its first task", "See its output above, and robocas doctor."
                 raise WorkerStartError(what, found=crash.found, fix=fix) from crash
             except BaseException:
@@ -136,7 +136,7 @@ class WorkerProcess(Generic[Task, Result]):
             raise RobocasError(what, found=error.strerror or error, fix=fix) from error
 
     def send(self, message: object) -> None:
-        """Send a message; raises ProcessDied."""
+        """Send a message; raises ProcessCrashError."""
         try:
             self.connection.send(message)
         except OSError as error:
@@ -154,7 +154,7 @@ class WorkerProcess(Generic[Task, Result]):
         return self.read()
 
     def check_limits(self, deadline: float) -> None:
-        """Kill the process and raise ProcessDied where it is too late (`time.monotonic`), or it has too much memory."""
+        """Kill the process and raise ProcessCrashError if it exceeds the deadline (`time.monotonic`) or the memory."""
         now = time.monotonic()
         if now > deadline:
             raise self._crash("too slow")
@@ -164,7 +164,7 @@ class WorkerProcess(Generic[Task, Result]):
                 raise self._crash("too much memory")
 
     def read(self) -> Any:
-        """Read the answer that is there; raises ProcessDied, or the error of the task."""
+        """Read the answer that is there; raises ProcessCrashError, or the error of the task."""
         try:
             answer = self.connection.recv()
         except (EOFError, OSError) as error:
@@ -173,7 +173,7 @@ class WorkerProcess(Generic[Task, Result]):
             answer.reraise()
         return answer
 
-    def _crash(self, reason: str = "") -> ProcessDied:
+    def _crash(self, reason: str = "") -> ProcessCrashError:
         """End the process, and return the error that says why."""
         assert self._process is not None
         if not reason:
@@ -183,7 +183,7 @@ class WorkerProcess(Generic[Task, Result]):
             reason = signal.Signals(-code).name if code is not None and code < 0 else f"exit code {code}"
             if code in (-signal.SIGTERM, -signal.SIGKILL):
                 wait([self._stop], _JOB_KILL_SECONDS)  # else the task would be blamed for the end of all
-        died = ProcessDied("its worker process died", found=reason)
+        died = ProcessCrashError("its worker process died", found=reason)
         died.pid = self.pid
         self.end()
         return died

@@ -27,9 +27,9 @@ from multiprocessing import Pipe
 from queue import Empty, SimpleQueue
 from typing import Any, Generic, TypeVar
 
-from robocas_ms3.core.errors import WorkerCrashed, WorkerStartError
+from robocas_ms3.core.errors import WorkerCrashError, WorkerStartError
 from robocas_ms3.core.signals import deferred_interrupts
-from robocas_ms3.core.worker_process import NO_LIMITS, Limits, ProcessDied, Worker, WorkerProcess
+from robocas_ms3.core.worker_process import NO_LIMITS, Limits, ProcessCrashError, Worker, WorkerProcess
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -61,7 +61,7 @@ class WorkerPool(Generic[Task, Result]):
         limits: of each task.
         retries: how often a task is tried again whose process crashed.
         on_crash: gives the result of a task whose last process crashed, and the reason, or raises an error; default:
-            raises `WorkerCrashed`.
+            raises `WorkerCrashError`.
     """
 
     def __init__(
@@ -186,7 +186,7 @@ class WorkerPool(Generic[Task, Result]):
             except WorkerStartError:
                 if not retries_left:
                     raise
-            except ProcessDied as crash:
+            except ProcessCrashError as crash:
                 reason = str(crash.found)
                 if retries_left:
                     _log.warning("%.80s: its worker process died (%s); it is tried again", task, reason)
@@ -240,4 +240,4 @@ def use_one_torch_thread() -> None:
 
 def _raise_crash(task: Any, reason: str) -> Any:
     what, fix = "its worker process died", "Is memory short? Use fewer --jobs."
-    raise WorkerCrashed(what, where=f"{task}"[:80], found=reason, fix=fix)
+    raise WorkerCrashError(what, where=f"{task}"[:80], found=reason, fix=fix)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Iterable
 from typing import TypeVar
 
-from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.demos.failures import EpisodeResult
 from robocas_ms3.planning.decisions import ONE_BY_ONE, Effort
 
@@ -22,7 +22,7 @@ class DeadEnd(Exception):  # noqa: N818
 
 def turns(
     candidates: Iterable[T], effort: Effort, result: EpisodeResult
-) -> Generator[tuple[T, bool], float | PlanningFailed | None, None]:
+) -> Generator[tuple[T, bool], float | PlanningError | None, None]:
     """Yield which candidate is next, and whether to continue from it, or only to play it for its score.
 
     A few are compared, and the episode continues from the best first; then from the next few. The caller sends the
@@ -35,14 +35,14 @@ def turns(
 
     Raises:
         DeadEnd: the episode continued from some candidates, and from no other it shall.
-        PlanningFailed: none can be played; of the last one.
+        PlanningError: none can be played; of the last one.
     """
-    failure, continued, left = PlanningFailed("decision", "no_candidate"), 0, iter(candidates)
+    failure, continued, left = PlanningError("decision", "no_candidate"), 0, iter(candidates)
     while continued < effort.tries and not result.exhausted:
         compared: list[tuple[float, T]] = []
         for candidate in left:
             outcome = yield candidate, False
-            if isinstance(outcome, PlanningFailed):
+            if isinstance(outcome, PlanningError):
                 failure = outcome
                 continue
             assert outcome is not None
@@ -74,16 +74,16 @@ class _Decision:
         chosen: index of the candidate that the episode continues from, if any.
     """
 
-    def __init__(self, turns: Generator[tuple[int, bool], float | PlanningFailed | None, None]) -> None:
+    def __init__(self, turns: Generator[tuple[int, bool], float | PlanningError | None, None]) -> None:
         self._turns = turns
         self.advance()
 
-    def advance(self, outcome: float | PlanningFailed | None = None) -> None:
+    def advance(self, outcome: float | PlanningError | None = None) -> None:
         """Take the outcome of a turn, and the next turn; see `backtracking.turns`."""
         self.chosen: int | None = None
         try:
             self.next: tuple[int, bool] | Exception = self._turns.send(outcome)
-        except (PlanningFailed, DeadEnd) as error:
+        except (PlanningError, DeadEnd) as error:
             self.next = error
 
 
@@ -104,7 +104,7 @@ class Resimulation:
                 return True
             except _Rerun:
                 continue
-            except PlanningFailed as error:
+            except PlanningError as error:
                 self._result.failed(error)
             except DeadEnd:
                 self._decisions.pop()
@@ -128,7 +128,7 @@ class Resimulation:
             if not continues:
                 try:
                     outcome = play(items[index])
-                except PlanningFailed as error:
+                except PlanningError as error:
                     outcome = error
                 decision.advance(outcome)
                 if decision.next != (index, True):

@@ -26,7 +26,7 @@ from typing import Any, NoReturn, TypeVar, cast
 
 import torch
 
-from robocas_ms3.core.errors import PlanningFailed, RobocasError
+from robocas_ms3.core.errors import PlanningError, RobocasError
 from robocas_ms3.core.remote_errors import RemoteError
 from robocas_ms3.core.signals import die_with_parent
 from robocas_ms3.demos.backtracking import DeadEnd, turns
@@ -142,7 +142,7 @@ class ForkedBranches:
             pass
         except DeadEnd:
             succeeded = False
-        except PlanningFailed as error:
+        except PlanningError as error:
             self._result.failed(error)
             succeeded = False
         except BaseException as error:
@@ -157,7 +157,7 @@ class ForkedBranches:
         """Choose; see `Decisions`. Returns in the child that continues the episode."""
         order = turns(enumerate(candidates), effort, self._result)
         played: dict[int, Child] = {}
-        outcome: float | PlanningFailed | None = None
+        outcome: float | PlanningError | None = None
         try:
             while True:
                 (number, candidate), continues = order.send(outcome)
@@ -171,12 +171,12 @@ class ForkedBranches:
                     again, failure = self._try(play, candidate)
                     if again is None:
                         return candidate
-                    if isinstance(failure, PlanningFailed) or not self._continue_as(again):
-                        self._result.failed(PlanningFailed("branch", "crashed"))
+                    if isinstance(failure, PlanningError) or not self._continue_as(again):
+                        self._result.failed(PlanningError("branch", "crashed"))
         finally:
             self._end_children()
 
-    def _try(self, play: Callable[[T], float], candidate: T) -> tuple[Child | None, float | PlanningFailed]:
+    def _try(self, play: Callable[[T], float], candidate: T) -> tuple[Child | None, float | PlanningError]:
         """Return a child that has played a candidate, and its answer; in the child, no child once it shall continue."""
         for last in (False, True):
             child = self._fork()
@@ -186,12 +186,12 @@ class ForkedBranches:
             try:
                 outcome = self._receive(child, PLAY_LIMIT)
             except ChildCrash as error:
-                outcome = PlanningFailed("branch", str(error))
+                outcome = PlanningError("branch", str(error))
                 if isinstance(error, ChildGone) and not last:
                     self._end(child)
                     continue
             break
-        if isinstance(outcome, PlanningFailed):
+        if isinstance(outcome, PlanningError):
             self._end(child)
         return child, outcome
 
@@ -222,7 +222,7 @@ class ForkedBranches:
         except ChildGone:
             return False
         except ChildCrash as error:
-            self._result.failed(PlanningFailed("branch", str(error)))
+            self._result.failed(PlanningError("branch", str(error)))
             return True
         finally:
             self._end(child)
@@ -248,7 +248,7 @@ class ForkedBranches:
     def _play(self, play: Callable[[T], float], candidate: T) -> None:
         try:
             score = float(play(candidate))
-        except PlanningFailed as error:
+        except PlanningError as error:
             self._send_and_exit(error)
         except BaseException as error:
             self._send_and_exit(RemoteError.of(error, "a branch"))
@@ -259,7 +259,7 @@ class ForkedBranches:
         except (EOFError, ConnectionError):
             os._exit(0)
 
-    def _send_and_exit(self, answer: bool | PlanningFailed | RemoteError) -> NoReturn:
+    def _send_and_exit(self, answer: bool | PlanningError | RemoteError) -> NoReturn:
         assert self._pipe is not None
         try:
             self._end_children()

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from robocas_ms3.core.checks import GREATEST_SEED
-from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.planning.decisions import Seconds
 
 FAILURES_FILE = "failures.jsonl"
@@ -74,7 +74,7 @@ class EpisodeResult:
     def exhausted(self) -> bool:
         return len(self.failures) >= self.max_attempts
 
-    def failed(self, error: PlanningFailed) -> None:
+    def failed(self, error: PlanningError) -> None:
         now = time.perf_counter()
         seconds = round(now - self.begun, 3)
         self.failures.append(Failure(self.seed, len(self.failures), error.stage, error.reason, seconds))

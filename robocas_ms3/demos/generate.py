@@ -17,7 +17,7 @@ import numpy as np
 
 from robocas_ms3.core.errors import DatasetError, RobocasError
 from robocas_ms3.core.files import flush_to_disk, make_folder, write_json
-from robocas_ms3.core.json_lines import Ledger
+from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.output_folder import FolderKind, OutputFolder
 from robocas_ms3.core.text import one_line
 from robocas_ms3.core.workers import Limits, Worker, WorkerPool, use_one_torch_thread
@@ -213,7 +213,7 @@ class _Run:
     def __init__(self, folder: Path) -> None:
         self._folder, self._trajectory = folder, folder / "trajectory.h5"
         self.shards = make_folder(folder / "episodes")
-        self.ledger: Ledger[Failure] = Ledger(folder / FAILURES_FILE, Failure)
+        self.ledger: JsonLinesFile[Failure] = JsonLinesFile(folder / FAILURES_FILE, Failure)
         noted: dict[int, dict[int, Failure]] = defaultdict(dict)  # by seed and attempt, the first of duplicates
         for failure in self.ledger.read():
             noted[failure.seed].setdefault(failure.attempt, failure)

@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
-from robocas_ms3.core.errors import EpisodeLost, LayoutError, PlanningFailed
+from robocas_ms3.core.errors import LayoutError, PlanningError, UnrecoverableError
 from robocas_ms3.core.extensions import load
 from robocas_ms3.demos.backtracking import Resimulation
 from robocas_ms3.demos.branches import ForkedBranches, say_once, why_not_fork
@@ -66,7 +66,7 @@ class EpisodeGenerator:
         assert isinstance(base_env, RoboCASEnv)
         self.planner: Planner = make_planner(settings.planner, robot, dt=base_env.control_timestep)
         self.reachability = Reachability(ArmChain(robot.files().arm_urdf, robot.description))
-        # a scripted policy tries once, from wherever the episode stands, and raises PlanningFailed
+        # a scripted policy tries once, from wherever the episode stands, and raises PlanningError
         self.policy: Callable[[Arm], None] = load(TASKS[settings.task].solver)
         self.worlds: list[OpenLoop] = []
         self.trials: Trials | None = None
@@ -94,14 +94,14 @@ class EpisodeGenerator:
         executor.rehearse = attempts.rehearse
         try:
             if takeover is not None and takeover.refused:
-                raise EpisodeLost("takeover", takeover.refused)
+                raise UnrecoverableError("takeover", takeover.refused)
             if self.settings.keep_recoveries:
                 attempts.make_in_one_motion()
             else:
                 attempts.make_from_resets(ForkedBranches(result) if self._fork else Resimulation(result))
         except LayoutError as error:
-            result.failed(PlanningFailed("layout", error.what))
-        except EpisodeLost as error:  # of a takeover; those of attempts are dealt with there
+            result.failed(PlanningError("layout", error.what))
+        except UnrecoverableError as error:  # of a takeover; those of attempts are dealt with there
             result.failed(error)
         result.attempts = len(result.failures) + result.success
         return result
@@ -149,16 +149,16 @@ class _Attempts:
                     self._play(arm)
                 self._finish(recoveries)
                 return
-            except PlanningFailed as error:
+            except PlanningError as error:
                 result.failed(error)
                 last = error
             try:
-                if not first < len(executor.actions) < self.generator.horizon or isinstance(last, EpisodeLost):
+                if not first < len(executor.actions) < self.generator.horizon or isinstance(last, UnrecoverableError):
                     raise last
                 back_out(arm)
                 span = [first, len(executor.actions) - 1]
                 recoveries.append({"range": span, "stage": last.stage, "reason": last.reason})
-            except PlanningFailed:
+            except PlanningError:
                 recoveries = []
                 self._reset()
 
@@ -193,9 +193,9 @@ class _Attempts:
 
     def _finish(self, recoveries: list[dict[str, Any]]) -> None:
         if len(self.executor.actions) > self.generator.horizon:
-            raise EpisodeLost("horizon", "too_long")
+            raise UnrecoverableError("horizon", "too_long")
         if not self.executor.flag("success"):
-            raise PlanningFailed("episode", "no_success")
+            raise PlanningError("episode", "no_success")
         self.rehearse(finished=True)
         self.result.success, self.result.steps = True, len(self.executor.actions)
         self.recorder.finish(self._describe(recoveries))

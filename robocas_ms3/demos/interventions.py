@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.planning.executor import OPEN
 from robocas_ms3.planning.protocol import Array, Trajectory
 from robocas_ms3.planning.skills.arm import BACK_OUT, Arm, moved_back, plan_back_out, raised
@@ -44,7 +44,7 @@ def _carry_on(arm: Arm, slot: int) -> None:
     if arm.approach == "top":
         hang_clear(arm, slot)  # it may have been lifted just above its neighbours
     if not arm.holds(slot):
-        raise PlanningFailed("lift", "slipped")
+        raise PlanningError("lift", "slipped")
     bring_to_basket(arm, slot)
 
 
@@ -62,7 +62,7 @@ def _get_free(arm: Arm) -> None:
         tcp = arm.planner.tcp(arm.at)
         try:
             motion = plan_back_out(arm, [moved_back(tcp, distance) for distance in BACK_OUT])
-        except PlanningFailed:
+        except PlanningError:
             motion = _plan_off(arm, tcp)
     arm.follow(motion)
 
@@ -76,8 +76,8 @@ def _plan_off(arm: Arm, tcp_in_base: Array) -> Trajectory:
         for goal in (moved_back(tcp_in_base, distance), raised(tcp_in_base, distance), inward):
             try:
                 line = arm.planner.plan_straight(arm.at, goal, stage="takeover", check_collisions=False)
-            except PlanningFailed:
+            except PlanningError:
                 continue
             if arm.planner.free(line.qpos[-1:], arm.planner.finger_width).all():
                 return line
-    raise PlanningFailed("takeover", "stuck")
+    raise PlanningError("takeover", "stuck")

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
-from robocas_ms3.core.errors import DatasetError, EpisodeLost
+from robocas_ms3.core.errors import DatasetError, UnrecoverableError
 from robocas_ms3.demos.failures import NOISY, Takeover
 from robocas_ms3.demos.recordings.environment import RecordedEnv
 from robocas_ms3.demos.recordings.motion import Array, Motion, sample_states, sample_stride
@@ -163,8 +163,8 @@ class Trials:
             noisy: play it with noise too; without, those environments stay behind.
 
         Raises:
-            EpisodeLost: ``clipped``, ``parted`` (the target is elsewhere than recorded) or ``no_success``; with noise
-                ``NOISY`` and the same.
+            UnrecoverableError: ``clipped``, ``parted`` (the target is elsewhere than recorded) or ``no_success``; with
+                noise ``NOISY`` and the same.
         """
         samples = sample_states(len(gripper), self._stride)
         if not finished:
@@ -177,7 +177,7 @@ class Trials:
                 world.step(action)
             reason = _what_is_wrong(world, states, int(new[-1]), finished)
             if reason:
-                raise EpisodeLost("replay", f"{NOISY}{reason}" if number else reason)
+                raise UnrecoverableError("replay", f"{NOISY}{reason}" if number else reason)
         self._played += len(actions)
 
     def _with_noise(self, actions: NDArray[np.float64], number: int) -> NDArray[np.float64]:

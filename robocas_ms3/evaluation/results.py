@@ -22,7 +22,7 @@ from pydantic import BaseModel, ConfigDict
 from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.files import replacing_folder, write_json
-from robocas_ms3.core.json_lines import Ledger
+from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.output_folder import FolderKind, OutputFolder, check_replaceable, setting_changes
 from robocas_ms3.core.strict_model import parse
 from robocas_ms3.evaluation.outcomes import Outcome
@@ -215,8 +215,8 @@ def versions() -> dict[str, str]:
     return {name: version(name) for name in _PACKAGES}
 
 
-def _ledger(folder: Path) -> Ledger[Outcome]:
-    return Ledger(folder / OUTCOMES, Outcome)
+def _ledger(folder: Path) -> JsonLinesFile[Outcome]:
+    return JsonLinesFile(folder / OUTCOMES, Outcome)
 
 
 def _read(folder: Path) -> Result:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.core.errors import EvaluationError, PolicyFailed
+from robocas_ms3.core.errors import EvaluationError, PolicyError
 from robocas_ms3.core.text import printable
 from robocas_ms3.evaluation.metrics import MEASURES, read_sum
 from robocas_ms3.evaluation.outcomes import Outcome, Retrieval, failure_stage
@@ -243,7 +243,7 @@ def _request_actions(batch: EpisodeBatch, policy: Policy, chunks: dict[int, list
     try:
         with policy_code(policy):
             actions: Any = np.asarray(policy.act(observations))
-    except PolicyFailed as failed:
+    except PolicyError as failed:
         for env in envs if failed.actions is None else failed.reasons:
             running[env].error = failed.reasons.get(env, str(failed))
         if failed.actions is None:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robocas_ms3.assets.pack import MANIFEST, load_pack, sha256
-from robocas_ms3.core.errors import EvaluationError, WorkerDied
+from robocas_ms3.core.errors import EvaluationError, VectorEnvCrashError
 from robocas_ms3.core.workers import Limits
 from robocas_ms3.datasets.conversion.env_renderer import require_renderer
 from robocas_ms3.evaluation import results
@@ -130,7 +130,7 @@ class EvaluationSession:
         ``max_steps`` replaces the protocol's maximum number of policy steps per episode.
 
         Raises:
-            WorkerDied: a process died twice in which no episode ran.
+            VectorEnvCrashError: a process died twice in which no episode ran.
         """
         try:
             for config in dict.fromkeys(episode.config for episode in episodes):
@@ -170,7 +170,7 @@ class EvaluationSession:
 
         Raises:
             EvaluationError: no episode runs, or the actions have another shape.
-            WorkerDied: a process of the environment died.
+            VectorEnvCrashError: a process of the environment died.
         """
         batch = self._batch
         if batch is None or not batch.running:
@@ -228,7 +228,7 @@ class EvaluationSession:
                 batch = self.open(episodes[0], min(self.settings.envs, len(left)), max_steps)
                 for ended in rollout(batch, self.policy, [self.episode_spec(episode) for episode in left.values()]):
                     yield self._outcome(ended, left.pop(ended.start.episode))
-            except WorkerDied as error:
+            except VectorEnvCrashError as error:
                 self.close()
                 lost = [] if batch is None else list(batch.lost(error.envs, f"its process died: {error.found}"))
                 deaths.update([ended.start.episode for ended in lost] or [_NO_EPISODE])

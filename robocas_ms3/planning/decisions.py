@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
-from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningError
 
 T = TypeVar("T")
 TRIES = 3  # candidates of one decision that are gone on from before the decision before it is made otherwise
@@ -48,14 +48,14 @@ class Decisions(Protocol):
 
         Args:
             candidates: the most promising first.
-            play: makes a candidate's motions and returns its score; raises ``PlanningFailed`` where it can't be done.
+            play: makes a candidate's motions and returns its score; raises ``PlanningError`` where it can't be done.
             effort: how many are compared, and continued from.
 
         Returns:
             The candidate that was played, its motions done.
 
         Raises:
-            PlanningFailed: of the last candidate, where none can be done; nothing has moved then.
+            PlanningError: of the last candidate, where none can be done; nothing has moved then.
         """
         ...
 
@@ -71,13 +71,13 @@ class StraightDecisions:
     done: Callable[[], int]
 
     def choose(self, candidates: Iterable[T], play: Callable[[T], float], effort: Effort = ONE_BY_ONE) -> T:
-        failure = PlanningFailed("decision", "no_candidate")
+        failure = PlanningError("decision", "no_candidate")
         for candidate in candidates:
             before = self.done()
             try:
                 play(candidate)
                 return candidate
-            except PlanningFailed as error:
+            except PlanningError as error:
                 failure = error
                 if self.done() > before:
                     raise

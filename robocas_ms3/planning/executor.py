@@ -37,7 +37,7 @@ class Executor:
         gripper: last command of the gripper.
         base: (3,) last command of the base joints: x m, y m, yaw rad.
         facts: counters of the policy for the record, e.g. ``pushes``.
-        rehearse: replays the actions so far open loop; raises ``EpisodeLost`` where the outcome differs.
+        rehearse: replays the actions so far open loop; raises ``UnrecoverableError`` where the outcome differs.
     """
 
     env: gym.Env

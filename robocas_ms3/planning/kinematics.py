@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.core.extensions import load
 from robocas_ms3.planning.protocol import Array
 from robocas_ms3.robots.description import RobotDescription
@@ -232,7 +232,7 @@ def follow_line(chain: ArmChain, start: Array, tcp_in_base: Array, *, stage: str
         (n, 7) configurations whose TCP poses are at most 1 cm and 3 deg apart; the first is ``start``.
 
     Raises:
-        PlanningFailed: ``line_unreachable``, or ``line_joint_jump``.
+        PlanningError: ``line_unreachable``, or ``line_joint_jump``.
     """
     start = np.asarray(start, dtype=np.float64)
     goals = _line_poses(chain.tcp(start[None])[0], tcp_in_base)
@@ -240,9 +240,9 @@ def follow_line(chain: ArmChain, start: Array, tcp_in_base: Array, *, stage: str
     if path is None or _largest_jump(path) > MAX_JUMP:
         path = _solve_in_turn(chain, start, goals)
     if path is None:
-        raise PlanningFailed(stage, "line_unreachable")
+        raise PlanningError(stage, "line_unreachable")
     if _largest_jump(path) > MAX_JUMP:
-        raise PlanningFailed(stage, "line_joint_jump")
+        raise PlanningError(stage, "line_joint_jump")
     return path
 
 

@@ -44,7 +44,7 @@ class PandaArmMotionPlanningSolver:
     """Plan motions of a Panda arm and execute them in one environment.
 
     The class has the methods of ManiSkill's solver of the same name. All poses and points are in the world frame. A
-    method that can't plan raises ``PlanningFailed`` and does not step the environment, where ManiSkill's prints a
+    method that can't plan raises ``PlanningError`` and does not step the environment, where ManiSkill's prints a
     status and returns -1. Methods that step return the last step: observation, reward, terminated, truncated, info.
 
     Args:

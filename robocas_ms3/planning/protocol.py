@@ -62,7 +62,7 @@ class Obstacle:
 
 
 class Planner(Protocol):
-    """What a backend offers. Every planning method raises ``PlanningFailed(stage, reason)``, never a sentinel.
+    """What a backend offers. Every planning method raises ``PlanningError(stage, reason)``, never a sentinel.
 
     ``RRTConnectPlanner`` lists its reasons at each method.
     """

@@ -10,7 +10,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.core.extensions import Registry
 from robocas_ms3.planning.collision import FclWorld
 from robocas_ms3.planning.kinematics import Reachability, follow_line, turn_between
@@ -68,28 +68,28 @@ class RRTConnectPlanner(FclWorld):
         """Plan as `plan_to_qpos` does to the configurations of a pose (4x4); reasons: ``no_ik``, or as there."""
         goals = self.ik(tcp_in_base, start, avoid_collisions=False)
         if not goals:
-            raise PlanningFailed(stage, "no_ik")
+            raise PlanningError(stage, "no_ik")
         return self.plan_to_qpos(start, goals, stage=stage)
 
     def plan_to_qpos(self, start: Array, goals: list[Array], *, stage: str, search: bool = True) -> Trajectory:
         """Plan a collision-free motion to the nearest of several configurations that can be reached.
 
         Raises:
-            PlanningFailed: ``start_in_collision``, ``start_outside_limits``, ``no_goals`` (the list is empty),
+            PlanningError: ``start_in_collision``, ``start_outside_limits``, ``no_goals`` (the list is empty),
                 ``goal_outside_limits`` (all goals are), ``goal_in_collision`` (all goals within the limits are),
                 ``not_straight``, ``rrt_timeout``, ``path_blocked``, ``timing_failed``.
         """
         start = self._checked_start(start, stage)
         wanted = np.array(goals, dtype=np.float64).reshape(-1, 7)
         if not len(wanted):
-            raise PlanningFailed(stage, "no_goals")
+            raise PlanningError(stage, "no_goals")
         lower, upper = self.chain.limits.T
         wanted = wanted[np.all((wanted >= lower) & (wanted <= upper), axis=1)]
         if not len(wanted):
-            raise PlanningFailed(stage, "goal_outside_limits")
+            raise PlanningError(stage, "goal_outside_limits")
         wanted = wanted[self.free(wanted, self.finger_width)]
         if not len(wanted):
-            raise PlanningFailed(stage, "goal_in_collision")
+            raise PlanningError(stage, "goal_in_collision")
         free = list(wanted[np.argsort(turn_between(wanted, start), kind="stable")])
         if np.linalg.norm(free[0] - start) < STILL:
             return Trajectory(free[0][None].copy(), self._dt)
@@ -98,7 +98,7 @@ class RRTConnectPlanner(FclWorld):
             if turn_between(goal, start) <= enough and self._straight_free(start, goal):
                 return self._timed(partial(stopping, np.array([start, goal])))
         if not search:
-            raise PlanningFailed(stage, "not_straight")
+            raise PlanningError(stage, "not_straight")
         reason = "rrt_timeout"
         # The nearest goal alone gets a quick try, then all of them the full budget; a path that slips through something
         # between two checks is searched again with the spacing of the final check.
@@ -118,7 +118,7 @@ class RRTConnectPlanner(FclWorld):
             if trajectory is not None:
                 return trajectory
             reason = "path_blocked"
-        raise PlanningFailed(stage, reason)
+        raise PlanningError(stage, reason)
 
     def plan_straight(
         self, start: Array, tcp_in_base: Array, *, stage: str, check_collisions: bool = True, speed: float = 1.0
@@ -126,7 +126,7 @@ class RRTConnectPlanner(FclWorld):
         """Move the TCP on a straight line.
 
         Raises:
-            PlanningFailed: ``start_in_collision``, ``start_outside_limits``, ``line_unreachable``, ``line_joint_jump``,
+            PlanningError: ``start_in_collision``, ``start_outside_limits``, ``line_unreachable``, ``line_joint_jump``,
                 ``straight_line_blocked``, ``timing_failed``.
         """
         start = self._checked_start(start, stage, obstacles=check_collisions)
@@ -135,10 +135,10 @@ class RRTConnectPlanner(FclWorld):
             return Trajectory(waypoints[-1:].copy(), self._dt)
         path = through(waypoints)
         if not self._path_free(path, obstacles=check_collisions):
-            raise PlanningFailed(stage, "straight_line_blocked")
+            raise PlanningError(stage, "straight_line_blocked")
         trajectory = self._timed(partial(timed, path), speed)
         if trajectory is None:
-            raise PlanningFailed(stage, "timing_failed")
+            raise PlanningError(stage, "timing_failed")
         return trajectory
 
     def join(self, start: Array, first: Trajectory, second: Trajectory) -> Trajectory:
@@ -165,9 +165,9 @@ class RRTConnectPlanner(FclWorld):
         start = np.asarray(start, dtype=np.float64)
         lower, upper = self.chain.limits.T
         if not np.all((lower - 1e-3 <= start) & (start <= upper + 1e-3)):
-            raise PlanningFailed(stage, "start_outside_limits")
+            raise PlanningError(stage, "start_outside_limits")
         if not self.all_free(start[None], obstacles=obstacles):
-            raise PlanningFailed(stage, "start_in_collision")
+            raise PlanningError(stage, "start_in_collision")
         return start
 
     def _straight_free(self, start: Array, goal: Array) -> bool:

@@ -22,7 +22,7 @@ from robocas_ms3.core.checks import GREATEST_SEED
 from robocas_ms3.core.documents import JSON_LIMIT, DocumentError, load_json, read_bytes
 from robocas_ms3.core.errors import PlanError
 from robocas_ms3.core.files import flush_to_disk, make_folder
-from robocas_ms3.core.json_lines import Ledger
+from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.output_folder import FolderKind, OutputFolder
 from robocas_ms3.core.strict_model import parse, validate_json
 from robocas_ms3.datasets.schema import episode_folder
@@ -191,8 +191,8 @@ class PlanFolder:
         for seed in seeds:
             shutil.rmtree(self.files(unit, seed).folder, ignore_errors=True)
 
-    def _ledger(self, unit: Unit) -> Ledger[Outcome]:
-        return Ledger(self.unit_folder(unit) / OUTCOMES, Outcome)
+    def _ledger(self, unit: Unit) -> JsonLinesFile[Outcome]:
+        return JsonLinesFile(self.unit_folder(unit) / OUTCOMES, Outcome)
 
 
 def read_plan(out: Path) -> PlanFolder:

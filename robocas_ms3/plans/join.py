@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from robocas_ms3.core.documents import DAMAGED, load_array, load_json
+from robocas_ms3.core.documents import DAMAGED_FILE_ERRORS, load_array, load_json
 from robocas_ms3.core.errors import PlanError
 from robocas_ms3.core.files import flush_to_disk, json_text, make_folder, replacing, write_json
 from robocas_ms3.core.output_folder import sweep
@@ -128,7 +128,7 @@ def _join_file(
 def _layouts_damage(path: Path, seeds: Sequence[int]) -> str:
     try:
         found = load_array(path)["seed"].tolist()
-    except (*DAMAGED, IndexError, KeyError, TypeError) as error:
+    except (*DAMAGED_FILE_ERRORS, IndexError, KeyError, TypeError) as error:
         return _reason(error)
     return "" if found == list(seeds) else f"{len(found)} layouts, of other seeds"
 

@@ -20,10 +20,10 @@ from robocas_ms3.core.errors import (
     DatasetError,
     LayoutError,
     PlanError,
-    PlanningFailed,
+    PlanningError,
     RobocasError,
     SimulationError,
-    WorkerCrashed,
+    WorkerCrashError,
     WorkerStartError,
 )
 from robocas_ms3.core.files import remove, write_json
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 
 TRIES = 2
 """How often a seed is tried whose process dies, before it is left out."""
-_OF_A_SEED = (LayoutError, PlanningFailed, SimulationError, DatasetError)  # other errors of ours affect all seeds
+_OF_A_SEED = (LayoutError, PlanningError, SimulationError, DatasetError)  # other errors of ours affect all seeds
 
 
 class Recorder:
@@ -231,7 +231,7 @@ class UnitWorker:
                 return process.run(files)
             except (WorkerStartError, ImportError) as failed:
                 raise PlanError("a process could not start", found=failed) from failed
-            except WorkerCrashed as crash:
+            except WorkerCrashError as crash:
                 reason = f"{crash.found}"
             except Exception as error:
                 if not _is_of_a_seed(error):

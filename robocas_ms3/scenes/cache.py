@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 from sapien import physx
 
 from robocas_ms3.assets.pack import MANIFEST, LoadedFurniture, sha256
-from robocas_ms3.core.documents import DAMAGED
+from robocas_ms3.core.documents import DAMAGED_FILE_ERRORS
 from robocas_ms3.core.errors import LayoutError, SimulationError
 from robocas_ms3.core.files import make_folder, open_for_append, write_json
 from robocas_ms3.core.locks import lock_file
@@ -189,7 +189,7 @@ class LayoutCache:
                 layout = read_layout(path)
                 layout.check(self._names)
                 return layout
-            except (*DAMAGED, KeyError, TypeError) as error:
+            except (*DAMAGED_FILE_ERRORS, KeyError, TypeError) as error:
                 _log.warning("%s: damaged, made again (%s)", path, error)
         known = None if objects_seed == seed else self.get(objects_seed, objects_seed).object_ids
         layout = self._sample.make(objects_seed, seed, known)

@@ -87,7 +87,7 @@ def read_layout(path: Path) -> Layout:
     """Read a layout.
 
     Raises:
-        ValueError: or another of `documents.DAMAGED`, or KeyError or TypeError: the file is damaged.
+        ValueError: or another of `documents.DAMAGED_FILE_ERRORS`, or KeyError or TypeError: the file is damaged.
     """
     with open_arrays(path) as file:
         values = {f.name: file[f.name] for f in fields(Layout)}

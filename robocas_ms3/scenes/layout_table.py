@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.core.documents import DAMAGED, check_regular, load_array
+from robocas_ms3.core.documents import DAMAGED_FILE_ERRORS, check_regular, load_array
 from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.core.files import replacing
 from robocas_ms3.core.poses import from_wxyz, to_wxyz
@@ -217,7 +217,7 @@ def _open(path: Path, load: Callable[[Path], Any], what: str, *, dimensions: int
         slots, words = rows.dtype["present"].itemsize, rows.dtype["relation"].itemsize // 4
         if rows.dtype != _record_type(slots, words) or rows.ndim != dimensions or not rows.size:
             raise ValueError("other fields than those of layouts")
-    except (*DAMAGED, KeyError, TypeError) as error:
+    except (*DAMAGED_FILE_ERRORS, KeyError, TypeError) as error:
         raise LayoutError(what, where=path, found=error, fix=_FIX if dimensions == 2 else "") from error
     return rows
 

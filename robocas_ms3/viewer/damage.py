@@ -6,14 +6,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
-from robocas_ms3.core.documents import DAMAGED
+from robocas_ms3.core.documents import DAMAGED_FILE_ERRORS
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.text import error_line
 from robocas_ms3.datasets.checks.scene import valid_values
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 
 T = TypeVar("T")
-_WRONG = (*DAMAGED, ArithmeticError, AttributeError, AssertionError, LookupError, RecursionError, TypeError)
+_WRONG = (*DAMAGED_FILE_ERRORS, ArithmeticError, AttributeError, AssertionError, LookupError, RecursionError, TypeError)
 """Errors that values of another kind than expected raise."""
 
 

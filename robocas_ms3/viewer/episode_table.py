@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from robocas_ms3.core.json_lines import Ledger
+from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.datasets.sources.provenance import environment_of
 from robocas_ms3.demos.failures import FAILURES_FILE, Failure
 
@@ -56,7 +56,7 @@ class Failures:
     @classmethod
     def read(cls, folder: Path) -> Failures:
         try:
-            lines = Ledger[FailedAttempt](folder / FAILURES_FILE, FailedAttempt).lines()
+            lines = JsonLinesFile[FailedAttempt](folder / FAILURES_FILE, FailedAttempt).lines()
         except OSError as error:
             return cls(note=f"`{FAILURES_FILE}` can't be read: {error.strerror}.")
         found: dict[int, list[FailedAttempt]] = defaultdict(list)

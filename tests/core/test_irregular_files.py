@@ -11,7 +11,7 @@ from robocas_ms3.assets.hulls import read_hulls
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.documents import DocumentError
 from robocas_ms3.core.errors import AssetError, ConfigError, EvaluationError, PlanError
-from robocas_ms3.core.json_lines import Ledger
+from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.paths import builtin_packs_dir
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
@@ -42,7 +42,7 @@ def write_result(root):
         (write_result, results.RUN, results.read, EvaluationError),
         (write_result, results.OUTCOMES, results.read, EvaluationError),
         (Path.mkdir, PLAN, read_plan, PlanError),
-        (Path.mkdir, "ledger.jsonl", lambda root: Ledger(root / "ledger.jsonl", Outcome).lines(), DocumentError),
+        (Path.mkdir, "ledger.jsonl", lambda root: JsonLinesFile(root / "ledger.jsonl", Outcome).lines(), DocumentError),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import pytest
 
 from robocas_ms3.core.errors import DatasetError, RobocasError
-from robocas_ms3.core.json_lines import Ledger
+from robocas_ms3.core.json_lines import JsonLinesFile
 
 
 @dataclass(frozen=True)
@@ -16,8 +16,8 @@ class Try:
 
 
 @pytest.fixture
-def ledger(tmp_path) -> Ledger[Try]:
-    return Ledger(tmp_path / "tries.jsonl", Try)
+def ledger(tmp_path) -> JsonLinesFile[Try]:
+    return JsonLinesFile(tmp_path / "tries.jsonl", Try)
 
 
 def test_what_is_appended_is_read_with_its_types(ledger):
@@ -63,7 +63,7 @@ def test_damaged_lines_are_told_from_one_that_was_cut_off(ledger):
 
 @pytest.mark.parametrize("number", ["NaN", "-Infinity", "1e999", "9" * 400 + ".5"])
 def test_a_number_that_is_not_finite_damages_its_line(tmp_path, number):
-    ledger: Ledger[Try] = Ledger(tmp_path / "tries.jsonl", Try)
+    ledger: JsonLinesFile[Try] = JsonLinesFile(tmp_path / "tries.jsonl", Try)
     ledger.path.write_text(f'{{"seed": 1, "seconds": {number}}}\n{{"seed": 2}}\n{{"seed": 3, "more": [{number}]}}\n')
     assert [line.record for line in ledger.lines()] == [None, Try(2), None]
     error = str(ledger.refusal(ledger.lines()[2], DatasetError, "no try"))
@@ -74,11 +74,11 @@ def test_a_number_that_is_not_finite_damages_its_line(tmp_path, number):
 
 
 def test_lines_of_any_json(tmp_path):
-    plain: Ledger[dict[str, int]] = Ledger(tmp_path / "plain.jsonl", dict[str, int])
+    plain: JsonLinesFile[dict[str, int]] = JsonLinesFile(tmp_path / "plain.jsonl", dict[str, int])
     plain.append([{"a": 1}])
     assert plain.read() == [{"a": 1}]
 
 
 def test_what_can_not_be_read_is_an_error(tmp_path):
     with pytest.raises(OSError, match="Is a directory"):
-        Ledger(tmp_path, Try).lines()
+        JsonLinesFile(tmp_path, Try).lines()

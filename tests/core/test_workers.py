@@ -14,7 +14,7 @@ from itertools import count
 
 import pytest
 
-from robocas_ms3.core.errors import AssetError, RobocasError, WorkerCrashed, WorkerStartError
+from robocas_ms3.core.errors import AssetError, RobocasError, WorkerCrashError, WorkerStartError
 from robocas_ms3.core.workers import FunctionWorker, Limits, WorkerPool
 
 ROOT = os.path.dirname(os.path.dirname(os.path.dirname(__file__)))
@@ -168,7 +168,7 @@ def test_a_crash_costs_only_its_own_task(tmp_path, ordered):
 
 def test_a_crash_is_an_error_by_default():
     with WorkerPool(Counter, 1, retries=0) as pool:
-        with pytest.raises(WorkerCrashed) as caught:
+        with pytest.raises(WorkerCrashError) as caught:
             list(pool.map(["die", "a"]))
         assert (caught.value.where, caught.value.found) == ("die", "SIGSEGV")
 
@@ -182,7 +182,7 @@ def run_pool_in_task(path):
 def test_a_crash_in_a_pool_of_the_task_is_an_error_of_the_task(tmp_path):
     (tmp_path / "log").write_text("")
     make_worker = partial(FunctionWorker, run_pool_in_task)
-    with WorkerPool(make_worker, 1, on_crash=lambda _, why: why) as pool, pytest.raises(WorkerCrashed) as caught:
+    with WorkerPool(make_worker, 1, on_crash=lambda _, why: why) as pool, pytest.raises(WorkerCrashError) as caught:
         pool.run(tmp_path / "log")
     assert caught.value.where == "die"
     assert (tmp_path / "log").read_text() == "x"  # not tried again

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from branch_notes import Notes
 
-from robocas_ms3.core.errors import PlanningFailed, RobocasError
+from robocas_ms3.core.errors import PlanningError, RobocasError
 from robocas_ms3.core.remote_errors import RemoteTraceback
 from robocas_ms3.demos import branches
 from robocas_ms3.demos.branches import ForkedBranches, why_not_fork
@@ -90,7 +90,7 @@ def test_a_child_that_is_killed_once_changes_nothing(tmp_path, moment):
         if second == "b":
             kill_once("it goes on")
         if (first, second) != ("b", "c"):
-            raise PlanningFailed("end", first + second)
+            raise PlanningError("end", first + second)
         (tmp_path / "outcome").write_text(first + second)
 
     ended, notes = forked(decide)
@@ -159,7 +159,7 @@ def test_an_interrupt_while_a_child_says_its_last_word_ends_the_child(monkeypatc
         def play(letter):
             if letter == "a":
                 runner._pipe.__class__ = Interrupted
-                raise PlanningFailed("play", "a")
+                raise PlanningError("play", "a")
             return 0.0
 
         assert runner.choose("ab", play) == "b"
@@ -187,10 +187,10 @@ def test_threads_that_write_do_not_hold_up_branches(capfd):
     def play(number):
         print("in a branch", file=sys.stderr)
         logging.getLogger("robocas_ms3").error("in a branch")
-        raise PlanningFailed("play", str(number))
+        raise PlanningError("play", str(number))
 
     def decide(runner):
-        with pytest.raises(PlanningFailed, match="play: 19"):
+        with pytest.raises(PlanningError, match="play: 19"):
             runner.choose(range(20), play)
 
     writers = [threading.Thread(target=write) for _ in range(2)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from branch_notes import Notes
 
-from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.demos.backtracking import DeadEnd, Resimulation, turns
 from robocas_ms3.demos.branches import ForkedBranches
 from robocas_ms3.planning.decisions import Effort, StraightDecisions
@@ -34,7 +34,7 @@ def search(decide, good):
             world.done = ""
             decide(world, runner)
             if world.done not in good:
-                raise PlanningFailed("end", world.done)
+                raise PlanningError("end", world.done)
             notes.outcome = world.done
 
         ended = runner.run(attempt)
@@ -83,7 +83,7 @@ def test_a_candidate_that_can_not_be_played_is_passed_over():
         def play(letter):
             world.act(letter)
             if letter != "c":
-                raise PlanningFailed("play", letter)
+                raise PlanningError("play", letter)
             return 0.0
 
         runner.choose("abcd", play, Effort(ahead=2))
@@ -96,9 +96,9 @@ def test_where_no_candidate_can_be_played_the_policy_may_do_something_else():
     def decide(world, runner):
         def no(letter):
             world.act(letter)
-            raise PlanningFailed("play", letter)
+            raise PlanningError("play", letter)
 
-        with pytest.raises(PlanningFailed, match="play: b"):
+        with pytest.raises(PlanningError, match="play: b"):
             runner.choose("ab", no)
         assert world.done == "", "what could not be done is undone"
         runner.choose("xy", lambda letter: (world.act(letter), 0.0)[1])
@@ -111,15 +111,15 @@ def test_without_undoing_the_first_that_can_be_played_stays():
 
     def play(letter):
         if letter == "a":
-            raise PlanningFailed("play", letter)
+            raise PlanningError("play", letter)
         world.act(letter)
         if letter == "c":
-            raise PlanningFailed("late", letter)
+            raise PlanningError("late", letter)
         return 0.0
 
     straight = StraightDecisions(lambda: len(world.done))
     assert straight.choose("ab", play) == "b"
-    with pytest.raises(PlanningFailed, match="late: c"):
+    with pytest.raises(PlanningError, match="late: c"):
         straight.choose("cb", play)
     assert world.done == "bc"
 
@@ -139,6 +139,6 @@ def test_candidates_are_taken_as_they_are_needed():
 def test_attempts_are_counted():
     order = turns("abc", Effort(), notes := Notes(max_attempts=1))
     assert (next(order), order.send(0.0)) == (("a", False), ("a", True))
-    notes.failed(PlanningFailed("end", "a"))
+    notes.failed(PlanningError("end", "a"))
     with pytest.raises(DeadEnd):
         order.send(None)

@@ -13,7 +13,7 @@ import torch
 from mani_skill.utils.gym_utils import find_max_episode_steps_value
 from mani_skill.utils.structs import Pose
 
-from robocas_ms3.core.errors import EpisodeLost, PlanningFailed
+from robocas_ms3.core.errors import PlanningError, UnrecoverableError
 from robocas_ms3.demos.branches import Child
 from robocas_ms3.demos.generate import generate
 from robocas_ms3.demos.generator import EpisodeGenerator
@@ -148,7 +148,7 @@ def waiting(steps):
         number = next(numbers)
         arm.executor.move_gripper(1.0, arm.at, seconds=abs(number) * arm.executor.dt)
         if number < 0:
-            raise PlanningFailed("grasp", "missed")
+            raise PlanningError("grasp", "missed")
 
     return policy, begun
 
@@ -214,7 +214,7 @@ def stirring(log):
             file.write(json.dumps(found) + "\n")
         stir(arm, 6)
         if arm.path == (0, 0):
-            raise PlanningFailed("stir", "enough")
+            raise PlanningError("stir", "enough")
 
     return policy
 
@@ -269,7 +269,7 @@ def test_forked_or_not_a_search_is_the_same_and_replays_bit_for_bit(tmp_path, mo
 def test_recoveries_stay_unless_the_episode_is_lost(tmp_path, monkeypatch, search_generator):
     call_it_done(monkeypatch)
     change(monkeypatch, search_generator, max_attempts=4, keep_recoveries=True)
-    failures = iter([PlanningFailed("grasp", "missed"), EpisodeLost("clear", "fell_off_table")])
+    failures = iter([PlanningError("grasp", "missed"), UnrecoverableError("clear", "fell_off_table")])
     begun = []
 
     def policy(arm):

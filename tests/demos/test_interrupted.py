@@ -8,7 +8,7 @@ import h5py
 import pytest
 
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.core.json_lines import Ledger
+from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.demos import generate as module
 from robocas_ms3.demos.failures import FAILURES_FILE, EpisodeResult, Failure
 from robocas_ms3.demos.generate import shard_name
@@ -80,7 +80,7 @@ def begun(out, shards, lines=()):
     run = {"settings": asdict(SETTINGS), "first_seed": 0}
     (out / "episodes").mkdir(parents=True)
     (out / "run.json").write_text(json.dumps(run))
-    Ledger(out / "failures.jsonl", Failure).append(lines)
+    JsonLinesFile(out / "failures.jsonl", Failure).append(lines)
     for seed in shards:
         record(out / "episodes", seed)
 
@@ -134,7 +134,7 @@ def test_what_was_cut_off_is_made_again(tmp_path, made, suffix, left):
     generate(out, episodes=3)
     assert made == [1, 2, 3]
     assert seeds_of(out) == [0, 1, 3]
-    assert Ledger(out / FAILURES_FILE, Failure).read() == [*lines_of(1), *lines_of(2)]
+    assert JsonLinesFile(out / FAILURES_FILE, Failure).read() == [*lines_of(1), *lines_of(2)]
 
 
 def test_killed_when_all_was_merged_already(tmp_path, made):

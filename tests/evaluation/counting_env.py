@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from robocas_ms3.core.errors import WorkerDied
+from robocas_ms3.core.errors import VectorEnvCrashError
 from robocas_ms3.evaluation.metrics import SUMS
 from robocas_ms3.evaluation.policy import EpisodeSpec, Policy
 from robocas_ms3.evaluation.rollout import EndConditions, EpisodeBatch, Rollout, rollout
@@ -81,7 +81,7 @@ class Dying(CountingEnv):
         at = [env for env in range(self.num_envs) if self.seed_of[env] == self.deadly and self.elapsed[env] == 1]
         if at and self.deaths[0] > 0:
             self.deaths[0] -= 1
-            died = WorkerDied("its process died", found="SIGSEGV")
+            died = VectorEnvCrashError("its process died", found="SIGSEGV")
             died.envs = tuple(at)
             raise died
         return super().step(actions)

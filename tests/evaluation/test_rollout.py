@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from counting_env import CountingEnv, play
 
-from robocas_ms3.core.errors import EvaluationError, PolicyFailed
+from robocas_ms3.core.errors import EvaluationError, PolicyError
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.evaluation.protocol import load_protocol
 
@@ -82,7 +82,7 @@ def test_an_episode_whose_policy_fails_or_acts_by_nan_ends_alone(fails):
         actions, ill = act(observations), np.array(observations.instructions) == "count to 4"
         actions[ill] = np.nan
         if fails and ill.any():
-            raise PolicyFailed({int(env): "no plan" for env in observations.envs[ill]}, actions)
+            raise PolicyError({int(env): "no plan" for env in observations.envs[ill]}, actions)
         return actions
 
     policy.act = sick

@@ -10,7 +10,7 @@ import torch
 from counting_env import BREAKS, CountingEnv, Dying
 
 from robocas_ms3.cli.main import run as cli
-from robocas_ms3.core.errors import DatasetError, EvaluationError, OutputExistsError, RobocasError, WorkerDied
+from robocas_ms3.core.errors import DatasetError, EvaluationError, OutputExistsError, RobocasError, VectorEnvCrashError
 from robocas_ms3.evaluation import results, session
 from robocas_ms3.evaluation.policies import make_policy
 from robocas_ms3.evaluation.policy import ExternalPolicy, PolicySpec
@@ -186,7 +186,7 @@ def test_envs_whose_process_dies_while_they_are_made_are_made_again_once(short, 
     def make_vec(env_id, count, **_):
         left[0] -= 1
         if left[0] >= 0:
-            raise WorkerDied("its process died", where="env 0", found="SIGSEGV")
+            raise VectorEnvCrashError("its process died", where="env 0", found="SIGSEGV")
         return CountingEnv(count)
 
     monkeypatch.setattr(session, "make_vec", make_vec)
@@ -194,7 +194,7 @@ def test_envs_whose_process_dies_while_they_are_made_are_made_again_once(short, 
         assert len(evaluate(tmp_path / "out", "noop", protocol=str(short))) == 8
         assert "SIGSEGV" in caplog.text
         return
-    with pytest.raises(WorkerDied, match="env 0: its process died"):
+    with pytest.raises(VectorEnvCrashError, match="env 0: its process died"):
         evaluate(tmp_path / "out", "noop", protocol=str(short))
 
 

@@ -18,7 +18,7 @@ from robocas_ms3.cli.layouts import Info, info
 from robocas_ms3.core import documents
 from robocas_ms3.core.documents import DocumentError, open_arrays
 from robocas_ms3.core.errors import AssetError, DatasetError, TrainingError
-from robocas_ms3.core.json_lines import Ledger
+from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.poses import planar
 from robocas_ms3.demos.failures import Failure
 from robocas_ms3.scenes.cache import ABOUT, LayoutCache
@@ -78,7 +78,7 @@ LINE = st.fixed_dictionaries({"seed": JSON}, optional={"more": JSON, "seconds": 
 @settings(max_examples=40, deadline=None, derandomize=True)
 @given(lines=st.lists(st.binary(max_size=20) | JSON | LINE, max_size=5))
 def test_ledgers(tmp_path_factory, lines):
-    ledger: Ledger[Try] = Ledger(tmp_path_factory.mktemp("ledger") / "tries.jsonl", Try)
+    ledger: JsonLinesFile[Try] = JsonLinesFile(tmp_path_factory.mktemp("ledger") / "tries.jsonl", Try)
     texts = [line if isinstance(line, bytes) else json.dumps(line).encode() for line in lines]
     ledger.path.write_bytes(b"\n".join(texts))
     for line in ledger.lines():
@@ -96,7 +96,7 @@ FAILURE = {"seed": 1, "attempt": 0, "stage": "a", "reason": "b", "seconds": 1.0}
 @pytest.mark.parametrize("changes", [{"attempt": -2}, {"seed": 2**62}, {"seconds": 1e308}, {"seconds": True}])
 def test_a_failure_out_of_range_is_no_failure(tmp_path, changes):
     (tmp_path / "failures.jsonl").write_text(json.dumps({**FAILURE, **changes}) + "\n")
-    assert Ledger(tmp_path / "failures.jsonl", Failure).read() == []
+    assert JsonLinesFile(tmp_path / "failures.jsonl", Failure).read() == []
 
 
 def test_arrays_that_unpack_to_more_than_there_may_be(tmp_path, monkeypatch):

@@ -18,7 +18,7 @@ from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.baselines.training.record import BUNDLED, read_run
 from robocas_ms3.core.documents import DocumentError
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.core.json_lines import Ledger
+from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.output_folder import OutputFolder
 from robocas_ms3.core.paths import builtin_packs_dir
 from robocas_ms3.core.poses import planar
@@ -223,7 +223,7 @@ def read_plan_folder(root):
 
 def read_generation(root):
     OutputFolder(root, OUTPUT, RUN).read()
-    count_by_stage(Ledger(root / "failures.jsonl", Failure).read())
+    count_by_stage(JsonLinesFile(root / "failures.jsonl", Failure).read())
 
 
 def read_conversion(root):

@@ -11,7 +11,7 @@ import pytest
 from faults import SITE, begun, files_of
 from synthetic import RayCaster, write_trajectory
 
-from robocas_ms3.core.errors import IncompleteError
+from robocas_ms3.core.errors import IncompleteDatasetError
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.conversion.convert import convert
 from robocas_ms3.datasets.conversion.settings import ConversionSettings
@@ -37,7 +37,7 @@ def test_a_conversion_leaves_out_what_ends_its_process_twice_and_goes_on_later(b
     made = {"embeddings": False, "video": False, "open_renderer": RayCaster, "size": (64, 48)}
     convert(ConversionSettings(trajectory, tmp_path / "whole", **made))
     log = befalls(1, "crash", 2)
-    with pytest.raises(IncompleteError, match=r"out: .*\(found episode_0000001: its.*: SIGSEGV\)") as error:
+    with pytest.raises(IncompleteDatasetError, match=r"out: .*\(found episode_0000001: its.*: SIGSEGV\)") as error:
         convert(ConversionSettings(trajectory, tmp_path / "out", jobs=2, episode_seconds=60, memory_gb=4, **made))
     assert "\n" not in str(error.value)
     assert sorted(key for _, key in begun(log)) == ["0", "1", "1", "2"]

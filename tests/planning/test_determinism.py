@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from planning_scenes import REST, Box, cloud, table_scene, top_down
 
-from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningError
 
 SCENE = [*table_scene(0), Box((0.55, 0.0, 0.15), (0.4, 0.03, 0.4))]
 
@@ -31,7 +31,7 @@ def session(planner) -> str:
             here = trajectory.qpos[-1]
             digest.update(trajectory.qpos.tobytes())
             digest.update(planner.plan_straight(here, top_down(0.5, goal[1, 3], 0.25), stage="up").qpos.tobytes())
-        except PlanningFailed as error:
+        except PlanningError as error:
             digest.update(str(error).encode())
     return digest.hexdigest()
 

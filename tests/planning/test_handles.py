@@ -11,7 +11,7 @@ from planning_scenes import REST
 
 from robocas_ms3.assets.kinematics import joint_motion
 from robocas_ms3.assets.manifest import Handle, Joint
-from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.planning.protocol import AttachedBody, Obstacle, Shape
 from robocas_ms3.planning.pull_path import MAX_SLIP, reached, track
 from robocas_ms3.planning.skills.drive import Surroundings, free_route
@@ -103,5 +103,5 @@ def test_pull_continues_from_the_position_of_the_joint(towards, monkeypatch):
     part = standing_at(towards * 0.35, joint, monkeypatch)
     assert part.least(None) == pytest.approx(0.03)  # a quarter of the range is more than what is left
     for position in (0.37, 0.38, 0.4):
-        with pytest.raises(PlanningFailed, match="at_the_end"):
+        with pytest.raises(PlanningError, match="at_the_end"):
             standing_at(towards * position, joint, monkeypatch).way(None)

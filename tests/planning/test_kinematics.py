@@ -7,7 +7,7 @@ import pytest
 from planning_scenes import REST, pose_error, top_down
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.planning.kinematics import ArmChain, Reachability, follow_line, rotation_vector
 from robocas_ms3.robots.description import MOBILE_PANDA
 
@@ -51,7 +51,7 @@ def test_a_line_is_straight_and_ends_at_its_goal(chain, checker, seed):
 
 
 def refusal(chain, start, goal) -> str:
-    with pytest.raises(PlanningFailed) as caught:
+    with pytest.raises(PlanningError) as caught:
         follow_line(chain, start, goal, stage="here")
     assert caught.value.stage == "here"
     return caught.value.reason

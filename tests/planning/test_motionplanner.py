@@ -15,7 +15,7 @@ import sapien
 from planning_scenes import Box
 
 import robocas_ms3  # noqa: F401  (registers RoboCASPick-v1)
-from robocas_ms3.core.errors import PlanningFailed, RobocasError
+from robocas_ms3.core.errors import PlanningError, RobocasError
 from robocas_ms3.planning import motionplanner
 from robocas_ms3.planning.motionplanner import PandaArmMotionPlanningSolver
 
@@ -62,7 +62,7 @@ def distance(a: sapien.Pose, b: sapien.Pose) -> float:
 @pytest.mark.parametrize("verb", VERBS)
 def test_a_plan_leads_to_its_pose_and_one_that_fails_steps_nothing(env, verb):
     solver, goal = PandaArmMotionPlanningSolver(env), sapien.Pose([0, 0.1, 0.1]) * tcp(env)
-    with pytest.raises(PlanningFailed) as caught:
+    with pytest.raises(PlanningError) as caught:
         getattr(solver, verb)(sapien.Pose([2.0, 0, 0.2], [0, 1, 0, 0]))
     assert caught.value.stage == verb
     planned = getattr(solver, verb)(goal, dry_run=True)
@@ -101,7 +101,7 @@ def test_an_obstacle_blocks_the_straight_line_and_is_passed_on_another_path(env,
     here, across = tcp(env), SIDEWAYS * tcp(env)
     between = sapien.Pose((here.p + across.p) / 2)
     add(solver, between)
-    with pytest.raises(PlanningFailed) as caught:
+    with pytest.raises(PlanningError) as caught:
         solver.move_to_pose_with_screw(across)
     assert caught.value.reason == "straight_line_blocked"
     around = solver.move_to_pose_with_RRTConnect(across, dry_run=True)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from mani_skill.utils.structs import Pose
 
-from robocas_ms3.core.errors import EpisodeLost, PlanningFailed
+from robocas_ms3.core.errors import PlanningError, UnrecoverableError
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.planning.decisions import StraightDecisions
@@ -53,7 +53,7 @@ def first_that_works(skill, slots):
     for slot in slots:
         try:
             skill(slot)
-        except PlanningFailed:
+        except PlanningError:
             continue
         return slot
     return None
@@ -109,13 +109,13 @@ def test_push_that_moves_nothing_is_a_failure(generator, monkeypatch):
         monkeypatch.setattr(heap, "push_away", move)
         heap.make(Move("push", slots[0], 30))
 
-    with pytest.raises(PlanningFailed, match="in_vain"):
+    with pytest.raises(PlanningError, match="in_vain"):
         push(0.015)
     assert facts == {"pushes": 0, "removals": 0}
     push(0.025)
     assert facts == {"pushes": 1, "removals": 0}
     facts["removals"] = heap.MOVES - 1
-    with pytest.raises(EpisodeLost, match="too_many_obstacles"):
+    with pytest.raises(UnrecoverableError, match="too_many_obstacles"):
         next(heap.moves())
 
 
@@ -139,7 +139,7 @@ def test_where_nothing_can_be_moved_the_target_is_grasped_as_it_lies(generator, 
     skills = []
 
     def refuse(*_):
-        raise PlanningFailed("push", "no_room")
+        raise PlanningError("push", "no_room")
 
     monkeypatch.setattr(Heap, "make", refuse)
     monkeypatch.setattr(Heap, "visible", True)
@@ -163,10 +163,10 @@ def test_after_a_push_the_arm_rises_clear_of_furniture_and_basket(generator, mon
         monkeypatch.setattr(push, "_fixed_bodies", lambda arm: [*fixed(arm), board])
 
     board_at(push.surface_in_base(arm)[0][2, 3] + 0.3)  # across hand or wrist
-    with pytest.raises(PlanningFailed, match="push"):
+    with pytest.raises(PlanningError, match="push"):
         push.plan_push(arm, pushed, target)
     board_at(arm.scene.tcp_in_base[2, 3] + 0.12)
-    with pytest.raises(PlanningFailed, match="push"):  # where a push was cut short
+    with pytest.raises(PlanningError, match="push"):  # where a push was cut short
         push._plan_lift(arm, np.array([1.0, 0, 0]))
     assert arm.planner.finger_width == width
     monkeypatch.setattr(push, "_fixed_bodies", fixed)
@@ -179,5 +179,5 @@ def test_what_lies_on_the_floor_ends_an_attempt_even_one_that_begins_after_the_f
     Heap(arm, target).check_surface()
     fallen = arm.env.objects[target if which == "target" else slots[0]]
     fallen.set_pose(Pose.create_from_pq(torch.tensor([[-1.0, -1.0, 0.1]]), fallen.pose.q))
-    with pytest.raises(EpisodeLost, match="fell_off_table"):
+    with pytest.raises(UnrecoverableError, match="fell_off_table"):
         Heap(arm, target).check_surface()

@@ -10,7 +10,7 @@ import pytest
 import torch
 from planning_scenes import REST, top_down
 
-from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.planning.protocol import Trajectory
 from robocas_ms3.planning.skills.arm import Arm, back_out
 
@@ -41,7 +41,7 @@ class Way(Arm):
 
     def plan_straight(self, start, goal, *, stage, check_collisions=True, speed=1.0):
         if check_collisions and self.left_out in self.blocking:
-            raise PlanningFailed(stage, "straight_line_blocked")
+            raise PlanningError(stage, "straight_line_blocked")
         self.lines.append((goal, check_collisions, self.left_out))
         return Trajectory(start[None], 0.05)
 
@@ -82,6 +82,6 @@ def test_the_way_out_of_a_failure(tcp, approach, blocking, moved, checked, left_
 @pytest.mark.parametrize("tcp", [LEVEL, top_down(0.6, 0.1, 0.05)])
 def test_before_a_shelf_it_stays_where_no_way_is_free(tcp):
     arm = Way(tcp, "front", blocking=(None, TARGET))
-    with pytest.raises(PlanningFailed, match="straight_line_blocked"):
+    with pytest.raises(PlanningError, match="straight_line_blocked"):
         back_out(arm)
     assert not arm.followed and not arm.lines

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from planning_scenes import REST, Box, cloud, corners, pose_error, table_scene, top_down
 
-from robocas_ms3.core.errors import ExtensionError, PlanningFailed
+from robocas_ms3.core.errors import ExtensionError, PlanningError
 from robocas_ms3.planning import rrt_connect
 from robocas_ms3.planning.kinematics import ArmChain
 from robocas_ms3.planning.protocol import AttachedBody, Planner, Trajectory
@@ -19,7 +19,7 @@ WALL = Box((0.55, 0.0, 0.15), (0.4, 0.03, 0.4))
 
 
 def reason_of(call, *args, **kwargs) -> str:
-    with pytest.raises(PlanningFailed) as caught:
+    with pytest.raises(PlanningError) as caught:
         call(*args, stage="here", **kwargs)
     assert caught.value.stage == "here"
     return caught.value.reason
@@ -42,7 +42,7 @@ def test_trajectories_are_free_everywhere(make_planner, checker, seed):
         goal = top_down(rng.uniform(0.4, 0.6), side * rng.uniform(0.12, 0.3), rng.uniform(0.1, 0.2), rng.uniform(-1, 1))
         try:
             trajectory = planner.plan_to_pose(here, goal, stage="reach")
-        except PlanningFailed as error:
+        except PlanningError as error:
             assert error.reason in ("goal_in_collision", "no_ik")
             continue
         planned += 1
@@ -53,7 +53,7 @@ def test_trajectories_are_free_everywhere(make_planner, checker, seed):
         assert distance < 2e-4 and angle < 2e-3
         try:
             down = planner.plan_straight(here, goal @ shifted(0.06), stage="approach")
-        except PlanningFailed as error:
+        except PlanningError as error:
             assert error.reason in ("straight_line_blocked", "line_unreachable", "line_joint_jump")
             continue
         straight += 1

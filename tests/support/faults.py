@@ -18,7 +18,7 @@ import h5py
 import numpy as np
 import psutil
 
-from robocas_ms3.core.json_lines import Ledger
+from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.datasets.conversion.episode_folder import find_damaged
 from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.datasets.sources.reader import Dataset
@@ -83,7 +83,7 @@ def content(command, out):
     """(episode, what came of it), without what a clock said; none may be there twice."""
     if command.name == "generate":
         episodes = json.loads((out / "trajectory.json").read_text())["episodes"]
-        lines: list[Failure] = Ledger(out / FAILURES_FILE, Failure).read()
+        lines: list[Failure] = JsonLinesFile(out / FAILURES_FILE, Failure).read()
         failed = {seed: list(of) for seed, of in groupby(lines, lambda line: line.seed)}
         assert list(failed) == sorted({line.seed for line in lines})
         with open_trajectory(out / "trajectory.h5") as file:

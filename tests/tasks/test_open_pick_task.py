@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import robocas_ms3  # noqa: F401
-from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.datasets.sources.arrays import episode_arrays
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.open_loop import Trials
@@ -203,7 +203,7 @@ def test_pick_drives_to_a_target_that_is_out_of_reach(tmp_path):
     pick = generator.policy
 
     def policy(arm) -> None:
-        with pytest.raises(PlanningFailed):
+        with pytest.raises(PlanningError):
             plan_grasp(arm, int(arm.env.target_slot[0]), 0.1)
         pick(arm)
 

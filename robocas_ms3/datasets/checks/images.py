@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.core.documents import DAMAGED, load_array
+from robocas_ms3.core.documents import DAMAGED_FILE_ERRORS, load_array
 from robocas_ms3.core.poses import from_xyzw
 from robocas_ms3.core.text import count_of, one_line
 from robocas_ms3.datasets import schema
@@ -50,7 +50,7 @@ def check_cameras(folder: Path, image_options: ImageOptions) -> Iterator[Violati
             except FileNotFoundError:
                 yield Violation(file, "", "this file", NO_FILE, "missing")
                 continue
-            except DAMAGED as error:
+            except DAMAGED_FILE_ERRORS as error:
                 yield Violation(file, "", "a numpy array", one_line(error))
                 continue
             wrong = list(check_camera_file(file, found, pose=name in pose_files))

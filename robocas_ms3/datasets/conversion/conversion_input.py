@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.core.documents import DAMAGED
+from robocas_ms3.core.documents import DAMAGED_FILE_ERRORS
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.text import count_of, one_line
 from robocas_ms3.datasets import schema
@@ -127,7 +127,7 @@ def complete_arrays(episode: SourceEpisode) -> dict[str, NDArray]:
     """Return the arrays of an episode, or raise DatasetError if it lacks any that it must have."""
     try:
         arrays = episode.arrays
-    except DAMAGED as error:
+    except DAMAGED_FILE_ERRORS as error:
         what, found = "these arrays can't be read", one_line(error)
         raise DatasetError(what, where=episode.where, found=found, fix=SEE_VALIDATE) from error
     missing, lengths = sorted(NEEDED - set(arrays)), set()

@@ -54,7 +54,7 @@ def convert(
 
     Raises:
         DatasetError: the input is unusable, nothing to convert, no render device.
-        IncompleteError: episodes can't be written; the dataset is complete without, ``left_out`` in its
+        IncompleteDatasetError: episodes can't be written; the dataset is complete without, ``left_out`` in its
             ``conversion.json`` says why, and the same call tries again.
         OutputExistsError: ``out`` is no dataset, or one of other settings or versions, or, without ``append``, of other
             recordings.

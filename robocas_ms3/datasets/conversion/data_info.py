@@ -11,7 +11,7 @@ import numpy as np
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import write_json
-from robocas_ms3.core.json_lines import Ledger
+from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.text import one_line
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.actions import action_space
@@ -72,8 +72,8 @@ def info_of(root: Path, before: tuple[Iterable[int], Iterable[int]] = ((), ())) 
 def add_failures(run: Path, out: Path, env_info: Mapping[str, Any]) -> None:
     """Add the failures of the run in a folder to a dataset, each once, with task and environment."""
     made_in = {"task": task_of(str(env_info.get("env_id"))), "environment": environment_of(env_info)}
-    there: Ledger[dict[str, Any]] = Ledger(out / FAILURES_FILE, dict[str, Any])
-    failures: Ledger[dict[str, Any]] = Ledger(run / FAILURES_FILE, dict[str, Any])
+    there: JsonLinesFile[dict[str, Any]] = JsonLinesFile(out / FAILURES_FILE, dict[str, Any])
+    failures: JsonLinesFile[dict[str, Any]] = JsonLinesFile(run / FAILURES_FILE, dict[str, Any])
     known = {_key(line) for line in there.read()}
     marked = ((line, {**line, **made_in}) for line in failures.read())
     new = [line for before, line in marked if not {_key(before), _key(line)} & known]

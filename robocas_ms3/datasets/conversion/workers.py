@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.core.errors import DatasetError, IncompleteError, MissingExtraError
+from robocas_ms3.core.errors import DatasetError, IncompleteDatasetError, MissingExtraError
 from robocas_ms3.core.files import replacing_folder
 from robocas_ms3.core.output_folder import OutputFolder
 from robocas_ms3.core.remote_errors import RemoteError
@@ -81,7 +81,7 @@ class WriteJob:
 
 def write_episodes(
     job: WriteJob, output: OutputFolder, on_episode: Callable[[WrittenEpisode], None] | None
-) -> tuple[list[WrittenEpisode], IncompleteError | None]:
+) -> tuple[list[WrittenEpisode], IncompleteDatasetError | None]:
     """Write episodes; return them by number, and an error that names those that can't be written.
 
     An episode that fails does not end the others, unless all share its error: the disk, an extra, or the first three.
@@ -133,12 +133,12 @@ def _death(task: Task, why: str) -> _Failure:
     return _Failure(episode, RemoteError.of(DatasetError(f"its process died twice: {why}", where=episode), "a worker"))
 
 
-def _incomplete(failures: list[_Failure], job: WriteJob) -> IncompleteError:
+def _incomplete(failures: list[_Failure], job: WriteJob) -> IncompleteDatasetError:
     reasons = {one.episode: one.reason for one in sorted(failures, key=lambda one: one.episode)}
     listed = [why if why.startswith(f"{one}: ") else f"{one}: {why}" for one, why in reasons.items()]
     more = f"; and {len(listed) - _LISTED} more" if len(listed) > _LISTED else ""
     what = f"{count_of(len(listed), 'episode')} could not be written"
-    error = IncompleteError(what, where=job.settings.out, found="; ".join(listed[:_LISTED]) + more, fix=job.fix)
+    error = IncompleteDatasetError(what, where=job.settings.out, found="; ".join(listed[:_LISTED]) + more, fix=job.fix)
     error.reasons, error.__cause__ = reasons, failures[0].sent.with_traceback()
     return error
 

@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from robocas_ms3.core.errors import DatasetError, IncompleteError, OutputExistsError
+from robocas_ms3.core.errors import DatasetError, IncompleteDatasetError, OutputExistsError
 from robocas_ms3.core.files import flush_to_disk, make_folder, naming, remove
 from robocas_ms3.core.output_folder import FolderKind, OutputFolder, sweep
 from robocas_ms3.core.strict_model import parse
@@ -64,7 +64,7 @@ def convert_lerobot(
 
     Raises:
         DatasetError: the input is unusable, nothing to convert, no render device, no such version or rate.
-        IncompleteError: episodes can't be written; all others are, and the same call tries again.
+        IncompleteDatasetError: episodes can't be written; all others are, and the same call tries again.
         OutputExistsError: ``out`` is a dataset of other settings, versions or episodes, or none.
         RobocasError: another conversion is running.
         MissingExtraError: the ``lerobot`` extra is not installed.
@@ -163,7 +163,7 @@ def _missing_parts(settings: ConversionSettings, variant: Variant, episodes: lis
     return WriteJob(settings, writer, missing, len(missing) < len(episodes), _FIX)
 
 
-def _without_missing(plan: dict[str, Any], parts: Path, incomplete: IncompleteError) -> dict[str, Any]:
+def _without_missing(plan: dict[str, Any], parts: Path, incomplete: IncompleteDatasetError) -> dict[str, Any]:
     """Return the plan of the parts that are there; the other episodes are in ``left_out``, with the reason."""
     episodes = list(enumerate(plan["episodes"]))
     there = [number for number, _ in episodes if (parts / episode_folder(number)).is_dir()]

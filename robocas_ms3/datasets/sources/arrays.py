@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.core.documents import DAMAGED, open_arrays
+from robocas_ms3.core.documents import DAMAGED_FILE_ERRORS, open_arrays
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import from_xyzw
 from robocas_ms3.core.text import one_line
@@ -86,9 +86,9 @@ def read_arrays(path: Path, keys: Container[str] | None = None) -> EpisodeArrays
                     if not isinstance(arrays[key], np.ndarray):  # a member that is no array is read as bytes
                         unreadable[key] = ValueError("no array")
                         del arrays[key]
-                except (*DAMAGED, MemoryError) as error:
+                except (*DAMAGED_FILE_ERRORS, MemoryError) as error:
                     unreadable[key] = error
-    except DAMAGED as error:
+    except DAMAGED_FILE_ERRORS as error:
         unreadable[""] = error
     return EpisodeArrays(path, arrays, unreadable, ignored=tuple(ignored))
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.core.documents import DAMAGED, load_array, load_json
+from robocas_ms3.core.documents import DAMAGED_FILE_ERRORS, load_array, load_json
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.text import one_line
 from robocas_ms3.datasets import schema
@@ -58,6 +58,6 @@ def read_array(path: Path) -> NDArray[np.float64]:
         array = load_array(path, CAMERA_LIMIT)
         if array.dtype.kind not in "fiu":
             raise ValueError("no array of numbers")
-    except DAMAGED as error:
+    except DAMAGED_FILE_ERRORS as error:
         raise DatasetError("this array can't be read", where=path, found=one_line(error), fix=SEE_VALIDATE) from error
     return array

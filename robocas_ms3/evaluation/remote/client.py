@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from websockets.asyncio.client import ClientConnection
 
-from robocas_ms3.core.errors import EvaluationError, PolicyFailed, WireError
+from robocas_ms3.core.errors import EvaluationError, PolicyError, WireError
 from robocas_ms3.core.text import one_line
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.evaluation.remote.connection import (
@@ -114,11 +114,11 @@ class RemotePolicy:
                 _log.warning("env %d: %s", env, error)
                 self._forget(env)
         if not chunks:
-            raise PolicyFailed(reasons)
+            raise PolicyError(reasons)
         first = next(iter(chunks.values()))
         actions = np.stack([chunks.get(row, np.zeros_like(first)) for row in range(len(envs))])
         if reasons:
-            raise PolicyFailed(reasons, actions)
+            raise PolicyError(reasons, actions)
         return actions
 
     def close(self) -> None:

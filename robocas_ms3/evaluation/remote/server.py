@@ -21,7 +21,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from robocas_ms3 import __version__
-from robocas_ms3.core.errors import EvaluationError, PolicyFailed, RobocasError, WireError
+from robocas_ms3.core.errors import EvaluationError, PolicyError, RobocasError, WireError
 from robocas_ms3.core.paths import builtin_packs_dir, data_dir, protocols_dir
 from robocas_ms3.core.text import error_line, one_line
 from robocas_ms3.evaluation.policy import (
@@ -302,7 +302,7 @@ class _Answers:
         reasons: dict[int, str] = {}
         try:
             return self._act(observations, starts), {}
-        except PolicyFailed as failed:
+        except PolicyError as failed:
             text = _log_failure(failed)
             reasons = {env: one_line(reason, 300) for env, reason in failed.reasons.items()}
             if failed.actions is not None:

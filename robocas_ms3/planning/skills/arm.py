@@ -8,7 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.planning.decisions import ONE_BY_ONE, TRIES, Decisions, Effort
 from robocas_ms3.planning.executor import CLOSED, OPEN, Executor
 from robocas_ms3.planning.kinematics import Reachability
@@ -132,7 +132,7 @@ class Arm:
         return first_plan(
             goals,
             lambda goal: self.planner.plan_straight(start, goal, stage=stage, check_collisions=check_collisions),
-            PlanningFailed(stage, "no_goal"),
+            PlanningError(stage, "no_goal"),
         )
 
     def plan_home(self, start: Array) -> Trajectory:
@@ -146,7 +146,7 @@ class Arm:
                 if not self.planner.collisions(self.at, self.planner.finger_width):
                     return
                 if rises == RISES:
-                    raise PlanningFailed("rise", "still_touching")
+                    raise PlanningError("rise", "still_touching")
                 motion = self.plan_rise(self.planner.tcp(self.at), RISE, stage="rise")
             self.follow(motion)
 
@@ -158,12 +158,12 @@ class Arm:
         return self.first_line(self.at, [up, inward], stage=stage, check_collisions=False)
 
 
-def first_plan(candidates: Iterable[T], plan: Callable[[T], Plan], failure: PlanningFailed) -> Plan:
+def first_plan(candidates: Iterable[T], plan: Callable[[T], Plan], failure: PlanningError) -> Plan:
     """Return the first plan of a candidate that succeeds, or raise the last failure; without candidates ``failure``."""
     for candidate in candidates:
         try:
             return plan(candidate)
-        except PlanningFailed as error:
+        except PlanningError as error:
             failure = error
     raise failure
 
@@ -191,7 +191,7 @@ def plan_back_out(arm: Arm, goals: list[Array]) -> Trajectory:
     """Plan a straight line to the first of several TCP poses (best first), free of all but the target."""
     try:
         return arm.first_line(arm.at, goals, stage="retreat")
-    except PlanningFailed:
+    except PlanningError:
         arm.planner.set_scene(arm.scene.obstacles(without=arm.target))
         return arm.first_line(arm.at, goals, stage="retreat")
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.core.poses import inverse, transform
 from robocas_ms3.planning.protocol import Array, Obstacle
 from robocas_ms3.planning.scene import seen_from
@@ -64,7 +64,7 @@ def _from_some_place(arm: Arm, go: Callable[[bool], None], act: Callable[[], Non
         try:
             act()
             return
-        except PlanningFailed:
+        except PlanningError:
             if len(arm.executor.actions) > length or not arm.executor.drives or place == PLACES - 1:
                 raise
 
@@ -93,9 +93,7 @@ def drive_to_object(arm: Arm, slot: int, *, elsewhere: bool = False) -> None:
             return best_route(arm, goals, around, share, enough=enough)
 
         # where the elbow is in the way of the nearest configurations, others are judged too
-        route = first_plan(
-            ((False, 2 * COMFORTABLE), (True, COMFORTABLE)), route_to, PlanningFailed("drive", "nowhere")
-        )
+        route = first_plan(((False, 2 * COMFORTABLE), (True, COMFORTABLE)), route_to, PlanningError("drive", "nowhere"))
     drive(arm, *route)
 
 
@@ -160,7 +158,7 @@ def drive_to_basket(arm: Arm, slot: int) -> None:
             route = best_route(arm, places_before(arm, center), around, share, enough=ABOVE_BASKET)
     drive(arm, *route)
     if not arm.holds(slot):
-        raise PlanningFailed("drive", "dropped")
+        raise PlanningError("drive", "dropped")
 
 
 def _fold(arm: Arm) -> Surroundings:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.core.poses import from_wxyz, planar, transform
 from robocas_ms3.planning.protocol import Array, Obstacle
 from robocas_ms3.planning.scene import seen_from
@@ -66,7 +66,7 @@ def drive(arm: Arm, *goals: Array) -> None:
         arm.executor.drive(np.concatenate([motion.qpos, wait]), arm.at)
         now = arm.env.agent.robot.get_qpos()[0, :3].cpu().numpy()
         if np.abs(now - goal).max() > ARRIVED:
-            raise PlanningFailed("drive", "held_up")
+            raise PlanningError("drive", "held_up")
 
 
 def places_before(arm: Arm, center: Array) -> Array:
@@ -103,7 +103,7 @@ def best_route(
             if share >= enough:
                 break
     if not best[1]:
-        raise PlanningFailed("drive", "nowhere_to_go")
+        raise PlanningError("drive", "nowhere_to_go")
     return best[1]
 
 

@@ -11,7 +11,7 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.core.poses import inverse
 from robocas_ms3.planning.grasp_choice import draw_order, filter_grasps, grip_margins, score_grasps
 from robocas_ms3.planning.protocol import Array, AttachedBody, Trajectory
@@ -45,15 +45,15 @@ def grasp(arm: Arm, slot: int, *, lift_height: float = 0.10, other_than: int = 0
     arm.follow(way_in)
     arm.close_gripper()
     if not arm.holds(slot):
-        raise PlanningFailed("grasp", "missed")
+        raise PlanningError("grasp", "missed")
     arm.follow(*out)
     if not arm.holds(slot):
-        raise PlanningFailed("lift", "slipped")
+        raise PlanningError("lift", "slipped")
 
 
 def plan_grasp(arm: Arm, slot: int, lift_height: float, other_than: int = 0) -> tuple[Trajectory, Out]:
     """Plan from where the arm is to the best grasp that has a way in and out, and out of the object's surroundings."""
-    planner, failure = arm.planner, PlanningFailed("grasp_sampling", "no_feasible_grasp")
+    planner, failure = arm.planner, PlanningError("grasp_sampling", "no_feasible_grasp")
     everything, others = arm.scene.obstacles(), arm.scene.obstacles(without=slot)
     with_room = arm.scene.obstacles(room=ROOM)
     ways: list[tuple[Array, Trajectory, Out]] = []  # pre-grasp configuration, way in, way out
@@ -72,17 +72,17 @@ def plan_grasp(arm: Arm, slot: int, lift_height: float, other_than: int = 0) -> 
         # in and out of the target's surroundings, where the target itself is no obstacle; it is one on the way there
         planner.set_scene(others)
         starts = planner.ik(moved_back(tcp_in_base, PREGRASP_DISTANCE), arm.at)[:ENTRIES]
-        failure = failure if starts else PlanningFailed("approach", "no_ik")
+        failure = failure if starts else PlanningError("approach", "no_ik")
         for start in starts:
             try:
                 planner.set_scene(with_room)
                 reach = planner.plan_to_qpos(arm.at, [start], stage="reach", search=False)
-            except PlanningFailed:
+            except PlanningError:
                 reach = None
             try:
                 planner.set_scene(others)
                 inward, out = _plan_way_in_and_out(arm, slot, start, tcp_in_base, lift_height)
-            except PlanningFailed as error:
+            except PlanningError as error:
                 failure = error
                 continue
             if reach is not None:
@@ -92,7 +92,7 @@ def plan_grasp(arm: Arm, slot: int, lift_height: float, other_than: int = 0) -> 
         if len(ways) >= WAYS:
             try:
                 return searched()
-            except PlanningFailed as error:
+            except PlanningError as error:
                 failure, ways = error, []
     if ways:
         return searched()
@@ -109,7 +109,7 @@ def candidates(arm: Arm, slot: int, other_than: int) -> Iterator[Array]:
     solved_before, qpos_before = arm.reachability.reachable(moved_back(tcp_in_base, PREGRASP_DISTANCE), arm.at)
     reachable = np.flatnonzero(solved & solved_before)
     if not len(reachable):
-        raise PlanningFailed("grasp_sampling", "unreachable" if len(kept) else "all_filtered")
+        raise PlanningError("grasp_sampling", "unreachable" if len(kept) else "all_filtered")
     surface = arm.env.object_assets[0][slot].surface_points(SPACING)
     scores = score_grasps(
         tcp_in_base[reachable],
@@ -136,7 +136,7 @@ def candidates(arm: Arm, slot: int, other_than: int) -> Iterator[Array]:
         found = True
         yield tcp_in_base[index]
     if not found:
-        raise PlanningFailed("grasp_sampling", "all_filtered")
+        raise PlanningError("grasp_sampling", "all_filtered")
 
 
 def _of_other_kinds(tcp: Array, count: int) -> list[int]:
@@ -170,14 +170,14 @@ def _plan_way_in_and_out(
 
 def _plan_withdrawal(arm: Arm, slot: int, start: Array, tcp_in_base: Array) -> tuple[Trajectory, Trajectory]:
     """Plan straight up, as little as leaves a way out, and from there straight and level back with the object."""
-    failure = PlanningFailed("withdraw", "no_way_out")
+    failure = PlanningError("withdraw", "no_way_out")
     vertices = np.concatenate(arm.env.object_assets[0][slot].hulls)
     held = AttachedBody(vertices, inverse(tcp_in_base) @ arm.scene.object_in_base(slot))
     back = -tcp_in_base[:2, 2] / np.linalg.norm(tcp_in_base[:2, 2])
     for height in FRONT_LIFTS:
         try:
             lift = arm.planner.plan_straight(start, raised(tcp_in_base, height), stage="lift")
-        except PlanningFailed as error:
+        except PlanningError as error:
             raise error if height == FRONT_LIFTS[0] else failure from error
         goals = []
         for distance in WITHDRAWALS:
@@ -186,7 +186,7 @@ def _plan_withdrawal(arm: Arm, slot: int, start: Array, tcp_in_base: Array) -> t
         arm.planner.attach(held)
         try:
             return lift, arm.first_line(lift.qpos[-1], goals, stage="withdraw")
-        except PlanningFailed as error:
+        except PlanningError as error:
             failure = error
         finally:
             arm.planner.attach(None)

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.assets.kinematics import joint_motion
 from robocas_ms3.assets.manifest import Handle, Joint
-from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.core.poses import inverse, transform
 from robocas_ms3.planning.protocol import Array, Obstacle, Shape, Trajectory
 from robocas_ms3.planning.pull_path import reached, track, turned_about_bar
@@ -76,7 +76,7 @@ class Part:
         start, far = self.position(arm), OPENED_AT_MOST[self.joint.kind] * self.end
         left = (far - start) * np.sign(far)
         if left < STEP[self.joint.kind]:
-            raise PlanningFailed("pull", "at_the_end")
+            raise PlanningError("pull", "at_the_end")
         return np.linspace(start, far, int(np.ceil(left / STEP[self.joint.kind])) + 1, dtype=np.float64)
 
     def least(self, arm: Arm) -> float:
@@ -121,7 +121,7 @@ def open_part(arm: Arm) -> None:
         pull(arm, part)
         if is_opened(arm):
             return
-    raise PlanningFailed("pull", "not_far_enough")
+    raise PlanningError("pull", "not_far_enough")
 
 
 def is_opened(arm: Arm) -> bool:
@@ -138,10 +138,10 @@ def pull(arm: Arm, part: Part) -> None:
     arm.follow(way_in)
     arm.close_gripper()
     if not part.pressed(arm):
-        raise PlanningFailed("handle", "missed")
+        raise PlanningError("handle", "missed")
     arm.follow(opening)
     if abs(part.position(arm) - before) < least:
-        raise PlanningFailed("pull", "slipped")
+        raise PlanningError("pull", "slipped")
     arm.open_gripper()
     with arm.planning():
         arm.hold_nothing()
@@ -151,14 +151,14 @@ def pull(arm: Arm, part: Part) -> None:
         back = first_plan(
             lines,
             lambda free: arm.first_line(arm.at, goals, stage="retreat", check_collisions=free),
-            PlanningFailed("retreat", "no_goal"),
+            PlanningError("retreat", "no_goal"),
         )
     arm.follow(back)
 
 
 def plan_pull(arm: Arm, part: Part) -> tuple[Trajectory, Trajectory]:
     """Plan to the hold that leads furthest, with the bar deep between the fingers where it fits, and the pull."""
-    failure = PlanningFailed("pull", "no_plan")
+    failure = PlanningError("pull", "no_plan")
     return first_plan((DEEPER, 0.0), lambda deeper: _plan_pull(arm, part, deeper), failure)
 
 
@@ -172,18 +172,18 @@ def _plan_pull(arm: Arm, part: Part, deeper: float) -> tuple[Trajectory, Traject
     order = np.lexsort((cost, -ends // 5))
     order = [i for i in order if ends[i] >= least]
     if not order:
-        raise PlanningFailed("pull", "unreachable")
+        raise PlanningError("pull", "unreachable")
     everything = arm.scene.obstacles()
     others = arm.scene.obstacles(without_link=(part.furniture, part.handle.link))
     order = _fitting(arm, part, paths[0], order, frames, others, deeper)
     if not order:
-        raise PlanningFailed("handle", "blocked")
+        raise PlanningError("handle", "blocked")
 
     def plan(index: int) -> tuple[Trajectory, Trajectory]:
         path = paths[: ends[index], index]
         free = _free_length(arm, part, path, frames, others)
         if free < least:
-            raise PlanningFailed("pull", "blocked")
+            raise PlanningError("pull", "blocked")
         free = _retreatable(arm, path[:free], int(np.ceil(least)))
         arm.planner.set_scene(everything)
         away = arm.planner.plan_straight(path[0], moved_back(arm.planner.tcp(path[0]), STANDOFF), stage="approach")
@@ -191,7 +191,7 @@ def _plan_pull(arm: Arm, part: Part, deeper: float) -> tuple[Trajectory, Traject
         inward = Trajectory(np.concatenate([away.qpos[-2::-1], path[:1]]), away.dt)
         return arm.planner.join(arm.at, reach, inward), _timed(path[:free], arm.robot, away.dt)
 
-    return first_plan(order[:PULLS_PLANNED], plan, PlanningFailed("pull", "no_plan"))
+    return first_plan(order[:PULLS_PLANNED], plan, PlanningError("pull", "no_plan"))
 
 
 def pull_share(arm: Arm, part: Part, arm_base_in_world: Array, others: list[Obstacle]) -> float:
@@ -202,7 +202,7 @@ def pull_share(arm: Arm, part: Part, arm_base_in_world: Array, others: list[Obst
     frames = inverse(arm_base_in_world) @ part.in_world(arm, positions)
     try:
         paths, ends, _ = _paths(arm, part, frames)
-    except PlanningFailed:
+    except PlanningError:
         return 0.0
     share = 0.0
     order = [i for i in np.argsort(-ends, kind="stable") if ends[i]]
@@ -231,7 +231,7 @@ def _paths(arm: Arm, part: Part, frames: Array, deeper: float = 0.0) -> tuple[Ar
     held = np.stack(goals, axis=1)
     solved, qpos = arm.reachability.reachable(np.array(starts), arm.at)
     if not solved.any():
-        raise PlanningFailed("handle", "unreachable")
+        raise PlanningError("handle", "unreachable")
     path = track(arm.reachability.chain.ending_behind(deeper), qpos[solved], held[:, solved])
     turned = np.tile(np.abs(TURNS), len(goals) // len(TURNS))[solved]
     return path, reached(path), turned
@@ -286,9 +286,9 @@ def _retreatable(arm: Arm, path: Array, least: int) -> int:
         try:
             plan_step_back(arm, path[length - 1], [moved_back(tcp, distance) for distance in RETREATS])
             return length
-        except PlanningFailed:
+        except PlanningError:
             continue
-    raise PlanningFailed("pull", "no_way_back")
+    raise PlanningError("pull", "no_way_back")
 
 
 def _timed(path: Array, robot: RobotDescription, dt: float) -> Trajectory:
@@ -299,5 +299,5 @@ def _timed(path: Array, robot: RobotDescription, dt: float) -> Trajectory:
         dt=dt,
     )
     if motion is None:
-        raise PlanningFailed("pull", "timing_failed")
+        raise PlanningError("pull", "timing_failed")
     return motion

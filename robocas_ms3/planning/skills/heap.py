@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from robocas_ms3.core.errors import EpisodeLost, PlanningFailed
+from robocas_ms3.core.errors import PlanningError, UnrecoverableError
 from robocas_ms3.planning.executor import OPEN
 from robocas_ms3.planning.protocol import Array
 from robocas_ms3.planning.skills.arm import Arm
@@ -75,7 +75,7 @@ class Heap:
     def moves(self) -> Iterator[Move]:
         """Yield moves of the highest obstacles, then of those that block grasps; pushes first, as they are faster."""
         if self.moves_made >= MOVES:
-            raise EpisodeLost("horizon", "too_many_obstacles")
+            raise UnrecoverableError("horizon", "too_many_obstacles")
         with self.arm.planning():
             slots = self._in_the_way()
         yield from (Move(skill, slot) for slot in slots[:2] for skill in ("push", "lift"))
@@ -101,7 +101,7 @@ class Heap:
         if move.skill == "push":
             push_away(arm, move.slot, self.target, turn_deg=move.turn_deg)
             if np.linalg.norm(self.middle(move.slot) - before) <= MOVED:
-                raise PlanningFailed("push", "in_vain")
+                raise PlanningError("push", "in_vain")
             facts["pushes"] += 1
         else:
             arm.executor.gripper = OPEN  # it opens on the way
@@ -127,10 +127,10 @@ class Heap:
         present = np.flatnonzero(self.env.present[0].cpu().numpy()).tolist()
         places = np.stack([self.arm.scene.object_in_base(slot)[:3, 3] for slot in present])
         if (places[:, 2] < frame[2, 3] - FALLEN).any():
-            raise EpisodeLost("clear", "fell_off_table")
+            raise UnrecoverableError("clear", "fell_off_table")
         local = (places - frame[:3, 3]) @ frame[:3, :3]
         if (np.abs(local[:, :2]) > half - AT_EDGE).any():
-            raise PlanningFailed("clear", "at_the_edge")
+            raise PlanningError("clear", "at_the_edge")
 
     def middle(self, slot: int) -> Array:
         return self.arm.scene.object_surface(slot).mean(axis=0)

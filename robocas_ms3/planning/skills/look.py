@@ -6,7 +6,7 @@ import numpy as np
 from mani_skill.sensors.camera import CameraConfig
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.core.poses import from_wxyz, inverse
 from robocas_ms3.planning.protocol import Array, Trajectory
 from robocas_ms3.planning.skills.arm import Arm
@@ -36,14 +36,14 @@ def plan_look(arm: Arm, point_in_base: Array, distance: tuple[float, float]) -> 
         if solved.any():
             break
     else:
-        raise PlanningFailed("look", "unreachable")
+        raise PlanningError("look", "unreachable")
     qpos = qpos[solved]
     arm.planner.set_scene(arm.scene.obstacles())
     near = qpos[np.argsort(np.abs(qpos - arm.at).max(axis=1), kind="stable")]
     near = near[: 4 * VIEWS_PLANNED]
     goals = near[arm.planner.free(near, arm.planner.finger_width)][:VIEWS_PLANNED]
     if not len(goals):
-        raise PlanningFailed("look", "goal_in_collision")
+        raise PlanningError("look", "goal_in_collision")
     return arm.planner.plan_to_qpos(arm.at, list(goals), stage="look")
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.core.poses import from_wxyz, inverse, transform
 from robocas_ms3.planning.kinematics import turn_between
 from robocas_ms3.planning.protocol import Array, AttachedBody, Trajectory
@@ -38,7 +38,7 @@ def carry_to_basket(arm: Arm, slot: int) -> None:
         motion = plan_carry(arm, slot)
     arm.follow(motion)
     if not arm.holds(slot):
-        raise PlanningFailed("transfer", "dropped")
+        raise PlanningError("transfer", "dropped")
 
 
 def release_into_basket(arm: Arm, slot: int) -> None:
@@ -52,7 +52,7 @@ def release_into_basket(arm: Arm, slot: int) -> None:
     arm.follow(retreat)
     # The object settles while the arm goes home; the demonstration ends as soon as it lies still.
     if not arm.follow(home, until="success"):
-        raise PlanningFailed("release", _why_not(arm))
+        raise PlanningError("release", _why_not(arm))
 
 
 def plan_carry(arm: Arm, slot: int) -> Trajectory:
@@ -63,7 +63,7 @@ def plan_carry(arm: Arm, slot: int) -> Trajectory:
     drops = drop_poses(arm, slot, arm.scene.arm_base_in_world)
     solved, qpos = arm.reachability.reachable(drops, arm.at)
     if not solved.any():
-        raise PlanningFailed("transfer", "unreachable")
+        raise PlanningError("transfer", "unreachable")
     order = _ranked(arm, slot, drops[solved], qpos[solved])
     drops, qpos = drops[solved][order], qpos[solved][order]
     attach_held(arm, slot)
@@ -72,7 +72,7 @@ def plan_carry(arm: Arm, slot: int) -> Trajectory:
         arm.planner.set_scene(arm.scene.obstacles(without=slot, room=room))
         return _plan_to_one_of(arm, drops, qpos)
 
-    return first_plan((CARRYING_ROOM, 0.0), plan, PlanningFailed("transfer", "no_plan"))
+    return first_plan((CARRYING_ROOM, 0.0), plan, PlanningError("transfer", "no_plan"))
 
 
 def _ranked(arm: Arm, slot: int, drops: Array, qpos: Array) -> NDArray[np.int_]:
@@ -93,23 +93,23 @@ def _plan_to_one_of(arm: Arm, drops: Array, qpos: Array) -> Trajectory:
     start = arm.at
     chosen = np.flatnonzero(arm.planner.free(qpos[:DROPS_CHECKED], arm.planner.finger_width))[:DROPS_PLANNED]
     if not len(chosen):
-        raise PlanningFailed("transfer", "no_free_place")
+        raise PlanningError("transfer", "no_free_place")
     drops, qpos = drops[chosen], qpos[chosen]
     for drop, goal in zip(drops, qpos, strict=True):
         try:
             carry = arm.planner.plan_to_qpos(start, [goal], stage="transfer", search=False)
             plan_step_back(arm, carry.qpos[-1], _ways_off(drop))  # no way up from there: no place to let go
             return carry
-        except PlanningFailed:
+        except PlanningError:
             continue
-    failure, left = PlanningFailed("transfer", "no_plan"), np.arange(len(drops))
+    failure, left = PlanningError("transfer", "no_plan"), np.arange(len(drops))
     while len(left):
         carry = arm.planner.plan_to_qpos(start, list(qpos[left]), stage="transfer")
         reached = int(np.argmin(np.abs(qpos[left] - carry.qpos[-1]).max(axis=1)))
         try:
             plan_step_back(arm, carry.qpos[-1], _ways_off(drops[left[reached]]))
             return carry
-        except PlanningFailed as error:
+        except PlanningError as error:
             failure, left = error, np.delete(left, reached)
     raise failure
 

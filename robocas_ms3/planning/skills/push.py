@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.core.poses import inverse
 from robocas_ms3.planning.executor import CLOSED
 from robocas_ms3.planning.protocol import Array, Obstacle, Trajectory
@@ -92,7 +92,7 @@ def plan_push(arm: Arm, slot: int, target: int, turn_deg: float = 0.0) -> PushPl
         starts = _starts(arm, slot, target, turn_deg)
         try:
             return _plan_along(arm, starts, movable={slot})
-        except PlanningFailed:
+        except PlanningError:
             return _plan_along(arm, starts, movable=set(range(len(arm.env.objects))) - {target})
     finally:
         planner.finger_width = width
@@ -101,11 +101,11 @@ def plan_push(arm: Arm, slot: int, target: int, turn_deg: float = 0.0) -> PushPl
 def _starts(arm: Arm, slot: int, target: int, turn_deg: float) -> list[tuple[Push, Array, Trajectory]]:
     """Return pushes with a free way down to the object: with a configuration (7,) above, and that way."""
     arm.planner.set_scene(arm.scene.obstacles())
-    failure, starts = PlanningFailed("push", "no_room"), []
+    failure, starts = PlanningError("push", "no_room"), []
     for push, qpos in reachable_pushes(arm, slot, target, arm.scene.obstacles_in_base(without=slot), turn_deg):
         try:
             starts.append((push, qpos, arm.planner.plan_straight(qpos, push.start, stage="push")))
-        except PlanningFailed as error:
+        except PlanningError as error:
             failure = error
         if len(starts) == PUSHES_PLANNED:
             break
@@ -116,7 +116,7 @@ def _starts(arm: Arm, slot: int, target: int, turn_deg: float) -> list[tuple[Pus
 
 def _plan_along(arm: Arm, starts: list[tuple[Push, Array, Trajectory]], movable: set[int]) -> PushPlan:
     """Plan on from where pushes begin, with some objects that may be moved on the way along."""
-    planner, failure = arm.planner, PlanningFailed("push", "no_room")
+    planner, failure = arm.planner, PlanningError("push", "no_room")
     along_scene, fixed = arm.scene.obstacles(without=movable), _fixed_bodies(arm)
     ways: list[tuple[Array, Trajectory, Trajectory, Trajectory]] = []
     first = np.zeros(3)
@@ -130,7 +130,7 @@ def _plan_along(arm: Arm, starts: list[tuple[Push, Array, Trajectory]], movable:
             lift = planner.plan_straight(along.qpos[-1], _lifted(push.end, push.direction), stage="push")
             ways.append((qpos, down, along, lift))
             first = push.direction
-        except PlanningFailed as error:
+        except PlanningError as error:
             failure = error
     if not ways:
         raise failure

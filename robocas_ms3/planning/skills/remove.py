@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, KDTree
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.core.poses import transform
 from robocas_ms3.planning.protocol import Array, Trajectory
 from robocas_ms3.planning.shapes import convex_hull
@@ -41,7 +41,7 @@ def remove(arm: Arm, slot: int) -> None:
         way = plan_place(arm, slot)
     arm.follow(way)
     if not arm.holds(slot):
-        raise PlanningFailed("remove", "dropped")
+        raise PlanningError("remove", "dropped")
     arm.open_gripper()
     with arm.planning():
         arm.hold_nothing()
@@ -110,7 +110,7 @@ def plan_place(arm: Arm, slot: int) -> Trajectory:
             if len(motions):
                 yield motions @ scene.tcp_in_base
 
-    failure = PlanningFailed("remove", "no_free_place")
+    failure = PlanningError("remove", "no_free_place")
     return first_plan(free_poses(), lambda places: _plan_to_one_of(arm, places), failure)
 
 
@@ -131,7 +131,7 @@ def _plan_to_one_of(arm: Arm, places: Array) -> Trajectory:
         return arm.planner.join(start, carry, down)
 
     order = np.argsort(np.abs(qpos - start).max(axis=1), kind="stable")[:PLACES_PLANNED]
-    return first_plan(order, plan, PlanningFailed("remove", "unreachable"))
+    return first_plan(order, plan, PlanningError("remove", "unreachable"))
 
 
 def turn_to_stand(vertices: Array, center_of_mass: Array) -> Array:

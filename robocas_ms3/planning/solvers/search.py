@@ -5,7 +5,7 @@ What to move, and how, is decided by trying a few ways and taking the one after 
 
 from __future__ import annotations
 
-from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.planning.decisions import Effort
 from robocas_ms3.planning.executor import OPEN
 from robocas_ms3.planning.skills.arm import Arm
@@ -38,7 +38,7 @@ def attempt(arm: Arm) -> None:
         done = len(arm.executor.actions)
         try:
             arm.choose(heap.moves(), heap.make, Effort(AHEAD, tries(heap.moves_made), ENOUGH))
-        except PlanningFailed:
+        except PlanningError:
             if len(arm.executor.actions) > done:
                 raise
             # nothing can be moved: perhaps it can be grasped as things stand
@@ -73,7 +73,7 @@ def _grasp(arm: Arm, slot: int) -> bool:
 
     try:
         arm.choose(range(GRASPS), play)
-    except PlanningFailed:
+    except PlanningError:
         if len(arm.executor.actions) > done:
             raise
         return False

@@ -54,7 +54,7 @@ def make_vec(
 
     Raises:
         VectorEnvError: there is no such environment or backend, or no GPU for it.
-        WorkerDied: a process died.
+        VectorEnvCrashError: a process died.
         Exception: whatever making an environment raises.
     """
     for name, value in (("num_envs", num_envs), ("workers", 1 if workers is None else workers)):

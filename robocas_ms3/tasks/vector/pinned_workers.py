@@ -15,7 +15,7 @@ from multiprocessing import Pipe
 from typing import Any, Generic, TypeVar
 
 from robocas_ms3.core.signals import deferred_interrupts
-from robocas_ms3.core.worker_process import START_SECONDS, Limits, ProcessDied, Worker, WorkerProcess
+from robocas_ms3.core.worker_process import START_SECONDS, Limits, ProcessCrashError, Worker, WorkerProcess
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -60,7 +60,7 @@ class PinnedWorkers(Generic[Task, Result]):
         """Give each worker its task, and wait for all results; first for those of an interrupted call.
 
         Raises:
-            ProcessDied: a process died, or exceeded a limit.
+            ProcessCrashError: a process died, or exceeded a limit.
             Exception: whatever making a worker, or the first task that failed, raised.
         """
         if not self.pids:
@@ -110,7 +110,7 @@ class PinnedWorkers(Generic[Task, Result]):
                         self._unread.discard(number)
                         try:
                             answers[number] = self._processes[number].read()
-                        except ProcessDied:
+                        except ProcessCrashError:
                             raise
                         except Exception as error:  # noqa: BLE001  (of a task; raised when all have answered)
                             errors[number] = error

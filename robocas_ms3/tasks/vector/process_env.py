@@ -17,8 +17,8 @@ import torch
 from gymnasium.vector.utils import batch_space
 from mani_skill.utils.registration import REGISTERED_ENVS
 
-from robocas_ms3.core.errors import VectorEnvError, WorkerDied
-from robocas_ms3.core.worker_process import NO_LIMITS, Limits, ProcessDied
+from robocas_ms3.core.errors import VectorEnvCrashError, VectorEnvError
+from robocas_ms3.core.worker_process import NO_LIMITS, Limits, ProcessCrashError
 from robocas_ms3.tasks.seeds import following_seeds
 from robocas_ms3.tasks.vector.pinned_workers import PinnedWorkers
 from robocas_ms3.tasks.vector.worker import EnvSettings, EnvWorker, Rows, join_rows, split_rows
@@ -41,7 +41,7 @@ class ProcessEnv(gym.Env):
 
     Raises:
         VectorEnvError: they can't be sent to processes.
-        WorkerDied: a process died.
+        VectorEnvCrashError: a process died.
         Exception: whatever making an environment raises.
 
     Attributes:
@@ -174,18 +174,18 @@ class ProcessEnv(gym.Env):
 
         Raises:
             VectorEnvError: it is closed.
-            WorkerDied: a process died; all of them are ended.
+            VectorEnvCrashError: a process died; all of them are ended.
             Exception: whatever the first env that failed raised.
         """
         if self._workers.closed:
             raise VectorEnvError("these environments are closed", fix="Make them again.")
         try:
             answers = self._workers.ask(commands)
-        except ProcessDied as crash:
+        except ProcessCrashError as crash:
             share = self._shares[self._workers.pids.index(crash.pid)]
             envs = [env for env in share if self._at_work[env]] or list(share)
             fix = "See its output above, and robocas doctor; make the environments again."
-            died = WorkerDied("its process died", where=name_envs(envs), found=crash.found, fix=fix)
+            died = VectorEnvCrashError("its process died", where=name_envs(envs), found=crash.found, fix=fix)
             died.envs = tuple(envs)
             self._must_reset.clear()
             self._workers.close()

@@ -10,7 +10,7 @@ from managing import files_of
 from synthetic import RayCaster, render_by, write_trajectory
 
 from robocas_ms3.cli.main import run as run_command
-from robocas_ms3.core.errors import AssetError, IncompleteError
+from robocas_ms3.core.errors import AssetError, IncompleteDatasetError
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.conversion import convert as conversion
 from robocas_ms3.datasets.sources.reader import Dataset
@@ -58,7 +58,9 @@ def test_a_broken_recording(many, tmp_path, how):
     _, whole = many
     trajectory, out = write_trajectory(tmp_path / "trajectory.h5", seeds=SEEDS, steps=16), tmp_path / "out"
     spoil(trajectory, 3, how)
-    with pytest.raises(IncompleteError, match=r"out: 1 episode could not.*found episode_0000003: .*traj_3") as error:
+    with pytest.raises(
+        IncompleteDatasetError, match=r"out: 1 episode could not.*found episode_0000003: .*traj_3"
+    ) as error:
         run(trajectory, out)
     assert "\n" not in str(error.value)
     assert validate(out).violations == []
@@ -83,7 +85,7 @@ def test_the_only_one_of_its_side(many, tmp_path):
         seed = SEEDS[val]
 
     for _ in range(2):
-        with pytest.raises(IncompleteError, match=f"episode_{val:07d}"):
+        with pytest.raises(IncompleteDatasetError, match=f"episode_{val:07d}"):
             run(trajectory, tmp_path / "out", open_renderer=OfVal)
         assert validate(tmp_path / "out").violations == []
         assert Dataset(tmp_path / "out").sides[1] == []
@@ -94,7 +96,7 @@ def test_the_only_one_of_its_side(many, tmp_path):
 def test_others_are_appended_meanwhile(many, tmp_path):
     trajectory, _ = many
     more = write_trajectory(tmp_path / "more.h5", seeds=(50, 51), steps=16)
-    with pytest.raises(IncompleteError):
+    with pytest.raises(IncompleteDatasetError):
         run(trajectory, tmp_path / "out", open_renderer=OfOddSeeds)
     run(more, tmp_path / "out", append=True)
     assert validate(tmp_path / "out").violations == []
@@ -116,7 +118,7 @@ def test_texts_that_cannot_be_read(many, tmp_path, monkeypatch):
     trajectory.with_suffix(".json").write_text(json.dumps(content))
     embedder = type("Embedder", (), {"__call__": lambda self, texts: np.eye(384, dtype=np.float32)[: len(texts)]})
     monkeypatch.setattr("robocas_ms3.scenes.language.embed.TextEmbedder", embedder)
-    with pytest.raises(IncompleteError, match="episode_0000003: .*traj_3: the JSON's entry: "):
+    with pytest.raises(IncompleteDatasetError, match="episode_0000003: .*traj_3: the JSON's entry: "):
         run(trajectory, tmp_path / "out", embeddings=True)
     assert validate(tmp_path / "out").violations == []
 

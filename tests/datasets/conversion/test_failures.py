@@ -4,7 +4,7 @@ from managing import convert_made_up as convert
 from managing import edit
 from synthetic import write_trajectory
 
-from robocas_ms3.core.json_lines import Ledger
+from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.conversion.data_info import add_failures
 from robocas_ms3.datasets.manage.merge import merge
@@ -20,7 +20,7 @@ OTHER = Failure(9, 1, "reach", "unreachable", 1.0)
 def run_of(folder, failures, seeds=(3, 5), **kwargs):
     """A trajectory and what went wrong with it."""
     folder.mkdir()
-    Ledger(folder / "failures.jsonl", Failure).append(failures)
+    JsonLinesFile(folder / "failures.jsonl", Failure).append(failures)
     return write_trajectory(folder / "trajectory.h5", seeds=seeds, **kwargs)
 
 

@@ -15,7 +15,7 @@ pytest.importorskip("av", reason="needs the extra 'lerobot'")
 pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
 
 from robocas_ms3.cli import main
-from robocas_ms3.core.errors import DatasetError, IncompleteError, OutputExistsError, RobocasError
+from robocas_ms3.core.errors import DatasetError, IncompleteDatasetError, OutputExistsError, RobocasError
 from robocas_ms3.datasets.conversion.settings import ConversionSettings
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check import check_lerobot
@@ -186,7 +186,7 @@ def test_a_image_of_another_size(dataset, tmp_path, episode, camera, kind, step)
     """An encoder would scale it without a word; what is not taken is not looked at."""
     folder = dataset / f"episode_{episode:07d}"
     shrink(folder / camera / kind / f"{step:04d}.png", (48, 64))
-    with pytest.raises(IncompleteError) as caught:
+    with pytest.raises(IncompleteDatasetError) as caught:
         convert_lerobot(ConversionSettings(dataset, tmp_path / "out"))
     assert list(caught.value.reasons) == [folder.name]
     assert caught.value.reasons[folder.name].startswith(f"{folder}, {camera}/{kind}, step {step}: ")

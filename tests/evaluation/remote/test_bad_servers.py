@@ -13,7 +13,7 @@ pytest.importorskip("msgpack")
 from counting_env import CountingEnv, play
 from remote_ends import IN_A_HURRY, Told, a_start, answering, serving, some_observations, talking
 
-from robocas_ms3.core.errors import EvaluationError, PolicyFailed
+from robocas_ms3.core.errors import EvaluationError, PolicyError
 from robocas_ms3.evaluation.remote.client import RemotePolicy
 from robocas_ms3.evaluation.remote.connection import MAX_ANSWER
 from robocas_ms3.evaluation.remote.wire import pack
@@ -44,7 +44,7 @@ def test_a_bad_answer_fails_the_episode(reply, reason):
     with answering(reply) as url:
         remote = RemotePolicy(f"{url}?{IN_A_HURRY}")
         remote.reset([a_start(0)])
-        with pytest.raises(PolicyFailed, match=reason):
+        with pytest.raises(PolicyError, match=reason):
             remote.act(some_observations(0))
 
 
@@ -69,7 +69,7 @@ def test_a_bad_answer_to_a_batch_fails_its_episodes(answer, failed):
     with answering(pack(answer), {"robocas_max_batch": 8}) as url:
         remote = RemotePolicy(f"{url}?{IN_A_HURRY}")
         remote.reset([a_start(0), a_start(1)])
-        with pytest.raises(PolicyFailed) as raised:
+        with pytest.raises(PolicyError) as raised:
             remote.act(some_observations(0, 1))
         remote.close()
     assert raised.value.reasons.keys() == failed
@@ -132,7 +132,7 @@ def test_a_server_that_does_not_read_is_not_waited_for():
         remote.reset([a_start(0)])
         seen = some_observations(0)
         seen.images["base_camera"] = np.zeros((1, 4096, 4096, 3), np.uint8)  # more than a socket holds
-        with pytest.raises(PolicyFailed, match="no answer within"):
+        with pytest.raises(PolicyError, match="no answer within"):
             remote.act(seen)
 
 

@@ -17,7 +17,7 @@ pytest.importorskip("msgpack")
 from counting_env import CountingEnv, play
 from remote_ends import CAMERA, IN_A_HURRY, Told, a_start, answering, serving, some_observations
 
-from robocas_ms3.core.errors import EvaluationError, PolicyFailed
+from robocas_ms3.core.errors import EvaluationError, PolicyError
 from robocas_ms3.evaluation.policies import make_policy
 from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.remote.client import RemotePolicy
@@ -100,7 +100,7 @@ def test_a_batch_of_the_announced_size_fits_in_a_message():
 
 
 class FailingIn(Told):
-    """Fail in one env by `PolicyFailed`, and in another one by an exception."""
+    """Fail in one env by `PolicyError`, and in another one by an exception."""
 
     failing, raising = 1, 4
 
@@ -109,7 +109,7 @@ class FailingIn(Told):
         if self.raising in observations.envs:
             raise RuntimeError("out of memory")
         if self.failing in observations.envs:
-            raise PolicyFailed({self.failing: "no\nplan"}, actions)
+            raise PolicyError({self.failing: "no\nplan"}, actions)
         return actions
 
 
@@ -118,14 +118,14 @@ def test_batches_are_split_and_failures_end_their_episodes_alone():
     with serving(policy, max_batch=2) as url:
         remote = RemotePolicy(url)
         remote.reset([a_start(env) for env in range(6)])
-        with pytest.raises(PolicyFailed) as failed:
+        with pytest.raises(PolicyError) as failed:
             remote.act(seen)
         assert [one.envs.tolist() for one in policy.seen] == [[0, 1], [2, 3], [4, 5]]
         exception = "the server failed: RuntimeError: out of memory"
         assert failed.value.reasons == {1: "the server failed: no plan", 4: exception, 5: exception}
         np.testing.assert_array_equal(failed.value.actions[[0, 2, 3]], Told().act(seen)[[0, 2, 3]])
         assert remote.act(some_observations(0, 2)).shape == (2, 3, 7)
-        with pytest.raises(PolicyFailed, match="connection is lost"):
+        with pytest.raises(PolicyError, match="connection is lost"):
             remote.act(some_observations(1))
         policy.failing = -1
         remote.reset([a_start(1, episode=9)])
@@ -206,7 +206,7 @@ def test_the_next_episode_finds_a_server_that_came_back_with_the_same_policy():
     policy = Told()
     with serving(policy, port):
         remote.reset([a_start(1, episode=9)])
-        with pytest.raises(PolicyFailed, match="connection is lost") as failed:
+        with pytest.raises(PolicyError, match="connection is lost") as failed:
             remote.act(some_observations(0, 1))
         assert failed.value.reasons.keys() == {0}
         assert policy.starts == [a_start(1, episode=9)]

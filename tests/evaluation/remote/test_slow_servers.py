@@ -22,7 +22,7 @@ from remote_ends import Told, a_start, answering, serving, some_observations
 from websockets.asyncio.server import serve
 from websockets.sync.client import connect
 
-from robocas_ms3.core.errors import PolicyFailed
+from robocas_ms3.core.errors import PolicyError
 from robocas_ms3.evaluation.remote import connection
 from robocas_ms3.evaluation.remote.client import RemotePolicy
 from robocas_ms3.evaluation.remote.messages import observation_message
@@ -124,7 +124,7 @@ def test_an_env_without_an_answer_fails_alone():
 
     with with_numbers(answer) as url:
         remote = started(f"{url}?timeout_s=1")
-        with pytest.raises(PolicyFailed) as failed:
+        with pytest.raises(PolicyError) as failed:
             remote.act(some_observations(*range(ENVS)))
         ended.set()
         assert failed.value.reasons == {2: "no answer within 1 s"}
@@ -183,7 +183,7 @@ def test_a_dead_network_is_noticed_by_both_ends(fast_pings):
         remote.reset([a_start(0)])
         remote.act(some_observations(0))
         cut.set()
-        with pytest.raises(PolicyFailed, match="keepalive ping timeout"):
+        with pytest.raises(PolicyError, match="keepalive ping timeout"):
             remote.act(some_observations(0))
         for _ in range(100):  # until the server has released the env
             other = RemotePolicy(url)

@@ -14,7 +14,7 @@ import pytest
 import torch
 from vector_envs import HORIZON, DiesWhenMade, LacksLayouts, Misbehaves, OwnError, Wins, doing, gone, make
 
-from robocas_ms3.core.errors import ConfigError, ExtensionError, LayoutError, VectorEnvError, WorkerDied
+from robocas_ms3.core.errors import ConfigError, ExtensionError, LayoutError, VectorEnvCrashError, VectorEnvError
 from robocas_ms3.core.workers import Limits
 from robocas_ms3.tasks import RoboCASPickEnv
 
@@ -117,7 +117,7 @@ def test_what_goes_wrong_in_a_process(capfd):
         env.step(doing(1, 1, 1, 1))
         # killed
         pids = env.unwrapped.pids
-        with pytest.raises(WorkerDied, match=r"env 3: its process died \(found SIGKILL"):
+        with pytest.raises(VectorEnvCrashError, match=r"env 3: its process died \(found SIGKILL"):
             env.step(doing(7, 0, 0, 4))  # without waiting for the first one
         assert gone(pids)
         with pytest.raises(VectorEnvError, match="closed"):
@@ -133,7 +133,7 @@ def test_a_process_that_is_killed_between_two_steps_is_not_replaced():
         env.reset(seed=0)
         pids = env.unwrapped.pids
         os.kill(pids[1], signal.SIGKILL)
-        with pytest.raises(WorkerDied, match="env 1: its process died") as died:
+        with pytest.raises(VectorEnvCrashError, match="env 1: its process died") as died:
             env.step(doing(0, 0))
         assert died.value.envs == (1,)
         assert gone(pids)
@@ -144,7 +144,7 @@ def test_a_process_that_is_killed_between_two_steps_is_not_replaced():
     ("limits", "found"), [(Limits(seconds=5), "too slow"), (Limits(memory_gb=0.3), "too much memory")]
 )
 def test_a_process_that_exceeds_a_limit_is_ended(limits, found):
-    raises = pytest.raises(WorkerDied, match="env 0")
+    raises = pytest.raises(VectorEnvCrashError, match="env 0")
     with raises as died, closing(make(1, 1, wrappers=[Misbehaves], limits=limits)) as env:
         env.reset(seed=0)
         env.step(doing(7))
@@ -171,7 +171,7 @@ def test_errors_of_making_arrive_as_themselves():
     assert "env 0" in str(error.value.__cause__)
     with pytest.raises(VectorEnvError, match="can't be sent"):
         make(1, 1, config={"lock": threading.Lock()})
-    with pytest.raises(WorkerDied) as died:
+    with pytest.raises(VectorEnvCrashError) as died:
         make(1, 1, wrappers=[DiesWhenMade])
     assert died.value.envs == (0,)
     assert died.value.found == "SIGSEGV" and "robocas doctor" in died.value.fix
