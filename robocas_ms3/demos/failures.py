@@ -67,7 +67,7 @@ class EpisodeResult:
     begun: float = field(default_factory=time.perf_counter)
 
     @property
-    def noisy_failures(self) -> int:
+    def noise_failures(self) -> int:
         return sum(failure.reason.startswith(NOISY) for failure in self.failures)
 
     @property

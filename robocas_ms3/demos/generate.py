@@ -49,7 +49,7 @@ class Summary:
 
     Attributes:
         seeds: number of seeds tried.
-        mean_seconds: CPU seconds per seed tried: reset, planning, simulation, trial.
+        mean_seconds: CPU seconds per seed tried: reset, planning, simulation, open-loop checks (`check`).
         mean_steps: control steps per episode.
         failures: ``{"stage: reason": count}`` of all attempts.
         gave_up: seeds without an episode.

@@ -70,10 +70,10 @@ class EpisodeGenerator:
         self.policy: Callable[[Arm], None] = load(TASKS[settings.task].solver)
         self.worlds: list[OpenLoop] = []
         self.trials: Trials | None = None
-        if settings.replay_rate and not config.base_motion:
+        if settings.check_rate and not config.base_motion:
             scene = {"config": settings.config, "layouts": settings.layouts, **chosen}
             env = RecordedEnv(TASKS[settings.task].env_id, None, scene).with_pack(settings.pack)
-            self.worlds = [OpenLoop(env, settings.replay_rate) for _ in range(1 + settings.noisy_trials)]
+            self.worlds = [OpenLoop(env, settings.check_rate) for _ in range(1 + settings.check_trials)]
             self.trials = Trials(self.worlds, settings)
         self._fork = fork and not settings.keep_recoveries
         reason = why_not_fork(renders=base_env.scene.can_render())
@@ -183,12 +183,12 @@ class _Attempts:
 
     @property
     def _noisy(self) -> bool:
-        return self.result.noisy_failures < self.generator.settings.noisy_failures
+        return self.result.noise_failures < self.generator.settings.check_failures
 
     def rehearse(self, *, finished: bool = False) -> None:
         if self.generator.trials is not None:
             gripper = np.array([action[7] for action in self.executor.actions])
-            with self.executor.seconds.spent_on("trial"):
+            with self.executor.seconds.spent_on("check"):
                 self.generator.trials.follow(self.recorder.states, gripper, finished=finished, noisy=self._noisy)
 
     def _finish(self, recoveries: list[dict[str, Any]]) -> None:
@@ -220,12 +220,12 @@ class _Attempts:
                 SubGoal.of(part.goal_type, part.goal_description, part.first, after - 1).model_dump()
                 for part, after in zip(executor.segments, bounds[1:], strict=True)
             ],
-            "replay_rate": settings.replay_rate if tried else None,
+            "check_rate": settings.check_rate if tried else None,
             "facts": {"disturbed": int(executor.info["disturbed"][0]), **executor.facts},
             "seconds": {part: round(value, 3) for part, value in asdict(executor.seconds).items()},
             "attempts": len(self.result.failures) + 1,
             "failed_attempts": [f"{failure.stage}: {failure.reason}" for failure in self.result.failures],
-            "noisy_trials": None if not tried else settings.noisy_trials if self._noisy else 0,
+            "check_trials": None if not tried else settings.check_trials if self._noisy else 0,
             "recoveries": recoveries,
             **({"takeover": {"policy": taken.policy, "policy_steps": taken.policy_steps}} if taken else {}),
         }

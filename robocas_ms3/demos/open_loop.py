@@ -183,7 +183,7 @@ class Trials:
     def _with_noise(self, actions: NDArray[np.float64], number: int) -> NDArray[np.float64]:
         # drawn from the first action on, so that an action's noise is the same however often it is played
         rng = np.random.default_rng([self._seed, number])
-        std = self._settings.noise_mm, self._settings.noise_deg
+        std = self._settings.check_noise_mm, self._settings.check_noise_deg
         return actions + draw_noise(rng, self._played + len(actions), *std)[self._played :]
 
 

@@ -38,15 +38,15 @@ class EpisodeSettings:
     """Attempts of the policy before a seed is given up."""
     keep_recoveries: bool = False
     """Leave failed attempts in the episode, as one continuous motion, instead of undoing them."""
-    replay_rate: Annotated[int | None, _NO_HINT] = None
+    check_rate: Annotated[int | None, _NO_HINT] = None
     """Rate in Hz at which an episode's own 7-D actions are tried open loop; an attempt whose actions don't succeed
     again is undone. 0: no trial. Default: 5, or the control rate where 5 doesn't divide it."""
-    noisy_trials: int = 1
+    check_trials: int = 1
     """How often they are tried with a robot's noise as well. 0: not at all."""
-    noisy_failures: int = 1
+    check_failures: int = 1
     """Attempts that may fail for noise alone; after so many an episode counts without, and its record says so."""
-    noise_mm: Annotated[float, tyro.conf.Suppress] = 0.5
-    noise_deg: Annotated[float, tyro.conf.Suppress] = 0.2
+    check_noise_mm: Annotated[float, tyro.conf.Suppress] = 0.5
+    check_noise_deg: Annotated[float, tyro.conf.Suppress] = 0.2
     layouts: Annotated[str, tyro.conf.Suppress] = "auto"
     """Where layouts come from, see `RoboCASEnv`."""
     planner: str = "rrt_connect"
@@ -61,11 +61,11 @@ class EpisodeSettings:
 
     def __post_init__(self) -> None:
         config = self.config or TASKS[self.task].default_config
-        rate = self.replay_rate
+        rate = self.check_rate
         if rate is None:
             rate = 5 if self.control_freq % 5 == 0 else self.control_freq
         object.__setattr__(self, "config", config)
-        object.__setattr__(self, "replay_rate", rate)
+        object.__setattr__(self, "check_rate", rate)
 
     def check(self) -> None:
         """Check the settings before anything is written.
@@ -79,7 +79,7 @@ class EpisodeSettings:
         from robocas_ms3.scenes.config import load_config_of
         from robocas_ms3.scenes.model import SceneModel
 
-        control, replay = self.control_freq, self.replay_rate or 0
+        control, replay = self.control_freq, self.check_rate or 0
         check_number("--max-attempts", self.max_attempts, 1)
         check_number("--control-freq", control, 1, SIM_FREQ)
         if SIM_FREQ % control:
@@ -89,13 +89,13 @@ class EpisodeSettings:
                 expected=f"one of {', '.join(str(f) for f in range(1, SIM_FREQ + 1) if SIM_FREQ % f == 0)}",
                 found=control,
             )
-        for name in ("noisy_trials", "noisy_failures", "noise_mm", "noise_deg"):
+        for name in ("check_trials", "check_failures", "check_noise_mm", "check_noise_deg"):
             check_number(f"--{name.replace('_', '-')}", getattr(self, name), 0)
-        check_number("--replay-rate", replay, 0, control)
+        check_number("--check-rate", replay, 0, control)
         if replay and (control % replay or SIM_FREQ % replay):
             raise RobocasError(
                 "the rate of the open-loop check must divide the control rate and the rate of physics",
-                where="--replay-rate",
+                where="--check-rate",
                 expected=f"a divisor of {control}, or 0 for no check",
                 found=replay,
             )
@@ -131,7 +131,7 @@ class GenerateSettings:
     process; then its seed is given up."""
     memory_gb: float = 8.0
     """GB of memory a process may use."""
-    noise: Annotated[tuple[float, float] | None, _NO_HINT] = None
+    check_noise: Annotated[tuple[float, float] | None, _NO_HINT] = None
     """Noise of the noisy trials: standard deviations in mm and degrees, of each component of each action. Default: 0.5
     0.2."""
     fork: bool = True
@@ -151,11 +151,11 @@ class GenerateSettings:
         config = load_task_config(name, overrides=self.set)
         if self.set or not isinstance(name, str) or name not in shipped_configs():
             episode = replace(episode, config=config.model_dump(mode="json"))
-        if self.noise is not None:
-            episode = replace(episode, noise_mm=self.noise[0], noise_deg=self.noise[1])
+        if self.check_noise is not None:
+            episode = replace(episode, check_noise_mm=self.check_noise[0], check_noise_deg=self.check_noise[1])
         stem = Path(name).stem if isinstance(name, str) else episode.task
         out = self.out or Path("demos") / f"{stem}-{Path(episode.pack).name}"
-        return replace(self, episode=episode, out=out, set=(), noise=None)
+        return replace(self, episode=episode, out=out, set=(), check_noise=None)
 
     def check(self) -> None:
         check_number("--episodes", self.episodes, 1)

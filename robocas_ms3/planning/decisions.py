@@ -91,7 +91,7 @@ class Seconds:
     reset: float = 0.0
     planning: float = 0.0
     simulation: float = 0.0
-    trial: float = 0.0
+    check: float = 0.0
 
     @contextmanager
     def spent_on(self, part: str) -> Iterator[None]:

@@ -107,7 +107,7 @@ def recording_settings(plan: Plan, part: int) -> EpisodeSettings:
     config = plan.parts[part]
     assert config.config is not None  # set by `load_plan`
     rate = int(plan.rate) if plan.rate == int(plan.rate) else 5  # episodes are checked at the dataset's rate
-    chosen = {"control_freq": plan.control_freq, "replay_rate": rate, **plan.recording.model_dump(exclude_none=True)}
+    chosen = {"control_freq": plan.control_freq, "check_rate": rate, **plan.recording.model_dump(exclude_none=True)}
     return EpisodeSettings(config.task, config.config, config.pack, **chosen)
 
 

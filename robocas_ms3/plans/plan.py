@@ -41,13 +41,13 @@ class RecordingConfig(StrictModel):
     robot: str | None = None
     max_attempts: Annotated[int, Field(ge=1, le=10_000)] | None = None
     keep_recoveries: bool | None = None
-    replay_rate: Annotated[int, Field(ge=0, le=100)] | None = Field(
+    check_rate: Annotated[int, Field(ge=0, le=100)] | None = Field(
         default=None, description="Hz; default: the rate of the dataset"
     )
-    noisy_trials: Annotated[int, Field(ge=0, le=10_000)] | None = None
-    noisy_failures: Annotated[int, Field(ge=0, le=10_000)] | None = None
-    noise_mm: Annotated[float, Field(ge=0, le=1000)] | None = None
-    noise_deg: Annotated[float, Field(ge=0, le=180)] | None = None
+    check_trials: Annotated[int, Field(ge=0, le=10_000)] | None = None
+    check_failures: Annotated[int, Field(ge=0, le=10_000)] | None = None
+    check_noise_mm: Annotated[float, Field(ge=0, le=1000)] | None = None
+    check_noise_deg: Annotated[float, Field(ge=0, le=180)] | None = None
 
 
 class ImagesConfig(StrictModel):

@@ -18,7 +18,7 @@ def demos(tmp_path_factory):
     """Two episodes in the scenes of paper-v1; the seeds of one of them validate."""
     out = tmp_path_factory.mktemp("demos") / "pick"
     words = ["generate", "pick", "--config", "pick_upstream_eval", "-n", "2", "--seed", str(SEED), "--out", str(out)]
-    assert run([*words, "--replay-rate", "0"]) == 0
+    assert run([*words, "--check-rate", "0"]) == 0
     return out / "trajectory.h5"
 
 

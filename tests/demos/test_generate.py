@@ -290,7 +290,7 @@ def test_recoveries_stay_unless_the_episode_is_lost(tmp_path, monkeypatch, searc
 
 @pytest.mark.parametrize("reason", ["no_success", "clipped", "parted"])
 def test_an_attempt_whose_own_actions_do_not_come_out_the_same_is_undone(tmp_path, monkeypatch, pick_generator, reason):
-    change(monkeypatch, pick_generator, noisy_failures=2)
+    change(monkeypatch, pick_generator, check_failures=2)
     world, spoilt = pick_generator.worlds[-1], []
     step, settle = world.step, world.settle
 
@@ -315,13 +315,13 @@ def test_an_attempt_whose_own_actions_do_not_come_out_the_same_is_undone(tmp_pat
     assert result.failures[0].stage == "replay"
     assert result.failures[0].reason == f"noisy_{reason}"
     data = read_json(tmp_path / "again.h5")["episodes"][0]["robocas"]
-    assert (data["replay_rate"], data["noisy_trials"]) == (5, 1)
+    assert (data["check_rate"], data["check_trials"]) == (5, 1)
 
 
 def test_where_noise_alone_spoils_attempts_an_episode_counts_without(tmp_path, monkeypatch, pick_generator):
-    change(monkeypatch, pick_generator, noisy_failures=2)
+    change(monkeypatch, pick_generator, check_failures=2)
     monkeypatch.setattr(pick_generator.worlds[1], "settle", lambda: False)
     result = pick_generator.generate(1, tmp_path, "spoilt")
     assert result.success
     assert [failure.reason for failure in result.failures].count("noisy_no_success") == 2
-    assert read_json(tmp_path / "spoilt.h5")["episodes"][0]["robocas"]["noisy_trials"] == 0
+    assert read_json(tmp_path / "spoilt.h5")["episodes"][0]["robocas"]["check_trials"] == 0

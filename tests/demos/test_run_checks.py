@@ -67,11 +67,11 @@ def test_a_wrong_argument_is_one_line_and_leaves_nothing(tmp_path, recording, ca
 
 
 def test_settings_are_resolved_once_and_for_all():
-    settings = GenerateSettings(EpisodeSettings("pick"), set=("objects.count=6",), noise=(1.0, 2.0)).resolve()
+    settings = GenerateSettings(EpisodeSettings("pick"), set=("objects.count=6",), check_noise=(1.0, 2.0)).resolve()
     assert settings == settings.resolve()
     assert isinstance(settings.episode.config, dict)
     assert settings.episode.config["objects"]["count"] == 6
-    assert (settings.episode.noise_mm, settings.episode.noise_deg) == (1.0, 2.0)
+    assert (settings.episode.check_noise_mm, settings.episode.check_noise_deg) == (1.0, 2.0)
     assert settings.out == Path("demos/pick_table_scattered-builtin")
 
 
@@ -123,14 +123,14 @@ def test_a_replay_never_replaces_what_it_replays(recording):
     assert notes.read_text() == "{}"
 
 
-DEFAULTS = ("planner", "noisy_failures", "after_policy", "after_steps")
+DEFAULTS = ("planner", "check_failures", "after_policy", "after_steps")
 
 
 @pytest.mark.parametrize(
     ("settings", "record", "change"),
     [
         (SETTINGS, {}, None),
-        (replace(SETTINGS, noisy_failures=2), {}, "settings.noisy_failures"),
+        (replace(SETTINGS, check_failures=2), {}, "settings.check_failures"),
         (replace(SETTINGS, after_steps=(5, 61)), {}, "settings.after_steps.1"),
         (SETTINGS, {"versions": {"sapien": "2.2.2"}}, "versions.sapien"),
         (SETTINGS, {"first_seed": 7}, "first_seed"),

@@ -80,7 +80,7 @@ CAMERAS = ("base_camera", "gripper_camera", "static_camera", "side_camera")
 
 def main():
     for words in (
-        "generate pick -n 1 --seed 5 --config four_cameras.yaml --out demos --noisy-trials 0 --replay-rate 0",
+        "generate pick -n 1 --seed 5 --config four_cameras.yaml --out demos --check-trials 0 --check-rate 0",
         "convert demos/trajectory.h5 --out robocas --no-embeddings --no-video",
         "convert robocas --to lerobot --out lerobot",
         "validate robocas",

@@ -31,7 +31,7 @@ def recordings(request, tmp_path_factory) -> tuple[str, list[Recording]]:
     """A task, and one demonstration for each env."""
     folder = tmp_path_factory.mktemp(request.param) / "demos"
     command = [sys.executable, ROOT / "robocas_cli.py", "generate", request.param, "-n", str(emulated_envs())]
-    subprocess.run([*command, "--out", folder, "--jobs", "2", "--replay-rate", "0"], check=True, cwd=ROOT)
+    subprocess.run([*command, "--out", folder, "--jobs", "2", "--check-rate", "0"], check=True, cwd=ROOT)
     with TrajectoryFile(folder / "trajectory.h5") as file:
         return request.param, [file.recording(i) for i in range(len(file.episodes))]
 

@@ -168,11 +168,11 @@ def test_a_misspelt_plan_names_the_nearest(capsys):
 
 
 def test_a_recording_s_settings_are_the_plan_s(written):
-    text = "rate: 10\ncontrol_freq: 20\nrecording: {noisy_trials: 0, max_attempts: 3}\n"
+    text = "rate: 10\ncontrol_freq: 20\nrecording: {check_trials: 0, max_attempts: 3}\n"
     settings = recording_settings(load_plan(written(GOOD + text)), 0)
-    assert (settings.replay_rate, settings.noisy_trials, settings.max_attempts) == (10, 0, 3)
+    assert (settings.check_rate, settings.check_trials, settings.max_attempts) == (10, 0, 3)
     assert settings == replace(
-        recording_settings(load_plan(written(GOOD)), 0), replay_rate=10, noisy_trials=0, max_attempts=3
+        recording_settings(load_plan(written(GOOD)), 0), check_rate=10, check_trials=0, max_attempts=3
     )
 
 

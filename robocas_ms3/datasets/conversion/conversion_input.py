@@ -158,7 +158,7 @@ def _distinct(source: EpisodeSource, entries: list[dict[str, Any]]) -> list[dict
 
 def _warn_of_other_rates(source: RenderedSource, entries: list[dict[str, Any]]) -> None:
     recorded = [source.file.episodes[entry["source"]].get("robocas") for entry in entries]
-    checked = [one.get("replay_rate") for one in recorded if isinstance(one, dict)]
+    checked = [one.get("check_rate") for one in recorded if isinstance(one, dict)]
     rates = {float(rate) for rate in checked if isinstance(rate, int | float) and rate}  # others are not checked
     others = sorted(rate for rate in rates if abs(rate - source.rate_hz) > 1e-9)
     if others:

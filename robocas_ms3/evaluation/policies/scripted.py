@@ -79,7 +79,7 @@ class ScriptedPolicy(TrackPolicy):
             start.config_file,
             start.pack,
             control_freq=_FREQ,
-            replay_rate=0,
+            check_rate=0,
             layouts=start.layouts_file,
             robot=start.robot,
         )

@@ -32,7 +32,7 @@ def tried(path, *rates):
     write_trajectory(path, seeds=tuple(range(len(rates))))
     content = json.loads(path.with_suffix(".json").read_text())
     for episode, rate in zip(content["episodes"], rates, strict=True):
-        episode["robocas"]["replay_rate"] = rate
+        episode["robocas"]["check_rate"] = rate
     path.with_suffix(".json").write_text(json.dumps(content))
     return path
 

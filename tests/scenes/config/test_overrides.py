@@ -105,7 +105,7 @@ def test_commands_refuse_a_wrong_key_and_write_nothing(words, tmp_path, monkeypa
 @pytest.mark.slow
 def test_a_recording_has_the_resolved_configuration_and_continues_with_no_other(tmp_path, capsys):
     out = tmp_path / "out"
-    words = ["generate", "pick", "-n", "1", "--out", str(out), "--replay-rate", "0", "--set"]
+    words = ["generate", "pick", "-n", "1", "--out", str(out), "--check-rate", "0", "--set"]
     assert run([*words, "objects.count=3"]) == 0
     expected = load_task_config(NAME, overrides=["objects.count=3"]).model_dump(mode="json")
     assert json.loads((out / "run.json").read_text())["settings"]["config"] == expected

@@ -36,7 +36,7 @@ class Demonstration:
     """
 
     def __init__(self, task: str, config: str, seed: int, folder: Path) -> None:
-        generator = EpisodeGenerator(EpisodeSettings(task, config, "builtin", replay_rate=0))
+        generator = EpisodeGenerator(EpisodeSettings(task, config, "builtin", check_rate=0))
         while not generator.generate(seed, folder, "demonstration").success:
             seed += 1
         generator.close()
