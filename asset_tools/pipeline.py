@@ -40,7 +40,7 @@ TOOLS = ("coacd", "trimesh", "manifold3d", "numpy", "scipy", "sapien", "xatlas",
     "scikit-image",
     "shapely",
 )
-SKIP = "Pass --skip-bad to leave it out."
+SKIP = "Pass --skip-errors to leave it out."
 PACK_NAME = r"[a-z0-9_\-]+"
 NOT_INVOLVED = ("inspection", "pipeline", "sheet", "studio")  # files that do not change what an asset is made into
 
@@ -226,7 +226,7 @@ def write_pack(
     *,
     description: str = "",
     processes: int = 1,
-    skip_bad: bool = False,
+    skip_errors: bool = False,
     record: bool = True,
     on_made: Callable[[JobResult], None] = lambda made: None,
 ) -> list[JobResult]:
@@ -238,7 +238,7 @@ def write_pack(
         kept: see `make_assets`.
         description: for the manifest.
         processes: how many to make at a time.
-        skip_bad: leave out assets that can't be made, instead of giving up.
+        skip_errors: leave out assets that can't be made, instead of giving up.
         record: write down what each asset was made from, for `up_to_date`.
         on_made: called after each asset.
 
@@ -249,11 +249,11 @@ def write_pack(
     results = []
     with replacing_folder(folder) as tmp:
         for made in make_assets(jobs, tmp, kept, processes=processes):
-            if made.asset is None and not skip_bad:
+            if made.asset is None and not skip_errors:
                 raise AssetError(made.error.rstrip("."), fix=SKIP)
             results.append(made)
             on_made(made)
-        results = _without_miscooked(results, tmp, skip_bad)
+        results = _without_miscooked(results, tmp, skip_errors)
         assets = sorted((made.asset for made in results if made.asset), key=lambda asset: (asset.kind, asset.id))
         if not assets:
             raise AssetError("none of the assets could be made", where=folder, found=results[0].error)
@@ -265,12 +265,12 @@ def write_pack(
     return results
 
 
-def _without_miscooked(results: list[JobResult], folder: Path, skip_bad: bool) -> list[JobResult]:
+def _without_miscooked(results: list[JobResult], folder: Path, skip_errors: bool) -> list[JobResult]:
     """Give up, or leave them out, where the physics engine makes less of hulls than their files say."""
     faults: dict[str, str] = {}
     for fault in cooking_faults(folder):
         faults.setdefault(fault.asset.partition("/")[0], str(fault))
-    if faults and not skip_bad:
+    if faults and not skip_errors:
         raise AssetError("; ".join(faults.values()), fix=SKIP)
     for name in faults:
         shutil.rmtree(folder / name)
@@ -290,10 +290,10 @@ def check_target(folder: Path) -> None:
     check_replaceable(folder, overwrite=True, marks=(MANIFEST,))
 
 
-def made_of(jobs: Sequence[Job], folder: Path, *, skip_bad: bool = False) -> bool:
-    """Whether a pack was made of just these assets, by this code; with ``skip_bad``, some may have been left out."""
+def made_of(jobs: Sequence[Job], folder: Path, *, skip_errors: bool = False) -> bool:
+    """Whether a pack was made of just these assets, by this code; with ``skip_errors``, some may have been left out."""
     try:
         found = load_json(folder / MADE_FROM)
-        return found["content"] == {job.id: job.content for job in jobs} and (skip_bad or not found["left_out"])
+        return found["content"] == {job.id: job.content for job in jobs} and (skip_errors or not found["left_out"])
     except (OSError, ValueError, TypeError, KeyError):
         return False

@@ -18,7 +18,7 @@ import tyro
 
 from robocas_ms3.plans import worker
 from robocas_ms3.plans.executors import LocalExecutor
-from robocas_ms3.plans.folder import PlanFolder, SeedFiles, Unit
+from robocas_ms3.plans.folder import PlanFolder, SeedFiles, WorkUnit
 from robocas_ms3.plans.plan import PartConfig, Plan
 from robocas_ms3.plans.run import run_shard
 
@@ -67,7 +67,7 @@ def main(cfg: Benchmark) -> None:
         cpu = time.process_time()
         run_shard(LocalExecutor(folder, cfg.workers), (0, 1))
         cpu = time.process_time() - cpu
-        units = [Unit(0, block) for block in range(cfg.units)]
+        units = [WorkUnit(0, block) for block in range(cfg.units)]
         at = np.sort([one.at for unit in units for one in folder.outcomes(unit) or ()])
     # from when every worker has started until the first has nothing left to do
     first, last = 2 * cfg.workers, cfg.units - cfg.workers

@@ -123,8 +123,8 @@ def report(cfg: Benchmark, out: Path, wall: float, ctrl_c: float, memory: dict[i
         "jobs": cfg.jobs,
         "episodes": {task: len(made) for task, made in good.items()},
         "seeds": {task: len(made) for task, made in found.items()},
-        "episodes_an_hour": round(3600 * episodes / wall, 1),
-        "episodes_an_hour_lately": read_status(out).episodes_an_hour,
+        "episodes_per_hour": round(3600 * episodes / wall, 1),
+        "episodes_an_hour_lately": read_status(out).episodes_per_hour,
         "cpu_seconds_an_episode": {task: round(seconds, 2) for task, seconds in cpu.items()},
         "wall_seconds_times_jobs_an_episode": round(wall * cfg.jobs / max(1, episodes), 2),
         "steps_an_episode": {
@@ -133,7 +133,7 @@ def report(cfg: Benchmark, out: Path, wall: float, ctrl_c: float, memory: dict[i
         "megabytes_an_episode": {
             task: round(sum(one.size for one in made) / 1e6 / max(1, len(made)), 2) for task, made in good.items()
         },
-        "deaths": sum(len(one.deaths) for made in found.values() for one in made),
+        "crashes": sum(len(one.crashes) for made in found.values() for one in made),
         "ctrl_c_seconds": round(ctrl_c, 2),
         "processes": [growth(one, episodes / cfg.jobs / wall) for one in memory.values() if len(one.at) * LOOK > 60],
     }

@@ -26,7 +26,7 @@ Job = Any
 class _Making:
     jobs: Jobs = CORES
     """Processes. Default: one for each CPU core."""
-    skip_bad: bool = False
+    skip_errors: bool = False
     """Leave out models with errors, instead of stopping at the first one."""
     overwrite: bool = False
     """Replace a pack of this name that was made from other files or settings; unchanged assets are reused."""
@@ -132,9 +132,11 @@ def import_scans(command: ImportScans) -> int:
 
     out, masses = _target(command.pack), _masses(command.masses)
     settings = ImportSettings(command.units, command.up, masses, command.licence, command.attribution)
-    from robocas_ms3.cli.terminal import say
+    from robocas_ms3.cli.terminal import print_line
 
-    jobs = scan_jobs(command.source, settings, partial(_inspect, command), lambda reason: say(f"skipped {reason}"))
+    jobs = scan_jobs(
+        command.source, settings, partial(_inspect, command), lambda reason: print_line(f"skipped {reason}")
+    )
     return _make(jobs, command, out, "scan")
 
 
@@ -166,9 +168,9 @@ def import_partnet(command: ImportPartNet) -> int:
     if not command.models:
         raise AssetError("no model given", expected="folders with a mobility.urdf", fix="Give at least one.")
     if command.template:
-        from robocas_ms3.cli.terminal import say_lines
+        from robocas_ms3.cli.terminal import print_text
 
-        say_lines(template(command.models[0]))
+        print_text(template(command.models[0]))
         return 0
     return _make(partnet_jobs(command.models, command.annotations), command, _target(command.pack), "PartNet model")
 
@@ -201,11 +203,11 @@ def build(command: Build) -> int:
 
 def _inspect(command: _Making, models: Mapping[str, Any]) -> Mapping[str, Any]:
     from asset_tools.inspection import inspect_models
-    from robocas_ms3.cli.progress import Bar
+    from robocas_ms3.cli.progress import ProgressBar
 
-    with Bar("models read", transient=True) as shown:
-        shown.start(len(models))
-        return inspect_models(models, command.jobs, shown.advance)
+    with ProgressBar("models read", transient=True) as bar:
+        bar.start(len(models))
+        return inspect_models(models, command.jobs, bar.advance)
 
 
 def _target(name: str) -> Path:
@@ -224,18 +226,18 @@ def _target(name: str) -> Path:
 def _make(jobs: list[Job], command: _Making, out: Path, what: str) -> int:
     from asset_tools.pipeline import check_jobs, made_of
     from robocas_ms3.assets.pack import load_pack
-    from robocas_ms3.cli.terminal import say
+    from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.core.errors import AssetError, OutputExistsError
 
-    if not command.skip_bad:
+    if not command.skip_errors:
         check_jobs(jobs)
-    if made_of(jobs, out, skip_bad=command.skip_bad):
+    if made_of(jobs, out, skip_errors=command.skip_errors):
         try:
             load_pack(out)
         except AssetError as error:
-            say(f"making it again: {error}")
+            print_line(f"making it again: {error}")
         else:
-            say(f"{out} is up to date")
+            print_line(f"{out} is up to date")
             if not (out / CONTACT_SHEET).exists():
                 _draw_sheet(out)
             return 0
@@ -248,21 +250,21 @@ def _make(jobs: list[Job], command: _Making, out: Path, what: str) -> int:
 
 def _write(jobs: list[Job], command: _Making, out: Path, description: str, *, record: bool = True) -> int:
     from asset_tools.pipeline import JobResult, write_pack
-    from robocas_ms3.cli.progress import Bar
-    from robocas_ms3.cli.terminal import say
+    from robocas_ms3.cli.progress import ProgressBar
+    from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.core.paths import cache_dir
 
-    with Bar(f"assets of {out.name} processed") as shown:
-        shown.start(len(jobs))
+    with ProgressBar(f"assets of {out.name} processed") as bar:
+        bar.start(len(jobs))
 
         def on_made(made: JobResult) -> None:
-            shown.advance()
+            bar.advance()
             if made.asset is None:
-                shown.note(f"left out: {made.error}")
+                bar.note(f"left out: {made.error}")
                 return
             for repair in made.asset.repairs:
                 if repair.startswith("warning:"):
-                    shown.note(f"{made.id}: {repair}")
+                    bar.note(f"{made.id}: {repair}")
 
         results = write_pack(
             jobs,
@@ -270,14 +272,14 @@ def _write(jobs: list[Job], command: _Making, out: Path, description: str, *, re
             cache_dir() / "assets",
             description=description,
             processes=command.jobs,
-            skip_bad=command.skip_bad,
+            skip_errors=command.skip_errors,
             record=record,
             on_made=on_made,
         )
     assets_show.info(assets_show.Info(pack=str(out)))
     bad = [made.id for made in results if made.asset is None]
     left_out = f"; {len(bad)} left out: {', '.join(bad)}" if bad else ""
-    say(f"wrote {out}: {count_of(len(results) - len(bad), 'asset')}{left_out}")
+    print_line(f"wrote {out}: {count_of(len(results) - len(bad), 'asset')}{left_out}")
     if record:
         _draw_sheet(out)
     return 0
@@ -286,20 +288,20 @@ def _write(jobs: list[Job], command: _Making, out: Path, description: str, *, re
 def _draw_sheet(folder: Path) -> None:
     from asset_tools.contact_sheet import contact_sheet
     from robocas_ms3.assets.pack import load_pack
-    from robocas_ms3.cli.progress import working
-    from robocas_ms3.cli.terminal import say
+    from robocas_ms3.cli.progress import spinner
+    from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.core.errors import AssetError
 
     pack = load_pack(folder)
     ids = [asset.id for asset in pack.manifest.assets]
     try:
-        with working(f"drawing {count_of(len(ids[:SHEET]), 'asset')}"):
+        with spinner(f"drawing {count_of(len(ids[:SHEET]), 'asset')}"):
             contact_sheet(pack, folder / CONTACT_SHEET, ids[:SHEET])
     except AssetError as error:
-        say(f"no contact sheet: {error}")
+        print_line(f"no contact sheet: {error}")
         return
     rest = f"; `robocas assets sheet {folder.name}` draws all {len(ids)}" if len(ids) > SHEET else ""
-    say(f"contact sheet: {folder / CONTACT_SHEET}{rest}")
+    print_line(f"contact sheet: {folder / CONTACT_SHEET}{rest}")
 
 
 def _masses(path: Path | None) -> dict[str, float]:

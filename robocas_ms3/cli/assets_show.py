@@ -132,13 +132,13 @@ def verify(command: Verify) -> int:
     """Run ``verify``; 1 where an asset falls short of what is asked of packs."""
     from robocas_ms3.assets.cooked_hulls import cooking_faults
     from robocas_ms3.assets.pack import load_pack
-    from robocas_ms3.cli.terminal import console, say
+    from robocas_ms3.cli.terminal import console, print_line
 
     pack = load_pack(command.pack)
     for loaded in pack.objects.values():
         _ = loaded.annotations
     faults = cooking_faults(pack.root)
-    say(f"{pack.name}: {count_of(len(pack.manifest.assets), 'asset')}, every file is as it should be")
+    print_line(f"{pack.name}: {count_of(len(pack.manifest.assets), 'asset')}, every file is as it should be")
     for fault in faults:
         console().print(printable(str(fault)), style="red", soft_wrap=True)
     if command.physics:
@@ -151,17 +151,17 @@ def sheet(command: Sheet) -> int:
     require_mesh_tools()
     from asset_tools.contact_sheet import contact_sheet
     from robocas_ms3.assets.pack import load_pack
-    from robocas_ms3.cli.progress import working
-    from robocas_ms3.cli.terminal import say
+    from robocas_ms3.cli.progress import spinner
+    from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.core.errors import AssetError
 
     pack = load_pack(command.pack)
     out = command.out or Path(f"{pack.name}.png")
     if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise AssetError("a sheet is a PNG or JPEG", where=out, expected=".png, .jpg", found=out.suffix or "no suffix")
-    with working(f"drawing {count_of(len(command.ids) or len(pack.manifest.assets), 'asset')}"):
+    with spinner(f"drawing {count_of(len(command.ids) or len(pack.manifest.assets), 'asset')}"):
         contact_sheet(pack, out, ids=command.ids or None)
-    say(f"wrote {out}")
+    print_line(f"wrote {out}")
     return 0
 
 
@@ -169,17 +169,17 @@ def _verify_physics(pack: Pack, jobs: int, out: Path | None) -> int:
     require_mesh_tools()
     from asset_tools.quality.measure import HEADER, differences, judge, rows
     from asset_tools.quality.packs import FURNITURE_HEADER, furniture_rows, judge_furniture, remeasure_pack
-    from robocas_ms3.cli.progress import Bar
+    from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.cli.terminal import print_table, table_console
     from robocas_ms3.core.files import write_json
 
     total = len(pack.manifest.assets)
     measured: dict[str, Any] = {}
-    with Bar("assets measured") as shown:
-        shown.start(total)
+    with ProgressBar("assets measured") as bar:
+        bar.start(total)
         for name, found in remeasure_pack(pack, jobs):
             measured[name] = found
-            shown.advance()
+            bar.advance()
     objects = {name: measured[name] for name in pack.objects}
     furniture = {name: measured[name] for name in pack.furniture}
     console = table_console()

@@ -17,21 +17,21 @@ if TYPE_CHECKING:
 
 @resumable
 def main(settings: ConversionSettings) -> int:
-    from robocas_ms3.cli.progress import Bar
-    from robocas_ms3.cli.terminal import say
+    from robocas_ms3.cli.progress import ProgressBar
+    from robocas_ms3.cli.terminal import print_line
 
     write: Callable[..., Conversion] = _find_format(settings).part("writer")
-    with Bar("episodes written") as shown:
-        done = write(settings, on_start=shown.start, on_episode=shown.advance)
+    with ProgressBar("episodes written") as bar:
+        done = write(settings, on_start=bar.start, on_episode=bar.advance)
     count = len(done.episodes)
     words = [f"{settings.out}: {count_of(count, 'episode')}"] + ([f"{done.kept} kept"] if done.kept else [])
     if count:
         megabytes = sum(episode.size for episode in done.episodes) / 1e6
         steps = count_of(sum(episode.steps for episode in done.episodes), "step")
         words += [steps, f"{megabytes:.0f} MB", f"{done.seconds / count:.1f} s an episode"]
-    say(", ".join(words))
+    print_line(", ".join(words))
     if count and settings.video and settings.to == "robocas" and not done.previews:
-        say("no videos of so many episodes: --all-videos makes them, and robocas video those of some")
+        print_line("no videos of so many episodes: --all-videos makes them, and robocas video those of some")
     return 0
 
 

@@ -23,15 +23,15 @@ class Doctor:
 
 
 def main(cfg: Doctor) -> int:
-    from robocas_ms3.cli.progress import working
-    from robocas_ms3.cli.terminal import say_json
+    from robocas_ms3.cli.progress import spinner
+    from robocas_ms3.cli.terminal import print_json
     from robocas_ms3.doctor.checks import examine
 
-    with working("examining"):
+    with spinner("examining"):
         findings = examine()
     failed = sum(finding.status == "fail" for finding in findings)
     if cfg.json:
-        say_json({"ok": not failed, "findings": [asdict(finding) for finding in findings]})
+        print_json({"ok": not failed, "findings": [asdict(finding) for finding in findings]})
     else:
         _print(findings, failed)
     return 1 if failed else 0

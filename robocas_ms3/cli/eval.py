@@ -55,8 +55,8 @@ def run(settings: EvaluationSettings) -> int:
             expected = f"one of {', '.join(TASKS)}; or {', '.join(COMMANDS)}"
             fix = nearest(word, [*TASKS, *COMMANDS])
             raise EvaluationError("no such task", where="--tasks", expected=expected, found=word, fix=fix)
-    from robocas_ms3.cli.progress import Bar
-    from robocas_ms3.cli.terminal import say, say_lines
+    from robocas_ms3.cli.progress import ProgressBar
+    from robocas_ms3.cli.terminal import print_line, print_text
     from robocas_ms3.core.workers import use_one_torch_thread
     from robocas_ms3.evaluation.policies import find_policy, open_policy
     from robocas_ms3.evaluation.protocol import load_protocol
@@ -69,37 +69,37 @@ def run(settings: EvaluationSettings) -> int:
 
     use_one_torch_thread()
     outcomes = []
-    with open_policy(settings.policy) as policy, Bar("episodes run") as shown:
+    with open_policy(settings.policy) as policy, ProgressBar("episodes run") as bar:
         session = EvaluationSession(policy, settings)
-        for outcome in session.run(shown.start):
+        for outcome in session.run(bar.start):
             outcomes.append(outcome)
-            shown.advance()
+            bar.advance()
     result = read(session.folder)
-    say_lines(markdown(result))
+    print_text(markdown(result))
     broken, succeeded = result.broken_off(), sum(outcome.success for outcome in outcomes)
     errors = f", {broken} broken off by an error (--retry-errors runs them again)" if broken else ""
     total = count_of(len(result.outcomes), "episode")
-    say(f"{count_of(len(outcomes), 'episode')} run, {succeeded} succeeded; {session.folder}: {total}{errors}")
+    print_line(f"{count_of(len(outcomes), 'episode')} run, {succeeded} succeeded; {session.folder}: {total}{errors}")
     eval_results.write_pages(result, session.folder, settings.protocol)
     return 1 if broken else 0
 
 
 def list_protocols(cfg: Protocols) -> int:
-    from robocas_ms3.cli.terminal import say
+    from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
 
     for name in shipped_protocols():
         protocol = load_protocol(name)
         count = count_of(len(protocol.episodes), "episode")
-        say(f"{name}: {count}, {protocol.hash[:12]}: {protocol.rules.description}")
+        print_line(f"{name}: {count}, {protocol.hash[:12]}: {protocol.rules.description}")
         if files := protocol.train_files():
-            say(f"    to train on: {', '.join(map(str, files))}")
+            print_line(f"    to train on: {', '.join(map(str, files))}")
     return 0
 
 
 def freeze(cfg: Freeze) -> int:
-    from robocas_ms3.cli.progress import Bar
-    from robocas_ms3.cli.terminal import say
+    from robocas_ms3.cli.progress import ProgressBar
+    from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.core.output_folder import check_replaceable
     from robocas_ms3.evaluation.freeze import freeze as make
     from robocas_ms3.evaluation.freeze import read_plan
@@ -107,11 +107,11 @@ def freeze(cfg: Freeze) -> int:
 
     plan = read_plan(cfg.plan)
     check_replaceable(cfg.out)
-    with Bar("episodes chosen") as shown:
+    with ProgressBar("episodes chosen") as bar:
         for done, total in make(plan, cfg.out, overrides=cfg.set):
-            shown.at(done, total)
+            bar.update(done, total)
     protocol = load_protocol(cfg.out)
-    say(f"{cfg.out}: {count_of(len(protocol.episodes), 'episode')}, {protocol.hash}")
+    print_line(f"{cfg.out}: {count_of(len(protocol.episodes), 'episode')}, {protocol.hash}")
     return 0
 
 

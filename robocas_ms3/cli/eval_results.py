@@ -84,31 +84,31 @@ class Videos:
 
 
 def report(cfg: Report) -> int:
-    from robocas_ms3.cli.terminal import say, say_lines
+    from robocas_ms3.cli.terminal import print_line, print_text
     from robocas_ms3.evaluation.report.tables import markdown
 
     result = _read(cfg.folders)
-    say_lines(markdown(result))
+    print_text(markdown(result))
     if cfg.out is None and len(cfg.folders) > 1:
-        say("Pass --out DIR for the page of several folders.")
+        print_line("Pass --out DIR for the page of several folders.")
     else:
         write_pages(result, cfg.out or result.folder, cfg.protocol)
     return 0
 
 
 def merge(cfg: Merge) -> int:
-    from robocas_ms3.cli.terminal import say
+    from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.evaluation.results import merge as write
 
     _check_folders(cfg.folders)
     result = write(cfg.folders, cfg.out)
-    say(f"{cfg.out}: {count_of(len(result.outcomes), 'episode')}")
+    print_line(f"{cfg.out}: {count_of(len(result.outcomes), 'episode')}")
     write_pages(result, cfg.out, cfg.protocol)
     return 0
 
 
 def compare(cfg: Compare) -> int:
-    from robocas_ms3.cli.terminal import say_lines
+    from robocas_ms3.cli.terminal import print_text
     from robocas_ms3.evaluation.report.comparison import comparison, comparison_of_splits
     from robocas_ms3.evaluation.results import parts_of, read
 
@@ -116,30 +116,30 @@ def compare(cfg: Compare) -> int:
     groups = [[folder] for folder in cfg.folders] if len(cfg.folders) == 2 else parts_of(cfg.folders)
     results = [read(*parts) for parts in groups]
     if len(results) == 1:
-        say_lines(comparison_of_splits(results[0], _protocol_of(results[0], cfg.protocol)))
+        print_text(comparison_of_splits(results[0], _protocol_of(results[0], cfg.protocol)))
     else:
-        say_lines(comparison(results))
+        print_text(comparison(results))
     return 0
 
 
 def verify(cfg: Verify) -> int:
-    from robocas_ms3.cli.terminal import say
+    from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.evaluation.verify import problems
 
     result = _read(cfg.folders)
     found = problems(result, _protocol_of(result, cfg.protocol))
     for problem in found:
-        say(problem)
+        print_line(problem)
     if broken := result.broken_off():
-        say(f"note: broken off by an error: {count_of(broken, 'episode')}, counted as failed")
+        print_line(f"note: broken off by an error: {count_of(broken, 'episode')}, counted as failed")
     valid = f"{count_of(len(result.outcomes), 'episode')} of {result.run.protocol}, all well"
-    say(f"{', '.join(map(str, cfg.folders))}: {count_of(len(found), 'problem') if found else valid}")
+    print_line(f"{', '.join(map(str, cfg.folders))}: {count_of(len(found), 'problem') if found else valid}")
     return 1 if found else 0
 
 
 def videos(cfg: Videos) -> int:
-    from robocas_ms3.cli.progress import Bar
-    from robocas_ms3.cli.terminal import say
+    from robocas_ms3.cli.progress import ProgressBar
+    from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.core.checks import check_number
     from robocas_ms3.core.errors import EvaluationError
     from robocas_ms3.evaluation.policies import POLICIES, open_policy
@@ -155,18 +155,18 @@ def videos(cfg: Videos) -> int:
 
     use_one_torch_thread()
     numbers = failed_of_each_kind(result, cfg.count)
-    with open_policy(name) as policy, Bar("episodes filmed") as shown:
+    with open_policy(name) as policy, ProgressBar("episodes filmed") as bar:
         for done, (path, same) in enumerate(film(result, protocol, policy, numbers), start=1):
-            say(str(path) + ("" if same else ": this time it came out differently"))
-            shown.at(done, len(numbers))
+            print_line(str(path) + ("" if same else ": this time it came out differently"))
+            bar.update(done, len(numbers))
     if not numbers:
-        say("no episode failed")
+        print_line("no episode failed")
     write_pages(result, cfg.folder, cfg.protocol)
     return 0
 
 
 def write_pages(result: Result, out: Path, protocol: str | None) -> None:
-    from robocas_ms3.cli.terminal import say
+    from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.core.errors import EvaluationError
     from robocas_ms3.evaluation.report import write_report
 
@@ -176,9 +176,9 @@ def write_pages(result: Result, out: Path, protocol: str | None) -> None:
         loaded = None  # one of the user's own
     matches = loaded is not None and loaded.hash == result.run.protocol_hash
     written = write_report(result, out, loaded if matches else None)
-    say(f"{out}: {', '.join(path.name for path in written)}")
+    print_line(f"{out}: {', '.join(path.name for path in written)}")
     if not any(path.suffix == ".parquet" for path in written):
-        say('no episodes.parquet without pyarrow; in the clone: pip install -e ".[lerobot]"')
+        print_line('no episodes.parquet without pyarrow; in the clone: pip install -e ".[lerobot]"')
 
 
 def _check_folders(folders: tuple[Path, ...]) -> None:

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 @resumable
 def main(settings: GenerateSettings) -> int:
     settings = settings.resolve()  # an invalid configuration is an error before the imports below, which take seconds
-    from robocas_ms3.cli.progress import Bar
-    from robocas_ms3.cli.terminal import say
+    from robocas_ms3.cli.progress import ProgressBar
+    from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.demos.generate import generate
 
     players, weights = None, ""
@@ -26,26 +26,28 @@ def main(settings: GenerateSettings) -> int:
 
         weights = check_acting(settings.episode)
         players = partial(Player, settings.episode)
-    with Bar("episodes recorded") as shown:
+    with ProgressBar("episodes recorded") as bar:
 
         def on_result(result: EpisodeResult) -> None:
             if result.success:
-                shown.advance()
+                bar.advance()
             else:
                 last = result.failures[-1]
-                shown.note(f"seed {result.seed}: given up ({last.stage}: {last.reason})")
+                bar.note(f"seed {result.seed}: given up ({last.stage}: {last.reason})")
 
         def on_start(there: int) -> None:
             if there >= settings.episodes:
-                shown.note(f"{settings.out} has {count_of(there, 'episode')} already")
-            shown.start(settings.episodes, there)
+                bar.note(f"{settings.out} has {count_of(there, 'episode')} already")
+            bar.start(settings.episodes, there)
 
         summary = generate(settings, on_start=on_start, on_result=on_result, players=players, weights=weights)
-        shown.at(settings.episodes, settings.episodes)  # a recorded episode may follow a seed that was missing
+        bar.update(settings.episodes, settings.episodes)  # a recorded episode may follow a seed that was missing
     seconds = ", ".join(f"{part} {value:.2f}" for part, value in summary.mean_seconds.items())
-    say(f"{count_of(summary.episodes, 'episode')} from {count_of(summary.seeds, 'seed')} ({summary.success_rate:.0%})")
-    say(f"mean seconds a seed: {seconds}; mean length {summary.mean_steps:.0f} steps")
+    print_line(
+        f"{count_of(summary.episodes, 'episode')} from {count_of(summary.seeds, 'seed')} ({summary.success_rate:.0%})"
+    )
+    print_line(f"mean seconds a seed: {seconds}; mean length {summary.mean_steps:.0f} steps")
     if summary.failures:
-        say("failed attempts: " + ", ".join(f"{reason} x{n}" for reason, n in summary.failures.items()))
-    say(f"wrote {summary.trajectory}")
+        print_line("failed attempts: " + ", ".join(f"{reason} x{n}" for reason, n in summary.failures.items()))
+    print_line(f"wrote {summary.trajectory}")
     return 0

@@ -44,8 +44,8 @@ class ImportRobocas:
 
 
 def main(cfg: ImportRobocas) -> int:
-    from robocas_ms3.cli.progress import Bar
-    from robocas_ms3.cli.terminal import say, say_json
+    from robocas_ms3.cli.progress import ProgressBar
+    from robocas_ms3.cli.terminal import print_json, print_line
     from robocas_ms3.core.output_folder import OutputFolder
     from robocas_ms3.core.text import count_of
     from robocas_ms3.datasets.conversion.episode_plan import DATASET
@@ -61,24 +61,24 @@ def main(cfg: ImportRobocas) -> int:
         from robocas_ms3.scenes.language.embed import TextEmbedder
 
         embed = TextEmbedder()
-    with Bar("episodes read") as shown:
-        found = survey(cfg.dataset, rate_hz=cfg.rate, turn_eef=cfg.turn_eef, on_episode=shown.at)
+    with ProgressBar("episodes read") as bar:
+        found = survey(cfg.dataset, rate_hz=cfg.rate, turn_eef=cfg.turn_eef, on_episode=bar.update)
     if cfg.json:
-        say_json(found.as_json())
+        print_json(found.as_json())
     else:
         _table(found)
     if not found.taken or cfg.out is None:
         return 0 if found.taken else 1
-    with Bar("episodes written") as shown:
-        options = CopyOptions(cfg.link, cfg.overwrite, shown.start, shown.advance)
+    with ProgressBar("episodes written") as bar:
+        options = CopyOptions(cfg.link, cfg.overwrite, bar.start, bar.advance)
         kept = import_robocas(found, cfg.out, embed=embed, options=options)
     if not cfg.json:
-        say(f"{cfg.out}: {count_of(len(found.taken), 'episode')}{f', {kept} kept' if kept else ''}")
+        print_line(f"{cfg.out}: {count_of(len(found.taken), 'episode')}{f', {kept} kept' if kept else ''}")
     return 0
 
 
 def _table(found: Survey) -> None:
-    from robocas_ms3.cli.terminal import print_table, say
+    from robocas_ms3.cli.terminal import print_line, print_table
     from robocas_ms3.core.text import count_of, format_ranges
 
     rows: dict[tuple[str, str, str], list[int]] = defaultdict(list)
@@ -91,4 +91,4 @@ def _table(found: Survey) -> None:
     cells = [(format_ranges(numbers) or "all", *key) for key, numbers in sorted(rows.items())]
     print_table(("episodes", "what", "where", "problem"), cells, box=None, pad_edge=False, header_style="bold")
     counts = f"can be taken: {len(found.taken)}, left out: {len(found.left_out)}"
-    say(f"{found.root}: {count_of(found.episodes, 'episode')}, {counts}")
+    print_line(f"{found.root}: {count_of(found.episodes, 'episode')}, {counts}")

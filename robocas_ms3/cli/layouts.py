@@ -65,8 +65,8 @@ class Info:
 
 def build(command: Build) -> int:
     from robocas_ms3.assets.pack import load_pack
-    from robocas_ms3.cli.progress import Bar
-    from robocas_ms3.cli.terminal import say
+    from robocas_ms3.cli.progress import ProgressBar
+    from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.core.checks import check_number
     from robocas_ms3.scenes.config import load_task_config
 
@@ -83,29 +83,29 @@ def build(command: Build) -> int:
     engine = choose_engine(command.engine) if objects is not None else None
     there = len(pairs) - len(cache.missing(pairs))
     failures = 0
-    with Bar("layouts made") as shown:
-        shown.start(len(pairs), there)
+    with ProgressBar("layouts made") as bar:
+        bar.start(len(pairs), there)
         for (chosen, seed), problem in cache.fill(pairs, command.jobs):
             if problem:
                 failures += 1
                 which = f"seed {seed}" if objects is None else f"objects {chosen}, seed {seed}"
-                shown.note(f"{which}: {problem}")
+                bar.note(f"{which}: {problem}")
             else:
-                shown.advance()
+                bar.advance()
     if engine is not None:  # for several envs, whose resets then read one file
         cache.write_table(engine, pairs)
     moving = 0
     if engine == "gpu":
         moving = try_all(cache, engine, pack=command.pack, furniture_pack=command.furniture_pack)
     made = len(pairs) - there - failures
-    say(f"{count_of(made, 'layout')} made, {there} there already, {count_of(failures, 'seed')} without one")
+    print_line(f"{count_of(made, 'layout')} made, {there} there already, {count_of(failures, 'seed')} without one")
     if engine is not None and (table := cache.table(engine)) is not None:
         sets, arrangements = table.rows.shape
         size = f"{count_of(sets, 'set')} of objects by {count_of(arrangements, 'seed')}"
-        say(f"table: {cache.table_path(engine)}, {size}")
+        print_line(f"table: {cache.table_path(engine)}, {size}")
     if engine == "gpu":
-        say(f"objects of {moving} move when the GPU simulates them: no reset takes these")
-    say(f"cache: {cache.folder}")
+        print_line(f"objects of {moving} move when the GPU simulates them: no reset takes these")
+    print_line(f"cache: {cache.folder}")
     return 1 if failures else 0
 
 
@@ -122,7 +122,7 @@ def choose_engine(wanted: Literal["auto", "cpu", "gpu"]) -> Engine:
 
 def try_all(cache: LayoutCache, engine: Engine, **packs: str) -> int:
     """Let the engine try layouts in state `UNTRIED`; return how many layouts of the table it moves."""
-    from robocas_ms3.cli.progress import Bar
+    from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.scenes.layout_table import State
     from robocas_ms3.tasks.layout_stability import judged, try_layouts, untried
 
@@ -131,11 +131,11 @@ def try_all(cache: LayoutCache, engine: Engine, **packs: str) -> int:
         found: dict[Pair, State] = {}
         trial = try_layouts(cache, engine, seeds, **packs)
         try:
-            with Bar("layouts tried") as shown:
-                shown.start(sum(map(len, seeds.values())))
+            with ProgressBar("layouts tried") as bar:
+                bar.start(sum(map(len, seeds.values())))
                 for pair, moved in trial:
                     found[pair] = judged(moved)
-                    shown.advance()
+                    bar.advance()
         finally:  # interrupted, it keeps what was found
             cache.mark_table(engine, found)
     table = cache.table(engine)
@@ -143,7 +143,7 @@ def try_all(cache: LayoutCache, engine: Engine, **packs: str) -> int:
 
 
 def info(command: Info) -> int:
-    from robocas_ms3.cli.terminal import print_table, say
+    from robocas_ms3.cli.terminal import print_line, print_table
     from robocas_ms3.core.documents import load_json
     from robocas_ms3.scenes.cache import ABOUT, caches_folder, count_layouts
 
@@ -159,7 +159,7 @@ def info(command: Info) -> int:
         rows.append((path.parent.name, count_layouts(path.parent), *of, furniture))
     print_table(("cache", "layouts", "task", "layout", "objects", "object pack", "furniture"), rows)
     if not rows:
-        say(f"no layout caches in {root}")
+        print_line(f"no layout caches in {root}")
     return 0
 
 

@@ -21,11 +21,11 @@ class List:
 
 
 def main(cfg: List) -> int:
-    from robocas_ms3.cli.terminal import say_json
+    from robocas_ms3.cli.terminal import print_json
 
     found = collect()
     if cfg.json:
-        say_json(found)
+        print_json(found)
     else:
         _print(found)
     return 0

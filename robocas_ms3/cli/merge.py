@@ -28,13 +28,13 @@ class Merge:
 
 
 def main(cfg: Merge) -> int:
-    from robocas_ms3.cli.progress import Bar
-    from robocas_ms3.cli.terminal import say
+    from robocas_ms3.cli.progress import ProgressBar
+    from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.datasets.manage.copy_episodes import CopyOptions
     from robocas_ms3.datasets.manage.merge import merge
 
-    with Bar("episodes written") as shown:
-        options = CopyOptions(not cfg.copy, cfg.overwrite, shown.start, shown.advance)
+    with ProgressBar("episodes written") as bar:
+        options = CopyOptions(not cfg.copy, cfg.overwrite, bar.start, bar.advance)
         done = merge(cfg.datasets, cfg.out, skip_duplicates=cfg.skip_duplicates, options=options)
-    say(str(done))
+    print_line(str(done))
     return 0

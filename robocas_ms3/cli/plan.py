@@ -75,8 +75,8 @@ class List:
 
 @resumable
 def run(command: Run) -> int:
-    from robocas_ms3.cli.progress import Display, show_plan
-    from robocas_ms3.cli.terminal import say
+    from robocas_ms3.cli.progress import ProgressDisplay, show_plan
+    from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.core.checks import check_number, parse_shard
     from robocas_ms3.core.errors import PlanError
     from robocas_ms3.plans.executors import open_executor
@@ -96,7 +96,7 @@ def run(command: Run) -> int:
         from robocas_ms3.datasets.conversion.env_renderer import require_renderer
 
         require_renderer()
-    with closing(Display()) as display:
+    with closing(ProgressDisplay()) as display:
 
         def show_stage(text: str) -> None:
             display.flush()  # the progress when the stage began
@@ -106,65 +106,65 @@ def run(command: Run) -> int:
         if shard:
             complete = run_shard(executor, shard, show)
         else:
-            report = run_plan(executor, overwrite=command.overwrite, show=show, say=show_stage)
+            report = run_plan(executor, overwrite=command.overwrite, on_status=show, on_stage=show_stage)
     if shard:
         then = f"robocas plan join {command.out} joins all" if complete else "other work units are missing"
-        say(f"{command.out}: the work units of shard {command.shard} are done; {then}")
+        print_line(f"{command.out}: the work units of shard {command.shard} are done; {then}")
     else:
         _say_products(command.out, report)
     return 0
 
 
 def join(command: Join) -> int:
-    from robocas_ms3.cli.terminal import tell
+    from robocas_ms3.cli.terminal import print_stderr
     from robocas_ms3.plans.run import join_plan
 
-    _say_products(command.out, join_plan(command.out, jobs=command.jobs, say=tell))
+    _say_products(command.out, join_plan(command.out, jobs=command.jobs, on_stage=print_stderr))
     return 0
 
 
 def list_plans(cfg: List) -> int:
-    from robocas_ms3.cli.terminal import say
+    from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.plans.load import load_plan, shipped_plans
 
     for name in shipped_plans():
         plan = load_plan(name)
-        say(f"{name}: {count_of(sum(part.episodes for part in plan.parts), 'episode')}. {plan.description}")
+        print_line(f"{name}: {count_of(sum(part.episodes for part in plan.parts), 'episode')}. {plan.description}")
     return 0
 
 
 def show_status(command: Status) -> int:
-    from robocas_ms3.cli.terminal import print_table, say, say_json
+    from robocas_ms3.cli.terminal import print_json, print_line, print_table
     from robocas_ms3.plans.status import read_status
 
     found = read_status(command.out)
     if command.json:
-        say_json(asdict(found))
+        print_json(asdict(found))
         return 0
     rows = []
     for part in found.parts:
         failed = ", ".join(f"{reason} x{count}" for reason, count in part.failed.items()) or "-"
         seconds = f"{part.record_seconds:.1f}", f"{part.render_seconds:.1f}"
         rows.append(
-            (part.name, f"{part.done} of {part.wanted}", part.tried, failed, *seconds, f"{part.bytes / 1e6:.0f}")
+            (part.name, f"{part.done} of {part.requested}", part.tried, failed, *seconds, f"{part.bytes / 1e6:.0f}")
         )
     columns = ("part", "episodes", "seeds", "failed", "record, CPU s each", "render, CPU s each", "MB")
     print_table(columns, rows, whole=columns[:3])
     if found.finished:
-        say("finished")
+        print_line("finished")
     elif found.seconds_left is not None:
         left, idle = found.seconds_left / 60, found.idle_seconds or 0.0
-        rate = count_of(round(found.episodes_an_hour), "episode")
-        say(f"{rate} per hour, {left:.0f} min left; the last one {idle:.0f} s ago")
+        rate = count_of(round(found.episodes_per_hour), "episode")
+        print_line(f"{rate} per hour, {left:.0f} min left; the last one {idle:.0f} s ago")
     return 0
 
 
 def _say_products(out: Path, report: dict[str, Any]) -> None:
-    from robocas_ms3.cli.terminal import say
+    from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.plans.folder import REPORT
 
     made = [str(path.relative_to(out)) for path in sorted(out.glob("d[ae]*s/*"))]
-    say(f"{out}: {count_of(report['episodes'], 'episode')}; {', '.join([*made, REPORT])}")
+    print_line(f"{out}: {count_of(report['episodes'], 'episode')}; {', '.join([*made, REPORT])}")
 
 
 def _option(word: str) -> tuple[str, str]:

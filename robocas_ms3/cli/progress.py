@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from typing import TYPE_CHECKING, Any
 
-from robocas_ms3.cli.terminal import tell, terminal_of_stderr
+from robocas_ms3.cli.terminal import print_stderr, terminal_of_stderr
 from robocas_ms3.core.text import count_of, printable
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ EVERY = 60.0  # s between two lines of a log
 _PART_BARS = 12  # parts of a plan; more of them have one bar
 
 
-class Display:
+class ProgressDisplay:
     """Rows of a progress display, or lines of a log if stderr is not a terminal.
 
     Args:
@@ -60,7 +60,7 @@ class Display:
 
     def note(self, text: str) -> None:
         if self.bars is None:
-            tell(text)
+            print_stderr(text)
         else:
             self.bars.console.print(printable(text), soft_wrap=True)
 
@@ -78,11 +78,11 @@ class Display:
     def _write_line(self) -> None:
         now = time.monotonic()
         self._next, self._written = now + EVERY, self._text
-        after = f"after {span(now - self._start)}" if now - self._start >= 1 else ""
-        tell(", ".join(filter(None, (self._text, self._about, after))))
+        after = f"after {format_duration(now - self._start)}" if now - self._start >= 1 else ""
+        print_stderr(", ".join(filter(None, (self._text, self._about, after))))
 
 
-class Bar:
+class ProgressBar:
     """Progress of one task, a context manager; its methods are callbacks of the work.
 
     Args:
@@ -91,11 +91,11 @@ class Bar:
     """
 
     def __init__(self, description: str, *, transient: bool = False) -> None:
-        self._description, self._display = description, Display(transient=transient)
+        self._description, self._display = description, ProgressDisplay(transient=transient)
         self.note, self.close = self._display.note, self._display.close
         self._start, self._done, self._there, self._count = 0.0, 0, 0, 0
 
-    def __enter__(self) -> Bar:
+    def __enter__(self) -> ProgressBar:
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -109,7 +109,7 @@ class Bar:
 
     def advance(self, *_: object) -> None:
         """Count one more item as done."""
-        self.at(self._done + 1, self._count)
+        self.update(self._done + 1, self._count)
 
     def at(self, done: int, count: int) -> None:
         """Set the number of items that are done. The first call starts a bar; its items do not count for the speed."""
@@ -120,35 +120,35 @@ class Bar:
 
     def _show(self, done: int) -> None:
         self._done = done
-        about = speed(done, self._count, self._there, time.monotonic() - self._start)
+        about = format_speed(done, self._count, self._there, time.monotonic() - self._start)
         text = f"{self._description}: {done} of {self._count}"
         self._display.show([(self._description, self._count, done)], text, about)
 
 
-def show_plan(display: Display, status: Status) -> None:
+def show_plan(display: ProgressDisplay, status: Status) -> None:
     """Show the status of a plan: a bar for each part, and one for all."""
-    rows = [(part.name, part.wanted, part.done) for part in status.parts]
-    total, done = sum(part.wanted for part in status.parts), sum(part.done for part in status.parts)
-    parts = [f"{name} {done} of {wanted}" for name, wanted, done in rows if 0 < done < wanted]
+    rows = [(part.name, part.requested, part.done) for part in status.parts]
+    total, done = sum(part.requested for part in status.parts), sum(part.done for part in status.parts)
+    parts = [f"{name} {done} of {requested}" for name, requested, done in rows if 0 < done < requested]
     text = f"{done} of {count_of(total, 'episode')}"
     text += f" ({'; '.join(parts[:_PART_BARS])})" if len(rows) > 1 and parts else ""
     about = ""
     if status.seconds_left is not None:
-        rate = count_of(round(status.episodes_an_hour), "episode")
-        about = f"{rate} per hour, {span(status.seconds_left)} left"
+        rate = count_of(round(status.episodes_per_hour), "episode")
+        about = f"{rate} per hour, {format_duration(status.seconds_left)} left"
     display.show([*(rows if 1 < len(rows) <= _PART_BARS else []), ("all", total, done)], text, about)
 
 
-def speed(done: float, count: float, there: float, seconds: float) -> str:
+def format_speed(done: float, count: float, there: float, seconds: float) -> str:
     """Return ``1.5 s each, 7 min left`` or the like; ``there`` items were done before these seconds."""
     if done <= there or seconds <= 0:
         return ""
     each = seconds / (done - there)
     rate = f"{each:.1f} s each" if each >= 1 else f"{1 / each:.1f} a second"
-    return rate + (f", {span(each * (count - done))} left" if done < count else "")
+    return rate + (f", {format_duration(each * (count - done))} left" if done < count else "")
 
 
-def span(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
     """Format a duration: ``45 s``, ``6 min``, ``3 h 20 min``, ``2.1 days``."""
     minutes = round(seconds / 60)
     if seconds < 59.5:
@@ -159,7 +159,7 @@ def span(seconds: float) -> str:
 
 
 @contextmanager
-def working(text: str) -> Iterator[None]:
+def spinner(text: str) -> Iterator[None]:
     terminal = terminal_of_stderr()
     with terminal.status(text) if terminal else nullcontext():
         yield

@@ -9,8 +9,8 @@ from robocas_ms3.demos.settings import ReplaySettings
 def main(settings: ReplaySettings) -> int:
     import numpy as np
 
-    from robocas_ms3.cli.progress import Bar
-    from robocas_ms3.cli.terminal import say
+    from robocas_ms3.cli.progress import ProgressBar
+    from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.demos.recordings.trajectory_json import read_json
 
     total = len(read_json(settings.file)["episodes"][: settings.count])  # an error before the imports below
@@ -20,16 +20,16 @@ def main(settings: ReplaySettings) -> int:
     use_one_torch_thread()
     replayed = replay(settings)
     done = []
-    with Bar("episodes replayed") as shown:
+    with ProgressBar("episodes replayed") as bar:
         for result in replayed:
             done.append(result)
-            shown.at(len(done), total)
+            bar.update(len(done), total)
     for result in done:
         if not result.success:
-            say(f"episode {result.episode_id} (seed {result.seed}): not successful")
+            print_line(f"episode {result.episode_id} (seed {result.seed}): not successful")
     good = sum(result.success for result in done)
-    say(f"{good} of {count_of(len(done), 'episode')} succeeded")
+    print_line(f"{good} of {count_of(len(done), 'episode')} succeeded")
     errors = [result.state_error for result in done if result.state_error is not None]
     if errors:
-        say(f"greatest difference from a recorded final state: {np.max(errors):.3g}")  # NaN where one is
+        print_line(f"greatest difference from a recorded final state: {np.max(errors):.3g}")  # NaN where one is
     return 0 if good == len(done) else 1

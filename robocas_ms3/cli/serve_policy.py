@@ -36,7 +36,7 @@ class ServePolicy:
 
 
 def main(cfg: ServePolicy) -> int:
-    from robocas_ms3.cli.terminal import say
+    from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.core.checks import check_number
     from robocas_ms3.core.errors import EvaluationError
     from robocas_ms3.evaluation.policies import open_policy
@@ -51,10 +51,10 @@ def main(cfg: ServePolicy) -> int:
     packs = [load_protocol(folder).rules.pack for folder in cfg.protocol]
     files = ServedFiles.of(cfg.protocol, packs)
     if not _is_loopback(strip_brackets(cfg.host)):
-        say(f"{cfg.host} is no loopback address: whoever can reach it can ask this policy")
+        print_line(f"{cfg.host} is no loopback address: whoever can reach it can ask this policy")
     with open_policy(cfg.policy) as policy:
         server = PolicyServer(policy, cfg.host, cfg.port, files, cfg.max_batch)
-        server.run(lambda url: say(f"{cfg.policy} at {url}"))
+        server.run(lambda url: print_line(f"{cfg.policy} at {url}"))
     return 0
 
 

@@ -53,7 +53,7 @@ def main(cfg: Show) -> int:
     import gymnasium as gym
 
     import robocas_ms3.tasks  # noqa: F401  (registers the environments)
-    from robocas_ms3.cli.terminal import say
+    from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.core.files import make_folder, replacing
     from robocas_ms3.scenes.task_specs import TASKS
     from robocas_ms3.tasks.base import RoboCASEnv
@@ -86,8 +86,8 @@ def main(cfg: Show) -> int:
         path = cfg.out / f"{Path(cfg.config).stem}_seed{cfg.seed}_{name}.png"
         with replacing(path) as tmp:
             Image.fromarray(pixels.cpu().numpy()).save(tmp)
-        say(f"wrote {path}")
-    say(f"instruction: {base_env.get_language_instruction()[0]}")
+        print_line(f"wrote {path}")
+    print_line(f"instruction: {base_env.get_language_instruction()[0]}")
     env.close()
     return 0
 
@@ -96,10 +96,10 @@ def print_config(config: TaskConfig) -> int:
     """Print a configuration as YAML that `load_task_config` loads."""
     import yaml
 
-    from robocas_ms3.cli.terminal import say_lines
+    from robocas_ms3.cli.terminal import print_text
 
     text = yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False, allow_unicode=True, default_flow_style=None)
-    say_lines(text.rstrip("\n"))
+    print_text(text.rstrip("\n"))
     return 0
 
 

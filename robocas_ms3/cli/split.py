@@ -46,8 +46,8 @@ class Split:
 
 
 def main(cfg: Split) -> int:
-    from robocas_ms3.cli.progress import Bar
-    from robocas_ms3.cli.terminal import say
+    from robocas_ms3.cli.progress import ProgressBar
+    from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.core.text import count_of
     from robocas_ms3.datasets.manage import split
     from robocas_ms3.datasets.manage.copy_episodes import CopyOptions, open_finished
@@ -58,7 +58,7 @@ def main(cfg: Split) -> int:
     share = None if cfg.val_share is None else split.Share(cfg.val_share, "seed" if whole else by)
     if cfg.in_place:
         train, val = split.resplit(cfg.dataset, share)
-        say(f"{cfg.dataset}: {count_of(len(train), 'episode')} for training, {len(val)} for validation")
+        print_line(f"{cfg.dataset}: {count_of(len(train), 'episode')} for training, {len(val)} for validation")
         return 0
     source = open_finished(cfg.dataset)
     if cfg.out_train and cfg.out_val:
@@ -71,11 +71,11 @@ def main(cfg: Split) -> int:
             else split.split_by_value(source.dataset, by, share)
         )
         pieces = {cfg.out / name: sides for name, sides in named.items()}
-    with Bar("episodes written") as shown:
-        options = CopyOptions(not cfg.copy, cfg.overwrite, shown.start, shown.advance)
+    with ProgressBar("episodes written") as bar:
+        options = CopyOptions(not cfg.copy, cfg.overwrite, bar.start, bar.advance)
         done = split.write_split(source, pieces, share, options)
     for written in done:
-        say(str(written))
+        print_line(str(written))
     return 0
 
 

@@ -30,20 +30,20 @@ class Stats:
 
 
 def main(cfg: Stats) -> int:
-    from robocas_ms3.cli.progress import Bar
-    from robocas_ms3.cli.terminal import say, say_json
+    from robocas_ms3.cli.progress import ProgressBar
+    from robocas_ms3.cli.terminal import print_json, print_line
     from robocas_ms3.datasets.schema import PREVIEW_FOLDER
     from robocas_ms3.datasets.statistics.collect import collect
     from robocas_ms3.datasets.statistics.plots import write_stats
 
-    with Bar("episodes read") as shown:
-        stats = collect(cfg.path, rate_hz=cfg.rate, on_episode=shown.at)
+    with ProgressBar("episodes read") as bar:
+        stats = collect(cfg.path, rate_hz=cfg.rate, on_episode=bar.update)
     default = cfg.path / PREVIEW_FOLDER / "stats" if cfg.path.is_dir() else cfg.path.with_name(f"{cfg.path.stem}_stats")
     out = cfg.out or (None if cfg.json else default)
     paths = write_stats(stats, out) if out else []
     if cfg.json:
-        say_json(stats.as_json())
+        print_json(stats.as_json())
         return 0
     images = len(paths) - 1
-    say(f"{cfg.path}: {stats.summary()}; {out}: stats.json and {count_of(images, 'image')}")
+    print_line(f"{cfg.path}: {stats.summary()}; {out}: stats.json and {count_of(images, 'image')}")
     return 0

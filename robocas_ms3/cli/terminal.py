@@ -57,21 +57,21 @@ def terminal_of_stderr() -> Console | None:
     return made if made.is_interactive else None
 
 
-def say(text: str) -> None:
+def print_line(text: str) -> None:
     """Print one line on stdout."""
-    say_lines(printable(text))
+    print_text(printable(text))
 
 
-def say_lines(text: str) -> None:
+def print_text(text: str) -> None:
     """Print lines on stdout. Data in them must have no line breaks of its own."""
     console().print(text, soft_wrap=True)
 
 
-def say_json(values: object) -> None:
-    say_lines(json.dumps(values, indent=2, ensure_ascii=False))
+def print_json(values: object) -> None:
+    print_text(json.dumps(values, indent=2, ensure_ascii=False))
 
 
-def tell(text: str) -> None:
+def print_stderr(text: str) -> None:
     """Print one line on stderr."""
     print(printable(text), file=sys.stderr, flush=True)
 

@@ -117,25 +117,25 @@ DEFAULT = "small"
 def train(baseline: str, cfg: Training) -> int:
     from robocas_ms3.baselines.training.record import find_run
     from robocas_ms3.baselines.training.session import Progress, RunOptions, train_run
-    from robocas_ms3.cli.progress import Bar
-    from robocas_ms3.cli.terminal import say
+    from robocas_ms3.cli.progress import ProgressBar
+    from robocas_ms3.cli.terminal import print_line
 
     data = getattr(cfg, "data", None)
     out = cfg.out or _default_out(baseline, data)
     start = None if cfg.start is None else find_run(Path(cfg.start)).absolute()
-    with Bar("episodes read", transient=True) as reading, Bar("steps trained") as stepping:
+    with ProgressBar("episodes read", transient=True) as reading, ProgressBar("steps trained") as stepping:
 
         def step(done: int, of: int) -> None:
             reading.close()  # a terminal has room for one
-            stepping.at(done, of)
+            stepping.update(done, of)
 
         first = os.environ.get("RANK", "0") == "0"  # one of several processes writes to the terminal
-        progress = Progress(stepping.note, reading.at, step) if first else Progress()
+        progress = Progress(stepping.note, reading.update, step) if first else Progress()
         changes, place = changes_of(cfg), out.absolute()
         options = RunOptions(baseline, data, place, changes, start=start, device=cfg.device, overwrite=cfg.overwrite)
         train_run(options, progress)
     if first:
-        say(f"{out}: trained. Next: robocas eval TASK --policy {out} --protocol {'paper-v1' if data else 'P'}")
+        print_line(f"{out}: trained. Next: robocas eval TASK --policy {out} --protocol {'paper-v1' if data else 'P'}")
     return 0
 
 

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from robocas_ms3.cli.options import Maybe
-from robocas_ms3.cli.progress import Bar
-from robocas_ms3.cli.terminal import say, say_json
+from robocas_ms3.cli.progress import ProgressBar
+from robocas_ms3.cli.terminal import print_json, print_line
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.text import count_of
 
@@ -54,15 +54,15 @@ def main(cfg: Validate) -> int:
     found = format_of(cfg.dataset)
     if found and found.name != "robocas" and cfg.replay:
         raise DatasetError("only RoboCAS folders can be replayed", where=cfg.dataset)
-    with Bar("episodes checked", transient=True) as shown:
+    with ProgressBar("episodes checked", transient=True) as bar:
         check = found.part("checker") if found and found.checker else validate
-        report: Report = check(cfg.dataset, on_episode=shown.at)
+        report: Report = check(cfg.dataset, on_episode=bar.update)
     if not cfg.json:
         for violation in report.violations:
-            say(str(violation))
+            print_line(str(violation))
         verdict = count_of(len(report.violations), "violation") if report.violations else "valid"
         counts = f"{count_of(report.episodes, 'episode')}, {count_of(report.steps, 'step')}"
-        say(f"{cfg.dataset}: {counts}, {verdict}")
+        print_line(f"{cfg.dataset}: {counts}, {verdict}")
     content, wrong = report.as_json(), bool(report.violations)
     if cfg.replay:
         replays = _replay(cfg.dataset, cfg.pack)
@@ -71,9 +71,9 @@ def main(cfg: Validate) -> int:
         wrong |= any((of_task["share"] or 0.0) < least for of_task in replays.by_task().values())
         if not cfg.json:
             for line in _lines(replays):
-                say(line)
+                print_line(line)
     if cfg.json:
-        say_json(content)
+        print_json(content)
     return 1 if wrong else 0
 
 
@@ -83,8 +83,8 @@ def _replay(root: Path, pack: str | None) -> ReplayReport:
     from robocas_ms3.datasets.checks.replay import replay_dataset
 
     use_one_torch_thread()
-    with Bar("episodes replayed", transient=True) as shown:
-        return replay_dataset(root, pack=pack, on_episode=shown.at)
+    with ProgressBar("episodes replayed", transient=True) as bar:
+        return replay_dataset(root, pack=pack, on_episode=bar.update)
 
 
 def _lines(report: ReplayReport) -> Iterator[str]:

@@ -31,8 +31,8 @@ class Video:
 
 
 def main(cfg: Video) -> int:
-    from robocas_ms3.cli.progress import Bar
-    from robocas_ms3.cli.terminal import say
+    from robocas_ms3.cli.progress import ProgressBar
+    from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.datasets.formats import open_source
     from robocas_ms3.datasets.images.video import contact_sheet, write_video
     from robocas_ms3.datasets.schema import PREVIEW_FOLDER, episode_folder
@@ -43,12 +43,12 @@ def main(cfg: Video) -> int:
     for number in numbers:  # before anything is written
         dataset.episode(number)
     suffix = "" if cfg.kind == "rgb" else f"_{cfg.kind}"
-    with Bar("episodes filmed") as shown:
-        shown.start(len(numbers))
+    with ProgressBar("episodes filmed") as bar:
+        bar.start(len(numbers))
         for number in numbers:
             path = out / f"{episode_folder(number)}{suffix}.mp4"
-            say(str(write_video(dataset, number, path, speed=cfg.speed, kind=cfg.kind)))
-            shown.advance()
+            print_line(str(write_video(dataset, number, path, speed=cfg.speed, kind=cfg.kind)))
+            bar.advance()
     sheet = out / f"contact_sheet{suffix}.png"
-    say(str(contact_sheet(dataset, sheet, episodes=cfg.episodes or None, kind=cfg.kind)))
+    print_line(str(contact_sheet(dataset, sheet, episodes=cfg.episodes or None, kind=cfg.kind)))
     return 0

@@ -38,7 +38,7 @@ class View:
 
 
 def main(cfg: View) -> int:
-    from robocas_ms3.cli.terminal import say
+    from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.viewer.source import open_source
 
     source = open_source(cfg.path)
@@ -51,7 +51,7 @@ def main(cfg: View) -> int:
 
     with Viewer(source, cfg.port) as server:
         server.warm_up()
-        say(f"{cfg.path} at {server.url} (Ctrl-C ends)")
+        print_line(f"{cfg.path} at {server.url} (Ctrl-C ends)")
         # a supervisor's stop is as clean as Ctrl-C, which is ignored where a shell started this in the background
         for ending in (signal.SIGTERM, signal.SIGINT):
             signal.signal(ending, signal.default_int_handler)
@@ -60,27 +60,27 @@ def main(cfg: View) -> int:
         try:
             server.serve_forever(poll_interval=0.1)
         except KeyboardInterrupt:
-            say("ended")
+            print_line("ended")
     return 0
 
 
 def _write(cfg: View, out: Path, source) -> int:
-    from robocas_ms3.cli.progress import Bar
-    from robocas_ms3.cli.terminal import say
+    from robocas_ms3.cli.progress import ProgressBar
+    from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.core.output_folder import check_replaceable
     from robocas_ms3.viewer.export import export
 
     check_replaceable(out, overwrite=cfg.overwrite, marks=("data/index.js",))
-    with Bar("episodes written", transient=True) as shown:
+    with ProgressBar("episodes written", transient=True) as bar:
         count, damaged = export(
             source,
             out,
             episodes=cfg.episodes,
             width=cfg.width,
             depth=cfg.depth,
-            on_episode=shown.at,
+            on_episode=bar.update,
         )
     for number, wrong in damaged.items():
-        say(f"episode {number} is damaged: {wrong}")
-    say(f"{count_of(count, 'episode')}: {out / 'index.html'}")
+        print_line(f"episode {number} is damaged: {wrong}")
+    print_line(f"{count_of(count, 'episode')}: {out / 'index.html'}")
     return 0

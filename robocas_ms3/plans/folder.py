@@ -47,11 +47,11 @@ class Outcome:
     success: bool  # whether there is an episode
     steps: Count = 0  # control steps of the episode
     failures: list[str] = field(default_factory=list)  # "stage: reason" of each attempt that failed
-    deaths: list[str] = field(default_factory=list)  # of each process that died, or was killed for a limit
+    crashes: list[str] = field(default_factory=list)  # of each process that died, or was killed for a limit
     record_seconds: Seconds = 0.0  # CPU time, of the processes that made the episode
     render_seconds: Seconds = 0.0
     size: Count = 0  # bytes of the files, without `outcome.json`
-    at: Seconds = 0.0  # end of the seed since 1970, by the clock of the machine
+    end_time: Seconds = 0.0  # end of the seed since 1970, by the clock of the machine
 
 
 _OUTCOME: TypeAdapter[Outcome] = TypeAdapter(Outcome)
@@ -110,7 +110,7 @@ class SeedFiles:
 
 
 @dataclass(frozen=True, order=True)
-class Unit:
+class WorkUnit:
     """A work unit: a block of a part's seeds."""
 
     part: int
@@ -151,47 +151,47 @@ class PlanFolder:
         """Return the folder to be entered, which checks that it was started with this plan and these versions."""
         return OutputFolder(self.path, _KIND, _settings_of(self.record()), overwrite=overwrite, shared=shared)
 
-    def unit_folder(self, unit: Unit) -> Path:
+    def unit_folder(self, unit: WorkUnit) -> Path:
         return self.path / UNITS / self.plan.name_of(unit.part) / f"{unit.block:05d}"
 
-    def files(self, unit: Unit, seed: int) -> SeedFiles:
+    def files(self, unit: WorkUnit, seed: int) -> SeedFiles:
         return SeedFiles(unit.part, seed, self.unit_folder(unit) / f"{seed:010d}")
 
-    def started_units(self) -> list[Unit]:
+    def started_units(self) -> list[WorkUnit]:
         """Return the units that have a folder, in order."""
-        units: list[Unit] = []
+        units: list[WorkUnit] = []
         for part in range(len(self.plan.parts)):
             with suppress(FileNotFoundError):  # listing asks an NFS server; whether a file exists may not
                 names = os.listdir(self.path / UNITS / self.plan.name_of(part))
-                units += sorted(Unit(part, int(name)) for name in names if name.isascii() and name.isdecimal())
+                units += sorted(WorkUnit(part, int(name)) for name in names if name.isascii() and name.isdecimal())
         return units
 
-    def outcomes(self, unit: Unit) -> list[Outcome] | None:
+    def outcomes(self, unit: WorkUnit) -> list[Outcome] | None:
         """Read the outcomes of all seeds of a unit, in order; None: it is not complete."""
         found: dict[int, Outcome] = {}
         with suppress(OSError, DocumentError):
-            found = {outcome.seed: outcome for outcome in self._ledger(unit).read()}
+            found = {outcome.seed: outcome for outcome in self._outcome_lines(unit).read()}
         seeds = unit.seeds(self.plan)
         return [found[seed] for seed in seeds] if found.keys() >= set(seeds) else None
 
-    def partial_outcomes(self, unit: Unit) -> list[Outcome]:
+    def partial_outcomes(self, unit: WorkUnit) -> list[Outcome]:
         """Read the outcomes of the seeds that are done of a unit that is not complete."""
         found = (self.files(unit, seed).outcome() for seed in unit.seeds(self.plan))
         return [outcome for outcome in found if outcome is not None]
 
-    def complete(self, unit: Unit) -> None:
+    def complete(self, unit: WorkUnit) -> None:
         """Write ``seeds.jsonl`` of a unit, once all seeds are done."""
         outcomes = self.partial_outcomes(unit)
         if len(outcomes) == len(unit.seeds(self.plan)):
-            self._ledger(unit).rewrite(outcomes)
+            self._outcome_lines(unit).rewrite(outcomes)
 
-    def forget(self, unit: Unit, seeds: Collection[int]) -> None:
+    def forget(self, unit: WorkUnit, seeds: Collection[int]) -> None:
         """Delete some seeds of a unit, which are then done again."""
-        self._ledger(unit).path.unlink(missing_ok=True)
+        self._outcome_lines(unit).path.unlink(missing_ok=True)
         for seed in seeds:
             shutil.rmtree(self.files(unit, seed).folder, ignore_errors=True)
 
-    def _ledger(self, unit: Unit) -> JsonLinesFile[Outcome]:
+    def _outcome_lines(self, unit: WorkUnit) -> JsonLinesFile[Outcome]:
         return JsonLinesFile(self.unit_folder(unit) / OUTCOMES, Outcome)
 
 

@@ -37,20 +37,20 @@ from robocas_ms3.plans.folder import (
     Outcome,
     PlanFolder,
     SeedFiles,
-    Unit,
+    WorkUnit,
 )
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.scenes.layout_table import join_frozen
 
 TRAJECTORY = "trajectory.h5"
-Chosen = Mapping[int, Sequence[tuple[Unit, Outcome]]]
+Chosen = Mapping[int, Sequence[tuple[WorkUnit, Outcome]]]
 """Part -> its episodes, in the order of their seeds."""
 EpisodeFiles = Mapping[int, Sequence[SeedFiles]]
-Say = Callable[[str], None]
+OnStage = Callable[[str], None]
 _log = logging.getLogger(__name__)
 
 
-def join(folder: PlanFolder, chosen: Chosen, *, jobs: int = 1, say: Say = lambda text: None) -> dict[str, Any]:
+def join(folder: PlanFolder, chosen: Chosen, *, jobs: int = 1, on_stage: OnStage = lambda text: None) -> dict[str, Any]:
     """Join all episodes, and return the content of ``report.json``; another call after a kill makes the same.
 
     Files of units are deleted once the joined files are on the disk and complete.
@@ -59,7 +59,7 @@ def join(folder: PlanFolder, chosen: Chosen, *, jobs: int = 1, say: Say = lambda
         folder: of the plan.
         chosen: the episodes.
         jobs: processes that make the LeRobot dataset, at most one per core.
-        say: called with each stage.
+        on_stage: called with the name of each stage.
 
     Raises:
         PlanError: a joined file is damaged, and the files of units are gone; or the disk does not keep it.
@@ -72,13 +72,13 @@ def join(folder: PlanFolder, chosen: Chosen, *, jobs: int = 1, say: Say = lambda
         finished = load_json(out / REPORT) == report
     # folders of seeds that are joined, not needed, or left by a killed process
     if not finished or any(path.is_dir() for path in (out / UNITS).glob("*/*/*")):
-        _join_files(folder, files, say)
+        _join_files(folder, files, on_stage)
     if not finished:
         if "datasets" in plan.stages and "lerobot" in plan.formats:
-            say("making the LeRobot dataset")
+            on_stage("making the LeRobot dataset")
             _convert_lerobot(plan, out / DATASETS / "robocas", out / DATASETS / "lerobot", jobs)
         if "statistics" in plan.stages:
-            say("drawing statistics")
+            on_stage("drawing statistics")
             _write_statistics(out)
     flush_to_disk(out)
     if not finished:
@@ -88,28 +88,32 @@ def join(folder: PlanFolder, chosen: Chosen, *, jobs: int = 1, say: Say = lambda
     return report
 
 
-def _join_files(folder: PlanFolder, files: EpisodeFiles, say: Say) -> None:
+def _join_files(folder: PlanFolder, files: EpisodeFiles, on_stage: OnStage) -> None:
     plan, out = folder.plan, folder.path
     seeds = {part: [each.seed for each in episodes] for part, episodes in files.items()}
     for part, episodes in files.items() if "layouts" in plan.stages else ():
         path, layouts = out / LAYOUTS / f"{plan.name_of(part)}.npy", [each.layout for each in episodes]
         sweep(make_folder(path.parent))
         damage, write = partial(_layouts_damage, path, seeds[part]), partial(join_frozen, path, layouts)
-        _join_file(path, layouts, damage, write, partial(say, f"joining layouts, {plan.name_of(part)}"))
+        _join_file(path, layouts, damage, write, partial(on_stage, f"joining layouts, {plan.name_of(part)}"))
     if "datasets" in plan.stages:
         root, count = out / DATASETS / "robocas", sum(map(len, files.values()))
         sweep(make_folder(root))
         damage, write = partial(_dataset_damage, root, count), partial(_join_dataset, plan, root, files)
-        _join_file(root, _dataset_sources(plan, root, files), damage, write, partial(say, "joining the dataset"))
+        _join_file(root, _dataset_sources(plan, root, files), damage, write, partial(on_stage, "joining the dataset"))
     for part, episodes in files.items() if "demonstrations" in plan.stages else ():
         path, recordings = out / DEMOS / plan.name_of(part) / TRAJECTORY, [each.recording for each in episodes]
         sweep(make_folder(path.parent))
         damage, write = partial(damage_of, path, seeds[part]), partial(merge, recordings, path)
-        _join_file(path, recordings, damage, write, partial(say, f"joining demonstrations, {plan.name_of(part)}"))
+        _join_file(path, recordings, damage, write, partial(on_stage, f"joining demonstrations, {plan.name_of(part)}"))
 
 
 def _join_file(
-    path: Path, sources: Iterable[Path], damage: Callable[[], str], write: Callable[[], None], say: Callable[[], None]
+    path: Path,
+    sources: Iterable[Path],
+    damage: Callable[[], str],
+    write: Callable[[], None],
+    on_start: Callable[[], None],
 ) -> None:
     """Write a file or folder that is joined from others, unless it is complete: ``damage`` returns nothing."""
     if not (found := damage()):
@@ -118,7 +122,7 @@ def _join_file(
         found = f"{found}; {gone.parent.name}/{gone.name} is gone"
         fix = "Restore either from a copy, or start again with --overwrite."
         raise PlanError("this is damaged, and can't be joined again", where=path, found=found, fix=fix)
-    say()
+    on_start()
     write()
     if found := damage():
         fix = "Check the disk; then run the command again."
@@ -170,9 +174,9 @@ def _join_dataset(plan: Plan, root: Path, files: EpisodeFiles) -> None:
                 entry = recording_entry(file, 0)
             entries[str(number)] = {**entry, **trajectory, "trajectory_episode": place}
     settings = dataset_settings(plan.rate, plan.images.chosen(), plan.embeddings)
-    write_json(root / schema.CONVERSION_FILE, {**header(settings, rule_of(plan)), "episodes": entries}, sync=True)
+    write_json(root / schema.CONVERSION_FILE, {**header(settings, split_rule(plan)), "episodes": entries}, sync=True)
     flush_to_disk(root)  # the episodes, before the file that lists them
-    write_info(root, split_of(plan, root))
+    write_info(root, split_episodes(plan, root))
 
 
 def _set_source(path: Path, source: dict[str, Any]) -> None:
@@ -183,14 +187,14 @@ def _set_source(path: Path, source: dict[str, Any]) -> None:
         tmp.write_text(text + "\n", encoding="utf-8")
 
 
-def rule_of(plan: Plan) -> str:
+def split_rule(plan: Plan) -> str:
     """Return in words which episodes validate, for ``conversion.json``."""
-    rule = Share(plan.split.val_share, plan.split.by).rule if plan.split else SPLIT_RULE
+    rule = Share(plan.split.val_fraction, plan.split.group_by).rule if plan.split else SPLIT_RULE
     named = [f"{part.name}: {part.split}" for part in plan.parts if part.split]
     return "; ".join([*named, *([rule] if len(named) < len(plan.parts) else [])])
 
 
-def split_of(plan: Plan, root: Path) -> tuple[list[int], list[int]]:
+def split_episodes(plan: Plan, root: Path) -> tuple[list[int], list[int]]:
     """Return training and validation episodes of a dataset; of the parts that name no split, by the plan's rule."""
     train: list[int] = []
     val: list[int] = []
@@ -199,7 +203,7 @@ def split_of(plan: Plan, root: Path) -> tuple[list[int], list[int]]:
         first = plan.first_episode(number)
         chosen = {None: free, "train": train, "val": val}[part.split]
         chosen += range(first, first + part.episodes)
-    by = plan.split.by if plan.split else "seed"
+    by = plan.split.group_by if plan.split else "seed"
     among, found = set(free), groups_of(Dataset(root), by) if free else {}
     groups = {number: group for number, group in found.items() if number in among}
     if plan.split is None:
@@ -208,7 +212,7 @@ def split_of(plan: Plan, root: Path) -> tuple[list[int], list[int]]:
         _log.warning("%s: all episodes have one %s: they are for training", root, by)
         by_rule = free, []
     else:
-        by_rule = cut(groups, [1 - plan.split.val_share, plan.split.val_share])
+        by_rule = cut(groups, [1 - plan.split.val_fraction, plan.split.val_fraction])
     return sorted([*train, *by_rule[0]]), sorted([*val, *by_rule[1]])
 
 

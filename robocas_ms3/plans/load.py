@@ -65,7 +65,7 @@ def load_plan(plan: str | Path) -> Plan:
     return loaded.model_copy(update={"parts": parts, "packs": found, "images": images})
 
 
-def most_seeds(episodes: int, block: int) -> int:
+def max_seeds(episodes: int, block: int) -> int:
     """Return how many seeds a part may try before the run ends because too few succeed."""
     return episodes + max(20, 3 * episodes) + 2 * block  # the last work units are done whole
 
@@ -112,7 +112,7 @@ def recording_settings(plan: Plan, part: int) -> EpisodeSettings:
 
 
 @contextmanager
-def opening_part(plan: Plan, part: int) -> Iterator[None]:
+def part_error_context(plan: Plan, part: int) -> Iterator[None]:
     """Open an environment, or whatever else all seeds of a part share: an error there is no seed's fault.
 
     Raises:
@@ -180,13 +180,13 @@ def _digest(pack: str) -> str:
 def _check_seeds(parts: Sequence[PartConfig], scenes: Sequence[Any], block: int, path: Path) -> None:
     """Check that no two parts may try the same seed of a scene: a dataset has no episode twice."""
     for number, part in enumerate(parts):
-        where, most = f"{path}, parts.{number}.seed", most_seeds(part.episodes, block)
+        where, most = f"{path}, parts.{number}.seed", max_seeds(part.episodes, block)
         if part.seed + most > GREATEST_SEED:
             expected = f"<= {GREATEST_SEED - most}"
             raise PlanError(f"seeds end at {GREATEST_SEED}", where=where, expected=expected, found=part.seed)
         for other, scene in zip(parts[:number], scenes, strict=False):
             first, last = sorted((part, other), key=lambda each: each.seed)
-            end = first.seed + most_seeds(first.episodes, block)
+            end = first.seed + max_seeds(first.episodes, block)
             if scenes[number] == scene and last.seed < end:
                 expected, found = f"one of the two from {end} on", f"{part.seed}, and {other.seed} of {other.name}"
                 raise PlanError("two parts may try the same seeds", where=where, expected=expected, found=found)

@@ -13,7 +13,7 @@ from robocas_ms3.datasets.lerobot.variants import NEWEST, Version
 from robocas_ms3.datasets.schema import ImageFormat
 from robocas_ms3.robots.cameras import STANDARD_NAMES
 
-Side = Literal["train", "val"]
+Split = Literal["train", "val"]
 Stage = Literal["layouts", "demonstrations", "datasets", "statistics"]
 _NEEDS = {"datasets": "demonstrations", "statistics": "datasets"}
 
@@ -28,7 +28,7 @@ class PartConfig(StrictModel):
     pack: str = "builtin"
     episodes: Annotated[int, Field(ge=1, le=1_000_000)] = Field(description="number of successful episodes")
     seed: Annotated[int, Field(ge=0, le=GREATEST_SEED)] = Field(default=0, description="first seed; others follow")
-    split: Side | None = Field(default=None, description="split of all its episodes; default: by the plan's rule")
+    split: Split | None = Field(default=None, description="split of all its episodes; default: by the plan's rule")
     name: Annotated[str, Field(pattern=r"^[\w-]+$", max_length=60)] | None = Field(
         default=None, description="name of its folders"
     )
@@ -75,8 +75,8 @@ class LimitsConfig(StrictModel):
 class SplitConfig(StrictModel):
     """Which episodes validate, of the parts that name no split; as `robocas split`."""
 
-    val_share: Annotated[float, Field(gt=0, lt=1)] = 0.1
-    by: Literal["seed", "target", "task"] = Field(default="seed", description="what stays in one split")
+    val_fraction: Annotated[float, Field(gt=0, lt=1)] = 0.1
+    group_by: Literal["seed", "target", "task"] = Field(default="seed", description="what stays in one split")
 
 
 class Plan(StrictModel):
@@ -112,8 +112,8 @@ class Plan(StrictModel):
         if "lerobot" in self.formats and "datasets" not in self.stages:
             raise ValueError("formats: lerobot needs the stage datasets")
         free = {part.task for part in self.parts if part.split is None}
-        if self.split and self.split.by == "task" and len(free) < 2:
-            raise ValueError("split: by task needs parts of two tasks that name no split")
+        if self.split and self.split.group_by == "task" and len(free) < 2:
+            raise ValueError("split: group_by task needs parts of two tasks that name no split")
         return self
 
     def name_of(self, part: int) -> str:

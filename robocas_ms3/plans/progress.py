@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator
 
 from robocas_ms3.core.errors import PlanError
-from robocas_ms3.plans.folder import DATASETS, DEMOS, REPORT, UNITS, Outcome, PlanFolder, Unit
+from robocas_ms3.plans.folder import DATASETS, DEMOS, REPORT, UNITS, Outcome, PlanFolder, WorkUnit
 
 Shard = tuple[int, int]
 """K, N: the work units whose block is K modulo N."""
@@ -25,8 +25,8 @@ class Progress:
 
     def __init__(self, folder: PlanFolder) -> None:
         self.folder, self.plan = folder, folder.plan
-        self.done: dict[Unit, list[Outcome]] = {}
-        self.partial: dict[Unit, list[Outcome]] = {}
+        self.done: dict[WorkUnit, list[Outcome]] = {}
+        self.partial: dict[WorkUnit, list[Outcome]] = {}
         # per part, of its first units that are done without a gap: number of units, of seeds, of successes
         self._first = [(0, 0, 0)] * len(self.plan.parts)
         self._failing: PlanError | None = None
@@ -36,7 +36,7 @@ class Progress:
         for unit in self.folder.started_units():
             self.add(unit)
 
-    def add(self, unit: Unit) -> bool:
+    def add(self, unit: WorkUnit) -> bool:
         """Read the outcomes of a unit; return whether it is complete."""
         if unit not in self.done:
             outcomes = self.folder.outcomes(unit)
@@ -51,7 +51,7 @@ class Progress:
     def _count(self, part: int) -> None:
         block, seeds, successes = self._first[part]
         # block by block without a gap: whether too many fail must not depend on which unit is done first
-        while (outcomes := self.done.get(Unit(part, block))) is not None:
+        while (outcomes := self.done.get(WorkUnit(part, block))) is not None:
             block, seeds, successes = block + 1, seeds + len(outcomes), successes + _successes(outcomes)
             if seeds - successes > max(20, 3 * successes):
                 every = (outcome for unit, done in self.done.items() if unit.part == part for outcome in done)
@@ -65,12 +65,12 @@ class Progress:
         if self._failing:
             raise self._failing
 
-    def forget_damaged(self) -> dict[Unit, list[int]]:
+    def delete_damaged(self) -> dict[WorkUnit, list[int]]:
         """Delete chosen episodes whose files have lost their size, as a disk with errors may do; return their seeds.
 
         None once files were moved.
         """
-        damaged: dict[Unit, list[int]] = {}
+        damaged: dict[WorkUnit, list[int]] = {}
         if any((self.folder.path / name).exists() for name in (DATASETS, DEMOS, REPORT)):
             return damaged
         for unit, outcome in (episode for episodes in self.chosen().values() for episode in episodes):
@@ -82,12 +82,12 @@ class Progress:
             self._first[unit.part] = 0, 0, 0
         return damaged
 
-    def missing(self, shard: Shard = (0, 1)) -> Iterator[Unit]:
+    def missing(self, shard: Shard = (0, 1)) -> Iterator[WorkUnit]:
         """Yield the units of a shard that are needed and not done, in the order of the plan."""
         for part, config in enumerate(self.plan.parts):
             block, _, expected = self._first[part]
             while expected < config.episodes:
-                unit = Unit(part, block)
+                unit = WorkUnit(part, block)
                 if unit in self.done:
                     expected += _successes(self.done[unit])
                 else:
@@ -96,9 +96,9 @@ class Progress:
                         yield unit
                 block += 1
 
-    def chosen(self) -> dict[int, list[tuple[Unit, Outcome]]]:
+    def chosen(self) -> dict[int, list[tuple[WorkUnit, Outcome]]]:
         """Return the episodes of each part: the first successful seeds, in order, once no unit is missing."""
-        chosen: dict[int, list[tuple[Unit, Outcome]]] = {}
+        chosen: dict[int, list[tuple[WorkUnit, Outcome]]] = {}
         for part, config in enumerate(self.plan.parts):
             units = sorted(unit for unit in self.done if unit.part == part)
             episodes = [(unit, outcome) for unit in units for outcome in self.done[unit] if outcome.success]

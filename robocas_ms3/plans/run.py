@@ -16,7 +16,7 @@ from robocas_ms3.core.output_folder import OutputFolder
 from robocas_ms3.core.signals import deferred_interrupts
 from robocas_ms3.core.text import count_of
 from robocas_ms3.plans.executors import Executor
-from robocas_ms3.plans.folder import Unit, read_plan
+from robocas_ms3.plans.folder import WorkUnit, read_plan
 from robocas_ms3.plans.join import join
 from robocas_ms3.plans.load import check_plan
 from robocas_ms3.plans.progress import Progress, Shard
@@ -36,8 +36,8 @@ def run_plan(
     executor: Executor,
     *,
     overwrite: bool = False,
-    show: Callable[[Status], None] = _ignore,
-    say: Callable[[str], None] = _ignore,
+    on_status: Callable[[Status], None] = _ignore,
+    on_stage: Callable[[str], None] = _ignore,
 ) -> dict[str, Any]:
     """Make the dataset of a plan, or continue, and return the content of ``report.json``.
 
@@ -47,8 +47,8 @@ def run_plan(
         executor: has the units done. Its output folder gets ``plan.json``, ``units/``, and in the end ``demos/``,
             ``datasets/``, ``statistics/``, ``report.json``.
         overwrite: replace the content of the folder.
-        show: is called with the progress now and then.
-        say: is called with each stage.
+        on_status: called with the status, at most once per second.
+        on_stage: called with the name of each stage.
 
     Raises:
         OutputExistsError: the folder was started with another plan or other versions, or by another command.
@@ -61,22 +61,22 @@ def run_plan(
         output.start(folder.record())
         with executor:
             progress = Progress(folder)
-            _do_units(executor, progress, output, show)
-            if damaged := progress.forget_damaged():
-                say(f"{count_of(sum(map(len, damaged.values())), 'episode')} again: damaged files")
-                _do_units(executor, progress, output, show)
-            if damaged := damaged and progress.forget_damaged():
+            _run_units(executor, progress, output, on_status)
+            if damaged := progress.delete_damaged():
+                on_stage(f"{count_of(sum(map(len, damaged.values())), 'episode')} again: damaged files")
+                _run_units(executor, progress, output, on_status)
+            if damaged := damaged and progress.delete_damaged():
                 unit, seeds = min(damaged.items())
                 found, fix = f"seed {seeds[0]}, made twice", "Check the disk; then run the command again."
                 what, where = "files don't keep the sizes that they were written with", folder.unit_folder(unit)
                 raise PlanError(what, where=where, found=found, fix=fix)
-        return join(folder, progress.chosen(), jobs=executor.jobs, say=say)
+        return join(folder, progress.chosen(), jobs=executor.jobs, on_stage=on_stage)
 
 
 def run_shard(
     executor: Executor,
     shard: Shard,
-    show: Callable[[Status], None] = _ignore,
+    on_status: Callable[[Status], None] = _ignore,
 ) -> bool:
     """Do the work units of a shard that are needed and not done, next to other shards in the same folder.
 
@@ -89,12 +89,12 @@ def run_shard(
         progress = Progress(folder)
         if next(progress.missing(shard), None):
             with executor:
-                _do_units(executor, progress, output, show, shard)
+                _run_units(executor, progress, output, on_status, shard)
     progress.read()
     return next(progress.missing(), None) is None
 
 
-def join_plan(out: Path, *, jobs: int = 1, say: Callable[[str], None] = _ignore) -> dict[str, Any]:
+def join_plan(out: Path, *, jobs: int = 1, on_stage: Callable[[str], None] = _ignore) -> dict[str, Any]:
     """Join the episodes of a plan whose work units are done; return the content of ``report.json``.
 
     Raises:
@@ -105,20 +105,24 @@ def join_plan(out: Path, *, jobs: int = 1, say: Callable[[str], None] = _ignore)
     folder = read_plan(out)
     with folder.open():
         progress = Progress(folder)
-        progress.forget_damaged()
+        progress.delete_damaged()
         missing = [f"{folder.unit_folder(unit).relative_to(out)}" for unit in progress.missing()]
         if missing:
             found, fix = f"{count_of(len(missing), 'unit')}, {missing[0]} first", "robocas plan run does them."
             raise PlanError("work units are missing", where=out, found=found, fix=fix)
-        return join(folder, progress.chosen(), jobs=jobs, say=say)
+        return join(folder, progress.chosen(), jobs=jobs, on_stage=on_stage)
 
 
-def _do_units(
-    executor: Executor, progress: Progress, output: OutputFolder, show: Callable[[Status], None], shard: Shard = (0, 1)
+def _run_units(
+    executor: Executor,
+    progress: Progress,
+    output: OutputFolder,
+    on_status: Callable[[Status], None],
+    shard: Shard = (0, 1),
 ) -> None:
     """Do the units that are needed; which ones these are is seen as seeds fail."""
-    running: dict[Any, Sequence[Unit]] = {}
-    killed: Counter[tuple[Unit, int]] = Counter()  # jobs that ended at a unit with so many seeds done
+    running: dict[Any, Sequence[WorkUnit]] = {}
+    killed: Counter[tuple[WorkUnit, int]] = Counter()  # jobs that ended at a unit with so many seeds done
     shown = -math.inf
     while True:
         busy = {unit for units in running.values() for unit in units}
@@ -134,10 +138,10 @@ def _do_units(
             progress.read()
             progress.check_failures()
             status = status_of(progress)
-            show(status)
+            on_status(status)
             shown = time.monotonic() + max(_LOOK, sum(part.tried for part in status.parts) / _LOOKS)
         if next(progress.missing(shard), None) is None:
-            show(status_of(progress))
+            on_status(status_of(progress))
             return
         for job in _ended(running, shown):
             job.result()
@@ -153,7 +157,7 @@ def _do_units(
         progress.check_failures()
 
 
-def _ended(running: dict[Any, Sequence[Unit]], until: float) -> list[Any]:
+def _ended(running: dict[Any, Sequence[WorkUnit]], until: float) -> list[Any]:
     while True:
         with deferred_interrupts():  # Ctrl-C inside could leave a lock of a future held
             ended = [job for job in running if job.done()]

@@ -19,8 +19,8 @@ class PartStatus:
     """Status of a part."""
 
     name: str
-    wanted: int  # episodes that the plan asks for
-    done: int  # episodes that are done, at most `wanted`
+    requested: int  # episodes that the plan asks for
+    done: int  # episodes that are done, at most `requested`
     tried: int  # seeds
     failed: dict[str, int]  # "stage: reason" -> number of seeds whose last attempt failed for it
     record_seconds: float  # CPU time per episode
@@ -33,7 +33,7 @@ class Status:
     """Status of a plan; the content of ``robocas plan status --json``."""
 
     parts: list[PartStatus]
-    episodes_an_hour: float  # in the ten minutes before the last episode
+    episodes_per_hour: float  # in the ten minutes before the last episode
     seconds_left: float | None  # until all are done, if they take the CPU time of others of their part; None: unknown
     idle_seconds: float | None  # since the last episode; None: there is none
     finished: bool  # whether everything is joined
@@ -55,29 +55,29 @@ def status_of(progress: Progress, *, finished: bool = False) -> Status:
     ]
     latest = time.time() + _RECENT  # a clock far ahead would hide all other episodes
     ends = sorted(
-        (outcome.at, part)
+        (outcome.end_time, part)
         for part, found in enumerate(outcomes)
         for outcome in found
-        if outcome.success and outcome.at <= latest
+        if outcome.success and outcome.end_time <= latest
     )
     recent = [(at, part) for at, part in ends if at > ends[-1][0] - _RECENT]
     seconds = recent[-1][0] - recent[0][0] if recent else 0.0
     left = seconds_left(parts, [part for _, part in recent[1:]], seconds) if seconds else None
     return Status(
         parts,
-        episodes_an_hour=round(3600 * (len(recent) - 1) / seconds, 1) if seconds else 0.0,
+        episodes_per_hour=round(3600 * (len(recent) - 1) / seconds, 1) if seconds else 0.0,
         seconds_left=None if left is None else round(left, 1),
         idle_seconds=round(max(0.0, time.time() - ends[-1][0]), 1) if ends else None,
         finished=finished,
     )
 
 
-def _part_status(name: str, wanted: int, outcomes: Sequence[Outcome]) -> PartStatus:
+def _part_status(name: str, requested: int, outcomes: Sequence[Outcome]) -> PartStatus:
     good = [outcome for outcome in outcomes if outcome.success]
-    done, count = min(wanted, len(good)), max(1, len(good))
+    done, count = min(requested, len(good)), max(1, len(good))
     return PartStatus(
         name,
-        wanted,
+        requested,
         done,
         tried=len(outcomes),
         failed=dict(Counter(each.failures[-1] for each in outcomes if not each.success and each.failures)),
@@ -98,5 +98,5 @@ def seconds_left(parts: Sequence[PartStatus], recent: Sequence[int], seconds: fl
     spent = [(part.record_seconds + part.render_seconds) * part.done for part in parts]
     mean = sum(spent) / max(1, sum(part.done for part in parts)) or 1.0  # 1.0: no CPU times are known
     cost = [each / part.done if each else mean for each, part in zip(spent, parts, strict=True)]
-    left = sum(each * (part.wanted - part.done) for each, part in zip(cost, parts, strict=True))
+    left = sum(each * (part.requested - part.done) for each, part in zip(cost, parts, strict=True))
     return left * seconds / sum(cost[part] for part in recent)

@@ -36,8 +36,8 @@ from robocas_ms3.datasets.conversion.episode_folder import FolderWriter
 from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.demos.recordings.environment import RecordedEnv
 from robocas_ms3.demos.recordings.trajectory_json import read_json
-from robocas_ms3.plans.folder import Outcome, PlanFolder, SeedFiles, Unit
-from robocas_ms3.plans.load import opening_part, recording_settings
+from robocas_ms3.plans.folder import Outcome, PlanFolder, SeedFiles, WorkUnit
+from robocas_ms3.plans.load import part_error_context, recording_settings
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.robots.registry import find_robot
 from robocas_ms3.scenes.config import load_config_of
@@ -70,7 +70,7 @@ class Recorder:
         start = _cpu_seconds()
         if self._part != files.part:
             self.close()
-            with opening_part(self._plan, files.part):
+            with part_error_context(self._plan, files.part):
                 self._open(files.part)
             self._part = files.part
         try:
@@ -162,7 +162,7 @@ class Renderer:
 
     def _open(self, env: RecordedEnv, control_mode: str, image_options: ImageOptions) -> EnvRenderer:
         assert self._part is not None
-        with opening_part(self._plan, self._part):
+        with part_error_context(self._plan, self._part):
             return self.open_env(env, control_mode, image_options)
 
     def _embed(self, texts: list[str]) -> NDArray[np.float32]:
@@ -178,7 +178,7 @@ class Renderer:
             self._source = None
 
 
-class UnitWorker:
+class WorkUnitWorker:
     """Does one work unit after the other, by two processes that are kept from unit to unit.
 
     One process records an episode, the other one renders it: a process with a renderer can't fork, as planning does.
@@ -191,12 +191,12 @@ class UnitWorker:
         self._record = WorkerPool(partial(Recorder, self._plan), 1, limits=limits[0], retries=0)
         self._render = WorkerPool(partial(Renderer, self._plan), 1, limits=limits[1], retries=0)
 
-    def do(self, unit: Unit) -> None:
+    def do(self, unit: WorkUnit) -> None:
         """Do the seeds of a unit that are not done; an error is one that every seed would meet."""
         for _ in self.seeds(unit):
             pass
 
-    def seeds(self, unit: Unit) -> Iterator[SeedFiles]:
+    def seeds(self, unit: WorkUnit) -> Iterator[SeedFiles]:
         """Do the seeds of a unit that are not done; yield the files of each, which are complete."""
         if self._folder.outcomes(unit) is not None:
             return
@@ -215,15 +215,15 @@ class UnitWorker:
         self._folder.complete(unit)
 
     def _outcome(self, files: SeedFiles) -> Outcome:
-        deaths = list[str]()
-        result = self._survive(self._record, "record", files, deaths)
+        crashes = list[str]()
+        result = self._survive(self._record, "record", files, crashes)
         if result["success"] and "datasets" in self._plan.stages:
-            result |= self._survive(self._render, "render", files, deaths)
+            result |= self._survive(self._render, "render", files, crashes)
         size = files.size() if result["success"] else 0
-        return Outcome(seed=files.seed, at=time.time(), size=size, deaths=deaths, **result)
+        return Outcome(seed=files.seed, end_time=time.time(), size=size, crashes=crashes, **result)
 
     def _survive(
-        self, process: WorkerPool[SeedFiles, dict[str, Any]], stage: str, files: SeedFiles, deaths: list[str]
+        self, process: WorkerPool[SeedFiles, dict[str, Any]], stage: str, files: SeedFiles, crashes: list[str]
     ) -> dict[str, Any]:
         """Do a stage of an episode; retry it when its process dies, up to `TRIES`."""
         for _ in range(TRIES):
@@ -237,9 +237,9 @@ class UnitWorker:
                 if not _is_of_a_seed(error):
                     raise
                 reason = error_line(error, 200)
-            deaths.append(f"{stage}: {reason}")
+            crashes.append(f"{stage}: {reason}")
             sweep(files.folder)
-        return {"success": False, "failures": [deaths[-1]]}
+        return {"success": False, "failures": [crashes[-1]]}
 
     def stop(self) -> None:
         """Kill the processes; `do` in another thread raises `CancelledError`."""

@@ -51,7 +51,7 @@ def test_scans_in_centimetres_become_a_pack_without_the_bad_ones(tmp_path):
     assert "\n" not in str(error.value)
     assert not (tmp_path / "mine").exists() and not [path for path in tmp_path.rglob("*.tmp")]
 
-    results = write_pack(scan_jobs(scans, settings), tmp_path / "mine", tmp_path / "kept", skip_bad=True)
+    results = write_pack(scan_jobs(scans, settings), tmp_path / "mine", tmp_path / "kept", skip_errors=True)
     errors = {made.id: made.error for made in results if made.asset is None}
     assert errors.keys() == BAD.keys()
     assert all(name in message and "\n" not in message for name, message in errors.items())
@@ -66,8 +66,8 @@ def test_scans_in_centimetres_become_a_pack_without_the_bad_ones(tmp_path):
     assert len(box.annotations.resting_poses) == 6
     assert box.asset.grasp_count >= 50
     # nothing to do a second time, until a scan or a setting changes
-    assert made_of(scan_jobs(scans, settings), tmp_path / "mine", skip_bad=True)
-    assert not made_of(scan_jobs(scans, ImportSettings()), tmp_path / "mine", skip_bad=True)
+    assert made_of(scan_jobs(scans, settings), tmp_path / "mine", skip_errors=True)
+    assert not made_of(scan_jobs(scans, ImportSettings()), tmp_path / "mine", skip_errors=True)
     with pytest.raises(AssetError, match="found smal"):
         scan_jobs(scans, ImportSettings(masses={"smal": 0.2}))
 

@@ -266,7 +266,7 @@ def test_a_bad_model_does_not_stop_the_others(folder, tmp_path):
     models = [folder, bad, tmp_path / "nothing", file, tmp_path / "other" / "model"]
     jobs = partnet_jobs(models, tmp_path)
     assert len({job.id for job in jobs}) == len(jobs) == len(models)
-    results = write_pack(jobs, tmp_path / "pack", tmp_path / "kept", skip_bad=True)
+    results = write_pack(jobs, tmp_path / "pack", tmp_path / "kept", skip_errors=True)
     assert sorted(made.id for made in results if made.asset) == ["model"]
 
 

@@ -71,7 +71,7 @@ def test_hulls_that_the_engine_would_shrink_make_no_pack(tmp_path):
     with pytest.raises(AssetError, match=r"ball: hull 0 shrinks by \d+\.\d mm on a GPU"):
         write_pack(todo, tmp_path / "pack", tmp_path / "kept")
     assert not (tmp_path / "pack").exists()
-    results = write_pack(todo, tmp_path / "pack", tmp_path / "kept", skip_bad=True)
+    results = write_pack(todo, tmp_path / "pack", tmp_path / "kept", skip_errors=True)
     assert [(made.id, made.asset is None) for made in sorted(results, key=lambda m: m.id)] == [
         ("ball", True),
         ("cube", False),
@@ -87,12 +87,12 @@ def test_a_failure_names_the_asset_leaves_no_pack_and_loses_nothing(tmp_path):
         write_pack(todo, tmp_path / "pack", kept)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["kept", "log"]
     assert [path.name for path in kept.iterdir()] == ["a-" + "1" * 20]
-    results = write_pack(todo, tmp_path / "pack", kept, skip_bad=True)
+    results = write_pack(todo, tmp_path / "pack", kept, skip_errors=True)
     assert [result.id for result in results if result.asset is None] == ["bad"]
     assert made_in(log) == ["a", "bad", "bad"]
-    assert made_of(todo, tmp_path / "pack", skip_bad=True) and not made_of(todo, tmp_path / "pack")
+    assert made_of(todo, tmp_path / "pack", skip_errors=True) and not made_of(todo, tmp_path / "pack")
     with pytest.raises(AssetError, match="none of the assets could be made"):
-        write_pack([bad], tmp_path / "none", kept, skip_bad=True)
+        write_pack([bad], tmp_path / "none", kept, skip_errors=True)
 
 
 def test_content_counts_files_settings_and_code(tmp_path):
@@ -117,7 +117,7 @@ def die(folder):
 def test_whatever_goes_wrong_is_said_of_the_asset_and_costs_no_other(tmp_path):
     log = tmp_path / "log"
     todo = [Job("odd", trip, "7" * 64), Job("deadly", die, "8" * 64), *jobs(log, a="1" * 64, b="2" * 64)]
-    results = write_pack(todo, tmp_path / "pack", tmp_path / "kept", skip_bad=True, processes=2)
+    results = write_pack(todo, tmp_path / "pack", tmp_path / "kept", skip_errors=True, processes=2)
     errors = {made.id: made.error for made in results}
     assert errors["odd"] == "odd: IndexError: list index out of range"
     assert errors["deadly"].startswith("deadly: the process that made it died (exit code 9)")

@@ -60,8 +60,8 @@ def test_scans_that_cannot_be_read_can_be_left_out(scans, capsys):
     (scans / "cut.ply").write_bytes(b"ply\nformat binary")
     (scans / "no_mesh").mkdir()
     code, shown = run(capsys, "import-scans", scans, "--pack", "mine", "--jobs", 1)
-    assert code == 1 and "cut" in shown and "--skip-bad" in shown
-    code, shown = run(capsys, "import-scans", scans, "--pack", "mine", "--jobs", 1, "--skip-bad")
+    assert code == 1 and "cut" in shown and "--skip-errors" in shown
+    code, shown = run(capsys, "import-scans", scans, "--pack", "mine", "--jobs", 1, "--skip-errors")
     assert code == 0 and "left out" in shown and "cut.ply" in shown and "skipped no_mesh/" in shown
     assert load_pack("mine").objects.keys() == {"red_box", "blue_box"}
 

@@ -14,24 +14,24 @@ from robocas_ms3.cli.terminal import console
 from robocas_ms3.plans.status import PartStatus, Status
 
 SCRIPT = """
-from robocas_ms3.cli.progress import Bar, working
-from robocas_ms3.cli.terminal import say
-with working("looking about"):
+from robocas_ms3.cli.progress import ProgressBar, spinner
+from robocas_ms3.cli.terminal import print_line
+with spinner("looking about"):
     pass
-with Bar("counted") as shown:
-    shown.start(2)
-    shown.advance()
-    shown.note("[1] is :odd: " + 90 * "x")
-    say("one")
-    shown.at(2, 2)
-with Bar("replayed", transient=True) as shown:
-    shown.at(1, 3)
-    shown.at(2, 3)
-with Bar("none") as shown:
-    shown.start(0)
-with Bar("never begun") as shown:
+with ProgressBar("counted") as bar:
+    bar.start(2)
+    bar.advance()
+    bar.note("[1] is :odd: " + 90 * "x")
+    print_line("one")
+    bar.update(2, 2)
+with ProgressBar("replayed", transient=True) as bar:
+    bar.update(1, 3)
+    bar.update(2, 3)
+with ProgressBar("none") as bar:
+    bar.start(0)
+with ProgressBar("never begun") as bar:
     pass
-say("done")
+print_line("done")
 """
 
 
@@ -73,11 +73,11 @@ def clock(monkeypatch):
 
 
 def test_a_log_has_the_first_line_one_per_minute_and_the_last(clock, capsys):
-    with progress.Bar("episodes") as shown:
-        shown.start(300)
+    with progress.ProgressBar("episodes") as bar:
+        bar.start(300)
         for _ in range(300):
             clock[0] += 1.5
-            shown.advance()
+            bar.advance()
     lines = capsys.readouterr().err.splitlines()
     assert lines[:2] == ["episodes: 0 of 300", "episodes: 40 of 300, 1.5 s each, 6 min left, after 1 min"]
     assert lines[-1] == "episodes: 300 of 300, 1.5 s each, after 8 min"
@@ -85,12 +85,12 @@ def test_a_log_has_the_first_line_one_per_minute_and_the_last(clock, capsys):
 
 
 def test_items_done_before_do_not_count_in_the_rate(clock, capsys):
-    with pytest.raises(KeyboardInterrupt), progress.Bar("layouts") as shown:
+    with pytest.raises(KeyboardInterrupt), progress.ProgressBar("layouts") as bar:
         clock[0] += 500  # before the first item
-        shown.at(90, 100)
+        bar.update(90, 100)
         clock[0] += 40
-        shown.at(91, 100)
-        shown.at(92, 100)
+        bar.update(91, 100)
+        bar.update(92, 100)
         raise KeyboardInterrupt
     assert capsys.readouterr().err.splitlines() == [
         "layouts: 90 of 100",
@@ -99,9 +99,9 @@ def test_items_done_before_do_not_count_in_the_rate(clock, capsys):
 
 
 def test_a_transient_bar_writes_nothing_within_a_minute(clock, capsys):
-    with progress.Bar("checked", transient=True) as shown:
+    with progress.ProgressBar("checked", transient=True) as bar:
         for done in range(1, 9):
-            shown.at(done, 9)
+            bar.update(done, 9)
             clock[0] += 10
     assert capsys.readouterr().err.splitlines() == ["checked: 7 of 9, 10.0 s each, 20 s left, after 1 min"]
 
@@ -111,7 +111,7 @@ def test_a_transient_bar_writes_nothing_within_a_minute(clock, capsys):
     [(0, "0 s"), (59.4, "59 s"), (59.6, "1 min"), (3569, "59 min"), (3590, "1 h 0 min"), (99000, "27 h 30 min")],
 )
 def test_spans(seconds, said):
-    assert progress.span(seconds) == said
+    assert progress.format_duration(seconds) == said
 
 
 def plan_status(*done):
@@ -123,7 +123,7 @@ def plan_status(*done):
 
 
 def test_a_plan_in_a_log(clock, capsys):
-    display = progress.Display()
+    display = progress.ProgressDisplay()
     for done in ((0, 0), (3, 0), (5, 1)):
         progress.show_plan(display, plan_status(*done))
         clock[0] += 31
@@ -144,7 +144,7 @@ def test_a_plan_on_a_terminal_has_a_bar_per_part_and_one_for_all(monkeypatch, ca
     file = io.StringIO()
     terminal = console(file=file, force_terminal=True, width=120)
     monkeypatch.setattr(progress, "terminal_of_stderr", lambda: terminal)
-    display = progress.Display()
+    display = progress.ProgressDisplay()
     for done in ((2, 0), (5, 1)):
         progress.show_plan(display, plan_status(*done))
     display.note("joining [red]the dataset")

@@ -11,7 +11,7 @@ from rich.text import Text
 from robocas_ms3.cli import main as cli
 from robocas_ms3.cli import progress
 from robocas_ms3.cli.list import List
-from robocas_ms3.cli.terminal import console, say, say_lines, tell
+from robocas_ms3.cli.terminal import console, print_line, print_stderr, print_text
 from robocas_ms3.core.documents import DocumentError
 from robocas_ms3.core.errors import RobocasError
 
@@ -25,11 +25,11 @@ def controls(text: str) -> set[str]:
 
 
 def test_a_line_is_one_line(capsys):
-    say(HOSTILE)
-    tell(HOSTILE)
+    print_line(HOSTILE)
+    print_stderr(HOSTILE)
     shown = capsys.readouterr()
     assert shown.out == shown.err == f"{SHOWN}\\u000a\\u000dc[bold]d[/e] :smile:\n"
-    say_lines(f"one\n{SHOWN}\x1b\ntwo")
+    print_text(f"one\n{SHOWN}\x1b\ntwo")
     assert capsys.readouterr().out == f"one\n{SHOWN}\\u001b\ntwo\n"
 
 
@@ -57,10 +57,10 @@ def test_bars_and_their_notes(monkeypatch):
     file = io.StringIO()
     made = console(file=file, force_terminal=True, width=200, color_system=None)
     monkeypatch.setattr(progress, "terminal_of_stderr", lambda: made)
-    with progress.Bar(HOSTILE) as shown:
-        shown.start(2)
-        shown.note(HOSTILE)
-        shown.advance()
+    with progress.ProgressBar(HOSTILE) as bar:
+        bar.start(2)
+        bar.note(HOSTILE)
+        bar.advance()
     assert "\x1b[2J" not in file.getvalue()
     assert not controls(file.getvalue()) - {"\x1b", "\r"}  # those that draw the bar
     assert SHOWN in file.getvalue()

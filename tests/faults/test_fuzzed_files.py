@@ -43,7 +43,7 @@ from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
 from robocas_ms3.evaluation.report.comparison import comparison
 from robocas_ms3.evaluation.report.page import page
 from robocas_ms3.evaluation.report.tables import markdown
-from robocas_ms3.plans.folder import OUTCOME, OUTCOMES, PLAN, Outcome, PlanFolder, Unit, read_plan
+from robocas_ms3.plans.folder import OUTCOME, OUTCOMES, PLAN, Outcome, PlanFolder, WorkUnit, read_plan
 from robocas_ms3.plans.load import load_plan, shipped_plans
 from robocas_ms3.plans.status import read_status
 from robocas_ms3.robots.cameras import STANDARD_NAMES
@@ -104,7 +104,7 @@ def write_result(root):
     made_up_results.write(root, [made_up_results.outcome(i, came_to=7 - i) for i in range(3)])
 
 
-COMPLETE, STARTED = Unit(0, 0), Unit(0, 1)
+COMPLETE, STARTED = WorkUnit(0, 0), WorkUnit(0, 1)
 
 
 def plan_folder(root):

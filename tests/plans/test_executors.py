@@ -11,7 +11,7 @@ from plan_stages import PLAN, assert_same, deaths_of, env_of_jobs, plan_faults, 
 
 from robocas_ms3.core.errors import MissingExtraError, PlanError
 from robocas_ms3.plans.executors import open_executor
-from robocas_ms3.plans.folder import PlanFolder, Unit
+from robocas_ms3.plans.folder import PlanFolder, WorkUnit
 
 
 @pytest.fixture(params=["local", "slurm", "ray", "ray without a shared folder"])
@@ -83,7 +83,7 @@ def test_a_unit_that_kills_its_jobs_again_and_again_ends_the_run(jobs, tmp_path)
     plan_faults(out, {11: ["kill job"] * 9})
     with pytest.raises(PlanError, match="the jobs of this unit die") as error:
         jobs.run(out, units_per_job="1")
-    assert error.value.where == PlanFolder(PLAN, out).unit_folder(Unit(0, 0))
+    assert error.value.where == PlanFolder(PLAN, out).unit_folder(WorkUnit(0, 0))
     if jobs.name == "slurm":
         assert any(Path(word.rstrip(";")).is_file() for word in str(error.value.fix).split())  # the job's log
 

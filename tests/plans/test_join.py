@@ -8,7 +8,7 @@ import pytest
 from plan_stages import PLAN, assert_same, run_here
 
 from robocas_ms3.core.errors import PlanError
-from robocas_ms3.plans.folder import PlanFolder, Unit
+from robocas_ms3.plans.folder import PlanFolder, WorkUnit
 
 
 @pytest.mark.parametrize(
@@ -67,7 +67,7 @@ def test_nothing_is_deleted_where_the_disk_does_not_keep_what_is_joined(out, mon
 
 def test_what_is_left_of_a_finished_plan_is_not_deleted_for_damaged_demonstrations(undisturbed, tmp_path, monkeypatch):
     out = shutil.copytree(undisturbed, tmp_path / "out")
-    left = PlanFolder(PLAN, out).files(Unit(0, 0), 10).recording
+    left = PlanFolder(PLAN, out).files(WorkUnit(0, 0), 10).recording
     left.parent.mkdir()
     left.write_bytes(b"left")
     os.truncate(out / "demos/a/trajectory.h5", 0)
@@ -94,5 +94,5 @@ def test_all_that_is_joined_is_on_the_disk_before_it_has_its_name(out, monkeypat
 def test_nothing_is_joined_twice(undisturbed, tmp_path):
     out = shutil.copytree(undisturbed, tmp_path / "out")
     said = []
-    run_here(out, say=said.append)
+    run_here(out, on_stage=said.append)
     assert said == []

@@ -9,7 +9,14 @@ from plan_stages import MadeUp
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import ConfigError, ExtensionError, MissingExtraError, OutputExistsError, PlanError
 from robocas_ms3.plans.folder import PLAN, PlanFolder, SeedFiles
-from robocas_ms3.plans.load import check_plan, load_plan, most_seeds, opening_part, recording_settings, shipped_plans
+from robocas_ms3.plans.load import (
+    check_plan,
+    load_plan,
+    max_seeds,
+    part_error_context,
+    recording_settings,
+    shipped_plans,
+)
 from robocas_ms3.plans.worker import Renderer
 from robocas_ms3.scenes.config import load_task_config
 
@@ -40,7 +47,7 @@ def test_the_paper_s_numbers():
 
 
 def test_parts_of_the_same_scenes_have_seeds_apart(written):
-    seed = most_seeds(5, block=10)
+    seed = max_seeds(5, block=10)
     text = "parts:\n  - {{task: pick, episodes: 5}}\n  - {{task: pick, episodes: 9, seed: {}}}\n"
     assert len(load_plan(written(text.format(seed))).parts) == 2
     with pytest.raises(PlanError, match="may try the same seeds"):
@@ -71,12 +78,12 @@ def test_a_pack_that_was_changed_is_noticed(written, tmp_path):
     with PlanFolder(plan, out).open(shared=True) as output:
         output.start(PlanFolder(plan, out).record())
     PlanFolder(load_plan(path), out).open(shared=True).check_record()
-    with opening_part(plan, 0):
+    with part_error_context(plan, 0):
         pass
     (pack / "manifest.json").write_text("{ }")
     with pytest.raises(OutputExistsError, match=r"packs\..*mine: "):
         PlanFolder(load_plan(path), out).open(shared=True).check_record()
-    with pytest.raises(PlanError) as error, opening_part(plan, 0):
+    with pytest.raises(PlanError) as error, part_error_context(plan, 0):
         pass
     assert error.value.where == str(pack)
     path.write_text(f"{path.read_text()}packs: {{{pack}: 12ab}}\n")
@@ -118,7 +125,7 @@ def test_what_fails_while_a_part_is_opened_ends_the_run(written, tmp_path, error
         (GOOD + "stages: [datasets]\n", "datasets needs demonstrations"),
         (GOOD + "stages: [demonstrations]\nformats: [robocas, lerobot]\n", "lerobot needs the stage datasets"),
         (GOOD + "images: {cameras: [nose]}\n", "no such camera"),
-        (GOOD + "split: {by: task}\n", "by task needs parts of two tasks"),
+        (GOOD + "split: {group_by: task}\n", "group_by task needs parts of two tasks"),
         ("parts:\n  - {task: pick, episodes: 1, name: ../up}\n", "parts.0.name"),
         (
             "parts:\n  - {task: pick, episodes: 1, name: a}\n  - {task: pick, episodes: 1, name: a}\n",

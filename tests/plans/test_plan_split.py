@@ -34,36 +34,36 @@ def of(monkeypatch):
 
     monkeypatch.setattr(splits, "groups_of", groups)
     monkeypatch.setattr(splits, "Dataset", lambda root: root)
-    return lambda plan: splits.split_of(plan, "somewhere")
+    return lambda plan: splits.split_episodes(plan, "somewhere")
 
 
 def test_without_a_word_it_is_what_conversions_do(of):
     plan = plan_of(None, None, None)
     assert of(plan) == splits.split_by_seed({n: 7 * n for n in range(35)})
     assert len(of(plan)[1]) == 4  # round(3.5)
-    assert splits.rule_of(plan) == SPLIT_RULE
+    assert splits.split_rule(plan) == SPLIT_RULE
 
 
 def test_a_part_may_validate_as_a_whole(of):
     plan = plan_of("train", "val", "train")
     assert of(plan) == ([*range(20), *range(25, 35)], [*range(20, 25)])
-    assert splits.rule_of(plan) == "a: train; b: val; c: train"
+    assert splits.split_rule(plan) == "a: train; b: val; c: train"
 
 
 def test_other_parts_go_by_the_rule(of):
-    plan = plan_of(None, "val", None, split={"val_share": 0.2, "by": "target"})
+    plan = plan_of(None, "val", None, split={"val_fraction": 0.2, "group_by": "target"})
     train, val = of(plan)
     assert sorted(train + val) == [*range(35)]
     assert set(range(20, 25)) < set(val)
     free = set(val) - set(range(20, 25))
     assert {n % 4 for n in free}.isdisjoint({n % 4 for n in train})  # a target is on one side
-    assert splits.rule_of(plan) == f"b: val; {split.Share(0.2, 'target').rule}"
+    assert splits.split_rule(plan) == f"b: val; {split.Share(0.2, 'target').rule}"
 
 
 def test_all_of_one_kind_train(of, caplog):
-    plan = plan_of(None, "val", None, split={"by": "seed"})
+    plan = plan_of(None, "val", None, split={"group_by": "seed"})
     plan = plan.model_copy(
-        update={"split": plan.split.model_copy(update={"by": "task"})}
+        update={"split": plan.split.model_copy(update={"group_by": "task"})}
     )  # parts of pick alone are free
     train, val = of(plan)
     assert (len(train), val) == (30, [*range(20, 25)])

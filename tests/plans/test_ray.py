@@ -16,8 +16,8 @@ ray = pytest.importorskip("ray", reason="needs the ray extra: plans on a cluster
 from plan_stages import PLAN, assert_same, env_of_jobs, run_here
 
 from robocas_ms3.core.errors import PlanError
-from robocas_ms3.plans.executors.ray import RayExecutor, do_units
-from robocas_ms3.plans.folder import PlanFolder, Unit
+from robocas_ms3.plans.executors.ray import RayExecutor, run_units
+from robocas_ms3.plans.folder import PlanFolder, WorkUnit
 from robocas_ms3.plans.run import run_plan
 
 RUNNER = Path(__file__).resolve().parents[1] / "support" / "plan_runner.py"
@@ -106,7 +106,7 @@ def test_a_cluster_that_is_not_there_is_an_error(tmp_path, address):
 def test_a_node_that_does_not_see_the_folder_is_an_error(tmp_path, monkeypatch):
     monkeypatch.setattr("robocas_ms3.plans.executors.ray._APPEARS", 0.0)
     with pytest.raises(PlanError, match="gather=yes"):
-        do_units(PlanFolder(PLAN, tmp_path / "elsewhere"), [Unit(0, 0)])
+        run_units(PlanFolder(PLAN, tmp_path / "elsewhere"), [WorkUnit(0, 0)])
 
 
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGKILL])

@@ -26,10 +26,10 @@ from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
 from robocas_ms3.demos.recordings.trajectory_json import versions
 from robocas_ms3.plans.executors import LocalExecutor
-from robocas_ms3.plans.folder import Outcome, PlanFolder, Unit
+from robocas_ms3.plans.folder import Outcome, PlanFolder, WorkUnit
 from robocas_ms3.plans.run import join_plan, run_shard
 from robocas_ms3.plans.status import read_status
-from robocas_ms3.plans.worker import Recorder, UnitWorker
+from robocas_ms3.plans.worker import Recorder, WorkUnitWorker
 from robocas_ms3.robots.cameras import STANDARD_NAMES
 
 SUPPORT = Path(__file__).resolve().parents[1] / "support"
@@ -98,7 +98,7 @@ def test_two_shards_may_be_the_same_at_the_same_time(undisturbed, tmp_path):
 
 
 def test_the_first_folder_of_a_seed_is_kept(tmp_path):
-    files = PlanFolder(PLAN, tmp_path).files(Unit(0, 0), 10)
+    files = PlanFolder(PLAN, tmp_path).files(WorkUnit(0, 0), 10)
     with files.temporary() as late, files.temporary() as first:
         for tmp in (late, first):
             tmp.recording.write_text("late" if tmp is late else "first")
@@ -108,7 +108,7 @@ def test_the_first_folder_of_a_seed_is_kept(tmp_path):
 
 
 def test_a_seed_whose_outcome_is_damaged_is_done_again(undisturbed, out):
-    unit = PlanFolder(PLAN, out).unit_folder(Unit(0, 0))
+    unit = PlanFolder(PLAN, out).unit_folder(WorkUnit(0, 0))
     (unit / "seeds.jsonl").unlink()
     os.truncate(unit / "0000000011" / "outcome.json", 20)
     run_here(out)
@@ -136,7 +136,7 @@ def test_a_seed_that_kills_twice_is_left_out_and_another_takes_its_place(tmp_pat
     assert report["parts"]["a"]["seeds"] == [10, 14, 15, 16, 17]
     found, damaged = read_status(out), "record: this recording is damaged"
     assert found.parts[0].failed == {"record: SIGSEGV": 1, "grasp: slipped": 1, damaged: 1}
-    assert (found.parts[0].done, found.parts[0].wanted) == (5, 5)
+    assert (found.parts[0].done, found.parts[0].requested) == (5, 5)
     assert found.finished
     assert deaths_of(out) == [(11, "record: SIGSEGV")] * 2 + [(13, damaged)] * 2
 
@@ -147,9 +147,9 @@ def test_a_machine_that_cannot_open_a_part_does_no_seed(tmp_path):
     (tmp_path / "out" / "plan.json").write_text(
         json.dumps({"plan": plan.model_dump(mode="json"), "versions": versions()})
     )
-    with made_up(Recorder), closing(UnitWorker(PlanFolder(plan, tmp_path / "out"))) as worker:
+    with made_up(Recorder), closing(WorkUnitWorker(PlanFolder(plan, tmp_path / "out"))) as worker:
         with pytest.raises(PlanError) as error:
-            worker.do(Unit(0, 0))
+            worker.do(WorkUnit(0, 0))
         assert error.value.where == "part a"
     assert seeds_done(tmp_path / "out") == 0
 
@@ -163,7 +163,7 @@ def test_hardly_any_success_is_an_error(tmp_path):
 
 
 def test_episodes_whose_files_were_cut_off_are_made_again(undisturbed, out):
-    folders = [PlanFolder(PLAN, out).files(Unit(0, 0), seed).folder for seed in (10, 11, 12)]
+    folders = [PlanFolder(PLAN, out).files(WorkUnit(0, 0), seed).folder for seed in (10, 11, 12)]
     image = sorted(folders[1].rglob("*.png"))[0]
     for path, length in ((folders[0] / "recording.h5", 1000), (image, 50), (folders[2] / "recording.json", 0)):
         os.truncate(path, length)
@@ -174,10 +174,10 @@ def test_episodes_whose_files_were_cut_off_are_made_again(undisturbed, out):
 
 
 def test_a_disk_that_damages_files_again_and_again_ends_the_run(out, monkeypatch):
-    monkeypatch.setattr("robocas_ms3.plans.progress.Progress.forget_damaged", lambda _: {Unit(1, 0): [4]})
+    monkeypatch.setattr("robocas_ms3.plans.progress.Progress.delete_damaged", lambda _: {WorkUnit(1, 0): [4]})
     with pytest.raises(PlanError, match="files don't keep the sizes") as error:
         run_here(out)
-    assert error.value.where == PlanFolder(PLAN, out).unit_folder(Unit(1, 0))
+    assert error.value.where == PlanFolder(PLAN, out).unit_folder(WorkUnit(1, 0))
     assert not (out / "datasets").exists()
 
 
@@ -205,7 +205,7 @@ def test_another_plan_is_refused_unless_it_is_to_overwrite_but_limits_and_descri
     run_here(out)  # nothing is left to do
     assert (out / "report.json").stat().st_mtime_ns == before
     run_here(out, other, overwrite=True)
-    assert PlanFolder(other, out).outcomes(Unit(0, 1))[0].seed == 14
+    assert PlanFolder(other, out).outcomes(WorkUnit(0, 1))[0].seed == 14
 
 
 def record_other_versions(out):
@@ -225,8 +225,8 @@ def test_a_machine_with_other_versions_does_no_unit(tmp_path):
     out = tmp_path / "out"
     shard(out, "4/5")
     record_other_versions(out)
-    worker = UnitWorker(PlanFolder(PLAN, out))
-    for start in (lambda: worker.do(Unit(0, 0)), lambda: shard(out, "0/2")):
+    worker = WorkUnitWorker(PlanFolder(PLAN, out))
+    for start in (lambda: worker.do(WorkUnit(0, 0)), lambda: shard(out, "0/2")):
         with pytest.raises(OutputExistsError, match=r"versions\.sapien: .*2\.2\.2"):
             start()
     assert not (out / "units").exists()
@@ -235,8 +235,8 @@ def test_a_machine_with_other_versions_does_no_unit(tmp_path):
 def test_a_worker_of_an_older_plan_keeps_nothing_in_the_folder_of_a_new_one(tmp_path):
     out = tmp_path / "out"
     shard(out, "4/5")
-    worker = UnitWorker(PlanFolder(PLAN, out))
-    seeds = worker.seeds(Unit(0, 0))
+    worker = WorkUnitWorker(PlanFolder(PLAN, out))
+    seeds = worker.seeds(WorkUnit(0, 0))
     next(seeds)
     run_here(out, PLAN.model_copy(update={"block": 2}), overwrite=True)
     with pytest.raises(OutputExistsError):

@@ -6,7 +6,7 @@ import pytest
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.files import make_folder, write_json
-from robocas_ms3.plans.folder import PLAN, Outcome, PlanFolder, Unit
+from robocas_ms3.plans.folder import PLAN, Outcome, PlanFolder, WorkUnit
 from robocas_ms3.plans.load import load_plan
 from robocas_ms3.plans.status import PartStatus, read_status, seconds_left
 
@@ -21,7 +21,7 @@ def started(tmp_path):
 
     def write(*outcomes):
         for outcome in outcomes:
-            unit = Unit(0, outcome.seed // 4)
+            unit = WorkUnit(0, outcome.seed // 4)
             with folder.files(unit, outcome.seed).temporary() as files:
                 files.write(outcome)
             folder.complete(unit)
@@ -30,7 +30,7 @@ def started(tmp_path):
 
 
 def good(seed, at=0.0):
-    return Outcome(seed, True, 100, record_seconds=1.0, render_seconds=3.0, size=10**6, at=at)
+    return Outcome(seed, True, 100, record_seconds=1.0, render_seconds=3.0, size=10**6, end_time=at)
 
 
 def test_status_is_read_from_the_folder_alone(started, tmp_path, capsys):
@@ -43,8 +43,8 @@ def test_status_is_read_from_the_folder_alone(started, tmp_path, capsys):
         write_failed()
         found = read_status(out)
         (part,) = found.parts
-        assert (part.done, part.wanted, part.bytes) == (4, 6, 4 * 10**6)
-        assert found.episodes_an_hour == 1080.0  # three in the 10 s after the first
+        assert (part.done, part.requested, part.bytes) == (4, 6, 4 * 10**6)
+        assert found.episodes_per_hour == 1080.0  # three in the 10 s after the first
     assert (part.tried, part.failed) == (5, {"record: SIGSEGV": 1})
     assert (part.record_seconds, part.render_seconds) == (1.5, 3.0)
     assert found.seconds_left == pytest.approx(2 * 10 / 3, abs=0.1)
@@ -61,8 +61,8 @@ def test_status_shows_reasons_with_brackets(started, capsys):
 
 
 def test_what_is_left_costs_what_its_part_costs():
-    def part(name, wanted, done, seconds):
-        return PartStatus(name, wanted, done, done, {}, seconds, 0.0, 0)
+    def part(name, requested, done, seconds):
+        return PartStatus(name, requested, done, done, {}, seconds, 0.0, 0)
 
     parts = [part("pick", 10, 10, 2.0), part("search", 5, 1, 20.0), part("select", 3, 0, 0.0)]
     # recent: ten picks and a search, 40 CPU s in 20 s; left: four searches, and three of a mean of 40 / 11
@@ -76,4 +76,4 @@ def test_the_rate_is_of_the_last_ten_minutes_by_clocks_that_are_right(started):
     out, write = started
     now = time.time()
     write(good(0, now - 5000), good(1, now - 100), good(2, now), good(4, now + 86400))
-    assert read_status(out).episodes_an_hour == 36.0
+    assert read_status(out).episodes_per_hour == 36.0

@@ -14,7 +14,7 @@ from synthetic import RayCaster, write_trajectory
 
 from robocas_ms3.core.errors import DatasetError, MissingExtraError
 from robocas_ms3.plans import worker
-from robocas_ms3.plans.folder import PlanFolder, Unit
+from robocas_ms3.plans.folder import PlanFolder, WorkUnit
 from robocas_ms3.plans.plan import PartConfig, Plan
 from robocas_ms3.plans.worker import Renderer
 
@@ -162,9 +162,9 @@ def assert_same(one, other):
 
 def deaths_of(out, plan=PLAN):
     """(seed, what its process died of) in units that are complete."""
-    units = [Unit(part, block) for part in range(len(plan.parts)) for block in range(9)]
+    units = [WorkUnit(part, block) for part in range(len(plan.parts)) for block in range(9)]
     found = (PlanFolder(plan, out).outcomes(unit) for unit in units)
-    return [(one.seed, death) for outcomes in found if outcomes for one in outcomes for death in one.deaths]
+    return [(one.seed, death) for outcomes in found if outcomes for one in outcomes for death in one.crashes]
 
 
 def seeds_done(out):

@@ -13,8 +13,8 @@ from pydantic import ValidationError
 from robocas_ms3.core.errors import PlanError
 from robocas_ms3.core.extensions import load
 from robocas_ms3.core.strict_model import StrictModel, refusal
-from robocas_ms3.plans.folder import PlanFolder, Unit
-from robocas_ms3.plans.worker import UnitWorker
+from robocas_ms3.plans.folder import PlanFolder, WorkUnit
+from robocas_ms3.plans.worker import WorkUnitWorker
 
 EXECUTORS = {
     "local": "robocas_ms3.plans.executors:LocalExecutor",
@@ -55,7 +55,7 @@ class Executor(ABC):
     def __exit__(self, *error: object) -> None: ...
 
     @abstractmethod
-    def submit(self, groups: Sequence[Sequence[Unit]]) -> Sequence[Any]:
+    def submit(self, groups: Sequence[Sequence[WorkUnit]]) -> Sequence[Any]:
         """Submit a job for each group of units; return the jobs, or those of the first groups if not all fit.
 
         The ``done()`` of a job returns whether it has ended, its ``result()`` raises an error that every seed would
@@ -74,11 +74,11 @@ class ThreadExecutor(Executor):
         self.threads = ThreadPoolExecutor(self.jobs, thread_name_prefix="plan")
         return self
 
-    def submit(self, groups: Sequence[Sequence[Unit]]) -> Sequence[Any]:
+    def submit(self, groups: Sequence[Sequence[WorkUnit]]) -> Sequence[Any]:
         return [self.threads.submit(self.run, group) for group in groups]
 
     @abstractmethod
-    def run(self, units: Sequence[Unit]) -> None:
+    def run(self, units: Sequence[WorkUnit]) -> None:
         """Do some units, as a job."""
 
 
@@ -86,12 +86,12 @@ class LocalExecutor(ThreadExecutor):
     """Work units on this machine: a thread per job, each with two processes. It has no options."""
 
     def __enter__(self) -> LocalExecutor:
-        self._workers = [UnitWorker(self.folder) for _ in range(self.jobs)]
+        self._workers = [WorkUnitWorker(self.folder) for _ in range(self.jobs)]
         self._idle = self._workers.copy()
         super().__enter__()
         return self
 
-    def run(self, units: Sequence[Unit]) -> None:
+    def run(self, units: Sequence[WorkUnit]) -> None:
         worker = self._idle.pop()
         try:
             for unit in units:

@@ -24,9 +24,9 @@ from robocas_ms3.core.signals import deferred_interrupts
 from robocas_ms3.core.strict_model import StrictModel
 from robocas_ms3.core.text import one_line
 from robocas_ms3.plans.executors import ThreadExecutor
-from robocas_ms3.plans.folder import OUTCOME, PLAN, Outcome, PlanFolder, SeedFiles, Unit
+from robocas_ms3.plans.folder import OUTCOME, PLAN, Outcome, PlanFolder, SeedFiles, WorkUnit
 from robocas_ms3.plans.plan import Plan
-from robocas_ms3.plans.worker import UnitWorker
+from robocas_ms3.plans.worker import WorkUnitWorker
 
 require_extra("ray", "plans on Ray", "ray")
 ray: Any = import_module("ray")
@@ -40,7 +40,7 @@ _CONNECT = 10.0  # s
 _CANCEL = 5.0  # s until tasks have ended
 _TEMPORARY = "robocas-ray-"
 _log = logging.getLogger(__name__)
-Piece = tuple[tuple[Unit, int], str, bytes]
+Piece = tuple[tuple[WorkUnit, int], str, bytes]
 """(unit, seed), name of a file in the seed's folder, what follows in it."""
 
 
@@ -69,7 +69,7 @@ class RayExecutor(ThreadExecutor):
         super().__enter__()
         return self
 
-    def run(self, units: Sequence[Unit]) -> None:
+    def run(self, units: Sequence[WorkUnit]) -> None:
         """Wait for a task; one that Ray has lost leaves units that are not done."""
         options = {"num_cpus": self.options.num_cpus, "num_gpus": self.options.num_gpus}
         if self.options.gather:
@@ -79,7 +79,7 @@ class RayExecutor(ThreadExecutor):
             send = ray.remote(**options)(send_units)
             task = send.remote(self.folder.plan, self.folder.record(), units, done)
         else:
-            do = ray.remote(**options, max_retries=RETRIES)(do_units)
+            do = ray.remote(**options, max_retries=RETRIES)(run_units)
             task = do.remote(self.folder, units)
         self._tasks.add(task)
         try:
@@ -94,7 +94,7 @@ class RayExecutor(ThreadExecutor):
         finally:
             self._tasks.discard(task)
 
-    def _receive(self, task: Any, units: Sequence[Unit]) -> None:
+    def _receive(self, task: Any, units: Sequence[WorkUnit]) -> None:
         """Receive the files of a task whose node does not see the plan's folder."""
         pieces = (ray.get(reference) for reference in task)
         for (unit, seed), files in groupby(pieces, lambda piece: piece[0]):
@@ -152,7 +152,7 @@ def _connect(options: RayOptions, jobs: int) -> None:
         _log.warning("%s; waiting for one", error)
 
 
-def do_units(folder: PlanFolder, units: Sequence[Unit]) -> None:
+def run_units(folder: PlanFolder, units: Sequence[WorkUnit]) -> None:
     """Do units in the plan's folder, as a task."""
     until = time.monotonic() + _APPEARS
     while not (folder.path / PLAN).is_file():
@@ -160,13 +160,13 @@ def do_units(folder: PlanFolder, units: Sequence[Unit]) -> None:
             where, fix = f"node {socket.gethostname()}", "Choose an --out that all nodes share, or gather=yes."
             raise PlanError("this node does not see the output folder", where=where, expected=folder.path, fix=fix)
         time.sleep(0.5)
-    with closing(UnitWorker(folder)) as worker:
+    with closing(WorkUnitWorker(folder)) as worker:
         for unit in units:
             worker.do(unit)
 
 
 def send_units(
-    plan: Plan, record: Mapping[str, Any], units: Sequence[Unit], done: Sequence[Sequence[Outcome]]
+    plan: Plan, record: Mapping[str, Any], units: Sequence[WorkUnit], done: Sequence[Sequence[Outcome]]
 ) -> Iterator[Piece]:
     """Do units in a temporary folder of the node, as a task, and send the files seed by seed.
 
@@ -180,13 +180,13 @@ def send_units(
                 files = folder.files(unit, outcome.seed)
                 make_folder(files.folder)
                 files.write(outcome)
-        with closing(UnitWorker(folder)) as worker:
+        with closing(WorkUnitWorker(folder)) as worker:
             for unit in units:
                 for files in worker.seeds(unit):
                     yield from _pieces(unit, files)
 
 
-def _pieces(unit: Unit, files: SeedFiles) -> Iterator[Piece]:
+def _pieces(unit: WorkUnit, files: SeedFiles) -> Iterator[Piece]:
     """Yield the files of a seed, and delete all but its outcome."""
     for path in sorted(path for path in files.folder.rglob("*") if path.is_file()):
         with path.open("rb") as file:

@@ -28,8 +28,8 @@ from robocas_ms3.core.files import make_folder
 from robocas_ms3.core.remote_errors import RemoteError
 from robocas_ms3.core.strict_model import StrictModel
 from robocas_ms3.plans.executors import Executor
-from robocas_ms3.plans.folder import PlanFolder, Unit
-from robocas_ms3.plans.worker import UnitWorker
+from robocas_ms3.plans.folder import PlanFolder, WorkUnit
+from robocas_ms3.plans.worker import WorkUnitWorker
 
 require_extra("slurm", "plans on Slurm", "submitit")
 submitit: Any = import_module("submitit")
@@ -106,11 +106,11 @@ class SlurmExecutor(Executor):
             "additional_parameters": {"requeue": True, **{k: v == "true" or v for k, v in sbatch.items()}},
         }
 
-    def submit(self, groups: Sequence[Sequence[Unit]]) -> list[_Job]:
+    def submit(self, groups: Sequence[Sequence[WorkUnit]]) -> list[_Job]:
         if time.monotonic() < self._not_before:
             return []
         try:
-            handles = self._submitit.submit_array([DoUnits(self.folder, tuple(group)) for group in groups])
+            handles = self._submitit.submit_array([WorkUnitJob(self.folder, tuple(group)) for group in groups])
         except Exception as error:
             self._refused += 1
             self._not_before = time.monotonic() + _RETRY
@@ -184,16 +184,16 @@ class _Job:
 
 
 @dataclass(frozen=True)
-class DoUnits:
+class WorkUnitJob:
     """What a job does, as submitit pickles it; a job that is requeued continues where the units stopped."""
 
     folder: PlanFolder
-    units: tuple[Unit, ...]
+    units: tuple[WorkUnit, ...]
 
     def __call__(self) -> RemoteError | None:
         """Do the units; return an error that every seed would meet."""
         signal.signal(signal.SIGTERM, _exit)  # submitit would ignore it, and Slurm wait for 30 s
-        worker = UnitWorker(self.folder)
+        worker = WorkUnitWorker(self.folder)
         # Slurm announces the end of the time to all processes of a job: block it in those of the worker, which inherit
         # the mask of this thread
         announcements = {signal.SIGUSR1, signal.SIGUSR2}
