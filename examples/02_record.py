@@ -6,9 +6,9 @@ python examples/02_record.py OUT
 import sys
 from pathlib import Path
 
-from robocas_ms3.demos.generate import generate
-from robocas_ms3.demos.replay import replay
+from robocas_ms3.demos.generation import generate
 from robocas_ms3.demos.settings import EpisodeSettings, GenerateSettings, ReplaySettings
+from robocas_ms3.demos.trajectory_replay import replay
 
 episode = EpisodeSettings("pick", "pick_table_scattered")
 summary = generate(GenerateSettings(episode, Path(sys.argv[1]), episodes=1, overwrite=True))

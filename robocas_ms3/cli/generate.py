@@ -18,7 +18,7 @@ def main(settings: GenerateSettings) -> int:
     settings = settings.resolve()  # an invalid configuration is an error before the imports below, which take seconds
     from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.cli.terminal import print_line
-    from robocas_ms3.demos.generate import generate
+    from robocas_ms3.demos.generation import generate
 
     players, weights = None, ""
     if settings.episode.after_policy:

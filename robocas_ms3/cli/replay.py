@@ -15,7 +15,7 @@ def main(settings: ReplaySettings) -> int:
 
     total = len(read_json(settings.file)["episodes"][: settings.count])  # an error before the imports below
     from robocas_ms3.core.workers import use_one_torch_thread
-    from robocas_ms3.demos.replay import replay
+    from robocas_ms3.demos.trajectory_replay import replay
 
     use_one_torch_thread()
     replayed = replay(settings)

@@ -1,19 +1,47 @@
-"""RoboCAS datasets: one declared schema, the converter, the validator, videos, statistics, a torch dataset."""
+"""RoboCAS and LeRobot datasets: read, convert, validate, draw statistics, and load samples for training.
 
-from __future__ import annotations
+Public names are imported from this package at first use; without the names of `training`, PyTorch is not loaded.
+"""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from robocas_ms3.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from robocas_ms3.datasets.training.options import SampleOptions
-    from robocas_ms3.datasets.training.torch_dataset import RoboCASDataset
+    from robocas_ms3.datasets.actions import ActionScale as ActionScale
+    from robocas_ms3.datasets.checks.dataset import Report as Report
+    from robocas_ms3.datasets.checks.dataset import validate as validate
+    from robocas_ms3.datasets.checks.violation import Violation as Violation
+    from robocas_ms3.datasets.conversion.convert import convert as convert
+    from robocas_ms3.datasets.conversion.settings import Conversion as Conversion
+    from robocas_ms3.datasets.conversion.settings import ConversionSettings as ConversionSettings
+    from robocas_ms3.datasets.conversion.settings import WrittenEpisode as WrittenEpisode
+    from robocas_ms3.datasets.formats import Format as Format
+    from robocas_ms3.datasets.formats import open_source as open_source
+    from robocas_ms3.datasets.images.image_files import ImageOptions as ImageOptions
+    from robocas_ms3.datasets.lerobot.convert import convert_lerobot as convert_lerobot
+    from robocas_ms3.datasets.lerobot.reader import LeRobotDataset as LeRobotDataset
+    from robocas_ms3.datasets.sources.episode_source import EpisodeSource as EpisodeSource
+    from robocas_ms3.datasets.sources.episode_source import SourceEpisode as SourceEpisode
+    from robocas_ms3.datasets.sources.reader import Dataset as Dataset
+    from robocas_ms3.datasets.training.options import SampleOptions as SampleOptions
+    from robocas_ms3.datasets.training.torch_dataset import RoboCASDataset as RoboCASDataset
 
-__all__ = ["RoboCASDataset", "SampleOptions"]
-
-
-def __getattr__(name: str) -> Any:
-    if name in __all__:
-        from robocas_ms3.datasets.training import torch_dataset
-
-        return getattr(torch_dataset, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__, __dir__, __all__ = lazy_exports(
+    __name__,
+    {
+        "robocas_ms3.datasets.actions": ["ActionScale"],
+        "robocas_ms3.datasets.checks.dataset": ["Report", "validate"],
+        "robocas_ms3.datasets.checks.violation": ["Violation"],
+        "robocas_ms3.datasets.conversion.convert": ["convert"],
+        "robocas_ms3.datasets.conversion.settings": ["Conversion", "ConversionSettings", "WrittenEpisode"],
+        "robocas_ms3.datasets.formats": ["Format", "open_source"],
+        "robocas_ms3.datasets.images.image_files": ["ImageOptions"],
+        "robocas_ms3.datasets.lerobot.convert": ["convert_lerobot"],
+        "robocas_ms3.datasets.lerobot.reader": ["LeRobotDataset"],
+        "robocas_ms3.datasets.sources.episode_source": ["EpisodeSource", "SourceEpisode"],
+        "robocas_ms3.datasets.sources.reader": ["Dataset"],
+        "robocas_ms3.datasets.training.options": ["SampleOptions"],
+        "robocas_ms3.datasets.training.torch_dataset": ["RoboCASDataset"],
+    },
+)

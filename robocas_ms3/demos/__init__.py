@@ -1,1 +1,28 @@
-"""Demonstrations: recording, generation over seeds and workers, the ledger of failures, replay."""
+"""Demonstrations: generation with the scripted policy over seeds and workers, recording, failures, replay.
+
+Public names are imported from this package at first use.
+"""
+
+from typing import TYPE_CHECKING
+
+from robocas_ms3.core.lazy import lazy_exports
+
+if TYPE_CHECKING:
+    from robocas_ms3.demos.generation import Summary as Summary
+    from robocas_ms3.demos.generation import generate as generate
+    from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile as TrajectoryFile
+    from robocas_ms3.demos.settings import EpisodeSettings as EpisodeSettings
+    from robocas_ms3.demos.settings import GenerateSettings as GenerateSettings
+    from robocas_ms3.demos.settings import ReplaySettings as ReplaySettings
+    from robocas_ms3.demos.trajectory_replay import Replay as Replay
+    from robocas_ms3.demos.trajectory_replay import replay as replay
+
+__getattr__, __dir__, __all__ = lazy_exports(
+    __name__,
+    {
+        "robocas_ms3.demos.generation": ["Summary", "generate"],
+        "robocas_ms3.demos.recordings.trajectory_file": ["TrajectoryFile"],
+        "robocas_ms3.demos.settings": ["EpisodeSettings", "GenerateSettings", "ReplaySettings"],
+        "robocas_ms3.demos.trajectory_replay": ["Replay", "replay"],
+    },
+)

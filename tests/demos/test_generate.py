@@ -15,12 +15,12 @@ from mani_skill.utils.structs import Pose
 
 from robocas_ms3.core.errors import PlanningError, UnrecoverableError
 from robocas_ms3.demos.branches import Child
-from robocas_ms3.demos.generate import generate
+from robocas_ms3.demos.generation import generate
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.open_loop import Trials
 from robocas_ms3.demos.recordings.trajectory_json import read_json
-from robocas_ms3.demos.replay import replay
 from robocas_ms3.demos.settings import EpisodeSettings, GenerateSettings, ReplaySettings
+from robocas_ms3.demos.trajectory_replay import replay
 from robocas_ms3.planning.executor import Executor
 from robocas_ms3.planning.protocol import Trajectory
 from robocas_ms3.robots.description import MOBILE_PANDA

@@ -9,9 +9,9 @@ import pytest
 
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.core.json_lines import JsonLinesFile
-from robocas_ms3.demos import generate as module
+from robocas_ms3.demos import generation as module
 from robocas_ms3.demos.failures import FAILURES_FILE, EpisodeResult, Failure
-from robocas_ms3.demos.generate import shard_name
+from robocas_ms3.demos.generation import shard_name
 from robocas_ms3.demos.recordings.trajectory_json import read_json
 from robocas_ms3.demos.settings import EpisodeSettings, GenerateSettings
 

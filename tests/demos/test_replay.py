@@ -11,7 +11,7 @@ import torch
 from synthetic import STEPS, write_trajectory
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.demos.replay import Recorded, state_distance
+from robocas_ms3.demos.trajectory_replay import Recorded, state_distance
 
 
 @pytest.fixture

@@ -10,11 +10,11 @@ from synthetic import write_trajectory
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import DatasetError, OutputExistsError, RobocasError
-from robocas_ms3.demos import generate as module
+from robocas_ms3.demos import generation as module
 from robocas_ms3.demos.failures import EpisodeResult, Failure
-from robocas_ms3.demos.generate import WEIGHTS
-from robocas_ms3.demos.replay import CONVERTIBLE, replay
+from robocas_ms3.demos.generation import WEIGHTS
 from robocas_ms3.demos.settings import EpisodeSettings, GenerateSettings, ReplaySettings
+from robocas_ms3.demos.trajectory_replay import CONVERTIBLE, replay
 
 SETTINGS = EpisodeSettings("pick")
 

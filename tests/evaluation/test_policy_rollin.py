@@ -18,8 +18,8 @@ from robocas_ms3.demos.failures import Takeover
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
 from robocas_ms3.demos.recordings.trajectory_json import read_json
-from robocas_ms3.demos.replay import replay
 from robocas_ms3.demos.settings import EpisodeSettings, ReplaySettings
+from robocas_ms3.demos.trajectory_replay import replay
 from robocas_ms3.evaluation.policies.replay import ReplayPolicy
 from robocas_ms3.evaluation.policy_rollin import Player, check_acting, steps_of
 

@@ -34,10 +34,10 @@ from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.trajectory import TrajectorySource
 from robocas_ms3.datasets.statistics.collect import collect
 from robocas_ms3.demos.failures import Failure, count_by_stage
-from robocas_ms3.demos.generate import OUTPUT
+from robocas_ms3.demos.generation import OUTPUT
 from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
-from robocas_ms3.demos.replay import Recorded
 from robocas_ms3.demos.settings import EpisodeSettings
+from robocas_ms3.demos.trajectory_replay import Recorded
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
 from robocas_ms3.evaluation.report.comparison import comparison

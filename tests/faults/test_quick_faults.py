@@ -15,7 +15,7 @@ from robocas_ms3.core.errors import IncompleteDatasetError
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.conversion.convert import convert
 from robocas_ms3.datasets.conversion.settings import ConversionSettings
-from robocas_ms3.demos.generate import generate
+from robocas_ms3.demos.generation import generate
 from robocas_ms3.demos.settings import EpisodeSettings, GenerateSettings
 
 

@@ -16,8 +16,8 @@ from robocas_ms3.demos.open_loop import Trials
 from robocas_ms3.demos.recordings.motion import sample_states
 from robocas_ms3.demos.recordings.subgoals import sample_subgoals
 from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
-from robocas_ms3.demos.replay import replay
 from robocas_ms3.demos.settings import EpisodeSettings, ReplaySettings
+from robocas_ms3.demos.trajectory_replay import replay
 from robocas_ms3.planning.executor import Executor
 from robocas_ms3.planning.skills.base_placement import drive_to_handle
 from robocas_ms3.planning.skills.drive import base_at, drive

@@ -17,7 +17,7 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import replacing
 from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
 from robocas_ms3.demos.recordings.trajectory_hdf5 import damage_of, merge, reserved, write_whole
-from robocas_ms3.demos.replay import Recorded
+from robocas_ms3.demos.trajectory_replay import Recorded
 from robocas_ms3.evaluation.policies.replay import ReplayPolicy
 from robocas_ms3.evaluation.policy import EpisodeSpec
 

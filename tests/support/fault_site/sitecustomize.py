@@ -21,7 +21,7 @@ import types
 FAULT = json.loads(os.environ.get("ROBOCAS_FAULT", "{}"))
 _MONOTONIC, _SLEEP, _TIME = time.monotonic, time.sleep, time.time
 POINTS = {  # module -> (class, method, what tells one task from the other)
-    "robocas_ms3.demos.generate": ("_EpisodeWorker", "run", lambda seed: seed),
+    "robocas_ms3.demos.generation": ("_EpisodeWorker", "run", lambda seed: seed),
     "robocas_ms3.datasets.conversion.workers": ("_EpisodeWorker", "run", lambda task: task[0]),
     "robocas_ms3.plans.worker": ("Recorder", "run", lambda files: files.seed),
     "robocas_ms3.evaluation.action_wrapper": ("PolicyActionWrapper", "reset", lambda seed=None, **_: int(seed or 0)),
