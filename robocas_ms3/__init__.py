@@ -15,13 +15,13 @@ if _TYPE_CHECKING:
     from robocas_ms3.core.errors import EmptySplitError as EmptySplitError
     from robocas_ms3.core.errors import EvaluationError as EvaluationError
     from robocas_ms3.core.errors import ExtensionError as ExtensionError
-    from robocas_ms3.core.errors import IncompleteError as IncompleteError
+    from robocas_ms3.core.errors import IncompleteDatasetError as IncompleteDatasetError
     from robocas_ms3.core.errors import LayoutError as LayoutError
     from robocas_ms3.core.errors import MissingExtraError as MissingExtraError
     from robocas_ms3.core.errors import OutputExistsError as OutputExistsError
     from robocas_ms3.core.errors import PlanError as PlanError
-    from robocas_ms3.core.errors import PlanningFailed as PlanningFailed
-    from robocas_ms3.core.errors import PolicyFailed as PolicyFailed
+    from robocas_ms3.core.errors import PlanningError as PlanningError
+    from robocas_ms3.core.errors import PolicyError as PolicyError
     from robocas_ms3.core.errors import RobocasError as RobocasError
     from robocas_ms3.core.errors import SimulationError as SimulationError
     from robocas_ms3.core.errors import TrainingError as TrainingError
@@ -41,13 +41,13 @@ __getattr__, __dir__, __all__ = _lazy_exports(
             "EmptySplitError",
             "EvaluationError",
             "ExtensionError",
-            "IncompleteError",
+            "IncompleteDatasetError",
             "LayoutError",
             "MissingExtraError",
             "OutputExistsError",
             "PlanError",
-            "PlanningFailed",
-            "PolicyFailed",
+            "PlanningError",
+            "PolicyError",
             "RobocasError",
             "SimulationError",
             "TrainingError",
