@@ -15,7 +15,7 @@ from trimesh.visual.color import to_rgba
 from trimesh.visual.material import PBRMaterial
 
 from robocas_ms3.core.errors import AssetError
-from robocas_ms3.core.files import replacing
+from robocas_ms3.core.files import atomic_file
 
 DEFAULT_ROUGHNESS = 0.6
 JPEG_QUALITY = 88
@@ -76,7 +76,7 @@ def write_glb(mesh: trimesh.Trimesh, path: Path | str) -> None:
     head = json.dumps(tree, separators=(",", ":")).encode()
     head += b" " * (-len(head) % 4)
     start = struct.pack("<4sIII4s", b"glTF", 2, 28 + len(head) + len(blob), len(head), b"JSON")
-    with replacing(path) as tmp:
+    with atomic_file(path) as tmp:
         tmp.write_bytes(start + head + struct.pack("<I4s", len(blob), b"BIN\0") + blob)
 
 

@@ -27,7 +27,7 @@ from robocas_ms3.assets.manifest import (
 from robocas_ms3.assets.pack import MANIFEST, sha256
 from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import AssetError, RobocasError
-from robocas_ms3.core.files import replacing_folder, write_json
+from robocas_ms3.core.files import atomic_folder, write_json
 from robocas_ms3.core.output_folder import check_replaceable
 from robocas_ms3.core.strict_model import validate_json
 from robocas_ms3.core.workers import FunctionWorker, WorkerPool
@@ -181,7 +181,7 @@ def _make(task: tuple[Job, Path]) -> tuple[JobResult, Path]:
     job, place = task
     start = time.perf_counter()
     try:
-        with replacing_folder(place) as tmp:
+        with atomic_folder(place) as tmp:
             asset = job.make(tmp)
             (tmp / ENTRY).write_text(asset.model_dump_json(), encoding="utf-8")
     except RobocasError as error:
@@ -247,7 +247,7 @@ def write_pack(
     """
     check_target(folder)
     results = []
-    with replacing_folder(folder) as tmp:
+    with atomic_folder(folder) as tmp:
         for made in make_assets(jobs, tmp, kept, processes=processes):
             if made.asset is None and not skip_errors:
                 raise AssetError(made.error.rstrip("."), fix=SKIP)

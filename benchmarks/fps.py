@@ -30,7 +30,7 @@ from sapien import physx
 import robocas_ms3.tasks  # noqa: F401
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.assets.physics import CONTACT_OFFSET
-from robocas_ms3.core.text import error_line
+from robocas_ms3.core.text import format_error
 from robocas_ms3.scenes import build
 from robocas_ms3.scenes.cache import layout_source
 from robocas_ms3.scenes.config import load_task_config
@@ -155,7 +155,7 @@ def start_physx() -> str:
         with redirect_stdout(sys.stderr):  # SAPIEN says there that it downloads
             physx.enable_gpu()
     except Exception as error:  # such as requests' for a library that cannot be downloaded
-        return f"PhysX does not start on the GPU: {error_line(error)}"
+        return f"PhysX does not start on the GPU: {format_error(error)}"
     return ""
 
 

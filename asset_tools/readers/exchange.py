@@ -24,7 +24,7 @@ from asset_tools.readers.images import open_texture
 from asset_tools.readers.obj import MOST_FACES, MOST_VERTICES, decode_text
 from asset_tools.readers.surface import Material, Part, decode_srgb
 from robocas_ms3.core.errors import AssetError, require_extra
-from robocas_ms3.core.text import error_line
+from robocas_ms3.core.text import format_error
 
 TEXTURE_COMMENT = re.compile(rb"comment\s+TextureFile\s+(.*)", re.IGNORECASE)
 PLY_UVS = {b"s", b"t", b"u", b"v", b"texture_u", b"texture_v", b"texcoord"}
@@ -61,7 +61,7 @@ def read_exchange(path: Path, files: ModelFiles) -> list[Part]:
     except AssetError:
         raise
     except Exception as error:  # whatever trimesh's parsers trip over
-        found = error_line(error, 200)
+        found = format_error(error, 200)
         raise AssetError("can't read this mesh", where=path, found=found, fix="Export it again.") from error
     if textures.error is not None:
         raise textures.error

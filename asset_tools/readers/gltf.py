@@ -20,7 +20,7 @@ from asset_tools.readers.gltf_buffers import Buffers, entry
 from asset_tools.readers.gltf_materials import READ_EXTENSIONS, Materials
 from asset_tools.readers.obj import MOST_FACES
 from asset_tools.readers.surface import Material, Part
-from robocas_ms3.core.documents import json_values
+from robocas_ms3.core.documents import decode_json
 from robocas_ms3.core.errors import AssetError
 from robocas_ms3.core.text import one_line
 
@@ -76,7 +76,7 @@ def _split(data: bytes, path: Path) -> tuple[Any, bytes]:
         if start + 8 <= len(data):
             blob = data[start + 8 : start + 8 + struct.unpack_from("<I", data, start)[0]]
     try:
-        return json_values(text), blob
+        return decode_json(text), blob
     except ValueError as error:
         raise _damaged(path, f"no JSON: {error}") from error
 

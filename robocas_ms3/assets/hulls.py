@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from robocas_ms3.core.documents import read_text
 from robocas_ms3.core.errors import AssetError
-from robocas_ms3.core.text import count_of
+from robocas_ms3.core.text import format_count
 
 Array = NDArray[np.float64]
 
@@ -85,7 +85,9 @@ def convex_faces(points: Array) -> tuple[Array, NDArray[np.int64]]:
     try:
         hull = ConvexHull(points)
     except (QhullError, ValueError) as error:
-        raise AssetError("the points of a convex hull lie in a plane", found=count_of(len(points), "point")) from error
+        raise AssetError(
+            "the points of a convex hull lie in a plane", found=format_count(len(points), "point")
+        ) from error
     used, local = np.unique(hull.simplices, return_inverse=True)
     vertices, faces = np.asarray(points, dtype=np.float64)[used], local.reshape(-1, 3)
     corners = vertices[faces]

@@ -24,7 +24,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from robocas_ms3.core.errors import AssetError
-from robocas_ms3.core.strict_model import LONGEST_NAME, StrictModel
+from robocas_ms3.core.strict_model import MAX_NAME_BYTES, StrictModel
 
 SCHEMA_VERSION = 2
 
@@ -62,15 +62,15 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Moments = Annotated[
     tuple[Positive, Positive, Positive], Field(description="principal moments, kg m2"), AfterValidator(_of_a_body)
 ]
-Name = Annotated[str, Field(pattern=r"^[a-z0-9_]+$", max_length=LONGEST_NAME)]
+Name = Annotated[str, Field(pattern=r"^[a-z0-9_]+$", max_length=MAX_NAME_BYTES)]
 FilePath = Annotated[str, Field(pattern=r"^[a-z0-9_./-]+$"), AfterValidator(_inside)]
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
 def check_asset_name(name: str, where: object) -> None:
     """Check that a name can be that of an asset, a link or a finish, which are folders and files of a pack."""
-    if re.fullmatch("[a-z0-9_]+", name) is None or len(name) > LONGEST_NAME:
-        expected = f"1 to {LONGEST_NAME} small letters, digits and underscores"
+    if re.fullmatch("[a-z0-9_]+", name) is None or len(name) > MAX_NAME_BYTES:
+        expected = f"1 to {MAX_NAME_BYTES} small letters, digits and underscores"
         raise AssetError("this name can't be used in a pack", where=where, expected=expected, found=repr(name)[:80])
 
 

@@ -21,7 +21,7 @@ from robocas_ms3.core.documents import JSON_LIMIT, DocumentError, check_regular,
 from robocas_ms3.core.errors import AssetError
 from robocas_ms3.core.paths import builtin_packs_dir, data_dir
 from robocas_ms3.core.poses import transform
-from robocas_ms3.core.strict_model import refusal, validate_json
+from robocas_ms3.core.strict_model import error_from_validation, validate_json
 
 VisualLevel = Literal["fast", "full"]
 
@@ -223,7 +223,9 @@ def _read(folder: Path, path: Path) -> Pack:
     except (OSError, DocumentError) as error:
         raise AssetError("can't read the manifest of the asset pack", where=path, found=error) from error
     except ValidationError as error:
-        raise refusal(error, PackManifest, AssetError, where=path, about="the manifest is damaged", fix=fix) from error
+        raise error_from_validation(
+            error, PackManifest, AssetError, where=path, about="the manifest is damaged", fix=fix
+        ) from error
     objects: dict[str, LoadedObject] = {}
     furniture: dict[str, LoadedFurniture] = {}
     for asset in manifest.assets:

@@ -20,7 +20,7 @@ from robocas_ms3.baselines.dataset_checks import check_base_stands
 from robocas_ms3.baselines.training.record import hash_dataset
 from robocas_ms3.core.documents import DAMAGED_FILE_ERRORS
 from robocas_ms3.core.errors import DatasetError, EvaluationError
-from robocas_ms3.core.files import replacing
+from robocas_ms3.core.files import atomic_file
 from robocas_ms3.core.paths import cache_dir
 from robocas_ms3.core.poses import from_wxyz
 from robocas_ms3.datasets.sources.split import split_by_seed
@@ -123,7 +123,7 @@ def load_states(path: Path, rate_hz: float, on_read: OnRead) -> dict[str, NDArra
         with suppress(*DAMAGED_FILE_ERRORS), np.load(cached) as arrays:
             return dict(arrays)
     arrays = read_states(path, rate_hz, on_read)
-    with replacing(cached) as tmp:
+    with atomic_file(cached) as tmp:
         np.savez(tmp, **arrays)  # pyright: ignore[reportArgumentType]  (its stub takes no mapping)
     return arrays
 

@@ -11,7 +11,7 @@ from robocas_ms3.baselines.registry import find_baseline
 from robocas_ms3.baselines.training.record import BUNDLED, RUN, WEIGHTS, hash_weights, read_run
 from robocas_ms3.core.errors import TrainingError
 from robocas_ms3.core.strict_model import parse
-from robocas_ms3.core.text import error_line
+from robocas_ms3.core.text import format_error
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, Policy, PolicySpec
 
 
@@ -85,6 +85,6 @@ def _damaged_facts(path: Path) -> Iterator[None]:
     try:
         yield
     except (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError) as error:
-        found = error_line(error, 200)
+        found = format_error(error, 200)
         what = "no network can be built from this configuration and these facts"
         raise TrainingError(what, where=path, found=found) from error

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 from robocas_ms3.core.errors import TrainingError, require_extra
 from robocas_ms3.core.extensions import Registry
-from robocas_ms3.core.signals import no_exit
-from robocas_ms3.core.text import nearest
+from robocas_ms3.core.signals import forbid_exit
+from robocas_ms3.core.text import did_you_mean
 
 if TYPE_CHECKING:
     from robocas_ms3.baselines.baseline import Baseline  # which imports torch
@@ -53,7 +53,7 @@ def find_baseline(name: str, *, where: object = "") -> Baseline:
     if name not in BASELINES:
         known = list(BASELINES)
         expected = f"one of {', '.join(known)}"
-        raise TrainingError("no such baseline", where=where or name, expected=expected, fix=nearest(name, known))
+        raise TrainingError("no such baseline", where=where or name, expected=expected, fix=did_you_mean(name, known))
     require_extra("train", "baselines", "safetensors")
-    with no_exit(f"baseline {name}"):
+    with forbid_exit(f"baseline {name}"):
         return BASELINES[name]()

@@ -14,7 +14,7 @@ from robocas_ms3.cli import assets_show
 from robocas_ms3.cli.assets_show import require_mesh_tools
 from robocas_ms3.cli.options import CORES, Jobs, Maybe, Several
 from robocas_ms3.core.checks import check_number
-from robocas_ms3.core.text import count_of
+from robocas_ms3.core.text import format_count
 
 CONTACT_SHEET = "contact_sheet.png"
 SHEET = 60  # assets on the contact sheet of an import
@@ -245,7 +245,7 @@ def _make(jobs: list[Job], command: _Making, out: Path, what: str) -> int:
         what = "a pack of this name exists; its files, settings or versions were others"
         fix = "Pass --overwrite to update it, or choose another name with --pack."
         raise OutputExistsError(what, where=out, fix=fix)
-    return _write(jobs, command, out, count_of(len(jobs), what))
+    return _write(jobs, command, out, format_count(len(jobs), what))
 
 
 def _write(jobs: list[Job], command: _Making, out: Path, description: str, *, record: bool = True) -> int:
@@ -279,7 +279,7 @@ def _write(jobs: list[Job], command: _Making, out: Path, description: str, *, re
     assets_show.info(assets_show.Info(pack=str(out)))
     bad = [made.id for made in results if made.asset is None]
     left_out = f"; {len(bad)} left out: {', '.join(bad)}" if bad else ""
-    print_line(f"wrote {out}: {count_of(len(results) - len(bad), 'asset')}{left_out}")
+    print_line(f"wrote {out}: {format_count(len(results) - len(bad), 'asset')}{left_out}")
     if record:
         _draw_sheet(out)
     return 0
@@ -295,7 +295,7 @@ def _draw_sheet(folder: Path) -> None:
     pack = load_pack(folder)
     ids = [asset.id for asset in pack.manifest.assets]
     try:
-        with spinner(f"drawing {count_of(len(ids[:SHEET]), 'asset')}"):
+        with spinner(f"drawing {format_count(len(ids[:SHEET]), 'asset')}"):
             contact_sheet(pack, folder / CONTACT_SHEET, ids[:SHEET])
     except AssetError as error:
         print_line(f"no contact sheet: {error}")

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 from robocas_ms3.cli.options import CORES, Jobs, Maybe, Several
 from robocas_ms3.core.checks import check_number
-from robocas_ms3.core.text import count_of, printable
+from robocas_ms3.core.text import escape_controls, format_count
 
 
 @dataclass
@@ -138,9 +138,9 @@ def verify(command: Verify) -> int:
     for loaded in pack.objects.values():
         _ = loaded.annotations
     faults = cooking_faults(pack.root)
-    print_line(f"{pack.name}: {count_of(len(pack.manifest.assets), 'asset')}, every file is as it should be")
+    print_line(f"{pack.name}: {format_count(len(pack.manifest.assets), 'asset')}, every file is as it should be")
     for fault in faults:
-        console().print(printable(str(fault)), style="red", soft_wrap=True)
+        console().print(escape_controls(str(fault)), style="red", soft_wrap=True)
     if command.physics:
         check_number("--jobs", command.jobs, 1)
         return max(_verify_physics(pack, command.jobs, command.json), int(bool(faults)))
@@ -159,7 +159,7 @@ def sheet(command: Sheet) -> int:
     out = command.out or Path(f"{pack.name}.png")
     if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise AssetError("a sheet is a PNG or JPEG", where=out, expected=".png, .jpg", found=out.suffix or "no suffix")
-    with spinner(f"drawing {count_of(len(command.ids) or len(pack.manifest.assets), 'asset')}"):
+    with spinner(f"drawing {format_count(len(command.ids) or len(pack.manifest.assets), 'asset')}"):
         contact_sheet(pack, out, ids=command.ids or None)
     print_line(f"wrote {out}")
     return 0
@@ -195,7 +195,7 @@ def _verify_physics(pack: Pack, jobs: int, out: Path | None) -> int:
         assets = {name: quality.model_dump() for name, quality in {**objects, **furniture}.items()}
         write_json(out, {"pack": pack.name, "assets": assets, "violations": [asdict(v) for v in violations]})
     if not violations:
-        console.print(f"{pack.name}: {count_of(total, 'asset')}, as good as packs should be")
+        console.print(f"{pack.name}: {format_count(total, 'asset')}, as good as packs should be")
     return 1 if violations else 0
 
 

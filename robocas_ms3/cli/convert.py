@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from robocas_ms3.cli.options import resumable
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.text import count_of
+from robocas_ms3.core.text import format_count
 from robocas_ms3.datasets.conversion.settings import Conversion, ConversionSettings
 
 if TYPE_CHECKING:
@@ -24,10 +24,10 @@ def main(settings: ConversionSettings) -> int:
     with ProgressBar("episodes written") as bar:
         done = write(settings, on_start=bar.start, on_episode=bar.advance)
     count = len(done.episodes)
-    words = [f"{settings.out}: {count_of(count, 'episode')}"] + ([f"{done.kept} kept"] if done.kept else [])
+    words = [f"{settings.out}: {format_count(count, 'episode')}"] + ([f"{done.kept} kept"] if done.kept else [])
     if count:
         megabytes = sum(episode.size for episode in done.episodes) / 1e6
-        steps = count_of(sum(episode.steps for episode in done.episodes), "step")
+        steps = format_count(sum(episode.steps for episode in done.episodes), "step")
         words += [steps, f"{megabytes:.0f} MB", f"{done.seconds / count:.1f} s an episode"]
     print_line(", ".join(words))
     if count and settings.video and settings.to == "robocas" and not done.previews:
@@ -37,12 +37,16 @@ def main(settings: ConversionSettings) -> int:
 
 def _find_format(settings: ConversionSettings) -> Format:
     """Return the format to write; raise an error if there is none, or an option does not suit it."""
-    from robocas_ms3.core.text import nearest
+    from robocas_ms3.core.text import did_you_mean
     from robocas_ms3.datasets.formats import FORMATS
 
     writable = [name for name, known in FORMATS.items() if known.writer]
     if settings.to not in writable:
-        what, expected, fix = "no such dataset format to write", f"one of {writable}", nearest(settings.to, writable)
+        what, expected, fix = (
+            "no such dataset format to write",
+            f"one of {writable}",
+            did_you_mean(settings.to, writable),
+        )
         raise DatasetError(what, where="--to", expected=expected, found=settings.to, fix=fix)
     chosen = FORMATS[settings.to]
     of_others = {option for known in FORMATS.values() for option in known.options if option not in chosen.options}

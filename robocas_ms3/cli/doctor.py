@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
-from robocas_ms3.core.text import count_of
+from robocas_ms3.core.text import format_count
 
 if TYPE_CHECKING:
     from robocas_ms3.doctor.checks import Finding
@@ -48,4 +48,4 @@ def _print(findings: list[Finding], failed: int) -> None:
     print_table(columns, rows)
     limited = sum(finding.status == "limited" for finding in findings)
     verdict = f"{failed} of what is needed fails" if failed else "everything needed works"
-    table_console().print(verdict + (f"; {count_of(limited, 'optional row')} limited" if limited else ""))
+    table_console().print(verdict + (f"; {format_count(limited, 'optional row')} limited" if limited else ""))

@@ -10,7 +10,7 @@ import tyro
 
 from robocas_ms3.cli import eval_results
 from robocas_ms3.cli.options import Repeated, resumable
-from robocas_ms3.core.text import count_of
+from robocas_ms3.core.text import format_count
 from robocas_ms3.evaluation.settings import EvaluationSettings
 
 DESCRIPTION = """Measure a policy by a protocol, and work with results.
@@ -47,13 +47,13 @@ class Freeze:
 def run(settings: EvaluationSettings) -> int:
     """Run the episodes that the result lacks; return 1 if any episode of the result ended with an error."""
     from robocas_ms3.core.errors import EvaluationError
-    from robocas_ms3.core.text import nearest
+    from robocas_ms3.core.text import did_you_mean
     from robocas_ms3.scenes.task_specs import TASKS
 
     for word in settings.tasks:  # before the imports below, which take seconds
         if word not in TASKS:
             expected = f"one of {', '.join(TASKS)}; or {', '.join(COMMANDS)}"
-            fix = nearest(word, [*TASKS, *COMMANDS])
+            fix = did_you_mean(word, [*TASKS, *COMMANDS])
             raise EvaluationError("no such task", where="--tasks", expected=expected, found=word, fix=fix)
     from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.cli.terminal import print_line, print_text
@@ -78,8 +78,10 @@ def run(settings: EvaluationSettings) -> int:
     print_text(markdown(result))
     broken, succeeded = result.broken_off(), sum(outcome.success for outcome in outcomes)
     errors = f", {broken} broken off by an error (--retry-errors runs them again)" if broken else ""
-    total = count_of(len(result.outcomes), "episode")
-    print_line(f"{count_of(len(outcomes), 'episode')} run, {succeeded} succeeded; {session.folder}: {total}{errors}")
+    total = format_count(len(result.outcomes), "episode")
+    print_line(
+        f"{format_count(len(outcomes), 'episode')} run, {succeeded} succeeded; {session.folder}: {total}{errors}"
+    )
     eval_results.write_pages(result, session.folder, settings.protocol)
     return 1 if broken else 0
 
@@ -90,7 +92,7 @@ def list_protocols(cfg: Protocols) -> int:
 
     for name in shipped_protocols():
         protocol = load_protocol(name)
-        count = count_of(len(protocol.episodes), "episode")
+        count = format_count(len(protocol.episodes), "episode")
         print_line(f"{name}: {count}, {protocol.hash[:12]}: {protocol.rules.description}")
         if files := protocol.train_files():
             print_line(f"    to train on: {', '.join(map(str, files))}")
@@ -111,7 +113,7 @@ def freeze(cfg: Freeze) -> int:
         for done, total in make(plan, cfg.out, overrides=cfg.set):
             bar.update(done, total)
     protocol = load_protocol(cfg.out)
-    print_line(f"{cfg.out}: {count_of(len(protocol.episodes), 'episode')}, {protocol.hash}")
+    print_line(f"{cfg.out}: {format_count(len(protocol.episodes), 'episode')}, {protocol.hash}")
     return 0
 
 

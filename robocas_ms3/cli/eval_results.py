@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from robocas_ms3.cli.options import Folders, Maybe
-from robocas_ms3.core.text import count_of
+from robocas_ms3.core.text import format_count
 
 if TYPE_CHECKING:
     from robocas_ms3.evaluation.protocol import LoadedProtocol
@@ -102,7 +102,7 @@ def merge(cfg: Merge) -> int:
 
     _check_folders(cfg.folders)
     result = write(cfg.folders, cfg.out)
-    print_line(f"{cfg.out}: {count_of(len(result.outcomes), 'episode')}")
+    print_line(f"{cfg.out}: {format_count(len(result.outcomes), 'episode')}")
     write_pages(result, cfg.out, cfg.protocol)
     return 0
 
@@ -131,9 +131,9 @@ def verify(cfg: Verify) -> int:
     for problem in found:
         print_line(problem)
     if broken := result.broken_off():
-        print_line(f"note: broken off by an error: {count_of(broken, 'episode')}, counted as failed")
-    valid = f"{count_of(len(result.outcomes), 'episode')} of {result.run.protocol}, all well"
-    print_line(f"{', '.join(map(str, cfg.folders))}: {count_of(len(found), 'problem') if found else valid}")
+        print_line(f"note: broken off by an error: {format_count(broken, 'episode')}, counted as failed")
+    valid = f"{format_count(len(result.outcomes), 'episode')} of {result.run.protocol}, all well"
+    print_line(f"{', '.join(map(str, cfg.folders))}: {format_count(len(found), 'problem') if found else valid}")
     return 1 if found else 0
 
 

@@ -6,7 +6,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from robocas_ms3.cli.options import resumable
-from robocas_ms3.core.text import count_of
+from robocas_ms3.core.text import format_count
 from robocas_ms3.demos.settings import GenerateSettings
 
 if TYPE_CHECKING:
@@ -37,15 +37,14 @@ def main(settings: GenerateSettings) -> int:
 
         def on_start(there: int) -> None:
             if there >= settings.episodes:
-                bar.note(f"{settings.out} has {count_of(there, 'episode')} already")
+                bar.note(f"{settings.out} has {format_count(there, 'episode')} already")
             bar.start(settings.episodes, there)
 
         summary = generate(settings, on_start=on_start, on_result=on_result, players=players, weights=weights)
         bar.update(settings.episodes, settings.episodes)  # a recorded episode may follow a seed that was missing
     seconds = ", ".join(f"{part} {value:.2f}" for part, value in summary.mean_seconds.items())
-    print_line(
-        f"{count_of(summary.episodes, 'episode')} from {count_of(summary.seeds, 'seed')} ({summary.success_rate:.0%})"
-    )
+    episodes, seeds = format_count(summary.episodes, "episode"), format_count(summary.seeds, "seed")
+    print_line(f"{episodes} from {seeds} ({summary.success_rate:.0%})")
     print_line(f"mean seconds a seed: {seconds}; mean length {summary.mean_steps:.0f} steps")
     if summary.failures:
         print_line("failed attempts: " + ", ".join(f"{reason} x{n}" for reason, n in summary.failures.items()))

@@ -47,7 +47,7 @@ def main(cfg: ImportRobocas) -> int:
     from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.cli.terminal import print_json, print_line
     from robocas_ms3.core.output_folder import OutputFolder
-    from robocas_ms3.core.text import count_of
+    from robocas_ms3.core.text import format_count
     from robocas_ms3.datasets.conversion.episode_plan import DATASET
     from robocas_ms3.datasets.manage.copy_episodes import CopyOptions, check_apart
     from robocas_ms3.datasets.manage.import_robocas import import_robocas
@@ -73,13 +73,13 @@ def main(cfg: ImportRobocas) -> int:
         options = CopyOptions(cfg.link, cfg.overwrite, bar.start, bar.advance)
         kept = import_robocas(found, cfg.out, embed=embed, options=options)
     if not cfg.json:
-        print_line(f"{cfg.out}: {count_of(len(found.taken), 'episode')}{f', {kept} kept' if kept else ''}")
+        print_line(f"{cfg.out}: {format_count(len(found.taken), 'episode')}{f', {kept} kept' if kept else ''}")
     return 0
 
 
 def _table(found: Survey) -> None:
     from robocas_ms3.cli.terminal import print_line, print_table
-    from robocas_ms3.core.text import count_of, format_ranges
+    from robocas_ms3.core.text import format_count, format_ranges
 
     rows: dict[tuple[str, str, str], list[int]] = defaultdict(list)
     for finding in found.findings:
@@ -91,4 +91,4 @@ def _table(found: Survey) -> None:
     cells = [(format_ranges(numbers) or "all", *key) for key, numbers in sorted(rows.items())]
     print_table(("episodes", "what", "where", "problem"), cells, box=None, pad_edge=False, header_style="bold")
     counts = f"can be taken: {len(found.taken)}, left out: {len(found.left_out)}"
-    print_line(f"{found.root}: {count_of(found.episodes, 'episode')}, {counts}")
+    print_line(f"{found.root}: {format_count(found.episodes, 'episode')}, {counts}")

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from robocas_ms3.scenes.layout_table import Engine, Pair
 
 from robocas_ms3.cli.options import CORES, Jobs, Maybe, Repeated
-from robocas_ms3.core.text import count_of
+from robocas_ms3.core.text import format_count
 
 
 @dataclass
@@ -98,10 +98,12 @@ def build(command: Build) -> int:
     if engine == "gpu":
         moving = try_all(cache, engine, pack=command.pack, furniture_pack=command.furniture_pack)
     made = len(pairs) - there - failures
-    print_line(f"{count_of(made, 'layout')} made, {there} there already, {count_of(failures, 'seed')} without one")
+    print_line(
+        f"{format_count(made, 'layout')} made, {there} there already, {format_count(failures, 'seed')} without one"
+    )
     if engine is not None and (table := cache.table(engine)) is not None:
         sets, arrangements = table.rows.shape
-        size = f"{count_of(sets, 'set')} of objects by {count_of(arrangements, 'seed')}"
+        size = f"{format_count(sets, 'set')} of objects by {format_count(arrangements, 'seed')}"
         print_line(f"table: {cache.table_path(engine)}, {size}")
     if engine == "gpu":
         print_line(f"objects of {moving} move when the GPU simulates them: no reset takes these")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from robocas_ms3.core.text import count_of
+from robocas_ms3.core.text import format_count
 
 
 @dataclass
@@ -52,7 +52,7 @@ def collect() -> dict[str, list[dict[str, Any]]]:
     configs = []
     for name, path in shipped_configs().items():
         config = load_task_config(path)
-        scene = f"{count_of(config.objects.count, 'object')}, {config.layout.kind}, on the {config.support}"
+        scene = f"{format_count(config.objects.count, 'object')}, {config.layout.kind}, on the {config.support}"
         configs.append({"name": name, "task": config.task, "scene": scene, "description": config.description})
     robots = [{"name": name, "agent": robot.agent} for name, robot in ROBOTS.items()]
     policies = [{"name": name, "package": "robocas_ms3", "of": "builtin"} for name in POLICIES.builtin]

@@ -22,10 +22,10 @@ import tyro
 from robocas_ms3 import __version__
 from robocas_ms3.cli.options import with_absolute_paths
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.core.files import FULL
+from robocas_ms3.core.files import DISK_FULL_ERRNOS
 from robocas_ms3.core.paths import ensure_home, is_writable, temporary_cache, variable_of
-from robocas_ms3.core.signals import INTERRUPTED, heed_ctrl_c, leave, no_exit
-from robocas_ms3.core.text import escape_log_lines, escape_tracebacks, printable
+from robocas_ms3.core.signals import INTERRUPTED, exit_command, forbid_exit, handle_interrupts
+from robocas_ms3.core.text import escape_controls, escape_log_lines, escape_tracebacks
 
 # Each is a module next to this one (import-robocas: import_robocas.py) with a function `main(cfg: Settings) -> int`. A
 # command with commands of its own has instead `COMMANDS`, such functions by name, `DESCRIPTION` and perhaps `DEFAULT`.
@@ -57,7 +57,7 @@ DESCRIPTION = (
 CLI_STYLE = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.DisallowNone)
 # What the system says of disks, file servers, names and limits, which no traceback explains
 _ENVIRONMENT = {
-    *FULL,
+    *DISK_FULL_ERRNOS,
     *(errno.EACCES, errno.EPERM, errno.EROFS, errno.EIO, errno.ENAMETOOLONG),
     *(errno.ESTALE, errno.ETIMEDOUT, errno.ENOTCONN, errno.EHOSTDOWN, errno.EHOSTUNREACH),
     *(errno.EMFILE, errno.ENFILE),
@@ -67,8 +67,8 @@ _ENVIRONMENT = {
 def main(argv: Sequence[str] | None = None) -> None:
     """Run ``robocas`` and leave the process with its exit code; default arguments: the process's own."""
     escape_tracebacks()
-    heed_ctrl_c()
-    leave(run(sys.argv[1:] if argv is None else argv))
+    handle_interrupts()
+    exit_command(run(sys.argv[1:] if argv is None else argv))
 
 
 def run(argv: Sequence[str]) -> int:
@@ -88,7 +88,7 @@ def run(argv: Sequence[str]) -> int:
     try:
         command, settings = parse(arguments)
         _lend_folders()
-        with no_exit(f"robocas {arguments[0]}"):
+        with forbid_exit(f"robocas {arguments[0]}"):
             return command(with_absolute_paths(settings))
     except KeyboardInterrupt as interrupt:  # a command may say how to go on
         return _say("; ".join(["interrupted", *map(str, interrupt.args)]), sys.stderr, INTERRUPTED)
@@ -186,7 +186,7 @@ def _lend_folders() -> None:
 def _remedy(error: OSError) -> str:
     """Return how much space is free where it does not suffice, and what to do."""
     variable = variable_of(error.filename) if error.filename else ""
-    if error.errno not in FULL:
+    if error.errno not in DISK_FULL_ERRNOS:
         return f". Set {variable} to a folder that can be written to." if variable else ""
     folders = [folder for folder in Path(error.filename or "").absolute().parents if folder.is_dir()]
     free = f" ({shutil.disk_usage(folders[0]).free / 2**20:.0f} MB free)" if error.filename else ""
@@ -195,5 +195,5 @@ def _remedy(error: OSError) -> str:
 
 
 def _say(text: str, stream: TextIO, code: int) -> int:
-    stream.write(printable(text) + "\n")
+    stream.write(escape_controls(text) + "\n")
     return code

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from robocas_ms3.cli.options import CORES, Jobs, Maybe, Repeated, resumable
-from robocas_ms3.core.text import count_of
+from robocas_ms3.core.text import format_count
 
 
 @dataclass
@@ -129,7 +129,7 @@ def list_plans(cfg: List) -> int:
 
     for name in shipped_plans():
         plan = load_plan(name)
-        print_line(f"{name}: {count_of(sum(part.episodes for part in plan.parts), 'episode')}. {plan.description}")
+        print_line(f"{name}: {format_count(sum(part.episodes for part in plan.parts), 'episode')}. {plan.description}")
     return 0
 
 
@@ -154,7 +154,7 @@ def show_status(command: Status) -> int:
         print_line("finished")
     elif found.seconds_left is not None:
         left, idle = found.seconds_left / 60, found.idle_seconds or 0.0
-        rate = count_of(round(found.episodes_per_hour), "episode")
+        rate = format_count(round(found.episodes_per_hour), "episode")
         print_line(f"{rate} per hour, {left:.0f} min left; the last one {idle:.0f} s ago")
     return 0
 
@@ -164,7 +164,7 @@ def _say_products(out: Path, report: dict[str, Any]) -> None:
     from robocas_ms3.plans.folder import REPORT
 
     made = [str(path.relative_to(out)) for path in sorted(out.glob("d[ae]*s/*"))]
-    print_line(f"{out}: {count_of(report['episodes'], 'episode')}; {', '.join([*made, REPORT])}")
+    print_line(f"{out}: {format_count(report['episodes'], 'episode')}; {', '.join([*made, REPORT])}")
 
 
 def _option(word: str) -> tuple[str, str]:

@@ -12,7 +12,7 @@ from contextlib import contextmanager, nullcontext
 from typing import TYPE_CHECKING, Any
 
 from robocas_ms3.cli.terminal import print_stderr, terminal_of_stderr
-from robocas_ms3.core.text import count_of, printable
+from robocas_ms3.core.text import escape_controls, format_count
 
 if TYPE_CHECKING:
     from robocas_ms3.plans.status import Status
@@ -62,7 +62,7 @@ class ProgressDisplay:
         if self.bars is None:
             print_stderr(text)
         else:
-            self.bars.console.print(printable(text), soft_wrap=True)
+            self.bars.console.print(escape_controls(text), soft_wrap=True)
 
     def flush(self) -> None:
         """Write the last progress to a log."""
@@ -130,11 +130,11 @@ def show_plan(display: ProgressDisplay, status: Status) -> None:
     rows = [(part.name, part.requested, part.done) for part in status.parts]
     total, done = sum(part.requested for part in status.parts), sum(part.done for part in status.parts)
     parts = [f"{name} {done} of {requested}" for name, requested, done in rows if 0 < done < requested]
-    text = f"{done} of {count_of(total, 'episode')}"
+    text = f"{done} of {format_count(total, 'episode')}"
     text += f" ({'; '.join(parts[:_PART_BARS])})" if len(rows) > 1 and parts else ""
     about = ""
     if status.seconds_left is not None:
-        rate = count_of(round(status.episodes_per_hour), "episode")
+        rate = format_count(round(status.episodes_per_hour), "episode")
         about = f"{rate} per hour, {format_duration(status.seconds_left)} left"
     display.show([*(rows if 1 < len(rows) <= _PART_BARS else []), ("all", total, done)], text, about)
 

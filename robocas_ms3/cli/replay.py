@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from robocas_ms3.core.text import count_of
+from robocas_ms3.core.text import format_count
 from robocas_ms3.demos.settings import ReplaySettings
 
 
@@ -28,7 +28,7 @@ def main(settings: ReplaySettings) -> int:
         if not result.success:
             print_line(f"episode {result.episode_id} (seed {result.seed}): not successful")
     good = sum(result.success for result in done)
-    print_line(f"{good} of {count_of(len(done), 'episode')} succeeded")
+    print_line(f"{good} of {format_count(len(done), 'episode')} succeeded")
     errors = [result.state_error for result in done if result.state_error is not None]
     if errors:
         print_line(f"greatest difference from a recorded final state: {np.max(errors):.3g}")  # NaN where one is

@@ -39,11 +39,11 @@ class Show:
 
 def main(cfg: Show) -> int:
     from robocas_ms3.assets.pack import load_pack
-    from robocas_ms3.core.checks import GREATEST_SEED, check_number
+    from robocas_ms3.core.checks import MAX_SEED, check_number
     from robocas_ms3.core.errors import RobocasError
     from robocas_ms3.scenes.config import load_task_config
 
-    check_number("--seed", cfg.seed, 0, GREATEST_SEED)
+    check_number("--seed", cfg.seed, 0, MAX_SEED)
     config = load_task_config(cfg.config, overrides=cfg.set)  # before seconds go by for what is imported next
     if cfg.print_config:
         return print_config(config)
@@ -54,7 +54,7 @@ def main(cfg: Show) -> int:
 
     import robocas_ms3.tasks  # noqa: F401  (registers the environments)
     from robocas_ms3.cli.terminal import print_line
-    from robocas_ms3.core.files import make_folder, replacing
+    from robocas_ms3.core.files import atomic_file, make_folder
     from robocas_ms3.scenes.task_specs import TASKS
     from robocas_ms3.tasks.base import RoboCASEnv
 
@@ -84,7 +84,7 @@ def main(cfg: Show) -> int:
     images["overview"] = overview[0]
     for name, pixels in images.items():
         path = cfg.out / f"{Path(cfg.config).stem}_seed{cfg.seed}_{name}.png"
-        with replacing(path) as tmp:
+        with atomic_file(path) as tmp:
             Image.fromarray(pixels.cpu().numpy()).save(tmp)
         print_line(f"wrote {path}")
     print_line(f"instruction: {base_env.get_language_instruction()[0]}")

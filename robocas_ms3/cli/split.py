@@ -48,7 +48,7 @@ class Split:
 def main(cfg: Split) -> int:
     from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.cli.terminal import print_line
-    from robocas_ms3.core.text import count_of
+    from robocas_ms3.core.text import format_count
     from robocas_ms3.datasets.manage import split
     from robocas_ms3.datasets.manage.copy_episodes import CopyOptions, open_finished
 
@@ -58,7 +58,7 @@ def main(cfg: Split) -> int:
     share = None if cfg.val_share is None else split.Share(cfg.val_share, "seed" if whole else by)
     if cfg.in_place:
         train, val = split.resplit(cfg.dataset, share)
-        print_line(f"{cfg.dataset}: {count_of(len(train), 'episode')} for training, {len(val)} for validation")
+        print_line(f"{cfg.dataset}: {format_count(len(train), 'episode')} for training, {len(val)} for validation")
         return 0
     source = open_finished(cfg.dataset)
     if cfg.out_train and cfg.out_val:

@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from robocas_ms3.cli.options import Maybe
-from robocas_ms3.core.text import count_of
+from robocas_ms3.core.text import format_count
 
 
 @dataclass
@@ -45,5 +45,5 @@ def main(cfg: Stats) -> int:
         print_json(stats.as_json())
         return 0
     images = len(paths) - 1
-    print_line(f"{cfg.path}: {stats.summary()}; {out}: stats.json and {count_of(images, 'image')}")
+    print_line(f"{cfg.path}: {stats.summary()}; {out}: stats.json and {format_count(images, 'image')}")
     return 0

@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterable, Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from robocas_ms3.core.text import printable
+from robocas_ms3.core.text import escape_controls
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -59,7 +59,7 @@ def terminal_of_stderr() -> Console | None:
 
 def print_line(text: str) -> None:
     """Print one line on stdout."""
-    print_text(printable(text))
+    print_text(escape_controls(text))
 
 
 def print_text(text: str) -> None:
@@ -73,7 +73,7 @@ def print_json(values: object) -> None:
 
 def print_stderr(text: str) -> None:
     """Print one line on stderr."""
-    print(printable(text), file=sys.stderr, flush=True)
+    print(escape_controls(text), file=sys.stderr, flush=True)
 
 
 @lru_cache(maxsize=1)
@@ -84,11 +84,11 @@ def _printable_console() -> type[Console]:
 
     class PrintableConsole(Console):
         def render_str(self, text: str, **options: Any) -> Text:
-            return super().render_str(printable(text, lines=True), **options)
+            return super().render_str(escape_controls(text, lines=True), **options)
 
         def render(self, *args: Any, **options: Any) -> Iterable[Segment]:
             for one in super().render(*args, **options):  # of a `Text` that was made elsewhere
-                yield one if one.control else Segment(printable(one.text, lines=True), one.style)
+                yield one if one.control else Segment(escape_controls(one.text, lines=True), one.style)
 
         def on_broken_pipe(self) -> NoReturn:  # rich ends the process here
             raise BrokenPipeError

@@ -13,7 +13,7 @@ from robocas_ms3.cli.options import Maybe
 from robocas_ms3.cli.progress import ProgressBar
 from robocas_ms3.cli.terminal import print_json, print_line
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.text import count_of
+from robocas_ms3.core.text import format_count
 
 if TYPE_CHECKING:
     from robocas_ms3.datasets.checks.dataset import Report
@@ -60,8 +60,8 @@ def main(cfg: Validate) -> int:
     if not cfg.json:
         for violation in report.violations:
             print_line(str(violation))
-        verdict = count_of(len(report.violations), "violation") if report.violations else "valid"
-        counts = f"{count_of(report.episodes, 'episode')}, {count_of(report.steps, 'step')}"
+        verdict = format_count(len(report.violations), "violation") if report.violations else "valid"
+        counts = f"{format_count(report.episodes, 'episode')}, {format_count(report.steps, 'step')}"
         print_line(f"{cfg.dataset}: {counts}, {verdict}")
     content, wrong = report.as_json(), bool(report.violations)
     if cfg.replay:
@@ -97,7 +97,7 @@ def _lines(report: ReplayReport) -> Iterator[str]:
     for task, of_task in report.by_task().items():
         name = task or "unknown task"
         if not of_task["tried"]:
-            yield f"{name}: none of {count_of(of_task['skipped'], 'episode')} could be replayed: no share is known"
+            yield f"{name}: none of {format_count(of_task['skipped'], 'episode')} could be replayed: no share is known"
         else:
             yield (
                 f"{name}: {of_task['succeeded']} of {of_task['tried']} replayed episodes succeed"

@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from robocas_ms3.cli.options import Maybe, Several
-from robocas_ms3.core.text import count_of
+from robocas_ms3.core.text import format_count
 
 
 @dataclass
@@ -82,5 +82,5 @@ def _write(cfg: View, out: Path, source) -> int:
         )
     for number, wrong in damaged.items():
         print_line(f"episode {number} is damaged: {wrong}")
-    print_line(f"{count_of(count, 'episode')}: {out / 'index.html'}")
+    print_line(f"{format_count(count, 'episode')}: {out / 'index.html'}")
     return 0

@@ -7,7 +7,7 @@ import re
 
 from robocas_ms3.core.errors import RobocasError
 
-GREATEST_SEED = 2**32 - 1  # numpy's older generators, which ManiSkill uses, take no greater one
+MAX_SEED = 2**32 - 1  # numpy's older generators, which ManiSkill uses, take no greater one
 
 
 def check_number(where: str, value: float, least: float, greatest: int | None = None) -> None:

@@ -65,24 +65,24 @@ def _reading(path: Path) -> Iterator[None]:
 def load_json(path: Path) -> Any:
     """Read a JSON file of bounded size and depth, whose numbers are finite and of 64 bits."""
     with _reading(path):
-        return json_values(read_text(path, JSON_LIMIT))
+        return decode_json(read_text(path, JSON_LIMIT))
 
 
-def json_values(text: str | bytes) -> Any:
-    """Read the values of a JSON text; raise DocumentError if it is not JSON, or has a value that `json_fault` names."""
+def decode_json(text: str | bytes) -> Any:
+    """Decode a JSON text; raise DocumentError for invalid JSON and for the values that `find_invalid_value` reports."""
     try:
         values = json.loads(text)
     except ValueError as error:
         raise DocumentError(str(error)) from error
     except RecursionError as error:
         raise DocumentError(_TOO_DEEP) from error
-    if fault := json_fault(values):
+    if fault := find_invalid_value(values):
         keys, found = fault
         raise DocumentError(f"{'.'.join(map(repr, keys[:_SHOWN_KEYS]))}: {found}" if keys else found)
     return values
 
 
-def json_fault(values: Any, depth: int = 0) -> tuple[tuple[Any, ...], str] | None:
+def find_invalid_value(values: Any, depth: int = 0) -> tuple[tuple[Any, ...], str] | None:
     """Return keys and description of the first value that the package does not keep in JSON, or None.
 
     These are NaN, infinity, integers beyond 64 bits, lone surrogates, and what is nested too deeply.
@@ -96,7 +96,7 @@ def json_fault(values: Any, depth: int = 0) -> tuple[tuple[Any, ...], str] | Non
         if is_dict and (found := _scalar_fault(key)):
             return (), f"key {found}"
         if isinstance(value, _CONTAINERS):
-            if fault := json_fault(value, depth + 1):
+            if fault := find_invalid_value(value, depth + 1):
                 return (key, *fault[0]), fault[1]
         elif found := _scalar_fault(value):
             return (key,), found

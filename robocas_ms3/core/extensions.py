@@ -10,8 +10,8 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
 from robocas_ms3.core.errors import ExtensionError
-from robocas_ms3.core.signals import no_exit
-from robocas_ms3.core.text import error_line, nearest
+from robocas_ms3.core.signals import forbid_exit
+from robocas_ms3.core.text import did_you_mean, format_error
 
 _log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -61,7 +61,7 @@ class Registry(Mapping[str, T]):
         if name in self:
             return self[name]
         known = list(self)
-        what, expected, fix = f"no such {self.kind}", f"one of {known}", nearest(name, known)
+        what, expected, fix = f"no such {self.kind}", f"one of {known}", did_you_mean(name, known)
         raise ExtensionError(what, where=where, expected=expected, found=repr(name), fix=fix)
 
     @cached_property
@@ -82,13 +82,13 @@ class Registry(Mapping[str, T]):
             raise ExtensionError(what, where=point.name, found=packages, fix="Uninstall all but one.")
         fix = f"Repair or uninstall {package_of(point)}."
         try:
-            with no_exit(f"{self.kind} {where}"):
+            with forbid_exit(f"{self.kind} {where}"):
                 found = point.load()
         except ExtensionError:
             raise
         except Exception as error:  # code of another package may raise anything
             what = f"this {self.kind} can't be loaded"
-            raise ExtensionError(what, where=where, found=error_line(error), fix=fix) from error
+            raise ExtensionError(what, where=where, found=format_error(error), fix=fix) from error
         if not isinstance(found, self.type):
             expected, what = f"a {self.type.__name__}", f"not a {self.kind}"
             raise ExtensionError(what, where=where, expected=expected, found=type(found).__name__, fix=fix)
@@ -100,11 +100,11 @@ def package_of(point: EntryPoint) -> str:
     return point.dist.name if point.dist else point.module.partition(".")[0]
 
 
-def load(path: str) -> Any:
+def load_object(path: str) -> Any:
     """Return the object of an import path, ``package.module:name``; raise ExtensionError if there is none."""
     module, _, name = path.partition(":")
     try:
-        with no_exit(path):
+        with forbid_exit(path):
             return getattr(import_module(module), name)
     except (ImportError, AttributeError, ValueError) as error:
         raise ExtensionError("no such object", where=path, expected="package.module:name", found=error) from error

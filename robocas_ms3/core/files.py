@@ -22,9 +22,9 @@ from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.core.paths import variable_of
 
 _Error = TypeVar("_Error", bound=RobocasError)
-FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
+DISK_FULL_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT})
 """Error numbers of a disk without room."""
-ABANDONED = 86400.0
+LEFTOVER_AGE = 86400.0
 """Age in s, since the last change, of files that a killed run left."""
 _SHOWN_KEYS = 8  # of the way to a wrong value, in a message
 _NAME_BYTES = 96  # of stem and of suffix that a temporary name repeats: file systems allow 255 in all
@@ -32,7 +32,7 @@ _TRIES = 5  # to rename a folder onto one that other processes replace
 
 
 @contextmanager
-def naming(path: Path | str) -> Iterator[None]:
+def add_path_to_errors(path: Path | str) -> Iterator[None]:
     """Give errors of the system a path where they have none: writing into an open file says no name.
 
     An error of copying names the file that was read, that of a full disk too: then it is this one.
@@ -40,14 +40,14 @@ def naming(path: Path | str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        copied = error.filename2 and error.errno in FULL
+        copied = error.filename2 and error.errno in DISK_FULL_ERRNOS
         if error.errno is None or (error.filename and not copied):
             raise
         raise OSError(error.errno, os.strerror(error.errno), str(path)) from error
 
 
 @contextmanager
-def replacing(path: Path | str, *, sync: bool = False) -> Iterator[Path]:
+def atomic_file(path: Path | str, *, sync: bool = False) -> Iterator[Path]:
     """Yield a temporary path next to ``path``; on success it replaces ``path``, on failure it is removed.
 
     The temporary name keeps the suffix, since many writers choose their format by it. Nobody can predict the name, so
@@ -62,7 +62,7 @@ def replacing(path: Path | str, *, sync: bool = False) -> Iterator[Path]:
     stem, suffix = (os.fsencode(part)[:_NAME_BYTES].decode(errors="ignore") for part in (path.stem, path.suffix))
     tmp = path.parent / f".{stem}.{secrets.token_hex(8)}.tmp{suffix}"
     try:
-        with naming(path):
+        with add_path_to_errors(path):
             yield tmp
             if sync:
                 _sync(tmp)
@@ -100,7 +100,7 @@ def _sync(path: Path) -> None:
 
 
 @contextmanager
-def replacing_folder(path: Path | str, *, sync: bool = False) -> Iterator[Path]:
+def atomic_folder(path: Path | str, *, sync: bool = False) -> Iterator[Path]:
     """Yield a new folder next to ``path``; on success it replaces ``path``, on failure it is removed.
 
     A folder that can't be renamed, see `is_fixed`, gets the content of the new one, one entry after the other.
@@ -116,7 +116,7 @@ def replacing_folder(path: Path | str, *, sync: bool = False) -> Iterator[Path]:
     tmp = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".tmp", dir=home))
     tmp.chmod(0o755)
     try:
-        with naming(path):
+        with add_path_to_errors(path):
             yield tmp
             if sync:
                 flush_to_disk(tmp)
@@ -175,7 +175,7 @@ def _restore_and_sweep(path: Path) -> None:
             if not path.exists():
                 os.replace(old, path)
         for leftover in [*path.parent.glob(f".{name}.*.tmp"), *path.parent.glob(f".{name}.*.old")]:
-            if time.time() - leftover.stat().st_mtime > ABANDONED:
+            if time.time() - leftover.stat().st_mtime > LEFTOVER_AGE:
                 shutil.rmtree(leftover, ignore_errors=True)
 
 
@@ -209,9 +209,9 @@ def flush_to_disk(folder: Path | str) -> None:
 
 
 def write_json(path: Path | str, data: Any, *, sync: bool = False) -> None:
-    """Write JSON whole or not at all; ``sync`` is that of `replacing`. Raises as `json_text` does."""
+    """Write JSON whole or not at all; ``sync`` is that of `atomic_file`. Raises as `json_text` does."""
     text = json_text(data, path, indent=2) + "\n"
-    with replacing(path, sync=sync) as tmp:
+    with atomic_file(path, sync=sync) as tmp:
         tmp.write_text(text, encoding="utf-8")
 
 
@@ -222,9 +222,9 @@ def json_text(
 
     Raises ``error``, whose ``where`` names the key, for a value that they would refuse, such as NaN.
     """
-    from robocas_ms3.core.documents import json_fault  # with YAML, for which `robocas --help` need not wait
+    from robocas_ms3.core.documents import find_invalid_value  # with YAML, for which `robocas --help` need not wait
 
-    if fault := json_fault(data):
+    if fault := find_invalid_value(data):
         keys, found = fault
         place = f"{where}, {'.'.join(map(str, keys[:_SHOWN_KEYS]))}" if keys else where
         expected = "finite numbers of 64 bits, Unicode text, JSON types"

@@ -17,8 +17,8 @@ from pydantic import TypeAdapter, ValidationError
 
 from robocas_ms3.core.documents import read_bytes
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.core.files import json_text, naming, open_for_append, replacing
-from robocas_ms3.core.strict_model import refusal, validate_json
+from robocas_ms3.core.files import add_path_to_errors, atomic_file, json_text, open_for_append
+from robocas_ms3.core.strict_model import error_from_validation, validate_json
 
 Record = TypeVar("Record")
 _Error = TypeVar("_Error", bound=RobocasError)
@@ -67,7 +67,7 @@ class JsonLinesFile(Generic[Record]):
         text = _text(records, self.path)
         if not text:
             return
-        with naming(self.path), open_for_append(self.path) as file:
+        with add_path_to_errors(self.path), open_for_append(self.path) as file:
             self._end_last_line(file)
             file.write(text)
             file.flush()
@@ -75,13 +75,13 @@ class JsonLinesFile(Generic[Record]):
                 os.fsync(file.fileno())
 
     def rewrite(self, records: Iterable[Record]) -> None:
-        with replacing(self.path) as tmp:
+        with atomic_file(self.path) as tmp:
             tmp.write_bytes(_text(records, self.path))
 
-    def refusal(self, line: Line[Record], error: type[_Error], about: str) -> _Error:
+    def line_error(self, line: Line[Record], error: type[_Error], about: str) -> _Error:
         """Return an error of ours for a damaged line of this file; ``about`` is what it isn't, such as "no outcome"."""
         assert line.problem is not None
-        return refusal(line.problem, self._form, error, where=f"{self.path}:{line.number}", about=about)
+        return error_from_validation(line.problem, self._form, error, where=f"{self.path}:{line.number}", about=about)
 
     def _read(self, number: int, text: bytes, last: int) -> Line[Record]:
         try:

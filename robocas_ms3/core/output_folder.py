@@ -1,7 +1,7 @@
 """Output folders: what may be written into, continued or replaced, and what a killed run leaves.
 
 The commands that write a folder step by step use `OutputFolder`. Commands that write a file or folder in one go use
-`check_replaceable` and `files.replacing` or `files.replacing_folder`.
+`check_replaceable` and `files.atomic_file` or `files.atomic_folder`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from robocas_ms3.core.errors import OutputExistsError, RobocasError
 from robocas_ms3.core.files import empty_folder, json_text, make_folder, remove, write_json
 from robocas_ms3.core.locks import LOCK, locked_folder
 
-_LEFTOVERS = (".*.tmp*", ".*.old")  # of `files.replacing` and `files.replacing_folder` in a process that was killed
+_LEFTOVERS = (".*.tmp*", ".*.old")  # of `files.atomic_file` and `files.atomic_folder` in a process that was killed
 _OVERWRITTEN = "overwritten"  # key of a record whose content is being moved away; a run that finds it starts again
 _SHOWN_CHANGES = 8
 _SHOWN_VALUE = 60  # characters
@@ -119,7 +119,7 @@ class OutputFolder:
     def _compare(self, record: dict[str, Any], settings: Mapping[str, Any]) -> None:
         now = json.loads(json_text(settings, self.path))
         before = self._kind.upgrade(record)
-        changes = [change for key, value in now.items() for change in setting_changes(before.get(key), value, key)]
+        changes = [change for key, value in now.items() for change in list_setting_changes(before.get(key), value, key)]
         if changes:
             more = len(changes) - _SHOWN_CHANGES
             found = "; ".join(changes[:_SHOWN_CHANGES]) + (f"; {more} more" if more > 0 else "")
@@ -135,11 +135,11 @@ class OutputFolder:
             return
         make_folder(self.path)
         if not self._shared:
-            sweep(self.path)
+            remove_leftovers(self.path)
         write_json(self._record_path(), record, sync=True)
 
     def _hide_content(self) -> None:
-        """Move the content into a temporary folder, which `sweep` deletes; the record is the last that is moved."""
+        """Move the content into a temporary folder, which `remove_leftovers` deletes; move the record last."""
         record = self._record_path()
         make_folder(record.parent)
         write_json(record, {self._kind.key: None, _OVERWRITTEN: True}, sync=True)
@@ -239,14 +239,14 @@ def check_replaceable(path: Path | str, *, overwrite: bool | None = None, marks:
         raise OutputExistsError(what, where=path, expected=" or ".join(marks), fix="Choose another.")
 
 
-def sweep(folder: Path) -> None:
+def remove_leftovers(folder: Path) -> None:
     """Remove temporary files and folders that a killed run left; the folder has to be locked."""
     for pattern in _LEFTOVERS:
         for leftover in folder.glob(pattern):
             remove(leftover)
 
 
-def setting_changes(before: Any, now: Any, path: str, tolerance: float = 0.0) -> list[str]:
+def list_setting_changes(before: Any, now: Any, path: str, tolerance: float = 0.0) -> list[str]:
     """Return ``path: before -> now`` for each JSON value that differs, of floats by more than a tolerance."""
     if isinstance(before, dict) and isinstance(now, dict):
         pairs = [(key, before.get(key), now.get(key)) for key in dict.fromkeys([*before, *now])]
@@ -256,7 +256,7 @@ def setting_changes(before: Any, now: Any, path: str, tolerance: float = 0.0) ->
         return []
     else:
         return [] if before == now else [f"{path}: {_shortened(before)} -> {_shortened(now)}"]
-    return [change for key, old, new in pairs for change in setting_changes(old, new, f"{path}.{key}", tolerance)]
+    return [change for key, old, new in pairs for change in list_setting_changes(old, new, f"{path}.{key}", tolerance)]
 
 
 def _shortened(value: Any) -> str:

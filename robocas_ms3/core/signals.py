@@ -1,4 +1,4 @@
-"""What may end the process: Ctrl-C, which may be deferred, and foreign code, which may not (`no_exit`)."""
+"""What may end the process: Ctrl-C, which may be deferred, and foreign code, which may not (`forbid_exit`)."""
 
 from __future__ import annotations
 
@@ -88,15 +88,15 @@ class _CommandInterrupt:
 _command = _CommandInterrupt()
 
 
-def heed_ctrl_c() -> None:
+def handle_interrupts() -> None:
     """Let the first Ctrl-C or SIGTERM end this process, a command, within seconds; later ones change nothing."""
     _command.install()
 
 
-def leave(code: int) -> NoReturn:
+def exit_command(code: int) -> NoReturn:
     """Leave the process with an exit code, at once if it was interrupted."""
     if code == INTERRUPTED:
-        end_process(_command.code)
+        exit_immediately(_command.code)
     sys.exit(code)
 
 
@@ -128,7 +128,7 @@ def deferred_interrupts(*, second_ends: bool = True) -> Iterator[list[Any]]:
             held[came[0][0]](*came[0])
 
 
-def end_process(code: int) -> NoReturn:
+def exit_immediately(code: int) -> NoReturn:
     """Run exit functions, and end the process without what torch and SAPIEN do then: it takes a second, or crashes."""
     atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):
@@ -146,7 +146,7 @@ def die_with_parent(parent: int) -> None:
 
 
 @contextmanager
-def no_exit(source: str) -> Iterator[None]:
+def forbid_exit(source: str) -> Iterator[None]:
     """Turn a SystemExit, or a KeyboardInterrupt without a signal, of the code of ``source`` into ExtensionError."""
     try:
         yield

@@ -13,17 +13,17 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, TypeAdapter, ValidationError, model_validator
 
-from robocas_ms3.core.documents import DocumentError, json_values
+from robocas_ms3.core.documents import DocumentError, decode_json
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.core.text import nearest, one_line
+from robocas_ms3.core.text import did_you_mean, one_line
 
 _Model = TypeVar("_Model", bound=BaseModel)
 _Error = TypeVar("_Error", bound=RobocasError)
-GREATEST_NUMBER = 1e12
+MAX_NUMBER = 1e12
 """No number of a declared form is larger: products of numbers like 1e308 are infinite."""
-LONGEST_NAME = 200
+MAX_NAME_BYTES = 200
 """Bytes; file systems allow 255, of which temporary files add some."""
-_NAME = f"1 to {LONGEST_NAME} printable characters without / and \\, no leading dot"
+_NAME = f"1 to {MAX_NAME_BYTES} printable characters without / and \\, no leading dot"
 # where pydantic's message alone does not say what was expected
 _EXPECTED = {
     "extra_forbidden": "no such key",
@@ -38,11 +38,11 @@ _EXPECTED = {
     "dict_type": "a mapping",
 }
 _FOUND_LENGTH = 80  # of a wrong value, or of a key, in a message
-_OUT_OF_RANGE = re.compile(rb"NaN|Infinity|\d[eE]\+?\d{3}|\d{19}")  # may be a number that `json_values` refuses
+_OUT_OF_RANGE = re.compile(rb"NaN|Infinity|\d[eE]\+?\d{3}|\d{19}")  # may be a number that `decode_json` refuses
 
 
 class StrictModel(BaseModel):
-    """Refuse unknown keys and numbers beyond `GREATEST_NUMBER`; nothing changes after loading."""
+    """Refuse unknown keys and numbers beyond `MAX_NUMBER`; nothing changes after loading."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -50,20 +50,20 @@ class StrictModel(BaseModel):
     def _numbers_are_bounded(self) -> StrictModel:
         for name, value in self:
             if (wrong := _too_large(value)) is not None:
-                raise ValueError(f"{name}: expected numbers of at most {GREATEST_NUMBER:g}, found {wrong:g}")
+                raise ValueError(f"{name}: expected numbers of at most {MAX_NUMBER:g}, found {wrong:g}")
         return self
 
 
 def _too_large(value: Any) -> float | None:
     """Return a number beyond the greatest that is in a value, or None; models inside check their own."""
     if isinstance(value, int | float):
-        return value if abs(value) > GREATEST_NUMBER else None
+        return value if abs(value) > MAX_NUMBER else None
     inside = value.values() if isinstance(value, Mapping) else value if isinstance(value, list | tuple) else ()
     return next((wrong for each in inside if (wrong := _too_large(each)) is not None), None)
 
 
 @dataclass(frozen=True)
-class Mistake:
+class InvalidValue:
     """An invalid value, in one line each."""
 
     key: str  # as the file has it; empty: at the top
@@ -106,7 +106,7 @@ def parse_json(
     try:
         return validate_json(model, text)
     except ValidationError as problem:
-        raise refusal(problem, model, error, where=where, about=about) from problem
+        raise error_from_validation(problem, model, error, where=where, about=about) from problem
 
 
 def validate_json(form: type[BaseModel] | TypeAdapter[Any], text: str | bytes) -> Any:
@@ -115,14 +115,14 @@ def validate_json(form: type[BaseModel] | TypeAdapter[Any], text: str | bytes) -
     found = validate(text, strict=True)
     if _OUT_OF_RANGE.search(text.encode() if isinstance(text, str) else text):  # hardly ever: then it is read once more
         try:
-            json_values(text)
+            decode_json(text)
         except DocumentError as problem:
             details: Any = {"type": "json_invalid", "loc": (), "input": "", "ctx": {"error": str(problem)}}
             raise ValidationError.from_exception_data("JSON", [details]) from problem
     return found
 
 
-def refusal(
+def error_from_validation(
     problem: ValidationError,
     form: type[BaseModel] | TypeAdapter[Any],
     error: type[_Error],
@@ -132,7 +132,7 @@ def refusal(
     fix: str = "",
 ) -> _Error:
     """Return pydantic's error as one of ours: its first mistake, and how many more there are; see `parse`."""
-    first, *others = mistakes(problem, form)
+    first, *others = list_invalid_values(problem, form)
     # a union has a mistake for each of its types, at its own place or further out
     more = sum(not f"{first.key}.".startswith(f"{other.key}." if other.key else "") for other in others)
     fixes = (first.fix, f"{more} more after this one." if more else "", fix)
@@ -141,11 +141,11 @@ def refusal(
     return error(what, where=where, expected=first.expected, found=first.found, fix=" ".join(filter(None, fixes)))
 
 
-def mistakes(
+def list_invalid_values(
     problem: ValidationError,
     form: type[BaseModel] | TypeAdapter[Any] | None = None,
     words: Mapping[str, str] | None = None,
-) -> list[Mistake]:
+) -> list[InvalidValue]:
     """Return pydantic's errors, one mistake per key, unknown keys first.
 
     Args:
@@ -159,7 +159,7 @@ def mistakes(
     found: dict[str, list[Any]] = {}
     for details in problem.errors(include_url=False):
         found.setdefault(".".join(_place(details["loc"], schema)[0]), []).append(details)
-    made = [_mistake(key, same, schema, {**_EXPECTED, **(words or {})}) for key, same in found.items()]
+    made = [_invalid_value(key, same, schema, {**_EXPECTED, **(words or {})}) for key, same in found.items()]
     return sorted(made, key=lambda mistake: mistake.kind != "extra_forbidden")  # it may be why another is missing
 
 
@@ -173,7 +173,7 @@ def check_name(name: str, error: type[RobocasError], *, where: object, fix: str 
 
 
 def _check_name(name: str) -> str:
-    fits = 0 < len(name.encode()) <= LONGEST_NAME
+    fits = 0 < len(name.encode()) <= MAX_NAME_BYTES
     if not (fits and name.isprintable()) or name.startswith(".") or {*name} & {"/", "\\"}:
         raise ValueError(f"not a name for a file: expected {_NAME}")
     return name
@@ -183,7 +183,7 @@ FileName = Annotated[str, AfterValidator(_check_name)]
 """A field of a declared form that becomes a part of a path."""
 
 
-def _mistake(key: str, same: list[Any], schema: dict[str, Any], words: Mapping[str, str]) -> Mistake:
+def _invalid_value(key: str, same: list[Any], schema: dict[str, Any], words: Mapping[str, str]) -> InvalidValue:
     details = same[0]
     kind, value, context = details["type"], details["input"], details.get("ctx", {})
     what, expected, found, fix = f"wrong value for {key or '(top level)'!r}", "", "", ""
@@ -191,13 +191,13 @@ def _mistake(key: str, same: list[Any], schema: dict[str, Any], words: Mapping[s
         *outer, name = details["loc"]
         name, known = one_line(name, _FOUND_LENGTH), sorted(_place(tuple(outer), schema)[1].get("properties", {}))
         what, expected = f"unknown key {key!r}", f"one of {known}" if known else "no such key"
-        found, fix = repr(name), nearest(name, known)
+        found, fix = repr(name), did_you_mean(name, known)
     elif kind in {"union_tag_invalid", "union_tag_not_found"}:
         discriminator = _place(details["loc"], schema)[1]["discriminator"]
         tag, kinds = discriminator["propertyName"], sorted(discriminator["mapping"])
         name = one_line(context.get("tag", ""), _FOUND_LENGTH)
         what, expected = f"wrong value for '{f'{key}.{tag}' if key else tag}'", f"one of {kinds}"
-        found, fix = repr(name) if name else "nothing", nearest(name, kinds)
+        found, fix = repr(name) if name else "nothing", did_you_mean(name, kinds)
     elif kind == "value_error":
         message = one_line(details["msg"].removeprefix("Value error, "))
         what = f"{key}: {message}" if key else message
@@ -208,7 +208,7 @@ def _mistake(key: str, same: list[Any], schema: dict[str, Any], words: Mapping[s
         expected = " or ".join(dict.fromkeys(_expected(details, words) for details in same))
         found = "nothing" if kind == "missing" else repr(value)
         found = found if len(found) <= _FOUND_LENGTH else f"{found[:_FOUND_LENGTH]}..."
-    return Mistake(key, kind, what, expected, found, fix, value, context)
+    return InvalidValue(key, kind, what, expected, found, fix, value, context)
 
 
 def _expected(details: Any, words: Mapping[str, str]) -> str:

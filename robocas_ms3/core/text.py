@@ -42,7 +42,7 @@ def format_ranges(numbers: Iterable[int]) -> str:
     return ", ".join(texts[:_RANGES]) + more
 
 
-def printable(text: str, *, lines: bool = False) -> str:
+def escape_controls(text: str, *, lines: bool = False) -> str:
     r"""Return a text with control characters as escapes (``\u001b``, valid in JSON too), for terminals and reports.
 
     Args:
@@ -63,37 +63,37 @@ def one_line(text: object, most: int | None = None) -> str:
     if isinstance(text, KeyError) and text.args:
         text = f"no key {text}"
     line = " ".join(str(text).split()) or (type(text).__name__ if isinstance(text, BaseException) else "")
-    return printable(line[:most])
+    return escape_controls(line[:most])
 
 
-def error_line(error: BaseException, most: int | None = None) -> str:
+def format_error(error: BaseException, most: int | None = None) -> str:
     """Return an error as `one_line` does, after the name of its type where it is not one of ours."""
     return one_line(error if isinstance(error, RobocasError) else f"{type(error).__name__}: {error}", most)
 
 
-def in_markdown(text: str) -> str:
+def escape_markdown(text: str) -> str:
     """Return a text as one line of Markdown that shows it as it is: no HTML, web links, emphasis or cells."""
-    return _MARKDOWN.sub(r"\\\g<0>", printable(text))
+    return _MARKDOWN.sub(r"\\\g<0>", escape_controls(text))
 
 
-class _LogLines(logging.Formatter):
+class _EscapingFormatter(logging.Formatter):
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802  (logging's name)
         """Return the message: one line where it is this package's, others may have several."""
-        return printable(super().formatMessage(record), lines=not record.name.startswith("robocas_ms3"))
+        return escape_controls(super().formatMessage(record), lines=not record.name.startswith("robocas_ms3"))
 
     def formatException(self, ei: Any) -> str:  # noqa: N802
-        return printable(super().formatException(ei), lines=True)
+        return escape_controls(super().formatException(ei), lines=True)
 
 
 def escape_log_lines() -> None:
     """Show control characters in log lines as escapes, in this process, where nobody set up a log handler."""
     if logging.lastResort is not None:
-        logging.lastResort.setFormatter(_LogLines())
+        logging.lastResort.setFormatter(_EscapingFormatter())
 
 
 def print_traceback(kind: type[BaseException], error: BaseException | None, at: TracebackType | None) -> None:
     """Print a traceback on stderr, control characters as escapes; a `sys.excepthook`."""
-    sys.stderr.write(printable("".join(traceback.format_exception(kind, error, at)), lines=True))
+    sys.stderr.write(escape_controls("".join(traceback.format_exception(kind, error, at)), lines=True))
 
 
 def escape_tracebacks() -> None:
@@ -107,18 +107,18 @@ def _print_error(args: threading.ExceptHookArgs | sys.UnraisableHookArgs) -> Non
         print_traceback(args.exc_type, args.exc_value, args.exc_traceback)
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
+def did_you_mean(name: str, known: Iterable[str]) -> str:
     """Return a question that names the known words most like a wrong one, best first; empty if none is like it."""
     found = get_close_matches(name, list(known), n=3, cutoff=0.7)
     return f"Did you mean {' or '.join(found)}?" if found else ""
 
 
-def count_of(count: int, noun: str) -> str:
+def format_count(count: int, noun: str) -> str:
     """Return ``1 episode``, ``2 episodes``."""
     return f"{count} {noun}" + ("" if count == 1 else "s")
 
 
-def called(asset_id: str, name: str = "") -> str:
+def format_object_name(asset_id: str, name: str = "") -> str:
     """Return the name of an object in instructions, and its id where that differs; either may be unknown, empty."""
     plain = asset_id.replace("_", " ")
     return f"{name} ({plain})" if name and plain and name != plain else name or plain

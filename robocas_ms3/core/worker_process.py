@@ -24,7 +24,7 @@ from tqdm import tqdm
 
 from robocas_ms3.core.errors import RobocasError, WorkerCrashError, WorkerStartError
 from robocas_ms3.core.remote_errors import RemoteError
-from robocas_ms3.core.signals import die_with_parent, end_process, exit_error
+from robocas_ms3.core.signals import die_with_parent, exit_error, exit_immediately
 from robocas_ms3.core.text import escape_log_lines, escape_tracebacks
 
 Task = TypeVar("Task")
@@ -237,7 +237,7 @@ def main(descriptor: int, parent: int) -> None:
     tqdm.set_lock(threading.RLock())  # its own is a semaphore of the system, which a killed process leaves behind
     with suppress(EOFError, OSError):
         _serve(Connection(descriptor))
-    end_process(0)
+    exit_immediately(0)
 
 
 def _serve(connection: Connection) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.extensions import Registry
-from robocas_ms3.core.signals import no_exit
+from robocas_ms3.core.signals import forbid_exit
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.sources.episode_source import EpisodeSource
 
@@ -52,7 +52,7 @@ class Format:
             raise DatasetError(f"this format has no {name}", where=self.title)
         module, _, function = path.partition(":")
         try:
-            with no_exit(f"{name} {path}"):
+            with forbid_exit(f"{name} {path}"):
                 return getattr(import_module(module), function)
         except (ImportError, AttributeError) as error:
             raise DatasetError(f"the {name} of this format can't be imported", where=path, found=error) from error

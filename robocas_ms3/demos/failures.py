@@ -14,7 +14,7 @@ from typing import Annotated, Any
 from numpy.typing import NDArray
 from pydantic import Field
 
-from robocas_ms3.core.checks import GREATEST_SEED
+from robocas_ms3.core.checks import MAX_SEED
 from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.planning.decisions import Seconds
 
@@ -33,7 +33,7 @@ class Failure:
         seconds: wall-clock time of the attempt; 0 if a kill came before it was noted.
     """
 
-    seed: Annotated[int, Field(ge=0, le=GREATEST_SEED)]
+    seed: Annotated[int, Field(ge=0, le=MAX_SEED)]
     attempt: Annotated[int, Field(ge=-1, le=10**6)]
     stage: str
     reason: str

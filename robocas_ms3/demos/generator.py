@@ -12,7 +12,7 @@ import numpy as np
 
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.core.errors import LayoutError, PlanningError, UnrecoverableError
-from robocas_ms3.core.extensions import load
+from robocas_ms3.core.extensions import load_object
 from robocas_ms3.demos.backtracking import Resimulation
 from robocas_ms3.demos.branches import ForkedBranches, say_once, why_not_fork
 from robocas_ms3.demos.failures import EpisodeResult, Takeover
@@ -67,7 +67,7 @@ class EpisodeGenerator:
         self.planner: Planner = make_planner(settings.planner, robot, dt=base_env.control_timestep)
         self.reachability = Reachability(ArmChain(robot.files().arm_urdf, robot.description))
         # a scripted policy tries once, from wherever the episode stands, and raises PlanningError
-        self.policy: Callable[[Arm], None] = load(TASKS[settings.task].solver)
+        self.policy: Callable[[Arm], None] = load_object(TASKS[settings.task].solver)
         self.worlds: list[OpenLoop] = []
         self.trials: Trials | None = None
         if settings.check_rate and not config.base_motion:

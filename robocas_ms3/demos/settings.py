@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from robocas_ms3.core.checks import GREATEST_SEED, check_number
+from robocas_ms3.core.checks import MAX_SEED, check_number
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.robots.registry import DEFAULT as DEFAULT_ROBOT
 from robocas_ms3.robots.registry import find_robot
@@ -159,7 +159,7 @@ class GenerateSettings:
 
     def check(self) -> None:
         check_number("--episodes", self.episodes, 1)
-        check_number("--seed", self.seed, 0, GREATEST_SEED)
+        check_number("--seed", self.seed, 0, MAX_SEED)
         check_number("--jobs", self.jobs, 0)
         check_number("--episode-seconds", self.episode_seconds, 1)
         check_number("--memory-gb", self.memory_gb, 0.1)

@@ -80,12 +80,12 @@ def planner() -> str:
 
 def packs() -> str:
     from robocas_ms3.assets.pack import load_pack, pack_folders
-    from robocas_ms3.core.text import count_of
+    from robocas_ms3.core.text import format_count
 
     loaded = [load_pack(name) for name in pack_folders()]
     if not any(pack.name == "builtin" for pack in loaded):
         raise RuntimeError("the builtin pack is not installed")
-    return ", ".join(f"{pack.name} ({count_of(len(pack.objects), 'object')})" for pack in loaded)
+    return ", ".join(f"{pack.name} ({format_count(len(pack.objects), 'object')})" for pack in loaded)
 
 
 def _falling_box(scene):
@@ -114,9 +114,9 @@ def _main() -> int:
         sys.stderr.write(f"{error}\n")
         return ABSENT
     except Exception as error:  # whatever the trial meets is its answer
-        from robocas_ms3.core.text import printable
+        from robocas_ms3.core.text import escape_controls
 
-        sys.stderr.write(printable(f"{type(error).__name__}: {' '.join(str(error).split())}") + "\n")
+        sys.stderr.write(escape_controls(f"{type(error).__name__}: {' '.join(str(error).split())}") + "\n")
         return 1
     answer.write(found + "\n")
     answer.flush()
@@ -125,6 +125,6 @@ def _main() -> int:
 
 if __name__ == "__main__":
     exit_code = _main()
-    from robocas_ms3.core.signals import end_process
+    from robocas_ms3.core.signals import exit_immediately
 
-    end_process(exit_code)  # a library that crashes while it is torn down has worked nevertheless
+    exit_immediately(exit_code)  # a library that crashes while it is torn down has worked nevertheless

@@ -16,8 +16,8 @@ import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.assets.pack import MANIFEST, load_pack, sha256
 from robocas_ms3.core.documents import DocumentError, load_yaml
 from robocas_ms3.core.errors import EvaluationError, LayoutError
-from robocas_ms3.core.files import make_folder, replacing, replacing_folder
-from robocas_ms3.core.strict_model import LONGEST_NAME, StrictModel, parse
+from robocas_ms3.core.files import atomic_file, atomic_folder, make_folder
+from robocas_ms3.core.strict_model import MAX_NAME_BYTES, StrictModel, parse
 from robocas_ms3.evaluation.protocol import (
     CONFIG_NAME,
     CONFIGS,
@@ -110,7 +110,7 @@ def freeze(plan: ProtocolPlan, folder: Path, overrides: Sequence[str] = ()) -> I
     rules = parse(Protocol, values, EvaluationError, where="rules", about=NO_RULES)
     configs, train = _configs(plan.parts, overrides), _configs(plan.train, overrides)
     total, episodes = sum(part.count for part in plan.parts), []
-    with replacing_folder(folder) as tmp:
+    with atomic_folder(folder) as tmp:
         make_folder(tmp / LAYOUTS)
         for inside, named in ((CONFIGS, configs), (TRAIN, train)):
             for name, config in named.items():
@@ -123,7 +123,7 @@ def freeze(plan: ProtocolPlan, folder: Path, overrides: Sequence[str] = ()) -> I
                 yield len(episodes), total
         for name, found in scenes.items():
             write_frozen(tmp / LAYOUTS / f"{name}.npy", pack.objects, found)
-        with replacing(tmp / EPISODES) as file:
+        with atomic_file(tmp / EPISODES) as file:
             file.write_text("".join(f"{episode.model_dump_json()}\n" for episode in episodes), encoding="utf-8")
         # A protocol that names no robot has the default.
         _write_yaml(rules.model_dump(mode="json", exclude={"robot"} if rules.robot == DEFAULT else None), tmp / RULES)
@@ -133,9 +133,9 @@ def _configs(parts: Sequence[Scene], overrides: Sequence[str]) -> dict[str, Task
     found: dict[str, TaskConfig] = {}
     for part in parts:
         config = part.changed(overrides)
-        if not re.fullmatch(CONFIG_NAME, part.file) or len(part.file) > LONGEST_NAME:
+        if not re.fullmatch(CONFIG_NAME, part.file) or len(part.file) > MAX_NAME_BYTES:
             what, fix = "invalid name of a configuration", "Give it a `name`, and a plain `split`."
-            expected = f"letters, digits, _ and -, at most {LONGEST_NAME}"
+            expected = f"letters, digits, _ and -, at most {MAX_NAME_BYTES}"
             raise EvaluationError(what, where=part.config, expected=expected, found=repr(part.file)[:80], fix=fix)
         if found.setdefault(part.file, config) != config:
             raise EvaluationError("two configurations of one name", where=part.file, fix="Give one of them a `name`.")

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.files import json_text
-from robocas_ms3.core.signals import no_exit
+from robocas_ms3.core.signals import forbid_exit
 from robocas_ms3.robots.cameras import CAMERA_NAME
 from robocas_ms3.robots.quantities import QUANTITIES
 from robocas_ms3.robots.registry import DEFAULT
@@ -234,8 +234,8 @@ def describe(policy: Policy) -> dict[str, Any]:
 
 
 def policy_code(policy: Policy) -> AbstractContextManager[None]:
-    """Call a policy inside: if its code tries to end the process, that is an error (`no_exit`)."""
-    return no_exit(f"policy {_class_of(policy)}")
+    """Call a policy inside: if its code tries to end the process, that is an error (`forbid_exit`)."""
+    return forbid_exit(f"policy {_class_of(policy)}")
 
 
 def _class_of(policy: Policy) -> str:

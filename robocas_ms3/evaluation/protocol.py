@@ -23,11 +23,11 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from robocas_ms3.core.checks import GREATEST_SEED, parse_shard
+from robocas_ms3.core.checks import MAX_SEED, parse_shard
 from robocas_ms3.core.documents import ARRAYS_LIMIT, JSON_LIMIT, DocumentError, load_yaml, read_bytes, read_text
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.paths import protocols_dir
-from robocas_ms3.core.strict_model import LONGEST_NAME, FileName, StrictModel, nearest, parse, parse_json
+from robocas_ms3.core.strict_model import MAX_NAME_BYTES, FileName, StrictModel, did_you_mean, parse, parse_json
 from robocas_ms3.evaluation.policy import CONVENTIONS, PolicySpec
 from robocas_ms3.evaluation.settings import EvaluationSettings
 from robocas_ms3.robots.registry import DEFAULT as DEFAULT_ROBOT
@@ -113,10 +113,10 @@ class ProtocolEpisode(StrictModel):
 
     episode: Annotated[int, Field(ge=0, le=10**7)] = Field(description="its number, from 0 on")
     task: str
-    config: Annotated[str, Field(pattern=CONFIG_NAME, max_length=LONGEST_NAME)] = Field(
+    config: Annotated[str, Field(pattern=CONFIG_NAME, max_length=MAX_NAME_BYTES)] = Field(
         description="name of a file in configs/"
     )
-    seed: Annotated[int, Field(ge=0, le=GREATEST_SEED)]
+    seed: Annotated[int, Field(ge=0, le=MAX_SEED)]
     split: str = Field(default="test", description="what it belongs to, such as a suite's")
     instruction: str = Field(description="what the policy is told")
     target: str = Field(description="id of the object that is meant")
@@ -153,7 +153,7 @@ class LoadedProtocol:
             for name in names:
                 if name not in known:
                     other = "Name a protocol that has it, or make one: robocas eval freeze."
-                    expected, fix = ", ".join(known), nearest(name, known) or other
+                    expected, fix = ", ".join(known), did_you_mean(name, known) or other
                     raise EvaluationError(f"the protocol has no such {kind}", expected=expected, found=name, fix=fix)
         (index, count), of_config, chosen = parse_shard(settings.shard, EvaluationError), Counter[str](), []
         for episode in self.episodes:
@@ -175,7 +175,7 @@ class LoadedProtocol:
             for name in spec.cameras:
                 if name not in known:
                     where, expected = f"{self.rules.name}, {config}", f"some of {', '.join(known)}"
-                    fix = nearest(name, known)
+                    fix = did_you_mean(name, known)
                     raise EvaluationError("no such camera", where=where, expected=expected, found=name, fix=fix)
 
     def check_one_configuration(self, episodes: Sequence[ProtocolEpisode], fix: str = "") -> None:
@@ -216,7 +216,10 @@ def load_protocol(name: str | Path) -> LoadedProtocol:
     shipped = shipped_protocols()
     folder = shipped.get(str(name), Path(name)).absolute()
     if not (folder / RULES).is_file():
-        expected, fix = f"a folder with {RULES}, or one of {', '.join(sorted(shipped))}", nearest(str(name), shipped)
+        expected, fix = (
+            f"a folder with {RULES}, or one of {', '.join(sorted(shipped))}",
+            did_you_mean(str(name), shipped),
+        )
         raise EvaluationError("no such protocol", where=name, expected=expected, fix=fix)
     try:
         data = load_yaml(folder / RULES)

@@ -21,9 +21,9 @@ from pydantic import BaseModel, ConfigDict
 
 from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.core.files import replacing_folder, write_json
+from robocas_ms3.core.files import atomic_folder, write_json
 from robocas_ms3.core.json_lines import JsonLinesFile
-from robocas_ms3.core.output_folder import FolderKind, OutputFolder, check_replaceable, setting_changes
+from robocas_ms3.core.output_folder import FolderKind, OutputFolder, check_replaceable, list_setting_changes
 from robocas_ms3.core.strict_model import parse
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.statistics import SuccessRate, success_rate
@@ -170,7 +170,7 @@ def read(*folders: Path) -> Result:
     for part in parts:
         expected, found = first.run.identity(), part.run.identity()
         if key := next((key for key in found if expected[key] != found[key]), ""):
-            changes = "; ".join(setting_changes(expected[key], found[key], key))
+            changes = "; ".join(list_setting_changes(expected[key], found[key], key))
             raise EvaluationError(
                 f"no part of one result with {first.folder}: another {key}", where=part.folder, found=changes
             )
@@ -205,7 +205,7 @@ def merge(folders: Sequence[Path], out: Path) -> Result:
     """Write parts of a result as one, into a folder that appears whole."""
     result = read(*folders)
     check_replaceable(out)
-    with replacing_folder(out) as folder:
+    with atomic_folder(out) as folder:
         write_json(folder / RUN, result.run.entries())
         _ledger(folder).rewrite(result.outcomes.values())
     return read(out)
@@ -235,7 +235,7 @@ def _outcomes(folder: Path) -> dict[int, Outcome]:
         if line.record is not None:
             _add(found, line.record, f"{ledger.path}:{line.number}")
         elif not line.cut_off:
-            raise ledger.refusal(line, EvaluationError, "no outcome of an episode") from line.problem
+            raise ledger.line_error(line, EvaluationError, "no outcome of an episode") from line.problem
     return found
 
 
@@ -243,6 +243,6 @@ def _add(outcomes: dict[int, Outcome], outcome: Outcome, where: str) -> None:
     """Add an episode, which may exist already with the same outcome."""
     before = outcomes.setdefault(outcome.episode, outcome).without_clock()
     now = outcome.without_clock()
-    if changes := [change for key in now for change in setting_changes(before[key], now[key], key)]:
+    if changes := [change for key in now for change in list_setting_changes(before[key], now[key], key)]:
         what = f"two outcomes of episode {outcome.episode} disagree"
         raise EvaluationError(what, where=where, found="; ".join(changes))

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import EvaluationError, PolicyError
-from robocas_ms3.core.text import printable
+from robocas_ms3.core.text import escape_controls
 from robocas_ms3.evaluation.metrics import MEASURES, read_sum
 from robocas_ms3.evaluation.outcomes import Outcome, Retrieval, failure_stage
 from robocas_ms3.evaluation.policy import (
@@ -72,7 +72,7 @@ class Rollout:
             steps=self.steps,
             seconds=round(self.seconds, 4),
             failure_stage=failure_stage(flags, self.error, TASKS[episode.task].stages),
-            error=printable(self.error),  # a text of the policy's code
+            error=escape_controls(self.error),  # a text of the policy's code
             flags=flags,
             flag_seconds=self.flag_seconds,
             measures=self.measures,

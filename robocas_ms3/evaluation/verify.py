@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from robocas_ms3.core.text import count_of
+from robocas_ms3.core.text import format_count
 from robocas_ms3.evaluation.outcomes import Outcome, failure_stage, score_of
 from robocas_ms3.evaluation.protocol import DEFAULT_HZ, LoadedProtocol, ProtocolEpisode
 from robocas_ms3.evaluation.results import Result, RunRecord
@@ -30,12 +30,12 @@ def problems(result: Result, protocol: LoadedProtocol) -> list[str]:
         found += [f"episode {number}: {problem}" for problem in of_episode]
     missing = len(set(range(count)) - result.outcomes.keys())
     if missing:
-        found.append(f"missing: {missing} of {count_of(count, 'episode')}")
+        found.append(f"missing: {missing} of {format_count(count, 'episode')}")
     return found
 
 
 def _problems(outcome: Outcome, episode: ProtocolEpisode, protocol: LoadedProtocol, run: RunRecord) -> Iterator[str]:
-    rules, flags, steps = protocol.rules, outcome.flags, count_of(outcome.steps, "step")
+    rules, flags, steps = protocol.rules, outcome.flags, format_count(outcome.steps, "step")
     for name in ("task", "config", "seed", "split", "p_vis"):
         if getattr(outcome, name) != getattr(episode, name):
             yield f"{name} is {getattr(outcome, name)}, not {getattr(episode, name)}"

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import RobotDescriptionError
-from robocas_ms3.core.text import error_line
+from robocas_ms3.core.text import format_error
 from robocas_ms3.planning.kinematics import ArmChain
 from robocas_ms3.planning.protocol import Array
 from robocas_ms3.planning.shapes import convex_hull, fcl_convex
@@ -137,7 +137,7 @@ def _read_hull(path: Path, scale: Array, link: str) -> tuple[Array, NDArray[np.i
             f"unusable collision mesh of link {link!r}",
             where=path,
             expected="a mesh with a volume in a format that trimesh loads, such as STL or OBJ",
-            found=error_line(error),
+            found=format_error(error),
             fix="Export the mesh again, as STL.",
         ) from error
     return corners, faces

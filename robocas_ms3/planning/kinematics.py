@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import PlanningError
-from robocas_ms3.core.extensions import load
+from robocas_ms3.core.extensions import load_object
 from robocas_ms3.planning.protocol import Array
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.robots.description_file import DescriptionFile
@@ -137,7 +137,7 @@ class Reachability:
     def __init__(self, chain: ArmChain) -> None:
         self.chain = chain
         self.lower, self.upper = self.chain.lower, self.chain.upper
-        self._geometry = load(self.chain.robot.inverse_kinematics)(self.chain)
+        self._geometry = load_object(self.chain.robot.inverse_kinematics)(self.chain)
 
     def reachable(self, tcp_in_base: Array, near: Array) -> tuple[NDArray[np.bool_], Array]:
         """Find for each pose (N, 4, 4) the solution that is nearest to a configuration (7,).

@@ -18,7 +18,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, TypeAdapter, ValidationError
 
-from robocas_ms3.core.checks import GREATEST_SEED
+from robocas_ms3.core.checks import MAX_SEED
 from robocas_ms3.core.documents import JSON_LIMIT, DocumentError, load_json, read_bytes
 from robocas_ms3.core.errors import PlanError
 from robocas_ms3.core.files import flush_to_disk, make_folder
@@ -43,7 +43,7 @@ Seconds = Annotated[float, Field(ge=0, le=1e12)]
 class Outcome:
     """Outcome of a seed."""
 
-    seed: Annotated[int, Field(ge=0, le=GREATEST_SEED)]
+    seed: Annotated[int, Field(ge=0, le=MAX_SEED)]
     success: bool  # whether there is an episode
     steps: Count = 0  # control steps of the episode
     failures: list[str] = field(default_factory=list)  # "stage: reason" of each attempt that failed

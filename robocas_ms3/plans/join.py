@@ -15,9 +15,9 @@ from typing import Any
 
 from robocas_ms3.core.documents import DAMAGED_FILE_ERRORS, load_array, load_json
 from robocas_ms3.core.errors import PlanError
-from robocas_ms3.core.files import flush_to_disk, json_text, make_folder, replacing, write_json
-from robocas_ms3.core.output_folder import sweep
-from robocas_ms3.core.text import count_of, one_line
+from robocas_ms3.core.files import atomic_file, flush_to_disk, json_text, make_folder, write_json
+from robocas_ms3.core.output_folder import remove_leftovers
+from robocas_ms3.core.text import format_count, one_line
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.conversion.data_info import write_info
 from robocas_ms3.datasets.conversion.episode_plan import dataset_settings, header
@@ -93,17 +93,17 @@ def _join_files(folder: PlanFolder, files: EpisodeFiles, on_stage: OnStage) -> N
     seeds = {part: [each.seed for each in episodes] for part, episodes in files.items()}
     for part, episodes in files.items() if "layouts" in plan.stages else ():
         path, layouts = out / LAYOUTS / f"{plan.name_of(part)}.npy", [each.layout for each in episodes]
-        sweep(make_folder(path.parent))
+        remove_leftovers(make_folder(path.parent))
         damage, write = partial(_layouts_damage, path, seeds[part]), partial(join_frozen, path, layouts)
         _join_file(path, layouts, damage, write, partial(on_stage, f"joining layouts, {plan.name_of(part)}"))
     if "datasets" in plan.stages:
         root, count = out / DATASETS / "robocas", sum(map(len, files.values()))
-        sweep(make_folder(root))
+        remove_leftovers(make_folder(root))
         damage, write = partial(_dataset_damage, root, count), partial(_join_dataset, plan, root, files)
         _join_file(root, _dataset_sources(plan, root, files), damage, write, partial(on_stage, "joining the dataset"))
     for part, episodes in files.items() if "demonstrations" in plan.stages else ():
         path, recordings = out / DEMOS / plan.name_of(part) / TRAJECTORY, [each.recording for each in episodes]
-        sweep(make_folder(path.parent))
+        remove_leftovers(make_folder(path.parent))
         damage, write = partial(damage_of, path, seeds[part]), partial(merge, recordings, path)
         _join_file(path, recordings, damage, write, partial(on_stage, f"joining demonstrations, {plan.name_of(part)}"))
 
@@ -145,7 +145,7 @@ def _dataset_damage(root: Path, count: int) -> str:
     except (OSError, ValueError, KeyError, TypeError) as error:
         return _reason(error)
     missing = sorted({schema.episode_folder(number) for number in range(count)} - names)
-    return f"no {missing[0]}" if missing else "" if listed == count else f"{listed} of {count_of(count, 'episode')}"
+    return f"no {missing[0]}" if missing else "" if listed == count else f"{listed} of {format_count(count, 'episode')}"
 
 
 def _reason(error: Exception) -> str:
@@ -183,7 +183,7 @@ def _set_source(path: Path, source: dict[str, Any]) -> None:
     """Set in an episode's ``scene.json`` where its recording is in the end."""
     scene = load_json(path)
     text = json_text({**scene, "source": {**scene["source"], **source}}, path, indent=1)
-    with replacing(path, sync=True) as tmp:
+    with atomic_file(path, sync=True) as tmp:
         tmp.write_text(text + "\n", encoding="utf-8")
 
 

@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.assets.pack import MANIFEST, pack_folders, sha256
-from robocas_ms3.core.checks import GREATEST_SEED
+from robocas_ms3.core.checks import MAX_SEED
 from robocas_ms3.core.documents import DocumentError, load_yaml
 from robocas_ms3.core.errors import MissingExtraError, PlanError, require_extra
 from robocas_ms3.core.paths import plans_dir
 from robocas_ms3.core.strict_model import parse
-from robocas_ms3.core.text import error_line, nearest
+from robocas_ms3.core.text import did_you_mean, format_error
 from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.plans.plan import PartConfig, Plan
 from robocas_ms3.robots.registry import find_robot
@@ -44,7 +44,7 @@ def load_plan(plan: str | Path) -> Plan:
     if str(plan) in shipped:
         path = shipped[str(plan)]
     elif path.suffix not in {".yaml", ".yml"} or not path.is_file():
-        expected, fix = f"a YAML file, or one of {', '.join(shipped)}", nearest(str(plan), shipped)
+        expected, fix = f"a YAML file, or one of {', '.join(shipped)}", did_you_mean(str(plan), shipped)
         raise PlanError("no such plan", where=plan, expected=expected, fix=fix)
     try:
         data = load_yaml(path)
@@ -129,14 +129,14 @@ def part_error_context(plan: Plan, part: int) -> Iterator[None]:
     except Exception as error:
         if isinstance(error, OSError) and error.errno:
             raise
-        found, fix = error_line(error), "Repair it, and run the command again."
+        found, fix = format_error(error), "Repair it, and run the command again."
         raise PlanError("this part can't be opened", where=f"part {config.name}", found=found, fix=fix) from error
 
 
 def _completed(part: PartConfig, number: int, path: Path) -> tuple[PartConfig, Any]:
     """Return a part with its configuration, pack and name; and what its scenes depend on."""
     if part.task not in TASKS:
-        where, expected, fix = f"{path}, parts.{number}", ", ".join(TASKS), nearest(part.task, list(TASKS))
+        where, expected, fix = f"{path}, parts.{number}", ", ".join(TASKS), did_you_mean(part.task, list(TASKS))
         raise PlanError("no such task", where=where, expected=expected, found=repr(part.task), fix=fix)
     spec = TASKS[part.task]
     name, config = part.config or spec.default_config, part.config or spec.default_config
@@ -181,9 +181,9 @@ def _check_seeds(parts: Sequence[PartConfig], scenes: Sequence[Any], block: int,
     """Check that no two parts may try the same seed of a scene: a dataset has no episode twice."""
     for number, part in enumerate(parts):
         where, most = f"{path}, parts.{number}.seed", max_seeds(part.episodes, block)
-        if part.seed + most > GREATEST_SEED:
-            expected = f"<= {GREATEST_SEED - most}"
-            raise PlanError(f"seeds end at {GREATEST_SEED}", where=where, expected=expected, found=part.seed)
+        if part.seed + most > MAX_SEED:
+            expected = f"<= {MAX_SEED - most}"
+            raise PlanError(f"seeds end at {MAX_SEED}", where=where, expected=expected, found=part.seed)
         for other, scene in zip(parts[:number], scenes, strict=False):
             first, last = sorted((part, other), key=lambda each: each.seed)
             end = first.seed + max_seeds(first.episodes, block)

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from robocas_ms3.core.checks import GREATEST_SEED
+from robocas_ms3.core.checks import MAX_SEED
 from robocas_ms3.core.strict_model import StrictModel
 from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.datasets.lerobot.variants import NEWEST, Version
@@ -27,7 +27,7 @@ class PartConfig(StrictModel):
     )
     pack: str = "builtin"
     episodes: Annotated[int, Field(ge=1, le=1_000_000)] = Field(description="number of successful episodes")
-    seed: Annotated[int, Field(ge=0, le=GREATEST_SEED)] = Field(default=0, description="first seed; others follow")
+    seed: Annotated[int, Field(ge=0, le=MAX_SEED)] = Field(default=0, description="first seed; others follow")
     split: Split | None = Field(default=None, description="split of all its episodes; default: by the plan's rule")
     name: Annotated[str, Field(pattern=r"^[\w-]+$", max_length=60)] | None = Field(
         default=None, description="name of its folders"

@@ -14,7 +14,7 @@ from typing import Any
 from robocas_ms3.core.errors import PlanError
 from robocas_ms3.core.output_folder import OutputFolder
 from robocas_ms3.core.signals import deferred_interrupts
-from robocas_ms3.core.text import count_of
+from robocas_ms3.core.text import format_count
 from robocas_ms3.plans.executors import Executor
 from robocas_ms3.plans.folder import WorkUnit, read_plan
 from robocas_ms3.plans.join import join
@@ -63,7 +63,7 @@ def run_plan(
             progress = Progress(folder)
             _run_units(executor, progress, output, on_status)
             if damaged := progress.delete_damaged():
-                on_stage(f"{count_of(sum(map(len, damaged.values())), 'episode')} again: damaged files")
+                on_stage(f"{format_count(sum(map(len, damaged.values())), 'episode')} again: damaged files")
                 _run_units(executor, progress, output, on_status)
             if damaged := damaged and progress.delete_damaged():
                 unit, seeds = min(damaged.items())
@@ -108,7 +108,7 @@ def join_plan(out: Path, *, jobs: int = 1, on_stage: Callable[[str], None] = _ig
         progress.delete_damaged()
         missing = [f"{folder.unit_folder(unit).relative_to(out)}" for unit in progress.missing()]
         if missing:
-            found, fix = f"{count_of(len(missing), 'unit')}, {missing[0]} first", "robocas plan run does them."
+            found, fix = f"{format_count(len(missing), 'unit')}, {missing[0]} first", "robocas plan run does them."
             raise PlanError("work units are missing", where=out, found=found, fix=fix)
         return join(folder, progress.chosen(), jobs=jobs, on_stage=on_stage)
 

@@ -27,8 +27,8 @@ from robocas_ms3.core.errors import (
     WorkerStartError,
 )
 from robocas_ms3.core.files import remove, write_json
-from robocas_ms3.core.output_folder import sweep
-from robocas_ms3.core.text import error_line
+from robocas_ms3.core.output_folder import remove_leftovers
+from robocas_ms3.core.text import format_error
 from robocas_ms3.core.workers import Limits, WorkerPool, use_one_torch_thread
 from robocas_ms3.datasets.conversion import rendered_source
 from robocas_ms3.datasets.conversion.conversion_input import ConversionInput
@@ -236,9 +236,9 @@ class WorkUnitWorker:
             except Exception as error:
                 if not _is_of_a_seed(error):
                     raise
-                reason = error_line(error, 200)
+                reason = format_error(error, 200)
             crashes.append(f"{stage}: {reason}")
-            sweep(files.folder)
+            remove_leftovers(files.folder)
         return {"success": False, "failures": [crashes[-1]]}
 
     def stop(self) -> None:

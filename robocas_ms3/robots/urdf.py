@@ -17,7 +17,7 @@ from xml.etree.ElementTree import Element, SubElement
 
 from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.core.files import make_folder, open_for_append, replacing_folder
+from robocas_ms3.core.files import atomic_folder, make_folder, open_for_append
 from robocas_ms3.core.locks import lock_file
 from robocas_ms3.core.paths import cache_dir
 from robocas_ms3.robots.description import MOBILE_PANDA as c
@@ -272,7 +272,7 @@ def made_once(folder: Path, make: Callable[[Path], None]) -> None:
         lock_file(lock, folder, wait=True)
         if _is_complete(folder):
             return
-        with replacing_folder(folder) as tmp:
+        with atomic_folder(folder) as tmp:
             make(tmp)
             names = sorted(str(path.relative_to(tmp)) for path in tmp.rglob("*") if path.is_file())
             (tmp / "files.json").write_text(json.dumps(names, indent=1), encoding="utf-8")

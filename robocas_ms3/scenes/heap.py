@@ -24,7 +24,7 @@ from robocas_ms3.assets.physics import (
 )
 from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.core.poses import planar, transform
-from robocas_ms3.core.text import count_of
+from robocas_ms3.core.text import format_count
 from robocas_ms3.scenes.config.task import StackedLayout
 from robocas_ms3.scenes.placement import Array, Region
 
@@ -81,7 +81,7 @@ def drop_heap(
         if inside.all() and top - region.z < headroom:
             return poses
     raise LayoutError(
-        f"no heap here of {count_of(len(assets), 'object')}",
+        f"no heap here of {format_count(len(assets), 'object')}",
         where="layout",
         found=f"{_TRIES} heaps fell apart" + (f" or rose above {headroom:.3f} m" if np.isfinite(headroom) else ""),
         fix="Lower objects.count or enlarge the surface.",

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.documents import open_arrays
-from robocas_ms3.core.files import replacing
+from robocas_ms3.core.files import atomic_file
 
 Array = NDArray[np.float64]
 
@@ -79,7 +79,7 @@ def write_layout(layout: Layout, path: Path) -> None:
     }
     archive = BytesIO()  # a zip file on a full disk raises once more when it is closed
     np.savez(archive, **arrays)
-    with replacing(path) as tmp:
+    with atomic_file(path) as tmp:
         tmp.write_bytes(archive.getbuffer())
 
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.documents import DAMAGED_FILE_ERRORS, check_regular, load_array
 from robocas_ms3.core.errors import LayoutError
-from robocas_ms3.core.files import replacing
+from robocas_ms3.core.files import atomic_file
 from robocas_ms3.core.poses import from_wxyz, to_wxyz
 from robocas_ms3.scenes.layout import Layout, ObjectIds
 
@@ -223,7 +223,7 @@ def _open(path: Path, load: Callable[[Path], Any], what: str, *, dimensions: int
 
 
 def _save(path: Path, rows: NDArray[np.void]) -> None:
-    with replacing(path) as tmp, tmp.open("wb") as file:
+    with atomic_file(path) as tmp, tmp.open("wb") as file:
         np.save(file, rows)
 
 

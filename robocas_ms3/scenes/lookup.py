@@ -11,7 +11,7 @@ from robocas_ms3.assets.manifest import Joint
 from robocas_ms3.assets.pack import LoadedFurniture, Pack, load_pack
 from robocas_ms3.core.errors import ConfigError
 from robocas_ms3.core.poses import planar
-from robocas_ms3.core.strict_model import nearest
+from robocas_ms3.core.strict_model import did_you_mean
 from robocas_ms3.scenes.config.task import OrderlyLayout, PlacedConfig, PoseConfig, SurfaceConfig, TaskConfig
 from robocas_ms3.scenes.placement import Array, Region
 from robocas_ms3.scenes.relations import NEED_THREE, RELATIONS
@@ -33,7 +33,7 @@ def furniture_pose(config: PlacedConfig, furniture: LoadedFurniture) -> Array:
 
 def _check_known(what: str, found: str, known: Collection[str]) -> None:
     if found not in known:
-        raise ConfigError(what, expected=f"one of {sorted(known)}", found=found, fix=nearest(found, known))
+        raise ConfigError(what, expected=f"one of {sorted(known)}", found=found, fix=did_you_mean(found, known))
 
 
 def find_furniture(pack: Pack, asset_id: str, *, key: str) -> LoadedFurniture:
@@ -125,7 +125,7 @@ def resolve_ids(pack: Pack, wanted: list[str | int] | list[str], *, key: str) ->
         expected = f"one of {sorted(pack.objects)}" + (
             f", or a GraspNet number of {sorted(numbers)}" if numbers else ""
         )
-        likely = " ".join(filter(None, (nearest(i, pack.objects) for i in unknown)))
+        likely = " ".join(filter(None, (did_you_mean(i, pack.objects) for i in unknown)))
         if likely:
             expected = f"ids of `robocas assets info {pack.name}`"
         what = f"{key}: no such object in pack {pack.name!r}"

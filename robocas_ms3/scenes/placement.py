@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.core.poses import planar
-from robocas_ms3.core.text import count_of
+from robocas_ms3.core.text import format_count
 from robocas_ms3.scenes.config.task import OrderlyLayout, ScatteredLayout
 
 Array = NDArray[np.float64]
@@ -82,7 +82,7 @@ def sample_scattered(
             poses[index] = planar(x, y, region.z, yaws[best]) @ placeable.resting_poses[choice]
         if len(placed) == len(placeables):
             return poses
-    size, things = np.subtract(region.max_xy, region.min_xy), count_of(len(placeables), "object")
+    size, things = np.subtract(region.max_xy, region.min_xy), format_count(len(placeables), "object")
     raise LayoutError(
         f"no room for {things} {min_gap * 100:.1f} cm apart on {size[0]:.2f} x {size[1]:.2f} m",
         where="layout",
@@ -163,7 +163,7 @@ def sample_orderly(
     (left, back), (right, edge) = corners.min(axis=0), corners.max(axis=0)
     count = int((taken <= right - left).sum()) if layout.keep_what_fits else len(members)
     if count == 0 or taken[count - 1] > right - left:
-        raise _does_not_fit(f"{count_of(len(members), 'column')} side by side", taken[count - 1], right - left)
+        raise _does_not_fit(f"{format_count(len(members), 'column')} side by side", taken[count - 1], right - left)
     start = left + widths[0] / 2 + rng.uniform() * (right - left - taken[count - 1])
 
     poses, there = np.tile(np.eye(4), (len(placeables), 1, 1)), np.zeros(len(placeables), dtype=bool)

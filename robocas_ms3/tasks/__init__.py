@@ -5,7 +5,7 @@ from typing import Any
 
 from mani_skill.utils.registration import REGISTERED_ENVS, register
 
-from robocas_ms3.core.extensions import load
+from robocas_ms3.core.extensions import load_object
 from robocas_ms3.robots.registry import ROBOTS
 from robocas_ms3.scenes.task_specs import TASKS, TaskSpec
 from robocas_ms3.tasks.open_pick import RoboCASOpenPickEnv
@@ -21,7 +21,7 @@ def env_class(name: str) -> Any:
         ExtensionError: the task is unknown, or its environment can't be loaded.
     """
     task = TASKS.find(name)
-    env = load(task.env)
+    env = load_object(task.env)
     if task.env_id not in REGISTERED_ENVS:
         register(task.env_id, env, max_episode_steps=task.max_episode_steps)
     return env
@@ -30,7 +30,7 @@ def env_class(name: str) -> Any:
 for _name in TASKS.builtin:
     env_class(_name)
 for _robot in ROBOTS.builtin.values():
-    load(_robot.agent)
+    load_object(_robot.agent)
 
 # Without a GPU each environment warns that rendering might be disabled, which a renderer on the CPU does as well.
 # The blank is in the logger's name.

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from robocas_ms3.assets.pack import VISUALS
 from robocas_ms3.assets.physics import CONTACT_OFFSET
 from robocas_ms3.core.errors import ConfigError, SimulationError, VectorEnvError
-from robocas_ms3.core.text import error_line
+from robocas_ms3.core.text import format_error
 from robocas_ms3.scenes.config import TaskConfig
 from robocas_ms3.scenes.task_specs import SIM_FREQ, STANDARD_FREQ
 
@@ -81,7 +81,7 @@ def _start_gpu_physics() -> None:
             'On the CPU: backend="processes" of make_vec, robocas eval --backend processes, robocas train --device cpu.'
         )
         what = "PhysX does not start on the GPU"
-        raise VectorEnvError(what, where="sim_backend", found=error_line(error), fix=fix) from error
+        raise VectorEnvError(what, where="sim_backend", found=format_error(error), fix=fix) from error
 
 
 def sim_config(num_envs: int, config: TaskConfig) -> SimConfig:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.text import called
+from robocas_ms3.core.text import format_object_name
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.sources.episode_source import EpisodeSource, Kind
 from robocas_ms3.demos.failures import Failure
@@ -102,7 +102,7 @@ class PageContent:
             steps=steps,
             instruction=instruction,
             task=scene.get("task") or "",
-            object=called(target.get("asset_id") or "", target.get("name") or ""),
+            object=format_object_name(target.get("asset_id") or "", target.get("name") or ""),
             seed=one_seed(scene.get("seed")),
             success=scene.get("success"),
             split=split,

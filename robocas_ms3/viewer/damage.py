@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 from robocas_ms3.core.documents import DAMAGED_FILE_ERRORS
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.text import error_line
+from robocas_ms3.core.text import format_error
 from robocas_ms3.datasets.checks.scene import valid_values
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 
@@ -23,7 +23,7 @@ def readable(where: object) -> Iterator[None]:
     try:
         yield
     except _WRONG as error:
-        what, found = "damaged, can't be shown", error_line(error)
+        what, found = "damaged, can't be shown", format_error(error)
         raise DatasetError(what, where=where, found=found, fix=SEE_VALIDATE) from error
 
 

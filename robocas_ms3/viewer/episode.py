@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.poses import from_xyzw
-from robocas_ms3.core.text import called
+from robocas_ms3.core.text import format_object_name
 from robocas_ms3.demos.recordings.subgoals import subgoal_runs
 from robocas_ms3.robots.quantities import GRIPPER_WIDTH
 
@@ -82,7 +82,7 @@ def show_arrays(
 
 def _objects(scene: Mapping[str, Any]) -> list[dict[str, Any]]:
     layout, target = scene.get("layout") or {}, (scene.get("target") or {}).get("slot")
-    names = {thing["slot"]: called(thing["id"], thing["name"]) for thing in scene.get("objects") or ()}
+    names = {thing["slot"]: format_object_name(thing["id"], thing["name"]) for thing in scene.get("objects") or ()}
     found = [
         {"name": names[slot], "target": slot == target, "path": [pose[:3]]}
         for slot, pose in enumerate(layout.get("poses") or ())

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.files import make_folder, replacing_folder
+from robocas_ms3.core.files import atomic_folder, make_folder
 from robocas_ms3.viewer.content import PageContent
 from robocas_ms3.viewer.damage import join_reasons, readable, reason
 from robocas_ms3.viewer.images import EncodedImage, depth_image, shrink_image
@@ -38,7 +38,7 @@ def export(
     rows = [e for e in index["episodes"] if e["n"] in set(chosen) or (e["n"] is None and not episodes)]
     index = {**index, "depth": index["depth"] and depth}
     damaged = {row["n"]: row["damage"] for row in rows if row["damage"]}
-    with replacing_folder(out) as folder:
+    with atomic_folder(out) as folder:
         for name in PAGE_FILES:
             target = folder / name if name == "index.html" else make_folder(folder / "page") / name
             target.write_bytes(page_file(name))

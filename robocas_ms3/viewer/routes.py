@@ -24,7 +24,7 @@ from importlib.resources import files
 from typing import Any
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.text import printable
+from robocas_ms3.core.text import escape_controls
 from robocas_ms3.viewer import images
 from robocas_ms3.viewer.content import CAMERA_NAME, PageContent
 from robocas_ms3.viewer.images import EncodedImage
@@ -40,7 +40,7 @@ _NUMBER = r"(0|[1-9][0-9]{0,8})"
 _EPISODE = re.compile(rf"/data/episode_{_NUMBER}\.js")
 _IMAGE = re.compile(rf"/images/{_NUMBER}/({CAMERA_NAME.pattern})/(rgb|depth)/{_NUMBER}\.jpg")
 _THUMBNAIL = re.compile(rf"/thumbnails/{_NUMBER}\.jpg")
-_CONTROL = re.compile(  # of `text.printable`, but for surrogates, of which JSON makes emoji
+_CONTROL = re.compile(  # of `text.escape_controls`, but for surrogates, of which JSON makes emoji
     r"(?<!\\)((?:\\\\)*)\\(u(?:00[01].|007f|00[89].|061c|200[ef]|202[89a-e]|206[6-9]))"
 )
 
@@ -128,4 +128,4 @@ def _image(image: EncodedImage) -> Response:
 
 
 def _not_found(why: str) -> Response:
-    return Response(404, "text/plain; charset=utf-8", (printable(why) + "\n").encode())
+    return Response(404, "text/plain; charset=utf-8", (escape_controls(why) + "\n").encode())

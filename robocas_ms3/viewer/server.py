@@ -11,7 +11,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.core.text import print_traceback, printable
+from robocas_ms3.core.text import escape_controls, print_traceback
 from robocas_ms3.viewer.content import PageContent
 from robocas_ms3.viewer.routes import Response, Routes
 
@@ -111,7 +111,7 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             return server.routes.respond(urlsplit(self.path).path)
         except Exception as error:  # a broken episode must not end the connection of all others
-            text = printable(f"{type(error).__name__}: {error}") + "\n"
+            text = escape_controls(f"{type(error).__name__}: {error}") + "\n"
             return Response(500, "text/plain; charset=utf-8", text.encode())
 
     def log_message(self, format: str, *args: object) -> None:

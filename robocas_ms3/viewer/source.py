@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import from_xyzw, inverse, transform
-from robocas_ms3.core.text import called
+from robocas_ms3.core.text import format_object_name
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.formats import format_of
 from robocas_ms3.datasets.images.image_headers import read_image_bytes
@@ -202,8 +202,10 @@ def _object_paths(
     target = scene.get("target") or {}
     target_actor = f"object_{target['slot']}" if target else ""
     names = {thing["slot"]: thing["name"] for thing in scene.get("objects") or ()}
-    shown = {f"object_{slot}": called(str(asset), names.get(slot, "")) for slot, asset in enumerate(ids or ())}
-    shown[target_actor] = called(target.get("asset_id") or "", target.get("name") or "")
+    shown = {
+        f"object_{slot}": format_object_name(str(asset), names.get(slot, "")) for slot, asset in enumerate(ids or ())
+    }
+    shown[target_actor] = format_object_name(target.get("asset_id") or "", target.get("name") or "")
     found = []
     for actor, states in recording.states.get("actors", {}).items():
         path = states[:, :3].astype(float)

@@ -9,7 +9,7 @@ from robocas_ms3.core.documents import (
     JSON_DEPTH,
     YAML_DEPTH,
     DocumentError,
-    json_values,
+    decode_json,
     load_array,
     load_json,
     load_yaml,
@@ -87,7 +87,7 @@ def test_lone_surrogates_of_json_are_refused(file, text):
     with pytest.raises(DocumentError):
         load_json(file(text))
     with pytest.raises(DocumentError):
-        json_values(text)
+        decode_json(text)
     assert load_json(file('"\\ud83d\\ude00"')) == "\U0001f600"
 
 

@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from robocas_ms3.core.errors import ExtensionError
-from robocas_ms3.core.extensions import Registry, load
+from robocas_ms3.core.extensions import Registry, load_object
 
 
 @pytest.fixture
@@ -78,7 +78,7 @@ def test_the_error_of_an_unknown_name_suggests_the_nearest_one():
 
 
 def test_objects_by_import_path():
-    assert load("robocas_ms3.core.extensions:load") is load
+    assert load_object("robocas_ms3.core.extensions:load") is load_object
     for path in ("robocas_ms3.core.extensions:nothing", "robocas_ms3.nothing:load", "robocas_ms3.core.extensions"):
         with pytest.raises(ExtensionError, match=f"{path}: no such object .expected package.module:name"):
-            load(path)
+            load_object(path)

@@ -7,13 +7,20 @@ import pytest
 from robocas_ms3.core import files
 from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.core.files import make_folder, naming, open_for_append, replacing, replacing_folder, write_json
+from robocas_ms3.core.files import (
+    add_path_to_errors,
+    atomic_file,
+    atomic_folder,
+    make_folder,
+    open_for_append,
+    write_json,
+)
 
 
 def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path):
     path = tmp_path / "a.json"
     write_json(path, {"n": 1})
-    with pytest.raises(ZeroDivisionError), replacing(path) as tmp:
+    with pytest.raises(ZeroDivisionError), atomic_file(path) as tmp:
         tmp.write_text("half")
         _ = 1 / 0
     assert path.read_text() == '{\n  "n": 1\n}\n'
@@ -22,13 +29,13 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path):
 
 def test_a_folder_appears_whole_and_replaces_the_old_one(tmp_path):
     path = tmp_path / "pack"
-    with replacing_folder(path) as tmp:
+    with atomic_folder(path) as tmp:
         (tmp / "one").write_text("1")
         assert not path.exists()
-    with replacing_folder(path) as tmp:
+    with atomic_folder(path) as tmp:
         (tmp / "two").write_text("2")
     assert [p.name for p in path.iterdir()] == ["two"]
-    with pytest.raises(ZeroDivisionError), replacing_folder(path) as tmp:
+    with pytest.raises(ZeroDivisionError), atomic_folder(path) as tmp:
         _ = 1 / 0
     assert [p.name for p in tmp_path.iterdir()] == ["pack"]
 
@@ -46,7 +53,7 @@ def test_another_process_may_replace_a_folder_at_the_same_time(tmp_path, monkeyp
         replace(source, target)
 
     monkeypatch.setattr(files.os, "replace", replace_after_another)
-    with replacing_folder(path) as tmp:
+    with atomic_folder(path) as tmp:
         (tmp / "ours").touch()
     assert [p.name for p in path.iterdir()] == ["ours"]
     assert [p.name for p in tmp_path.iterdir()] == ["asset"]
@@ -58,7 +65,7 @@ def test_what_a_killed_run_left_is_swept_up_a_day_later(tmp_path):
         folder.mkdir()
     os.utime(old, (0, 0))
     os.utime(other, (0, 0))
-    with replacing_folder(tmp_path / "pack"):
+    with atomic_folder(tmp_path / "pack"):
         pass
     assert sorted(p.name for p in tmp_path.iterdir()) == [".pack.b.tmp", ".spack.c.tmp", "pack"]
 
@@ -75,10 +82,14 @@ def test_a_folder_that_cannot_be_made_says_what_chooses_it(tmp_path, monkeypatch
 
 def test_a_full_disk_is_that_of_what_is_written_not_of_what_is_copied(tmp_path):
     full = OSError(errno.ENOSPC, "No space left on device", "/site-packages/hand.stl", None, str(tmp_path / "hand.stl"))
-    with pytest.raises(OSError, match="No space") as error, naming(tmp_path / "outer"), naming(tmp_path / "robots"):
+    with (
+        pytest.raises(OSError, match="No space") as error,
+        add_path_to_errors(tmp_path / "outer"),
+        add_path_to_errors(tmp_path / "robots"),
+    ):
         raise full
     assert error.value.filename == str(tmp_path / "robots")
-    with pytest.raises(OSError, match="No such file") as error, naming(tmp_path / "robots"):
+    with pytest.raises(OSError, match="No such file") as error, add_path_to_errors(tmp_path / "robots"):
         (tmp_path / "gone").read_text()
     assert error.value.filename == str(tmp_path / "gone")
 
@@ -103,7 +114,7 @@ def test_what_is_to_survive_a_power_cut_is_on_the_disk_before_it_has_its_name(tm
     assert temporary.startswith(".b.")
     assert temporary.endswith(".tmp.json")  # as `outputs.sweep` looks for it
     done.clear()
-    with replacing_folder(tmp_path / "folder", sync=True) as folder:
+    with atomic_folder(tmp_path / "folder", sync=True) as folder:
         (folder / "file").write_text("")
     assert done == [("sync", folder.name), ("rename", folder.name)]
 
@@ -127,7 +138,7 @@ def test_a_temporary_name_is_another_each_time(tmp_path):
     """A symbolic link under a name known before would lead the writer to another file."""
     names = set()
     for _ in range(3):
-        with replacing(tmp_path / "run.json") as tmp:
+        with atomic_file(tmp_path / "run.json") as tmp:
             tmp.write_text("{}")
             names.add(tmp.name)
     assert len(names) == 3

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from robocas_ms3.core.errors import OutputExistsError, RobocasError
-from robocas_ms3.core.files import replacing_folder
+from robocas_ms3.core.files import atomic_folder
 from robocas_ms3.core.locks import locked_folder
-from robocas_ms3.core.output_folder import FolderKind, OutputFolder, check_replaceable, sweep
+from robocas_ms3.core.output_folder import FolderKind, OutputFolder, check_replaceable, remove_leftovers
 
 KIND = FolderKind("robocas test", ("run.json",), "rate", marks=("old_format",))
 SETTINGS = {"rate": 5, "camera": {"size": [640, 480], "depth": True}}
@@ -194,7 +194,7 @@ def test_leftovers_are_removed_and_links_are_not_followed(tmp_path):
     (tmp_path / "disk").mkdir()
     (tmp_path / "disk" / "file").touch()
     (tmp_path / ".link.tmp").symlink_to(tmp_path / "disk")
-    sweep(tmp_path)
+    remove_leftovers(tmp_path)
     assert names(tmp_path) == ["disk", "kept.tmp"]
     assert (tmp_path / "disk" / "file").exists()
 
@@ -226,10 +226,10 @@ def test_mounted_folder_is_locked_and_emptied_in_place(mounted):
 
 def test_mounted_folder_is_replaced_from_within(mounted):
     (mounted / "old").touch()
-    with pytest.raises(ZeroDivisionError), replacing_folder(mounted) as folder:
+    with pytest.raises(ZeroDivisionError), atomic_folder(mounted) as folder:
         (folder / "new").touch()
         _ = 1 / 0
     assert names(mounted) == ["old"]
-    with replacing_folder(mounted) as folder:
+    with atomic_folder(mounted) as folder:
         (folder / "new").mkdir()
     assert names(mounted) == ["new"]

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from robocas_ms3.core.errors import ExtensionError
-from robocas_ms3.core.extensions import Registry, load
-from robocas_ms3.core.signals import no_exit
+from robocas_ms3.core.extensions import Registry, load_object
+from robocas_ms3.core.signals import forbid_exit
 from robocas_ms3.core.workers import FunctionWorker, WorkerPool
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -21,8 +21,8 @@ PYTHONS_OWN = "import signal; signal.signal(signal.SIGINT, signal.default_int_ha
 NATIVE = """
 import hashlib
 from contextlib import nullcontext
-from robocas_ms3.core.signals import deferred_interrupts, heed_ctrl_c
-heed_ctrl_c()
+from robocas_ms3.core.signals import deferred_interrupts, handle_interrupts
+handle_interrupts()
 with deferred_interrupts(second_ends=False):
     pass
 with {around}:
@@ -37,11 +37,11 @@ LONG_CALLS = {
 }
 STEP = """
 import hashlib, os, signal, threading
-from robocas_ms3.core.signals import deferred_interrupts, heed_ctrl_c
+from robocas_ms3.core.signals import deferred_interrupts, handle_interrupts
 def interrupt():
     for _ in range(5):
         os.kill(os.getpid(), signal.SIGINT)
-heed_ctrl_c()
+handle_interrupts()
 try:
     with deferred_interrupts() as came:
         threading.Thread(target=interrupt).start()
@@ -53,8 +53,8 @@ except KeyboardInterrupt:
 """
 WRITING = """
 import time
-from robocas_ms3.core.signals import deferred_interrupts, heed_ctrl_c
-heed_ctrl_c()
+from robocas_ms3.core.signals import deferred_interrupts, handle_interrupts
+handle_interrupts()
 try:
     with deferred_interrupts(second_ends=False):
         print("ready", flush=True)
@@ -83,22 +83,22 @@ except KeyboardInterrupt:
 """
 ENDING = """
 import sys, time
-from robocas_ms3.core.signals import INTERRUPTED, heed_ctrl_c, leave
-heed_ctrl_c()
+from robocas_ms3.core.signals import INTERRUPTED, handle_interrupts, exit_command
+handle_interrupts()
 try:
     print("ready", flush=True)
     time.sleep(100)
 except KeyboardInterrupt:
     time.sleep({seconds})  # ends processes
     print("interrupted", file=sys.stderr)
-    leave(INTERRUPTED)
+    exit_command(INTERRUPTED)
 """
 UNSIGNALLED = """
 from robocas_ms3.core.errors import ExtensionError
-from robocas_ms3.core.signals import heed_ctrl_c, no_exit
-heed_ctrl_c()
+from robocas_ms3.core.signals import handle_interrupts, forbid_exit
+handle_interrupts()
 try:
-    with no_exit("policy mine:Policy"):
+    with forbid_exit("policy mine:Policy"):
         raise KeyboardInterrupt
 except ExtensionError as error:
     print(error.where)
@@ -166,11 +166,11 @@ def test_a_file_is_written_although_ctrl_c_came_twice():
 
 
 def test_an_exit_is_an_error_of_its_source():
-    with pytest.raises(ExtensionError) as caught, no_exit("policy mine:Policy"):
+    with pytest.raises(ExtensionError) as caught, forbid_exit("policy mine:Policy"):
         sys.exit(0)
     assert caught.value.where == "policy mine:Policy"
     assert __file__ in str(caught.value.found)
-    with pytest.raises(KeyboardInterrupt), no_exit("a library has no handler of its own"):
+    with pytest.raises(KeyboardInterrupt), forbid_exit("a library has no handler of its own"):
         raise KeyboardInterrupt
 
 
@@ -192,14 +192,14 @@ def test_the_import_of_an_extension_can_not_end_the_process(leaving):
     with pytest.raises(ExtensionError):
         numbers.find("bad")
     with pytest.raises(ExtensionError):
-        load("leaving_module:BAD")
+        load_object("leaving_module:BAD")
 
 
-def leave(how: BaseException) -> None:
+def raise_exit(how: BaseException) -> None:
     raise how
 
 
 @pytest.mark.parametrize("how", [SystemExit(0), KeyboardInterrupt()])
 def test_code_in_a_worker_can_not_end_the_program(how):
-    with WorkerPool(partial(FunctionWorker, leave), 2) as pool, pytest.raises(ExtensionError):
+    with WorkerPool(partial(FunctionWorker, raise_exit), 2) as pool, pytest.raises(ExtensionError):
         list(pool.map([how]))

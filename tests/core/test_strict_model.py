@@ -10,11 +10,11 @@ from robocas_ms3.core.strict_model import (
     FileName,
     StrictModel,
     check_name,
-    mistakes,
-    nearest,
+    did_you_mean,
+    error_from_validation,
+    list_invalid_values,
     parse,
     parse_json,
-    refusal,
 )
 
 
@@ -114,18 +114,18 @@ def test_other_words_and_other_forms():
     form = TypeAdapter(dict[str, Ball])
     with pytest.raises(ValidationError) as caught:
         form.validate_json('{"a": {"radius": "x"}, "b": 3}', strict=True)
-    first, second = mistakes(caught.value, form, {"float_type": "metres"})
+    first, second = list_invalid_values(caught.value, form, {"float_type": "metres"})
     assert (first.key, first.expected, first.found, first.value) == ("a.radius", "metres", "'x'", "x")
     assert (second.key, second.kind) == ("b", "model_type")
-    made = refusal(caught.value, form, AssetError, where="f", fix="Make it again.")
+    made = error_from_validation(caught.value, form, AssetError, where="f", fix="Make it again.")
     assert str(made) == (
         "f: wrong value for 'a.radius' (expected a number, found 'x'). 1 more after this one. Make it again."
     )
 
 
 def test_the_nearest_words():
-    assert nearest("shelv", ["table", "shelf"]) == "Did you mean shelf?"
-    assert nearest("sofa", ["table", "shelf"]) == ""
+    assert did_you_mean("shelv", ["table", "shelf"]) == "Did you mean shelf?"
+    assert did_you_mean("sofa", ["table", "shelf"]) == ""
 
 
 class Form(StrictModel):

@@ -4,15 +4,28 @@ import subprocess
 import sys
 
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.core.text import called, count_of, error_line, format_ranges, in_markdown, one_line, printable
+from robocas_ms3.core.text import (
+    escape_controls,
+    escape_markdown,
+    format_count,
+    format_error,
+    format_object_name,
+    format_ranges,
+    one_line,
+)
 
 
 def test_counts_ranges_and_names_of_objects():
-    assert [count_of(n, "episode") for n in (0, 1, 2)] == ["0 episodes", "1 episode", "2 episodes"]
+    assert [format_count(n, "episode") for n in (0, 1, 2)] == ["0 episodes", "1 episode", "2 episodes"]
     assert format_ranges([0, 1, 2, 5, 7, 8]) == "0-2, 5, 7-8"
-    assert called("large_elephant", "grey toy elephant") == "grey toy elephant (large elephant)"
-    assert called("jam_jar", "jam jar") == called("jam_jar") == called("", "jam jar") == "jam jar"
-    assert called("") == ""
+    assert format_object_name("large_elephant", "grey toy elephant") == "grey toy elephant (large elephant)"
+    assert (
+        format_object_name("jam_jar", "jam jar")
+        == format_object_name("jam_jar")
+        == format_object_name("", "jam jar")
+        == "jam jar"
+    )
+    assert format_object_name("") == ""
 
 
 HOSTILE = (
@@ -21,14 +34,14 @@ HOSTILE = (
 
 
 def test_control_characters_are_escapes_and_all_else_stays():
-    shown = printable(HOSTILE + "\n\té 😀 \u0645\u0646")
+    shown = escape_controls(HOSTILE + "\n\té 😀 \u0645\u0646")
     assert shown.isprintable()
     assert shown.encode()
     assert "\\u001b]0;title\\u0007\\u009b31m\\u007f\\u202eevil\\u2069\\u2028\\u000d\\udcff | `x` <script>" in shown
     assert shown.endswith("\\u000a\\u0009é 😀 \u0645\u0646")
-    assert printable(shown) == shown
-    assert printable("a\n\tb\x1b\r", lines=True) == "a\n\tb\\u001b\\u000d"
-    assert json.loads(printable(json.dumps(HOSTILE, ensure_ascii=False))) == HOSTILE  # as `--json` prints it
+    assert escape_controls(shown) == shown
+    assert escape_controls("a\n\tb\x1b\r", lines=True) == "a\n\tb\\u001b\\u000d"
+    assert json.loads(escape_controls(json.dumps(HOSTILE, ensure_ascii=False))) == HOSTILE  # as `--json` prints it
 
 
 MARKUP = "__bold__ _x_ a_b (_c_) https://a.example WWW.a.example ftp://b \\* $x$ C:\\_ end\\"
@@ -36,20 +49,20 @@ MARKUP = "__bold__ _x_ a_b (_c_) https://a.example WWW.a.example ftp://b \\* $x$
 
 def test_a_text_in_markdown_has_no_markup():
     for text in (HOSTILE, MARKUP):
-        shown = in_markdown(text)
+        shown = escape_markdown(text)
         assert shown.isprintable()
         assert not re.search(r"(?<!\\)(?:\\\\)*[<>|`*\[\]&$]|(?<!\\)://|www\.", shown, re.IGNORECASE)
         assert not re.search(r"(?<![\w\\])_|(?<!\\)_(?!\w)", shown)
-        assert re.sub(r"\\([!-/:-@\[-`{-~])", r"\1", shown) == printable(text)
-    assert in_markdown("pick_table_scattered 0.5 \x1b") == "pick_table_scattered 0.5 \\u001b"
+        assert re.sub(r"\\([!-/:-@\[-`{-~])", r"\1", shown) == escape_controls(text)
+    assert escape_markdown("pick_table_scattered 0.5 \x1b") == "pick_table_scattered 0.5 \\u001b"
 
 
 def test_an_error_is_one_line():
     assert one_line(ValueError("a\n  b\x1b"), 3) == "a b"
     assert one_line(TimeoutError()) == "TimeoutError"
     assert one_line(KeyError("steps")) == "no key 'steps'"
-    assert error_line(OSError("no\nroom")) == "OSError: no room"
-    assert error_line(RobocasError("bad", where="file")) == "file: bad"
+    assert format_error(OSError("no\nroom")) == "OSError: no room"
+    assert format_error(RobocasError("bad", where="file")) == "file: bad"
 
 
 def test_log_lines_of_this_package_are_one_line_without_control_characters(tmp_path):

@@ -83,7 +83,7 @@ def test_ledgers(tmp_path_factory, lines):
     ledger.path.write_bytes(b"\n".join(texts))
     for line in ledger.lines():
         if line.record is None:
-            assert "\n" not in str(ledger.refusal(line, DatasetError, "no try"))
+            assert "\n" not in str(ledger.line_error(line, DatasetError, "no try"))
         else:
             json.dumps([line.record.seconds, line.record.more], allow_nan=False)
     ledger.append([Try(1)])

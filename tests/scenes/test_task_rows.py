@@ -5,7 +5,7 @@ import inspect
 import pytest
 
 from robocas_ms3.core.errors import ConfigError
-from robocas_ms3.core.extensions import load
+from robocas_ms3.core.extensions import load_object
 from robocas_ms3.scenes.config import load_config_of
 from robocas_ms3.scenes.language.texts import Templates
 from robocas_ms3.scenes.targets import TargetRule
@@ -16,11 +16,11 @@ from robocas_ms3.scenes.task_specs import TASKS
 def test_what_a_row_names_is_there(spec):
     assert TASKS[spec.name] is spec
     assert load_config_of(spec).task == spec.name
-    assert isinstance(load(spec.target), TargetRule)
-    assert load(spec.env).SPEC is spec
-    assert list(inspect.signature(load(spec.solver)).parameters) == ["arm"]
+    assert isinstance(load_object(spec.target), TargetRule)
+    assert load_object(spec.env).SPEC is spec
+    assert list(inspect.signature(load_object(spec.solver)).parameters) == ["arm"]
     for check in spec.checks:
-        load(check)(load_config_of(spec))
+        load_object(check)(load_config_of(spec))
     assert Templates.for_task(spec).upstream
 
 

@@ -34,9 +34,9 @@ from robocas_ms3.baselines.lerobot.policy import (
     state_of,
 )
 from robocas_ms3.core.errors import DatasetError, RobocasError
-from robocas_ms3.core.files import replacing_folder, write_json
+from robocas_ms3.core.files import atomic_folder, write_json
 from robocas_ms3.core.output_folder import check_replaceable
-from robocas_ms3.core.text import printable
+from robocas_ms3.core.text import escape_controls
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset, LeRobotEpisode
 from robocas_ms3.datasets.lerobot.schema import INDICES, INFO_FILE, STAGING, STATS_FILE, image_key, is_depth
 from robocas_ms3.datasets.lerobot.stats import vector_stats
@@ -62,7 +62,7 @@ def prepare(source: Path, out: Path, embed: Embed | None) -> None:
     dataset = _open(source)
     features = dataset.info["features"]
     depths = [key for key, feature in features.items() if is_depth(feature)]  # policies would take it for RGB
-    with replacing_folder(out) as part:
+    with atomic_folder(out) as part:
         ignored = shutil.ignore_patterns(*_NOT_COPIED, *depths)
         shutil.copytree(source, part, ignore=ignored, copy_function=_link, dirs_exist_ok=True)
         vectors: dict[str, NDArray[np.float32]] = {}
@@ -147,7 +147,7 @@ def main(words: Sequence[str] | None = None) -> int:
             embed = TextEmbedder()
         prepare(cfg.dataset, cfg.out, embed)
     except RobocasError as error:
-        print(printable(f"error: {error}"), file=sys.stderr)
+        print(escape_controls(f"error: {error}"), file=sys.stderr)
         return 1
     return 0
 

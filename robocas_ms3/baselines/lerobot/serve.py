@@ -18,7 +18,7 @@ from typing import Any
 from robocas_ms3.baselines.lerobot.policy import LeRobotPolicy
 from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import EvaluationError, RobocasError
-from robocas_ms3.core.text import escape_log_lines, escape_tracebacks, printable
+from robocas_ms3.core.text import escape_controls, escape_log_lines, escape_tracebacks
 from robocas_ms3.datasets.lerobot.schema import checksum
 from robocas_ms3.evaluation.remote.server import PolicyServer
 
@@ -85,9 +85,11 @@ def main(words: Sequence[str] | None = None) -> int:
         checkpoint = cfg.run if (cfg.run / "config.json").is_file() else cfg.run / CHECKPOINT
         rate_hz = cfg.rate if cfg.rate is not None else rate_of(cfg.run / INFO)
         policy = open_checkpoint(checkpoint, rate_hz, cfg.device, cfg.play)
-        PolicyServer(policy, cfg.host, cfg.port).run(lambda url: print(printable(f"{checkpoint} at {url}"), flush=True))
+        PolicyServer(policy, cfg.host, cfg.port).run(
+            lambda url: print(escape_controls(f"{checkpoint} at {url}"), flush=True)
+        )
     except RobocasError as error:
-        print(printable(f"error: {error}"), file=sys.stderr)
+        print(escape_controls(f"error: {error}"), file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         return 130

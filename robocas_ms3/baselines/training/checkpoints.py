@@ -15,7 +15,7 @@ from safetensors.torch import save as to_bytes
 
 from robocas_ms3.baselines.training.record import WEIGHTS
 from robocas_ms3.core.errors import TrainingError
-from robocas_ms3.core.files import replacing
+from robocas_ms3.core.files import atomic_file
 
 Tensors = Mapping[str, torch.Tensor]
 
@@ -77,7 +77,7 @@ def save(path: Path, tensors: Tensors, metadata: Mapping[str, str], step: int) -
     """Write tensors; an existing file stays whole until the new one is."""
     copies = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
     content = _sort_header(to_bytes(copies, {**metadata, "step": str(step)}))
-    with replacing(path, sync=True) as tmp:
+    with atomic_file(path, sync=True) as tmp:
         tmp.write_bytes(content)  # save_file writes files that only the owner reads
 
 

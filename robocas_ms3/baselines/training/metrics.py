@@ -14,7 +14,7 @@ from typing import Any
 import torch
 
 from robocas_ms3.baselines.training.record import METRICS, TENSORBOARD
-from robocas_ms3.core.files import make_folder, naming, open_for_append, replacing
+from robocas_ms3.core.files import add_path_to_errors, atomic_file, make_folder, open_for_append
 
 _FIRST_COLUMNS = ("step", "split", "epoch", "seconds", "learning_rate")
 
@@ -66,7 +66,7 @@ class MetricsLog:
         is_first = not self._columns
         if is_first:
             self._columns = [*_FIRST_COLUMNS, *metrics]
-        with naming(self._path), TextIOWrapper(open_for_append(self._path), "utf-8", newline="") as file:
+        with add_path_to_errors(self._path), TextIOWrapper(open_for_append(self._path), "utf-8", newline="") as file:
             writer = csv.DictWriter(file, self._columns, extrasaction="ignore", lineterminator="\n")
             if is_first:
                 writer.writeheader()
@@ -86,7 +86,7 @@ class MetricsLog:
         self._columns = list(rows[0]) if rows else []
         if kept:
             self.seconds = _number(kept[-1]["seconds"], 0.0)
-        with replacing(self._path) as tmp, tmp.open("w", newline="", encoding="utf-8") as file:
+        with atomic_file(self._path) as tmp, tmp.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, self._columns, extrasaction="ignore", lineterminator="\n")
             if self._columns:
                 writer.writeheader()
@@ -105,7 +105,7 @@ class TensorBoardWriter:
         make_folder(folder)
         # TensorBoard reads the files in the order of their names
         self._path = folder / f"events.out.tfevents.{int(time.time()):010d}.{len(list(folder.iterdir())):04d}"
-        with naming(self._path):
+        with add_path_to_errors(self._path):
             self._records: Any = RecordWriter(self._path.open("xb"))
         self._write(file_version="brain.Event:2")
         if first:
@@ -118,11 +118,11 @@ class TensorBoardWriter:
         self._write(step=step, summary=summary(value=scalars))
 
     def close(self) -> None:
-        with naming(self._path):
+        with add_path_to_errors(self._path):
             self._records.close()
 
     def _write(self, **event: Any) -> None:
-        with naming(self._path):
+        with add_path_to_errors(self._path):
             self._records.write(self._events.Event(wall_time=time.time(), **event).SerializeToString())
             self._records.flush()
 

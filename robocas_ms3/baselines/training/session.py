@@ -28,8 +28,8 @@ from robocas_ms3.baselines.training.record import (
     read_run,
 )
 from robocas_ms3.core.errors import EmptySplitError, TrainingError, require_extra
-from robocas_ms3.core.output_folder import FolderKind, OutputFolder, setting_changes
-from robocas_ms3.core.signals import no_exit
+from robocas_ms3.core.output_folder import FolderKind, OutputFolder, list_setting_changes
+from robocas_ms3.core.signals import forbid_exit
 from robocas_ms3.core.strict_model import parse
 
 if TYPE_CHECKING:
@@ -95,7 +95,7 @@ def train_run(options: RunOptions, progress: Progress | None = None) -> RunRecor
     baseline: Any = find_baseline(options.baseline)
     progress, data = progress or Progress(), options.data
     _check_data(baseline, data)
-    with no_exit(f"baseline {options.baseline}"), _open_output(options) as output, ExitStack() as stack:
+    with forbid_exit(f"baseline {options.baseline}"), _open_output(options) as output, ExitStack() as stack:
         recorded = _read_recorded(output, baseline)
         initial = load_initial_weights(baseline, options.start, recorded, options.out)
         base = recorded or (initial.record if initial else None)
@@ -177,7 +177,7 @@ def combine_facts(own: dict[str, Any], initial: InitialWeights | None, data: Pat
     scales = () if data is None else (key for key in own if key in others and key not in _INPUTS)
     for key in (*_INPUTS, *scales):
         tolerance = _TOLERANCE if key in _INPUTS else math.inf
-        if changes := setting_changes(others.get(key), own.get(key), key, tolerance):
+        if changes := list_setting_changes(others.get(key), own.get(key), key, tolerance):
             what, where = f"the run of --start has other {key}", data or initial.name
             fix = "Start from a run with the same inputs, convert the data as for that run, or leave out --start."
             raise TrainingError(what, where=where, found=changes[0], fix=fix)

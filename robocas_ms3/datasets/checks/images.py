@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.documents import DAMAGED_FILE_ERRORS, load_array
 from robocas_ms3.core.poses import from_xyzw
-from robocas_ms3.core.text import count_of, one_line
+from robocas_ms3.core.text import format_count, one_line
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks import depth as geometry
 from robocas_ms3.datasets.checks.violation import NO_FILE, Violation
@@ -92,7 +92,7 @@ def check_images(
             if header == NO_FILE:
                 yield Violation(file, "", "an image of every step", NO_FILE, "missing")
             elif header == _SURPLUS:
-                expected = f"{count_of(len(wanted), 'image')} from {min(wanted, default='none')}"
+                expected = f"{format_count(len(wanted), 'image')} from {min(wanted, default='none')}"
                 yield Violation(file, "", expected, _SURPLUS, "surplus")
             elif isinstance(header, str):
                 yield Violation(file, "", _SOUND, header)

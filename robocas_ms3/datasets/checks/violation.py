@@ -11,7 +11,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ValidationError
 
 from robocas_ms3.core.documents import load_json
-from robocas_ms3.core.strict_model import mistakes
+from robocas_ms3.core.strict_model import list_invalid_values
 from robocas_ms3.core.text import one_line
 
 NO_FILE = "no file"
@@ -60,7 +60,7 @@ def check_form(model: type[BaseModel], content: Mapping[str, Any], file: str) ->
         model.model_validate(content)
     except ValidationError as error:
         found: dict[str, Violation] = {}
-        for mistake in mistakes(error, words=_WORDS):
+        for mistake in list_invalid_values(error, words=_WORDS):
             expected, value = mistake.expected or mistake.what.removeprefix(f"{mistake.key}: "), shorten(mistake.value)
             if mistake.kind in ("too_short", "too_long"):
                 limit = mistake.context.get("min_length", mistake.context.get("max_length"))

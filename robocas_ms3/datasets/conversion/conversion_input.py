@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.documents import DAMAGED_FILE_ERRORS
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.text import count_of, one_line
+from robocas_ms3.core.text import format_count, one_line
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.conversion.rendered_source import RenderedSource, open_env
 from robocas_ms3.datasets.conversion.settings import ConversionSettings
@@ -51,7 +51,7 @@ class ConversionInput:
             raise DatasetError(
                 "no successful episodes to convert" if some else "no episodes to convert",
                 where=self.source.root,
-                found=count_of(len(self.source.numbers), "episode"),
+                found=format_count(len(self.source.numbers), "episode"),
                 fix="Pass --include-failed to convert them all the same." if some else "",
             )
         if isinstance(self.source, RenderedSource):

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import write_json
-from robocas_ms3.core.output_folder import OutputFolder, sweep
+from robocas_ms3.core.output_folder import OutputFolder, remove_leftovers
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.conversion.conversion_input import ConversionInput, open_trajectory
 from robocas_ms3.datasets.conversion.data_info import add_failures, write_info
@@ -74,7 +74,7 @@ def convert(
         settings.check_device()
         embed = partial(_look_up, embed_texts(source, entries)) if settings.embeddings else None
         output.start(content)
-        sweep(out / schema.PREVIEW_FOLDER)
+        remove_leftovers(out / schema.PREVIEW_FOLDER)
         before = _split_before(out)
         for folder in (out / schema.episode_folder(number) for number, _ in tasks):
             if folder.is_dir() and (path := find_damaged(folder, image_options)):
@@ -91,7 +91,7 @@ def convert(
             written, incomplete = write_episodes(job, output, on_episode)
         finally:
             for folder in (out, out / schema.PREVIEW_FOLDER):
-                sweep(folder)  # left by workers that died; others wrote it again
+                remove_leftovers(folder)  # left by workers that died; others wrote it again
         if incomplete:
             write_json(out / schema.CONVERSION_FILE, without_unwritten(out, content, incomplete.reasons))
         add_failures(settings.source.parent, out, source.file.env_info)

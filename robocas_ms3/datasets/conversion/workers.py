@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError, IncompleteDatasetError, MissingExtraError
-from robocas_ms3.core.files import replacing_folder
+from robocas_ms3.core.files import atomic_folder
 from robocas_ms3.core.output_folder import OutputFolder
 from robocas_ms3.core.remote_errors import RemoteError
-from robocas_ms3.core.text import count_of, error_line
+from robocas_ms3.core.text import format_count, format_error
 from robocas_ms3.core.workers import NO_LIMITS, WorkerPool, use_one_torch_thread
 from robocas_ms3.datasets.conversion.conversion_input import ConversionInput, complete_arrays, open_input
 from robocas_ms3.datasets.conversion.settings import ConversionSettings, WrittenEpisode
@@ -59,7 +59,7 @@ class EpisodeWriter(ABC):
 
     def write(self, number: int, given: ConversionInput, source: int) -> WrittenEpisode:
         """Write episode ``source`` of the input as episode ``number`` of the dataset."""
-        with replacing_folder(self.folder(number), sync=True) as folder:
+        with atomic_folder(self.folder(number), sync=True) as folder:
             episode = given.source.episode(source)
             wanted = GivenEpisode(number, episode, complete_arrays(episode), given)
             with closing(given.frames(episode)) as frames:
@@ -125,7 +125,7 @@ class _Failure:
 
     @property
     def reason(self) -> str:
-        return error_line(self.sent.error).rstrip(".")
+        return format_error(self.sent.error).rstrip(".")
 
 
 def _death(task: Task, why: str) -> _Failure:
@@ -137,7 +137,7 @@ def _incomplete(failures: list[_Failure], job: WriteJob) -> IncompleteDatasetErr
     reasons = {one.episode: one.reason for one in sorted(failures, key=lambda one: one.episode)}
     listed = [why if why.startswith(f"{one}: ") else f"{one}: {why}" for one, why in reasons.items()]
     more = f"; and {len(listed) - _LISTED} more" if len(listed) > _LISTED else ""
-    what = f"{count_of(len(listed), 'episode')} could not be written"
+    what = f"{format_count(len(listed), 'episode')} could not be written"
     error = IncompleteDatasetError(what, where=job.settings.out, found="; ".join(listed[:_LISTED]) + more, fix=job.fix)
     error.reasons, error.__cause__ = reasons, failures[0].sent.with_traceback()
     return error

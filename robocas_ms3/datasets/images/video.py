@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.files import make_folder, replacing
+from robocas_ms3.core.files import atomic_file, make_folder
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.images.png import encode_png
 from robocas_ms3.datasets.images.preview_frames import EpisodeDrawing, Images
@@ -63,7 +63,7 @@ def write_video(
     episode = dataset.episode(number)
     drawing = EpisodeDrawing(number, episode.arrays, dataset.rate_hz)
     with (
-        replacing(path) as tmp,
+        atomic_file(path) as tmp,
         open_video(tmp, dataset.rate_hz * speed) as video,
         closing(shots(episode, episode.cameras, kind)) as run,
     ):
@@ -101,7 +101,7 @@ class Preview:
 def open_preview(root: Path, drawing: EpisodeDrawing, *, row: bool) -> Iterator[Preview]:
     """Open the preview of an episode, with a row of the contact sheet or without; the video appears whole."""
     path = make_folder(root / schema.PREVIEW_FOLDER) / f"{schema.episode_folder(drawing.number)}.mp4"
-    with replacing(path) as tmp, open_video(tmp, drawing.rate_hz, *_PREVIEW_OPTIONS, quality=6) as video:
+    with atomic_file(path) as tmp, open_video(tmp, drawing.rate_hz, *_PREVIEW_OPTIONS, quality=6) as video:
         yield Preview(video, drawing, row=row)
 
 
@@ -127,7 +127,7 @@ def _row(dataset: EpisodeSource, number: int, kind: Kind = "rgb") -> NDArray[np.
 
 
 def _write_sheet(rows: Sequence[NDArray[np.uint8]], path: Path | str) -> Path:
-    with replacing(path) as tmp:
+    with atomic_file(path) as tmp:
         tmp.write_bytes(encode_png(np.concatenate(rows)))
     return Path(path)
 

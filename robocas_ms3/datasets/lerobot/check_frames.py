@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.text import count_of, one_line
+from robocas_ms3.core.text import format_count, one_line
 from robocas_ms3.datasets.checks import arrays as laws
 from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.lerobot import schema
@@ -112,7 +112,7 @@ def _check_episode(
     """Check indices, timestamps, texts and outcome of an episode, and that features are consistent."""
     length = row["length"]
     if len(table) != length:
-        yield "", count_of(length, "frame"), str(len(table))
+        yield "", format_count(length, "frame"), str(len(table))
         return
     wrong = [(key, *fault) for key, found in columns.items() if (fault := _number_fault(found, info["features"][key]))]
     yield from wrong

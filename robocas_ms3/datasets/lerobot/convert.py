@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.core.errors import DatasetError, IncompleteDatasetError, OutputExistsError
-from robocas_ms3.core.files import flush_to_disk, make_folder, naming, remove
-from robocas_ms3.core.output_folder import FolderKind, OutputFolder, sweep
+from robocas_ms3.core.files import add_path_to_errors, flush_to_disk, make_folder, remove
+from robocas_ms3.core.output_folder import FolderKind, OutputFolder, remove_leftovers
 from robocas_ms3.core.strict_model import parse
-from robocas_ms3.core.text import count_of
+from robocas_ms3.core.text import format_count
 from robocas_ms3.datasets.conversion.conversion_input import ConversionInput, open_input
 from robocas_ms3.datasets.conversion.episode_plan import LEFT_OUT, with_versions
 from robocas_ms3.datasets.conversion.settings import Conversion, ConversionSettings, WrittenEpisode
@@ -85,7 +85,7 @@ def convert_lerobot(
                 for name in (_JOINED, *_FOLDERS):  # left half joined by a conversion that was killed
                     if os.path.lexists(out / name):
                         remove(out / name)
-                sweep(out / _PARTS)
+                remove_leftovers(out / _PARTS)
                 job = _missing_parts(settings, variant, plan["episodes"])
                 if on_start:
                     on_start(len(job.tasks))
@@ -136,7 +136,7 @@ def _check_episodes(output: OutputFolder, plan: Mapping[str, Any]) -> None:
     recorded, now = output.recorded.get("episodes", []), plan["episodes"]
     listed = sorted([*recorded, *output.recorded.get(LEFT_OUT, [])], key=lambda entry: entry.get("source") or 0)
     if len(listed) != len(now) or not all(map(_is_same, listed, now)):
-        what, expected = "a dataset of other episodes", count_of(len(recorded), "episode")
+        what, expected = "a dataset of other episodes", format_count(len(recorded), "episode")
         fix = "Choose another folder, or pass --overwrite to start again."
         raise OutputExistsError(what, where=output.path, expected=expected, found=f"{len(now)}", fix=fix)
 
@@ -178,7 +178,7 @@ def _join(out: Path, plan: Mapping[str, Any]) -> None:
     from robocas_ms3.datasets.lerobot.writer import join_parts
 
     joined = make_folder(out / _JOINED)
-    with naming(joined):
+    with add_path_to_errors(joined):
         join_parts(sorted((out / _PARTS).glob("episode_*")), plan, joined, FILE_LIMITS)
         flush_to_disk(joined)  # before the parts go
     for name in _FOLDERS:

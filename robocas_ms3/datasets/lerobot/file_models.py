@@ -18,7 +18,7 @@ from pydantic import (
     model_validator,
 )
 
-from robocas_ms3.core.documents import JSON_LIMIT, json_values, read_text
+from robocas_ms3.core.documents import JSON_LIMIT, decode_json, read_text
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.strict_model import parse
 from robocas_ms3.core.text import one_line
@@ -130,7 +130,7 @@ def read_lines(path: Path, form: type[_Line], most: int) -> list[_Line]:
         lines = [line for line in read_text(path, JSON_LIMIT).split("\n") if line.strip()]
         if len(lines) > most:
             raise DatasetError("too many lines", where=path, expected=f"{most} at most", found=len(lines))
-        values = [json_values(line) for line in lines]
+        values = [decode_json(line) for line in lines]
     except (OSError, ValueError) as error:
         raise DatasetError("these JSON lines can't be read", where=path, found=one_line(error)) from error
     return [parse(form, found, DatasetError, where=f"{path}, line {n}") for n, found in enumerate(values, 1)]

@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from robocas_ms3.core.files import write_json
-from robocas_ms3.core.text import count_of
+from robocas_ms3.core.text import format_count
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.language import EVENTS, EVENTS_TYPE, PERSISTENT, PERSISTENT_TYPE, Row
 from robocas_ms3.datasets.lerobot.parts import FRAMES_FILE, SUBGOAL, EpisodeRecord, Part, video_name
@@ -177,7 +177,9 @@ class LeRobotWriter:
         root, layout = self._root, self._layout
         if self._clipped:
             limit = schema.MAX_DEPTH_MM
-            _log.warning("%s: depth above %d mm is stored as %d mm", count_of(self._clipped, "episode"), limit, limit)
+            _log.warning(
+                "%s: depth above %d mm is stored as %d mm", format_count(self._clipped, "episode"), limit, limit
+            )
         if layout.one_file_per_episode:
             tasks = ({"task_index": index, "task": task} for task, index in self._tasks.items())
             _write_lines(root / schema.TASKS_LINES, tasks)

@@ -14,10 +14,10 @@ from typing import Any, Literal
 import robocas_ms3
 from robocas_ms3.core.documents import check_regular
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.files import replacing_folder
+from robocas_ms3.core.files import atomic_folder
 from robocas_ms3.core.output_folder import OutputFolder
 from robocas_ms3.core.strict_model import parse
-from robocas_ms3.core.text import count_of, format_ranges
+from robocas_ms3.core.text import format_count, format_ranges
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks import arrays as laws
 from robocas_ms3.datasets.checks.images import check_cameras, check_images
@@ -117,9 +117,9 @@ class CopyResult:
 
     def __str__(self) -> str:
         kept = f", {self.kept} of them were there" if self.kept else ""
-        linked = f"{count_of(self.linked, 'file')} linked, {self.copied} copied"
-        skipped = f", {count_of(self.skipped, 'duplicate')} left out" if self.skipped else ""
-        return f"{self.out}: {count_of(self.episodes, 'episode')}{kept}, {linked}{skipped}"
+        linked = f"{format_count(self.linked, 'file')} linked, {self.copied} copied"
+        skipped = f", {format_count(self.skipped, 'duplicate')} left out" if self.skipped else ""
+        return f"{self.out}: {format_count(self.episodes, 'episode')}{kept}, {linked}{skipped}"
 
 
 def copy_episodes(
@@ -150,7 +150,7 @@ def _copy(out: Path, members: Sequence[CopiedEpisode], record: Mapping[str, Any]
         missing = [n for n in range(len(members)) if not (out / schema.episode_folder(n)).is_dir()]
         for number in missing:
             member = members[number]
-            with replacing_folder(out / schema.episode_folder(number)) as folder:
+            with atomic_folder(out / schema.episode_folder(number)) as folder:
                 placer.place_tree(member.source.root / schema.episode_folder(member.number), folder)
             if options.on_episode:
                 options.on_episode(number)

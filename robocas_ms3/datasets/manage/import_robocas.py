@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.files import replacing_folder, write_json
+from robocas_ms3.core.files import atomic_folder, write_json
 from robocas_ms3.core.strict_model import parse
-from robocas_ms3.core.text import count_of
+from robocas_ms3.core.text import format_count
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.conversion.data_info import write_info
 from robocas_ms3.datasets.conversion.episode_folder import write_episode_files
@@ -52,7 +52,7 @@ def import_robocas(
         OutputExistsError: ``out`` is another dataset, or none.
     """
     if not surveyed.taken or surveyed.image_options is None:
-        found = f"{count_of(surveyed.episodes, 'episode')}, nothing whole"
+        found = f"{format_count(surveyed.episodes, 'episode')}, nothing whole"
         fix = "robocas import-robocas without --out says what is wrong."
         raise DatasetError("no episode can be taken", where=surveyed.root, found=found, fix=fix)
     dataset, options = Dataset(surveyed.root), options or CopyOptions(link=False)
@@ -70,7 +70,7 @@ def import_robocas(
                 where = surveyed.root / schema.episode_folder(number)
                 raise DatasetError("this episode changed meanwhile", where=where)
             episode.stored = _embedded(episode, embedded, embed)
-            with replacing_folder(out / schema.episode_folder(number)) as folder:
+            with atomic_folder(out / schema.episode_folder(number)) as folder:
                 _write(folder, dataset.episode(number), episode, surveyed, placer)
             if options.on_episode:
                 options.on_episode(number)

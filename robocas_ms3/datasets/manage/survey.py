@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.text import count_of
+from robocas_ms3.core.text import format_count
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.images import Sizes, check_camera_file, check_images
 from robocas_ms3.datasets.checks.violation import NO_FILE, Violation
@@ -116,7 +116,7 @@ def survey(
     taken = {episode.number: episode for episode in usable if episode.usable}
     lacking = [number for number, episode in taken.items() if not episode.embedded]
     if lacking and len(lacking) < len(taken):
-        found = f"{count_of(len(lacking), 'episode')} without"
+        found = f"{format_count(len(lacking), 'episode')} without"
         wrong = Violation(schema.EPISODE_FILE, "embeddings", "in all episodes or none", found)
         findings.append(Finding(None, wrong, "mended", "not taken"))
     findings = sorted(_merged(findings, taken), key=lambda f: -1 if f.episode is None else f.episode)
@@ -210,7 +210,7 @@ def _check_images(episode: ImportedEpisode, source: Episode) -> None:
     for wrong in check_images(source.folder, image_options, episode.stored.steps, sizes):
         folders.setdefault((wrong.file.rpartition("/")[0], wrong.kind == "surplus"), []).append(wrong)
     for found in folders.values():
-        more = f"and {count_of(len(found) - 1, 'other')}" if len(found) > 1 else ""
+        more = f"and {format_count(len(found) - 1, 'other')}" if len(found) > 1 else ""
         episode.note(found[0], "noted" if found[0].kind == "surplus" else "left out", more)
     different = set(sizes.values())
     size = None if len(different) != 1 or _FULL_SIZE in different else different.pop()

@@ -18,7 +18,7 @@ from pydantic import (
 )
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.strict_model import refusal
+from robocas_ms3.core.strict_model import error_from_validation
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 from robocas_ms3.demos.recordings.subgoals import SubGoal
@@ -212,4 +212,6 @@ def read_scene(scene: Mapping[str, Any], where: object) -> SceneRecord:
         return SceneRecord.model_validate(with_unknown(scene))
     except ValidationError as problem:
         about = "this description of a scene is damaged"
-        raise refusal(problem, SceneRecord, DatasetError, where=where, about=about, fix=SEE_VALIDATE) from problem
+        raise error_from_validation(
+            problem, SceneRecord, DatasetError, where=where, about=about, fix=SEE_VALIDATE
+        ) from problem

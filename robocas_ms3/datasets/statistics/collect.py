@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.text import count_of, error_line
+from robocas_ms3.core.text import format_count, format_error
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.actions import ACTION_ARRAYS, ACTION_NAMES, checked_actions
 from robocas_ms3.datasets.formats import open_source
@@ -64,7 +64,7 @@ class Stats:
         try:
             layout, surface = Layout.model_validate(episode.layout), surface_of(scene.config or {})
         except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
-            what, found = "this description of a scene is damaged", error_line(error, 200)
+            what, found = "this description of a scene is damaged", format_error(error, 200)
             raise DatasetError(what, where=where, found=found, fix=SEE_VALIDATE) from error
         slots = [n for n in range(len(layout.object_ids)) if not layout.present or layout.present[n]]
         poses = np.array(layout.poses, dtype=np.float64).reshape(-1, 7)
@@ -91,10 +91,10 @@ class Stats:
         tasks = ", ".join(f"{task} {len(lengths)}" for task, lengths in sorted(self.lengths.items()))
         covered = [share for share in (one.coverage for one in self.layouts.values()) if share is not None]
         parts = [
-            f"{count_of(self.episodes, 'episode')} ({tasks})",
-            f"{count_of(self.steps, 'step')} ({self.steps / self.rate_hz / 60:.1f} min at {self.rate_hz:g} Hz)",
-            f"{count_of(len(self.targets), 'target')} of {count_of(len(self.objects), 'object')}",
-            count_of(len(self.instructions), "instruction"),
+            f"{format_count(self.episodes, 'episode')} ({tasks})",
+            f"{format_count(self.steps, 'step')} ({self.steps / self.rate_hz / 60:.1f} min at {self.rate_hz:g} Hz)",
+            f"{format_count(len(self.targets), 'target')} of {format_count(len(self.objects), 'object')}",
+            format_count(len(self.instructions), "instruction"),
         ]
         if covered:
             low, high = f"{min(covered):.0%}", f"{max(covered):.0%}"

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from robocas_ms3.core.errors import require_extra
-from robocas_ms3.core.files import make_folder, replacing, write_json
-from robocas_ms3.core.text import called, count_of, printable
+from robocas_ms3.core.files import atomic_file, make_folder, write_json
+from robocas_ms3.core.text import escape_controls, format_count, format_object_name
 from robocas_ms3.datasets.actions import ACTION_NAMES
 from robocas_ms3.datasets.statistics.collect import Stats, counted, histogram
 from robocas_ms3.datasets.statistics.layouts import LayoutMap
@@ -33,7 +33,7 @@ def write_stats(stats: Stats, out: Path) -> list[Path]:
             (out / f"{name}.png").unlink(missing_ok=True)  # of an earlier run
             continue
         paths.append(out / f"{name}.png")
-        with replacing(paths[-1]) as tmp:
+        with atomic_file(paths[-1]) as tmp:
             figure.savefig(tmp, dpi=DPI)
     return paths
 
@@ -63,7 +63,7 @@ def _shape(count: int, columns: int) -> tuple[int, int]:
 
 def _label(text: str) -> str:
     """Return a text of the dataset as a short label: on one line, no formula between dollars."""
-    text = printable(text)
+    text = escape_controls(text)
     return (text if len(text) <= _TEXT else text[: _TEXT - 1].rstrip() + "…").replace("$", r"\$")
 
 
@@ -82,7 +82,7 @@ def draw_lengths(stats: Stats) -> Any:
         median = float(np.median(lengths))
         axes.axvline(median, color=ORANGE, linestyle="--", linewidth=1)
         about = f"median {median:.0f} steps = {median / stats.rate_hz:.0f} s"
-        axes.set_title(f"{_label(task)}: {count_of(len(lengths), 'episode')}, {about}")
+        axes.set_title(f"{_label(task)}: {format_count(len(lengths), 'episode')}, {about}")
         axes.set(xlabel=f"steps of {stats.rate_hz:g} Hz", ylabel="episodes")
         _whole_numbers(axes.xaxis)
         _whole_numbers(axes.yaxis)
@@ -97,7 +97,7 @@ def draw_objects(stats: Stats) -> Any:
     figure = _figure(7, 1.2 + 0.2 * len(ids))
     axes = _axes(figure, 1, 1, 1)[0]
     rows = np.arange(len(ids))
-    names = [_label(called(i, stats.names.get(i, ""))) for i in ids]
+    names = [_label(format_object_name(i, stats.names.get(i, ""))) for i in ids]
     axes.barh(rows, [stats.objects[i] for i in ids], color=GREY, height=0.8, label="took part")
     axes.barh(rows, [stats.targets[i] for i in ids], color=ORANGE, height=0.45, label="was the target")
     axes.set_yticks(rows, names)
@@ -147,7 +147,7 @@ def _draw_layout(figure: Any, axes: Any, name: str, layout: LayoutMap) -> None:
     axes.set_ylim(layout.x_edges[0], layout.x_edges[-1])
     axes.locator_params(nbins=5)
     covered = "" if layout.coverage is None else f", {layout.coverage:.0%} covered"
-    axes.set_title(f"{_label(name)}\n{count_of(layout.episodes, 'episode')}{covered}")
+    axes.set_title(f"{_label(name)}\n{format_count(layout.episodes, 'episode')}{covered}")
     axes.set(xlabel=f"y of {layout.frame} (m)", ylabel="x (m)")
     bar = figure.colorbar(mesh, cax=axes.inset_axes((1.04, 0.0, 0.04, 1.0)))  # as high as the map
     bar.ax.set_ylim(0, max(1, layout.counts.max()))
@@ -218,7 +218,7 @@ def draw_subgoals(stats: Stats) -> Any:
     for box in boxes["boxes"]:
         box.set(facecolor="#b9d3ea", edgecolor=BLUE)
     labels = [
-        f"{_label(kind)}\n{count_of(len(s), 'time')}, median {np.median(s):.1f} s"
+        f"{_label(kind)}\n{format_count(len(s), 'time')}, median {np.median(s):.1f} s"
         for kind, s in zip(kinds, seconds, strict=True)
     ]
     axes.set_yticks(np.arange(1, len(kinds) + 1), labels)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch.utils.data import get_worker_info
 
 from robocas_ms3.core.errors import DatasetError, EmptySplitError
-from robocas_ms3.core.text import count_of
+from robocas_ms3.core.text import format_count
 from robocas_ms3.datasets.actions import ACTION_ARRAYS, ActionScale, check_finite, checked_actions
 from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.datasets.sources.episode_source import EpisodeSource, Kind, SourceEpisode
@@ -88,7 +88,7 @@ class RoboCASDataset(torch.utils.data.Dataset):
         if not len(self):
             longest = max(self.source.lengths[number] for number in self.episodes)
             needed = options.observation_horizon + options.action_horizon if options.padding == "drop" else 2
-            what, expected = "no episode is long enough", count_of(needed, "step")
+            what, expected = "no episode is long enough", format_count(needed, "step")
             raise DatasetError(what, where=path, expected=expected, found=longest, fix="Pad them.")
         self.stages = np.concatenate([self._stages_of(number, within) for number, within in self._steps.items()])
         self.scale: ActionScale | None = None

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from robocas_ms3.assets.pack import pack_folders
 from robocas_ms3.core.errors import DatasetError, ExtensionError
-from robocas_ms3.core.strict_model import StrictModel, mistakes
+from robocas_ms3.core.strict_model import StrictModel, list_invalid_values
 from robocas_ms3.robots.cameras import CameraSpec
 from robocas_ms3.robots.registry import RobotSpec, find_robot
 from robocas_ms3.scenes.config.load import load_config_of, shipped_configs
@@ -141,7 +141,7 @@ def recorded_id(env_id: str) -> str:
 
 
 def _refusal(error: ValidationError, where: object) -> DatasetError:
-    first = mistakes(error, _Info)[0]
+    first = list_invalid_values(error, _Info)[0]
     name, fix, expected = first.key.rpartition(".")[2], first.fix, first.expected
     if first.kind == "string_pattern_mismatch":
         expected = "a name, no path"

@@ -15,7 +15,7 @@ from mani_skill.utils.gym_utils import find_max_episode_steps_value
 from mani_skill.utils.wrappers.record import parse_env_info
 from numpy.typing import NDArray
 
-from robocas_ms3.core.files import replacing, write_json
+from robocas_ms3.core.files import atomic_file, write_json
 from robocas_ms3.demos.recordings.environment import recorded_id
 from robocas_ms3.demos.recordings.trajectory_hdf5 import write_whole
 from robocas_ms3.demos.recordings.trajectory_json import versions
@@ -87,7 +87,7 @@ class EpisodeRecorder(gym.Wrapper):
                 group.create_dataset(name, data=values, dtype=bool)
             _write(group, "env_states", {**self.states, **_stacked(steps.beside_bodies)})
 
-        with replacing(self._trajectory, sync=True) as tmp:
+        with atomic_file(self._trajectory, sync=True) as tmp:
             write_whole(tmp, fill)
             # the JSON first: an HDF5 file that is there always has its JSON
             write_json(

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.documents import DocumentError, check_regular
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.files import replacing, write_json
+from robocas_ms3.core.files import atomic_file, write_json
 from robocas_ms3.core.text import one_line
 from robocas_ms3.demos.recordings.trajectory_json import one_seed, read_json
 
@@ -218,7 +218,7 @@ def merge(shards: list[Path], out: Path) -> None:
     merged: dict[str, Any] = {}
     episodes: list[dict[str, Any]] = []
     sizes = [shard.stat().st_size for shard in shards]
-    with replacing(out, sync=True) as tmp:
+    with atomic_file(out, sync=True) as tmp:
         with reserved(tmp, sum(sizes) + _MARGIN * (1 + len(sizes))) as target:
             for shard in shards:
                 data = read_json(shard)

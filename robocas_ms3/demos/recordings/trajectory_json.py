@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, NonNegativeInt
 
-from robocas_ms3.core.checks import GREATEST_SEED
+from robocas_ms3.core.checks import MAX_SEED
 from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.strict_model import parse
@@ -44,7 +44,7 @@ def _single_seed(value: Any) -> Any:
     return value if one_seed(value) is None else one_seed(value)
 
 
-Seed = Annotated[int, BeforeValidator(_single_seed), Field(ge=0, le=GREATEST_SEED)]
+Seed = Annotated[int, BeforeValidator(_single_seed), Field(ge=0, le=MAX_SEED)]
 """A seed of ``env.reset``; ManiSkill writes a list of one."""
 
 

@@ -18,8 +18,8 @@ from typing import Any, Literal
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.extensions import Registry
-from robocas_ms3.core.signals import no_exit
-from robocas_ms3.core.strict_model import nearest
+from robocas_ms3.core.signals import forbid_exit
+from robocas_ms3.core.strict_model import did_you_mean
 from robocas_ms3.evaluation.policies.plain import NoopPolicy, RandomPolicy
 from robocas_ms3.evaluation.policy import Policy, PolicySpec
 
@@ -78,7 +78,7 @@ def find_policy(name: str) -> Callable[[], Policy]:
     if re.fullmatch(r"\w+(\.\w+)*", kind) and rest.isidentifier():
         return partial(_make_own, name, kind, rest)
     expected = f"{', '.join(known)}, a folder of robocas train, replay:TRAJECTORY.h5, module:Class or ws://host:port"
-    raise EvaluationError("no such policy", where=name, expected=expected, fix=nearest(name, known))
+    raise EvaluationError("no such policy", where=name, expected=expected, fix=did_you_mean(name, known))
 
 
 def make_policy(name: str) -> Policy:
@@ -88,7 +88,7 @@ def make_policy(name: str) -> Policy:
         EvaluationError: there is no such policy (`find_policy`), or it lacks something that `Policy` has.
         ExtensionError: that of a package can't be loaded, or several have it.
     """
-    with no_exit(f"policy {name}"):
+    with forbid_exit(f"policy {name}"):
         policy: Any = find_policy(name)()
         for what, fits in (
             ("spec", isinstance(getattr(policy, "spec", None), PolicySpec)),
@@ -104,7 +104,7 @@ def make_policy(name: str) -> Policy:
 @contextmanager
 def open_policy(name: str) -> Iterator[Policy]:
     """Make a policy, and close it at the end if it can be closed."""
-    with no_exit(f"policy {name}"):
+    with forbid_exit(f"policy {name}"):
         policy = make_policy(name)
         try:
             yield policy

@@ -18,7 +18,7 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import WebSocketException
 
 from robocas_ms3.core.errors import EvaluationError, WireError
-from robocas_ms3.core.strict_model import refusal
+from robocas_ms3.core.strict_model import error_from_validation
 from robocas_ms3.core.text import one_line
 from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.remote.messages import ServerMetadata, read_metadata
@@ -91,7 +91,9 @@ def read_address(text: str) -> Address:
     try:
         return _FORM.validate_python({**options, "url": url, "spec": spec or None})
     except ValidationError as problem:
-        raise refusal(problem, _FORM, EvaluationError, where=text, about="invalid address of a policy") from problem
+        raise error_from_validation(
+            problem, _FORM, EvaluationError, where=text, about="invalid address of a policy"
+        ) from problem
 
 
 def enable_tcp_keepalive(connection: Any) -> None:

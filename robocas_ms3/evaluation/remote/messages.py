@@ -19,7 +19,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue, Po
 
 from robocas_ms3.core.errors import EvaluationError, WireError
 from robocas_ms3.core.paths import protocols_dir
-from robocas_ms3.core.strict_model import refusal
+from robocas_ms3.core.strict_model import error_from_validation
 from robocas_ms3.core.text import one_line
 from robocas_ms3.evaluation.policy import CONVENTIONS, ROBOT, EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.evaluation.remote.wire import MAX_BYTES
@@ -97,7 +97,7 @@ def read_request(message: Mapping[str, Any]) -> Request:
     try:
         return Request.model_validate(message)
     except ValidationError as problem:
-        raise refusal(problem, Request, WireError, where="", about="invalid request") from problem
+        raise error_from_validation(problem, Request, WireError, where="", about="invalid request") from problem
 
 
 def read_metadata(message: Any, url: str) -> ServerMetadata:
@@ -105,7 +105,9 @@ def read_metadata(message: Any, url: str) -> ServerMetadata:
     try:
         return ServerMetadata.model_validate(message if isinstance(message, dict) else {})
     except ValidationError as problem:
-        raise refusal(problem, ServerMetadata, EvaluationError, where=url, about="invalid metadata") from problem
+        raise error_from_validation(
+            problem, ServerMetadata, EvaluationError, where=url, about="invalid metadata"
+        ) from problem
 
 
 def read_policy_spec(message: Any, where: object) -> PolicySpec:
@@ -114,7 +116,7 @@ def read_policy_spec(message: Any, where: object) -> PolicySpec:
     try:
         return _POLICY_SPEC.validate_json(json.dumps(message), strict=True)
     except ValidationError as problem:
-        raise refusal(problem, _POLICY_SPEC, EvaluationError, where=where, about=what) from problem
+        raise error_from_validation(problem, _POLICY_SPEC, EvaluationError, where=where, about=what) from problem
     except (TypeError, ValueError) as error:
         raise EvaluationError(what, where=where, found=one_line(error, 200)) from error
 

@@ -23,7 +23,7 @@ from websockets.http11 import Request, Response
 from robocas_ms3 import __version__
 from robocas_ms3.core.errors import EvaluationError, PolicyError, RobocasError, WireError
 from robocas_ms3.core.paths import builtin_packs_dir, data_dir, protocols_dir
-from robocas_ms3.core.text import error_line, one_line
+from robocas_ms3.core.text import format_error, one_line
 from robocas_ms3.evaluation.policy import (
     EpisodeSpec,
     Observations,
@@ -228,7 +228,7 @@ class PolicyServer:
             return pack(self._answers.answer(value, envs)), 0
         except WireError as error:
             _log.warning("a client sent an invalid message: %s", error)
-            return error_line(error, 300), _GARBAGE
+            return format_error(error, 300), _GARBAGE
         except Exception as error:  # a policy may raise anything; other clients are still served
             return _log_failure(error), _FAILED
 
@@ -324,7 +324,7 @@ def _netloc(host: str, port: int) -> str:
 def _log_failure(error: Exception) -> str:
     """Log an error of a policy, with a traceback if it is none of ours, and return it as a line for its client."""
     _log.warning("the policy failed: %s", error, exc_info=None if isinstance(error, RobocasError) else error)
-    return error_line(error, 300)
+    return format_error(error, 300)
 
 
 def _health(client: ServerConnection, request: Request) -> Response | None:

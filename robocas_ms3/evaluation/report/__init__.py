@@ -6,8 +6,8 @@ import importlib.util
 from dataclasses import asdict
 from pathlib import Path
 
-from robocas_ms3.core.files import make_folder, replacing
-from robocas_ms3.core.text import printable
+from robocas_ms3.core.files import atomic_file, make_folder
+from robocas_ms3.core.text import escape_controls
 from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.report.page import page
 from robocas_ms3.evaluation.report.tables import markdown
@@ -32,11 +32,11 @@ def write_report(result: Result, folder: Path, protocol: LoadedProtocol | None =
     written = []
     for name, text in ((MARKDOWN, markdown(result)), (PAGE, page(result, folder, protocol))):
         written.append(folder / name)
-        with replacing(folder / name) as tmp:
-            tmp.write_text(printable(text, lines=True), encoding="utf-8")
+        with atomic_file(folder / name) as tmp:
+            tmp.write_text(escape_controls(text, lines=True), encoding="utf-8")
     if importlib.util.find_spec("pyarrow") is not None:
         written.append(folder / PARQUET)
-        with replacing(folder / PARQUET) as tmp:
+        with atomic_file(folder / PARQUET) as tmp:
             write_parquet(result, tmp)
     return written
 

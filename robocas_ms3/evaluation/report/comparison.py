@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import combinations
 
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.core.text import count_of, in_markdown
+from robocas_ms3.core.text import escape_markdown, format_count
 from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.results import Result
 from robocas_ms3.evaluation.statistics import Comparison, compare, holm, too_few
@@ -43,7 +43,7 @@ def comparison(results: Sequence[Result]) -> str:
     measured = first.run.protocol + (" with upstream's weld" if first.run.weld else "")
     said = [f"{name}: {one.run.policy.name} ({one.folder})" for name, one in zip(names, results, strict=True)]
     both = "both" if len(results) == 2 else "all"
-    head = in_markdown(f"{', '.join(said)}; {count_of(len(shared), 'episode')} of {measured} that {both} have.")
+    head = escape_markdown(f"{', '.join(said)}; {format_count(len(shared), 'episode')} of {measured} that {both} have.")
     others = [one.run for one in results[1:]]
     differing = ["backend"] if any(run.backend != first.run.backend for run in others) else []
     differing += ["versions"] if any(run.versions != first.run.versions for run in others) else []
@@ -83,7 +83,7 @@ def comparison_of_splits(result: Result, protocol: LoadedProtocol) -> str:
         fix = "Name another result to compare it with."
         raise EvaluationError("no two splits of this result have the same scenes", where=result.folder, fix=fix)
     head = f"{result.run.policy.name} ({result.folder}), splits of {result.run.protocol} over the same scenes."
-    return _table(in_markdown(head), "task", rows)
+    return _table(escape_markdown(head), "task", rows)
 
 
 def _table(head: str, where: str, rows: list[Row]) -> str:
@@ -105,10 +105,10 @@ def _table(head: str, where: str, rows: list[Row]) -> str:
         c, (p, claims) = row.found, adjusted[number]
         change = f"{100 * c.difference:+.1f} ({100 * c.low:+.1f} to {100 * c.high:+.1f})"
         counts = (c.n, c.successes_b, c.successes_a, c.only_b, c.only_a, change, f"{c.p_value:.3g}", f"{p:.3g}")
-        names = (in_markdown(row.where), in_markdown(", ".join(row.pair)))
+        names = (escape_markdown(row.where), escape_markdown(", ".join(row.pair)))
         lines.append(f"| {' | '.join(map(str, (*names, *counts)))} |")
         warning = None if p <= _ALPHA else too_few(c, alpha=_ALPHA / claims)
         if warning:
             pair = "" if len({row.pair for row in rows}) == 1 else f", {', '.join(row.pair)}"
-            warnings.append(f"- {in_markdown(f'{row.where}{pair}')}: {warning}")
+            warnings.append(f"- {escape_markdown(f'{row.where}{pair}')}: {warning}")
     return "\n".join([*lines, *(["", *warnings] if warnings else [])]) + "\n"

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from robocas_ms3.core.text import count_of
+from robocas_ms3.core.text import format_count
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.report.tables import WELDED, Cell, Fraction, Table, failure_name, mean, stages_of, tables
@@ -46,16 +46,16 @@ def page(result: Result, folder: Path | None = None, protocol: LoadedProtocol | 
 def _lead(result: Result, protocol: LoadedProtocol | None) -> str:
     count = len(result.outcomes)
     total = count if protocol is None else len(protocol.episodes)
-    episodes = count_of(count, "episode") if protocol is None else f"{count} of {count_of(total, 'episode')}"
+    episodes = format_count(count, "episode") if protocol is None else f"{count} of {format_count(total, 'episode')}"
     notes = [WELDED] if result.run.weld else []
     if protocol is not None and count < total:
         missing = Counter(episode.config for episode in protocol.episodes if episode.episode not in result.outcomes)
         of = ", ".join(f"{many} of {escape(config)}" for config, many in missing.items())
         notes.append(
-            f"Missing of the protocol: {count_of(missing.total(), 'episode')} ({of}). This is no whole result."
+            f"Missing of the protocol: {format_count(missing.total(), 'episode')} ({of}). This is no whole result."
         )
     if broken := result.broken_off():
-        notes.append(f"Broken off by an error: {count_of(broken, 'episode')}, counted as failed.")
+        notes.append(f"Broken off by an error: {format_count(broken, 'episode')}, counted as failed.")
     lead = f"{episodes}, protocol hash <code>{escape(result.run.protocol_hash[:16])}</code>."
     return f'<p class="lead">{lead}</p>\n' + "".join(f'<p class="note">{note}</p>\n' for note in notes)
 
@@ -170,7 +170,7 @@ def _failed_episodes(result: Result, folder: Path | None) -> str:
     command = "<code>robocas eval videos RESULT --policy POLICY</code>"
     videos = "Numbers that are links lead to videos." if linked else f"{command} films some of them."
     note = (
-        f'<span id="count">{len(failed)}</span> of {count_of(len(result.outcomes), "episode")}. '
+        f'<span id="count">{len(failed)}</span> of {format_count(len(result.outcomes), "episode")}. '
         f"Ended by: the time limit, a failure such as a target on the floor, or an error. {videos}"
     )
     table = _html_table(heads, rows, "failed")

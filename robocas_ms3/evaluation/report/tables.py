@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from robocas_ms3.core.text import count_of, in_markdown
+from robocas_ms3.core.text import escape_markdown, format_count
 from robocas_ms3.evaluation.outcomes import STAGES, Outcome
 from robocas_ms3.evaluation.results import Result
 from robocas_ms3.evaluation.statistics import SuccessRate, success_by
@@ -83,15 +83,16 @@ def markdown(result: Result) -> str:
     run, broken = result.run, result.broken_off()
     versions = ", ".join(f"{name} {number}" for name, number in run.versions.items())
     lines = [
-        f"# {in_markdown(title(result))}",
+        f"# {escape_markdown(title(result))}",
         "",
         *([f"**{WELDED}**", ""] if run.weld else []),
-        f"Protocol hash {in_markdown(run.protocol_hash[:16])}, {count_of(len(result.outcomes), 'episode')}, "
-        f"{in_markdown(run.backend)}; {in_markdown(versions)}. Intervals are Clopper-Pearson's, 95 %. {_STAGE_NOTE}",
-        *(["", f"**Broken off by an error: {count_of(broken, 'episode')}, counted as failed.**"] if broken else []),
+        f"Protocol hash {escape_markdown(run.protocol_hash[:16])}, {format_count(len(result.outcomes), 'episode')}, "
+        f"{escape_markdown(run.backend)}; {escape_markdown(versions)}. "
+        f"Intervals are Clopper-Pearson's, 95 %. {_STAGE_NOTE}",
+        *(["", f"**Broken off by an error: {format_count(broken, 'episode')}, counted as failed.**"] if broken else []),
     ]
     for table in tables(result) if result.outcomes else ():
-        heads = " | ".join(in_markdown(head.rstrip("#%")) for head in table.heads)
+        heads = " | ".join(escape_markdown(head.rstrip("#%")) for head in table.heads)
         lines += ["", f"## {table.title}", "", f"| {heads} |", "|" + "---|" * len(table.heads)]
         for row in table.rows:
             cells = (_markdown_cell(cell, head) for cell, head in zip(row, table.heads, strict=True))
@@ -219,4 +220,4 @@ def _markdown_cell(cell: Cell, head: str) -> str:
     if isinstance(cell, SuccessRate):
         text = f"{100 * cell.rate:.0f} %"
         return f"{text} ({100 * cell.low:.0f} to {100 * cell.high:.0f})" if head.endswith("%") else text
-    return in_markdown(str(cell.count or "") if isinstance(cell, Fraction) else cell or "")
+    return escape_markdown(str(cell.count or "") if isinstance(cell, Fraction) else cell or "")

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.core.files import make_folder, replacing
+from robocas_ms3.core.files import atomic_file, make_folder
 from robocas_ms3.datasets.conversion.env_renderer import require_renderer
 from robocas_ms3.datasets.images.video import open_video
 from robocas_ms3.evaluation.policy import Policy
@@ -61,7 +61,7 @@ def film(
             before, path = result.outcomes[number], result.folder / VIDEOS / video_name(number)
             # As long as the first time, so that it is the same episode whatever ended it.
             fps = session.rate / recorder.period * _SPEED
-            with replacing(path) as tmp, open_video(tmp, fps, quality=6) as recorder.writer:
+            with atomic_file(path) as tmp, open_video(tmp, fps, quality=6) as recorder.writer:
                 (outcome,) = session.play([protocol.episodes[number]], before.steps)
             yield path, outcome.without_clock() == before.without_clock()
 

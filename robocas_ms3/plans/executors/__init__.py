@@ -11,8 +11,8 @@ from typing import Any
 from pydantic import ValidationError
 
 from robocas_ms3.core.errors import PlanError
-from robocas_ms3.core.extensions import load
-from robocas_ms3.core.strict_model import StrictModel, refusal
+from robocas_ms3.core.extensions import load_object
+from robocas_ms3.core.strict_model import StrictModel, error_from_validation
 from robocas_ms3.plans.folder import PlanFolder, WorkUnit
 from robocas_ms3.plans.worker import WorkUnitWorker
 
@@ -45,7 +45,9 @@ class Executor(ABC):
             self.options: Any = self.options_type.model_validate_strings(dict(options or {}))
         except ValidationError as error:
             about = "not a valid option of this executor"
-            raise refusal(error, self.options_type, PlanError, where="--executor-option", about=about) from error
+            raise error_from_validation(
+                error, self.options_type, PlanError, where="--executor-option", about=about
+            ) from error
         self.units_per_job: int = getattr(self.options, "units_per_job", 1)
 
     @abstractmethod
@@ -109,4 +111,4 @@ class LocalExecutor(ThreadExecutor):
 
 def open_executor(name: str, folder: PlanFolder, jobs: int, options: Mapping[str, str]) -> Executor:
     """Return an executor of this name; raises as `Executor` does."""
-    return load(EXECUTORS[name])(folder, jobs, options)
+    return load_object(EXECUTORS[name])(folder, jobs, options)

@@ -19,7 +19,7 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from robocas_ms3.core.errors import PlanError, RobocasError, require_extra
-from robocas_ms3.core.files import ABANDONED, make_folder, write_json
+from robocas_ms3.core.files import LEFTOVER_AGE, make_folder, write_json
 from robocas_ms3.core.signals import deferred_interrupts
 from robocas_ms3.core.strict_model import StrictModel
 from robocas_ms3.core.text import one_line
@@ -203,7 +203,7 @@ def _temporary_folder() -> Iterator[Path]:
     """Yield a temporary folder of this node; delete those of tasks that were killed a day ago."""
     for path in Path(tempfile.gettempdir()).glob(f"{_TEMPORARY}*"):
         with suppress(OSError):
-            if time.time() - path.stat().st_mtime > ABANDONED:
+            if time.time() - path.stat().st_mtime > LEFTOVER_AGE:
                 shutil.rmtree(path, ignore_errors=True)
     with tempfile.TemporaryDirectory(prefix=_TEMPORARY, ignore_cleanup_errors=True) as folder:
         yield Path(folder)

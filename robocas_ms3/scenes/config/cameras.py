@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
 from robocas_ms3.core.errors import ConfigError
-from robocas_ms3.core.strict_model import StrictModel, nearest
+from robocas_ms3.core.strict_model import StrictModel, did_you_mean
 from robocas_ms3.robots.cameras import CAMERA_NAME, CameraSpec, Mount
 
 _Coordinate = Annotated[float, Field(ge=-100, le=100)]
@@ -79,7 +79,7 @@ def changed_cameras(cameras: tuple[CameraSpec, ...], changes: list[tuple[str, Ca
                 "no such camera, and no place for a further one",
                 where=f"cameras.{name}",
                 expected=f"one of {list(specs)}, or `position`",
-                fix=nearest(name, specs),
+                fix=did_you_mean(name, specs),
             )
         specs[name] = change.change(specs.get(name, CameraSpec(name)))
     return tuple(specs.values())

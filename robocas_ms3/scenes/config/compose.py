@@ -16,7 +16,7 @@ import yaml
 
 from robocas_ms3.core.documents import YAML_DEPTH
 from robocas_ms3.core.errors import ConfigError, RobocasError
-from robocas_ms3.core.strict_model import nearest
+from robocas_ms3.core.strict_model import did_you_mean
 from robocas_ms3.scenes.config.task import TaskConfig
 
 EXTENDS = "extends"
@@ -117,7 +117,7 @@ class Composition:
             place, old = (*path, " ".join(str(key).split())), values.get(key)
             if new is None and removes and (declared := _declaration(place)) in {"key", "name"}:
                 if declared == "name" and key not in values:
-                    expected, fix = f"one of {sorted(map(str, values))}", nearest(str(key), map(str, values))
+                    expected, fix = f"one of {sorted(map(str, values))}", did_you_mean(str(key), map(str, values))
                     what = f"there is no {'.'.join(place)!r} to remove"
                     raise ConfigError(what, where=source, expected=expected, found=repr(str(key)), fix=fix)
                 values.pop(key, None)

@@ -12,7 +12,7 @@ from typing import Any
 from robocas_ms3.core.documents import YAML_LIMIT, DocumentError, load_yaml, read_text
 from robocas_ms3.core.errors import ConfigError
 from robocas_ms3.core.paths import task_configs_dir
-from robocas_ms3.core.strict_model import nearest, parse
+from robocas_ms3.core.strict_model import did_you_mean, parse
 from robocas_ms3.scenes.config.compose import EXTENDS, Composition, parse_override
 from robocas_ms3.scenes.config.task import TaskConfig
 from robocas_ms3.scenes.language.texts import synonym_texts
@@ -148,7 +148,7 @@ def _read(path: Path) -> dict[Any, Any]:
     if not isinstance(data, dict):
         raise ConfigError("a task configuration is a mapping", where=path, found=type(data).__name__)
     for key in data:
-        if key != EXTENDS and key not in TaskConfig.model_fields and (likely := nearest(str(key), [EXTENDS])):
+        if key != EXTENDS and key not in TaskConfig.model_fields and (likely := did_you_mean(str(key), [EXTENDS])):
             expected = f"one of {[EXTENDS, *sorted(TaskConfig.model_fields)]}"
             raise ConfigError(f"unknown key {key!r}", where=path, expected=expected, found=repr(key), fix=likely)
     return data
@@ -164,12 +164,12 @@ def _find(config: str | Path, folder: Path | None = None, where: str = "") -> Pa
     with suppress(OSError, ValueError):  # such as a name that is too long
         if is_yaml and path.is_file():
             return path
-    likely = nearest(path.stem if is_yaml else name, shipped)
+    likely = did_you_mean(path.stem if is_yaml else name, shipped)
     what, expected = "no such task configuration", "a YAML file (.yaml, .yml) or a shipped name"
     if folder is not None:
         files = [str(path.relative_to(folder)) for end in _SUFFIXES for path in sorted(folder.glob(f"*{end}"))]
         what, expected = "no such base", f"a shipped name or a YAML file (.yaml, .yml) relative to {folder}"
-        likely = nearest(name, [*shipped, *files]) or nearest(f"{name}.yaml", files) or likely
+        likely = did_you_mean(name, [*shipped, *files]) or did_you_mean(f"{name}.yaml", files) or likely
     if is_yaml and not likely:
         raise ConfigError("no such file", where=where or name, expected=expected, found=str(path.absolute()))
     raise ConfigError(

@@ -5,7 +5,7 @@ from PIL import Image
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.files import replacing
+from robocas_ms3.core.files import atomic_file
 from robocas_ms3.datasets.images.preview_frames import THUMBNAIL, EpisodeDrawing
 from robocas_ms3.datasets.images.video import PANEL, colour_depth, contact_sheet, open_video, write_video
 from robocas_ms3.datasets.sources.reader import Dataset
@@ -32,7 +32,7 @@ def test_videos_show_every_step_in_real_time(made, tmp_path):
 
 def test_a_failed_video_leaves_no_file(tmp_path):
     """FFmpeg once went on after the error, and made its file again."""
-    with pytest.raises(ZeroDivisionError), replacing(tmp_path / "e.mp4") as tmp, open_video(tmp, 5) as video:
+    with pytest.raises(ZeroDivisionError), atomic_file(tmp_path / "e.mp4") as tmp, open_video(tmp, 5) as video:
         video.append_data(np.zeros((16, 16, 3), np.uint8))
         _ = 1 / 0
     assert video.closed

@@ -14,7 +14,7 @@ import pytest
 from synthetic import STEPS, write_trajectory
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.files import replacing
+from robocas_ms3.core.files import atomic_file
 from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
 from robocas_ms3.demos.recordings.trajectory_hdf5 import damage_of, merge, reserved, write_whole
 from robocas_ms3.demos.trajectory_replay import Recorded
@@ -58,10 +58,10 @@ def test_what_was_reserved_and_not_needed_is_given_back(tmp_path, monkeypatch, s
 def test_no_room_is_an_error_before_anything_is_lost(tmp_path):
     """No crash when HDF5 frees the file, and nothing is left."""
     with files_of_at_most(100_000):
-        with pytest.raises(OSError, match="x.h5") as error, replacing(tmp_path / "x.h5") as tmp:
+        with pytest.raises(OSError, match="x.h5") as error, atomic_file(tmp_path / "x.h5") as tmp:
             write_whole(tmp, fill)
         assert error.value.errno == errno.EFBIG
-        with pytest.raises(OSError, match="y.h5"), replacing(tmp_path / "y.h5") as tmp, reserved(tmp, 500_000):
+        with pytest.raises(OSError, match="y.h5"), atomic_file(tmp_path / "y.h5") as tmp, reserved(tmp, 500_000):
             raise AssertionError("it was opened")
     assert list(tmp_path.iterdir()) == []
 
