@@ -14,7 +14,7 @@ import tyro
 
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.errors import LayoutError
-from robocas_ms3.core.poses import transform
+from robocas_ms3.core.poses import transform_points
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.sample import sample_layout
@@ -36,7 +36,7 @@ def main(cfg: Benchmark) -> None:
     """Run it."""
     pack = load_pack(cfg.pack)
     model = SceneModel.load(load_task_config(cfg.config), pack, load_pack("builtin"))
-    support = transform(model.support_pose, np.array([[0, 0, model.region.z]]))[0, 2]
+    support = transform_points(model.support_pose, np.array([[0, 0, model.region.z]]))[0, 2]
     for asset in pack.objects.values():  # read once a process, and not part of what a layout takes
         _ = asset.hulls, asset.annotations, asset.surface_points()
     heights, shares, targets, seconds, failures = [], [], [], [], []
@@ -50,7 +50,8 @@ def main(cfg: Benchmark) -> None:
         seconds.append(time.process_time() - start)
         assets = [pack.objects[i] for i in layout.object_ids]
         tops = [
-            transform(p, np.concatenate(a.hulls))[:, 2].max() for a, p in zip(assets, layout.object_poses, strict=True)
+            transform_points(p, np.concatenate(a.hulls))[:, 2].max()
+            for a, p in zip(assets, layout.object_poses, strict=True)
         ]
         heights.append(max(tops) - support)
         shares.append(layout.visible_shares)

@@ -16,7 +16,7 @@ import numpy as np
 import tyro
 
 from robocas_ms3.assets.pack import VisualLevel, load_pack
-from robocas_ms3.core.poses import transform
+from robocas_ms3.core.poses import transform_points
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.placement import Array
@@ -51,7 +51,7 @@ def main(args: Args) -> None:
     model = SceneModel.load(load_task_config(args.config), load_pack(args.pack), load_pack("builtin"))
     region = model.region
     middle = np.append(np.add(region.min_xy, region.max_xy) / 2, region.z)
-    center = transform(model.support_pose, middle[None])[0]
+    center = transform_points(model.support_pose, middle[None])[0]
     layouts = [sample_layout(model, seed, seed) for seed in range(args.heaps)]
     levels: tuple[VisualLevel, ...] = ("fast", "full")
     report: dict[str, object] = {"heaps": args.heaps, "objects": len(layouts[0].object_ids)}

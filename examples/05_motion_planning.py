@@ -17,7 +17,7 @@ from mani_skill.examples.motionplanning.base_motionplanner.utils import compute_
 
 import robocas_ms3  # noqa: F401  (registers RoboCASPick-v1)
 from robocas_ms3.core.errors import PlanningError
-from robocas_ms3.core.poses import inverse, transform
+from robocas_ms3.core.poses import inverse, transform_points
 from robocas_ms3.planning.grasp_choice import filter_grasps, grip_margins
 from robocas_ms3.planning.motionplanner import PandaArmMotionPlanningSolver
 from robocas_ms3.planning.protocol import AttachedBody
@@ -99,7 +99,7 @@ def ranked_grasps(env, scene, slot):
     target, base = env.object_assets[0][slot], scene.arm_base_in_world
     notes, object_in_world = target.annotations, base @ scene.object_in_base(slot)
     kept = filter_grasps(notes, object_in_world, base)
-    points = transform(base, scene.obstacles_in_base(without=slot))
+    points = transform_points(base, scene.obstacles_in_base(without=slot))
     margins = grip_margins(notes.grasps_tcp_in_object[kept.index], kept.widths, target.surface_points(SPACING))
     distance = np.linalg.norm(kept.tcp_in_world[:, :3, 3] - object_in_world[:3, 3], axis=1)
     score = margins + np.exp(-distance / 0.03) - kept.tcp_in_world[:, 2, 2]
@@ -113,7 +113,7 @@ def ranked_drops(env, scene, slot, held, rng):
     inner = env.model.basket.asset.inner
     inside = Inside(scene.basket_in_base, np.array(inner.min), np.array(inner.max))
     center = np.array([env.object_assets[0][slot].asset.center_of_mass])
-    vertices, center = transform(held.object_in_tcp, held.vertices), transform(held.object_in_tcp, center)
+    vertices, center = transform_points(held.object_in_tcp, held.vertices), transform_points(held.object_in_tcp, center)
     drops = sample_drops(rng, 200, inside, vertices, center[0])
     overhang = overhangs(drops, inside, vertices, margin=0.03)
     order = np.lexsort((drops[:, 2, 2], np.ceil(overhang / 0.015)))

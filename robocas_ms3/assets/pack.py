@@ -20,7 +20,7 @@ from robocas_ms3.assets.manifest import SCHEMA_VERSION, FurnitureAsset, ObjectAs
 from robocas_ms3.core.documents import JSON_LIMIT, DocumentError, check_regular, read_bytes
 from robocas_ms3.core.errors import AssetError
 from robocas_ms3.core.paths import builtin_packs_dir, data_dir
-from robocas_ms3.core.poses import transform
+from robocas_ms3.core.poses import transform_points
 from robocas_ms3.core.strict_model import error_from_validation, validate_json
 
 VisualLevel = Literal["fast", "full"]
@@ -94,7 +94,7 @@ class LoadedFurniture(Part):
     def all_surface_points(self, positions: Mapping[str, float]) -> Array:
         """Return points (P, 3), m, on body and links in the furniture's frame; joints not in ``positions`` are at 0."""
         poses = link_poses(self.asset.links, positions)
-        links = [transform(pose, self.links[name].surface_points()) for name, pose in poses.items()]
+        links = [transform_points(pose, self.links[name].surface_points()) for name, pose in poses.items()]
         return np.concatenate([self.surface_points(), *links])
 
     def finish(self, part: str, name: str) -> Path:

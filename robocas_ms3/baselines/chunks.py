@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from torch.nn import functional as F
 
 from robocas_ms3.baselines.baseline import Batch
-from robocas_ms3.core.poses import Array, from_parts, from_wxyz, inverse
+from robocas_ms3.core.poses import Array, from_rotation, from_wxyz, inverse
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.robots.quantities import GRIPPER_WIDTH
 
@@ -66,7 +66,7 @@ def decode(rows: NDArray[np.floating], tcp: NDArray[np.floating]) -> tuple[Array
     second = rows[..., 6:9] - (first * rows[..., 6:9]).sum(-1, keepdims=True) * first
     second /= np.maximum(np.linalg.norm(second, axis=-1, keepdims=True), 1e-9)
     turns = np.stack([first, second, np.cross(first, second)], axis=-1)
-    return tcp @ from_parts(rows[..., :3], turns), rows[..., 9]
+    return tcp @ from_rotation(rows[..., :3], turns), rows[..., 9]
 
 
 def _rows(poses: NDArray[np.floating], last: NDArray[np.floating]) -> NDArray[np.float32]:

@@ -1,7 +1,7 @@
-"""Functions on batched arrays of either kind: tensors on a GPU, NumPy's on a CPU.
+"""Operations on batches that are torch tensors on a GPU and NumPy arrays on a CPU.
 
-All arrays of a call are of the same kind. With tensors on a CPU a step of pick takes 17 % longer, of search 7 %, of
-pick in end-effector modes 13 % (`benchmarks/step.py`).
+All arrays of a call have the same type. NumPy is faster on a CPU: with tensors an environment step takes 17 % longer in
+pick, 7 % in search and 13 % in pick with end-effector control (`benchmarks/step.py`).
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from torch import Tensor
 Array: TypeAlias = NDArray[Any] | Tensor
 
 
-def native(tensor: Tensor) -> Array:
-    """Return a tensor as it is on a GPU, on a CPU as a NumPy array that shares its memory."""
+def to_native(tensor: Tensor) -> Array:
+    """Return a GPU tensor unchanged, and a CPU tensor as a NumPy array that shares its memory."""
     return tensor if tensor.is_cuda else tensor.numpy()
 
 
@@ -26,7 +26,7 @@ def as_tensor(array: Array) -> Tensor:
     return array if isinstance(array, Tensor) else torch.from_numpy(array)
 
 
-def choose(condition: Array, yes: Array, no: Array) -> Array:
+def where(condition: Array, yes: Array, no: Array) -> Array:
     """Return ``yes`` where the condition holds, ``no`` elsewhere."""
     if isinstance(condition, Tensor):
         return torch.where(condition, yes, no)  # pyright: ignore[reportCallIssue, reportArgumentType]
@@ -42,19 +42,19 @@ def as_double(values: Array) -> Array:
 
 
 def clamp(values: Array, low: Array | float, high: Array | float) -> Array:
-    """Return values within limits, which are numbers or arrays."""
+    """Clamp values to limits, which are numbers or arrays."""
     if isinstance(values, Tensor):
         return values.clamp(low, high)  # pyright: ignore[reportCallIssue, reportArgumentType]
     return np.minimum(np.maximum(values, low), high)  # `np.clip` takes three times as long
 
 
-def greater(one: Array, other: Array) -> Array:
-    if isinstance(one, Tensor):
-        return torch.maximum(one, other)  # pyright: ignore[reportArgumentType]
-    return np.maximum(one, other)
+def maximum(first: Array, second: Array) -> Array:
+    if isinstance(first, Tensor):
+        return torch.maximum(first, second)  # pyright: ignore[reportArgumentType]
+    return np.maximum(first, second)
 
 
-def join(arrays: list[Array], axis: int = -1) -> Array:
+def concatenate(arrays: list[Array], axis: int = -1) -> Array:
     if isinstance(arrays[0], Tensor):
         return torch.cat(arrays, dim=axis)  # pyright: ignore[reportArgumentType]
     return np.concatenate(arrays, axis=axis)
@@ -67,21 +67,21 @@ def matmul(first: Array, second: Array) -> Array:
     return first @ second
 
 
-def length(vectors: Array) -> Array:
-    """Return the lengths (...) of vectors (..., D)."""
+def norm(vectors: Array) -> Array:
+    """Return the Euclidean norms (...) of vectors (..., D)."""
     return (vectors * vectors).sum(-1) ** 0.5
 
 
 def known_all_false(conditions: Array) -> bool:
-    """Return whether all flags are known to be False; on a GPU False, as asking would wait for the device."""
+    """Return whether all flags are False; False on a GPU, where reading them would synchronize with the device."""
     return not isinstance(conditions, Tensor) and not conditions.any()
 
 
 def known_all_true(conditions: Array) -> bool:
-    """Return whether all flags are known to be True; on a GPU False, as asking would wait for the device."""
+    """Return whether all flags are True; False on a GPU, where reading them would synchronize with the device."""
     return not isinstance(conditions, Tensor) and bool(conditions.all())
 
 
-def count_up(count: int, like: Array) -> Array:
-    """Return the integers 0 to count - 1, of the kind and on the device of ``like``."""
+def arange(count: int, like: Array) -> Array:
+    """Return the integers 0 to count - 1 with the array type and the device of ``like``."""
     return torch.arange(count, device=like.device) if isinstance(like, Tensor) else np.arange(count)

@@ -1,7 +1,7 @@
-"""Rigid transforms in NumPy: 4x4 matrices, and the seven numbers that files and simulators have instead.
+"""Rigid transforms in NumPy, float64: 4x4 matrices, and 7-D poses (position, quaternion) of files and simulators.
 
-``T_a_b`` maps points of frame b into frame a. Quaternions are wxyz, but for RoboCAS folders and SciPy, which have xyzw.
-Batches of envs: `core.rotations`.
+``T_a_b`` maps points of frame b into frame a. Quaternions are wxyz, except in RoboCAS datasets and SciPy, which use
+xyzw. `core.rotations` has operations on batches of environments.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 
 def inverse(poses: Array) -> Array:
-    """Inverse of rigid transforms (..., 4, 4)."""
+    """Invert rigid transforms (..., 4, 4)."""
     result = np.zeros_like(poses)
     rotation = np.swapaxes(poses[..., :3, :3], -1, -2)
     result[..., :3, :3] = rotation
@@ -27,41 +27,41 @@ def inverse(poses: Array) -> Array:
 
 
 def from_wxyz(poses: Any) -> Array:
-    """(..., 4, 4) of poses (..., 7), an array or a tensor on a CPU: position, quaternion wxyz."""
+    """Convert poses (..., 7) (position, quaternion wxyz; array or CPU tensor) to transforms (..., 4, 4)."""
     if poses.ndim == 1:
-        return _one(*poses.tolist())
+        return _single_from_wxyz(*poses.tolist())
     poses = np.asarray(poses, np.float64)
     return from_xyzw(poses[..., :3], wxyz_to_xyzw(poses[..., 3:]))
 
 
 def to_wxyz(poses: Array) -> Array:
-    """(..., 7) of transforms (..., 4, 4): position, quaternion wxyz of either sign."""
+    """Convert transforms (..., 4, 4) to poses (..., 7): position, quaternion wxyz of either sign."""
     xyzw = Rotation.from_matrix(poses[..., :3, :3].reshape(-1, 3, 3)).as_quat().reshape(*poses.shape[:-2], 4)
     return np.concatenate([poses[..., :3, 3], xyzw_to_wxyz(xyzw)], axis=-1)
 
 
 def from_xyzw(positions: Array, xyzw: Array) -> Array:
-    """(..., 4, 4) of positions (..., 3) and quaternions (..., 4) xyzw."""
+    """Return transforms (..., 4, 4) from positions (..., 3) and quaternions xyzw (..., 4)."""
     rotation = Rotation.from_quat(xyzw.reshape(-1, 4)).as_matrix()
-    return from_parts(positions, rotation.reshape(*xyzw.shape[:-1], 3, 3))
+    return from_rotation(positions, rotation.reshape(*xyzw.shape[:-1], 3, 3))
 
 
-def from_parts(positions: Any, rotations: Any) -> Array:
-    """(..., 4, 4) of positions (..., 3) and rotation matrices (..., 3, 3)."""
+def from_rotation(positions: Any, rotations: Any) -> Array:
+    """Return transforms (..., 4, 4) from positions (..., 3) and rotation matrices (..., 3, 3)."""
     positions = np.asarray(positions, np.float64)
     result = np.zeros((*positions.shape[:-1], 4, 4))
     result[..., :3, :3], result[..., :3, 3], result[..., 3, 3] = rotations, positions, 1
     return result
 
 
-def planar(x: float, y: float, z: float, yaw: float) -> Array:
-    """4x4 of a turn by ``yaw`` (rad) about the vertical, then a shift (m)."""
+def from_xyz_yaw(x: float, y: float, z: float, yaw: float) -> Array:
+    """Return the transform (4, 4) with position x, y, z in m and rotation ``yaw`` in rad about the z axis."""
     cos, sin = np.cos(yaw), np.sin(yaw)
     return np.array([[cos, -sin, 0, x], [sin, cos, 0, y], [0, 0, 1, z], [0, 0, 0, 1.0]])
 
 
-def transform(pose: Array, points: Array) -> Array:
-    """Points (..., P, 3) moved by a 4x4, or by one each of (..., 4, 4)."""
+def transform_points(pose: Array, points: Array) -> Array:
+    """Transform points (..., P, 3) by one transform (4, 4), or by one per batch element (..., 4, 4)."""
     offset = pose[..., None, :3, 3] if pose.ndim > 2 else pose[:3, 3]
     return points @ pose[..., :3, :3].swapaxes(-1, -2) + offset
 
@@ -74,8 +74,8 @@ def xyzw_to_wxyz(quaternions: Array) -> Array:
     return np.roll(quaternions, 1, axis=-1)
 
 
-def _one(px: float, py: float, pz: float, w: float, x: float, y: float, z: float) -> Array:
-    """To the bit what SciPy gives, which takes ten times as long."""
+def _single_from_wxyz(px: float, py: float, pz: float, w: float, x: float, y: float, z: float) -> Array:
+    """Return bit for bit the transform (4, 4) that SciPy gives, in a tenth of the time."""
     length = math.sqrt(x * x + y * y + z * z + w * w)
     w, x, y, z = w / length, x / length, y / length, z / length
     xx, yy, zz, ww = x * x, y * y, z * z, w * w

@@ -1,8 +1,8 @@
-"""Rotations of batches, tensors or NumPy's arrays (`arrays`). Quaternions are wxyz.
+"""Rotations of batches, which are tensors or NumPy arrays (`core.arrays`). Quaternions are wxyz.
 
-`core.poses` has rigid transforms in float64. Products of quaternions are as those of ManiSkill, whose own functions
-take a third of a millisecond on a CPU: float32, computed in float64, as products of float32 matrices may be TF32 on a
-GPU. Matrices of quaternions are computed in float32.
+Quaternion products are computed in float64 and returned in float32, since float32 matrix products may use TF32 on a
+GPU. Rotation matrices are computed in float32. ManiSkill's own functions give the same values, but take 0.3 ms each on
+a CPU. `core.poses` has rigid transforms in float64.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from robocas_ms3.core.arrays import Array, as_double, as_float, choose, join, matmul
+from robocas_ms3.core.arrays import Array, as_double, as_float, concatenate, matmul, where
 
 
 def from_euler(angles: Array) -> Array:
-    """Return unit quaternions (N, 4), w >= 0, of intrinsic XYZ Euler angles (N, 3), rad: R = Rx Ry Rz."""
+    """Convert intrinsic XYZ Euler angles (N, 3) in rad to unit quaternions (N, 4), w >= 0: R = Rx Ry Rz."""
     half = 0.5 * as_double(angles)
     library: Any = torch if isinstance(half, Tensor) else np
     (cx, cy, cz), (sx, sy, sz) = library.cos(half).T, library.sin(half).T
@@ -29,29 +29,29 @@ def from_euler(angles: Array) -> Array:
         cx * yz[2] - sx * yz[3],
         cx * yz[3] + sx * yz[2],
     ]
-    return positive(as_float(library.stack(parts, 1)))
+    return standardize(as_float(library.stack(parts, 1)))
 
 
 def multiply(first: Array, second: Array) -> Array:
-    """Return products (N, 4), w >= 0, of unit quaternions (N, 4)."""
-    product = matmul(left_matrix(as_double(first)), as_double(second)[:, :, None])
-    return positive(as_float(product[:, :, 0]))
+    """Multiply unit quaternions (N, 4); return products (N, 4) with w >= 0."""
+    product = matmul(left_product_matrix(as_double(first)), as_double(second)[:, :, None])
+    return standardize(as_float(product[:, :, 0]))
 
 
-def turn(quaternion: Array, vector: Array) -> Array:
-    """Return vectors (N, 3) turned by unit quaternions (N, 4)."""
-    left = left_matrix(as_double(quaternion))
+def rotate_float64(quaternion: Array, vector: Array) -> Array:
+    """Rotate vectors (N, 3) by unit quaternions (N, 4), computed in float64 and returned in float32."""
+    left = left_product_matrix(as_double(quaternion))
     half = matmul(left[:, :, 1:], as_double(vector)[:, :, None])
-    return as_float(matmul(left, join([-half[:, :1], half[:, 1:]], axis=1))[:, 1:, 0])
+    return as_float(matmul(left, concatenate([-half[:, :1], half[:, 1:]], axis=1))[:, 1:, 0])
 
 
-def positive(quaternion: Array) -> Array:
-    """Return the same rotations as quaternions (N, 4) with w >= 0."""
-    return choose(quaternion[:, :1] < 0, -quaternion, quaternion)
+def standardize(quaternion: Array) -> Array:
+    """Flip the signs of quaternions (N, 4) so that w >= 0."""
+    return where(quaternion[:, :1] < 0, -quaternion, quaternion)
 
 
-def left_matrix(quaternion: Array) -> Array:
-    """Return the matrices (N, 4, 4) that multiply quaternions by others (N, 4) from the left."""
+def left_product_matrix(quaternion: Array) -> Array:
+    """Return matrices (N, 4, 4) of the product with a quaternion (N, 4) on the left: q * p = L(q) p."""
     if isinstance(quaternion, Tensor):
         return torch.stack(_left_numbers(*quaternion.T), 1).reshape(-1, 4, 4)
     return (quaternion @ _LEFT).reshape(-1, 4, 4)
@@ -63,7 +63,7 @@ def _left_numbers(w: Any, x: Any, y: Any, z: Any) -> list[Any]:
 
 _LEFT = np.array([_left_numbers(*unit) for unit in np.eye(4)])
 
-# The entries of a rotation matrix, row by row, in the products of a quaternion's numbers, ww, wx, wy, ..., zz.
+# Coefficients of the rotation matrix (row-major) for the products ww, wx, wy, ..., zz of the quaternion's components
 _PRODUCTS = np.array(
     [
         # ww wx wy wz  xw xx xy xz  yw yx yy yz  zw zx zy zz
@@ -86,9 +86,9 @@ def _products_on(device: torch.device) -> Tensor:
     return torch.from_numpy(_PRODUCTS).to(device)
 
 
-def rotation(quaternion: Array) -> Array:
-    """Return the matrices (..., 3, 3) of unit quaternions (..., 4)."""
-    # few operations, as each takes longer than its arithmetic
+def to_matrix(quaternion: Array) -> Array:
+    """Convert unit quaternions (..., 4) to rotation matrices (..., 3, 3)."""
+    # few array operations, since the overhead per operation dominates
     products = quaternion[..., :, None] * quaternion[..., None, :]
     table = _products_on(quaternion.device) if isinstance(quaternion, Tensor) else _PRODUCTS
     shape = quaternion.shape[:-1]
@@ -97,14 +97,14 @@ def rotation(quaternion: Array) -> Array:
 
 def rotate_inverse(quaternion: Array, vector: Array) -> Array:
     """Rotate vectors (..., 3) by the inverse of unit quaternions (..., 4)."""
-    return (vector[..., None, :] @ rotation(quaternion))[..., 0, :]
+    return (vector[..., None, :] @ to_matrix(quaternion))[..., 0, :]
 
 
 def rotate(quaternion: Array, vector: Array) -> Array:
     """Rotate vectors (..., 3) by unit quaternions (..., 4)."""
-    return (rotation(quaternion) @ vector[..., None])[..., 0]
+    return (to_matrix(quaternion) @ vector[..., None])[..., 0]
 
 
-def upward(quaternion: Array) -> Array:
-    """Return the vertical axes (..., 3) of bodies with unit quaternions (..., 4)."""
-    return rotation(quaternion)[..., 2]
+def vertical_axis(quaternion: Array) -> Array:
+    """Return the z axes (..., 3) of frames with orientations (..., 4), unit quaternions."""
+    return to_matrix(quaternion)[..., 2]

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from robocas_ms3.core.arrays import as_float, as_tensor, choose, greater, known_all_false, length, native
+from robocas_ms3.core.arrays import as_float, as_tensor, known_all_false, maximum, norm, to_native, where
 from robocas_ms3.tasks import terms
 from robocas_ms3.tasks.base import RoboCASEnv
 from robocas_ms3.tasks.bodies import link_poses
@@ -36,9 +36,9 @@ class EpisodeMetrics:
 
     def __init__(self, env: RoboCASEnv) -> None:
         self._env = env
-        self._sums: Any = native(torch.zeros(env.num_envs, len(SUMS), device=env.device))
-        self._near = native(torch.zeros(env.num_envs, dtype=torch.bool, device=env.device))
-        self._in_v0: Any = native(torch.zeros(env.num_envs, dtype=torch.bool, device=env.device))
+        self._sums: Any = to_native(torch.zeros(env.num_envs, len(SUMS), device=env.device))
+        self._near = to_native(torch.zeros(env.num_envs, dtype=torch.bool, device=env.device))
+        self._in_v0: Any = to_native(torch.zeros(env.num_envs, dtype=torch.bool, device=env.device))
         self._tcp = self._tcp_pos()
         self._moment: Moment | None = None
         self._retrieval = RetrievalOrder(env) if isinstance(env, RoboCASSearchEnv) else None
@@ -55,18 +55,18 @@ class EpisodeMetrics:
         """Add a control step; ``opened`` (N,): whether the last command of each gripper was to open."""
         env, sums = self._env, self._sums
         tcp = self._tcp_pos()
-        sums[:, _PATH] += length(tcp - self._tcp)
+        sums[:, _PATH] += norm(tcp - self._tcp)
         self._tcp = tcp
         moment = env.success_check.moment
         if moment is not self._moment:
             self._moment = moment
-            impulse = length(moment.forces).sum((1, 2)) * env.control_timestep
+            impulse = norm(moment.forces).sum((1, 2)) * env.control_timestep
             sums[:, _IMPULSE] += impulse
-            sums[:, _DISTURBED] = greater(sums[:, _DISTURBED], as_float(moment.disturbed.sum(1)))
-            sums[:, _FALLEN] = greater(sums[:, _FALLEN], as_float(env.success_check.fallen().sum(1)))
-            target = terms.of_target(moment.objects[..., :2], native(env.target_slot))
+            sums[:, _DISTURBED] = maximum(sums[:, _DISTURBED], as_float(moment.disturbed.sum(1)))
+            sums[:, _FALLEN] = maximum(sums[:, _FALLEN], as_float(env.success_check.fallen().sum(1)))
+            target = terms.of_target(moment.objects[..., :2], to_native(env.target_slot))
             if moment.basket is not None:  # otherwise that rule never holds
-                self._near = length(target - moment.basket[:, :2]) <= V0_RADIUS
+                self._near = norm(target - moment.basket[:, :2]) <= V0_RADIUS
             if self._retrieval is not None:
                 self._retrieval.update(moment)
         open_command = torch.as_tensor(opened, device=env.device) if isinstance(tcp, torch.Tensor) else opened
@@ -110,10 +110,10 @@ class RetrievalOrder:
         shape = tuple(env.present.shape)
         self._over = torch.zeros(*shape, shape[1], dtype=torch.bool, device=env.device)
         self._needed = torch.zeros(shape, dtype=torch.bool, device=env.device)
-        self._moved_at = native(torch.zeros(shape, dtype=torch.int16, device=env.device))
-        self._moved_time = native(torch.zeros(shape, dtype=torch.int32, device=env.device))  # control steps
-        self._held = native(torch.zeros(shape[0], dtype=torch.bool, device=env.device))  # by now
-        self._steps = native(torch.zeros(shape[0], dtype=torch.int16, device=env.device))
+        self._moved_at = to_native(torch.zeros(shape, dtype=torch.int16, device=env.device))
+        self._moved_time = to_native(torch.zeros(shape, dtype=torch.int32, device=env.device))  # control steps
+        self._held = to_native(torch.zeros(shape[0], dtype=torch.bool, device=env.device))  # by now
+        self._steps = to_native(torch.zeros(shape[0], dtype=torch.int16, device=env.device))
         self._found: Tensor | None = None  # of `read`, until something changes
 
     def reset(self, envs: Any) -> None:
@@ -127,7 +127,7 @@ class RetrievalOrder:
         over[rows, env.target_slot[envs]] = False  # what the target lies on need not wait for it
         first = env.clutter(envs).obstacles | over[rows, :, env.target_slot[envs]]
         self._over[envs], self._needed[envs] = over, needed(first, over)
-        some = native(envs)
+        some = to_native(envs)
         self._moved_at[some], self._moved_time[some], self._steps[some] = 0, _NEVER, 0
         self._held[some], self._found = False, None
 
@@ -137,9 +137,9 @@ class RetrievalOrder:
         if known_all_false(now):
             return
         self._found = None
-        time = native(self._env.elapsed_steps.to(torch.int32))[:, None]
-        self._moved_at = choose(now, self._steps[:, None] + 1, self._moved_at)
-        self._moved_time = choose(now, time, self._moved_time)
+        time = to_native(self._env.elapsed_steps.to(torch.int32))[:, None]
+        self._moved_at = where(now, self._steps[:, None] + 1, self._moved_at)
+        self._moved_time = where(now, time, self._moved_time)
 
     def end_step(self) -> None:
         self._steps += 1

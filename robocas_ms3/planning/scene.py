@@ -11,7 +11,7 @@ from mani_skill.utils.structs import Articulation
 
 from robocas_ms3.assets.kinematics import link_poses
 from robocas_ms3.assets.pack import Part
-from robocas_ms3.core.poses import from_wxyz, inverse, transform
+from robocas_ms3.core.poses import from_wxyz, inverse, transform_points
 from robocas_ms3.planning.protocol import Array, Obstacle, Shape
 from robocas_ms3.tasks.base import RoboCASEnv
 
@@ -98,7 +98,7 @@ class PlanningScene:
 
     def object_surface(self, slot: int) -> Array:
         """Return samples (P, 3) of an object's surface."""
-        return transform(self.object_in_base(slot), self.env.object_assets[0][slot].surface_points(SPACING))
+        return transform_points(self.object_in_base(slot), self.env.object_assets[0][slot].surface_points(SPACING))
 
     @property
     def basket_in_base(self) -> Array:
@@ -149,5 +149,5 @@ class PlanningScene:
                 away = points - middle
                 points = points[np.einsum("ij,ij->i", away, away) <= radius**2]
             if len(points):
-                pieces.append(transform(in_base, points))
+                pieces.append(transform_points(in_base, points))
         return np.concatenate(pieces)

@@ -8,7 +8,7 @@ import torch
 from mani_skill.agents.controllers import PDJointPosController
 from sapien.physx import PhysxArticulationJoint
 
-from robocas_ms3.core.arrays import as_tensor, clamp, native
+from robocas_ms3.core.arrays import as_tensor, clamp, to_native
 
 # Distances of a joint from its drive target (rad, m) that no motion explains: the state was set from outside.
 ARM_SET_FROM_OUTSIDE, HELD_SET_FROM_OUTSIDE = 0.3, 0.02
@@ -41,11 +41,11 @@ class DirectDrives(BatchedDrives):
     def _initialize_joints(self) -> None:
         super()._initialize_joints()
         self._drives: list[PhysxArticulationJoint] = [joint._objs[0] for joint in self.joints]
-        self._columns = native(self.active_joint_indices)
+        self._columns = to_native(self.active_joint_indices)
 
     def _clip_and_scale_action_space(self) -> None:
         super()._clip_and_scale_action_space()
-        low, high = native(self.action_space_low), native(self.action_space_high)
+        low, high = to_native(self.action_space_low), to_native(self.action_space_high)
         self._middle, self._half = 0.5 * (high + low), 0.5 * (high - low)
 
     def _clip_and_scale_action(self, action: Any) -> Any:
@@ -53,7 +53,7 @@ class DirectDrives(BatchedDrives):
 
     def _taken(self, action: Any) -> Any:
         """An action (N, size) tensor, native and scaled."""
-        return self._preprocess_action(native(action))
+        return self._preprocess_action(to_native(action))
 
     def _now(self) -> Any:
         """(N, joints) present positions, rad or m, native."""

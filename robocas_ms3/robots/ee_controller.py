@@ -19,13 +19,13 @@ from robocas_ms3.core.arrays import (
     as_double,
     as_float,
     as_tensor,
-    choose,
     clamp,
-    join,
+    concatenate,
     known_all_false,
     known_all_true,
-    length,
-    native,
+    norm,
+    to_native,
+    where,
 )
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.robots.drives import ARM_SET_FROM_OUTSIDE, EvenDrives
@@ -47,7 +47,7 @@ def _relative_pose(frame: Link, link: Link) -> Any:
     if frame.scene.gpu_sim_enabled:
         base, pose = frame.pose, link.pose  # ManiSkill's own product waits for the GPU
         inverse = torch.cat([base.q[:, :1], -base.q[:, 1:]], dim=1)
-        return join([rotations.turn(inverse, pose.p - base.p), rotations.multiply(inverse, pose.q)])
+        return concatenate([rotations.rotate_float64(inverse, pose.p - base.p), rotations.multiply(inverse, pose.q)])
     pose = frame._bodies[0].entity_pose.inv() * link._bodies[0].entity_pose
     position, quaternion = pose.p, pose.q
     if quaternion[0] < 0:  # as ManiSkill's products
@@ -72,7 +72,7 @@ class _ArmChainController(PDEEPoseController):
         if names != self._chain.joint_names:
             what, expected = "the controlled joints are not those of the arm", ", ".join(self._chain.joint_names)
             raise RobocasError(what, where=self.config.urdf_path, expected=expected, found=", ".join(names))
-        limits = as_double(native(self.articulation.get_qlimits()[0, self.active_joint_indices]))
+        limits = as_double(to_native(self.articulation.get_qlimits()[0, self.active_joint_indices]))
         self._lower, self._upper = limits[:, 0], limits[:, 1]
 
     def _solve(self, target: Any, qpos: Any) -> tuple[Any, Any]:
@@ -94,14 +94,14 @@ class RoboCASEEPoseController(EvenDrives, _ArmChainController):
 
     def _clip_and_scale_action(self, action: Any) -> Any:
         position, rotation = clamp(action[:, :3], -1, 1), action[:, 3:]
-        rotation = rotation / clamp(length(rotation)[:, None], 1.0, np.inf)
-        return self._middle + self._half * join([position, rotation])
+        rotation = rotation / clamp(norm(rotation)[:, None], 1.0, np.inf)
+        return self._middle + self._half * concatenate([position, rotation])
 
     def _wanted_pose(self, reference: Any, action: Any) -> Any:
         """Return targets (N, 7) in the arm's base frame of actions (N, 6), m and rad, relative to a pose or not."""
         if reference is not None:
-            return join([*ee_delta_target(reference[:, :3], reference[:, 3:], action)])
-        return join([action[:, :3], rotations.from_euler(action[:, 3:6])])
+            return concatenate([*ee_delta_target(reference[:, :3], reference[:, 3:], action)])
+        return concatenate([action[:, :3], rotations.from_euler(action[:, 3:6])])
 
     sets_target_qvel = True
 
@@ -111,13 +111,13 @@ class RoboCASEEPoseController(EvenDrives, _ArmChainController):
         reference = self._reference_pose() if self.config.use_delta else None
         last = now = self._now()
         if self._target_qpos is not None:
-            last = native(self._target_qpos)
-        start = choose(abs(last - now) > ARM_SET_FROM_OUTSIDE, now, last)
+            last = to_native(self._target_qpos)
+        start = where(abs(last - now) > ARM_SET_FROM_OUTSIDE, now, last)
         wanted = self._wanted_pose(reference, action)
         target, solved = self._solve(wanted, now)
         if not known_all_true(solved):
             stay = self._reference_pose() if reference is None else reference
-            target, wanted = choose(solved[:, None], target, now), choose(solved[:, None], wanted, stay)
+            target, wanted = where(solved[:, None], target, now), where(solved[:, None], wanted, stay)
         self._target_pose, self._target_qpos = Pose(raw_pose=as_tensor(wanted)), as_tensor(target)
         if self.config.use_delta:
             self._drive_with(start, (target - start) * self._control_freq)
@@ -139,13 +139,13 @@ class RoboCASEEPoseController(EvenDrives, _ArmChainController):
         if not self.config.use_target or self._target_pose is None:
             return now
         far, turned = EE_HELD_BACK
-        target = native(self._target_pose.raw_pose)
-        distance = length(target[:, :3] - now[:, :3])
+        target = to_native(self._target_pose.raw_pose)
+        distance = norm(target[:, :3] - now[:, :3])
         cosine = abs((target[:, 3:] * now[:, 3:]).sum(1))  # of half the angle between them
         lost = (distance > far) | (cosine < np.cos(turned / 2))
         if known_all_false(lost):
             return target
-        return choose(lost[:, None], now, target)
+        return where(lost[:, None], now, target)
 
 
 @dataclass

@@ -50,4 +50,4 @@ def ee_delta_target(position: Array, quaternion: Array, delta: Array) -> tuple[A
         Position (N, 3) and quaternion (N, 4) of the target in the parent frame.
     """
     rotation = rotations.from_euler(delta[:, 3:6])
-    return position + rotations.turn(quaternion, delta[:, :3]), rotations.multiply(quaternion, rotation)
+    return position + rotations.rotate_float64(quaternion, delta[:, :3]), rotations.multiply(quaternion, rotation)

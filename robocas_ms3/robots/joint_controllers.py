@@ -17,7 +17,7 @@ from mani_skill.agents.controllers import (
 from mani_skill.agents.controllers.base_controller import CombinedController
 from mani_skill.utils.structs import Pose
 
-from robocas_ms3.core.arrays import as_tensor, choose, clamp, join, native
+from robocas_ms3.core.arrays import as_tensor, clamp, concatenate, to_native, where
 from robocas_ms3.robots.drives import (
     ARM_SET_FROM_OUTSIDE,
     HELD_SET_FROM_OUTSIDE,
@@ -43,7 +43,7 @@ class FingersController(DirectDrives, PDJointPosMimicController):
     def set_action(self, action: Any) -> None:
         """Take the position (N, 1) of every finger."""
         action = self._taken(action)
-        self._target_qpos = as_tensor(join([action] * len(self.joints)))
+        self._target_qpos = as_tensor(concatenate([action] * len(self.joints)))
         self.set_drive_targets(self._target_qpos)
 
 
@@ -65,15 +65,15 @@ class SmoothJointPosController(EvenDrives):
 
     def _initialize_joints(self) -> None:
         super()._initialize_joints()
-        limits = native(self.articulation.get_qlimits()[0, self.active_joint_indices])
+        limits = to_native(self.articulation.get_qlimits()[0, self.active_joint_indices])
         self._low, self._high = limits[:, 0], limits[:, 1]
 
     def set_action(self, action: Any) -> None:
         """Take the positions (N, joints), rad or m, to command at the end of the control step."""
         action = self._taken(action)
         assert self._target_qpos is not None, "the controller has not been reset"
-        now, last = self._now(), native(self._target_qpos)
-        start = choose(abs(last - now) > ARM_SET_FROM_OUTSIDE, now, last)
+        now, last = self._now(), to_native(self._target_qpos)
+        start = where(abs(last - now) > ARM_SET_FROM_OUTSIDE, now, last)
         travel = action if self.config.use_delta else action - start
         if self.config.max_speed is not None:
             furthest = self.config.max_speed / self._control_freq
@@ -111,8 +111,8 @@ class HeldJointsController(DirectDrives):
     def set_action(self, action: Any) -> None:
         """Keep the drive targets, unless the state was set from outside: then hold the joints where they are now."""
         assert self._target_qpos is not None, "the controller has not been reset"
-        now, held = self._now(), native(self._target_qpos)
-        self._target_qpos = as_tensor(choose(abs(held - now) > HELD_SET_FROM_OUTSIDE, now, held))
+        now, held = self._now(), to_native(self._target_qpos)
+        self._target_qpos = as_tensor(where(abs(held - now) > HELD_SET_FROM_OUTSIDE, now, held))
         self.set_drive_targets(self._target_qpos)
 
 

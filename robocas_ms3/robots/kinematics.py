@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from robocas_ms3.core.arrays import Array, choose, clamp, join, known_all_false, matmul
+from robocas_ms3.core.arrays import Array, clamp, concatenate, known_all_false, matmul, where
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.core.rotations import left_matrix, positive
+from robocas_ms3.core.rotations import left_product_matrix, standardize
 from robocas_ms3.robots.description_file import read_joints
 
 IK_ITERATIONS = 8
@@ -92,15 +92,15 @@ class SerialChain:
             frames = self._frames(qpos[..., 0])
             tip = frames[-1]
             rotation = matmul(to_target, tip[1, ..., :1])
-            rotation = positive(rotation)
-            error = join([position - tip[0, :, :3, 3:], 2 * rotation[:, 1:]], axis=1)  # (N, 6, 1)
+            rotation = standardize(rotation)
+            error = concatenate([position - tip[0, :, :3, 3:], 2 * rotation[:, 1:]], axis=1)  # (N, 6, 1)
             square = matmul(error.swapaxes(1, 2), error)  # (N, 1, 1)
             moving = square > IK_CONVERGED**2
             if iteration == IK_ITERATIONS or known_all_false(moving):
                 return qpos[..., 0], square[:, 0, 0] < IK_TOLERANCE**2
             error = error * moving / clamp(square**0.5 / IK_MAX_ERROR, 1.0, np.inf)
             twists = _twists(frames)
-            room = choose(matmul(twists, error) < 0, qpos - lower, upper - qpos)
+            room = where(matmul(twists, error) < 0, qpos - lower, upper - qpos)
             twists = twists * (room > 0)
             damping = (IK_DAMPING * square + IK_LEAST_DAMPING) * self._identity
             step = matmul(twists, _solve(matmul(twists.swapaxes(1, 2), twists) + damping, error))
@@ -108,7 +108,7 @@ class SerialChain:
             iteration += 1
 
     def _frames(self, qpos: Array) -> Array:
-        """Return poses of the joints and the tip, and the `left_matrix` of each orientation: (n + 1, 2, N, 4, 4)."""
+        """Return poses of joints and the tip, and left product matrices of their orientations (n + 1, 2, N, 4, 4)."""
         rows, count = len(qpos), qpos.shape[1] + 1
         angles = qpos @ self._angles + self._shift
         sines = torch.sin(angles) if isinstance(angles, Tensor) else np.sin(angles)
@@ -136,9 +136,9 @@ def _joint_constants(fixed: list[NDArray[np.float64]]) -> tuple[NDArray[np.float
     weights, constant = np.zeros((count, 4, count + 1, 2, 4, 4)), np.zeros((count + 1, 2, 4, 4))
     quarter_turn = np.zeros((4, 4))
     quarter_turn[:2, :2] = [[0, -1], [1, 0]]
-    half_turn = left_matrix(np.array([[0.0, 0, 0, 1]]))[0]
+    half_turn = left_product_matrix(np.array([[0.0, 0, 0, 1]]))[0]
     for i, pose in enumerate(fixed):
-        quaternion = left_matrix(Rotation.from_matrix(pose[:3, :3]).as_quat()[None, [3, 0, 1, 2]])[0]
+        quaternion = left_product_matrix(Rotation.from_matrix(pose[:3, :3]).as_quat()[None, [3, 0, 1, 2]])[0]
         if i == count:
             constant[i] = pose, quaternion
         else:
@@ -157,7 +157,7 @@ def _frame_about(z: NDArray[np.float64]) -> NDArray[np.float64]:
     return pose
 
 
-_QUOTIENT = (left_matrix(np.eye(4)) @ np.diag([1, -1, -1, -1])).reshape(4, 16)
+_QUOTIENT = (left_product_matrix(np.eye(4)) @ np.diag([1, -1, -1, -1])).reshape(4, 16)
 """Turns quaternions a (N, 4) into matrices (N, 16) that multiply quaternions b to a times the conjugate of b."""
 
 
@@ -165,7 +165,7 @@ def _twists(frames: Array) -> Array:
     """Return the motions (N, n, 6) of the tip, m and rad, per rad of each joint."""
     poses = frames[:, 0, :, :3]
     axes, points = poses[:-1, ..., 2], poses[..., 3]
-    return join([_cross(axes, points[-1:] - points[:-1]), axes]).swapaxes(0, 1)
+    return concatenate([_cross(axes, points[-1:] - points[:-1]), axes]).swapaxes(0, 1)
 
 
 def _cross(first: Array, second: Array) -> Array:

@@ -13,7 +13,7 @@ from robocas_ms3.assets.hulls import Hull
 from robocas_ms3.assets.kinematics import link_poses
 from robocas_ms3.assets.pack import LoadedFurniture
 from robocas_ms3.core.errors import ConfigError
-from robocas_ms3.core.poses import transform
+from robocas_ms3.core.poses import transform_points
 from robocas_ms3.robots.description import Envelope, RobotDescription
 from robocas_ms3.scenes.config.task import TaskConfig
 from robocas_ms3.scenes.placement import Array, Region
@@ -76,7 +76,7 @@ def check_clearance(
     if envelope is not None:
         if config.randomisation.robot is None:
             arm = np.array(envelope.arm_at_start[config.robot_start])
-            _check_arm(transform(robot_pose, _densely(arm)), fixed)
+            _check_arm(transform_points(robot_pose, _densely(arm)), fixed)
         _check_reach(config, placed.get("basket"), region, _shoulders(config, robot_pose, robot, envelope), envelope)
 
 
@@ -120,16 +120,18 @@ def _near(one: Standing, other: Standing) -> list[tuple[Hull, Hull]]:
 
 
 def _world_hulls(part: LoadedFurniture, pose: Array, joints: Mapping[str, float]) -> list[Hull]:
-    hulls = [Hull(transform(pose, hull.vertices), hull.faces) for hull in part.hull_meshes]
+    hulls = [Hull(transform_points(pose, hull.vertices), hull.faces) for hull in part.hull_meshes]
     for name, moved in link_poses(part.asset.links, joints).items():
-        hulls += [Hull(transform(pose @ moved, hull.vertices), hull.faces) for hull in part.links[name].hull_meshes]
+        hulls += [
+            Hull(transform_points(pose @ moved, hull.vertices), hull.faces) for hull in part.links[name].hull_meshes
+        ]
     return hulls
 
 
 def _body(envelope: Envelope, robot_pose: Array) -> Standing:
     corners = np.array(list(product((-1.0, 1.0), (-1.0, 1.0), (0.0, 1.0))))
     sides = np.array([(0, 1, 2), (0, 1, 4), (0, 2, 4)])  # one along x, y and z each: those opposite add no axes
-    hulls = [Hull(transform(robot_pose, corners * box), sides) for box in envelope.body_boxes]
+    hulls = [Hull(transform_points(robot_pose, corners * box), sides) for box in envelope.body_boxes]
     return Standing("robot", hulls)
 
 
@@ -158,7 +160,7 @@ def _shoulders(config: TaskConfig, robot_pose: Array, robot: RobotDescription, e
     spans = [np.arange(low, high + _STEP, _STEP) for low, high in ranges]
     x, y = (grid.ravel() for grid in np.meshgrid(*spans))
     height = np.full(len(x), robot.arm_base_height + envelope.shoulder)
-    return transform(robot_pose, np.stack([x, y, height], axis=1))
+    return transform_points(robot_pose, np.stack([x, y, height], axis=1))
 
 
 def _check_reach(
@@ -194,5 +196,5 @@ def _within(distance: float, limit: float, what: str, fix: str) -> None:
 
 def _distance(points: Array, frame: Array, low: Array, high: Array) -> float:
     """Return the least distance of points (P, 3) in the world from a box in a frame, m."""
-    local = transform(np.asarray(np.linalg.inv(frame), dtype=np.float64), points)
+    local = transform_points(np.asarray(np.linalg.inv(frame), dtype=np.float64), points)
     return float(np.linalg.norm(local - np.clip(local, low, high), axis=1).min())

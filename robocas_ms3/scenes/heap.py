@@ -23,7 +23,7 @@ from robocas_ms3.assets.physics import (
     solid_of,
 )
 from robocas_ms3.core.errors import LayoutError
-from robocas_ms3.core.poses import planar, transform
+from robocas_ms3.core.poses import from_xyz_yaw, transform_points
 from robocas_ms3.core.text import format_count
 from robocas_ms3.scenes.config.task import StackedLayout
 from robocas_ms3.scenes.placement import Array, Region
@@ -72,12 +72,12 @@ def drop_heap(
         with engine_settings():
             poses = _spread(assets, _fill_bucket(rng, assets, region, layout), region)
         centers = np.stack(
-            [transform(p, np.array([a.asset.center_of_mass]))[0] for a, p in zip(assets, poses, strict=True)]
+            [transform_points(p, np.array([a.asset.center_of_mass]))[0] for a, p in zip(assets, poses, strict=True)]
         )
         inside = (centers[:, :2] >= np.array(region.min_xy) - SPREAD) & (
             centers[:, :2] <= np.array(region.max_xy) + SPREAD
         )
-        top = max(transform(p, np.concatenate(a.hulls))[:, 2].max() for a, p in zip(assets, poses, strict=True))
+        top = max(transform_points(p, np.concatenate(a.hulls))[:, 2].max() for a, p in zip(assets, poses, strict=True))
         if inside.all() and top - region.z < headroom:
             return poses
     raise LayoutError(
@@ -102,11 +102,13 @@ def _fill_bucket(
     for index in falling_order(rng, assets, layout.order_noise).tolist():
         asset = assets[index]
         pose = _falling_pose(rng, asset, layout.tumble_probability)
-        points = transform(pose, outlines[index])
+        points = transform_points(pose, outlines[index])
         room = np.maximum(half - np.abs(points[:, :2]).max(axis=0), 0)
         x, y = middle + rng.uniform(-1, 1, 2) * room * layout.drop_spread
-        top = max((transform(pose_matrix(b), outlines[i])[:, 2].max() for i, b in bodies.items()), default=region.z)
-        pose = planar(x, y, top + layout.drop_height - points[:, 2].min(), 0) @ pose
+        top = max(
+            (transform_points(pose_matrix(b), outlines[i])[:, 2].max() for i, b in bodies.items()), default=region.z
+        )
+        pose = from_xyz_yaw(x, y, top + layout.drop_height - points[:, 2].min(), 0) @ pose
         bodies[index] = add_body(scene, replace(solid_of(asset), hulls=[outlines[index]]), pose)
         _run(scene, layout.fall_seconds, list(bodies.values()))
     _run(scene, BUCKET_SECONDS, list(bodies.values()))
@@ -155,7 +157,7 @@ def _falling_pose(rng: np.random.Generator, asset: LoadedObject, tumble: float) 
         pose[:3, 3] = -pose[:3, :3] @ np.array(asset.asset.center_of_mass)
         return pose
     choice = int(rng.choice(len(notes.resting_probabilities), p=notes.resting_probabilities))
-    return planar(0, 0, 0, rng.uniform(-np.pi, np.pi)) @ notes.resting_poses[choice]
+    return from_xyz_yaw(0, 0, 0, rng.uniform(-np.pi, np.pi)) @ notes.resting_poses[choice]
 
 
 def _add_walls(scene: sapien.Scene, middle: Array, half: Array, z: float) -> list[sapien.Entity]:

@@ -10,7 +10,7 @@ import numpy as np
 from robocas_ms3.assets.manifest import Joint
 from robocas_ms3.assets.pack import LoadedFurniture, Pack, load_pack
 from robocas_ms3.core.errors import ConfigError
-from robocas_ms3.core.poses import planar
+from robocas_ms3.core.poses import from_xyz_yaw
 from robocas_ms3.core.strict_model import did_you_mean
 from robocas_ms3.scenes.config.task import OrderlyLayout, PlacedConfig, PoseConfig, SurfaceConfig, TaskConfig
 from robocas_ms3.scenes.placement import Array, Region
@@ -21,7 +21,7 @@ OPENED_AT_MOST = {"prismatic": 0.95, "revolute": 0.8}  # share of a joint's rang
 
 
 def fixture_pose(config: PoseConfig) -> Array:
-    return planar(*config.position, np.deg2rad(config.yaw_deg))
+    return from_xyz_yaw(*config.position, np.deg2rad(config.yaw_deg))
 
 
 def furniture_pose(config: PlacedConfig, furniture: LoadedFurniture) -> Array:

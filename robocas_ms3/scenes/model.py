@@ -10,7 +10,7 @@ import numpy as np
 from robocas_ms3.assets.kinematics import link_poses
 from robocas_ms3.assets.manifest import Joint
 from robocas_ms3.assets.pack import LoadedFurniture, Pack
-from robocas_ms3.core.poses import transform
+from robocas_ms3.core.poses import transform_points
 from robocas_ms3.robots.description import MOBILE_PANDA, RobotDescription
 from robocas_ms3.scenes.clearance import check_clearance
 from robocas_ms3.scenes.config.task import TaskConfig
@@ -151,7 +151,7 @@ class SceneModel:
         furniture = self._opened_points if opened else self.furniture_points
         if self.basket is None or basket_pose is None:
             return furniture
-        return np.concatenate([furniture, transform(basket_pose, self.basket.surface_points())])
+        return np.concatenate([furniture, transform_points(basket_pose, self.basket.surface_points())])
 
     @cached_property
     def furniture_points(self) -> Array:
@@ -165,7 +165,9 @@ class SceneModel:
     def _furniture_points(self, *, opened: bool) -> Array:
         return np.concatenate(
             [
-                transform(self.furniture_poses[n], asset.all_surface_points(self.joint_positions(n, opened=opened)))
+                transform_points(
+                    self.furniture_poses[n], asset.all_surface_points(self.joint_positions(n, opened=opened))
+                )
                 for n, asset in self.furniture.items()
             ]
         )

@@ -10,7 +10,7 @@ import shapely
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import LayoutError
-from robocas_ms3.core.poses import planar
+from robocas_ms3.core.poses import from_xyz_yaw
 from robocas_ms3.core.text import format_count
 from robocas_ms3.scenes.config.task import OrderlyLayout, ScatteredLayout
 
@@ -79,7 +79,7 @@ def sample_scattered(
             shapely.prepare(outlines[best])
             placed.append(outlines[best])
             x, y = positions[best]
-            poses[index] = planar(x, y, region.z, yaws[best]) @ placeable.resting_poses[choice]
+            poses[index] = from_xyz_yaw(x, y, region.z, yaws[best]) @ placeable.resting_poses[choice]
         if len(placed) == len(placeables):
             return poses
     size, things = np.subtract(region.max_xy, region.min_xy), format_count(len(placeables), "object")
@@ -152,7 +152,7 @@ def sample_orderly(
     choices = [p.display_pose if p.display_pose >= 0 else int(np.argmax(p.probabilities)) for p in placeables]
     low, high = np.zeros((len(placeables), 2)), np.zeros((len(placeables), 2))  # extents along the edge, and ahead
     for i, (placeable, choice, yaw) in enumerate(zip(placeables, choices, yaws, strict=True)):
-        turned = placeable.footprints[choice] @ planar(0, 0, 0, yaw)[:2, :2].T @ np.column_stack([along, front])
+        turned = placeable.footprints[choice] @ from_xyz_yaw(0, 0, 0, yaw)[:2, :2].T @ np.column_stack([along, front])
         low[i], high[i] = turned.min(axis=0), turned.max(axis=0)
 
     members = _ordered(rng, columns)
@@ -171,7 +171,7 @@ def sample_orderly(
         free = edge  # what is left of the column begins here
         for i in column:
             x, y = (center - (low[i, 0] + high[i, 0]) / 2) * along + (free - high[i, 1]) * front
-            poses[i] = planar(x, y, region.z, yaws[i]) @ placeables[i].resting_poses[choices[i]]
+            poses[i] = from_xyz_yaw(x, y, region.z, yaws[i]) @ placeables[i].resting_poses[choices[i]]
             free -= high[i, 1] - low[i, 1] + layout.row_gap
             depth = edge - free - layout.row_gap
             there[i] = depth <= edge - back

@@ -9,7 +9,7 @@ import numpy as np
 
 from robocas_ms3.assets.physics import TIME_STEP, Solid, add_body, add_fixed, engine_settings, new_scene, pose_matrix
 from robocas_ms3.core.errors import LayoutError
-from robocas_ms3.core.poses import planar, transform
+from robocas_ms3.core.poses import from_xyz_yaw, transform_points
 from robocas_ms3.robots.description import PANDA_ENVELOPE
 from robocas_ms3.scenes.config.randomisation import PoseRandomisation
 from robocas_ms3.scenes.model import SceneModel
@@ -41,7 +41,7 @@ def place_basket(model: SceneModel, robot_pose: Array, rng: np.random.Generator)
     points = model.basket.surface_points()
 
     def good(pose: Array) -> bool:
-        return body_is_free(robot_pose, transform(pose, points)) and basket_stands(model, pose)
+        return body_is_free(robot_pose, transform_points(pose, points)) and basket_stands(model, pose)
 
     return _place("basket", model.basket_pose, model.config.randomisation.basket, rng, good)
 
@@ -66,7 +66,7 @@ def _place(
 def _moved(pose: Array, by: PoseRandomisation, rng: np.random.Generator) -> Array:
     """Shift a pose in x and y and turn it about its own vertical."""
     shift, yaw = rng.uniform(-by.position, by.position, 2), np.deg2rad(rng.uniform(-by.yaw_deg, by.yaw_deg))
-    moved = pose @ planar(0, 0, 0, yaw)
+    moved = pose @ from_xyz_yaw(0, 0, 0, yaw)
     moved[:2, 3] += shift
     return moved
 
@@ -78,7 +78,7 @@ def body_is_free(base_in_world: Array, cloud: Array) -> bool:
         base_in_world: 4x4 of a frame on the floor, turned as the mobile base is: the robot's root, base joints at 0.
         cloud: the points, m.
     """
-    local = transform(np.asarray(np.linalg.inv(base_in_world), dtype=np.float64), cloud)
+    local = transform_points(np.asarray(np.linalg.inv(base_in_world), dtype=np.float64), cloud)
     x, y, z = np.abs(local[:, 0]), np.abs(local[:, 1]), local[:, 2]
     inside = [(x <= half_x) & (y <= half_y) & (z <= height) for half_x, half_y, height in _BODY_BOXES]
     return not ((z > 0) & np.logical_or.reduce(inside)).any()

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.assets.pack import LoadedFurniture, LoadedObject
 from robocas_ms3.core.errors import LayoutError
-from robocas_ms3.core.poses import planar, transform
+from robocas_ms3.core.poses import from_xyz_yaw, transform_points
 from robocas_ms3.scenes.config.task import OrderlyLayout, ScatteredLayout, StackedLayout
 from robocas_ms3.scenes.heap import drop_heap
 from robocas_ms3.scenes.layout import PARKING_HEIGHT, Layout, ObjectIds
@@ -132,7 +132,7 @@ def meets_basket(
     walls = np.concatenate(basket.hulls)
     low, high = walls.min(axis=0), walls.max(axis=0)
     for asset, pose in zip(assets, poses, strict=True):
-        points = transform(np.linalg.inv(basket_pose) @ pose, np.concatenate(asset.hulls))
+        points = transform_points(np.linalg.inv(basket_pose) @ pose, np.concatenate(asset.hulls))
         if np.all((points.max(axis=0) > low) & (points.min(axis=0) < high)):
             return True
     return False
@@ -202,7 +202,7 @@ def placeable(asset: LoadedObject, headroom: float = np.inf) -> PlaceableObject:
     low = np.arange(len(notes.resting_poses))
     if np.isfinite(headroom):
         points = np.concatenate(asset.hulls)
-        low = low[[transform(pose, points)[:, 2].max() < headroom for pose in notes.resting_poses]]
+        low = low[[transform_points(pose, points)[:, 2].max() < headroom for pose in notes.resting_poses]]
     return PlaceableObject(
         asset.asset.id,
         notes.resting_poses[low],
@@ -237,4 +237,4 @@ def _presence(model: SceneModel, slots: int, rng: np.random.Generator) -> tuple[
 
 
 def _parked(slot: int, asset: LoadedObject) -> Array:
-    return planar(slot * 0.5, 0, PARKING_HEIGHT, 0) @ asset.annotations.resting_poses[0]
+    return from_xyz_yaw(slot * 0.5, 0, PARKING_HEIGHT, 0) @ asset.annotations.resting_poses[0]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from robocas_ms3.assets.annotations import GRIPPER_RADIUS
 from robocas_ms3.assets.pack import LoadedObject
 from robocas_ms3.core.extensions import load_object
-from robocas_ms3.core.poses import transform
+from robocas_ms3.core.poses import transform_points
 from robocas_ms3.scenes.grasp_checks import PREGRASP_DISTANCE, has_free_grasps
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.placement import Array
@@ -91,7 +91,7 @@ class Arrangement:
     def has_free_grasps(self, slot: int) -> bool:
         """Return whether enough of an object's grasps are clear of everything else."""
         others = [
-            transform(self.opened_poses[other], self.assets[other].surface_points())
+            transform_points(self.opened_poses[other], self.assets[other].surface_points())
             for other in np.flatnonzero(self.present)
             if other != slot and self._within_reach(slot, other)
         ]
@@ -170,7 +170,7 @@ def selection_camera(model: SceneModel) -> PinholeCamera:
     """Return the camera that p_vis is measured with: over the middle of the objects' region."""
     region = model.region
     middle = np.append(np.add(region.min_xy, region.max_xy) / 2, region.z)
-    center = transform(model.support_pose, middle[None])[0]
+    center = transform_points(model.support_pose, middle[None])[0]
     return top_down_camera(center[:2], center[2])
 
 

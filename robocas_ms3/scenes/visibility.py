@@ -15,7 +15,7 @@ from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
 from robocas_ms3.assets.pack import Part, VisualLevel
-from robocas_ms3.core.poses import transform
+from robocas_ms3.core.poses import transform_points
 from robocas_ms3.scenes.placement import Array
 
 PixelBox = tuple[slice, slice]  # rows, columns
@@ -120,7 +120,7 @@ class Scenery:
 
 def _depths(camera: PinholeCamera, mesh: trimesh.Trimesh, pose: Array) -> tuple[PixelBox, Array]:
     """Return the box of pixels that a mesh appears in, and its depth there, m; infinite: none."""
-    box = camera.pixel_box(transform(pose, mesh.vertices))
+    box = camera.pixel_box(transform_points(pose, mesh.vertices))
     # rays go into the mesh's frame: its search tree is built once, and single precision is plenty there
     to_mesh = pose[:3, :3].T
     position = to_mesh @ (camera.pose[:3, 3] - pose[:3, 3])

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 
 from robocas_ms3.core import rotations
-from robocas_ms3.core.arrays import Array, known_all_true, native
+from robocas_ms3.core.arrays import Array, known_all_true, to_native
 from robocas_ms3.tasks import rewards, terms
 
 _RIM = 0.05  # m around the basket's inside that still count as over it for a target that falls
@@ -116,9 +116,9 @@ class InBasket(Goal):
         assert inner is not None  # the model saw to it
         low, high = (torch.tensor(corner, device=env.device) for corner in (inner.min, inner.max))
         aside = torch.tensor([_RIM, _RIM, torch.inf], device=env.device)
-        self._inside = native(low), native(high)
-        self._above = native(low - aside), native(high + aside)
-        self._drop = native(torch.cat([(low + high)[:2] / 2, high[2:] + _DROP_HEIGHT]))  # in the basket's frame
+        self._inside = to_native(low), to_native(high)
+        self._above = to_native(low - aside), to_native(high + aside)
+        self._drop = to_native(torch.cat([(low + high)[:2] / 2, high[2:] + _DROP_HEIGHT]))  # in the basket's frame
 
     def holds(self, centers: Array, basket: Array | None) -> Array:
         return terms.inside_box(centers, *_split(basket), *self._inside)
@@ -129,13 +129,13 @@ class InBasket(Goal):
         return position + rotations.rotate(quaternion, self._drop)
 
     def measures(self, basket: Array | None) -> dict[str, Array]:
-        start = native(self.env.basket_at_start)
+        start = to_native(self.env.basket_at_start)
         return {"basket_stands": terms.stands(*_split(basket), *_split(start))}
 
     def lost(self, basket: Array | None, measures: dict[str, Array]) -> Array | None:
         if known_all_true(measures["basket_stands"]):  # as nearly always
             return None
-        start = native(self.env.basket_at_start)
+        start = to_native(self.env.basket_at_start)
         over = terms.fell_over(*_split(basket), *_split(start))
         return over & ~measures["basket_stands"]
 
@@ -146,7 +146,7 @@ class InBasket(Goal):
     def progress(self, now: Moment, brought: Array, table: rewards.RewardTable) -> tuple[Array, dict[str, Array]]:
         """See `Goal`: grasp, lift, carry, place, release, rest."""
         env = self.env
-        slot = native(env.target_slot)
+        slot = to_native(env.target_slot)
         target, center = terms.of_target(now.objects, slot), env.target_center(now.objects)
         basket, turned = _split(now.basket)
         inside = rotations.rotate_inverse(turned, center - basket)  # the target in the basket's frame
@@ -164,7 +164,7 @@ class InBasket(Goal):
                 (delivered & ~now.touched, table.index("rest")),
             ],
         )
-        start = terms.of_target(native(env.start_poses)[..., 2], slot)
+        start = terms.of_target(to_native(env.start_poses)[..., 2], slot)
         return stage, {
             "reach": rewards.closeness(env.tcp_in_world()[:, :3], center),
             "lift": rewards.rise(target[:, 2], start, terms.LIFT),
@@ -175,7 +175,7 @@ class InBasket(Goal):
         }
 
     def penalties(self, now: Moment) -> dict[str, Array]:
-        return {"basket_shift": rewards.shift(_split(now.basket)[0], native(self.env.basket_at_start)[:, :3])}
+        return {"basket_shift": rewards.shift(_split(now.basket)[0], to_native(self.env.basket_at_start)[:, :3])}
 
 
 def _split(basket: Array | None) -> tuple[Array, Array]:

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from robocas_ms3.core import rotations
-from robocas_ms3.core.arrays import Array, as_tensor, join, native
+from robocas_ms3.core.arrays import Array, as_tensor, concatenate, to_native
 from robocas_ms3.robots.cameras import CameraSpec, Vec3
 from robocas_ms3.scenes.model import SceneModel
 
@@ -19,25 +19,25 @@ def privileged_observations(env: Any) -> dict[str, torch.Tensor]:
     """Return the poses of objects and basket, and the target's position relative to TCP and goal, (N, D) each."""
     state, tcp = env.bodies.read(), env.tcp_in_world()
     objects, basket = env.bodies.objects(state), env.bodies.basket(state)
-    center = env.target_center(native(objects))
+    center = env.target_center(to_native(objects))
     observations = {
         "object_poses": torch.where(env.present[..., None], objects[..., :7], 0.0).flatten(1),
         "target": env.is_target.float(),
         **({} if basket is None else {"basket_pose": basket}),
     }
     to_target = center - tcp[:, :3]
-    point = env.goal.point(None if basket is None else native(basket))
+    point = env.goal.point(None if basket is None else to_native(basket))
     if point is None:
         observations["tcp_to_target"] = in_tcp_frame(tcp, to_target[:, None])[:, 0]
     else:
-        seen = in_tcp_frame(tcp, join([to_target, point - center]).reshape(-1, 2, 3))
+        seen = in_tcp_frame(tcp, concatenate([to_target, point - center]).reshape(-1, 2, 3))
         observations |= {"tcp_to_target": seen[:, 0], env.goal.TOWARDS: seen[:, 1]}
     return observations | {"target_extents": env.success_check.target_extents}
 
 
 def in_tcp_frame(tcp: Array, vectors: Array) -> torch.Tensor:
     """Return vectors (N, V, 3) of the world along the axes of poses (N, 7); both native (`arrays`)."""
-    return as_tensor(vectors @ rotations.rotation(tcp[:, 3:]))
+    return as_tensor(vectors @ rotations.to_matrix(tcp[:, 3:]))
 
 
 def over_the_shoulder(model: SceneModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -8,7 +8,7 @@ from mani_skill.utils.structs import Articulation
 from numpy.typing import NDArray
 
 from robocas_ms3.core import rotations
-from robocas_ms3.core.arrays import Array, as_tensor, known_all_false, native
+from robocas_ms3.core.arrays import Array, as_tensor, known_all_false, to_native
 from robocas_ms3.scenes.task_specs import OPEN_PICK
 from robocas_ms3.tasks import rewards
 from robocas_ms3.tasks.base import STAGES, RoboCASEnv
@@ -51,7 +51,7 @@ class RoboCASOpenPickEnv(RoboCASEnv):
         self._opening = furniture, [active.name for active in furniture.active_joints].index(joint.name)
         handle = self.model.furniture[opening.furniture].asset.handles[opening.handle]
         # the frames of all parts coincide while everything is shut
-        self._handle = furniture.links_map[handle.link], native(torch.tensor([handle.position], device=self.device))
+        self._handle = furniture.links_map[handle.link], to_native(torch.tensor([handle.position], device=self.device))
 
     def opening_position(self) -> torch.Tensor:
         """Return the position (N,) m or rad of the joint that has to be opened."""
@@ -72,7 +72,7 @@ class RoboCASOpenPickEnv(RoboCASEnv):
     def evaluate(self) -> dict[str, torch.Tensor]:
         """Return what `RoboCASEnv.evaluate` does, and ``furniture_opened``."""
         found = super().evaluate()
-        opened = self.success_check.reach("furniture_opened", native(self.furniture_opened()))
+        opened = self.success_check.reach("furniture_opened", to_native(self.furniture_opened()))
         return {**found, "furniture_opened": opened}
 
     def reward_progress(self) -> tuple[Array, dict[str, Array]]:
@@ -86,7 +86,7 @@ class RoboCASOpenPickEnv(RoboCASEnv):
         return stage, found
 
     def _opened_share(self) -> Array:
-        return rewards.rise(native(self.opening_position()), 0.0, self.model.opened_position)
+        return rewards.rise(to_native(self.opening_position()), 0.0, self.model.opened_position)
 
     def privileged_observations(self) -> dict[str, torch.Tensor]:
         """Return those of `RoboCASEnv`, how far it is open (N, 1), 1 where that is enough, and where the handle is."""

@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from robocas_ms3.core.arrays import Array, as_float, as_tensor, choose, clamp, length, native
+from robocas_ms3.core.arrays import Array, as_float, as_tensor, clamp, norm, to_native, where
 from robocas_ms3.tasks.occlusion import MAX_HIDDEN_SHARE, MAX_OBSTACLES
 from robocas_ms3.tasks.terms import BASKET_SHIFT
 
@@ -83,20 +83,20 @@ def weigh(
         for name, weight in own.items():
             counted[name] = passed + here * terms.get(name, none)
             reward = reward + weight * counted[name]
-    return choose(stage >= len(table.stages), none + table.total, reward), counted
+    return where(stage >= len(table.stages), none + table.total, reward), counted
 
 
 def furthest(first: Array, conditions: list[tuple[Array, int]]) -> Array:
     """(N,) stages: that of the last condition (N,) that holds, and where none does, ``first`` (N,)."""
     stage = first
     for condition, place in conditions:
-        stage = choose(condition, 0 * stage + place, stage)
+        stage = where(condition, 0 * stage + place, stage)
     return stage
 
 
 def closeness(points: Array, goals: Array, *, half: float = 0.1) -> Array:
     """(N,) in (0, 1]: 1 where points (N, 3) are at their goals, a half where they are ``half`` metres away."""
-    return half / (half + length(goals - points))
+    return half / (half + norm(goals - points))
 
 
 def rise(value: Array, start: Array | float, by: float) -> Array:
@@ -118,7 +118,7 @@ def let_go(held: Array, touched: Array) -> Array:
 
 def calm(linear_velocity: Array, angular_velocity: Array) -> Array:
     """(N,) in [0, 1]: 1 at rest, 0 at velocities (N, 3) of 0.3 m/s or 5 rad/s and more."""
-    return 1 - clamp(length(linear_velocity) / 0.3 + length(angular_velocity) / 5.0, 0.0, 1.0)
+    return 1 - clamp(norm(linear_velocity) / 0.3 + norm(angular_velocity) / 5.0, 0.0, 1.0)
 
 
 def count_share(count: Array) -> Array:
@@ -128,7 +128,7 @@ def count_share(count: Array) -> Array:
 
 def shift(position: Array, position_before: Array) -> Array:
     """(N,) in [0, 1]: how far a body at (N, 3) was shifted, 1 from 0.1 m on, as far as a basket may go."""
-    return clamp(length(position - position_before) / BASKET_SHIFT, 0.0, 1.0)
+    return clamp(norm(position - position_before) / BASKET_SHIFT, 0.0, 1.0)
 
 
 def action_rate(action: Array, before: Array) -> Array:
@@ -177,15 +177,15 @@ class DenseReward:
         stage, found = progress
         penalties = {**penalties, "action_rate": self._action_rate(action)}
         penalties = {name: penalties[name] for name in self._table.penalties}
-        stage = choose(native(info["success"]), 0 * stage + len(self._table.stages), stage)
+        stage = where(to_native(info["success"]), 0 * stage + len(self._table.stages), stage)
         reward, counted = weigh(self._table, stage, found, penalties)
         counted.update(penalties)
         info["reward_terms"] = {name: as_tensor(term) for name, term in counted.items()}
-        return as_tensor(reward * ~native(info["fail"]))
+        return as_tensor(reward * ~to_native(info["fail"]))
 
     def _action_rate(self, action: Any) -> Array:
         before = self.last_action
         if action is None or before is None or before.shape[-1] != action.shape[-1]:
-            return native(torch.zeros(self._num_envs, device=self._device))
+            return to_native(torch.zeros(self._num_envs, device=self._device))
         action = torch.as_tensor(action, device=self._device).reshape(self._num_envs, -1)
-        return action_rate(native(action), native(torch.where(before.isnan(), action, before)))
+        return action_rate(to_native(action), to_native(torch.where(before.isnan(), action, before)))

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from robocas_ms3.core.arrays import Array, as_tensor, known_all_false, native
+from robocas_ms3.core.arrays import Array, as_tensor, known_all_false, to_native
 from robocas_ms3.scenes.targets import selection_camera
 from robocas_ms3.scenes.task_specs import SEARCH
 from robocas_ms3.tasks import occlusion, rewards, terms
@@ -96,9 +96,9 @@ class RoboCASSearchEnv(RoboCASEnv):
         if not unchanged and not known_all_false(due := self._due()):
             moment = self.success_check.moment
             in_heap = (
-                terms.of_target(moment.objects[..., 2], native(self.target_slot)) > self.success_check.fallen_below
+                terms.of_target(moment.objects[..., 2], to_native(self.target_slot)) > self.success_check.fallen_below
             )
-            cleared = native(self._measure(as_tensor(due), as_tensor(moment.objects[..., :7])))
+            cleared = to_native(self._measure(as_tensor(due), as_tensor(moment.objects[..., :7])))
             found["obstacles_cleared"] = self.success_check.reach("obstacles_cleared", cleared & in_heap & due)
         cleared_at_reset = torch.where(self._just_reset, found["obstacles_cleared"], self._cleared_at_reset)
         self._cleared_at_reset, self._just_reset = cleared_at_reset, torch.zeros_like(self._just_reset)
@@ -117,7 +117,7 @@ class RoboCASSearchEnv(RoboCASEnv):
         """(N,) bool, native: whose clutter is measured in this step."""
         stages = self.success_check.stages
         settled = stages["target_grasped"] | stages["obstacles_cleared"]
-        return ((native(self.elapsed_steps) % self._measure_period == 0) | native(self._measure_now)) & ~settled
+        return ((to_native(self.elapsed_steps) % self._measure_period == 0) | to_native(self._measure_now)) & ~settled
 
     def _measure(self, due: torch.Tensor, poses: torch.Tensor) -> torch.Tensor:
         """(N,) bool, which of the envs that are due are cleared; keeps their hidden shares and obstacles.
@@ -157,8 +157,8 @@ class RoboCASSearchEnv(RoboCASEnv):
         settled = stages["obstacles_cleared"] | stages["target_grasped"]
         covered = (stage == self.REWARDS.index("grasp")) & ~settled
         if not known_all_false(covered):
-            found["push_point"] = rewards.closeness(self.tcp_in_world()[:, :3], native(self._push_point))
-            found["clear"] = rewards.uncovered(native(self.hidden_share), native(self._obstacles.sum(dim=1)))
+            found["push_point"] = rewards.closeness(self.tcp_in_world()[:, :3], to_native(self._push_point))
+            found["clear"] = rewards.uncovered(to_native(self.hidden_share), to_native(self._obstacles.sum(dim=1)))
             stage = rewards.furthest(stage, [(covered, self.REWARDS.index("clear"))])
         return stage, found
 

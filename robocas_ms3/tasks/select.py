@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from robocas_ms3.core.arrays import as_tensor, native
+from robocas_ms3.core.arrays import as_tensor, to_native
 from robocas_ms3.scenes.task_specs import SELECT
 from robocas_ms3.tasks import terms
 from robocas_ms3.tasks.base import RoboCASEnv
@@ -35,6 +35,6 @@ class RoboCASSelectEnv(RoboCASEnv):
 
     def _others_out(self) -> torch.Tensor:
         """(N,) bool."""
-        inside = self.goal.holds(self.success_check.centers(native(self.object_states)), native(self.basket_pose))
-        others_in = terms.another_of_its_kind(inside, native(self._kinds), native(self.target_slot))
+        inside = self.goal.holds(self.success_check.centers(to_native(self.object_states)), to_native(self.basket_pose))
+        others_in = terms.another_of_its_kind(inside, to_native(self._kinds), to_native(self.target_slot))
         return as_tensor(~others_in)

@@ -12,7 +12,7 @@ from mani_skill.utils.structs import Articulation
 
 from robocas_ms3.assets.manifest import BODY
 from robocas_ms3.core import rotations
-from robocas_ms3.core.arrays import Array, as_tensor, count_up, known_all_false, native
+from robocas_ms3.core.arrays import Array, arange, as_tensor, known_all_false, to_native
 from robocas_ms3.tasks import terms
 from robocas_ms3.tasks.bodies import link_poses
 from robocas_ms3.tasks.goals import Moment
@@ -41,17 +41,17 @@ class SuccessCheck:
     def __init__(self, env: Any, stages: Sequence[str]) -> None:
         self._env = env
         self.reached = torch.zeros(len(stages), env.num_envs, dtype=torch.bool, device=env.device)
-        self.stages = dict(zip(stages, native(self.reached), strict=True))
+        self.stages = dict(zip(stages, to_native(self.reached), strict=True))
         self._last: tuple[object, dict[str, torch.Tensor]] | None = None
         shut = env.model.support_motion(opened=False)
-        self._support_shut = native(torch.as_tensor(shut, dtype=torch.float32, device=env.device))
+        self._support_shut = to_native(torch.as_tensor(shut, dtype=torch.float32, device=env.device))
         facts = [[asset.asset for asset in row] for row in env.object_assets]
         centers = [[fact.center_of_mass for fact in row] for row in facts]
-        self._centers_of_mass = native(torch.tensor(centers, dtype=torch.float32, device=env.device))
+        self._centers_of_mass = to_native(torch.tensor(centers, dtype=torch.float32, device=env.device))
         extents = [[fact.extents for fact in row] for row in facts]
         self._extents = torch.tensor(extents, dtype=torch.float32, device=env.device)
         self.target_extents = self._extents[:, 0]
-        self._sideways = native(torch.tensor([[0.0, 1.0, 0.0]], device=env.device))
+        self._sideways = to_native(torch.tensor([[0.0, 1.0, 0.0]], device=env.device))
         self.surface = float(env.model.support_pose[2, 3]) + env.model.region.z
         self.fallen_below = self.surface - terms.FALLEN
 
@@ -83,7 +83,7 @@ class SuccessCheck:
         if self._last is not None and depends_on is not None and self._last[0] == depends_on:
             return dict(self._last[1])
         # right after a reset the engine still reports the contacts of before
-        forces = forces * native(env.elapsed_steps > 0)[:, None, None, None]
+        forces = forces * to_native(env.elapsed_steps > 0)[:, None, None, None]
         found = self._check(forces, *self._objects_and_basket(state))
         self._last = self._dependencies(forces), found
         return dict(found)
@@ -96,9 +96,9 @@ class SuccessCheck:
     def _check(self, forces: Array, objects: Array, basket: Array | None) -> dict[str, torch.Tensor]:
         """Check from forces (N, 3, K, 3), states (N, K, 13) and the basket's pose (N, 7) or None, all native."""
         env = self._env
-        slot, goal = native(env.target_slot), env.goal
+        slot, goal = to_native(env.target_slot), env.goal
         grasped, touched = self.grasped(forces), terms.touched(forces)
-        lifted = terms.lifted(objects[..., 2], native(env.start_poses)[..., 2], grasped)
+        lifted = terms.lifted(objects[..., 2], to_native(env.start_poses)[..., 2], grasped)
         measures = self._measures(touched, objects, basket)
         held = terms.of_target(grasped, slot)
         now = {
@@ -128,7 +128,7 @@ class SuccessCheck:
 
     def target_center(self, objects: Array) -> Array:
         """Return the target's centre of mass (N, 3) in the world, from the objects' states (N, K, 13)."""
-        slot = native(self._env.target_slot)
+        slot = to_native(self._env.target_slot)
         target, center = terms.of_target(objects, slot), terms.of_target(self._centers_of_mass, slot)
         return target[:, :3] + rotations.rotate(target[:, 3:7], center)
 
@@ -151,11 +151,11 @@ class SuccessCheck:
     def _objects_and_basket(self, state: torch.Tensor) -> tuple[Array, Array | None]:
         """States of the objects (N, K, 13) and pose of the basket (N, 7) or None, native, from that of all bodies."""
         basket = self._env.bodies.basket(state)
-        return native(self._env.bodies.objects(state)), None if basket is None else native(basket)
+        return to_native(self._env.bodies.objects(state)), None if basket is None else to_native(basket)
 
     def _measures(self, touched: Array, objects: Array, basket: Array | None) -> dict[str, Array]:
         """`measures`, native, from which objects the gripper touches (N, K), their states and the basket's pose."""
-        goal, slot = self._env.goal, native(self._env.target_slot)
+        goal, slot = self._env.goal, to_native(self._env.target_slot)
         target = terms.of_target(objects, slot)
         return {
             goal.NAME: goal.holds(self.target_center(objects), basket),
@@ -170,14 +170,14 @@ class SuccessCheck:
         The target is carried to the goal, and if it falls, that is ``fail``.
         """
         env, objects = self._env, self.moment.objects
-        low = (objects[..., 2] < self.fallen_below) & native(env.present & ~env.is_target)
+        low = (objects[..., 2] < self.fallen_below) & to_native(env.present & ~env.is_target)
         if known_all_false(low):  # as nearly always
             return low
         return low & ~env.goal.holds(self.centers(objects), self.moment.basket)
 
     def _has_failed(self, measures: dict[str, Array], objects: Array, basket: Array | None) -> Array:
         """(N,) bool of ``fail``, native, from the measures, states (N, K, 13) and the basket's pose."""
-        goal, slot = self._env.goal, native(self._env.target_slot)
+        goal, slot = self._env.goal, to_native(self._env.target_slot)
         height = terms.of_target(objects[..., 2], slot)
         low, lost = height < self.fallen_below, goal.lost(basket, measures)
         if lost is None and known_all_false(low):  # as nearly always
@@ -194,5 +194,5 @@ class SuccessCheck:
             links = [support.links_map[name] for name in (BODY, env.model.support_link)]
             body, part = link_poses(env.scene, links).swapaxes(0, 1)
             undo = terms.way_back(body, part, self._support_shut)
-        moved = terms.disturbed(poses, native(env.start_poses), undo) & native(env.present)
-        return moved & (count_up(moved.shape[1], moved) != native(env.target_slot)[:, None])
+        moved = terms.disturbed(poses, to_native(env.start_poses), undo) & to_native(env.present)
+        return moved & (arange(moved.shape[1], moved) != to_native(env.target_slot)[:, None])

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import math
 
-from robocas_ms3.core.arrays import Array, count_up, length
-from robocas_ms3.core.rotations import rotate_inverse, rotation, upward
+from robocas_ms3.core.arrays import Array, arange, norm
+from robocas_ms3.core.rotations import rotate_inverse, to_matrix, vertical_axis
 
 MIN_GRASP_FORCE = 0.5  # N, on each finger
 MAX_GRASP_ANGLE = 85.0  # deg between the force on a finger and the direction in which it opens
@@ -42,7 +42,7 @@ def inside_box(points: Array, box_position: Array, box_quaternion: Array, low: A
 
 def pressed(left_force: Array, right_force: Array) -> Array:
     """Return which objects (N, K) press on both fingers, in any direction, from forces (N, K, 3)."""
-    return (length(left_force) >= MIN_GRASP_FORCE) & (length(right_force) >= MIN_GRASP_FORCE)
+    return (norm(left_force) >= MIN_GRASP_FORCE) & (norm(right_force) >= MIN_GRASP_FORCE)
 
 
 def finger_grasps(left_force: Array, right_force: Array, closing_axis: Array) -> Array:
@@ -58,14 +58,14 @@ def finger_grasps(left_force: Array, right_force: Array, closing_axis: Array) ->
 
 
 def _presses(force: Array, opening: Array) -> Array:
-    size = length(force)
+    size = norm(force)
     aligned = (force * opening).sum(-1) >= _cosine(MAX_GRASP_ANGLE) * size
     return (size >= MIN_GRASP_FORCE) & aligned
 
 
 def touched(forces: Array) -> Array:
     """Return which objects (N, K) touch any of B bodies, from the forces (N, B, K, 3) between them."""
-    return (length(forces) >= MIN_CONTACT_FORCE).any(1)  # pyright: ignore[reportReturnType]
+    return (norm(forces) >= MIN_CONTACT_FORCE).any(1)  # pyright: ignore[reportReturnType]
 
 
 def lifted(height: Array, rest_height: Array, grasped: Array) -> Array:
@@ -75,12 +75,12 @@ def lifted(height: Array, rest_height: Array, grasped: Array) -> Array:
 
 def at_rest(linear_velocity: Array, angular_velocity: Array) -> Array:
     """Return whether bodies with velocities (N, 3) in m/s and rad/s are at rest, (N,)."""
-    return (length(linear_velocity) <= REST_SPEED) & (length(angular_velocity) <= REST_TURN)
+    return (norm(linear_velocity) <= REST_SPEED) & (norm(angular_velocity) <= REST_TURN)
 
 
 def stands(position: Array, quaternion: Array, position_before: Array, quaternion_before: Array) -> Array:
     """Return whether baskets still stand where they stood, (N,)."""
-    shift = length(position - position_before)
+    shift = norm(position - position_before)
     return (shift <= BASKET_SHIFT) & (_cosine_of_tilt(quaternion, quaternion_before) >= _cosine(BASKET_TILT))
 
 
@@ -97,7 +97,7 @@ def fell_off(height: Array, surface: float, above_basket: Array, touched: Array)
 
 def of_target(values: Array, target: Array) -> Array:
     """Return the target's entry (N, ...) of values per object (N, K, ...), by its slot (N,)."""
-    return values[count_up(len(target), values), target]
+    return values[arange(len(target), values), target]
 
 
 def another_of_its_kind(marked: Array, kinds: Array, target: Array) -> Array:
@@ -108,7 +108,7 @@ def another_of_its_kind(marked: Array, kinds: Array, target: Array) -> Array:
         kinds: (N, K) integers; objects of a kind share theirs.
         target: (N,) slots.
     """
-    slots = count_up(kinds.shape[1], kinds)
+    slots = arange(kinds.shape[1], kinds)
     alike = (kinds == of_target(kinds, target)[:, None]) & (slots != target[:, None])
     return (marked & alike).any(1)  # pyright: ignore[reportReturnType]
 
@@ -124,8 +124,8 @@ def way_back(body: Array, part: Array, part_before: Array) -> tuple[Array, Array
     Returns:
         Rotation (N, 3, 3) and translation (N, 3), m, to be applied after it.
     """
-    turned = rotation(body[:, 3:])
-    turn = turned @ part_before[:3, :3] @ rotation(part[:, 3:]).swapaxes(1, 2)
+    turned = to_matrix(body[:, 3:])
+    turn = turned @ part_before[:3, :3] @ to_matrix(part[:, 3:]).swapaxes(1, 2)
     position = body[:, :3] + turned @ part_before[:3, 3]
     return turn, position - (turn @ part[:, :3, None])[..., 0]
 
@@ -138,16 +138,16 @@ def disturbed(poses: Array, start: Array, undo: tuple[Array, Array] | None = Non
         start: (N, K, 7) as they stood.
         undo: `way_back` of what they stand on; None: it can't move.
     """
-    position, up = poses[..., :3], upward(poses[..., 3:])
+    position, up = poses[..., :3], vertical_axis(poses[..., 3:])
     if undo is not None:
         turn, shift = undo
         position, up = shift[:, None] + position @ turn.swapaxes(1, 2), up @ turn.swapaxes(1, 2)
-    upright = (up * upward(start[..., 3:])).sum(-1)  # cosine of the tilt
-    return (length(position - start[..., :3]) > DISTURBED_SHIFT) | (upright < _cosine(DISTURBED_TILT))
+    upright = (up * vertical_axis(start[..., 3:])).sum(-1)  # cosine of the tilt
+    return (norm(position - start[..., :3]) > DISTURBED_SHIFT) | (upright < _cosine(DISTURBED_TILT))
 
 
 def _cosine_of_tilt(quaternion: Array, quaternion_before: Array) -> Array:
-    return (upward(quaternion) * upward(quaternion_before)).sum(-1)
+    return (vertical_axis(quaternion) * vertical_axis(quaternion_before)).sum(-1)
 
 
 def _cosine(degrees: float) -> float:

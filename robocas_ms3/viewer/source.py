@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.poses import from_xyzw, inverse, transform
+from robocas_ms3.core.poses import from_xyzw, inverse, transform_points
 from robocas_ms3.core.text import format_object_name
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.formats import format_of
@@ -209,7 +209,7 @@ def _object_paths(
     found = []
     for actor, states in recording.states.get("actors", {}).items():
         path = states[:, :3].astype(float)
-        if actor in ("ground", "room") or np.linalg.norm(transform(inverse(base_in_world), path[:1])) > _PARKED:
+        if actor in ("ground", "room") or np.linalg.norm(transform_points(inverse(base_in_world), path[:1])) > _PARKED:
             continue
         still = np.ptp(path, axis=0).max() < _STILL
         name = shown.get(actor, actor.replace("_", " "))

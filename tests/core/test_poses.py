@@ -15,15 +15,15 @@ def transforms(draw):
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     count = draw(st.integers(1, 9))
     turns = Rotation.random(2 * count, random_state=rng).as_matrix().reshape(count, 2, 3, 3)
-    return poses.from_parts(rng.uniform(-2, 2, (count, 2, 3)), turns)
+    return poses.from_rotation(rng.uniform(-2, 2, (count, 2, 3)), turns)
 
 
 def test_by_hand():
     # a quarter turn about z, at (1, 2, 3): the frame's x points along the world's y
     pose = poses.from_wxyz(np.array([1, 2, 3, np.sqrt(0.5), 0, 0, np.sqrt(0.5)]))
     np.testing.assert_allclose(pose, [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]], atol=1e-12)
-    np.testing.assert_allclose(poses.planar(1, 2, 3, np.pi / 2), pose, atol=1e-12)
-    np.testing.assert_allclose(poses.transform(pose, np.array([[1.0, 0, 0]])), [[1, 3, 3]], atol=1e-12)
+    np.testing.assert_allclose(poses.from_xyz_yaw(1, 2, 3, np.pi / 2), pose, atol=1e-12)
+    np.testing.assert_allclose(poses.transform_points(pose, np.array([[1.0, 0, 0]])), [[1, 3, 3]], atol=1e-12)
     np.testing.assert_allclose(poses.inverse(pose)[:3, 3], [-2, 1, -3], atol=1e-12)
     np.testing.assert_array_equal(poses.from_wxyz(torch.tensor([1.0, 2, 3, 1, 0, 0, 0]))[:3, 3], [1, 2, 3])
 

@@ -47,4 +47,4 @@ def test_products_and_turned_vectors_are_maniskills():
     products, turned = quaternion_multiply(*exact[:2]), quaternion_apply(exact[0], exact[2])
     for one, other, vector in ((first, second, vectors), tensors):
         same(rotations.multiply(one, other), products)
-        same(rotations.turn(one, vector), turned)
+        same(rotations.rotate_float64(one, vector), turned)

@@ -36,7 +36,7 @@ def recording(tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("generate --seed -5", "--seed: this number is out of range (expected 0 to 4294967295, found -5)"),
+        ("generate --seed -5", "--seed: number out of range (expected 0 to 4294967295, found -5)"),
         (
             "generate --control-freq 7",
             "--control-freq: the control rate must divide the rate of physics",

@@ -19,7 +19,7 @@ from robocas_ms3.core import documents
 from robocas_ms3.core.documents import DocumentError, open_arrays
 from robocas_ms3.core.errors import AssetError, DatasetError, TrainingError
 from robocas_ms3.core.json_lines import JsonLinesFile
-from robocas_ms3.core.poses import planar
+from robocas_ms3.core.poses import from_xyz_yaw
 from robocas_ms3.demos.failures import Failure
 from robocas_ms3.scenes.cache import ABOUT, LayoutCache
 from robocas_ms3.scenes.config import load_task_config
@@ -32,8 +32,10 @@ def cache(tmp_path, monkeypatch):
     """A cache whose layouts are drawn at no cost: all the same one."""
     pack = load_pack("builtin")
     cache = LayoutCache(SceneModel.load(load_task_config("pick_table_scattered"), pack, pack), tmp_path)
-    poses = np.stack([planar(0.1 * i, 0.2, 0.6, i) for i in range(3)])
-    layout = Layout(tuple(cache._names[:3]), poses, planar(0.7, 0.15, 0, 1.5), planar(1.3, 0.9, 0.6, 0), target=1)
+    poses = np.stack([from_xyz_yaw(0.1 * i, 0.2, 0.6, i) for i in range(3)])
+    layout = Layout(
+        tuple(cache._names[:3]), poses, from_xyz_yaw(0.7, 0.15, 0, 1.5), from_xyz_yaw(1.3, 0.9, 0.6, 0), target=1
+    )
     monkeypatch.setattr(cache._sample, "make", lambda *_: layout)
     return cache
 

@@ -21,7 +21,7 @@ from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.output_folder import OutputFolder
 from robocas_ms3.core.paths import builtin_packs_dir
-from robocas_ms3.core.poses import planar
+from robocas_ms3.core.poses import from_xyz_yaw
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.conversion.convert import convert
 from robocas_ms3.datasets.conversion.episode_plan import DATASET, dataset_settings, plan_episodes
@@ -57,9 +57,9 @@ OBJECT = min(PACK.glob("*/annotations.npz")).parent
 NAMES = ["one", "three", "two"]
 LAYOUT = Layout(
     ("two", "one", "two"),
-    np.stack([planar(0.1 * i, 0.2, 0.6, i) for i in range(3)]),
-    planar(0.7, 0.15, 0, 1.5),
-    planar(1.3, 0.9, 0.6, 0),
+    np.stack([from_xyz_yaw(0.1 * i, 0.2, 0.6, i) for i in range(3)]),
+    from_xyz_yaw(0.7, 0.15, 0, 1.5),
+    from_xyz_yaw(1.3, 0.9, 0.6, 0),
     target=1,
 )
 RUN = {"settings": asdict(EpisodeSettings("pick")), "first_seed": 0, "versions": {"a": "1"}}

@@ -11,7 +11,7 @@ import pytest
 from planning_scenes import REST, Box, cloud, corners, table_scene
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.core.poses import transform
+from robocas_ms3.core.poses import transform_points
 from robocas_ms3.planning.collision import FclWorld
 from robocas_ms3.planning.protocol import AttachedBody, Obstacle, Shape
 from robocas_ms3.robots.description import MOBILE_PANDA
@@ -166,6 +166,6 @@ def test_the_comparison_of_boxes_loses_no_contact(world, monkeypatch):
     found = contacts(held, pose)
     assert 20 < sum(map(bool, found)) < 80
     assert sum("attached" in names for names in found) > 5
-    assert contacts(transform(pose, held), np.eye(4)) == found
+    assert contacts(transform_points(pose, held), np.eye(4)) == found
     monkeypatch.setattr(FclWorld, "_broad_phase", everything)
     assert contacts(held, pose) == found

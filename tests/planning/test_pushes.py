@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.core.poses import transform
+from robocas_ms3.core.poses import transform_points
 from robocas_ms3.planning import pushes as pushing
 from robocas_ms3.planning.skills.look import sample_views
 from robocas_ms3.planning.skills.remove import free_places, turn_to_stand
@@ -99,7 +99,7 @@ def test_free_places_are_on_the_surface_and_clear_of_everything():
     assert len(motions) > 20
     tree = KDTree(standing[:, :2])
     for motion in motions[:: len(motions) // 20]:
-        placed = transform(motion, held)
+        placed = transform_points(motion, held)
         assert placed[:, 2].min() == pytest.approx(SURFACE + 0.012)
         assert np.all(np.abs(placed[:, :2] - TABLE[:2, 3]) <= HALF - 0.03 + 1e-9)
         assert tree.query(placed[:, :2])[0].min() >= 0.02

@@ -6,7 +6,7 @@ from scipy.spatial import ConvexHull
 
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.errors import LayoutError
-from robocas_ms3.core.poses import transform
+from robocas_ms3.core.poses import transform_points
 from robocas_ms3.scenes import heap
 from robocas_ms3.scenes.config.task import StackedLayout
 from robocas_ms3.scenes.heap import SPREAD, drop_heap
@@ -37,11 +37,13 @@ def test_objects_lie_on_the_plane_and_on_each_other():
     on_others = []
     for seed in range(3):
         assets, poses = make_heap(seed)
-        low = np.array([transform(p, np.concatenate(a.hulls))[:, 2].min() for a, p in zip(assets, poses, strict=True)])
+        low = np.array(
+            [transform_points(p, np.concatenate(a.hulls))[:, 2].min() for a, p in zip(assets, poses, strict=True)]
+        )
         assert low.min() > REGION.z - 0.002  # nothing has sunk in
         on_others.append((low > REGION.z + 0.01).sum())
         for asset, pose in zip(assets, poses, strict=True):
-            center = transform(pose, np.array([asset.asset.center_of_mass]))[0, :2]
+            center = transform_points(pose, np.array([asset.asset.center_of_mass]))[0, :2]
             assert (center >= np.array(REGION.min_xy) - SPREAD).all()
             assert (center <= np.array(REGION.max_xy) + SPREAD).all()
         camera = top_down_camera(np.array([0.1, -0.05]), REGION.z, size=128)

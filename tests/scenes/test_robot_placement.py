@@ -5,7 +5,7 @@ import pytest
 from scene_models import load_scene
 
 from robocas_ms3.core.errors import LayoutError
-from robocas_ms3.core.poses import planar
+from robocas_ms3.core.poses import from_xyz_yaw
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.robot_placement import _moved, basket_stands, body_is_free, place_basket, place_robot
 from robocas_ms3.scenes.sample import sample_layout
@@ -75,7 +75,7 @@ def test_what_nothing_moves_stays_and_draws_nothing():
 
 
 def test_the_robots_body_is_low_and_wide_high_and_narrow_and_above_the_floor():
-    root = planar(1.0, 2.0, 0.0, np.pi / 2)  # ahead is +y
+    root = from_xyz_yaw(1.0, 2.0, 0.0, np.pi / 2)  # ahead is +y
     for hit in ([1.0, 2.27, 0.2], [1.22, 2.0, 0.2], [1.0, 2.14, 0.6]):
         assert not body_is_free(root, np.array([hit]))
     for beside in ([1.0, 2.29, 0.2], [1.24, 2.0, 0.2], [1.0, 2.16, 0.6], [1.0, 2.0, 0.65], [1.0, 2.0, -5.0]):

@@ -8,7 +8,7 @@ from scene_models import load_scene
 
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.errors import ConfigError, LayoutError
-from robocas_ms3.core.poses import transform
+from robocas_ms3.core.poses import transform_points
 from robocas_ms3.scenes import sample
 from robocas_ms3.scenes.config import load_task_config, shipped_configs
 from robocas_ms3.scenes.layout import PARKING_HEIGHT
@@ -87,8 +87,8 @@ def test_columns_that_do_not_fit_leave_their_slots_empty():
 def test_upstreams_scenes_have_layouts_beside_the_basket(name):
     scene = load_scene(name)
     region = np.array([[*scene.region.min_xy, scene.region.z], [*scene.region.max_xy, scene.region.z]])
-    low, high = np.sort(transform(scene.support_pose, region)[:, :2], axis=0)
-    walls = transform(scene.basket_pose, np.concatenate(scene.basket.hulls))[:, :2]
+    low, high = np.sort(transform_points(scene.support_pose, region)[:, :2], axis=0)
+    walls = transform_points(scene.basket_pose, np.concatenate(scene.basket.hulls))[:, :2]
     apart = np.maximum(low - walls.max(axis=0), walls.min(axis=0) - high).max()
     assert apart > -1e-6  # of the second versions they touch
     for seed in range(2):
@@ -128,7 +128,7 @@ def height_of(scene: SceneModel, layout) -> float:
     """Of the highest object, above the surface, m."""
     objects = scene.object_pack.objects
     parts = [
-        transform(pose, np.concatenate(objects[i].hulls))
+        transform_points(pose, np.concatenate(objects[i].hulls))
         for i, pose in zip(layout.object_ids, layout.object_poses, strict=True)
     ]
     return np.concatenate(parts)[:, 2].max() - (scene.support_pose[2, 3] + scene.region.z)

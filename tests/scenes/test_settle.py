@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scene_models import load_scene
 
-from robocas_ms3.core.poses import planar
+from robocas_ms3.core.poses import from_xyz_yaw
 from robocas_ms3.scenes.settle import settle
 
 
@@ -16,7 +16,7 @@ def model():
 def on_table(model, name: str, x: float = 0.9, y: float = 0.9, lift: float = 0.0) -> np.ndarray:
     notes = model.object_pack.objects[name].annotations
     stands = notes.resting_poses[max(notes.display_pose, 0)]
-    return planar(x, y, 0.61 + lift, 0.3) @ stands
+    return from_xyz_yaw(x, y, 0.61 + lift, 0.3) @ stands
 
 
 def run(model, names, poses):

@@ -17,20 +17,20 @@ def test_rotations_are_scipys(make):
     quaternions = make(found.as_quat()[:, [3, 0, 1, 2]].astype("float32").reshape(1, 5, 4))
     vectors = np.random.default_rng(0).uniform(-1, 1, (1, 5, 3)).astype(np.float32)
     for turned, expected in (
-        (rotations.rotation(quaternions), found.as_matrix()),
+        (rotations.to_matrix(quaternions), found.as_matrix()),
         (rotations.rotate(quaternions, make(vectors)), found.apply(vectors[0])),
         (rotations.rotate_inverse(quaternions, make(vectors)), found.inv().apply(vectors[0])),
-        (rotations.upward(quaternions), found.apply([0, 0, 1])),
+        (rotations.vertical_axis(quaternions), found.apply([0, 0, 1])),
     ):
         assert abs(np.asarray(turned)[0] - expected).max() < 1e-6
 
 
 def test_arrays_of_a_cpu_are_numpys_and_share_memory():
     tensor = torch.zeros(2)
-    arrays.native(tensor)[1] = 3.0
+    arrays.to_native(tensor)[1] = 3.0
     assert tensor.tolist() == [0, 3]
     assert arrays.as_tensor(tensor) is tensor
-    arrays.as_tensor(arrays.native(tensor))[0] = 1.0
+    arrays.as_tensor(arrays.to_native(tensor))[0] = 1.0
     assert tensor.tolist() == [1, 3]
 
 

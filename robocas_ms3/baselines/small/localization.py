@@ -19,7 +19,7 @@ from torch import nn
 
 from robocas_ms3.baselines.small.config import View
 from robocas_ms3.baselines.training.metrics import mean_of_sum
-from robocas_ms3.core.poses import Array, inverse, transform
+from robocas_ms3.core.poses import Array, inverse, transform_points
 
 CELL = 8
 """Side of a cell in pixels."""
@@ -45,7 +45,7 @@ def project_points(
         stored: width and height of those.
         view: of the camera.
     """
-    seen = transform(inverse(camera), np.asarray(points, np.float64))
+    seen = transform_points(inverse(camera), np.asarray(points, np.float64))
     depth = np.maximum(seen[..., 2:], _NEAREST)
     share = (seen[..., :2] / depth * intrinsic[:2] + intrinsic[2:]) / np.array(stored)
     left, top, right, bottom = np.array(view.box()) / np.tile(view.rendered, 2)

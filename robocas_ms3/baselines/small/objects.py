@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.baselines.small.config import View
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.poses import Array, from_xyzw, inverse, transform
+from robocas_ms3.core.poses import Array, from_xyzw, inverse, transform_points
 from robocas_ms3.datasets.schema import SCENE_FILE
 from robocas_ms3.datasets.sources.episode_source import SourceEpisode
 from robocas_ms3.robots.cameras import Parent
@@ -68,7 +68,7 @@ def locate_objects(
     except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
         where = f"{episode.where}/{SCENE_FILE}"
         raise DatasetError("this description of a scene is damaged", where=where, found=error) from error
-    in_base = transform(inverse(_base(arrays)), points[None])
+    in_base = transform_points(inverse(_base(arrays)), points[None])
     commands = arrays["gripper_status"].reshape(-1)
     unmoved = np.logical_and.accumulate(commands == commands[0])
     places = {
@@ -101,8 +101,8 @@ def same_calibration(one: dict[str, Any], other: dict[str, Any], keys: Sequence[
 def in_camera_parent(parent: Parent, points: Array, tcp_in_base: Array, arrays: Mapping[str, NDArray[Any]]) -> Array:
     """Return points (T, N, 3) in the arm's base in the frame of a camera's parent; ``tcp_in_base`` (T, 4, 4)."""
     if parent == "ee":
-        return transform(inverse(tcp_in_base), points)
-    return transform(_base(arrays), points) if parent == "world" else points
+        return transform_points(inverse(tcp_in_base), points)
+    return transform_points(_base(arrays), points) if parent == "world" else points
 
 
 def _base(arrays: Mapping[str, NDArray[Any]]) -> Array:

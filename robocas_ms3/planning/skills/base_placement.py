@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 from robocas_ms3.core.errors import PlanningError
-from robocas_ms3.core.poses import inverse, transform
+from robocas_ms3.core.poses import inverse, transform_points
 from robocas_ms3.planning.protocol import Array, Obstacle
 from robocas_ms3.planning.scene import seen_from
 from robocas_ms3.planning.skills.arm import Arm, first_plan, moved_back
@@ -112,7 +112,7 @@ def drive_to_handle(arm: Arm, *, elsewhere: bool = False) -> None:
     with arm.planning():
         others = arm.scene.obstacles_in_world(without_link=(part.furniture, part.handle.link))
         moved = part.in_world(arm, part.way(arm))
-        swept = np.concatenate([transform(frame, part.surface(arm)[::THINNED]) for frame in moved[::THINNED]])
+        swept = np.concatenate([transform_points(frame, part.surface(arm)[::THINNED]) for frame in moved[::THINNED]])
         if not elsewhere and share(base_at(arm)) >= PULLED:
             return
     around = _fold(arm)
@@ -179,7 +179,7 @@ def clear_grasps(arm: Arm, slot: int) -> Array:
     tests = directions_ok(poses, np.ones(3), arm.approach)
     poses = poses[np.all([passed for name, passed in tests.items() if name != SIDE], axis=0)]
     near = arm.scene.obstacles_in_base(without=slot, radius=NEIGHBOURHOOD, around=object_in_base[:3, 3])
-    return poses[gripper_is_clear(poses, transform(base, near))]
+    return poses[gripper_is_clear(poses, transform_points(base, near))]
 
 
 def reach_share(arm: Arm, base: Array, grasps: Array, others: list[Obstacle], *, thorough: bool = False) -> float:

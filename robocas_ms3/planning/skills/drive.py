@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from robocas_ms3.core.errors import PlanningError
-from robocas_ms3.core.poses import from_wxyz, planar, transform
+from robocas_ms3.core.poses import from_wxyz, from_xyz_yaw, transform_points
 from robocas_ms3.planning.protocol import Array, Obstacle
 from robocas_ms3.planning.scene import seen_from
 from robocas_ms3.planning.skills.arm import Arm
@@ -43,7 +43,7 @@ class Surroundings:
 def surroundings(arm: Arm, *, without: int | tuple[()] = ()) -> Surroundings:
     cloud = arm.scene.obstacles_in_base(without=without, radius=np.inf)[::THINNED]
     obstacles = arm.scene.obstacles_in_world(without=without)
-    return Surroundings(obstacles, transform(arm.scene.arm_base_in_world, cloud))
+    return Surroundings(obstacles, transform_points(arm.scene.arm_base_in_world, cloud))
 
 
 def base_at(arm: Arm) -> Array:
@@ -53,7 +53,7 @@ def base_at(arm: Arm) -> Array:
 def arm_base_in_world(arm: Arm, base: Array) -> Array:
     """Return the arm's base (4x4) with the base joints at a pose."""
     root = from_wxyz(arm.env.agent.robot.pose.raw_pose[0])
-    return root @ planar(float(base[0]), float(base[1]), arm.robot.arm_base_height, float(base[2]))
+    return root @ from_xyz_yaw(float(base[0]), float(base[1]), arm.robot.arm_base_height, float(base[2]))
 
 
 def drive(arm: Arm, *goals: Array) -> None:

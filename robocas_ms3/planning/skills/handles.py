@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from robocas_ms3.assets.kinematics import joint_motion
 from robocas_ms3.assets.manifest import Handle, Joint
 from robocas_ms3.core.errors import PlanningError
-from robocas_ms3.core.poses import inverse, transform
+from robocas_ms3.core.poses import inverse, transform_points
 from robocas_ms3.planning.protocol import Array, Obstacle, Shape, Trajectory
 from robocas_ms3.planning.pull_path import reached, track, turned_about_bar
 from robocas_ms3.planning.scene import SPACING, shape_of
@@ -247,14 +247,14 @@ def _fitting(
     deeper: float = 0.0,
 ) -> list[int]:
     """Return the ways in the order that have the handle between the open fingers and touch nothing."""
-    surface = transform(frames[0], part.surface(arm))
+    surface = transform_points(frames[0], part.surface(arm))
     near = surface[np.linalg.norm(surface - (frames[0] @ part.hold)[:3, 3], axis=1) < NEAR]
     arm.planner.set_scene([*others, part.obstacle(arm, frames[0])])
 
     width = arm.robot.open_width
 
     def holds(start: Array) -> bool:
-        bar = transform(inverse(arm.planner.tcp(start)), near) + (0, 0, deeper)
+        bar = transform_points(inverse(arm.planner.tcp(start)), near) + (0, 0, deeper)
         between = np.abs(bar) < (BETWEEN[0], width / 2, BETWEEN[1])
         return bool(between.all(axis=1).any())
 
@@ -270,7 +270,7 @@ def _free_length(arm: Arm, part: Part, path: Array, frames: Array, others: list[
     length = 3 * int(blocked[0]) if len(blocked) else len(path)
     if not length:
         return 0
-    points, held = part.surface(arm), transform(inverse(frames[0]), planner.tcp(path[0])[None, :3, 3])
+    points, held = part.surface(arm), transform_points(inverse(frames[0]), planner.tcp(path[0])[None, :3, 3])
     rest = Shape(points=points[np.linalg.norm(points - held, axis=1) > CUT])
     for i in np.linspace(0, length - 1, CHECKED).round().astype(int):
         planner.set_scene([Obstacle(part.handle.link, rest, frames[i])])

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import PlanningError
-from robocas_ms3.core.poses import from_wxyz, inverse, transform
+from robocas_ms3.core.poses import from_wxyz, inverse, transform_points
 from robocas_ms3.planning.kinematics import turn_between
 from robocas_ms3.planning.protocol import Array, AttachedBody, Trajectory
 from robocas_ms3.planning.skills.arm import CARRYING_ROOM, Arm, first_plan, moved_back, plan_step_back, raised
@@ -81,7 +81,7 @@ def _ranked(arm: Arm, slot: int, drops: Array, qpos: Array) -> NDArray[np.int_]:
     Of those the near and steep ones, since an object slides off a leaning gripper, and none at the end of the reach.
     """
     inside = _inside_basket(arm, arm.scene.arm_base_in_world)
-    overhang = overhangs(drops, inside, transform(*held_object(arm, slot)), DROP_MARGIN)
+    overhang = overhangs(drops, inside, transform_points(*held_object(arm, slot)), DROP_MARGIN)
     lean = np.arccos(np.clip(-drops[:, 2, 2], -1, 1))
     stretched = np.maximum(qpos[:, ELBOW] - STRETCHED, 0)
     cost = turn_between(qpos, arm.at) + LEAN_WEIGHT * lean + STRETCH_WEIGHT * stretched
@@ -134,8 +134,8 @@ def drop_poses(arm: Arm, slot: int, arm_base_in_world: Array) -> Array:
         arm.rng,
         DROPS_SAMPLED,
         _inside_basket(arm, arm_base_in_world),
-        transform(object_in_tcp, vertices),
-        transform(object_in_tcp, center_of_mass)[0],
+        transform_points(object_in_tcp, vertices),
+        transform_points(object_in_tcp, center_of_mass)[0],
     )
 
 

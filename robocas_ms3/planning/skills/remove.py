@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull, KDTree
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import PlanningError
-from robocas_ms3.core.poses import transform
+from robocas_ms3.core.poses import transform_points
 from robocas_ms3.planning.protocol import Array, Trajectory
 from robocas_ms3.planning.shapes import convex_hull
 from robocas_ms3.planning.skills.arm import Arm, first_plan, moved_back, plan_step_back, raised
@@ -56,7 +56,7 @@ def hang_clear(arm: Arm, slot: int) -> None:
 
 def lift_height(arm: Arm, slot: int) -> float:
     """Return how far to lift an object so that it hangs above everything around it, m."""
-    points = transform(arm.scene.object_in_base(slot), np.concatenate(arm.env.object_assets[0][slot].hulls))
+    points = transform_points(arm.scene.object_in_base(slot), np.concatenate(arm.env.object_assets[0][slot].hulls))
     middle = points.mean(axis=0)
     radius = float(np.linalg.norm((points - middle)[:, :2], axis=1).max())
     others = arm.scene.obstacles_in_base(without=slot)
@@ -98,15 +98,15 @@ def plan_place(arm: Arm, slot: int) -> Trajectory:
     down as it is held only where that can't be done.
     """
     scene, asset, held = arm.scene, arm.env.object_assets[0][slot], arm.scene.object_in_base(slot)
-    vertices = transform(held, np.concatenate(asset.hulls))
-    standing = turn_to_stand(vertices, transform(held, np.array([asset.asset.center_of_mass]))[0])
+    vertices = transform_points(held, np.concatenate(asset.hulls))
+    standing = turn_to_stand(vertices, transform_points(held, np.array([asset.asset.center_of_mass]))[0])
     others = scene.obstacles_in_base(without=slot)
     arm.planner.set_scene(scene.obstacles(without=slot))
     attach_held(arm, slot)
 
     def free_poses() -> Iterator[Array]:
         for turn, margin in itertools.product((standing, np.eye(4)), EDGE_MARGINS):
-            motions = free_places(transform(turn, vertices), others, *surface_in_base(arm), margin) @ turn
+            motions = free_places(transform_points(turn, vertices), others, *surface_in_base(arm), margin) @ turn
             if len(motions):
                 yield motions @ scene.tcp_in_base
 

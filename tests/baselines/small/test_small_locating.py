@@ -19,7 +19,7 @@ from robocas_ms3.baselines.small.localization import (
     project_points,
 )
 from robocas_ms3.baselines.training.metrics import mean_of_sum
-from robocas_ms3.core.poses import from_parts, inverse, transform
+from robocas_ms3.core.poses import from_rotation, inverse, transform_points
 
 INTRINSIC = np.array([64.0, 64.0, 32.0, 24.0])  # of 64 x 48 images: 0.5 m to the side at 1 m is at the edge
 WHOLE = View(rendered=(64, 48), size=(64, 48))  # 8 x 6 cells
@@ -100,7 +100,7 @@ def turned(seed=0):
     """A TCP somewhere before the arm, (1, 4, 4)."""
     draw = np.random.default_rng(seed)
     turn = Rotation.from_euler("xyz", [np.pi, 0, 0]) * Rotation.from_rotvec(draw.normal(size=3) * 0.2)
-    return from_parts(np.array([[0.5, 0.1, 0.3]]) + draw.normal(size=(1, 3)) * 0.1, turn.as_matrix()[None])
+    return from_rotation(np.array([[0.5, 0.1, 0.3]]) + draw.normal(size=(1, 3)) * 0.1, turn.as_matrix()[None])
 
 
 def test_a_height_above_the_camera_gives_no_point_behind_it():
@@ -118,14 +118,16 @@ def test_a_point_that_is_seen_is_found(x, y, z, seed, on_hand):
         mount = inverse(turned(1)[0]) @ mount
     camera = tcp[0] @ mount if on_hand else mount
     point = np.array([0.4 + x, y, z])
-    assume(transform(inverse(camera), point[None])[0, 2] > 0.1 and camera[2, 3] > z + 0.05)  # before it, and below
+    assume(
+        transform_points(inverse(camera), point[None])[0, 2] > 0.1 and camera[2, 3] > z + 0.05
+    )  # before it, and below
     place = project_points(point[None], camera, intrinsic, (64, 48), WHOLE)
     ray = point - camera[:3, 3]
     assume(-ray[2] > 0.05 * np.linalg.norm(ray))  # not level with it
     own = lift(mount.tolist(), on_hand, intrinsic.tolist())
     with torch.autocast("cpu", torch.bfloat16):  # in which matrices are multiplied; a point stays where it is
         found = own.locate(torch.from_numpy(place), torch.tensor([z]), torch.from_numpy(tcp).float())
-    expected = transform(inverse(tcp[0]), point[None])
+    expected = transform_points(inverse(tcp[0]), point[None])
     assert found.numpy() == pytest.approx(expected, abs=2e-3)
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from robocas_ms3.baselines.small.objects import in_camera_parent, locate_objects
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.poses import from_parts
+from robocas_ms3.core.poses import from_rotation
 from robocas_ms3.robots.cameras import standard_parent
 
 STEPS = 5
@@ -34,7 +34,7 @@ def episode(layout=LAYOUT, target="lemon"):
 
 def tcp(heights):
     """Over the apple, fingers down: x of the TCP is x of the base, y and z are turned round."""
-    return from_parts([[1, 0, height] for height in heights], np.diag([1.0, -1, -1]))
+    return from_rotation([[1, 0, height] for height in heights], np.diag([1.0, -1, -1]))
 
 
 def test_places_by_hand():
