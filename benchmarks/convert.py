@@ -30,13 +30,10 @@ import torch
 import tyro
 from convert_memory import repeated
 
-from robocas_ms3.datasets.conversion.convert import convert
+from robocas_ms3.datasets import ConversionSettings, ImageOptions, convert, convert_lerobot
 from robocas_ms3.datasets.conversion.env_renderer import EnvRenderer
-from robocas_ms3.datasets.conversion.settings import ConversionSettings
-from robocas_ms3.datasets.images.image_files import ImageOptions
-from robocas_ms3.datasets.lerobot.convert import convert_lerobot
+from robocas_ms3.demos import TrajectoryFile
 from robocas_ms3.demos.recordings.motion import sample_states, sample_stride
-from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
 
 ROOT = Path(__file__).resolve().parents[1]
 CASES = {  # name -> format, whether with depth

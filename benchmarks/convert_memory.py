@@ -117,8 +117,7 @@ def repeated(source: Path, count: int, target: Path) -> Path:
 
 def measure(cfg: Benchmark, trajectory: Path, to: str, out: Path) -> dict[str, Any]:
     """One conversion, in the process that this is called in."""
-    from robocas_ms3.datasets.conversion.convert import convert
-    from robocas_ms3.datasets.conversion.settings import ConversionSettings
+    from robocas_ms3.datasets import ConversionSettings, convert
 
     peaks: list[int] = []
     common: dict[str, Any] = {
@@ -134,7 +133,7 @@ def measure(cfg: Benchmark, trajectory: Path, to: str, out: Path) -> dict[str, A
         peaks.append(_peak(resource.RUSAGE_SELF))
 
     if to == "lerobot":
-        from robocas_ms3.datasets.lerobot.convert import convert_lerobot
+        from robocas_ms3.datasets import convert_lerobot
 
         done = convert_lerobot(ConversionSettings(trajectory, out, **common), on_episode=on_episode)
     else:

@@ -22,11 +22,16 @@ import tyro
 from numpy.typing import NDArray
 
 import robocas_ms3
-from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
-from robocas_ms3.evaluation.protocol import ProtocolEpisode, load_protocol
+from robocas_ms3.evaluation import (
+    EpisodeSpec,
+    EvaluationSession,
+    EvaluationSettings,
+    Observations,
+    PolicySpec,
+    load_protocol,
+)
+from robocas_ms3.evaluation.protocol import ProtocolEpisode
 from robocas_ms3.evaluation.rollout import rollout
-from robocas_ms3.evaluation.session import EvaluationSession
-from robocas_ms3.evaluation.settings import EvaluationSettings
 from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.scenes.task_specs import TASKS
 

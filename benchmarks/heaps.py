@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import tyro
 
+from robocas_ms3 import LayoutError
 from robocas_ms3.assets.pack import load_pack
-from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.core.poses import transform_points
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.model import SceneModel

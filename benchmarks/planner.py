@@ -16,7 +16,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from robocas_ms3.core.errors import PlanningError
+from robocas_ms3 import PlanningError
 from robocas_ms3.planning.kinematics import ArmChain, Reachability
 from robocas_ms3.planning.protocol import Array
 from robocas_ms3.planning.rrt_connect import RRTConnectPlanner

@@ -22,9 +22,7 @@ import numpy as np
 import tyro
 from websockets.asyncio.server import ServerConnection, serve
 
-from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
-from robocas_ms3.evaluation.remote.client import RemotePolicy
-from robocas_ms3.evaluation.remote.server import PolicyServer
+from robocas_ms3.evaluation import EpisodeSpec, Observations, PolicyServer, PolicySpec, RemotePolicy
 from robocas_ms3.evaluation.remote.wire import pack
 
 SERVERS = ("serial", "parallel", "batched")

@@ -17,8 +17,8 @@ from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from robocas_ms3.demos import EpisodeSettings
 from robocas_ms3.demos.generator import EpisodeGenerator
-from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.tasks import TASKS
 

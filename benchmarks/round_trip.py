@@ -19,20 +19,14 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.checks.dataset import validate
-from robocas_ms3.datasets.conversion.convert import convert
-from robocas_ms3.datasets.conversion.settings import ConversionSettings
+from robocas_ms3.datasets import ConversionSettings, Dataset, LeRobotDataset, convert, convert_lerobot, schema, validate
 from robocas_ms3.datasets.lerobot.check import check_lerobot
-from robocas_ms3.datasets.lerobot.convert import convert_lerobot
-from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.variants import NEWEST, VARIANTS
 from robocas_ms3.datasets.manage.copy_episodes import CopyOptions, open_finished
 from robocas_ms3.datasets.manage.import_robocas import import_robocas
 from robocas_ms3.datasets.manage.merge import merge
 from robocas_ms3.datasets.manage.split import split_by_value, write_split
 from robocas_ms3.datasets.manage.survey import survey
-from robocas_ms3.datasets.sources.reader import Dataset
 
 _NOT_UPSTREAMS = {"agv_pose", "rel_agv_pose", "language_embedding", "step_goal_embs"}
 

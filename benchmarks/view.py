@@ -23,9 +23,7 @@ from typing import Any
 
 import tyro
 
-from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.conversion.convert import convert
-from robocas_ms3.datasets.conversion.settings import ConversionSettings
+from robocas_ms3.datasets import ConversionSettings, convert, schema
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests" / "support"))

@@ -6,9 +6,7 @@ python examples/02_record.py OUT
 import sys
 from pathlib import Path
 
-from robocas_ms3.demos.generation import generate
-from robocas_ms3.demos.settings import EpisodeSettings, GenerateSettings, ReplaySettings
-from robocas_ms3.demos.trajectory_replay import replay
+from robocas_ms3.demos import EpisodeSettings, GenerateSettings, ReplaySettings, generate, replay
 
 episode = EpisodeSettings("pick", "pick_table_scattered")
 summary = generate(GenerateSettings(episode, Path(sys.argv[1]), episodes=1, overwrite=True))

@@ -10,9 +10,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.datasets.conversion.convert import convert
-from robocas_ms3.datasets.conversion.settings import ConversionSettings
-from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.datasets import ConversionSettings, Dataset, convert
 
 if len(sys.argv) != 3:
     sys.exit("python examples/03_read_dataset.py TRAJECTORY.h5 OUT")

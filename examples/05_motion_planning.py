@@ -16,7 +16,7 @@ import tyro
 from mani_skill.examples.motionplanning.base_motionplanner.utils import compute_grasp_info_by_obb, get_actor_obb
 
 import robocas_ms3  # noqa: F401  (registers RoboCASPick-v1)
-from robocas_ms3.core.errors import PlanningError
+from robocas_ms3 import PlanningError
 from robocas_ms3.core.poses import inverse, transform_points
 from robocas_ms3.planning.grasp_choice import filter_grasps, grip_margins
 from robocas_ms3.planning.motionplanner import PandaArmMotionPlanningSolver

@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 import tyro
 
-from robocas_ms3.baselines.training.session import Progress, RunOptions, train_run
+from robocas_ms3.baselines import Progress, RunOptions, train_run
 
 
 @dataclass

@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3 import EvaluationError
 from robocas_ms3.core.documents import load_json
-from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.datasets.actions import ActionScale
-from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
+from robocas_ms3.datasets import ActionScale
+from robocas_ms3.evaluation import EpisodeSpec, Observations, PolicySpec
 
 HORIZON = 11  # frames, as in the paper's appendix
 MODEL_SIZE = (320, 256)  # width, height in pixels: the paper trains it on the images of its RT-1

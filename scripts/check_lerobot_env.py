@@ -25,7 +25,7 @@ from lerobot.processor import PolicyProcessorPipeline
 from lerobot.scripts.lerobot_eval import rollout
 from lerobot.utils.import_utils import register_third_party_plugins
 
-from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation import load_protocol
 
 HUB_FILE = Path(__file__).resolve().parents[1] / "examples" / "lerobot_hub" / "env.py"
 COMMIT = "0123456789abcdef0123456789abcdef01234567"

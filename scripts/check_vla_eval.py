@@ -37,12 +37,15 @@ from vla_eval.specs import (
     check_specs,
 )
 
-from robocas_ms3.evaluation import results
+from robocas_ms3.evaluation import (
+    EpisodeSpec,
+    EvaluationSession,
+    EvaluationSettings,
+    Observations,
+    load_protocol,
+    results,
+)
 from robocas_ms3.evaluation.policies.scripted import ScriptedPolicy
-from robocas_ms3.evaluation.policy import EpisodeSpec, Observations
-from robocas_ms3.evaluation.protocol import load_protocol
-from robocas_ms3.evaluation.session import EvaluationSession
-from robocas_ms3.evaluation.settings import EvaluationSettings
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.robots.quantities import GRIPPER_WIDTH, STATE, columns_of
 

@@ -84,6 +84,7 @@ def find_run(run: Path) -> Path:
 
 
 def read_run(folder: Path) -> RunRecord:
+    """Read the record of a training run, `run.json` in its folder; raise TrainingError if there is none."""
     path = folder / RUN
     if not path.is_file():
         fix = "Name the --out of a `robocas train`."
