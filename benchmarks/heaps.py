@@ -54,8 +54,8 @@ def main(cfg: Benchmark) -> None:
             for a, p in zip(assets, layout.object_poses, strict=True)
         ]
         heights.append(max(tops) - support)
-        shares.append(layout.visible_shares)
-        targets.append(layout.visible_shares[layout.target])
+        shares.append(layout.visible_fractions)
+        targets.append(layout.visible_fractions[layout.target])
     visible, target = np.concatenate(shares), np.array(targets)
     print(
         json.dumps(

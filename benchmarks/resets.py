@@ -14,7 +14,7 @@ import numpy as np
 import torch
 import tyro
 
-from robocas_ms3.scenes.cache import LayoutCache, pairs_of
+from robocas_ms3.scenes.cache import LayoutCache, seed_pairs
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.tasks import TASKS
 
@@ -39,7 +39,7 @@ def main(cfg: Benchmark) -> None:
     config = load_task_config(cfg.config)
     env = gym.make(TASKS[config.task].env_id, config=cfg.config, pack=cfg.pack, obs_mode="none", render_backend="none")
     base = env.unwrapped
-    pairs = pairs_of(range(cfg.seeds))
+    pairs = seed_pairs(range(cfg.seeds))
     failed = {pair for pair, problem in LayoutCache(base.model).fill(pairs) if problem}
     seeds = [seed for seed, _ in pairs if (seed, seed) not in failed]
     rounds = []

@@ -21,7 +21,7 @@ from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.placement import Array
 from robocas_ms3.scenes.sample import sample_layout
-from robocas_ms3.scenes.visibility import Scenery, object_mesh, top_down_camera
+from robocas_ms3.scenes.visibility import MeshScene, object_mesh, top_down_camera
 
 SIZES = (512, 256, 128, 64)
 
@@ -62,13 +62,13 @@ def main(args: Args) -> None:
         for layout in layouts:
             meshes = [object_mesh(model.object_pack.objects[i], level).copy() for i in layout.object_ids]
             triangles.append(sum(len(mesh.faces) for mesh in meshes))
-            scenery = Scenery(meshes, layout.object_poses)
+            scenery = MeshScene(meshes, layout.object_poses)
             for size in SIZES:
                 camera = top_down_camera(center[:2], center[2], size=size)
                 if size == SIZES[0]:
-                    first.append(milliseconds(lambda: scenery.visible_shares(camera), 1))  # noqa: B023
-                spent[size].append(milliseconds(lambda: scenery.visible_shares(camera), args.repeats))  # noqa: B023
-                shares[size].append(scenery.visible_shares(camera))
+                    first.append(milliseconds(lambda: scenery.visible_fractions(camera), 1))  # noqa: B023
+                spent[size].append(milliseconds(lambda: scenery.visible_fractions(camera), args.repeats))  # noqa: B023
+                shares[size].append(scenery.visible_fractions(camera))
         finest = np.concatenate(shares[SIZES[0]])
         report[level] = {
             "triangles": round(float(np.mean(triangles))),

@@ -23,7 +23,7 @@ from robocas_ms3.planning.motionplanner import PandaArmMotionPlanningSolver
 from robocas_ms3.planning.protocol import AttachedBody
 from robocas_ms3.planning.scene import SPACING, PlanningScene
 from robocas_ms3.planning.skills.place import Inside, overhangs, sample_drops
-from robocas_ms3.scenes.grasp_checks import gripper_is_clear
+from robocas_ms3.scenes.grasp_checks import is_gripper_clear
 
 
 def solve_pick_cube(env, seed=None, debug=False, vis=False):
@@ -103,7 +103,7 @@ def ranked_grasps(env, scene, slot):
     margins = grip_margins(notes.grasps_tcp_in_object[kept.index], kept.widths, target.surface_points(SPACING))
     distance = np.linalg.norm(kept.tcp_in_world[:, :3, 3] - object_in_world[:3, 3], axis=1)
     score = margins + np.exp(-distance / 0.03) - kept.tcp_in_world[:, 2, 2]
-    score[~gripper_is_clear(kept.tcp_in_world, points)] = -np.inf
+    score[~is_gripper_clear(kept.tcp_in_world, points)] = -np.inf
     order = np.argsort(-score, kind="stable")
     return [sapien.Pose(kept.tcp_in_world[i]) for i in order if np.isfinite(score[i])]
 

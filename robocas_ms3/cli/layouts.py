@@ -11,7 +11,7 @@ import tyro
 
 if TYPE_CHECKING:
     from robocas_ms3.scenes.cache import LayoutCache
-    from robocas_ms3.scenes.layout_table import Engine, Pair
+    from robocas_ms3.scenes.layout_table import Engine, SeedPair
 
 from robocas_ms3.cli.options import CORES, Jobs, Maybe, Repeated
 from robocas_ms3.core.text import format_count
@@ -75,10 +75,10 @@ def build(command: Build) -> int:
     seeds = parse_seeds(command.seeds, "--seeds")
     config = load_task_config(command.config, overrides=command.set)
     packs = load_pack(command.pack), load_pack(command.furniture_pack)  # before what takes seconds to import
-    from robocas_ms3.scenes.cache import LayoutCache, pairs_of
+    from robocas_ms3.scenes.cache import LayoutCache, seed_pairs
     from robocas_ms3.scenes.model import SceneModel
 
-    pairs = pairs_of(seeds, objects)
+    pairs = seed_pairs(seeds, objects)
     cache = LayoutCache(SceneModel.load(config, *packs), command.out or "auto")
     engine = choose_engine(command.engine) if objects is not None else None
     there = len(pairs) - len(cache.missing(pairs))
@@ -123,25 +123,25 @@ def choose_engine(wanted: Literal["auto", "cpu", "gpu"]) -> Engine:
 
 
 def try_all(cache: LayoutCache, engine: Engine, **packs: str) -> int:
-    """Let the engine try layouts in state `UNTRIED`; return how many layouts of the table it moves."""
+    """Let the engine try layouts in state `UNCHECKED`; return how many layouts of the table it moves."""
     from robocas_ms3.cli.progress import ProgressBar
-    from robocas_ms3.scenes.layout_table import State
-    from robocas_ms3.tasks.layout_stability import judged, try_layouts, untried
+    from robocas_ms3.scenes.layout_table import LayoutStatus
+    from robocas_ms3.tasks.layout_stability import check_layouts, status_of, unchecked_layouts
 
-    seeds = untried(cache, engine)
+    seeds = unchecked_layouts(cache, engine)
     if seeds:
-        found: dict[Pair, State] = {}
-        trial = try_layouts(cache, engine, seeds, **packs)
+        found: dict[SeedPair, LayoutStatus] = {}
+        trial = check_layouts(cache, engine, seeds, **packs)
         try:
             with ProgressBar("layouts tried") as bar:
                 bar.start(sum(map(len, seeds.values())))
                 for pair, moved in trial:
-                    found[pair] = judged(moved)
+                    found[pair] = status_of(moved)
                     bar.advance()
         finally:  # interrupted, it keeps what was found
-            cache.mark_table(engine, found)
+            cache.write_statuses(engine, found)
     table = cache.table(engine)
-    return len(table.pairs(State.MOVES)) if table else 0
+    return len(table.pairs(LayoutStatus.UNSTABLE)) if table else 0
 
 
 def info(command: Info) -> int:

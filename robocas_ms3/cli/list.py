@@ -42,7 +42,7 @@ def collect() -> dict[str, list[dict[str, Any]]]:
     from robocas_ms3.core.extensions import package_of
     from robocas_ms3.evaluation.policies import POLICIES
     from robocas_ms3.robots.registry import ROBOTS
-    from robocas_ms3.scenes.config import load_task_config, shipped_configs
+    from robocas_ms3.scenes.config import bundled_configs, load_task_config
     from robocas_ms3.scenes.task_specs import TASKS
 
     tasks = [
@@ -50,7 +50,7 @@ def collect() -> dict[str, list[dict[str, Any]]]:
         for task in TASKS.values()
     ]
     configs = []
-    for name, path in shipped_configs().items():
+    for name, path in bundled_configs().items():
         config = load_task_config(path)
         scene = f"{format_count(config.objects.count, 'object')}, {config.layout.kind}, on the {config.support}"
         configs.append({"name": name, "task": config.task, "scene": scene, "description": config.description})

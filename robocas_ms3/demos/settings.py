@@ -76,7 +76,7 @@ class EpisodeSettings:
         """
         from robocas_ms3.assets.pack import load_pack
         from robocas_ms3.planning.rrt_connect import BACKENDS
-        from robocas_ms3.scenes.config import load_config_of
+        from robocas_ms3.scenes.config import load_config_for
         from robocas_ms3.scenes.model import SceneModel
 
         control, replay = self.control_freq, self.check_rate or 0
@@ -102,7 +102,7 @@ class EpisodeSettings:
         check_number("--after-steps", self.after_steps[0], 1)
         check_number("--after-steps", self.after_steps[1], self.after_steps[0])
         BACKENDS.find(self.planner, where="planner")
-        robot, config = find_robot(self.robot), load_config_of(TASKS[self.task], self.config)
+        robot, config = find_robot(self.robot), load_config_for(TASKS[self.task], self.config)
         SceneModel.load(config, load_pack(self.pack), load_pack("builtin"), robot=robot.description)
 
 
@@ -145,11 +145,11 @@ class GenerateSettings:
         Raises:
             ConfigError: the configuration is invalid.
         """
-        from robocas_ms3.scenes.config import load_task_config, shipped_configs
+        from robocas_ms3.scenes.config import bundled_configs, load_task_config
 
         episode, name = self.episode, self.episode.config
         config = load_task_config(name, overrides=self.set)
-        if self.set or not isinstance(name, str) or name not in shipped_configs():
+        if self.set or not isinstance(name, str) or name not in bundled_configs():
             episode = replace(episode, config=config.model_dump(mode="json"))
         if self.check_noise is not None:
             episode = replace(episode, check_noise_mm=self.check_noise[0], check_noise_deg=self.check_noise[1])

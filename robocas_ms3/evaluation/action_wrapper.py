@@ -84,11 +84,11 @@ class PolicyActionWrapper(gym.Wrapper):
         actions = actions.reshape(self._base.num_envs, self._convention.size)
         if not np.isfinite(actions).all():
             raise EvaluationError("an action is not finite", where="action", found=actions.tolist())
-        self._base.looks = False  # not before the last of its control steps, and not after each of these
+        self._base.renders_images = False  # not before the last of its control steps, and not after each of these
         try:
             obs, *others, info = self._act(actions)
         finally:
-            self._base.looks = True
+            self._base.renders_images = True
         self._steps += 1
         if (self._steps % self._image_period == 0).any() and isinstance(obs, dict) and "sensor_data" in obs:
             obs = self._base.get_obs(info)
@@ -184,7 +184,7 @@ class Weld:
             return
         env = self._env
         forces = env.gripper_forces()
-        touched = terms.touched(forces[:, :1]) & terms.touched(forces[:, 1:2])  # by the left finger, by the right
+        touched = terms.is_touched(forces[:, :1]) & terms.is_touched(forces[:, 1:2])  # by the left finger, by the right
         raised = env.object_poses[..., 2] - env.start_poses[..., 2] >= RAISED
         found = (touched & raised & env.present)[0].nonzero()
         if len(found):

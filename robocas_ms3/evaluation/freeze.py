@@ -30,9 +30,9 @@ from robocas_ms3.evaluation.protocol import (
     ProtocolEpisode,
 )
 from robocas_ms3.robots.registry import DEFAULT
-from robocas_ms3.scenes.config import TaskConfig, load_task_config, shipped_configs
+from robocas_ms3.scenes.config import TaskConfig, bundled_configs, load_task_config
 from robocas_ms3.scenes.layout import Layout
-from robocas_ms3.scenes.layout_table import write_frozen
+from robocas_ms3.scenes.layout_table import write_frozen_layouts
 from robocas_ms3.scenes.task_specs import TASKS
 from robocas_ms3.tasks.base import RoboCASEnv
 
@@ -94,7 +94,7 @@ def read_plan(path: Path) -> ProtocolPlan:
 
     def located(scene: Scene) -> Scene:
         file = path.parent / scene.config
-        own = file.is_file() and scene.config not in shipped_configs()
+        own = file.is_file() and scene.config not in bundled_configs()
         return scene.model_copy(update={"config": str(file)}) if own else scene
 
     return plan.model_copy(update={name: list(map(located, getattr(plan, name))) for name in ("parts", "train")})
@@ -122,7 +122,7 @@ def freeze(plan: ProtocolPlan, folder: Path, overrides: Sequence[str] = ()) -> I
                 episodes.append(_episode(len(episodes), part, seed, layout, env))
                 yield len(episodes), total
         for name, found in scenes.items():
-            write_frozen(tmp / LAYOUTS / f"{name}.npy", pack.objects, found)
+            write_frozen_layouts(tmp / LAYOUTS / f"{name}.npy", pack.objects, found)
         with atomic_file(tmp / EPISODES) as file:
             file.write_text("".join(f"{episode.model_dump_json()}\n" for episode in episodes), encoding="utf-8")
         # A protocol that names no robot has the default.
@@ -165,7 +165,7 @@ def _scenes(part: ProtocolPart, config: TaskConfig, pack: str) -> Iterator[tuple
 
 
 def _episode(number: int, part: ProtocolPart, seed: int, layout: Layout, env: RoboCASEnv) -> ProtocolEpisode:
-    p_vis = float(layout.visible_shares[layout.target])
+    p_vis = float(layout.visible_fractions[layout.target])
     return ProtocolEpisode(
         episode=number,
         task=env.SPEC.name,

@@ -12,7 +12,7 @@ from robocas_ms3.core.arrays import as_float, as_tensor, known_all_false, maximu
 from robocas_ms3.tasks import terms
 from robocas_ms3.tasks.base import RoboCASEnv
 from robocas_ms3.tasks.bodies import link_poses
-from robocas_ms3.tasks.goals import Moment
+from robocas_ms3.tasks.goals import TaskState
 from robocas_ms3.tasks.search import ENVS_AT_ONCE, RoboCASSearchEnv
 
 V0_RADIUS = 0.1  # m between the origins of target and basket in xy: upstream's success
@@ -31,7 +31,7 @@ class EpisodeMetrics:
 
     `update` is called after every control step, `end_step` and `read` once per policy step. The impulse integrates the
     forces found after each control step, so it is accurate for lasting contacts and an estimate for knocks. If nothing
-    has moved or touched the gripper since the last call (`Moment`), only the TCP is read.
+    has moved or touched the gripper since the last call (`TaskState`), only the TCP is read.
     """
 
     def __init__(self, env: RoboCASEnv) -> None:
@@ -40,7 +40,7 @@ class EpisodeMetrics:
         self._near = to_native(torch.zeros(env.num_envs, dtype=torch.bool, device=env.device))
         self._in_v0: Any = to_native(torch.zeros(env.num_envs, dtype=torch.bool, device=env.device))
         self._tcp = self._tcp_pos()
-        self._moment: Moment | None = None
+        self._moment: TaskState | None = None
         self._retrieval = RetrievalOrder(env) if isinstance(env, RoboCASSearchEnv) else None
 
     def reset(self, envs: Any) -> None:
@@ -57,14 +57,14 @@ class EpisodeMetrics:
         tcp = self._tcp_pos()
         sums[:, _PATH] += norm(tcp - self._tcp)
         self._tcp = tcp
-        moment = env.success_check.moment
+        moment = env.success_check.state
         if moment is not self._moment:
             self._moment = moment
             impulse = norm(moment.forces).sum((1, 2)) * env.control_timestep
             sums[:, _IMPULSE] += impulse
             sums[:, _DISTURBED] = maximum(sums[:, _DISTURBED], as_float(moment.disturbed.sum(1)))
-            sums[:, _FALLEN] = maximum(sums[:, _FALLEN], as_float(env.success_check.fallen().sum(1)))
-            target = terms.of_target(moment.objects[..., :2], to_native(env.target_slot))
+            sums[:, _FALLEN] = maximum(sums[:, _FALLEN], as_float(env.success_check.fallen_objects().sum(1)))
+            target = terms.select_target(moment.objects[..., :2], to_native(env.target_slot))
             if moment.basket is not None:  # otherwise that rule never holds
                 self._near = norm(target - moment.basket[:, :2]) <= V0_RADIUS
             if self._retrieval is not None:
@@ -122,7 +122,7 @@ class RetrievalOrder:
 
     def _reset(self, envs: Tensor) -> None:
         env = self._env
-        over = env.covering(envs) >= LIES_OVER
+        over = env.pairwise_occlusion(envs) >= LIES_OVER
         rows = torch.arange(len(over), device=env.device)
         over[rows, env.target_slot[envs]] = False  # what the target lies on need not wait for it
         first = env.clutter(envs).obstacles | over[rows, :, env.target_slot[envs]]
@@ -131,7 +131,7 @@ class RetrievalOrder:
         self._moved_at[some], self._moved_time[some], self._steps[some] = 0, _NEVER, 0
         self._held[some], self._found = False, None
 
-    def update(self, moment: Moment) -> None:
+    def update(self, moment: TaskState) -> None:
         self._held |= moment.held
         now = moment.disturbed & (self._moved_at == 0) & ~self._held[:, None]
         if known_all_false(now):

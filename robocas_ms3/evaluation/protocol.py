@@ -32,7 +32,7 @@ from robocas_ms3.evaluation.policy import CONVENTIONS, PolicySpec
 from robocas_ms3.evaluation.settings import EvaluationSettings
 from robocas_ms3.robots.registry import DEFAULT as DEFAULT_ROBOT
 from robocas_ms3.robots.registry import find_robot
-from robocas_ms3.scenes.config.load import check_no_base, load_task_config
+from robocas_ms3.scenes.config.load import check_no_extends, load_task_config
 from robocas_ms3.scenes.task_specs import TASKS
 
 NO_RULES = "no rules of a protocol"
@@ -238,7 +238,7 @@ def load_protocol(name: str | Path) -> LoadedProtocol:
             if not path.is_file():
                 raise EvaluationError("a protocol's file is not there", where=path)
     for path in sorted((folder / CONFIGS).glob("*.yaml")) + loaded.train_files():
-        check_no_base(path)
+        check_no_extends(path)
     return loaded
 
 

@@ -13,8 +13,8 @@ from robocas_ms3.scenes.grasp_checks import (
     MAX_WIDTH,
     TESTED_AT_ONCE,
     Approach,
-    directions_ok,
-    seen_from,
+    check_directions,
+    to_tcp_frames,
 )
 
 Array = NDArray[np.float64]
@@ -54,7 +54,7 @@ def filter_grasps(
     poses = object_in_world @ annotations.grasps_tcp_in_object
     base_to_object = object_in_world[:3, 3] - arm_base_in_world[:3, 3]
     passed = annotations.grasp_widths <= MAX_WIDTH
-    for test in directions_ok(poses, base_to_object, approach).values():
+    for test in check_directions(poses, base_to_object, approach).values():
         passed = passed & test
     index = np.flatnonzero(passed)
     both = np.concatenate([index, index])
@@ -77,7 +77,7 @@ def grip_margins(tcp: Array, widths: Array, surface: Array) -> Array:
     widest, deepest = np.abs(GRIP_SHIFTS).max(axis=0)
     batch = max(1, TESTED_AT_ONCE // len(surface))
     for start in range(0, len(tcp), batch):
-        x, y, z = seen_from(tcp[start : start + batch], surface)
+        x, y, z = to_tcp_frames(tcp[start : start + batch], surface)
         near = (np.abs(y) <= MAX_WIDTH / 2) & (np.abs(x) <= PAD_HALF_WIDTH + widest)
         near &= (z >= PAD_BEHIND_TCP - deepest) & (z <= PAD_BEFORE_TCP + deepest)
         grasp, _ = np.nonzero(near)

@@ -40,7 +40,7 @@ from robocas_ms3.plans.folder import (
     WorkUnit,
 )
 from robocas_ms3.plans.plan import Plan
-from robocas_ms3.scenes.layout_table import join_frozen
+from robocas_ms3.scenes.layout_table import join_frozen_layouts
 
 TRAJECTORY = "trajectory.h5"
 Chosen = Mapping[int, Sequence[tuple[WorkUnit, Outcome]]]
@@ -94,7 +94,7 @@ def _join_files(folder: PlanFolder, files: EpisodeFiles, on_stage: OnStage) -> N
     for part, episodes in files.items() if "layouts" in plan.stages else ():
         path, layouts = out / LAYOUTS / f"{plan.name_of(part)}.npy", [each.layout for each in episodes]
         remove_leftovers(make_folder(path.parent))
-        damage, write = partial(_layouts_damage, path, seeds[part]), partial(join_frozen, path, layouts)
+        damage, write = partial(_layouts_damage, path, seeds[part]), partial(join_frozen_layouts, path, layouts)
         _join_file(path, layouts, damage, write, partial(on_stage, f"joining layouts, {plan.name_of(part)}"))
     if "datasets" in plan.stages:
         root, count = out / DATASETS / "robocas", sum(map(len, files.values()))

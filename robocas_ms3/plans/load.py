@@ -19,7 +19,7 @@ from robocas_ms3.core.text import did_you_mean, format_error
 from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.plans.plan import PartConfig, Plan
 from robocas_ms3.robots.registry import find_robot
-from robocas_ms3.scenes.config import TaskConfig, load_config_of, shipped_configs
+from robocas_ms3.scenes.config import TaskConfig, bundled_configs, load_config_for
 from robocas_ms3.scenes.task_specs import TASKS
 
 _FURNITURE_PACK = "builtin"
@@ -142,8 +142,8 @@ def _completed(part: PartConfig, number: int, path: Path) -> tuple[PartConfig, A
     name, config = part.config or spec.default_config, part.config or spec.default_config
     if isinstance(config, str) and (path.parent / config).is_file():
         config = path.parent / config
-    loaded = load_config_of(spec, config)
-    shipped = isinstance(config, str) and config in shipped_configs()  # a file may change until the next run
+    loaded = load_config_for(spec, config)
+    shipped = isinstance(config, str) and config in bundled_configs()  # a file may change until the next run
     stem, pack = Path(name).stem if isinstance(name, str) else part.task, part.pack
     if pack not in pack_folders():  # a folder, relative to the plan or to the working directory
         folders = [folder for folder in (path.parent / pack, Path(pack)) if folder.is_dir()]

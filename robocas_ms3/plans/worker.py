@@ -40,8 +40,8 @@ from robocas_ms3.plans.folder import Outcome, PlanFolder, SeedFiles, WorkUnit
 from robocas_ms3.plans.load import part_error_context, recording_settings
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.robots.registry import find_robot
-from robocas_ms3.scenes.config import load_config_of
-from robocas_ms3.scenes.layout_table import write_frozen
+from robocas_ms3.scenes.config import load_config_for
+from robocas_ms3.scenes.layout_table import write_frozen_layouts
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.task_specs import TASKS
 
@@ -76,7 +76,7 @@ class Recorder:
         try:
             if self._model is not None:  # as the environment samples it
                 layout = self._layouts(files.seed, files.seed)
-                write_frozen(files.layout, self._model.object_pack.objects, {files.seed: layout})
+                write_frozen_layouts(files.layout, self._model.object_pack.objects, {files.seed: layout})
             result = self._record(files, self._generator) if self._generator else {"success": True}
         except LayoutError as error:
             result = {"success": False, "failures": [f"layout: {error.what}"]}
@@ -87,7 +87,7 @@ class Recorder:
         if "layouts" in self._plan.stages:
             from robocas_ms3.scenes.cache import layout_source
 
-            config, robot = load_config_of(TASKS[settings.task], settings.config), find_robot(settings.robot)
+            config, robot = load_config_for(TASKS[settings.task], settings.config), find_robot(settings.robot)
             pack = load_pack(settings.pack)
             self._model = SceneModel.load(config, pack, load_pack("builtin"), robot=robot.description)
             self._layouts = layout_source(self._model, settings.layouts)

@@ -89,7 +89,7 @@ def build_objects(
     """Build the objects of all envs, a row of assets per env: an actor per slot, and the plane for unused slots."""
     columns = zip(*assets, strict=True)
     actors = [build_object_slot(scene, slot, column, level) for slot, column in enumerate(columns)]
-    if config.leaves_slots_empty:
+    if config.has_unused_slots:
         build_parking(scene, len(actors))
     return actors
 

@@ -23,7 +23,15 @@ from robocas_ms3.core.locks import lock_file
 from robocas_ms3.core.paths import cache_dir
 from robocas_ms3.core.workers import FunctionWorker, WorkerPool
 from robocas_ms3.scenes.layout import Layout, LayoutSource, ObjectIds, read_layout, write_layout
-from robocas_ms3.scenes.layout_table import Engine, FrozenLayouts, LayoutTable, Pair, State, mark_table, write_table
+from robocas_ms3.scenes.layout_table import (
+    Engine,
+    FrozenLayouts,
+    LayoutStatus,
+    LayoutTable,
+    SeedPair,
+    write_statuses,
+    write_table,
+)
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.sample import sample_layout
 
@@ -58,7 +66,7 @@ def layout_source(model: SceneModel, layouts: str | Path | LayoutSource | None =
         return layouts
     if str(layouts).endswith(".npy"):
         return FrozenLayouts(Path(str(layouts)), model.object_pack.objects)
-    return Sampler(model) if layouts is None else LayoutCache(model, layouts)
+    return LayoutSampler(model) if layouts is None else LayoutCache(model, layouts)
 
 
 def caches_folder(root: str | Path = "auto") -> Path:
@@ -66,7 +74,7 @@ def caches_folder(root: str | Path = "auto") -> Path:
     return cache_dir() / "layouts" if root == "auto" else Path(root)
 
 
-class Sampler:
+class LayoutSampler:
     """Samples layouts, the same ones in every process.
 
     Where PhysX has a GPU it cooks hulls otherwise, on a CPU too, and heaps come to rest elsewhere. There a worker
@@ -128,7 +136,7 @@ class LayoutCache:
 
     def __init__(self, model: SceneModel, root: str | Path = "auto") -> None:
         self.model = model
-        self._sample = Sampler(model)
+        self._sample = LayoutSampler(model)
         self._names = sorted(model.object_pack.objects)
         self._about = _about(model)
         key = hashlib.sha256(json.dumps(self._about, sort_keys=True).encode()).hexdigest()[:16]
@@ -148,12 +156,12 @@ class LayoutCache:
     def table_path(self, engine: Engine) -> Path:
         return self.folder / f"table-{engine}.npy"
 
-    def write_table(self, engine: Engine, pairs: Iterable[Pair]) -> LayoutTable | None:
+    def write_table(self, engine: Engine, pairs: Iterable[SeedPair]) -> LayoutTable | None:
         """Write the layouts that exist of some pairs as a table, if any does; an earlier table's layouts stay in it."""
         with self._locked():
             before = self.table(engine)
             states = {pair: before.state(pair) for pair in before.pairs()} if before else {}
-            layouts: dict[Pair, Layout] = {}
+            layouts: dict[SeedPair, Layout] = {}
             for pair in dict.fromkeys([*states, *pairs]):
                 if self.path(*pair).is_file():
                     layouts[pair] = self.get(*pair)
@@ -163,9 +171,9 @@ class LayoutCache:
                 write_table(self.table_path(engine), self._names, layouts, states)
             return self.table(engine)
 
-    def mark_table(self, engine: Engine, states: Mapping[Pair, State]) -> None:
+    def write_statuses(self, engine: Engine, states: Mapping[SeedPair, LayoutStatus]) -> None:
         with self._locked():
-            mark_table(self.table_path(engine), self._names, states)
+            write_statuses(self.table_path(engine), self._names, states)
 
     @contextmanager
     def _locked(self) -> Iterator[None]:
@@ -202,10 +210,10 @@ class LayoutCache:
 
     __call__ = get
 
-    def missing(self, pairs: Iterable[Pair]) -> list[Pair]:
+    def missing(self, pairs: Iterable[SeedPair]) -> list[SeedPair]:
         return [pair for pair in pairs if not self.path(*pair).is_file()]
 
-    def fill(self, pairs: Iterable[Pair], jobs: int = 1) -> Generator[tuple[Pair, str], None, None]:
+    def fill(self, pairs: Iterable[SeedPair], jobs: int = 1) -> Generator[tuple[SeedPair, str], None, None]:
         """Make the layouts that are missing. Objects' own layouts come first, with which the others begin.
 
         Args:
@@ -228,7 +236,7 @@ class LayoutCache:
             yield from pool.map((pair for pair in others if pair[0] not in without), ordered=False)
 
 
-def _make(cache: LayoutCache, pair: Pair) -> tuple[Pair, str]:
+def _make(cache: LayoutCache, pair: SeedPair) -> tuple[SeedPair, str]:
     try:
         cache.get(*pair)
     except LayoutError as error:
@@ -236,11 +244,11 @@ def _make(cache: LayoutCache, pair: Pair) -> tuple[Pair, str]:
     return pair, ""
 
 
-def _crashed(pair: Pair, why: str) -> tuple[Pair, str]:
+def _crashed(pair: SeedPair, why: str) -> tuple[SeedPair, str]:
     return pair, f"the process that made it died ({why}); is memory short?"
 
 
-def pairs_of(seeds: Iterable[int], objects: Iterable[int] | None = None) -> list[Pair]:
+def seed_pairs(seeds: Iterable[int], objects: Iterable[int] | None = None) -> list[SeedPair]:
     """Return the pairs of seeds whose layouts environments ask for.
 
     Args:

@@ -23,7 +23,7 @@ _STEP, _ALONG = 0.05, 0.01  # m between places of the base that are tried, and a
 
 
 @dataclass(frozen=True)
-class Standing:
+class CollisionBody:
     """Something in the scene: its key in the configuration, and its hulls in the world, m."""
 
     key: str
@@ -58,7 +58,7 @@ def check_clearance(
         ConfigError: naming the two, and by how much.
     """
     joints = {f"furniture.{name}": item.joints for name, item in config.furniture.items()}
-    around = {key: Standing(key, _world_hulls(*at, joints.get(key, {}))) for key, at in placed.items()}
+    around = {key: CollisionBody(key, _world_hulls(*at, joints.get(key, {}))) for key, at in placed.items()}
     room, basket = around.pop("room"), around.pop("basket", None)
     pairs = [*combinations(around.values(), 2), *((one, room) for one in around.values())]
     fixed = [*around.values(), room]
@@ -113,7 +113,7 @@ def _edges(hull: Hull) -> Array:
     return np.unique(ways.round(6), axis=0)
 
 
-def _near(one: Standing, other: Standing) -> list[tuple[Hull, Hull]]:
+def _near(one: CollisionBody, other: CollisionBody) -> list[tuple[Hull, Hull]]:
     (low, high), (other_low, other_high) = one.bounds, other.bounds
     gap = np.minimum(high[:, None] - other_low[None], other_high[None] - low[:, None]).min(axis=2)
     return [(one.hulls[i], other.hulls[j]) for i, j in np.argwhere(gap > _TOUCHING)]
@@ -128,11 +128,11 @@ def _world_hulls(part: LoadedFurniture, pose: Array, joints: Mapping[str, float]
     return hulls
 
 
-def _body(envelope: Envelope, robot_pose: Array) -> Standing:
+def _body(envelope: Envelope, robot_pose: Array) -> CollisionBody:
     corners = np.array(list(product((-1.0, 1.0), (-1.0, 1.0), (0.0, 1.0))))
     sides = np.array([(0, 1, 2), (0, 1, 4), (0, 2, 4)])  # one along x, y and z each: those opposite add no axes
     hulls = [Hull(transform_points(robot_pose, corners * box), sides) for box in envelope.body_boxes]
-    return Standing("robot", hulls)
+    return CollisionBody("robot", hulls)
 
 
 def _densely(corners: Array) -> Array:
@@ -140,7 +140,7 @@ def _densely(corners: Array) -> Array:
     return np.concatenate([np.linspace(a, b, int(np.ceil(np.linalg.norm(b - a) / _ALONG)) + 1) for a, b in pieces])
 
 
-def _check_arm(points: Array, others: list[Standing]) -> None:
+def _check_arm(points: Array, others: list[CollisionBody]) -> None:
     """Check that the arm, sampled at points (P, 3), does not start inside of something."""
     for other in others:
         for hull, low, high in zip(other.hulls, *other.bounds, strict=True):

@@ -30,7 +30,7 @@ TESTED_AT_ONCE = 1 << 16  # pairs of grasp and point
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # of the wrist, about the approach: the same grasp
 
 
-def directions_ok(
+def check_directions(
     tcp_in_world: Array, base_to_object: Array, approach: Approach = "top"
 ) -> dict[str, NDArray[np.bool_]]:
     """Test the directions of grasps against gravity and the robot.
@@ -59,7 +59,7 @@ def directions_ok(
     return tests | {"from_the_robots_side": from_side, "closing_is_level": closing_is_level}
 
 
-def gripper_is_clear(tcp_in_world: Array, points_in_world: Array, side_clearance: float = 0.0) -> NDArray[np.bool_]:
+def is_gripper_clear(tcp_in_world: Array, points_in_world: Array, side_clearance: float = 0.0) -> NDArray[np.bool_]:
     """Return for each grasp (G, 4, 4) whether no point (P, 3) is in the open gripper, from pre-grasp to grasp.
 
     Args:
@@ -99,7 +99,7 @@ def _bounds_around(tcp_in_world: Array, low: Array, high: Array) -> tuple[Array,
 
 def _any_inside(tcp: Array, points: Array, low: Array, high: Array) -> NDArray[np.bool_]:
     """Return for each TCP (G, 4, 4) whether a point (P, 3) is in one of the boxes (B, 3), or in their mirror image."""
-    x, y, z = seen_from(tcp, points)
+    x, y, z = to_tcp_frames(tcp, points)
     y = np.abs(y)
     inside = np.zeros(len(tcp), dtype=bool)
     for (x0, y0, z0), (x1, y1, z1) in zip(low, high, strict=True):
@@ -107,7 +107,7 @@ def _any_inside(tcp: Array, points: Array, low: Array, high: Array) -> NDArray[n
     return inside
 
 
-def seen_from(tcp: Array, points: Array) -> Iterator[Array]:
+def to_tcp_frames(tcp: Array, points: Array) -> Iterator[Array]:
     """Yield coordinates x, y, z, (G, P) each, of points (P, 3) in the frames of TCPs (G, 4, 4)."""
     # no BLAS, whose threads may change the last bits
     a, b, c = (points[:, i] - tcp[:, i, 3, None] for i in range(3))
@@ -137,7 +137,7 @@ def has_free_grasps(
     notes, center = asset.annotations, object_in_world[:3, 3]
     grasps = object_in_world @ notes.grasps_tcp_in_object
     good = notes.grasp_widths <= MAX_WIDTH
-    for passed in directions_ok(grasps, center[:2] - robot_xy, approach).values():
+    for passed in check_directions(grasps, center[:2] - robot_xy, approach).values():
         good &= passed
     grasps = grasps[good]
     if at_least == 0 or len(grasps) < at_least:
@@ -148,7 +148,7 @@ def has_free_grasps(
     for start in range(0, len(grasps), batch):
         if free >= at_least or free + len(grasps) - start < at_least:
             break
-        free += int(gripper_is_clear(grasps[start : start + batch], near, side_clearance=SIDE_CLEARANCE).sum())
+        free += int(is_gripper_clear(grasps[start : start + batch], near, side_clearance=SIDE_CLEARANCE).sum())
     return free >= at_least
 
 

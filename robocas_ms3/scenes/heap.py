@@ -99,7 +99,7 @@ def _fill_bucket(
     _add_walls(scene, middle, half, region.z)
     bodies: dict[int, physx.PhysxRigidDynamicComponent] = {}
     outlines = [outline(asset) for asset in assets]
-    for index in falling_order(rng, assets, layout.order_noise).tolist():
+    for index in draw_drop_order(rng, assets, layout.order_noise).tolist():
         asset = assets[index]
         pose = _falling_pose(rng, asset, layout.tumble_probability)
         points = transform_points(pose, outlines[index])
@@ -141,7 +141,7 @@ def _middle(region: Region) -> Array:
     return np.add(region.min_xy, region.max_xy) / 2
 
 
-def falling_order(rng: np.random.Generator, assets: Sequence[LoadedObject], noise: float | None) -> NDArray[np.intp]:
+def draw_drop_order(rng: np.random.Generator, assets: Sequence[LoadedObject], noise: float | None) -> NDArray[np.intp]:
     """Draw the order of falling: by size times a random factor, whose logarithm deviates by ``noise``; None: any."""
     if noise is None:
         return rng.permutation(len(assets))

@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 ObjectIds = tuple[str, ...]
 """Objects of a scene: an id of the object pack per slot."""
 
+_FILE_KEYS = {"visible_fractions": "visible_fractions"}  # keys of files where they differ from the fields' names
 _ROTATION_ERROR = 1e-3  # by which a matrix may differ from a rotation, as single precision does
 PARKING_HEIGHT = -5.0  # z of the plane, m, on which slots wait that an episode does not use
 
@@ -35,7 +36,7 @@ class Layout:
         target: slot of the target.
         relation: how the instruction tells the target from identical objects, e.g. ``nearest``; empty: by its name.
         present: (K,) which slots take part; default: all. The number of slots is the same for every seed.
-        visible_shares: (K,) p_vis of each object from the selection camera; NaN where it was not asked for.
+        visible_fractions: (K,) p_vis of each object from the selection camera; NaN where it was not asked for.
     """
 
     object_ids: ObjectIds
@@ -45,18 +46,18 @@ class Layout:
     target: int
     relation: str = ""
     present: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
-    visible_shares: Array = field(default_factory=lambda: np.zeros(0))
+    visible_fractions: Array = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         if len(self.present) == 0:
             object.__setattr__(self, "present", np.ones(len(self.object_ids), dtype=bool))
-        if len(self.visible_shares) == 0:
-            object.__setattr__(self, "visible_shares", np.full(len(self.object_ids), np.nan))
+        if len(self.visible_fractions) == 0:
+            object.__setattr__(self, "visible_fractions", np.full(len(self.object_ids), np.nan))
 
     def check(self, names: Collection[str]) -> None:
         """Raise ValueError where a layout read from a file can't be built with the objects of these names."""
         count = len(self.object_ids)
-        shapes = self.object_poses.shape, self.present.shape, self.visible_shares.shape
+        shapes = self.object_poses.shape, self.present.shape, self.visible_fractions.shape
         if shapes != ((count, 4, 4), (count,), (count,)) or not set(self.object_ids) <= set(names):
             raise ValueError("other objects than those of the pack, or not as many poses as objects")
         fixtures = [self.robot_pose] if self.basket_pose is None else [self.robot_pose, self.basket_pose]
@@ -73,7 +74,7 @@ LayoutSource = Callable[[int, int], Layout]
 
 
 def write_layout(layout: Layout, path: Path) -> None:
-    values = {f.name: getattr(layout, f.name) for f in fields(Layout)}
+    values = {_FILE_KEYS.get(f.name, f.name): getattr(layout, f.name) for f in fields(Layout)}
     arrays: dict[str, Any] = {
         name: np.zeros(0) if value is None else np.asarray(value) for name, value in values.items()
     }
@@ -90,7 +91,7 @@ def read_layout(path: Path) -> Layout:
         ValueError: or another of `documents.DAMAGED_FILE_ERRORS`, or KeyError or TypeError: the file is damaged.
     """
     with open_arrays(path) as file:
-        values = {f.name: file[f.name] for f in fields(Layout)}
+        values = {f.name: file[_FILE_KEYS.get(f.name, f.name)] for f in fields(Layout)}
     return Layout(
         **{
             **values,

@@ -25,24 +25,24 @@ from robocas_ms3.scenes.layout import Layout, ObjectIds
 
 Engine = Literal["cpu", "gpu"]
 
-Pair = tuple[int, int]
+SeedPair = tuple[int, int]
 """Objects seed, seed."""
 
 _FIX = "Make it again: robocas layouts build."
 
 
-class State(IntEnum):
-    """State of a layout in a table."""
+class LayoutStatus(IntEnum):
+    """LayoutStatus of a layout in a table."""
 
-    LACKING = 0
-    UNTRIED = 1  # stable in the engine that made it
-    STAYS = 2
-    MOVES = 3  # the engine of the table moves its objects
+    MISSING = 0
+    UNCHECKED = 1  # stable in the engine that made it
+    STABLE = 2
+    UNSTABLE = 3  # the engine of the table moves its objects
 
 
-def good(states: NDArray[np.uint8]) -> NDArray[np.bool_]:
+def is_usable(states: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Return whether an episode may begin with layouts in these states."""
-    return (states == State.UNTRIED) | (states == State.STAYS)
+    return (states == LayoutStatus.UNCHECKED) | (states == LayoutStatus.STABLE)
 
 
 class LayoutTable:
@@ -61,45 +61,47 @@ class LayoutTable:
         self._sets, self._seeds = self.rows["objects_seed"][:, 0].copy(), self.rows["seed"][0].copy()  # rising
         self._states = self.rows["state"].copy()
 
-    def places(self, objects_seeds: NDArray[np.int64], seeds: NDArray[np.int64]) -> tuple[NDArray, NDArray, NDArray]:
-        """Return `State`, row and column of E pairs, (E,) each; of those not in the table the state is `LACKING`."""
+    def find_records(
+        self, objects_seeds: NDArray[np.int64], seeds: NDArray[np.int64]
+    ) -> tuple[NDArray, NDArray, NDArray]:
+        """Return `LayoutStatus`, row and column (E,) each of E seed pairs; absent pairs are `MISSING`."""
         rows = np.minimum(np.searchsorted(self._sets, objects_seeds), len(self._sets) - 1)
         columns = np.minimum(np.searchsorted(self._seeds, seeds), len(self._seeds) - 1)
         there = (self._sets[rows] == objects_seeds) & (self._seeds[columns] == seeds)
-        return np.where(there, self._states[rows, columns], State.LACKING), rows, columns
+        return np.where(there, self._states[rows, columns], LayoutStatus.MISSING), rows, columns
 
-    def state(self, pair: Pair) -> State:
-        return State(int(self.places(np.array([pair[0]]), np.array([pair[1]]))[0][0]))
+    def state(self, pair: SeedPair) -> LayoutStatus:
+        return LayoutStatus(int(self.find_records(np.array([pair[0]]), np.array([pair[1]]))[0][0]))
 
-    def pairs(self, *states: State) -> list[Pair]:
+    def pairs(self, *states: LayoutStatus) -> list[SeedPair]:
         """Return the pairs of the layouts in these states; default: of all that the table holds."""
         rows, columns = np.nonzero(np.isin(self._states, states) if states else self._states)
         return [*zip(self._sets[rows].tolist(), self._seeds[columns].tolist(), strict=True)]
 
-    def stays(self, objects_seed: int) -> bool:
-        return bool(good(self._states[self._sets == objects_seed]).any())
+    def has_usable_layout(self, objects_seed: int) -> bool:
+        return bool(is_usable(self._states[self._sets == objects_seed]).any())
 
     def object_ids(self, objects_seed: int) -> ObjectIds | None:
         """Return the objects of a seed; None where the table has no layout of them."""
         row = int(np.searchsorted(self._sets, objects_seed))
         if row == len(self._sets) or self._sets[row] != objects_seed:
             return None
-        column = int(np.argmax(self._states[row] != State.LACKING))
+        column = int(np.argmax(self._states[row] != LayoutStatus.MISSING))
         return tuple(str(self._names[i]) for i in self.rows["objects"][row, column].tolist())
 
-    def layout(self, pair: Pair) -> Layout | None:
+    def layout(self, pair: SeedPair) -> Layout | None:
         """Return a layout, in single precision; None where the table lacks it."""
-        state, rows, columns = self.places(np.array([pair[0]]), np.array([pair[1]]))
-        return _layout(self.rows[rows[0], columns[0]], self._names) if state[0] != State.LACKING else None
+        state, rows, columns = self.find_records(np.array([pair[0]]), np.array([pair[1]]))
+        return _layout(self.rows[rows[0], columns[0]], self._names) if state[0] != LayoutStatus.MISSING else None
 
 
 def write_table(
     path: Path,
     names: Sequence[str],
-    layouts: Mapping[Pair, Layout],
-    states: Mapping[Pair, State] = MappingProxyType({}),
+    layouts: Mapping[SeedPair, Layout],
+    states: Mapping[SeedPair, LayoutStatus] = MappingProxyType({}),
 ) -> None:
-    """Write layouts as a table; ``names`` are sorted, and pairs of its seeds without a layout are `State.LACKING`."""
+    """Write layouts as a table; a pair of its seeds without a layout is `LayoutStatus.MISSING`."""
     records = _records(names, layouts, states)
     sets, row = np.unique(records["objects_seed"], return_inverse=True)
     seeds, column = np.unique(records["seed"], return_inverse=True)
@@ -109,13 +111,13 @@ def write_table(
     _save(path, rows)
 
 
-def mark_table(path: Path, names: Sequence[str], states: Mapping[Pair, State]) -> None:
-    """Write the states of some layouts into a table; layouts that it lacks stay `State.LACKING`."""
+def write_statuses(path: Path, names: Sequence[str], states: Mapping[SeedPair, LayoutStatus]) -> None:
+    """Write the states of some layouts into a table; layouts that it lacks stay `LayoutStatus.MISSING`."""
     table = LayoutTable(path, names)
     rows = np.array(table.rows)
     for pair, state in states.items():
-        before, row, column = table.places(np.array([pair[0]]), np.array([pair[1]]))
-        if before[0] != State.LACKING:
+        before, row, column = table.find_records(np.array([pair[0]]), np.array([pair[1]]))
+        if before[0] != LayoutStatus.MISSING:
             rows["state"][row[0], column[0]] = state
     _save(path, rows)
 
@@ -152,11 +154,11 @@ class FrozenLayouts:
         return _layout(self._records[self._places[seed]], self._names)
 
 
-def write_frozen(path: Path, names: Collection[str], layouts: Mapping[int, Layout]) -> None:
+def write_frozen_layouts(path: Path, names: Collection[str], layouts: Mapping[int, Layout]) -> None:
     _save(path, _records(sorted(names), {(seed, seed): layout for seed, layout in layouts.items()}))
 
 
-def join_frozen(path: Path, parts: Sequence[Path]) -> None:
+def join_frozen_layouts(path: Path, parts: Sequence[Path]) -> None:
     """Join files of one configuration's layouts, in the order given; see `FrozenLayouts`.
 
     Raises:
@@ -170,7 +172,9 @@ def join_frozen(path: Path, parts: Sequence[Path]) -> None:
 
 
 def _records(
-    names: Sequence[str], layouts: Mapping[Pair, Layout], states: Mapping[Pair, State] = MappingProxyType({})
+    names: Sequence[str],
+    layouts: Mapping[SeedPair, Layout],
+    states: Mapping[SeedPair, LayoutStatus] = MappingProxyType({}),
 ) -> NDArray[np.void]:
     slots = len(next(iter(layouts.values())).object_ids)
     words = max(1, *(len(layout.relation) for layout in layouts.values()))
@@ -179,7 +183,7 @@ def _records(
     for i, (pair, layout) in enumerate(layouts.items()):
         records[i] = (
             *pair,
-            states.get(pair, State.UNTRIED),
+            states.get(pair, LayoutStatus.UNCHECKED),
             [number[name] for name in layout.object_ids],
             to_wxyz(layout.object_poses),
             to_wxyz(layout.robot_pose),
@@ -187,7 +191,7 @@ def _records(
             layout.target,
             layout.relation,
             layout.present,
-            layout.visible_shares,
+            layout.visible_fractions,
         )
     return records
 
@@ -202,7 +206,7 @@ def _layout(record: Any, names: Sequence[str]) -> Layout:
             target=int(record["target"]),
             relation=str(record["relation"]),
             present=record["present"].copy(),
-            visible_shares=record["visible_shares"].astype(np.float64),
+            visible_fractions=record["visible_fractions"].astype(np.float64),
         )
         layout.check(names)
     except (ValueError, IndexError) as error:
@@ -240,6 +244,6 @@ def _record_type(slots: int, words: int) -> np.dtype:
             ("target", "i2"),
             ("relation", f"U{words}"),
             ("present", "?", (slots,)),
-            ("visible_shares", "f4", (slots,)),
+            ("visible_fractions", "f4", (slots,)),  # visible fractions; frozen protocols have this name
         ]
     )

@@ -14,10 +14,10 @@ from robocas_ms3.core.poses import from_xyz_yaw
 from robocas_ms3.core.strict_model import did_you_mean
 from robocas_ms3.scenes.config.task import OrderlyLayout, PlacedConfig, PoseConfig, SurfaceConfig, TaskConfig
 from robocas_ms3.scenes.placement import Array, Region
-from robocas_ms3.scenes.relations import NEED_THREE, RELATIONS
+from robocas_ms3.scenes.relations import RELATIONS, THREE_OBJECT_RELATIONS
 from robocas_ms3.scenes.task_specs import TASKS
 
-OPENED_AT_MOST = {"prismatic": 0.95, "revolute": 0.8}  # share of a joint's range that scripted pulls aim at
+MAX_OPENED_FRACTION = {"prismatic": 0.95, "revolute": 0.8}  # share of a joint's range that scripted pulls aim at
 
 
 def fixture_pose(config: PoseConfig) -> Array:
@@ -90,7 +90,7 @@ def _check_relations(pack: Pack, config: TaskConfig, ids: list[str]) -> None:
     named = "relation" in TASKS[config.task].slots
     if not named or not isinstance(layout, OrderlyLayout) or set(asked) == set(RELATIONS):
         return
-    wrong = [relation for relation in asked if relation in NEED_THREE]
+    wrong = [relation for relation in asked if relation in THREE_OBJECT_RELATIONS]
     sets = [resolve_ids(pack, names, key="randomisation.object_sets") for names in random.object_sets or ()] or [ids]
     most = max(_most_alike(pack, names, config, layout.copies) for names in sets)
     if random.distractors and random.distractors.count[1]:  # may be of the same name
@@ -163,7 +163,7 @@ def check_joints(config: TaskConfig, furniture: dict[str, LoadedFurniture]) -> N
         return
     _check_known("opening.handle: no such handle", opening.handle, furniture[opening.furniture].asset.handles)
     joint = find_opened_joint(config, furniture)
-    limit = OPENED_AT_MOST[joint.kind]
+    limit = MAX_OPENED_FRACTION[joint.kind]
     if opening.opened_at >= limit:
         raise ConfigError(
             f"opening.opened_at: scripted pulls open the {joint.kind} joint {joint.name!r} no further than {limit}",

@@ -20,12 +20,12 @@ Relation = Literal[
 """The first three order objects by horizontal distance, the others from left to right."""
 
 RELATIONS: tuple[Relation, ...] = get_args(Relation)
-NEED_THREE: tuple[Relation, ...] = ("second_nearest", "second_from_left", "middle", "second_from_right")
+THREE_OBJECT_RELATIONS: tuple[Relation, ...] = ("second_nearest", "second_from_left", "middle", "second_from_right")
 """Relations that need at least three objects."""
 MARGIN = 0.03  # m by which the named object differs from every other in what the relation compares
 
 
-def related(relation: Relation, xy_in_robot: NDArray[np.float64]) -> int | None:
+def select_by_relation(relation: Relation, xy_in_robot: NDArray[np.float64]) -> int | None:
     """Return the index of the object that a relation names; None where the answer is not clear by `MARGIN`.
 
     Args:
@@ -36,7 +36,7 @@ def related(relation: Relation, xy_in_robot: NDArray[np.float64]) -> int | None:
     key = np.linalg.norm(xy_in_robot, axis=1) if by_distance else -xy_in_robot[:, 1]
     order = np.argsort(key, kind="stable")
     count = len(order)
-    if count < (3 if relation in NEED_THREE else 2) or (relation == "middle" and count % 2 == 0):
+    if count < (3 if relation in THREE_OBJECT_RELATIONS else 2) or (relation == "middle" and count % 2 == 0):
         return None
     place = {
         "nearest": 0,

@@ -27,7 +27,7 @@ def place_robot(model: SceneModel, rng: np.random.Generator) -> Array:
     """Draw 4x4 of the robot's root until its body is clear of furniture; as configured where nothing moves it."""
     by = model.config.randomisation.robot
     points = np.zeros((0, 3)) if by is None else model.furniture_points
-    return _place("robot", model.robot_pose, by, rng, lambda pose: body_is_free(pose, points))
+    return _place("robot", model.robot_pose, by, rng, lambda pose: is_body_clear(pose, points))
 
 
 def place_basket(model: SceneModel, robot_pose: Array, rng: np.random.Generator) -> Array | None:
@@ -41,7 +41,7 @@ def place_basket(model: SceneModel, robot_pose: Array, rng: np.random.Generator)
     points = model.basket.surface_points()
 
     def good(pose: Array) -> bool:
-        return body_is_free(robot_pose, transform_points(pose, points)) and basket_stands(model, pose)
+        return is_body_clear(robot_pose, transform_points(pose, points)) and is_basket_stable(model, pose)
 
     return _place("basket", model.basket_pose, model.config.randomisation.basket, rng, good)
 
@@ -71,7 +71,7 @@ def _moved(pose: Array, by: PoseRandomisation, rng: np.random.Generator) -> Arra
     return moved
 
 
-def body_is_free(base_in_world: Array, cloud: Array) -> bool:
+def is_body_clear(base_in_world: Array, cloud: Array) -> bool:
     """Return whether no point (P, 3) in the world is in the robot's body; points below the floor are not.
 
     Args:
@@ -84,7 +84,7 @@ def body_is_free(base_in_world: Array, cloud: Array) -> bool:
     return not ((z > 0) & np.logical_or.reduce(inside)).any()
 
 
-def basket_stands(model: SceneModel, basket_pose: Array) -> bool:
+def is_basket_stable(model: SceneModel, basket_pose: Array) -> bool:
     """Simulate whether the basket stays at a pose 4x4 in the world, also with a load in any of its corners; 30 ms.
 
     Over an edge it tips, in the air it falls, out of a wall it is pushed.

@@ -19,7 +19,7 @@ from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.placement import Array, PlaceableObject, choose_objects, sample_orderly, sample_scattered
 from robocas_ms3.scenes.robot_placement import place_basket, place_robot
 from robocas_ms3.scenes.settle import settle
-from robocas_ms3.scenes.targets import Arrangement, choose_target, target_rule
+from robocas_ms3.scenes.targets import SettledScene, choose_target, target_rule
 from robocas_ms3.scenes.task_specs import TASKS
 
 # Every random decision of a scene has a stream of its own, so that a new one never shifts the others.
@@ -30,7 +30,7 @@ _SEVERAL = 5  # layouts without a target, from which on the error blames the tar
 _log = logging.getLogger(__name__)
 
 
-def object_set(model: SceneModel, objects_seed: int, number: int = 0) -> ObjectIds:
+def draw_object_set(model: SceneModel, objects_seed: int, number: int = 0) -> ObjectIds:
     """Draw the ``number``-th set of objects of a seed, an id per slot: those of the task, then distractors.
 
     Raises:
@@ -56,8 +56,8 @@ def object_set(model: SceneModel, objects_seed: int, number: int = 0) -> ObjectI
 def sample_layout(model: SceneModel, objects_seed: int, seed: int, object_ids: ObjectIds | None = None) -> Layout:
     """Draw a layout, let it settle, and choose its target. The same seeds give the same layout.
 
-    The objects of a seed are the first set it draws (`object_set`) that can be laid out with this very seed: of some
-    kinds side by side on a shelf none can be grasped, whatever their order.
+    The objects of a seed are the first drawn set (`draw_object_set`) for which this seed gives a layout. Some sets have
+    none: side by side on a shelf, no object of them can be grasped in any order.
 
     Args:
         model: the scene's assets.
@@ -83,7 +83,7 @@ def sample_layout(model: SceneModel, objects_seed: int, seed: int, object_ids: O
     unsettled, untargeted, unarranged = 0, 0, []
     for number in range(_SETS):
         try:
-            ids = object_ids or object_set(model, objects_seed, number)
+            ids = object_ids or draw_object_set(model, objects_seed, number)
         except LayoutError as error:
             unarranged += [error] * _TRIES
             continue
@@ -105,7 +105,7 @@ def sample_layout(model: SceneModel, objects_seed: int, seed: int, object_ids: O
             present[wanted] = fits
             used = [assets[slot] for slot in np.flatnonzero(present)]
             placed = model.support_pose @ model.support_motion(opened=False) @ arranged[fits]
-            if config.randomisation.basket is not None and meets_basket(used, placed, model.basket, basket_pose):
+            if config.randomisation.basket is not None and overlaps_basket(used, placed, model.basket, basket_pose):
                 basket_pose = place_basket(model, robot_pose, basket_rng)
                 unsettled += 1
                 continue
@@ -114,16 +114,16 @@ def sample_layout(model: SceneModel, objects_seed: int, seed: int, object_ids: O
             if not stable:
                 unsettled += 1
                 continue
-            scene = Arrangement(model, assets, poses, present, candidate & present, robot_pose, basket_pose)
+            scene = SettledScene(model, assets, poses, present, candidate & present, robot_pose, basket_pose)
             if (choice := choose_target(target_rng, scene)) is not None:
                 return Layout(
-                    ids, poses, robot_pose, basket_pose, choice.slot, choice.relation, present, choice.visible_shares
+                    ids, poses, robot_pose, basket_pose, choice.slot, choice.relation, present, choice.visible_fractions
                 )
             untargeted += 1
     raise _failure(model, unarranged, unsettled, untargeted)
 
 
-def meets_basket(
+def overlaps_basket(
     assets: list[LoadedObject], poses: Array, basket: LoadedFurniture | None, basket_pose: Array | None
 ) -> bool:
     """Return whether an object at its pose (K, 4, 4) is in the basket, or meets its walls, judged by bounding boxes."""
@@ -175,7 +175,7 @@ def _usable(model: SceneModel, ids: list[str], *, columns: bool = False) -> list
     """Return the ids of objects that fit under what is above; for columns those with a display pose, if any has one."""
     if not columns and model.headroom == np.inf:
         return ids
-    things = {i: placeable(model.object_pack.objects[i], model.headroom) for i in ids}
+    things = {i: make_placeable(model.object_pack.objects[i], model.headroom) for i in ids}
     usable = [i for i in ids if len(things[i].resting_poses)]
     if not usable:
         room = f"objects lower than {model.headroom:.3f} m"
@@ -196,7 +196,7 @@ def _warn_left_out(ids: tuple[str, ...]) -> None:
     )
 
 
-def placeable(asset: LoadedObject, headroom: float = np.inf) -> PlaceableObject:
+def make_placeable(asset: LoadedObject, headroom: float = np.inf) -> PlaceableObject:
     """Return an object with its resting poses that are lower than ``headroom``, m."""
     notes = asset.annotations
     low = np.arange(len(notes.resting_poses))
@@ -219,7 +219,7 @@ def _arrange(
     layout, region, everything = model.config.layout, model.region, np.ones(len(assets), dtype=bool)
     if isinstance(layout, StackedLayout):
         return drop_heap(rng, assets, region, layout, headroom=model.headroom), everything
-    placeables = [placeable(asset, model.headroom) for asset in assets]
+    placeables = [make_placeable(asset, model.headroom) for asset in assets]
     if isinstance(layout, ScatteredLayout):
         return sample_scattered(rng, placeables, region, layout), everything
     return sample_orderly(rng, placeables, region, layout, model.front)

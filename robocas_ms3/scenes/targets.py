@@ -16,28 +16,28 @@ from robocas_ms3.core.poses import transform_points
 from robocas_ms3.scenes.grasp_checks import PREGRASP_DISTANCE, has_free_grasps
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.placement import Array
-from robocas_ms3.scenes.relations import related
+from robocas_ms3.scenes.relations import select_by_relation
 from robocas_ms3.scenes.task_specs import TASKS
-from robocas_ms3.scenes.visibility import PinholeCamera, Scenery, object_mesh, top_down_camera
+from robocas_ms3.scenes.visibility import MeshScene, PinholeCamera, object_mesh, top_down_camera
 
 
 @dataclass(frozen=True)
-class Choice:
+class TargetChoice:
     """The target.
 
     Attributes:
         slot: its index.
         relation: how the instruction tells it from objects of the same name; empty: not needed.
-        visible_shares: (K,) p_vis where the rule asked for it; empty: it did not.
+        visible_fractions: (K,) p_vis where the rule asked for it; empty: it did not.
     """
 
     slot: int
     relation: str = ""
-    visible_shares: Array = field(default_factory=lambda: np.zeros(0))
+    visible_fractions: Array = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True)
-class Arrangement:
+class SettledScene:
     """Settled objects, before a target is chosen. K slots; poses 4x4 in the world, m.
 
     Attributes:
@@ -129,7 +129,7 @@ class TargetRule:
         keys: of ``target`` in a configuration, numbers that let fewer objects qualify the higher they are.
     """
 
-    choose: Callable[[np.random.Generator, Arrangement], Choice | None]
+    choose: Callable[[np.random.Generator, SettledScene], TargetChoice | None]
     keys: tuple[str, ...] = ("min_grasps",)
 
 
@@ -137,11 +137,11 @@ def target_rule(task: str) -> TargetRule:
     return load_object(TASKS[task].target)
 
 
-def choose_target(rng: np.random.Generator, scene: Arrangement) -> Choice | None:
+def choose_target(rng: np.random.Generator, scene: SettledScene) -> TargetChoice | None:
     return target_rule(scene.model.config.task).choose(rng, scene)
 
 
-def _by_name(rng: np.random.Generator, scene: Arrangement) -> Choice | None:
+def _by_name(rng: np.random.Generator, scene: SettledScene) -> TargetChoice | None:
     """Choose any object; its name is all the instruction says, so among same-named ones the nearest is meant."""
     nearest: dict[str, int] = {}
     for slot in np.argsort(np.linalg.norm(scene.xy_in_robot, axis=1), kind="stable"):
@@ -149,10 +149,10 @@ def _by_name(rng: np.random.Generator, scene: Arrangement) -> Choice | None:
             nearest.setdefault(scene.names[slot], int(slot))
     slots = sorted(slot for slot in nearest.values() if scene.eligible[slot])
     shuffled = rng.permutation(np.array(slots, dtype=int)).tolist()
-    return next((Choice(slot) for slot in shuffled if scene.has_free_grasps(slot)), None)
+    return next((TargetChoice(slot) for slot in shuffled if scene.has_free_grasps(slot)), None)
 
 
-def _by_relation(rng: np.random.Generator, scene: Arrangement) -> Choice | None:
+def _by_relation(rng: np.random.Generator, scene: SettledScene) -> TargetChoice | None:
     """Choose one of several identical objects, named by where it is among them; or by its name alone, the nearest."""
     if not scene.model.config.target.relations:
         return _by_name(rng, scene)
@@ -160,9 +160,9 @@ def _by_relation(rng: np.random.Generator, scene: Arrangement) -> Choice | None:
     for index in rng.permutation(len(pairs)):
         name, relation = pairs[index]
         slots = [s for s, n in enumerate(scene.names) if n == name and scene.present[s]]
-        found = related(relation, scene.xy_in_robot[slots])
+        found = select_by_relation(relation, scene.xy_in_robot[slots])
         if found is not None and scene.eligible[slots[found]] and scene.has_free_grasps(slots[found]):
-            return Choice(slots[found], relation)
+            return TargetChoice(slots[found], relation)
     return None
 
 
@@ -174,7 +174,7 @@ def selection_camera(model: SceneModel) -> PinholeCamera:
     return top_down_camera(center[:2], center[2])
 
 
-def _by_visibility(rng: np.random.Generator, scene: Arrangement) -> Choice | None:
+def _by_visibility(rng: np.random.Generator, scene: SettledScene) -> TargetChoice | None:
     """Choose a hidden object, near ones more often: weight 1 / distance to the robot (upstream's when it makes data).
 
     An object whose grasps furniture or basket block does not qualify, whatever lies on it: a can on its broad side, a
@@ -183,8 +183,8 @@ def _by_visibility(rng: np.random.Generator, scene: Arrangement) -> Choice | Non
     rules = scene.model.config.target
     slots = np.flatnonzero(scene.present)
     shares = np.full(len(scene.assets), np.nan)
-    scenery = Scenery([object_mesh(scene.assets[s]) for s in slots], scene.poses[slots])
-    shares[slots] = scenery.visible_shares(selection_camera(scene.model))
+    scenery = MeshScene([object_mesh(scene.assets[s]) for s in slots], scene.poses[slots])
+    shares[slots] = scenery.visible_fractions(selection_camera(scene.model))
     unique = np.array([scene.names.count(name) == 1 for name in scene.names])
     fits = scene.eligible & unique
     if rules.max_visible_share is not None:
@@ -194,7 +194,7 @@ def _by_visibility(rng: np.random.Generator, scene: Arrangement) -> Choice | Non
     while weight.any():
         slot = int(rng.choice(len(weight), p=weight / weight.sum()))
         if scene.has_uncovered_grasps(slot) and (rules.min_free_grasps == 0 or scene.has_free_grasps(slot)):
-            return Choice(slot, visible_shares=shares)
+            return TargetChoice(slot, visible_fractions=shares)
         weight[slot] = 0
     return None
 

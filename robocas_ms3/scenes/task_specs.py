@@ -56,7 +56,7 @@ class TaskSpec:
         return self.steps(STANDARD_FREQ)
 
 
-HAS_BASKET = "robocas_ms3.scenes.config.task:has_basket"
+REQUIRE_BASKET = "robocas_ms3.scenes.config.task:require_basket"
 
 PICK = TaskSpec(
     name="pick",
@@ -68,7 +68,7 @@ PICK = TaskSpec(
     seconds=40,
     training_seconds=20,
     summary="grasp the named object among scattered ones and drop it into the basket",
-    checks=(HAS_BASKET,),
+    checks=(REQUIRE_BASKET,),
 )
 SELECT = TaskSpec(
     name="select",
@@ -81,7 +81,7 @@ SELECT = TaskSpec(
     training_seconds=20,
     summary="grasp the one of several identical objects that the instruction names by where it stands",
     slots=("relation",),
-    checks=(HAS_BASKET, "robocas_ms3.scenes.config.task:has_copies"),
+    checks=(REQUIRE_BASKET, "robocas_ms3.scenes.config.task:require_copies"),
 )
 SEARCH = TaskSpec(
     name="search",
@@ -93,7 +93,7 @@ SEARCH = TaskSpec(
     seconds=120,
     training_seconds=90,
     summary="find the named object in a heap, clear what covers it, and drop it into the basket",
-    checks=(HAS_BASKET,),
+    checks=(REQUIRE_BASKET,),
 )
 OPEN_PICK = TaskSpec(
     name="open_pick",
@@ -106,6 +106,6 @@ OPEN_PICK = TaskSpec(
     training_seconds=40,
     summary="open a door or drawer, take the named object out and drop it into the basket",
     slots=("part",),
-    checks=(HAS_BASKET,),
+    checks=(REQUIRE_BASKET,),
 )
 TASKS = Registry("task", "robocas_ms3.tasks", TaskSpec, {spec.name: spec for spec in (PICK, SELECT, SEARCH, OPEN_PICK)})

@@ -20,7 +20,7 @@ from robocas_ms3.scenes.placement import Array
 
 PixelBox = tuple[slice, slice]  # rows, columns
 
-HEIGHT = 0.5  # m, of the selection camera above the support, upstream's
+SELECTION_CAMERA_HEIGHT = 0.5  # m, of the selection camera above the support, upstream's
 _FAR = 1e30  # embree's distance of a miss is greater
 _scenes: WeakKeyDictionary[trimesh.Trimesh, EmbreeScene] = WeakKeyDictionary()
 
@@ -64,10 +64,10 @@ class PinholeCamera:
 
 
 def top_down_camera(center_xy: Array, support_z: float, *, size: int = 512) -> PinholeCamera:
-    """Return upstream's selection camera: it looks straight down on (x, y) from `HEIGHT` above the support."""
+    """Return RoboCAS-v0's selection camera, which looks down on (x, y) from `SELECTION_CAMERA_HEIGHT`."""
     pose = np.eye(4)
     pose[:3, :3] = np.column_stack([(0, 0, -1.0), (0, 1.0, 0), (1.0, 0, 0)])
-    pose[:3, 3] = *center_xy, support_z + HEIGHT
+    pose[:3, 3] = *center_xy, support_z + SELECTION_CAMERA_HEIGHT
     return PinholeCamera(pose, size, size)
 
 
@@ -84,7 +84,7 @@ def object_mesh(asset: Part, level: VisualLevel = "fast") -> trimesh.Trimesh:
     return _mesh_of(path, path.stat().st_mtime_ns)
 
 
-class Scenery:
+class MeshScene:
     """Meshes at their poses, seen by any number of cameras.
 
     Args:
@@ -95,7 +95,7 @@ class Scenery:
     def __init__(self, meshes: Sequence[trimesh.Trimesh], poses: Array) -> None:
         self._placed = list(zip(meshes, poses, strict=True))
 
-    def visible_shares(self, camera: PinholeCamera) -> Array:
+    def visible_fractions(self, camera: PinholeCamera) -> Array:
         """Return p_vis = visible / full projected area of each mesh (K,), in 0..1; NaN where it is out of view."""
         ids, full = self.segmentation(camera)
         visible = np.bincount(ids[ids >= 0], minlength=len(full))

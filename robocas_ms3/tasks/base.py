@@ -23,7 +23,7 @@ from robocas_ms3.robots.agent import MobileManipulator
 from robocas_ms3.robots.registry import DEFAULT, find_robot
 from robocas_ms3.scenes import build
 from robocas_ms3.scenes.cache import layout_source
-from robocas_ms3.scenes.config import TaskConfig, load_config_of
+from robocas_ms3.scenes.config import TaskConfig, load_config_for
 from robocas_ms3.scenes.language.instructions import Instruction, episode_instruction
 from robocas_ms3.scenes.layout import Layout, LayoutSource
 from robocas_ms3.scenes.model import SceneModel
@@ -33,7 +33,7 @@ from robocas_ms3.tasks.bodies import Bodies, Contacts, link_poses
 from robocas_ms3.tasks.goals import Goal, InBasket
 from robocas_ms3.tasks.initial_states import place
 from robocas_ms3.tasks.observations import over_the_shoulder, place_camera, privileged_observations
-from robocas_ms3.tasks.rewards import DENSE, TRANSFER, DenseReward, RewardTable, count_share
+from robocas_ms3.tasks.rewards import DENSE, TRANSFER, DenseReward, RewardTable, count_fraction
 from robocas_ms3.tasks.seeds import EpisodeSeeds, check_reset_options
 from robocas_ms3.tasks.success import SuccessCheck
 
@@ -63,7 +63,7 @@ class RoboCASEnv(BaseEnv):
     Attributes:
         present: (N, K) bool, which object slots are in use.
         target_slot: (N,) slot of the target; ``is_target`` (N, K) bool has the same as flags.
-        start_poses: (N, K, 7) poses of the objects at the start of the episode; ``basket_at_start`` (N, 7).
+        start_poses: (N, K, 7) poses of the objects at the start of the episode; ``basket_start_poses`` (N, 7).
     """
 
     SPEC: ClassVar[TaskSpec]
@@ -73,7 +73,7 @@ class RoboCASEnv(BaseEnv):
     SUPPORTED_REWARD_MODES = ("sparse", *DENSE, "none")  # the first is the default
 
     agent: MobileManipulator
-    looks = True  # else images are black
+    renders_images = True  # else images are black
 
     def __init__(
         self,
@@ -88,7 +88,7 @@ class RoboCASEnv(BaseEnv):
         **kwargs: Any,
     ) -> None:
         engine.check_engine(num_envs, visual_level, **kwargs)
-        self.task_config = load_config_of(self.SPEC, config)
+        self.task_config = load_config_for(self.SPEC, config)
         self.robot_spec = find_robot(robot_uids, where="robot_uids")
         load_object(self.robot_spec.agent)  # registers it with ManiSkill
         robot = self.robot_spec.description
@@ -161,7 +161,7 @@ class RoboCASEnv(BaseEnv):
         self.present = torch.ones(self.num_envs, slots, dtype=torch.bool, device=self.device)
         self.target_slot = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
         self.is_target = torch.zeros_like(self.present)
-        self.basket_at_start = torch.zeros(self.num_envs, 7, device=self.device)
+        self.basket_start_poses = torch.zeros(self.num_envs, 7, device=self.device)
         self.dense_reward = DenseReward(self.REWARDS, self.num_envs, self.device)
         self.goal = self.GOAL(self)
         self.success_check = SuccessCheck(self, self.STAGES)
@@ -219,7 +219,7 @@ class RoboCASEnv(BaseEnv):
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         self._engine_errors.check()
-        place(self, self.seeds.find_starts(env_idx.cpu().numpy(), self.device), env_idx)
+        place(self, self.seeds.find_initial_states(env_idx.cpu().numpy(), self.device), env_idx)
         self.success_check.reset(env_idx)
         self.dense_reward.reset(env_idx)
 
@@ -227,10 +227,10 @@ class RoboCASEnv(BaseEnv):
         return self.seeds.layout(env)
 
     def get_state_dict(self) -> dict:
-        """Return the state in ManiSkill's form, from one read of all bodies, and `state_beside_bodies`."""
-        return {**self.bodies.split(self.bodies.read().clone()), **self.state_beside_bodies()}
+        """Return the state in ManiSkill's form, from one read of all bodies, and `extra_state`."""
+        return {**self.bodies.split(self.bodies.read().clone()), **self.extra_state()}
 
-    def state_beside_bodies(self) -> dict:
+    def extra_state(self) -> dict:
         """Return targets of controllers, and the ``stages`` (N, stages) bool that were reached so far."""
         task = {"stages": self.success_check.reached.T.clone()}
         return {"controller": self.agent.controller.targets(), "task": task}
@@ -293,8 +293,8 @@ class RoboCASEnv(BaseEnv):
         """Return stages, ``success`` and ``fail`` (N,) bool, and ``disturbed`` (N,) int; see docs/tasks.md."""
         return self.success_check.check()
 
-    def target_measures(self) -> dict[str, torch.Tensor]:
-        return self.success_check.measures()
+    def success_conditions(self) -> dict[str, torch.Tensor]:
+        return self.success_check.success_conditions()
 
     def instruction(self, env: int = 0, target: str = "") -> Instruction:
         """Return the instruction of an env; with ``target`` the one it would have if its target had that name."""
@@ -319,17 +319,17 @@ class RoboCASEnv(BaseEnv):
 
     def _get_obs_sensor_data(self, apply_texture_transforms: bool = True) -> dict:
         last = self._last_obs.get("sensor_data") if isinstance(self._last_obs, dict) else None
-        if self.looks or last is None:  # None: point clouds, made of images
+        if self.renders_images or last is None:  # None: point clouds, made of images
             return super()._get_obs_sensor_data(apply_texture_transforms)
         return {camera: {kind: torch.zeros_like(of) for kind, of in kinds.items()} for camera, kinds in last.items()}
 
     def get_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
         if self._reward_mode == "progress":
-            reward = self.dense_reward.gain(self.compute_normalized_dense_reward(obs, action, info))
+            reward = self.dense_reward.increase(self.compute_normalized_dense_reward(obs, action, info))
         else:
             reward = super().get_reward(obs, action, info)
         if self._reward_mode in DENSE and action is not None:
-            self.dense_reward.remember(action)
+            self.dense_reward.store_action(action)
         return reward
 
     def compute_sparse_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
@@ -337,13 +337,13 @@ class RoboCASEnv(BaseEnv):
 
     def compute_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
         """Return the reward (N,) float32 in [0, ``REWARDS.total``]; add ``reward_terms`` to the last step's info."""
-        moment = self.success_check.moment
-        penalties = {"disturbed": count_share(moment.disturbed.sum(1)), **self.goal.penalties(moment)}
-        return self.dense_reward.weigh(self.reward_progress(), penalties, action, info)
+        moment = self.success_check.state
+        penalties = {"disturbed": count_fraction(moment.disturbed.sum(1)), **self.goal.penalties(moment)}
+        return self.dense_reward.compute(self.reward_progress(), penalties, action, info)
 
     def reward_progress(self) -> tuple[Array, dict[str, Array]]:
         """Return how far the envs are; see `Goal.progress`."""
-        return self.goal.progress(self.success_check.moment, self.success_check.stages["target_lifted"], self.REWARDS)
+        return self.goal.progress(self.success_check.state, self.success_check.stages["target_lifted"], self.REWARDS)
 
     def compute_normalized_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
         return self.compute_dense_reward(obs, action, info) / self.REWARDS.total

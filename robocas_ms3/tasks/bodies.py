@@ -87,24 +87,24 @@ class Bodies:
         return self._state
 
     @property
-    def others(self) -> tuple[bytes, bytes] | None:
+    def state_except_robot(self) -> tuple[bytes, bytes] | None:
         """All but the robot at the last `read`, to be compared: the same means that nothing moved; None on a GPU."""
         if self._scene.gpu_sim_enabled:
             return None
         return self._packed[: self._robot.start], self._packed[self._robot.stop :]
 
-    def of_actors(self, state: torch.Tensor) -> torch.Tensor:
+    def actor_states(self, state: torch.Tensor) -> torch.Tensor:
         """(N, A, 13) the actors' part of a state (N, D), in the order of ``actors``."""
         count = len(self._actors)
         return state[:, : count * BODY].view(-1, count, BODY)
 
     def objects(self, state: torch.Tensor) -> torch.Tensor:
         """(N, K, 13) the objects' part of a state (N, D); a view."""
-        return self.of_actors(state)[:, self._objects]
+        return self.actor_states(state)[:, self._objects]
 
     def basket(self, state: torch.Tensor) -> torch.Tensor | None:
         """(N, 7) the basket's pose in a state (N, D), a view; None where there is no basket."""
-        return None if self._basket is None else self.of_actors(state)[:, self._basket, :7]
+        return None if self._basket is None else self.actor_states(state)[:, self._basket, :7]
 
     def split(self, states: _Batch) -> dict[str, dict[str, _Batch]]:
         """Name the parts of states (..., D), as ManiSkill does: ``{"actors": {name: (..., 13)}, ...}``; all views."""
@@ -133,7 +133,7 @@ class Bodies:
         start = starts[robot._objs[0]]
         return np.array(order), slice(4 * start, 4 * (start + BODY + _PACKED_PER_JOINT * robot.max_dof))
 
-    def put_objects(self, envs: torch.Tensor, poses: torch.Tensor) -> None:
+    def set_object_poses(self, envs: torch.Tensor, poses: torch.Tensor) -> None:
         """Put the objects of some envs somewhere at once, on a GPU; `ManiSkillScene._gpu_apply_all` tells PhysX.
 
         Args:
@@ -146,7 +146,7 @@ class Bodies:
         self._px.cuda_rigid_body_data.torch()[self._rows[envs, self._objects], :7] = poses
 
     def stop(self, envs: torch.Tensor) -> None:
-        """Take all velocities from some envs (E,) at once, on a GPU; see `put_objects`."""
+        """Take all velocities from some envs (E,) at once, on a GPU; see `set_object_poses`."""
         self._px.cuda_rigid_body_data.torch()[self._rows[envs].flatten(), 7:BODY] = 0.0
         for articulation in self._articulations:
             self._px.cuda_articulation_qvel.torch()[articulation._data_index[envs], : articulation.max_dof] = 0.0

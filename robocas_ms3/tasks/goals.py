@@ -20,7 +20,7 @@ _DROP_HEIGHT, _LOWERING = 0.1, 0.25  # m above the basket's rim: where a carry l
 _FAR = 0.2  # m from there at which half of the carry is done
 
 
-class Moment(NamedTuple):
+class TaskState(NamedTuple):
     """What `RoboCASEnv.evaluate` found last.
 
     Attributes:
@@ -51,35 +51,35 @@ class Goal(ABC):
 
     NAME: ClassVar[str]
     """Of its measure, ``in_basket``; the stage is ``target_in_basket``."""
-    LIFTS: ClassVar[bool] = True
+    REQUIRES_LIFT: ClassVar[bool] = True
     """Whether the target must have been lifted for success."""
-    TOWARDS: ClassVar[str] = "target_to_goal"
+    VECTOR_NAME: ClassVar[str] = "target_to_goal"
     """Name of the observation of the way from the target's centre of mass to `point`."""
 
     def __init__(self, env: Any) -> None:
         self.env = env
 
     @abstractmethod
-    def holds(self, centers: Array, basket: Array | None) -> Array:
+    def is_at_goal(self, centers: Array, basket: Array | None) -> Array:
         """Return which objects are at the goal, (N,) or (N, K), from their centres of mass (N, 3) or (N, K, 3)."""
 
-    def measures(self, basket: Array | None) -> dict[str, Array]:
+    def success_conditions(self, basket: Array | None) -> dict[str, Array]:
         """Return what else has to hold at the moment of success: (N,) bool each."""
         return {}
 
-    def lost(self, basket: Array | None, measures: dict[str, Array]) -> Array | None:
+    def is_lost(self, basket: Array | None, measures: dict[str, Array]) -> Array | None:
         """Return in which envs (N,) the goal itself can't be reached any more; None: in none."""
         return None
 
-    def catches(self, positions: Array, basket: Array | None) -> Array | None:
+    def is_over_goal(self, positions: Array, basket: Array | None) -> Array | None:
         """Return which targets at (N, 3) m may be lower than where they stood, (N,) bool; None: none may."""
         return None
 
-    def point(self, basket: Array | None) -> Array | None:
+    def position(self, basket: Array | None) -> Array | None:
         """Return where the target's centre of mass is to be brought, (N, 3) m in the world; None: not at one point."""
         return None
 
-    def progress(self, now: Moment, brought: Array, table: rewards.RewardTable) -> tuple[Array, dict[str, Array]]:
+    def progress(self, now: TaskState, brought: Array, table: rewards.RewardTable) -> tuple[Array, dict[str, Array]]:
         """Return how far an episode is, for dense rewards.
 
         Args:
@@ -95,7 +95,7 @@ class Goal(ABC):
         """
         raise NotImplementedError(f"{type(self).__name__} has no dense rewards")
 
-    def penalties(self, now: Moment) -> dict[str, Array]:
+    def penalties(self, now: TaskState) -> dict[str, Array]:
         """Return penalties of dense rewards by name, (N,) in [0, 1] each."""
         return {}
 
@@ -107,7 +107,7 @@ class InBasket(Goal):
     """
 
     NAME = "in_basket"
-    TOWARDS = "target_to_drop"
+    VECTOR_NAME = "target_to_drop"
 
     def __init__(self, env: Any) -> None:
         super().__init__(env)
@@ -120,40 +120,40 @@ class InBasket(Goal):
         self._above = to_native(low - aside), to_native(high + aside)
         self._drop = to_native(torch.cat([(low + high)[:2] / 2, high[2:] + _DROP_HEIGHT]))  # in the basket's frame
 
-    def holds(self, centers: Array, basket: Array | None) -> Array:
-        return terms.inside_box(centers, *_split(basket), *self._inside)
+    def is_at_goal(self, centers: Array, basket: Array | None) -> Array:
+        return terms.is_inside_box(centers, *_split(basket), *self._inside)
 
-    def point(self, basket: Array | None) -> Array:
+    def position(self, basket: Array | None) -> Array:
         """See `Goal`: over the middle of the basket's rim."""
         position, quaternion = _split(basket)
         return position + rotations.rotate(quaternion, self._drop)
 
-    def measures(self, basket: Array | None) -> dict[str, Array]:
-        start = to_native(self.env.basket_at_start)
-        return {"basket_stands": terms.stands(*_split(basket), *_split(start))}
+    def success_conditions(self, basket: Array | None) -> dict[str, Array]:
+        start = to_native(self.env.basket_start_poses)
+        return {"basket_stands": terms.is_basket_standing(*_split(basket), *_split(start))}
 
-    def lost(self, basket: Array | None, measures: dict[str, Array]) -> Array | None:
+    def is_lost(self, basket: Array | None, measures: dict[str, Array]) -> Array | None:
         if known_all_true(measures["basket_stands"]):  # as nearly always
             return None
-        start = to_native(self.env.basket_at_start)
-        over = terms.fell_over(*_split(basket), *_split(start))
+        start = to_native(self.env.basket_start_poses)
+        over = terms.has_basket_fallen(*_split(basket), *_split(start))
         return over & ~measures["basket_stands"]
 
-    def catches(self, positions: Array, basket: Array | None) -> Array | None:
+    def is_over_goal(self, positions: Array, basket: Array | None) -> Array | None:
         """See `Goal`: those above the basket."""
-        return terms.inside_box(positions, *_split(basket), *self._above)
+        return terms.is_inside_box(positions, *_split(basket), *self._above)
 
-    def progress(self, now: Moment, brought: Array, table: rewards.RewardTable) -> tuple[Array, dict[str, Array]]:
+    def progress(self, now: TaskState, brought: Array, table: rewards.RewardTable) -> tuple[Array, dict[str, Array]]:
         """See `Goal`: grasp, lift, carry, place, release, rest."""
         env = self.env
         slot = to_native(env.target_slot)
-        target, center = terms.of_target(now.objects, slot), env.target_center(now.objects)
+        target, center = terms.select_target(now.objects, slot), env.target_center(now.objects)
         basket, turned = _split(now.basket)
         inside = rotations.rotate_inverse(turned, center - basket)  # the target in the basket's frame
         low, high = self._inside
         over = ((inside[:, :2] >= low[:2]) & (inside[:, :2] <= high[:2])).all(-1) & (inside[:, 2] >= low[2])  # pyright: ignore[reportOperatorIssue]
         delivered = brought & now.at_goal
-        stage = rewards.furthest(
+        stage = rewards.furthest_stage(
             0 * slot + table.index("grasp"),
             [
                 (now.held, table.index("lift")),
@@ -164,18 +164,20 @@ class InBasket(Goal):
                 (delivered & ~now.touched, table.index("rest")),
             ],
         )
-        start = terms.of_target(to_native(env.start_poses)[..., 2], slot)
+        start = terms.select_target(to_native(env.start_poses)[..., 2], slot)
         return stage, {
             "reach": rewards.closeness(env.tcp_in_world()[:, :3], center),
-            "lift": rewards.rise(target[:, 2], start, terms.LIFT),
-            "carry": rewards.closeness(center, self.point(now.basket), half=_FAR),
-            "place": 1 - rewards.rise(inside[:, 2], high[2], _LOWERING),
-            "released": rewards.let_go(now.held, now.touched),
-            "at_rest": rewards.calm(target[:, 7:10], target[:, 10:]),
+            "lift": rewards.progress_fraction(target[:, 2], start, terms.LIFT),
+            "carry": rewards.closeness(center, self.position(now.basket), half=_FAR),
+            "place": 1 - rewards.progress_fraction(inside[:, 2], high[2], _LOWERING),
+            "released": rewards.release_fraction(now.held, now.touched),
+            "at_rest": rewards.stillness(target[:, 7:10], target[:, 10:]),
         }
 
-    def penalties(self, now: Moment) -> dict[str, Array]:
-        return {"basket_shift": rewards.shift(_split(now.basket)[0], to_native(self.env.basket_at_start)[:, :3])}
+    def penalties(self, now: TaskState) -> dict[str, Array]:
+        return {
+            "basket_shift": rewards.shift_fraction(_split(now.basket)[0], to_native(self.env.basket_start_poses)[:, :3])
+        }
 
 
 def _split(basket: Array | None) -> tuple[Array, Array]:

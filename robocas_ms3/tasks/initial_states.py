@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.poses import to_wxyz
 from robocas_ms3.scenes.layout import Layout
-from robocas_ms3.scenes.layout_table import LayoutTable, good
+from robocas_ms3.scenes.layout_table import LayoutTable, is_usable
 
 
 @dataclass(frozen=True)
-class Starts:
+class InitialStates:
     """Layouts of E envs. K object slots; world frame, metres, quaternions wxyz; on the envs' device.
 
     Attributes:
@@ -35,7 +35,7 @@ class Starts:
     present: torch.Tensor
 
     @classmethod
-    def of(cls, layouts: Sequence[Layout], device: torch.device | str) -> Starts:
+    def of(cls, layouts: Sequence[Layout], device: torch.device | str) -> InitialStates:
 
         def poses(matrices: list[NDArray[np.float64]]) -> torch.Tensor:
             return torch.from_numpy(to_wxyz(np.stack(matrices)).astype(np.float32)).to(device)
@@ -49,41 +49,44 @@ class Starts:
             torch.from_numpy(np.stack([layout.present for layout in layouts])).to(device),
         )
 
-    def with_rows(self, rows: NDArray[np.bool_], others: Starts) -> Starts:
+    def with_rows(self, rows: NDArray[np.bool_], others: InitialStates) -> InitialStates:
         """Return these starts, in their order, where ``rows`` (E,) is True, and others elsewhere."""
         order = torch.from_numpy(np.argsort(np.argsort(~rows, kind="stable"))).to(self.targets.device)
-        return Starts(
-            **{f.name: torch.cat([getattr(self, f.name), getattr(others, f.name)])[order] for f in fields(Starts)}
+        return InitialStates(
+            **{
+                f.name: torch.cat([getattr(self, f.name), getattr(others, f.name)])[order]
+                for f in fields(InitialStates)
+            }
         )
 
 
-class TabledStarts:
-    """Starts of envs that keep their objects: a reset gathers them on the device.
+class InitialStateTable:
+    """InitialStates of envs that keep their objects: a reset gathers them on the device.
 
     All layouts of these objects are in its memory, 0.4 kB each with ten objects. ``objects_seeds`` (N,) are the envs'.
     """
 
     def __init__(self, table: LayoutTable, objects_seeds: NDArray[np.int64], device: torch.device | str) -> None:
         self._table, self._objects_seeds, self._device = table, objects_seeds, device
-        there = table.places(objects_seeds, np.zeros_like(objects_seeds))[1]
+        there = table.find_records(objects_seeds, np.zeros_like(objects_seeds))[1]
         rows, self._row_of_env = np.unique(there, return_inverse=True)
         taken = table.rows[rows]  # copied: records of any length, which tensors can't be made of
         names = ("object_poses", "robot_pose", "basket_pose", "target", "present")
         self._kept = [torch.from_numpy(np.ascontiguousarray(taken[name])).to(device) for name in names]
 
-    def good(self, envs: NDArray[np.int64], seeds: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def is_usable(self, envs: NDArray[np.int64], seeds: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return which layouts (E,) of some envs, by their seeds (E,), exist and are good, as far as is known."""
-        return good(self._table.places(self._objects_seeds[envs], seeds)[0])
+        return is_usable(self._table.find_records(self._objects_seeds[envs], seeds)[0])
 
-    def gather(self, envs: NDArray[np.int64], seeds: NDArray[np.int64]) -> Starts:
+    def gather(self, envs: NDArray[np.int64], seeds: NDArray[np.int64]) -> InitialStates:
         """Return the starts of some envs by the seeds (E,) of their layouts, all of which are good."""
-        columns = self._table.places(self._objects_seeds[envs], seeds)[2]
+        columns = self._table.find_records(self._objects_seeds[envs], seeds)[2]
         row, column = (torch.from_numpy(index).to(self._device) for index in (self._row_of_env[envs], columns))
         objects, robots, baskets, targets, present = (kept[row, column] for kept in self._kept)
-        return Starts(objects, robots, baskets, targets.long(), present)
+        return InitialStates(objects, robots, baskets, targets.long(), present)
 
 
-def place(env: Any, starts: Starts, envs: torch.Tensor) -> None:
+def place(env: Any, starts: InitialStates, envs: torch.Tensor) -> None:
     """Put robot, furniture, basket and objects of some envs (E,) where their episodes start."""
     with torch.device(env.device):
         qpos: Any = torch.as_tensor(env.agent.keyframes[env.task_config.robot_start].qpos, dtype=torch.float32)
@@ -99,9 +102,9 @@ def place(env: Any, starts: Starts, envs: torch.Tensor) -> None:
         if env.fixtures.basket is not None:
             basket = Pose.create(starts.basket_poses)
             env.fixtures.basket.set_pose(basket)
-            env.basket_at_start[envs] = basket.raw_pose
+            env.basket_start_poses[envs] = basket.raw_pose
         if env.gpu_sim_enabled:
-            env.bodies.put_objects(envs, starts.object_poses)
+            env.bodies.set_object_poses(envs, starts.object_poses)
         else:
             for slot, actor in enumerate(env.objects):
                 actor.set_pose(Pose.create(starts.object_poses[:, slot]))

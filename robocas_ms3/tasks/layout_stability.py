@@ -9,7 +9,7 @@ import gymnasium as gym
 
 from robocas_ms3.scenes.cache import LayoutCache
 from robocas_ms3.scenes.layout import Layout
-from robocas_ms3.scenes.layout_table import Engine, Pair, State
+from robocas_ms3.scenes.layout_table import Engine, LayoutStatus, SeedPair
 from robocas_ms3.scenes.settle import CHECK_SECONDS, MAX_SHIFT
 from robocas_ms3.scenes.task_specs import TASKS
 
@@ -17,24 +17,24 @@ _ENVS = {"cpu": 1, "gpu": 256}  # at once
 _BACKENDS = {"cpu": "physx_cpu", "gpu": "physx_cuda"}
 
 
-def untried(cache: LayoutCache, engine: Engine) -> dict[int, list[int]]:
+def unchecked_layouts(cache: LayoutCache, engine: Engine) -> dict[int, list[int]]:
     """Seeds of layouts that are to be tried, by objects seed."""
     table = cache.table(engine)
     seeds: dict[int, list[int]] = {}
-    for objects_seed, seed in table.pairs(State.UNTRIED) if table else ():
+    for objects_seed, seed in table.pairs(LayoutStatus.UNCHECKED) if table else ():
         seeds.setdefault(objects_seed, []).append(seed)
     return seeds
 
 
-def try_layouts(
+def check_layouts(
     cache: LayoutCache, engine: Engine, seeds: dict[int, list[int]], **kwargs: Any
-) -> Generator[tuple[Pair, float]]:
+) -> Generator[tuple[SeedPair, float]]:
     """Let an environment begin with each layout and do nothing for a second.
 
     Args:
         cache: where the layouts are.
         engine: that is to run them.
-        seeds: of layouts, by objects seed (`untried`).
+        seeds: of layouts, by objects seed (`unchecked_layouts`).
         kwargs: for ``gym.make``: the packs that the cache is of.
 
     Yields:
@@ -78,6 +78,6 @@ def try_layouts(
         env.close()
 
 
-def judged(moved: float) -> State:
+def status_of(moved: float) -> LayoutStatus:
     """What is known of a layout whose objects moved that far, m."""
-    return State.STAYS if moved <= MAX_SHIFT else State.MOVES
+    return LayoutStatus.STABLE if moved <= MAX_SHIFT else LayoutStatus.UNSTABLE

@@ -26,12 +26,12 @@ def privileged_observations(env: Any) -> dict[str, torch.Tensor]:
         **({} if basket is None else {"basket_pose": basket}),
     }
     to_target = center - tcp[:, :3]
-    point = env.goal.point(None if basket is None else to_native(basket))
+    point = env.goal.position(None if basket is None else to_native(basket))
     if point is None:
         observations["tcp_to_target"] = in_tcp_frame(tcp, to_target[:, None])[:, 0]
     else:
         seen = in_tcp_frame(tcp, concatenate([to_target, point - center]).reshape(-1, 2, 3))
-        observations |= {"tcp_to_target": seen[:, 0], env.goal.TOWARDS: seen[:, 1]}
+        observations |= {"tcp_to_target": seen[:, 0], env.goal.VECTOR_NAME: seen[:, 1]}
     return observations | {"target_extents": env.success_check.target_extents}
 
 

@@ -17,7 +17,7 @@ from torch.nn.functional import pad
 CELL = 0.005  # edge of a cell, m, where the target is
 CELLS = 64  # cells a side, so that what is seen within 0.16 m of the target's middle counts
 NEAREST = 0.05  # m below the camera; what is higher counts as if it were there
-MAX_HIDDEN_SHARE = 0.2  # of a cleared target, the paper's
+MAX_HIDDEN_FRACTION = 0.2  # of a cleared target, the paper's
 MAX_OBSTACLES = 1  # around it, the same
 REACH = 2  # cells around the target's outline in which others count as neighbours: 1 cm
 LEAST_MOTION = 1e-4  # m, and of a quaternion's components: less changes nothing that counts in cells of 5 mm
@@ -31,18 +31,18 @@ class Clutter(NamedTuple):
     """What is in the way of a target.
 
     Attributes:
-        hidden_share: (N,) share of the target's outline that others cover, 1 - p_vis.
+        hidden_fraction: (N,) share of the target's outline that others cover, 1 - p_vis.
         obstacles: (N, K) bool, which others stick out above the target's mean height, visibly and within 1 cm of its
             outline.
     """
 
-    hidden_share: Tensor
+    hidden_fraction: Tensor
     obstacles: Tensor
 
     @property
     def cleared(self) -> Tensor:
         """(N,) bool, the paper's rule: at most a fifth is hidden, and fewer than two obstacles are left."""
-        return (self.hidden_share <= MAX_HIDDEN_SHARE) & (self.obstacles.sum(dim=1) <= MAX_OBSTACLES)
+        return (self.hidden_fraction <= MAX_HIDDEN_FRACTION) & (self.obstacles.sum(dim=1) <= MAX_OBSTACLES)
 
 
 def surface_points(poses: Tensor, points: Tensor) -> Tensor:
@@ -65,7 +65,7 @@ def surface_points(poses: Tensor, points: Tensor) -> Tensor:
     return rotation @ points + poses[..., :3, None]
 
 
-def seen_from(points: Tensor, eye: Tensor, depth: Tensor) -> Tensor:
+def project_down(points: Tensor, eye: Tensor, depth: Tensor) -> Tensor:
     """Where points appear to a camera that looks straight down.
 
     Args:
@@ -80,7 +80,7 @@ def seen_from(points: Tensor, eye: Tensor, depth: Tensor) -> Tensor:
     return (points[:, :, :2] - eye[:2, None]) * (depth[:, None, None] / below)[:, :, None]
 
 
-def moved_near(poses: Tensor, before: Tensor, radii: Tensor, target: Tensor, eye: Tensor) -> Tensor:
+def has_moved_near(poses: Tensor, before: Tensor, radii: Tensor, target: Tensor, eye: Tensor) -> Tensor:
     """Return whether anything that `clutter` looks at has moved, the targets included.
 
     Args:
@@ -121,7 +121,7 @@ def clutter(points: Tensor, present: Tensor, target: Tensor, eye: Tensor) -> Clu
     env = torch.arange(len(target), device=points.device)
     own = points[env, target]  # (N, 3, P)
     depth = (eye[2] - own[:, 2].mean(dim=-1)).clamp(min=NEAREST)
-    seen = seen_from(points, eye, depth)
+    seen = project_down(points, eye, depth)
     outline = seen[env, target]
     middle = (outline.amin(dim=-1) + outline.amax(dim=-1)) / 2
     cells, heights = _cells(seen, middle), points[:, :, 2]
@@ -132,7 +132,7 @@ def clutter(points: Tensor, present: Tensor, target: Tensor, eye: Tensor) -> Clu
     closed = _closed(torch.stack([_height_map(cells[env, target], own[:, 2]), top], dim=1))
     at_target, above_it = closed[:, 0], closed[:, 1] > closed[:, 0]
     filled = at_target > _NOTHING
-    hidden_share = (filled & above_it).sum(dim=(1, 2)) / filled.sum(dim=(1, 2)).clamp(min=1)
+    hidden_fraction = (filled & above_it).sum(dim=(1, 2)) / filled.sum(dim=(1, 2)).clamp(min=1)
 
     around = _widened(filled.float(), REACH) > 0
     sticks_out = around & (top > at_target) & (top > own[:, 2].mean(dim=-1)[:, None, None])
@@ -140,10 +140,10 @@ def clutter(points: Tensor, present: Tensor, target: Tensor, eye: Tensor) -> Clu
     limit = torch.where(sticks_out, top, -_NOTHING).flatten(1)
     limit = pad(limit, (0, 1), value=-_NOTHING)
     highest = heights >= limit.gather(1, others_cells).view_as(heights)
-    return Clutter(hidden_share, highest.any(dim=-1))
+    return Clutter(hidden_fraction, highest.any(dim=-1))
 
 
-def covering(points: Tensor, present: Tensor, eye: Tensor) -> Tensor:
+def pairwise_occlusion(points: Tensor, present: Tensor, eye: Tensor) -> Tensor:
     """How much of each object every other one would hide from the camera, if there were but these two.
 
     Args:
@@ -158,7 +158,7 @@ def covering(points: Tensor, present: Tensor, eye: Tensor) -> Tensor:
     heights, shares = points[:, :, 2], []
     for slot in range(slots):
         own = points[:, slot]
-        seen = seen_from(points, eye, (eye[2] - own[:, 2].mean(dim=-1)).clamp(min=NEAREST))
+        seen = project_down(points, eye, (eye[2] - own[:, 2].mean(dim=-1)).clamp(min=NEAREST))
         outline = seen[:, slot]
         cells = _cells(seen, (outline.amin(dim=-1) + outline.amax(dim=-1)) / 2)
         maps = _closed(_height_map(cells.flatten(0, 1), heights.flatten(0, 1)).unflatten(0, (count, slots)))

@@ -81,18 +81,18 @@ class RoboCASOpenPickEnv(RoboCASEnv):
         shut = (stage == self.REWARDS.index("grasp")) & ~self.success_check.stages["furniture_opened"]
         if not known_all_false(shut):
             found["handle"] = rewards.closeness(self.tcp_in_world()[:, :3], self.handle_in_world())
-            found["open"] = self._opened_share()
-            stage = rewards.furthest(stage, [(shut, self.REWARDS.index("open"))])
+            found["open"] = self._opened_fraction()
+            stage = rewards.furthest_stage(stage, [(shut, self.REWARDS.index("open"))])
         return stage, found
 
-    def _opened_share(self) -> Array:
-        return rewards.rise(to_native(self.opening_position()), 0.0, self.model.opened_position)
+    def _opened_fraction(self) -> Array:
+        return rewards.progress_fraction(to_native(self.opening_position()), 0.0, self.model.opened_position)
 
     def privileged_observations(self) -> dict[str, torch.Tensor]:
         """Return those of `RoboCASEnv`, how far it is open (N, 1), 1 where that is enough, and where the handle is."""
         tcp = self.tcp_in_world()
         return {
             **super().privileged_observations(),
-            "opened_share": as_tensor(self._opened_share())[:, None],
+            "opened_fraction": as_tensor(self._opened_fraction())[:, None],
             "tcp_to_handle": in_tcp_frame(tcp, (self.handle_in_world() - tcp[:, :3])[:, None])[:, 0],
         }

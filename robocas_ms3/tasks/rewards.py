@@ -14,7 +14,7 @@ from typing import Any
 import torch
 
 from robocas_ms3.core.arrays import Array, as_float, as_tensor, clamp, norm, to_native, where
-from robocas_ms3.tasks.occlusion import MAX_HIDDEN_SHARE, MAX_OBSTACLES
+from robocas_ms3.tasks.occlusion import MAX_HIDDEN_FRACTION, MAX_OBSTACLES
 from robocas_ms3.tasks.terms import BASKET_SHIFT
 
 _MANY_OBSTACLES = 5  # more than a cleared target may have: counts as the worst
@@ -86,7 +86,7 @@ def weigh(
     return where(stage >= len(table.stages), none + table.total, reward), counted
 
 
-def furthest(first: Array, conditions: list[tuple[Array, int]]) -> Array:
+def furthest_stage(first: Array, conditions: list[tuple[Array, int]]) -> Array:
     """(N,) stages: that of the last condition (N,) that holds, and where none does, ``first`` (N,)."""
     stage = first
     for condition, place in conditions:
@@ -99,34 +99,34 @@ def closeness(points: Array, goals: Array, *, half: float = 0.1) -> Array:
     return half / (half + norm(goals - points))
 
 
-def rise(value: Array, start: Array | float, by: float) -> Array:
+def progress_fraction(value: Array, start: Array | float, by: float) -> Array:
     """(N,) in [0, 1]: how much of the way from its start a value (N,) has risen, of a way of ``by``."""
     return clamp((value - start) / by, 0.0, 1.0)
 
 
-def uncovered(hidden_share: Array, obstacles: Array) -> Array:
+def clear_fraction(hidden_fraction: Array, obstacles: Array) -> Array:
     """(N,) in [0, 1]: 1 where a target is cleared, less the more of it is hidden (N,) and the more obstacles (N,)."""
-    hidden = clamp((hidden_share - MAX_HIDDEN_SHARE) / (1 - MAX_HIDDEN_SHARE), 0.0, 1.0)
+    hidden = clamp((hidden_fraction - MAX_HIDDEN_FRACTION) / (1 - MAX_HIDDEN_FRACTION), 0.0, 1.0)
     around = clamp((as_float(obstacles) - MAX_OBSTACLES) / _MANY_OBSTACLES, 0.0, 1.0)
     return 1 - (hidden + around) / 2
 
 
-def let_go(held: Array, touched: Array) -> Array:
+def release_fraction(held: Array, touched: Array) -> Array:
     """(N,) in [0, 1]: 0 while the gripper holds the target, a half while it only touches it, 1 after that."""
     return 1 - (as_float(held) + as_float(held | touched)) / 2
 
 
-def calm(linear_velocity: Array, angular_velocity: Array) -> Array:
+def stillness(linear_velocity: Array, angular_velocity: Array) -> Array:
     """(N,) in [0, 1]: 1 at rest, 0 at velocities (N, 3) of 0.3 m/s or 5 rad/s and more."""
     return 1 - clamp(norm(linear_velocity) / 0.3 + norm(angular_velocity) / 5.0, 0.0, 1.0)
 
 
-def count_share(count: Array) -> Array:
+def count_fraction(count: Array) -> Array:
     """(N,) in [0, 1]: a number of things (N,), 1 from 3 on."""
     return clamp(as_float(count) / 3, 0.0, 1.0)
 
 
-def shift(position: Array, position_before: Array) -> Array:
+def shift_fraction(position: Array, position_before: Array) -> Array:
     """(N,) in [0, 1]: how far a body at (N, 3) was shifted, 1 from 0.1 m on, as far as a basket may go."""
     return clamp(norm(position - position_before) / BASKET_SHIFT, 0.0, 1.0)
 
@@ -154,10 +154,10 @@ class DenseReward:
             if last is not None:
                 last[envs] = torch.nan
 
-    def remember(self, action: Any) -> None:
+    def store_action(self, action: Any) -> None:
         self.last_action = torch.as_tensor(action, device=self._device).reshape(self._num_envs, -1).clone()
 
-    def gain(self, level: torch.Tensor) -> torch.Tensor:
+    def increase(self, level: torch.Tensor) -> torch.Tensor:
         """Return how much a reward (N,) has risen since the last step; 0 in the first one."""
         before = level if self.last_level is None else self.last_level
         self.last_level = level.clone()

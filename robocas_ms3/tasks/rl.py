@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.core.errors import ConfigError
-from robocas_ms3.scenes.config import TaskConfig, load_config_of
+from robocas_ms3.scenes.config import TaskConfig, load_config_for
 from robocas_ms3.scenes.task_specs import TASKS
 
 CONTROL_FREQ = 5  # Hz: `pd_ee_delta_pose` was made for it
@@ -30,7 +30,7 @@ def rl_kwargs(task: str, config: str | Path | dict | TaskConfig | None = None) -
     if spec is None:
         known = ", ".join(f"{spec.name} or {spec.env_id}" for spec in TASKS.values())
         raise ConfigError("no such task", where="rl_kwargs", expected=known, found=repr(task))
-    drives = load_config_of(spec, config).base_motion
+    drives = load_config_for(spec, config).base_motion
     return {
         **({} if config is None else {"config": config}),
         "obs_mode": "state",

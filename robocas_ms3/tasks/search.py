@@ -49,7 +49,7 @@ class RoboCASSearchEnv(RoboCASEnv):
         self._measured: _Measured | None = None
         flags = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self._cleared_at_reset, self._measure_now, self._just_reset = flags, flags.clone(), flags.clone()
-        self.hidden_share = torch.zeros(self.num_envs, device=self.device)
+        self.hidden_fraction = torch.zeros(self.num_envs, device=self.device)
         self._obstacles = torch.zeros_like(self.present)
         self._push_point = torch.zeros(self.num_envs, 3, device=self.device)
 
@@ -60,10 +60,10 @@ class RoboCASSearchEnv(RoboCASEnv):
         self._just_reset[env_idx] = True
         self._measure_now[env_idx] = True
 
-    def state_beside_bodies(self) -> dict:
-        """See `RoboCASEnv`; ``task`` also holds ``cleared_at_reset`` and ``hidden_share``, (N, 1) each."""
-        state = super().state_beside_bodies()
-        own = {"cleared_at_reset": self._cleared_at_reset, "hidden_share": self.hidden_share}
+    def extra_state(self) -> dict:
+        """See `RoboCASEnv`; ``task`` also holds ``cleared_at_reset`` and ``hidden_fraction``, (N, 1) each."""
+        state = super().extra_state()
+        own = {"cleared_at_reset": self._cleared_at_reset, "hidden_fraction": self.hidden_fraction}
         return {**state, "task": {**state["task"], **{name: value[:, None].clone() for name, value in own.items()}}}
 
     def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None) -> None:
@@ -74,7 +74,7 @@ class RoboCASSearchEnv(RoboCASEnv):
         self._measured = None  # else later results would depend on what was before
         self._just_reset[envs], self._measure_now[envs] = False, True
         self._cleared_at_reset = self._cleared_at_reset.clone()  # infos hold it
-        own = {"cleared_at_reset": self._cleared_at_reset, "hidden_share": self.hidden_share}
+        own = {"cleared_at_reset": self._cleared_at_reset, "hidden_fraction": self.hidden_fraction}
         for name, value in state.get("task", {}).items():
             if name in own:
                 own[name][envs] = torch.as_tensor(value).to(own[name]).reshape(-1)
@@ -84,19 +84,22 @@ class RoboCASSearchEnv(RoboCASEnv):
         points = occlusion.surface_points(self.object_states[envs, :, :7], self._surface_points[envs])
         return occlusion.clutter(points, self.present[envs], self.target_slot[envs], self._eye)
 
-    def covering(self, envs: Any = slice(None)) -> torch.Tensor:
-        """(E, K, K) share of each object (column) that each other one (row) hides, as `occlusion.covering`."""
+    def pairwise_occlusion(self, envs: Any = slice(None)) -> torch.Tensor:
+        """(E, K, K) share of each object (column) that each other one (row) hides, as `occlusion.pairwise_occlusion`."""
         points = occlusion.surface_points(self.object_states[envs, :, :7], self._surface_points[envs])
-        return occlusion.covering(points, self.present[envs], self._eye)
+        return occlusion.pairwise_occlusion(points, self.present[envs], self._eye)
 
     def evaluate(self) -> dict[str, torch.Tensor]:
         """Return what `RoboCASEnv.evaluate` does, ``obstacles_cleared`` and ``cleared_at_reset``."""
         found, measured = super().evaluate(), self._measured
-        unchanged = measured is not None and measured.others is not None and measured.others == self.bodies.others
+        unchanged = (
+            measured is not None and measured.others is not None and measured.others == self.bodies.state_except_robot
+        )
         if not unchanged and not known_all_false(due := self._due()):
-            moment = self.success_check.moment
+            moment = self.success_check.state
             in_heap = (
-                terms.of_target(moment.objects[..., 2], to_native(self.target_slot)) > self.success_check.fallen_below
+                terms.select_target(moment.objects[..., 2], to_native(self.target_slot))
+                > self.success_check.fallen_below
             )
             cleared = to_native(self._measure(as_tensor(due), as_tensor(moment.objects[..., :7])))
             found["obstacles_cleared"] = self.success_check.reach("obstacles_cleared", cleared & in_heap & due)
@@ -126,7 +129,7 @@ class RoboCASSearchEnv(RoboCASEnv):
             due: (N,) bool.
             poses: (N, K, 7) of the objects.
         """
-        others, measured = self.bodies.others, self._measured
+        others, measured = self.bodies.state_except_robot, self._measured
         if others is not None and measured is not None:  # on a CPU it is known whether anything has moved
             still = measured.others == others or not self._moved(poses, measured.poses)
             if still:
@@ -138,7 +141,7 @@ class RoboCASSearchEnv(RoboCASEnv):
         for envs in envs_to_measure.split(ENVS_AT_ONCE):
             found, taken = self.clutter(envs), due[envs]
             cleared[envs] = found.cleared & taken
-            self.hidden_share[envs] = torch.where(taken, found.hidden_share, self.hidden_share[envs])
+            self.hidden_fraction[envs] = torch.where(taken, found.hidden_fraction, self.hidden_fraction[envs])
             self._obstacles[envs] = torch.where(taken[:, None], found.obstacles, self._obstacles[envs])
             if self._reward_mode in DENSE:
                 points = occlusion.surface_points(poses[envs], self._surface_points[envs])
@@ -148,7 +151,7 @@ class RoboCASSearchEnv(RoboCASEnv):
         return cleared
 
     def _moved(self, poses: torch.Tensor, before: torch.Tensor) -> bool:
-        return bool(occlusion.moved_near(poses, before, self._radii, self.target_slot, self._eye).any())
+        return bool(occlusion.has_moved_near(poses, before, self._radii, self.target_slot, self._eye).any())
 
     def reward_progress(self) -> tuple[Array, dict[str, Array]]:
         """See `RoboCASEnv`; before the target may be grasped, it has to be cleared or held once."""
@@ -158,13 +161,15 @@ class RoboCASSearchEnv(RoboCASEnv):
         covered = (stage == self.REWARDS.index("grasp")) & ~settled
         if not known_all_false(covered):
             found["push_point"] = rewards.closeness(self.tcp_in_world()[:, :3], to_native(self._push_point))
-            found["clear"] = rewards.uncovered(to_native(self.hidden_share), to_native(self._obstacles.sum(dim=1)))
-            stage = rewards.furthest(stage, [(covered, self.REWARDS.index("clear"))])
+            found["clear"] = rewards.clear_fraction(
+                to_native(self.hidden_fraction), to_native(self._obstacles.sum(dim=1))
+            )
+            stage = rewards.furthest_stage(stage, [(covered, self.REWARDS.index("clear"))])
         return stage, found
 
     def privileged_observations(self) -> dict[str, torch.Tensor]:
-        """Return those of `RoboCASEnv`, and ``hidden_share`` (N, 1), as last measured before the target was held."""
-        return {**super().privileged_observations(), "hidden_share": self.hidden_share[:, None].clone()}
+        """Return those of `RoboCASEnv`, and ``hidden_fraction`` (N, 1), as last measured before the target was held."""
+        return {**super().privileged_observations(), "hidden_fraction": self.hidden_fraction[:, None].clone()}
 
 
 class _Measured(NamedTuple):

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from robocas_ms3.core.errors import ConfigError, LayoutError, RobocasError
 from robocas_ms3.scenes.cache import LayoutCache
 from robocas_ms3.scenes.layout import Layout, LayoutSource, ObjectIds
-from robocas_ms3.scenes.layout_table import FrozenLayouts, LayoutTable, Pair, State
-from robocas_ms3.tasks.initial_states import Starts, TabledStarts
+from robocas_ms3.scenes.layout_table import FrozenLayouts, LayoutStatus, LayoutTable, SeedPair
+from robocas_ms3.tasks.initial_states import InitialStates, InitialStateTable
 
 SEVERAL_ENVS_SEEDS = (0, 99)  # least and greatest seed of several envs' unseeded resets
 _OTHER_SEEDS = 20  # tried where a seed has no layout
@@ -27,7 +27,7 @@ class _UnstableLayout(LayoutError):
     """The engine moves the objects of a layout."""
 
 
-def following_seeds(first: int, count: int, within: tuple[int, int] | None) -> list[int]:
+def consecutive_seeds(first: int, count: int, within: tuple[int, int] | None) -> list[int]:
     """Return consecutive seeds. A first seed of the range ``within`` makes them wrap around in this range."""
     if within is None or not within[0] <= first <= within[1]:
         return [first + i for i in range(count)]
@@ -96,7 +96,7 @@ class EpisodeSeeds:
         self.objects_seeds = np.zeros(num_envs, dtype=np.int64)
         self.object_ids: list[ObjectIds] = []
         self.table: LayoutTable | None = None
-        self.tabled: TabledStarts | None = None
+        self.initial_state_table: InitialStateTable | None = None
         self._num_envs = num_envs
         self._objects_stay = objects_stay
         self.first_reset = True
@@ -107,7 +107,7 @@ class EpisodeSeeds:
         self._before: tuple[NDArray[np.int64], dict[int, Layout]] = (self.layout_seeds, {})  # the present reset
         self._found: dict[int, Layout] = {}  # by env
         self._built_with: dict[int, Layout] = {}  # by seed
-        self._failed: dict[Pair, LayoutError] = {}  # finding out takes long
+        self._failed: dict[SeedPair, LayoutError] = {}  # finding out takes long
 
     def start_reset(self, seed: Any, envs: list[int]) -> Any:
         """Return the seeds of a reset of some envs.
@@ -125,10 +125,10 @@ class EpisodeSeeds:
             return seed
         within = self.range or SEVERAL_ENVS_SEEDS
         if first:
-            return following_seeds(within[0], self._num_envs, within)
+            return consecutive_seeds(within[0], self._num_envs, within)
         if seed is not None and np.ndim(seed) == 0:
             self._requested = set(envs[:1])
-            return following_seeds(int(np.asarray(seed)), len(envs), within)
+            return consecutive_seeds(int(np.asarray(seed)), len(envs), within)
         return seed
 
     def retry_reset(self, error: LayoutError) -> bool:
@@ -168,21 +168,21 @@ class EpisodeSeeds:
             self._other_seeds = _OTHER_SEEDS if self.table else self._other_seeds
         self.object_ids = [self._first_possible(self._objects_of, env, seeds) for env in range(self._num_envs)]
         self.objects_seeds = np.array(seeds)
-        self.tabled = TabledStarts(self.table, self.objects_seeds, device) if self.table else None
+        self.initial_state_table = InitialStateTable(self.table, self.objects_seeds, device) if self.table else None
 
-    def find_starts(self, envs: NDArray[np.int64], device: torch.device) -> Starts:
+    def find_initial_states(self, envs: NDArray[np.int64], device: torch.device) -> InitialStates:
         """Return where some envs' episodes start; gathered on their device if the cache's table holds them all."""
         self.forget_layouts(envs)
-        if self.tabled is None:
-            return Starts.of([self.layout(env) for env in envs.tolist()], device)
-        for env in envs[~self.tabled.good(envs, self.layout_seeds[envs])].tolist():
+        if self.initial_state_table is None:
+            return InitialStates.of([self.layout(env) for env in envs.tolist()], device)
+        for env in envs[~self.initial_state_table.is_usable(envs, self.layout_seeds[envs])].tolist():
             self.layout(env)  # may draw another seed, which the table holds
-        tabled = self.tabled.good(envs, self.layout_seeds[envs])
-        found = self.tabled.gather(envs[tabled], self.layout_seeds[envs[tabled]])
+        tabled = self.initial_state_table.is_usable(envs, self.layout_seeds[envs])
+        found = self.initial_state_table.gather(envs[tabled], self.layout_seeds[envs[tabled]])
         if tabled.all():
             return found
         others = [self.layout(env) for env in envs[~tabled].tolist()]
-        return found.with_rows(tabled, Starts.of(others, device))
+        return found.with_rows(tabled, InitialStates.of(others, device))
 
     def forget_layouts(self, envs: NDArray[np.int64]) -> None:
         for env in envs.tolist():
@@ -198,7 +198,7 @@ class EpisodeSeeds:
 
     def _objects_of(self, seed: int) -> ObjectIds:
         if self.table is not None and (tabled := self.table.object_ids(seed)) is not None:
-            if not self.table.stays(seed):
+            if not self.table.has_usable_layout(seed):
                 where, fix = f"objects seed {seed}", "Take another seed."
                 raise _UnstableLayout("no layout of these objects stays", where=where, fix=fix)
             return tabled
@@ -206,11 +206,11 @@ class EpisodeSeeds:
             self._built_with[seed] = self._layout((seed, seed))
         return self._built_with[seed].object_ids
 
-    def _layout(self, pair: Pair) -> Layout:
+    def _layout(self, pair: SeedPair) -> Layout:
         if pair[0] == pair[1] and pair[0] in self._built_with:
             return self._built_with[pair[0]]
         if self.table is not None:
-            if self.table.state(pair) == State.MOVES:
+            if self.table.state(pair) == LayoutStatus.UNSTABLE:
                 where = f"objects seed {pair[0]}, seed {pair[1]}"
                 fix = "Take another seed."
                 raise _UnstableLayout("objects move as soon as this engine runs", where=where, fix=fix)

@@ -29,12 +29,14 @@ class RoboCASSelectEnv(RoboCASEnv):
         found = super().evaluate()
         return {**found, "success": found["success"] & self._others_out()}
 
-    def target_measures(self) -> dict[str, torch.Tensor]:
+    def success_conditions(self) -> dict[str, torch.Tensor]:
         """Return those of `RoboCASEnv`, and ``others_out``: no other object of the target's name is in the basket."""
-        return {**super().target_measures(), "others_out": self._others_out()}
+        return {**super().success_conditions(), "others_out": self._others_out()}
 
     def _others_out(self) -> torch.Tensor:
         """(N,) bool."""
-        inside = self.goal.holds(self.success_check.centers(to_native(self.object_states)), to_native(self.basket_pose))
-        others_in = terms.another_of_its_kind(inside, to_native(self._kinds), to_native(self.target_slot))
+        inside = self.goal.is_at_goal(
+            self.success_check.centers(to_native(self.object_states)), to_native(self.basket_pose)
+        )
+        others_in = terms.is_any_other_of_kind(inside, to_native(self._kinds), to_native(self.target_slot))
         return as_tensor(~others_in)

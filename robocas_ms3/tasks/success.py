@@ -15,7 +15,7 @@ from robocas_ms3.core import rotations
 from robocas_ms3.core.arrays import Array, arange, as_tensor, known_all_false, to_native
 from robocas_ms3.tasks import terms
 from robocas_ms3.tasks.bodies import link_poses
-from robocas_ms3.tasks.goals import Moment
+from robocas_ms3.tasks.goals import TaskState
 
 
 class SuccessCheck:
@@ -36,7 +36,7 @@ class SuccessCheck:
         fallen_below: height below which an object counts as fallen off it, m.
     """
 
-    moment: Moment
+    moment: TaskState
 
     def __init__(self, env: Any, stages: Sequence[str]) -> None:
         self._env = env
@@ -78,7 +78,7 @@ class SuccessCheck:
         """Return stages, ``success`` and ``fail`` (N,) bool and ``disturbed`` (N,) int; don't write to them."""
         env = self._env
         state = env.bodies.read()
-        forces = env.gripper_contacts.forces(env.bodies.others)
+        forces = env.gripper_contacts.forces(env.bodies.state_except_robot)
         depends_on = self._dependencies(forces)
         if self._last is not None and depends_on is not None and self._last[0] == depends_on:
             return dict(self._last[1])
@@ -90,35 +90,35 @@ class SuccessCheck:
 
     def _dependencies(self, forces: Array) -> object:
         """Return what the next result depends on, on a CPU while nothing touches the gripper; None: unknown."""
-        others = self._env.bodies.others
+        others = self._env.bodies.state_except_robot
         return None if others is None or forces.any() else (others, self.reached.numpy().tobytes())
 
     def _check(self, forces: Array, objects: Array, basket: Array | None) -> dict[str, torch.Tensor]:
         """Check from forces (N, 3, K, 3), states (N, K, 13) and the basket's pose (N, 7) or None, all native."""
         env = self._env
         slot, goal = to_native(env.target_slot), env.goal
-        grasped, touched = self.grasped(forces), terms.touched(forces)
-        lifted = terms.lifted(objects[..., 2], to_native(env.start_poses)[..., 2], grasped)
+        grasped, touched = self.grasped(forces), terms.is_touched(forces)
+        lifted = terms.is_lifted(objects[..., 2], to_native(env.start_poses)[..., 2], grasped)
         measures = self._measures(touched, objects, basket)
-        held = terms.of_target(grasped, slot)
+        held = terms.select_target(grasped, slot)
         now = {
             "reached_any": touched.any(1),
             "picked_any": lifted.any(1),
-            "reached_target": terms.of_target(touched, slot),
+            "reached_target": terms.select_target(touched, slot),
             "target_grasped": held,
-            "target_lifted": terms.of_target(lifted, slot),
+            "target_lifted": terms.select_target(lifted, slot),
             f"target_{goal.NAME}": measures[goal.NAME],
         }
         for stage, flags in now.items():
             if stage in self.stages:
                 self.reach(stage, flags)
         success = reduce(and_, measures.values())
-        if goal.LIFTS:
+        if goal.REQUIRES_LIFT:
             success = self.stages["target_lifted"] & success
         fail = self._has_failed(measures, objects, basket)
         stages = dict(zip(self.stages, self.reached.clone(), strict=True))
         disturbed = self._disturbed(objects[..., :7])
-        self.moment = Moment(objects, basket, held, now["reached_target"], measures[goal.NAME], disturbed, forces)
+        self.state = TaskState(objects, basket, held, now["reached_target"], measures[goal.NAME], disturbed, forces)
         flags = {"success": as_tensor(success), "fail": as_tensor(fail)}
         return {**stages, **flags, "disturbed": as_tensor(disturbed.sum(1))}
 
@@ -129,22 +129,22 @@ class SuccessCheck:
     def target_center(self, objects: Array) -> Array:
         """Return the target's centre of mass (N, 3) in the world, from the objects' states (N, K, 13)."""
         slot = to_native(self._env.target_slot)
-        target, center = terms.of_target(objects, slot), terms.of_target(self._centers_of_mass, slot)
+        target, center = terms.select_target(objects, slot), terms.select_target(self._centers_of_mass, slot)
         return target[:, :3] + rotations.rotate(target[:, 3:7], center)
 
     def grasped(self, forces: Array) -> Array:
         """Return which objects (N, K) both fingers hold, from forces (N, 3, K, 3) N on the gripper; native."""
-        pressed = terms.pressed(forces[:, 0], forces[:, 1])
+        pressed = terms.is_pressed(forces[:, 0], forces[:, 1])
         if known_all_false(pressed):  # as most of the time: no need to ask in which direction
             return pressed
         finger = link_poses(self._env.scene, [self._env.agent.finger1_link])[:, 0]
         # the left finger opens along its own +y
         opening = rotations.rotate(finger[:, 3:], self._sideways)
-        return terms.finger_grasps(forces[:, 0], forces[:, 1], opening)
+        return terms.is_grasped(forces[:, 0], forces[:, 1], opening)
 
-    def measures(self) -> dict[str, torch.Tensor]:
+    def success_conditions(self) -> dict[str, torch.Tensor]:
         """Return what has to hold at the same moment for success, besides the lift: (N,) bool each."""
-        touched = terms.touched(self._env.gripper_contacts.forces())
+        touched = terms.is_touched(self._env.gripper_contacts.forces())
         found = self._measures(touched, *self._objects_and_basket(self._env.bodies.read()))
         return {name: as_tensor(measure) for name, measure in found.items()}
 
@@ -156,34 +156,36 @@ class SuccessCheck:
     def _measures(self, touched: Array, objects: Array, basket: Array | None) -> dict[str, Array]:
         """`measures`, native, from which objects the gripper touches (N, K), their states and the basket's pose."""
         goal, slot = self._env.goal, to_native(self._env.target_slot)
-        target = terms.of_target(objects, slot)
+        target = terms.select_target(objects, slot)
         return {
-            goal.NAME: goal.holds(self.target_center(objects), basket),
-            "untouched": ~terms.of_target(touched, slot),
-            "at_rest": terms.at_rest(target[:, 7:10], target[:, 10:]),
-            **goal.measures(basket),
+            goal.NAME: goal.is_at_goal(self.target_center(objects), basket),
+            "untouched": ~terms.select_target(touched, slot),
+            "at_rest": terms.is_at_rest(target[:, 7:10], target[:, 10:]),
+            **goal.success_conditions(basket),
         }
 
-    def fallen(self) -> Array:
+    def fallen_objects(self) -> Array:
         """Return which other objects (N, K) lay 5 cm below the surface in `moment`, outside of the goal; native.
 
         The target is carried to the goal, and if it falls, that is ``fail``.
         """
-        env, objects = self._env, self.moment.objects
+        env, objects = self._env, self.state.objects
         low = (objects[..., 2] < self.fallen_below) & to_native(env.present & ~env.is_target)
         if known_all_false(low):  # as nearly always
             return low
-        return low & ~env.goal.holds(self.centers(objects), self.moment.basket)
+        return low & ~env.goal.is_at_goal(self.centers(objects), self.state.basket)
 
     def _has_failed(self, measures: dict[str, Array], objects: Array, basket: Array | None) -> Array:
         """(N,) bool of ``fail``, native, from the measures, states (N, K, 13) and the basket's pose."""
         goal, slot = self._env.goal, to_native(self._env.target_slot)
-        height = terms.of_target(objects[..., 2], slot)
-        low, lost = height < self.fallen_below, goal.lost(basket, measures)
+        height = terms.select_target(objects[..., 2], slot)
+        low, lost = height < self.fallen_below, goal.is_lost(basket, measures)
         if lost is None and known_all_false(low):  # as nearly always
             return low
-        caught = goal.catches(terms.of_target(objects[..., :3], slot), basket)
-        fell = terms.fell_off(height, self.surface, low & False if caught is None else caught, ~measures["untouched"])
+        caught = goal.is_over_goal(terms.select_target(objects[..., :3], slot), basket)
+        fell = terms.has_target_fallen(
+            height, self.surface, low & False if caught is None else caught, ~measures["untouched"]
+        )
         return fell if lost is None else fell | lost
 
     def _disturbed(self, poses: Array) -> Array:
@@ -193,6 +195,6 @@ class SuccessCheck:
         if isinstance(support, Articulation) and env.model.support_link:
             links = [support.links_map[name] for name in (BODY, env.model.support_link)]
             body, part = link_poses(env.scene, links).swapaxes(0, 1)
-            undo = terms.way_back(body, part, self._support_shut)
-        moved = terms.disturbed(poses, to_native(env.start_poses), undo) & to_native(env.present)
+            undo = terms.inverse_motion(body, part, self._support_shut)
+        moved = terms.is_disturbed(poses, to_native(env.start_poses), undo) & to_native(env.present)
         return moved & (arange(moved.shape[1], moved) != to_native(env.target_slot)[:, None])

@@ -21,7 +21,7 @@ FALLEN = 0.05  # m below the surface that objects stand on, at which one counts 
 DISTURBED_SHIFT, DISTURBED_TILT = 0.03, 30.0  # m and deg at which an object no longer stands as it stood
 
 
-def inside_box(points: Array, box_position: Array, box_quaternion: Array, low: Array, high: Array) -> Array:
+def is_inside_box(points: Array, box_position: Array, box_quaternion: Array, low: Array, high: Array) -> Array:
     """Return whether points are in a box that is fixed to a moving frame.
 
     Args:
@@ -40,12 +40,12 @@ def inside_box(points: Array, box_position: Array, box_quaternion: Array, low: A
     return ((local >= low) & (local <= high)).all(-1)  # pyright: ignore[reportReturnType]
 
 
-def pressed(left_force: Array, right_force: Array) -> Array:
+def is_pressed(left_force: Array, right_force: Array) -> Array:
     """Return which objects (N, K) press on both fingers, in any direction, from forces (N, K, 3)."""
     return (norm(left_force) >= MIN_GRASP_FORCE) & (norm(right_force) >= MIN_GRASP_FORCE)
 
 
-def finger_grasps(left_force: Array, right_force: Array, closing_axis: Array) -> Array:
+def is_grasped(left_force: Array, right_force: Array, closing_axis: Array) -> Array:
     """Return which objects (N, K) press on both fingers, each in its own opening direction, as ``Panda.is_grasping``.
 
     Args:
@@ -63,44 +63,44 @@ def _presses(force: Array, opening: Array) -> Array:
     return (size >= MIN_GRASP_FORCE) & aligned
 
 
-def touched(forces: Array) -> Array:
+def is_touched(forces: Array) -> Array:
     """Return which objects (N, K) touch any of B bodies, from the forces (N, B, K, 3) between them."""
     return (norm(forces) >= MIN_CONTACT_FORCE).any(1)  # pyright: ignore[reportReturnType]
 
 
-def lifted(height: Array, rest_height: Array, grasped: Array) -> Array:
+def is_lifted(height: Array, rest_height: Array, grasped: Array) -> Array:
     """Return which objects (N, K) the gripper holds at least ``LIFT`` above where they rested."""
     return grasped & (height - rest_height >= LIFT)
 
 
-def at_rest(linear_velocity: Array, angular_velocity: Array) -> Array:
+def is_at_rest(linear_velocity: Array, angular_velocity: Array) -> Array:
     """Return whether bodies with velocities (N, 3) in m/s and rad/s are at rest, (N,)."""
     return (norm(linear_velocity) <= REST_SPEED) & (norm(angular_velocity) <= REST_TURN)
 
 
-def stands(position: Array, quaternion: Array, position_before: Array, quaternion_before: Array) -> Array:
+def is_basket_standing(position: Array, quaternion: Array, position_before: Array, quaternion_before: Array) -> Array:
     """Return whether baskets still stand where they stood, (N,)."""
     shift = norm(position - position_before)
     return (shift <= BASKET_SHIFT) & (_cosine_of_tilt(quaternion, quaternion_before) >= _cosine(BASKET_TILT))
 
 
-def fell_over(position: Array, quaternion: Array, position_before: Array, quaternion_before: Array) -> Array:
+def has_basket_fallen(position: Array, quaternion: Array, position_before: Array, quaternion_before: Array) -> Array:
     """Return whether baskets have fallen: are lower than they stood, or tilted past turning back, (N,)."""
     dropped = position_before[:, 2] - position[:, 2] > BASKET_DROP
     return dropped | (_cosine_of_tilt(quaternion, quaternion_before) < _cosine(BASKET_FALL))
 
 
-def fell_off(height: Array, surface: float, above_basket: Array, touched: Array) -> Array:
+def has_target_fallen(height: Array, surface: float, above_basket: Array, touched: Array) -> Array:
     """Return whether targets (N,) are below the surface that they stood on, neither above the basket nor touched."""
     return (height < surface - FALLEN) & ~above_basket & ~touched
 
 
-def of_target(values: Array, target: Array) -> Array:
+def select_target(values: Array, target: Array) -> Array:
     """Return the target's entry (N, ...) of values per object (N, K, ...), by its slot (N,)."""
     return values[arange(len(target), values), target]
 
 
-def another_of_its_kind(marked: Array, kinds: Array, target: Array) -> Array:
+def is_any_other_of_kind(marked: Array, kinds: Array, target: Array) -> Array:
     """Return whether an object of the target's kind other than the target is marked, (N,).
 
     Args:
@@ -109,11 +109,11 @@ def another_of_its_kind(marked: Array, kinds: Array, target: Array) -> Array:
         target: (N,) slots.
     """
     slots = arange(kinds.shape[1], kinds)
-    alike = (kinds == of_target(kinds, target)[:, None]) & (slots != target[:, None])
+    alike = (kinds == select_target(kinds, target)[:, None]) & (slots != target[:, None])
     return (marked & alike).any(1)  # pyright: ignore[reportReturnType]
 
 
-def way_back(body: Array, part: Array, part_before: Array) -> tuple[Array, Array]:
+def inverse_motion(body: Array, part: Array, part_before: Array) -> tuple[Array, Array]:
     """Return the motion that brings a part of a body, such as a drawer, back to where it was.
 
     Args:
@@ -130,13 +130,13 @@ def way_back(body: Array, part: Array, part_before: Array) -> tuple[Array, Array
     return turn, position - (turn @ part[:, :3, None])[..., 0]
 
 
-def disturbed(poses: Array, start: Array, undo: tuple[Array, Array] | None = None) -> Array:
+def is_disturbed(poses: Array, start: Array, undo: tuple[Array, Array] | None = None) -> Array:
     """Return which objects (N, K) are no longer where they stood, or have fallen over.
 
     Args:
         poses: (N, K, 7) now.
         start: (N, K, 7) as they stood.
-        undo: `way_back` of what they stand on; None: it can't move.
+        undo: `inverse_motion` of what they stand on; None: it can't move.
     """
     position, up = poses[..., :3], vertical_axis(poses[..., 3:])
     if undo is not None:

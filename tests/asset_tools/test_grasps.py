@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from asset_tools.grasps import sample_grasps
-from robocas_ms3.scenes.grasp_checks import gripper_is_clear
+from robocas_ms3.scenes.grasp_checks import is_gripper_clear
 
 
 def cup():
@@ -44,7 +44,7 @@ def test_frames_and_clearance(name):
     assert grasps.qualities.min() >= 0.1 and grasps.qualities.max() <= 1
     # Other samples than those the sampler tested: a grasp may pass a corner by less than their spacing, no more.
     samples = trimesh.sample.sample_surface(mesh, 3000, seed=8)[0]
-    assert gripper_is_clear(grasps.tcp_in_object, samples).mean() >= 0.95
+    assert is_gripper_clear(grasps.tcp_in_object, samples).mean() >= 0.95
 
 
 def test_box_is_held_across_its_thin_side():

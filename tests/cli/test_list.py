@@ -5,14 +5,14 @@ import pytest
 from robocas_ms3.cli.list import List, collect, main
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.paths import data_dir
-from robocas_ms3.scenes.config import load_task_config, shipped_configs
+from robocas_ms3.scenes.config import bundled_configs, load_task_config
 
 
 def test_tasks_and_configs_are_listed():
     found = collect()
     assert {"name": "pick", "env_id": "RoboCASPick-v1"}.items() <= found["tasks"][0].items()
     configs = {row["name"]: row for row in found["configs"]}
-    assert configs.keys() == shipped_configs().keys()
+    assert configs.keys() == bundled_configs().keys()
     for name, row in configs.items():
         assert row["description"], f"{name} doesn't say what it is"
         assert row["scene"].startswith(f"{load_task_config(name).objects.count} objects")
@@ -49,7 +49,7 @@ def test_a_damaged_pack_does_not_hide_the_others(damaged_pack, capsys):
 
 
 def test_names_are_whole_in_a_pipe_and_in_a_narrow_terminal(capsys, monkeypatch):
-    names = [*shipped_configs(), "RoboCASOpenPick-v1"]
+    names = [*bundled_configs(), "RoboCASOpenPick-v1"]
     assert main(List()) == 0
     piped = capsys.readouterr().out
     assert [name for name in names if f" {name} " not in piped] == []

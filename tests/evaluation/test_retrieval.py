@@ -29,7 +29,7 @@ class Heaps:
     def moment(self, *, held: bool = False):
         return SimpleNamespace(disturbed=self.disturbed.numpy(), held=np.array([held] * len(self.disturbed)))
 
-    def covering(self, envs):
+    def pairwise_occlusion(self, envs):
         return OVER.repeat(len(envs), 1, 1)
 
     def clutter(self, envs):

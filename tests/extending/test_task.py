@@ -38,7 +38,7 @@ def test_its_environment_is_made_without_a_basket(site):
 obs, reward, terminated, truncated, info = env.step(hold)
 print(base.get_language_instruction())
 print(sorted(obs["extra"]), sorted(base.STAGES), gym.spec("RoboCASPushZone-v1").max_episode_steps)
-print(0 < float(reward) < 0.3, list(info["reward_terms"]), sorted(base.target_measures()))
+print(0 < float(reward) < 0.3, list(info["reward_terms"]), sorted(base.success_conditions()))
 """,
     )
     assert said.splitlines() == [
@@ -108,11 +108,11 @@ def test_a_configuration_with_a_mistyped_task_is_told_its_name(site):
         "-c",
         """
 from robocas_ms3.scenes.task_specs import TASKS
-from robocas_ms3.scenes.config import load_config_of
+from robocas_ms3.scenes.config import load_config_for
 from robocas_ms3.core.errors import ConfigError
-config = load_config_of(TASKS["push_zone"]).model_dump(mode="json")
+config = load_config_for(TASKS["push_zone"]).model_dump(mode="json")
 try:
-    load_config_of(TASKS["push_zone"], config | {"task": "push_zones"})
+    load_config_for(TASKS["push_zone"], config | {"task": "push_zones"})
 except ConfigError as error:
     print(error)
 """,

@@ -48,7 +48,7 @@ from robocas_ms3.plans.load import load_plan, shipped_plans
 from robocas_ms3.plans.status import read_status
 from robocas_ms3.robots.cameras import STANDARD_NAMES
 from robocas_ms3.scenes.layout import Layout
-from robocas_ms3.scenes.layout_table import FrozenLayouts, LayoutTable, write_frozen, write_table
+from robocas_ms3.scenes.layout_table import FrozenLayouts, LayoutTable, write_frozen_layouts, write_table
 from robocas_ms3.viewer.routes import Routes
 from robocas_ms3.viewer.source import open_source as open_page
 
@@ -148,7 +148,7 @@ def write_training(root):
 def write_layouts(root):
     root.mkdir()
     write_table(root / "table.npy", NAMES, dict.fromkeys([(0, 0), (0, 1)], LAYOUT))
-    write_frozen(root / "frozen.npy", NAMES, {0: LAYOUT})
+    write_frozen_layouts(root / "frozen.npy", NAMES, {0: LAYOUT})
 
 
 # Readers of such folders

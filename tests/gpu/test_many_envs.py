@@ -13,9 +13,9 @@ from gpu_emulation import emulated_envs
 
 import robocas_ms3  # noqa: F401
 from robocas_ms3.cli.layouts import Build, build
-from robocas_ms3.scenes.layout_table import State
+from robocas_ms3.scenes.layout_table import LayoutStatus
 from robocas_ms3.tasks import TASKS
-from robocas_ms3.tasks.initial_states import Starts
+from robocas_ms3.tasks.initial_states import InitialStates
 
 pytestmark = [
     pytest.mark.gpu,
@@ -127,16 +127,16 @@ def test_heaps_are_tried_by_this_engine_and_resets_gather_what_stays(tmp_path):
         render_backend="none",
     )
     env: Any = made.unwrapped
-    assert env.seeds.tabled is not None
-    assert not env.seeds.table.pairs(State.UNTRIED)
-    tried = {state: len(env.seeds.table.pairs(state)) for state in (State.STAYS, State.MOVES)}
+    assert env.seeds.initial_state_table is not None
+    assert not env.seeds.table.pairs(LayoutStatus.UNCHECKED)
+    tried = {state: len(env.seeds.table.pairs(state)) for state in (LayoutStatus.STABLE, LayoutStatus.UNSTABLE)}
     assert sum(tried.values()) == count * count
-    assert tried[State.MOVES] <= count, tried
+    assert tried[LayoutStatus.UNSTABLE] <= count, tried
     for _ in range(5):
         made.reset()
         assert env.object_poses.is_cuda
         for i in (0, ENVS - 1):
-            wanted = Starts.of([env.layout(i)], env.device).object_poses[0]
+            wanted = InitialStates.of([env.layout(i)], env.device).object_poses[0]
             torch.testing.assert_close(env.object_poses[i], wanted, atol=1e-4, rtol=0)
     made.close()
 

@@ -11,7 +11,7 @@ from grasp_poses import BASE, CENTER, grasp
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.poses import inverse
 from robocas_ms3.planning.grasp_choice import draw_order, filter_grasps, score_grasps
-from robocas_ms3.scenes.grasp_checks import SIDE_CLEARANCE, gripper_is_clear, has_free_grasps
+from robocas_ms3.scenes.grasp_checks import SIDE_CLEARANCE, has_free_grasps, is_gripper_clear
 
 OBJECT = np.eye(4)
 OBJECT[:3, 3] = CENTER
@@ -80,7 +80,7 @@ def test_batch_gives_the_counts_of_single_grasps():
     base = np.eye(4)
     base[1, 3] = -0.7
     kept = filter_grasps(notes, pose, base)
-    clear = gripper_is_clear(kept.tcp_in_world, points, side_clearance=SIDE_CLEARANCE)
+    clear = is_gripper_clear(kept.tcp_in_world, points, side_clearance=SIDE_CLEARANCE)
     free = int(clear.sum()) // 2
     assert 0 < free < len(kept) // 2
     for least, found in ((0, True), (free, True), (free + 1, False)):

@@ -18,9 +18,9 @@ from scene_models import load_scene
 
 from robocas_ms3.core.errors import SimulationError
 from robocas_ms3.scenes import cache as cache_module
-from robocas_ms3.scenes.cache import LayoutCache, Sampler, count_layouts, layout_source, pairs_of
+from robocas_ms3.scenes.cache import LayoutCache, LayoutSampler, count_layouts, layout_source, seed_pairs
 from robocas_ms3.scenes.layout import Layout
-from robocas_ms3.scenes.layout_table import State
+from robocas_ms3.scenes.layout_table import LayoutStatus
 from robocas_ms3.scenes.sample import sample_layout
 
 NO_TARGET = {"target": {"max_distance": 0.1}, "objects": {"ids": "all", "count": 2}}
@@ -41,7 +41,7 @@ def test_a_layout_is_made_once_and_comes_back_the_same(tmp_path, monkeypatch):
     monkeypatch.setattr(cache_module, "sample_layout", None)  # making it again would fail
     cache = LayoutCache(scene, tmp_path)
     assert_same(cache.get(1, 1), made)
-    assert cache.missing(pairs_of(range(3))) == [(0, 0), (2, 2)]
+    assert cache.missing(seed_pairs(range(3))) == [(0, 0), (2, 2)]
     assert count_layouts(cache.folder) == 1
 
 
@@ -83,13 +83,13 @@ def test_a_table_keeps_what_an_earlier_one_holds_and_what_is_known_of_it(tmp_pat
     for pair in ((0, 0), (0, 1), (2, 1)):
         cache.get(*pair)
     cache.write_table("cpu", [(0, 0), (0, 1)])
-    cache.mark_table("cpu", {(0, 1): State.MOVES})
+    cache.write_statuses("cpu", {(0, 1): LayoutStatus.UNSTABLE})
     cache.path(0, 0).unlink()
     table = cache.write_table("cpu", [(2, 1), (2, 9)])  # of the last there is no layout yet
     assert table is not None
     assert table.pairs() == [(0, 0), (0, 1), (2, 1)]
-    assert table.pairs(State.MOVES) == [(0, 1)]
-    assert table.pairs(State.UNTRIED) == [(0, 0), (2, 1)]
+    assert table.pairs(LayoutStatus.UNSTABLE) == [(0, 1)]
+    assert table.pairs(LayoutStatus.UNCHECKED) == [(0, 0), (2, 1)]
     path = cache.table_path("cpu")
     path.write_bytes(path.read_bytes()[:-9])
     assert cache.table("cpu") is None  # damaged
@@ -114,7 +114,7 @@ def test_a_table_is_changed_by_one_process_at_a_time(tmp_path):
 @pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_objects_that_can_not_be_laid_out_are_tried_once_and_leave_nothing_behind(jobs, tmp_path):
     cache = LayoutCache(load_scene(**NO_TARGET), tmp_path)
-    problems = dict(cache.fill(pairs_of([0, 1, 2], [1]), jobs))
+    problems = dict(cache.fill(seed_pairs([0, 1, 2], [1]), jobs))
     assert problems.keys() == {(1, 1), (1, 0), (1, 2)}
     assert len(set(problems.values())) == 1
     assert "no object qualifies" in problems[1, 1]
@@ -131,7 +131,7 @@ def gpu(monkeypatch):
 
 def test_the_worker_samples_the_same_layouts_is_replaced_and_ends_with_its_object(gpu):
     scene, before = load_scene(), psutil.Process().children()
-    sampler = Sampler(scene)
+    sampler = LayoutSampler(scene)
 
     def worker() -> psutil.Process:
         (process,) = [child for child in psutil.Process().children() if child not in before]
@@ -160,7 +160,7 @@ def kill_this_process():
 
 def test_a_process_that_dies_twice_is_not_a_missing_layout(gpu):
     with pytest.raises(SimulationError) as caught:
-        Sampler(load_scene()).make(0, 1, Deadly())  # pyright: ignore[reportArgumentType]
+        LayoutSampler(load_scene()).make(0, 1, Deadly())  # pyright: ignore[reportArgumentType]
     assert (caught.value.where, caught.value.found) == ("seed 1", "SIGSEGV")
 
 
@@ -188,5 +188,5 @@ def test_a_process_whose_physx_has_a_gpu_makes_the_same_layouts():
 
 
 def test_each_object_seed_goes_with_itself_and_all_layout_seeds():
-    assert pairs_of([0, 1]) == [(0, 0), (1, 1)]
-    assert pairs_of([0, 1], [1, 7]) == [(1, 1), (1, 0), (7, 7), (7, 0), (7, 1)]
+    assert seed_pairs([0, 1]) == [(0, 0), (1, 1)]
+    assert seed_pairs([0, 1], [1, 7]) == [(1, 1), (1, 0), (7, 7), (7, 0), (7, 1)]

@@ -14,7 +14,7 @@ from robocas_ms3.core.paths import protocols_dir
 from robocas_ms3.robots.description_file import chain
 from robocas_ms3.robots.registry import PANDA
 from robocas_ms3.scenes.clearance import overlap
-from robocas_ms3.scenes.config import load_task_config, shipped_configs
+from robocas_ms3.scenes.config import bundled_configs, load_task_config
 from robocas_ms3.scenes.model import SceneModel
 
 
@@ -72,7 +72,7 @@ def test_what_a_seed_moves_is_not_judged_by_where_it_is_configured():
 
 def test_all_that_is_shipped_can_be():
     pack = load_pack("builtin")
-    configs = [name for name in shipped_configs() if "partnet" not in name]
+    configs = [name for name in bundled_configs() if "partnet" not in name]
     for config in [*configs, *protocols_dir().glob("*/configs/*.yaml")]:
         SceneModel.load(load_task_config(config), pack, pack)
 

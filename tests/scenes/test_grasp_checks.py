@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from grasp_poses import CENTER, grasp
 
-from robocas_ms3.scenes.grasp_checks import directions_ok, gripper_is_clear
+from robocas_ms3.scenes.grasp_checks import check_directions, is_gripper_clear
 
 
 @pytest.mark.parametrize(
@@ -31,15 +31,15 @@ from robocas_ms3.scenes.grasp_checks import directions_ok, gripper_is_clear
     ],
 )
 def test_approach_directions(approach, lean, heading, from_there, from_the_robots_side):
-    found = directions_ok(grasp(lean, heading)[None], CENTER, approach)
+    found = check_directions(grasp(lean, heading)[None], CENTER, approach)
     names = {"top": "from_above", "front": "from_the_front"}[approach], "from_the_robots_side"
     assert [bool(found[name][0]) for name in names] == [from_there, from_the_robots_side]
 
 
 def test_the_direction_turns_with_the_object():
     sideways = grasp(30, 90)
-    assert directions_ok(sideways[None], np.array([0.0, 0.5, -0.4]))["from_the_robots_side"][0]
-    assert not directions_ok(sideways[None], np.array([0.5, 0.0, -0.4]))["from_the_robots_side"][0]
+    assert check_directions(sideways[None], np.array([0.0, 0.5, -0.4]))["from_the_robots_side"][0]
+    assert not check_directions(sideways[None], np.array([0.5, 0.0, -0.4]))["from_the_robots_side"][0]
 
 
 @pytest.mark.parametrize(
@@ -47,7 +47,7 @@ def test_the_direction_turns_with_the_object():
 )
 def test_the_closing_axis_may_tilt_by_60_degrees(closing, level):
     # An approach along x: turning about it by c tilts the closing axis (y) by c from the horizontal.
-    assert bool(directions_ok(grasp(90, 0, closing)[None], CENTER)["closing_is_level"][0]) is level
+    assert bool(check_directions(grasp(90, 0, closing)[None], CENTER)["closing_is_level"][0]) is level
 
 
 @pytest.mark.parametrize(
@@ -74,7 +74,7 @@ def test_points_in_the_open_gripper(point, clear):
     for turn in (0, 180):
         pose = grasp(30, 10, turn)
         inside = pose[:3, :3] @ (np.array(point) * ([1, 1, 1] if turn == 0 else [-1, -1, 1])) + pose[:3, 3]
-        assert gripper_is_clear(pose[None], inside[None])[0] == clear
+        assert is_gripper_clear(pose[None], inside[None])[0] == clear
 
 
 def test_many_grasps_among_many_points_are_judged_as_each_alone():
@@ -90,7 +90,7 @@ def test_many_grasps_among_many_points_are_judged_as_each_alone():
         in_palm = (abs(x) <= 0.033) & (abs(y) <= 0.104) & (z >= -0.28) & (z <= -0.067)
         expected.append(not (in_tip | in_knuckle | in_palm).any())
     assert 0 < sum(expected) < 40
-    assert gripper_is_clear(grasps, points).tolist() == expected
+    assert is_gripper_clear(grasps, points).tolist() == expected
 
 
 @pytest.mark.parametrize(
@@ -106,4 +106,4 @@ def test_many_grasps_among_many_points_are_judged_as_each_alone():
 def test_a_free_grasp_leaves_room_at_its_sides(point, clear):
     pose = grasp(30, 10)
     there = pose[:3, :3] @ np.array(point) + pose[:3, 3]
-    assert gripper_is_clear(pose[None], there[None], side_clearance=0.005)[0] == clear
+    assert is_gripper_clear(pose[None], there[None], side_clearance=0.005)[0] == clear

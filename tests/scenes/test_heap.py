@@ -11,7 +11,7 @@ from robocas_ms3.scenes import heap
 from robocas_ms3.scenes.config.task import StackedLayout
 from robocas_ms3.scenes.heap import SPREAD, drop_heap
 from robocas_ms3.scenes.placement import Region
-from robocas_ms3.scenes.visibility import Scenery, object_mesh, top_down_camera
+from robocas_ms3.scenes.visibility import MeshScene, object_mesh, top_down_camera
 
 REGION = Region((-0.05, -0.25), (0.25, 0.15), 0.61)
 
@@ -47,7 +47,7 @@ def test_objects_lie_on_the_plane_and_on_each_other():
             assert (center >= np.array(REGION.min_xy) - SPREAD).all()
             assert (center <= np.array(REGION.max_xy) + SPREAD).all()
         camera = top_down_camera(np.array([0.1, -0.05]), REGION.z, size=128)
-        shares = Scenery([object_mesh(a) for a in assets], poses).visible_shares(camera)
+        shares = MeshScene([object_mesh(a) for a in assets], poses).visible_fractions(camera)
         assert (shares < 0.9).sum() >= 2  # something is hidden
     assert sum(on_others) >= len(on_others)
 
@@ -64,12 +64,12 @@ def test_small_objects_rather_fall_first_without_noise_always_and_with_null_any(
     assets = [load_pack("builtin").objects[i] for i in ("power_drill", "soap", "padlock")]
 
     def firsts(noise):
-        found = [int(heap.falling_order(np.random.default_rng(s), assets, noise)[0]) for s in range(300)]
+        found = [int(heap.draw_drop_order(np.random.default_rng(s), assets, noise)[0]) for s in range(300)]
         return np.bincount(found, minlength=3) / 300
 
     shares = firsts(0.5)
     assert shares[2] > 0.6 and shares[1] > 0.02 and shares[0] < 0.02
-    assert heap.falling_order(np.random.default_rng(0), assets, 0.0).tolist() == [2, 1, 0]
+    assert heap.draw_drop_order(np.random.default_rng(0), assets, 0.0).tolist() == [2, 1, 0]
     assert firsts(None).min() > 0.23
 
 

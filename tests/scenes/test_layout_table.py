@@ -12,11 +12,11 @@ from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.scenes.layout_table import (
     FrozenLayouts,
+    LayoutStatus,
     LayoutTable,
-    State,
-    join_frozen,
-    mark_table,
-    write_frozen,
+    join_frozen_layouts,
+    write_frozen_layouts,
+    write_statuses,
     write_table,
 )
 
@@ -36,7 +36,7 @@ def layout(seed: int, objects: tuple[str, ...] | None = None, slots: int = 3) ->
         target=int(rng.integers(slots)),
         relation=("", "nearest")[seed % 2],
         present=rng.random(slots) < 0.7,
-        visible_shares=np.array([np.nan, *rng.random(slots - 1)]),
+        visible_fractions=np.array([np.nan, *rng.random(slots - 1)]),
     )
 
 
@@ -56,7 +56,7 @@ def assert_same(found: Layout, wanted: Layout) -> None:
     assert found.object_ids == wanted.object_ids
     assert (found.target, found.relation) == (wanted.target, wanted.relation)
     np.testing.assert_array_equal(found.present, wanted.present)
-    for name in ("object_poses", "robot_pose", "basket_pose", "visible_shares"):
+    for name in ("object_poses", "robot_pose", "basket_pose", "visible_fractions"):
         np.testing.assert_allclose(getattr(found, name), getattr(wanted, name), atol=1e-6, err_msg=name)
 
 
@@ -76,27 +76,39 @@ def test_what_it_lacks_it_does_not_make_up(layouts, tmp_path):
     table = LayoutTable(path, NAMES)
     for pair in ((5, 20), (5, 50), (5, 15), (8, 10), (3, 10), (0, 0)):
         assert table.layout(pair) is None
-        assert table.state(pair) == State.LACKING
+        assert table.state(pair) == LayoutStatus.MISSING
     assert [table.object_ids(seed) is None for seed in (1, 2, 3, 5, 9)] == [True, False, True, False, True]
-    states = table.places(np.array([5, 5, 9]), np.array([10, 20, 10]))[0]
-    assert states.tolist() == [State.UNTRIED, State.LACKING, State.LACKING]
+    states = table.find_records(np.array([5, 5, 9]), np.array([10, 20, 10]))[0]
+    assert states.tolist() == [LayoutStatus.UNCHECKED, LayoutStatus.MISSING, LayoutStatus.MISSING]
 
 
 def test_what_is_found_of_layouts_is_kept(layouts, table, tmp_path):
-    found = {(5, 40): State.MOVES, (2, 10): State.STAYS, (0, 0): State.STAYS, (9, 9): State.MOVES, (5, 15): State.STAYS}
-    mark_table(tmp_path / "table.npy", NAMES, found)  # some of which it lacks
+    found = {
+        (5, 40): LayoutStatus.UNSTABLE,
+        (2, 10): LayoutStatus.STABLE,
+        (0, 0): LayoutStatus.STABLE,
+        (9, 9): LayoutStatus.UNSTABLE,
+        (5, 15): LayoutStatus.STABLE,
+    }
+    write_statuses(tmp_path / "table.npy", NAMES, found)  # some of which it lacks
     marked = LayoutTable(tmp_path / "table.npy", NAMES)
-    assert marked.pairs(State.MOVES) == [(5, 40)]
-    assert marked.pairs(State.STAYS) == [(2, 10)]
-    assert len(marked.pairs(State.UNTRIED)) == len(layouts) - 2
-    assert not table.pairs(State.MOVES)  # that was opened before
+    assert marked.pairs(LayoutStatus.UNSTABLE) == [(5, 40)]
+    assert marked.pairs(LayoutStatus.STABLE) == [(2, 10)]
+    assert len(marked.pairs(LayoutStatus.UNCHECKED)) == len(layouts) - 2
+    assert not table.pairs(LayoutStatus.UNSTABLE)  # that was opened before
     assert marked.pairs() == sorted(layouts)
     known = marked.layout((5, 40))
     assert known is not None
     assert_same(known, layouts[5, 40])
-    assert marked.stays(5)
-    mark_table(tmp_path / "table.npy", NAMES, dict.fromkeys([pair for pair in layouts if pair[0] == 5], State.MOVES))
-    assert [LayoutTable(tmp_path / "table.npy", NAMES).stays(seed) for seed in (2, 5, 9)] == [True, False, False]
+    assert marked.has_usable_layout(5)
+    write_statuses(
+        tmp_path / "table.npy", NAMES, dict.fromkeys([pair for pair in layouts if pair[0] == 5], LayoutStatus.UNSTABLE)
+    )
+    assert [LayoutTable(tmp_path / "table.npy", NAMES).has_usable_layout(seed) for seed in (2, 5, 9)] == [
+        True,
+        False,
+        False,
+    ]
 
 
 def test_a_damaged_one_is_named(tmp_path):
@@ -114,10 +126,10 @@ def test_a_damaged_one_is_named(tmp_path):
 
 def test_frozen_parts_make_the_file_of_the_whole(tmp_path):
     layouts = {seed: replace(layout(seed), relation=said) for seed, said in ((3, ""), (4, "nearest"), (9, "left"))}
-    write_frozen(tmp_path / "whole.npy", NAMES, layouts)
+    write_frozen_layouts(tmp_path / "whole.npy", NAMES, layouts)
     for seed, one in layouts.items():
-        write_frozen(tmp_path / f"{seed}.npy", NAMES, {seed: one})
-    join_frozen(tmp_path / "joined.npy", [tmp_path / f"{seed}.npy" for seed in layouts])
+        write_frozen_layouts(tmp_path / f"{seed}.npy", NAMES, {seed: one})
+    join_frozen_layouts(tmp_path / "joined.npy", [tmp_path / f"{seed}.npy" for seed in layouts])
     assert (tmp_path / "joined.npy").read_bytes() == (tmp_path / "whole.npy").read_bytes()
     found = FrozenLayouts(tmp_path / "joined.npy", NAMES)
     assert found.seeds == (3, 4)
@@ -128,12 +140,12 @@ def test_frozen_parts_make_the_file_of_the_whole(tmp_path):
 
 
 def test_what_can_not_be_joined_is_refused_and_nothing_written(tmp_path):
-    write_frozen(tmp_path / "a.npy", NAMES, {1: layout(1)})
-    write_frozen(tmp_path / "b.npy", NAMES, {2: layout(2, slots=4)})
+    write_frozen_layouts(tmp_path / "a.npy", NAMES, {1: layout(1)})
+    write_frozen_layouts(tmp_path / "b.npy", NAMES, {2: layout(2, slots=4)})
     (tmp_path / "c.npy").write_bytes((tmp_path / "a.npy").read_bytes()[:-5])
     np.save(tmp_path / "d.npy", np.zeros(3))
     for other in "bcd":
         with pytest.raises(LayoutError) as caught:
-            join_frozen(tmp_path / "joined.npy", [tmp_path / "a.npy", tmp_path / f"{other}.npy"])
+            join_frozen_layouts(tmp_path / "joined.npy", [tmp_path / "a.npy", tmp_path / f"{other}.npy"])
         assert caught.value.where == tmp_path / f"{other}.npy"
     assert not (tmp_path / "joined.npy").exists()

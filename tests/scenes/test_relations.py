@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robocas_ms3.scenes.relations import MARGIN, RELATIONS, related
+from robocas_ms3.scenes.relations import MARGIN, RELATIONS, select_by_relation
 
 # y = 0.2 is on the robot's left; distances 0.54, 0.6, 0.81, 0.7 m
 FOUR = np.array([[0.5, 0.2], [0.6, 0.0], [0.8, -0.1], [0.63, -0.3]])
@@ -27,17 +27,17 @@ FOUR = np.array([[0.5, 0.2], [0.6, 0.0], [0.8, -0.1], [0.63, -0.3]])
     ],
 )
 def test_four_objects(relation, expected):
-    assert related(relation, FOUR) == expected
+    assert select_by_relation(relation, FOUR) == expected
 
 
 @pytest.mark.parametrize(("order", "expected"), [([0, 1, 3], 1), ([3, 1, 0], 1), ([1, 0, 3], 0), ([0, 3, 1], 2)])
 def test_the_middle_of_three_wherever_it_is_listed(order, expected):
-    assert related("middle", FOUR[order]) == expected
+    assert select_by_relation("middle", FOUR[order]) == expected
 
 
 def test_of_two_only_the_ends_are_named():
     two = FOUR[:2]
-    found = {relation: related(relation, two) for relation in RELATIONS}
+    found = {relation: select_by_relation(relation, two) for relation in RELATIONS}
     assert {relation for relation, index in found.items() if index is not None} == {
         "nearest",
         "farthest",
@@ -46,15 +46,15 @@ def test_of_two_only_the_ends_are_named():
     }
     assert found["nearest"] == found["leftmost"] == 0
     assert found["farthest"] == found["rightmost"] == 1
-    assert all(related(relation, FOUR[:count]) is None for relation in RELATIONS for count in (0, 1))
+    assert all(select_by_relation(relation, FOUR[:count]) is None for relation in RELATIONS for count in (0, 1))
 
 
 @pytest.mark.parametrize(("gap", "clear"), [(0.029, False), (0.031, True)])
 def test_neighbours_closer_than_3_cm_are_not_told_apart(gap, clear):
     row = np.array([[0.5, gap], [0.5, 0.0], [0.5, -0.2]])
-    assert (related("leftmost", row) == 0) is clear
-    assert (related("middle", row) == 1) is clear  # it has that neighbour too
-    assert related("rightmost", row) == 2  # it has not
+    assert (select_by_relation("leftmost", row) == 0) is clear
+    assert (select_by_relation("middle", row) == 1) is clear  # it has that neighbour too
+    assert select_by_relation("rightmost", row) == 2  # it has not
 
 
 POINTS = st.lists(
@@ -68,14 +68,14 @@ POINTS = st.lists(
 def test_left_and_right_swap_in_a_mirror(points):
     here, mirrored = np.array(points), np.array(points) * [1, -1]
     for one, other in (("leftmost", "rightmost"), ("second_from_left", "second_from_right"), ("middle", "middle")):
-        assert related(one, here) == related(other, mirrored)
-    assert related("nearest", here) == related("nearest", mirrored)
+        assert select_by_relation(one, here) == select_by_relation(other, mirrored)
+    assert select_by_relation("nearest", here) == select_by_relation("nearest", mirrored)
 
 
 @given(POINTS)
 def test_what_is_named_differs_from_all_others(points):
     here = np.array(points)
     for relation, key in (("leftmost", here[:, 1]), ("farthest", np.linalg.norm(here, axis=1))):
-        found = related(relation, here)
+        found = select_by_relation(relation, here)
         if found is not None:
             assert np.delete(key, found).max() <= key[found] - MARGIN + 1e-12

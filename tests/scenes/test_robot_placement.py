@@ -7,7 +7,7 @@ from scene_models import load_scene
 from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.core.poses import from_xyz_yaw
 from robocas_ms3.scenes.model import SceneModel
-from robocas_ms3.scenes.robot_placement import _moved, basket_stands, body_is_free, place_basket, place_robot
+from robocas_ms3.scenes.robot_placement import _moved, is_basket_stable, is_body_clear, place_basket, place_robot
 from robocas_ms3.scenes.sample import sample_layout
 
 
@@ -23,13 +23,13 @@ def test_a_basket_stands_where_all_that_lies_in_it_has_something_below():
     edge = (scene.support_pose @ [*table.max_xy, 0, 1])[0]  # in x
     inner = scene.basket.asset.inner.max[0]  # from its middle to its wall
     at_edge = shifted(scene.basket_pose, x=edge - scene.basket_pose[0, 3])
-    assert basket_stands(scene, scene.basket_pose)
-    assert basket_stands(scene, shifted(at_edge, x=-inner))
-    assert not basket_stands(scene, shifted(at_edge, x=-0.02))  # not with something on the wrong side
-    assert not basket_stands(scene, shifted(at_edge, x=0.05))
-    assert not basket_stands(scene, shifted(scene.basket_pose, z=0.1))  # in the air
+    assert is_basket_stable(scene, scene.basket_pose)
+    assert is_basket_stable(scene, shifted(at_edge, x=-inner))
+    assert not is_basket_stable(scene, shifted(at_edge, x=-0.02))  # not with something on the wrong side
+    assert not is_basket_stable(scene, shifted(at_edge, x=0.05))
+    assert not is_basket_stable(scene, shifted(scene.basket_pose, z=0.1))  # in the air
     on_floor = load_scene("pick_side_table_scattered")
-    assert basket_stands(on_floor, on_floor.basket_pose)
+    assert is_basket_stable(on_floor, on_floor.basket_pose)
 
 
 def test_a_basket_that_would_hang_over_the_edge_is_drawn_again():
@@ -39,13 +39,13 @@ def test_a_basket_that_would_hang_over_the_edge_is_drawn_again():
     for seed in range(8):
         first = _moved(scene.basket_pose, by, np.random.default_rng(seed))
         pose = place_basket(scene, scene.robot_pose, np.random.default_rng(seed))
-        assert basket_stands(scene, pose)
+        assert is_basket_stable(scene, pose)
         redrawn += not np.array_equal(pose, first)
-        if basket_stands(scene, first):
+        if is_basket_stable(scene, first):
             np.testing.assert_array_equal(pose, first)
     assert 0 < redrawn < 8
     layout = sample_layout(scene, 1, 1)
-    assert basket_stands(scene, layout.basket_pose)
+    assert is_basket_stable(scene, layout.basket_pose)
 
 
 def test_a_basket_that_stands_nowhere_says_what_to_change():
@@ -61,10 +61,10 @@ def test_a_robot_that_would_stand_in_furniture_is_drawn_again():
     for seed in range(30):
         first = _moved(scene.robot_pose, scene.config.randomisation.robot, np.random.default_rng(seed))
         pose = place_robot(scene, np.random.default_rng(seed))
-        assert body_is_free(pose, scene.furniture_points)
+        assert is_body_clear(pose, scene.furniture_points)
         redrawn += not np.array_equal(pose, first)
     assert 0 < redrawn < 30
-    assert body_is_free(sample_layout(scene, 2, 2).robot_pose, scene.furniture_points)
+    assert is_body_clear(sample_layout(scene, 2, 2).robot_pose, scene.furniture_points)
 
 
 def test_what_nothing_moves_stays_and_draws_nothing():
@@ -77,6 +77,6 @@ def test_what_nothing_moves_stays_and_draws_nothing():
 def test_the_robots_body_is_low_and_wide_high_and_narrow_and_above_the_floor():
     root = from_xyz_yaw(1.0, 2.0, 0.0, np.pi / 2)  # ahead is +y
     for hit in ([1.0, 2.27, 0.2], [1.22, 2.0, 0.2], [1.0, 2.14, 0.6]):
-        assert not body_is_free(root, np.array([hit]))
+        assert not is_body_clear(root, np.array([hit]))
     for beside in ([1.0, 2.29, 0.2], [1.24, 2.0, 0.2], [1.0, 2.16, 0.6], [1.0, 2.0, 0.65], [1.0, 2.0, -5.0]):
-        assert body_is_free(root, np.array([beside]))
+        assert is_body_clear(root, np.array([beside]))

@@ -10,10 +10,10 @@ from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.errors import ConfigError, LayoutError
 from robocas_ms3.core.poses import transform_points
 from robocas_ms3.scenes import sample
-from robocas_ms3.scenes.config import load_task_config, shipped_configs
+from robocas_ms3.scenes.config import bundled_configs, load_task_config
 from robocas_ms3.scenes.layout import PARKING_HEIGHT
 from robocas_ms3.scenes.model import SceneModel
-from robocas_ms3.scenes.sample import meets_basket, object_set, sample_layout
+from robocas_ms3.scenes.sample import draw_object_set, overlaps_basket, sample_layout
 
 
 def test_objects_and_their_places_have_seeds_of_their_own():
@@ -21,7 +21,7 @@ def test_objects_and_their_places_have_seeds_of_their_own():
     one, again, moved, other = (sample_layout(scene, *seeds) for seeds in ((4, 4), (4, 4), (4, 5), (5, 5)))
     np.testing.assert_array_equal(one.object_poses, again.object_poses)
     assert (one.object_ids, one.target) == (again.object_ids, again.target)
-    assert one.object_ids == moved.object_ids == object_set(scene, 4) != other.object_ids
+    assert one.object_ids == moved.object_ids == draw_object_set(scene, 4) != other.object_ids
     assert not np.allclose(one.object_poses, moved.object_poses)
 
 
@@ -34,7 +34,7 @@ def test_objects_among_which_no_target_is_found_give_way_to_others(monkeypatch):
 
     monkeypatch.setattr(sample, "choose_target", fussy)
     found = sample_layout(scene, 4, 4)
-    assert asked[0] == object_set(scene, 4) != found.object_ids == object_set(scene, 4, 1)
+    assert asked[0] == draw_object_set(scene, 4) != found.object_ids == draw_object_set(scene, 4, 1)
     assert sample_layout(scene, 4, 5).object_ids == found.object_ids
     monkeypatch.setattr(sample, "choose_target", choose)
     assert sample_layout(scene, 4, 5, found.object_ids).object_ids == found.object_ids
@@ -50,21 +50,21 @@ def test_objects_that_do_not_fit_give_way_to_others(monkeypatch):
         return arrange(rng, model, assets)
 
     monkeypatch.setattr(sample, "_arrange", fussy)
-    assert sample_layout(scene, 4, 4).object_ids == object_set(scene, 4, 1)
+    assert sample_layout(scene, 4, 4).object_ids == draw_object_set(scene, 4, 1)
     assert len(tried) == 2  # it tries often itself
     tried[:] = []
     with pytest.raises(LayoutError, match="no room"):
-        sample_layout(scene, 4, 4, object_set(scene, 4))
+        sample_layout(scene, 4, 4, draw_object_set(scene, 4))
 
 
 def test_objects_and_kinds_may_be_drawn_again():
     ids = {"ids": ["mug", "soap_box", "sugar_box"], "count": 4, "repeats": True}
-    scattered = [object_set(load_scene(objects=ids), seed) for seed in range(20)]
+    scattered = [draw_object_set(load_scene(objects=ids), seed) for seed in range(20)]
     assert max(chosen.count(i) for chosen in scattered for i in chosen) > 2  # by turns it would be 2
     layout = {"kind": "orderly", "copies": 2, "rows": 2}
-    for chosen in (object_set(load_scene(objects=ids, layout=layout), seed) for seed in range(20)):
+    for chosen in (draw_object_set(load_scene(objects=ids, layout=layout), seed) for seed in range(20)):
         assert chosen[0] == chosen[1] and chosen[2] == chosen[3]
-    assert any(len(set(object_set(load_scene(objects=ids, layout=layout), seed))) == 1 for seed in range(20))
+    assert any(len(set(draw_object_set(load_scene(objects=ids, layout=layout), seed))) == 1 for seed in range(20))
 
 
 def test_columns_that_do_not_fit_leave_their_slots_empty():
@@ -83,7 +83,7 @@ def test_columns_that_do_not_fit_leave_their_slots_empty():
     assert sample_layout(scene, 1, 2).present.tolist() != layout.present.tolist()
 
 
-@pytest.mark.parametrize("name", [name for name in shipped_configs() if "_upstream" in name])
+@pytest.mark.parametrize("name", [name for name in bundled_configs() if "_upstream" in name])
 def test_upstreams_scenes_have_layouts_beside_the_basket(name):
     scene = load_scene(name)
     region = np.array([[*scene.region.min_xy, scene.region.z], [*scene.region.max_xy, scene.region.z]])
@@ -96,7 +96,7 @@ def test_upstreams_scenes_have_layouts_beside_the_basket(name):
         used = [
             scene.object_pack.objects[i] for i, there in zip(layout.object_ids, layout.present, strict=True) if there
         ]
-        assert not meets_basket(used, layout.object_poses[layout.present], scene.basket, layout.basket_pose)
+        assert not overlaps_basket(used, layout.object_poses[layout.present], scene.basket, layout.basket_pose)
 
 
 def test_columns_leave_out_what_has_no_display_pose_and_say_so_once(caplog):
@@ -105,12 +105,12 @@ def test_columns_leave_out_what_has_no_display_pose_and_say_so_once(caplog):
     assert lying
     ids = ["mug", "soap_box", "sugar_box", *lying]
     scene = load_scene(layout={"kind": "orderly", "copies": 2, "rows": 2}, objects={"ids": ids, "count": 6})
-    drawn = {i for seed in range(6) for i in object_set(scene, seed)}
+    drawn = {i for seed in range(6) for i in draw_object_set(scene, seed)}
     assert drawn == {"mug", "soap_box", "sugar_box"}
     told = [record.getMessage() for record in caplog.records]
     assert len(told) == 1 and told[0].endswith(": " + ", ".join(lying))
     caplog.clear()
-    object_set(load_scene(layout={"kind": "orderly"}), 0)  # all that can stand: nothing to tell
+    draw_object_set(load_scene(layout={"kind": "orderly"}), 0)  # all that can stand: nothing to tell
     assert not caplog.records
 
 
@@ -188,10 +188,10 @@ def test_nothing_stands_in_a_basket_that_was_moved_among_the_objects():
     for seed in (5, 6, 7):
         layout = sample_layout(moving, seed, seed)
         assets = [moving.object_pack.objects[i] for i in layout.object_ids]
-        assert not meets_basket(assets, layout.object_poses, moving.basket, layout.basket_pose)
+        assert not overlaps_basket(assets, layout.object_poses, moving.basket, layout.basket_pose)
     inside = layout.object_poses.copy()
     inside[0, :3, 3] = layout.basket_pose[:3, 3] + [0, 0, 0.05]
-    assert meets_basket(assets, inside, moving.basket, layout.basket_pose)
+    assert overlaps_basket(assets, inside, moving.basket, layout.basket_pose)
 
 
 def rows(copies: int, relations: list[str] | None, count: int = 10, **objects) -> SceneModel:
@@ -264,12 +264,12 @@ def test_joints_and_openings(name, opening, joints, words):
 
 def test_orderly_objects_come_in_kinds():
     scene = load_scene(layout={"kind": "orderly", "copies": 3}, objects={"ids": "all", "count": 7})
-    ids = object_set(scene, 0)
+    ids = draw_object_set(scene, 0)
     assert [ids.count(kind) for kind in dict.fromkeys(ids)] == [3, 3, 1]
 
 
 def test_one_of_several_object_sets_is_drawn():
     sets = [["apple", "lemon", "peach"], ["mug", "banana", "padlock"]]
     scene = load_scene(objects={"ids": "all", "count": 3}, randomisation={"object_sets": sets})
-    drawn = {frozenset(object_set(scene, seed)) for seed in range(20)}
+    drawn = {frozenset(draw_object_set(scene, seed)) for seed in range(20)}
     assert drawn == {frozenset(one) for one in sets}

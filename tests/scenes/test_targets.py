@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from robocas_ms3.scenes import targets
-from robocas_ms3.scenes.targets import Arrangement, choose_target
+from robocas_ms3.scenes.targets import SettledScene, choose_target
 
 
 @pytest.fixture
 def arrangement(monkeypatch):
     """Make arrangements of objects at (x, y) in the robot's frame, which is the world's."""
 
-    def make(task, names, positions, *, blocked=(), flat=(), grasps=50, shares=0.0, **rules) -> Arrangement:
+    def make(task, names, positions, *, blocked=(), flat=(), grasps=50, shares=0.0, **rules) -> SettledScene:
         known = {"min_grasps": 20, "min_free_grasps": 1, "max_distance": 0.8, "relations": ["nearest"]}
         target = SimpleNamespace(**{**known, "max_visible_share": 0.9, "weight": "nearness", **rules})
         model = SimpleNamespace(
@@ -25,23 +25,23 @@ def arrangement(monkeypatch):
         poses = np.tile(np.eye(4), (len(names), 1, 1))
         poses[:, :2, 3] = positions
         everything = np.ones(len(names), dtype=bool)
-        scenery = SimpleNamespace(visible_shares=lambda camera: np.broadcast_to(shares, len(names)))
-        monkeypatch.setattr(targets, "Scenery", lambda meshes, poses: scenery)
+        scenery = SimpleNamespace(visible_fractions=lambda camera: np.broadcast_to(shares, len(names)))
+        monkeypatch.setattr(targets, "MeshScene", lambda meshes, poses: scenery)
         monkeypatch.setattr(targets, "object_mesh", lambda asset: asset)
-        monkeypatch.setattr(Arrangement, "has_free_grasps", lambda self, slot: slot not in blocked)
-        monkeypatch.setattr(Arrangement, "has_uncovered_grasps", lambda self, slot: slot not in flat)
+        monkeypatch.setattr(SettledScene, "has_free_grasps", lambda self, slot: slot not in blocked)
+        monkeypatch.setattr(SettledScene, "has_uncovered_grasps", lambda self, slot: slot not in flat)
         assets = [SimpleNamespace(asset=SimpleNamespace(name=name, grasp_count=grasps)) for name in names]
-        return Arrangement(model, assets, poses, everything, everything, np.eye(4), np.eye(4))
+        return SettledScene(model, assets, poses, everything, everything, np.eye(4), np.eye(4))
 
     return make
 
 
-def drawn(scene: Arrangement) -> set:
+def drawn(scene: SettledScene) -> set:
     choices = [choose_target(np.random.default_rng(seed), scene) for seed in range(30)]
     return {(choice.slot, choice.relation) if choice else None for choice in choices}
 
 
-def share_of_first(scene: Arrangement) -> float:
+def share_of_first(scene: SettledScene) -> float:
     return np.mean([choose_target(np.random.default_rng(seed), scene).slot == 0 for seed in range(400)])
 
 
@@ -71,7 +71,7 @@ def test_search_wants_a_hidden_object_whose_name_is_its_own(arrangement):
     assert drawn(scene) == {(2, ""), (4, "")}
     choice = choose_target(np.random.default_rng(0), scene)
     assert choice is not None
-    np.testing.assert_array_equal(choice.visible_shares, shares)
+    np.testing.assert_array_equal(choice.visible_fractions, shares)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import pytest
 
 from robocas_ms3.core.errors import ConfigError
 from robocas_ms3.core.extensions import load_object
-from robocas_ms3.scenes.config import load_config_of
+from robocas_ms3.scenes.config import load_config_for
 from robocas_ms3.scenes.language.texts import Templates
 from robocas_ms3.scenes.targets import TargetRule
 from robocas_ms3.scenes.task_specs import TASKS
@@ -15,12 +15,12 @@ from robocas_ms3.scenes.task_specs import TASKS
 @pytest.mark.parametrize("spec", TASKS.values(), ids=list(TASKS))
 def test_what_a_row_names_is_there(spec):
     assert TASKS[spec.name] is spec
-    assert load_config_of(spec).task == spec.name
+    assert load_config_for(spec).task == spec.name
     assert isinstance(load_object(spec.target), TargetRule)
     assert load_object(spec.env).SPEC is spec
     assert list(inspect.signature(load_object(spec.solver)).parameters) == ["arm"]
     for check in spec.checks:
-        load_object(check)(load_config_of(spec))
+        load_object(check)(load_config_for(spec))
     assert Templates.for_task(spec).upstream
 
 
@@ -33,4 +33,4 @@ def test_a_horizon_is_as_many_seconds_at_any_rate(name, standard, slow):
 
 def test_a_configuration_of_another_task_is_refused():
     with pytest.raises(ConfigError, match=r"RoboCASPick-v1 can't run .*select_table_orderly .expected task: pick"):
-        load_config_of(TASKS["pick"], "select_table_orderly")
+        load_config_for(TASKS["pick"], "select_table_orderly")

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.assets.pack import load_pack
-from robocas_ms3.scenes.visibility import PinholeCamera, Scenery, object_mesh, top_down_camera
+from robocas_ms3.scenes.visibility import MeshScene, PinholeCamera, object_mesh, top_down_camera
 
 PLATE = trimesh.creation.box((0.1, 0.1, 0.002))
 HIGH = PinholeCamera(top_down_camera(np.zeros(2), 9.5).pose, 256, 256, 0.03)  # nearly parallel rays
@@ -21,7 +21,7 @@ def at(*position: float) -> np.ndarray:
 
 
 def shares(*poses, camera=HIGH) -> np.ndarray:
-    return Scenery([PLATE] * len(poses), np.asarray(poses)).visible_shares(camera)
+    return MeshScene([PLATE] * len(poses), np.asarray(poses)).visible_fractions(camera)
 
 
 def test_shares_by_hand():
@@ -35,17 +35,17 @@ def test_shares_by_hand():
 
 def test_the_share_depends_on_where_the_camera_is():
     wall = trimesh.creation.box((0.01, 1.0, 1.0))
-    scenery = Scenery([PLATE, wall], np.stack([at(0, 0, 0), at(0.3, 0, 0)]))
+    scenery = MeshScene([PLATE, wall], np.stack([at(0, 0, 0), at(0.3, 0, 0)]))
     behind, above = np.eye(4), top_down_camera(np.zeros(2), 0.0)
     behind[:3, :3] = np.diag([-1.0, -1.0, 1.0])  # looks along -x, at the wall
     behind[:3, 3] = 1.0, 0, 0.2
-    assert scenery.visible_shares(PinholeCamera(behind, 128, 128))[0] == 0
-    assert scenery.visible_shares(above)[0] == 1
+    assert scenery.visible_fractions(PinholeCamera(behind, 128, 128))[0] == 0
+    assert scenery.visible_fractions(above)[0] == 1
 
 
 def test_pixels_are_where_the_camera_sees_things():
     camera = PinholeCamera(np.eye(4), 100, 80, np.pi / 2)  # looks along x: y is left, z up
-    ids = Scenery([trimesh.creation.box((0.1, 0.1, 0.1))], at(2.0, 0.5, 0.5)[None]).segmentation(camera)[0]
+    ids = MeshScene([trimesh.creation.box((0.1, 0.1, 0.1))], at(2.0, 0.5, 0.5)[None]).segmentation(camera)[0]
     rows, columns = np.nonzero(ids == 0)
     # 2 m ahead, 0.5 left, 0.5 up; focal length 40: 10 pixels left of and above the middle
     assert columns.mean() + 0.5 == pytest.approx(50 - 10, abs=0.6)
@@ -57,7 +57,7 @@ def test_the_selection_camera_looks_down_with_the_worlds_x_up():
     np.testing.assert_allclose(camera.pose[:3, 3], [0.3, 0.2, 1.1])
     np.testing.assert_allclose(camera.pose[:3, 0], [0, 0, -1])
     assert camera.focal_length == pytest.approx(256)
-    scenery = Scenery([PLATE] * 3, np.stack([at(0, 0, 0), at(0, 0.075, 0.01), at(0.05, 0, 0.02)]))
+    scenery = MeshScene([PLATE] * 3, np.stack([at(0, 0, 0), at(0, 0.075, 0.01), at(0.05, 0, 0.02)]))
     ids = scenery.segmentation(HIGH)[0]
     # 0.1 m are 85 pixels; the world's x is up, y left: the third plate covers part of the others
     assert [ids[148, 148], ids[148, 64], ids[85, 128], ids[2, 2]] == [0, 1, 2, -1]
@@ -65,9 +65,9 @@ def test_the_selection_camera_looks_down_with_the_worlds_x_up():
 
 def test_a_mesh_that_is_changed_is_seen_as_it_is_now():
     plate = PLATE.copy()
-    before = Scenery([plate], np.eye(4)[None]).segmentation(HIGH)[1][0]
+    before = MeshScene([plate], np.eye(4)[None]).segmentation(HIGH)[1][0]
     plate.apply_scale(0.5)
-    assert Scenery([plate], np.eye(4)[None]).segmentation(HIGH)[1][0] == pytest.approx(before / 4, rel=0.05)
+    assert MeshScene([plate], np.eye(4)[None]).segmentation(HIGH)[1][0] == pytest.approx(before / 4, rel=0.05)
 
 
 def test_meshes_are_in_the_assets_frame():
@@ -89,10 +89,10 @@ def test_laws(seed):
     np.testing.assert_array_equal(seen, ~np.isnan(more))
     assert ((few[seen] >= 0) & (few[seen] <= 1)).all()
     assert (more[seen] <= few[seen]).all()  # more cover shows no more
-    alone = [Scenery([PLATE], pose[None]).segmentation(camera) for pose in poses]
-    ids, full = Scenery([PLATE] * 5, poses).segmentation(camera)
+    alone = [MeshScene([PLATE], pose[None]).segmentation(camera) for pose in poses]
+    ids, full = MeshScene([PLATE] * 5, poses).segmentation(camera)
     np.testing.assert_array_equal(full, [one[1][0] for one in alone])
     for i, (one, _) in enumerate(alone):
         assert (one[ids == i] == 0).all()  # each pixel shows one of those that would fill it
-    other_way = Scenery([PLATE] * 5, poses[::-1]).segmentation(camera)[0]  # the order of meshes doesn't matter
+    other_way = MeshScene([PLATE] * 5, poses[::-1]).segmentation(camera)[0]  # the order of meshes doesn't matter
     np.testing.assert_array_equal(np.where(other_way >= 0, 4 - other_way, -1), ids)

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.assets.pack import LoadedObject, load_pack
-from robocas_ms3.scenes.visibility import PinholeCamera, Scenery, object_mesh, top_down_camera
+from robocas_ms3.scenes.visibility import MeshScene, PinholeCamera, object_mesh, top_down_camera
 
 pytestmark = pytest.mark.slow
 
@@ -73,9 +73,9 @@ def test_shares_agree_with_the_segmentation(rendered, seed, camera):
     together = segmentation(camera, poses, list(range(COUNT)))
     visible = np.array([(together == i).sum() for i in range(COUNT)])
     full = np.array([(segmentation(camera, poses, [i]) == i).sum() for i in range(COUNT)])
-    scenery = Scenery([object_mesh(asset) for asset in assets], poses)
+    scenery = MeshScene([object_mesh(asset) for asset in assets], poses)
     large = full >= 200
-    shares = scenery.visible_shares(camera)
+    shares = scenery.visible_fractions(camera)
     assert large.sum() >= 6
     assert shares[large] == pytest.approx(visible[large] / full[large], abs=0.02)
     assert shares[large].min() < 0.6  # something is hidden

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from robocas_ms3.cli import main as cli
-from robocas_ms3.scenes.config import shipped_configs
+from robocas_ms3.scenes.config import bundled_configs
 
 ROOT = Path(__file__).resolve().parents[2]
 STUB = '#!/bin/sh\nprintf "%s\\n" "$*" >> "$CALLS"\n'
@@ -60,7 +60,7 @@ def test_they_call_what_there_is(tmp_path, words):
     made = {str(folder / "run"), str(folder / "data")}
     for call in calls:
         cli.parse(call)
-        assert call[0] != "generate" or call[call.index("--config") + 1] in shipped_configs()
+        assert call[0] != "generate" or call[call.index("--config") + 1] in bundled_configs()
         read = [word.removesuffix("/trajectory.h5") for word in call if word.startswith(str(folder))]
         out = call[call.index("--out") + 1]
         read.remove(out)

@@ -75,16 +75,16 @@ def test_a_read_is_never_out_of_date(env):
 def test_others_stay_the_same_while_only_the_robot_moves(env):
     base = env.unwrapped
     robot, before = base.agent.robot, base.bodies.read()
-    others = base.bodies.others
+    others = base.bodies.state_except_robot
     robot.set_qpos(robot.get_qpos() + 0.02)
     robot.set_pose(sapien.Pose([0.1, 0.2, 0.3]))
     assert not torch.equal(base.bodies.read(), before)
-    assert base.bodies.others == others
+    assert base.bodies.state_except_robot == others
     for _, moved in zip(range(6), set_everything(base), strict=False):
         assert moved is None
         base.bodies.read()
-        assert base.bodies.others != others
-        others = base.bodies.others
+        assert base.bodies.state_except_robot != others
+        others = base.bodies.state_except_robot
 
 
 def test_a_state_dict_is_maniskills(env):

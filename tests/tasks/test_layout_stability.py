@@ -7,13 +7,13 @@ import pytest
 
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.cli.layouts import try_all
-from robocas_ms3.scenes.cache import LayoutCache, count_layouts, pairs_of
+from robocas_ms3.scenes.cache import LayoutCache, count_layouts, seed_pairs
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.layout import write_layout
-from robocas_ms3.scenes.layout_table import State
+from robocas_ms3.scenes.layout_table import LayoutStatus
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.tasks import layout_stability
-from robocas_ms3.tasks.layout_stability import judged, try_layouts, untried
+from robocas_ms3.tasks.layout_stability import check_layouts, status_of, unchecked_layouts
 
 
 @pytest.fixture
@@ -21,7 +21,7 @@ def cache(tmp_path) -> LayoutCache:
     """Of small heaps, two sets of objects with two layouts each; in one of them an object hangs in the air."""
     pack = load_pack("builtin")
     cache = LayoutCache(SceneModel.load(load_task_config("search_table_small_heap"), pack, pack), tmp_path)
-    pairs = pairs_of([0, 1], [0, 1])
+    pairs = seed_pairs([0, 1], [0, 1])
     assert not any(problem for _, problem in cache.fill(pairs))
     layout = cache.get(1, 0)
     poses = layout.object_poses.copy()
@@ -33,18 +33,18 @@ def cache(tmp_path) -> LayoutCache:
 
 @pytest.mark.slow
 def test_a_heap_that_moves_is_found(cache):
-    assert untried(cache, "gpu") == {}
-    seeds = untried(cache, "cpu")
+    assert unchecked_layouts(cache, "gpu") == {}
+    seeds = unchecked_layouts(cache, "cpu")
     assert seeds == {0: [0, 1], 1: [0, 1]}
-    moved = dict(try_layouts(cache, "cpu", seeds))
+    moved = dict(check_layouts(cache, "cpu", seeds))
     assert moved.keys() == {(0, 0), (0, 1), (1, 0), (1, 1)}
     assert moved.pop((1, 0)) > 0.02
     assert max(moved.values()) < 0.003
-    cache.mark_table("cpu", {pair: judged(by) for pair, by in moved.items()})
+    cache.write_statuses("cpu", {pair: status_of(by) for pair, by in moved.items()})
     table = cache.table("cpu")
     assert table is not None
-    assert table.pairs(State.STAYS) == [(0, 0), (0, 1), (1, 1)]
-    assert untried(cache, "cpu") == {1: [0]}
+    assert table.pairs(LayoutStatus.STABLE) == [(0, 0), (0, 1), (1, 1)]
+    assert unchecked_layouts(cache, "cpu") == {1: [0]}
     assert count_layouts(cache.folder) == 4  # none was made on the way
 
 
@@ -55,16 +55,16 @@ def test_what_was_found_before_an_interruption_is_kept(cache, monkeypatch):
         yield (0, 1), 0.02
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(layout_stability, "try_layouts", tried)
+    monkeypatch.setattr(layout_stability, "check_layouts", tried)
     for _ in range(2):
         with pytest.raises(KeyboardInterrupt):
             try_all(cache, "cpu")
     table = cache.table("cpu")
     assert table is not None
-    assert (table.pairs(State.STAYS), table.pairs(State.MOVES)) == ([(0, 0)], [(0, 1)])
-    assert table.pairs(State.UNTRIED) == [(1, 0), (1, 1)]
+    assert (table.pairs(LayoutStatus.STABLE), table.pairs(LayoutStatus.UNSTABLE)) == ([(0, 0)], [(0, 1)])
+    assert table.pairs(LayoutStatus.UNCHECKED) == [(1, 0), (1, 1)]
 
 
 def test_three_millimetres_are_allowed():
-    assert judged(0.0029) == State.STAYS
-    assert judged(0.0031) == judged(float("nan")) == State.MOVES
+    assert status_of(0.0029) == LayoutStatus.STABLE
+    assert status_of(0.0031) == status_of(float("nan")) == LayoutStatus.UNSTABLE

@@ -9,7 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from robocas_ms3.core.poses import to_wxyz
-from robocas_ms3.tasks.occlusion import Clutter, clutter, covering, moved_near, push_point, seen_from, surface_points
+from robocas_ms3.tasks.occlusion import (
+    Clutter,
+    clutter,
+    has_moved_near,
+    pairwise_occlusion,
+    project_down,
+    push_point,
+    surface_points,
+)
 
 
 def plate(x: tuple[float, float], y: tuple[float, float], z: float) -> torch.Tensor:
@@ -31,7 +39,7 @@ def measure(*others: torch.Tensor, present: list[bool] | None = None, eye: torch
 
 def test_nothing_near_is_clear():
     found = measure(FAR)
-    assert found.hidden_share.tolist() == [0]
+    assert found.hidden_fraction.tolist() == [0]
     assert not found.obstacles.any()
     assert found.cleared.tolist() == [True]
 
@@ -39,29 +47,29 @@ def test_nothing_near_is_clear():
 @pytest.mark.parametrize(("edge", "share"), [(0.0, 0.5), (0.03, 0.2), (-0.05, 1.0)])
 def test_hidden_share_is_the_share_of_cells_under_a_plate(edge, share):
     found = measure(plate((edge, 0.05), (-0.05, 0.05), 0.7))
-    assert found.hidden_share.item() == pytest.approx(share, abs=0.05)  # one row of 20 cells
+    assert found.hidden_fraction.item() == pytest.approx(share, abs=0.05)  # one row of 20 cells
     assert found.obstacles.tolist() == [[False, True]]
 
 
 def test_what_is_nearer_to_the_camera_hides_more():
     eye = torch.tensor([0.0, 0.0, 1.15])  # 0.5 m above the target
     half_way = plate((0.0, 0.025), (-0.025, 0.025), 0.9)  # 0.25 m below the camera, so it appears at twice its size
-    assert measure(half_way, eye=eye).hidden_share.item() == pytest.approx(0.5, abs=0.05)
-    assert measure(half_way).hidden_share.item() == pytest.approx(0.125, abs=0.05)
+    assert measure(half_way, eye=eye).hidden_fraction.item() == pytest.approx(0.5, abs=0.05)
+    assert measure(half_way).hidden_fraction.item() == pytest.approx(0.125, abs=0.05)
     beside = torch.tensor([0.0, 0.05, 1.15])  # sees the plate from the right, so further left
-    assert measure(half_way, eye=beside).hidden_share.item() == pytest.approx(0.25, abs=0.05)
+    assert measure(half_way, eye=beside).hidden_fraction.item() == pytest.approx(0.25, abs=0.05)
 
 
 def test_where_points_appear_by_hand():
     points = torch.tensor([[0.1, 0.2, 0.6], [0.1, 0.2, 0.8], [0.1, 0.2, 2.0]]).T[None, None]
-    seen = seen_from(points, torch.tensor([0.0, 0.1, 1.0]), torch.tensor([0.4]))
+    seen = project_down(points, torch.tensor([0.0, 0.1, 1.0]), torch.tensor([0.4]))
     expected = torch.tensor([[0.1, 0.1], [0.2, 0.2], [0.8, 0.8]])  # the last is above the camera: 5 cm below it
     assert torch.allclose(seen[0, 0].T, expected)
 
 
 def test_what_lies_under_the_target_hides_nothing():
     found = measure(plate((-0.05, 0.05), (-0.05, 0.05), 0.62))
-    assert found.hidden_share.item() == 0
+    assert found.hidden_fraction.item() == 0
     assert not found.obstacles.any()
 
 
@@ -72,7 +80,7 @@ def test_a_neighbour_within_a_centimetre_and_higher_is_an_obstacle():
     assert measure(beside(0.006, 0.66)).obstacles.tolist() == [[False, True]]
     assert measure(beside(0.006, 0.64)).obstacles.tolist() == [[False, False]]  # lower
     assert measure(beside(0.020, 0.66)).obstacles.tolist() == [[False, False]]  # too far
-    assert measure(beside(0.006, 0.66)).hidden_share.item() == 0
+    assert measure(beside(0.006, 0.66)).hidden_fraction.item() == 0
 
 
 def test_two_obstacles_are_too_many():
@@ -91,7 +99,7 @@ def test_envs_do_not_mix():
     cover = plate((-0.05, 0.05), (-0.05, 0.05), 0.7)
     points = torch.stack([torch.stack([TARGET, cover]), torch.stack([TARGET, FAR]), torch.stack([TARGET, cover])])
     found = clutter(points, torch.ones(3, 2, dtype=torch.bool), torch.tensor([0, 0, 1]), HIGH_ABOVE)
-    assert found.hidden_share.tolist() == pytest.approx([1, 0, 0])
+    assert found.hidden_fraction.tolist() == pytest.approx([1, 0, 0])
     assert found.obstacles.tolist() == [[False, True], [False, False], [False, False]]
 
 
@@ -103,7 +111,7 @@ def test_the_share_hangs_on_the_arrangement_only(x, y, yaw):
     moved = surface_points(pose.expand(1, 2, 7), points)
     found = clutter(moved, torch.ones(1, 2, dtype=torch.bool), torch.tensor([0]), HIGH_ABOVE)
     # of 20 or 21 rows of cells those in which the upper plate begins and ends count whole: 10 to 12
-    assert found.hidden_share.item() == pytest.approx(0.5, abs=1.5 / 21 + 1e-3)
+    assert found.hidden_fraction.item() == pytest.approx(0.5, abs=1.5 / 21 + 1e-3)
 
 
 def test_points_follow_their_object():
@@ -138,7 +146,7 @@ def test_what_moves_far_away_does_not_count_as_motion():
         return torch.tensor([[[x, y, 0.7, 1, 0, 0, 0] for x, y in places]])
 
     def moved(before: torch.Tensor, now: torch.Tensor) -> bool:
-        return bool(moved_near(now, before, torch.full((1, 2), 0.05), torch.tensor([0]), HIGH_ABOVE))
+        return bool(has_moved_near(now, before, torch.full((1, 2), 0.05), torch.tensor([0]), HIGH_ABOVE))
 
     still = at((0, 0), (0.11, 0))  # within two radii and three cells, along x and along y: 0.115 m
     assert not moved(still, still + 5e-5)
@@ -174,7 +182,7 @@ def test_what_is_near_in_the_image_is_near():
         before = torch.tensor([[[0.2, 0, 0.5, 1, 0, 0, 0], [x, 0, z, 1, 0, 0, 0]]])
         now = before.clone()
         now[0, 1, 0] += 1e-3
-        return bool(moved_near(now, before, radii, torch.tensor([0]), eye))
+        return bool(has_moved_near(now, before, radii, torch.tensor([0]), eye))
 
     assert moved(0.1, 0.75)  # right in front of the target
     assert not moved(0.1, 0.5)
@@ -202,7 +210,7 @@ def test_hidden_shares_are_what_rays_say():
         count = len(sampled)
         world = surface_points(poses, points).expand(count, -1, -1, -1)
         found = clutter(world, torch.ones(count, count, dtype=torch.bool), torch.arange(count), eye)
-        differences += np.abs(found.hidden_share.numpy() - (1 - layout.visible_shares)).tolist()
+        differences += np.abs(found.hidden_fraction.numpy() - (1 - layout.visible_fractions)).tolist()
     assert len(differences) > 30
     assert np.nanmean(differences) < 0.04
     assert np.nanpercentile(differences, 95) < 0.12
@@ -214,7 +222,7 @@ def test_how_much_of_each_object_every_other_one_covers():
     small, aside = plate((0.1, 0.15), (0, 0.05), 0.6), plate((0.4, 0.5), (0, 0.1), 0.9)
     points = torch.stack([target, lid, small, aside])[None].expand(2, -1, -1, -1)
     present = torch.tensor([[True] * 4, [True, True, False, True]])
-    shares = covering(points, present, HIGH_ABOVE)
+    shares = pairwise_occlusion(points, present, HIGH_ABOVE)
     wanted = torch.zeros(4, 4)
     wanted[1, 0], wanted[2, 1] = 0.5, 0.25
     torch.testing.assert_close(shares[0], wanted, atol=0.06, rtol=0)

@@ -23,7 +23,7 @@ from robocas_ms3.planning.skills.base_placement import drive_to_handle
 from robocas_ms3.planning.skills.drive import base_at, drive
 from robocas_ms3.planning.skills.grasp import plan_grasp
 from robocas_ms3.planning.skills.handles import Part, open_part, pull_share
-from robocas_ms3.scenes.config import load_task_config, shipped_configs
+from robocas_ms3.scenes.config import bundled_configs, load_task_config
 from robocas_ms3.scenes.language.templates import subgoal
 
 pytestmark = pytest.mark.slow
@@ -34,7 +34,7 @@ CONFIGS = ["open_pick_container", "open_pick_refrigerator"]  # sliding and hinge
 
 @pytest.mark.parametrize("name", CONFIGS)
 def test_it_is_opened_from_the_configured_share_on(name):
-    assert name in shipped_configs()
+    assert name in bundled_configs()
     env = gym.make("RoboCASOpenPick-v1", config=name, **STATE_ONLY)
     env.reset(seed=0)
     base = env.unwrapped

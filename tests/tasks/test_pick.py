@@ -50,7 +50,7 @@ def test_success_needs_all_of_its_conditions(env):
     base.success_check.stages["target_lifted"][:] = True
     assert settle(env, 40)["success"]
     base.objects[int(base.target_slot[0])].set_linear_velocity(torch.tensor([[0.0, 0.0, 0.5]]))
-    assert not bool(base.target_measures()["at_rest"][0])
+    assert not bool(base.success_conditions()["at_rest"][0])
     assert settle(env, 40)["success"]
     # a basket that was pushed too far
     basket = base.fixtures.basket
@@ -61,7 +61,7 @@ def test_success_needs_all_of_its_conditions(env):
     flags = settle(env, 10)
     assert flags["target_in_basket"]
     assert not flags["success"]
-    assert not bool(base.target_measures()["basket_stands"][0])
+    assert not bool(base.success_conditions()["basket_stands"][0])
     basket.set_pose(Pose.create(home))
 
 
@@ -136,13 +136,13 @@ def test_the_result_stays_while_nothing_moves(env):
     env.reset(seed=0)
     base = env.unwrapped
     settle(env, 60)  # what was laid out comes to rest
-    before = base.success_check.moment
+    before = base.success_check.state
     flags = settle(env, 10)
-    assert base.success_check.moment is before
+    assert base.success_check.state is before
     target = base.objects[int(base.target_slot[0])]
     target.set_pose(Pose.create_from_pq(target.pose.p + torch.tensor([[0, 0, 0.5]]), target.pose.q))
     base.evaluate()
-    assert base.success_check.moment is not before
+    assert base.success_check.state is not before
     base.success_check.stages["target_lifted"][:] = True  # what was reached counts too
     assert bool(base.evaluate()["target_lifted"][0])
     assert not flags["target_lifted"]

@@ -29,32 +29,32 @@ def test_closeness_halves_every_so_far(make):
 
 def test_rise_is_the_share_of_the_way_either_way(make):
     heights, starts = make([0.60, 0.615, 0.63, 0.8, 0.5]), make([0.60] * 5)
-    assert floats(rewards.rise(heights, starts, 0.03)) == pytest.approx([0, 0.5, 1, 1, 0], abs=1e-5)
+    assert floats(rewards.progress_fraction(heights, starts, 0.03)) == pytest.approx([0, 0.5, 1, 1, 0], abs=1e-5)
     # a joint that opens backwards
-    assert floats(rewards.rise(make([0.0, -0.5, -2.0, 0.1]), 0.0, -1.0)) == pytest.approx([0, 0.5, 1, 0])
+    assert floats(rewards.progress_fraction(make([0.0, -0.5, -2.0, 0.1]), 0.0, -1.0)) == pytest.approx([0, 0.5, 1, 0])
 
 
 def test_uncovered_is_full_where_a_target_is_cleared(make):
     hidden, obstacles = make([0.0, 0.2, 0.6, 1.0, 1.0]), make([0, 1, 1, 6, 9])
-    assert floats(rewards.uncovered(hidden, obstacles)) == pytest.approx([1, 1, 0.75, 0, 0], abs=1e-6)
+    assert floats(rewards.clear_fraction(hidden, obstacles)) == pytest.approx([1, 1, 0.75, 0, 0], abs=1e-6)
 
 
 def test_let_go_is_held_then_touched_then_free(make):
     held, touched = make([True, True, False, False]), make([True, False, True, False])
-    assert floats(rewards.let_go(held, touched)) == [0, 0, 0.5, 1]
+    assert floats(rewards.release_fraction(held, touched)) == [0, 0, 0.5, 1]
 
 
 def test_calm_counts_both_velocities(make):
     linear = make([[0.0, 0, 0], [0, 0.15, 0], [0, 0, 0], [0.15, 0, 0], [3.0, 0, 0]])
     angular = make([[0.0, 0, 0], [0, 0, 0], [0, 0, 2.5], [1.25, 0, 0], [0, 0, 0]])
-    assert floats(rewards.calm(linear, angular)) == pytest.approx([1, 0.5, 0.5, 0.25, 0], abs=1e-6)
+    assert floats(rewards.stillness(linear, angular)) == pytest.approx([1, 0.5, 0.5, 0.25, 0], abs=1e-6)
 
 
 def test_penalties_are_shares(make):
-    assert floats(rewards.count_share(make([0, 1, 3, 7]))) == pytest.approx([0, 1 / 3, 1, 1])
+    assert floats(rewards.count_fraction(make([0, 1, 3, 7]))) == pytest.approx([0, 1 / 3, 1, 1])
     before = make([[1.0, 0, 0]] * 3)
     after = make([[1.0, 0, 0], [1.03, 0.04, 0], [0, 0, 0]])
-    assert floats(rewards.shift(after, before)) == pytest.approx([0, 0.5, 1], abs=1e-6)
+    assert floats(rewards.shift_fraction(after, before)) == pytest.approx([0, 0.5, 1], abs=1e-6)
     # all of two components to and fro; one of them by half
     actions, last = make([[1.0, -1.0], [0.5, 0]]), make([[-1.0, 1.0], [0.0, 0]])
     assert floats(rewards.action_rate(actions, last)) == pytest.approx([1, 0.125])
@@ -62,7 +62,7 @@ def test_penalties_are_shares(make):
 
 def test_the_furthest_stage_counts(make):
     held, over = make([False, True, False, True]), make([False, False, True, True])
-    assert rewards.furthest(make([0, 0, 0, 0]), [(held, 2), (over, 5)]).tolist() == [0, 2, 5, 5]
+    assert rewards.furthest_stage(make([0, 0, 0, 0]), [(held, 2), (over, 5)]).tolist() == [0, 2, 5, 5]
 
 
 TABLE = RewardTable({"near": {"reach": 2.0, "grasp": 1.0}, "far": {"carry": 4.0, "success": 1.0}}, {"shift": 0.25})
@@ -72,7 +72,7 @@ def test_weigh_by_hand(make):
     stage = make([0, 0, 1, 1, 2])
     terms = {name: make([0.5] * 5) for name in ("reach", "carry")} | {"grasp": make([0.0, 1, 0, 0, 0])}
     shift = {"shift": make([0.0, 0.4, 0.0, 1.0, 1.0])}
-    reward, counted = rewards.weigh(TABLE, stage, terms, shift)
+    reward, counted = rewards.weighted_reward(TABLE, stage, terms, shift)
     # 2 x 0.5; (2 x 0.5 + 1) x 0.9; 3 + 4 x 0.5; 3 + 4 x 0.5 x 0.75; all of it, whatever the penalty
     assert floats(reward) == pytest.approx([1, 1.8, 5, 4.5, 8])
     assert floats(counted["reach"]) == pytest.approx([0.5, 0.45, 1, 1, 1])
@@ -84,7 +84,7 @@ def test_weigh_by_hand(make):
 
 def test_a_success_is_worth_the_total_exactly(make):
     odd = RewardTable({"a": {"x": 0.1, "y": 0.7}, "b": {"z": 0.3}}, {"p": 0.5})
-    reward, _ = rewards.weigh(odd, make([2]), {}, {"p": make([1.0])})
+    reward, _ = rewards.weighted_reward(odd, make([2]), {}, {"p": make([1.0])})
     assert floats(reward / odd.total) == [1.0]
 
 
@@ -101,7 +101,7 @@ def test_a_later_stage_is_worth_at_least_what_any_earlier_one_is(name, data):
     def worth(stage: int) -> float:
         values = {term: np.array([data.draw(SHARES)], np.float32) for term in table.weights if term != "success"}
         taken = {term: np.array([data.draw(SHARES)], np.float32) for term in table.penalties}
-        reward, counted = rewards.weigh(table, np.array([stage]), values, taken)
+        reward, counted = rewards.weighted_reward(table, np.array([stage]), values, taken)
         assert all(0 <= term.item() <= 1 for term in counted.values())
         return (reward / table.total).item()
 

@@ -55,9 +55,9 @@ def test_the_target_of_a_heap_is_hidden_in_part(env):
     env.reset(seed=0)
     base = env.unwrapped
     layout = base.layout()
-    assert layout.visible_shares[layout.target] < base.task_config.target.max_visible_share
+    assert layout.visible_fractions[layout.target] < base.task_config.target.max_visible_share
     found = base.clutter()
-    assert found.hidden_share.shape == (1,)
+    assert found.hidden_fraction.shape == (1,)
     assert found.obstacles.shape == (1, 8)
     assert not bool(found.obstacles[0, layout.target])
 
@@ -69,7 +69,7 @@ def test_taking_the_others_away_clears_the_target_until_the_next_reset(env):
     assert not hold(env)
     take_away_the_others(base)
     assert hold(env)
-    assert base.hidden_share.tolist() == [0]
+    assert base.hidden_fraction.tolist() == [0]
     base.set_state(before)
     assert hold(env)  # sticky
     _, info = env.reset(seed=seed)
@@ -90,7 +90,7 @@ def test_the_heap_is_looked_at_five_times_a_second(env):
 
 
 def test_a_target_that_lies_clear_from_the_beginning_is_told_from_one_that_was_cleared(env, monkeypatch):
-    monkeypatch.setattr(occlusion.Clutter, "cleared", property(lambda found: found.hidden_share <= 1))
+    monkeypatch.setattr(occlusion.Clutter, "cleared", property(lambda found: found.hidden_fraction <= 1))
     _, info = env.reset(seed=0)
     assert bool(info["obstacles_cleared"][0])
     assert bool(info["cleared_at_reset"][0])
@@ -104,20 +104,20 @@ def test_a_target_that_lies_clear_from_the_beginning_is_told_from_one_that_was_c
 def test_a_restored_heap_is_looked_at_at_once(env):
     seed = covered_seed(env)
     base = env.unwrapped
-    before, share = base.get_state_dict(), base.hidden_share.clone()
+    before, share = base.get_state_dict(), base.hidden_fraction.clone()
     take_away_the_others(base)
     assert hold(env)
     cleared = base.get_state_dict()
     base.set_state_dict(before)
     info = base.get_info()
-    assert torch.equal(base.hidden_share, share)
+    assert torch.equal(base.hidden_fraction, share)
     assert not bool(info["obstacles_cleared"][0])
     env.reset(seed=seed)
     base.set_state_dict(cleared)
     info = base.get_info()
-    assert base.hidden_share.tolist() == [0]  # it is not looked at any more
+    assert base.hidden_fraction.tolist() == [0]  # it is not looked at any more
     base.set_state_dict({**cleared, "task": {"stages": cleared["task"]["stages"]}})  # what is missing stays
-    assert base.hidden_share.tolist() == [0]
+    assert base.hidden_fraction.tolist() == [0]
     assert bool(info["obstacles_cleared"][0])
     assert not bool(info["cleared_at_reset"][0])
 

@@ -15,7 +15,7 @@ from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.scenes.config import load_task_config
-from robocas_ms3.scenes.config.load import shipped_configs
+from robocas_ms3.scenes.config.load import bundled_configs
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.relations import MARGIN
 from robocas_ms3.scenes.sample import sample_layout
@@ -26,7 +26,7 @@ def load(name):
     return SceneModel.load(load_task_config(name), pack, pack)
 
 
-SELECT = sorted(name for name in shipped_configs() if name.startswith("select_"))
+SELECT = sorted(name for name in bundled_configs() if name.startswith("select_"))
 
 
 @pytest.mark.parametrize("name", [name for name in SELECT if load_task_config(name).target.relations])
@@ -97,7 +97,7 @@ def test_the_wrong_instance_in_the_basket_spoils_it():
     put(alike)
     found = base.evaluate()
     assert not bool(found["success"][0]) and bool(found["target_in_basket"][0])
-    assert [name for name, holds in base.target_measures().items() if not bool(holds[0])] == ["others_out"]
+    assert [name for name, holds in base.success_conditions().items() if not bool(holds[0])] == ["others_out"]
     env.close()
 
 

@@ -14,8 +14,8 @@ from robocas_ms3.cli.layouts import Build, build
 from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.scenes import cache
 from robocas_ms3.scenes.layout import read_layout
-from robocas_ms3.scenes.layout_table import State
-from robocas_ms3.tasks.initial_states import Starts
+from robocas_ms3.scenes.layout_table import LayoutStatus
+from robocas_ms3.tasks.initial_states import InitialStates
 
 STATE_ONLY = {"render_backend": "none", "control_mode": "pd_joint_pos", "obs_mode": "none"}
 
@@ -41,16 +41,16 @@ def tabled(built, tmp_path, monkeypatch):
     return tmp_path
 
 
-def assert_same(one: Starts, two: Starts) -> None:
-    for field in fields(Starts):
+def assert_same(one: InitialStates, two: InitialStates) -> None:
+    for field in fields(InitialStates):
         torch.testing.assert_close(getattr(one, field.name), getattr(two, field.name), atol=1e-6, rtol=0)
 
 
 def test_several_envs_reset_from_a_table_built_for_them(tabled, monkeypatch):
     env, asked = several(tabled, monkeypatch, seeds=(0, 1))
     everyone = np.arange(4)
-    one_by_one = Starts.of([env.layout(i) for i in range(4)], "cpu")
-    assert_same(env.seeds.find_starts(everyone, env.device), one_by_one)
+    one_by_one = InitialStates.of([env.layout(i) for i in range(4)], "cpu")
+    assert_same(env.seeds.find_initial_states(everyone, env.device), one_by_one)
     assert asked == [[(0, 0), (1, 1), (0, 0), (1, 1)]]
     for _ in range(20):
         env.reset()
@@ -58,19 +58,21 @@ def test_several_envs_reset_from_a_table_built_for_them(tabled, monkeypatch):
     assert all([objects for objects, _ in one] == [0, 1, 0, 1] for one in asked)
     env.reset(options={"env_idx": torch.tensor([2])})
     assert [objects for objects, _ in asked[-1]] == [0]
-    assert_same(env.seeds.find_starts(np.array([2]), env.device), Starts.of([env.layout(2)], "cpu"))
+    assert_same(env.seeds.find_initial_states(np.array([2]), env.device), InitialStates.of([env.layout(2)], "cpu"))
     assert env.layouts[0].object_ids == env.seeds.object_ids[2] == env.seeds.object_ids[0] != env.seeds.object_ids[1]
 
 
 def test_what_moves_where_it_would_run_is_drawn_no_more_and_an_error_where_it_is_asked_for(tabled, monkeypatch):
     env, _ = several(tabled, monkeypatch, num_envs=2, seeds=(0, 2))
     layouts: Any = env.seeds.layouts
-    layouts.mark_table("gpu", {(0, 1): State.MOVES, (1, 1): State.MOVES, (1, 2): State.STAYS})
+    layouts.write_statuses(
+        "gpu", {(0, 1): LayoutStatus.UNSTABLE, (1, 1): LayoutStatus.UNSTABLE, (1, 2): LayoutStatus.STABLE}
+    )
     env, _ = several(tabled, monkeypatch, num_envs=2, seeds=(0, 2))
     assert env.seeds.objects_seeds.tolist() == [0, 1]  # env 1 keeps its objects, and begins with another layout of them
     for _ in range(20):
         env.reset()
-        assert env.seeds.find_starts(np.arange(2), env.device).targets.shape == (2,)
+        assert env.seeds.find_initial_states(np.arange(2), env.device).targets.shape == (2,)
         assert 1 not in env.seeds.layout_seeds
     with pytest.raises(LayoutError, match="objects seed 0, seed 1: objects move as soon as this engine runs"):
         env.reset(seed=[1, 0])
@@ -79,13 +81,13 @@ def test_what_moves_where_it_would_run_is_drawn_no_more_and_an_error_where_it_is
 def test_many_layouts_may_move_and_all_of_some_objects(tabled, monkeypatch, caplog):
     env, _ = several(tabled, monkeypatch, num_envs=2, seeds=(0, 2))
     layouts: Any = env.seeds.layouts
-    layouts.mark_table("gpu", {pair: State.MOVES for pair in [(0, 0), (0, 2), (1, 0), (1, 1), (1, 2)]})
+    layouts.write_statuses("gpu", {pair: LayoutStatus.UNSTABLE for pair in [(0, 0), (0, 2), (1, 0), (1, 1), (1, 2)]})
     for _ in range(10):
         env, _ = several(tabled, monkeypatch, num_envs=2, seeds=(0, 1))
         assert env.seeds.objects_seeds.tolist() == [0, 0]
         for _ in range(10):
             env._set_episode_rng(None, torch.tensor([0, 1]))
-            assert env.seeds.find_starts(np.arange(2), env.device).targets.shape == (2,)
+            assert env.seeds.find_initial_states(np.arange(2), env.device).targets.shape == (2,)
             assert env.seeds.layout_seeds.tolist() == [1, 1]
     assert not [record for record in caplog.records if record.levelname == "WARNING"]
 
@@ -93,7 +95,7 @@ def test_many_layouts_may_move_and_all_of_some_objects(tabled, monkeypatch, capl
 def test_a_reset_that_is_refused_leaves_the_envs_as_they_were(tabled, monkeypatch):
     env, _ = several(tabled, monkeypatch, num_envs=2, seeds=(0, 2))
     layouts: Any = env.seeds.layouts
-    layouts.mark_table("gpu", {(0, 1): State.MOVES})
+    layouts.write_statuses("gpu", {(0, 1): LayoutStatus.UNSTABLE})
     env, _ = several(tabled, monkeypatch, num_envs=2, seeds=(0, 2))
     env.reset(seed=[2, 0])
     before = [env.layout(i).object_poses for i in range(2)]
@@ -102,7 +104,7 @@ def test_a_reset_that_is_refused_leaves_the_envs_as_they_were(tabled, monkeypatc
             env.reset(seed=[1, 2])
     assert env.seeds.layout_seeds.tolist() == [2, 0]
     np.testing.assert_array_equal([env.layout(i).object_poses for i in range(2)], before)
-    layouts.mark_table("gpu", {(0, 1): State.STAYS})
+    layouts.write_statuses("gpu", {(0, 1): LayoutStatus.STABLE})
     env.reset(options={"reconfigure": True}, seed=[0, 1])
     env.reset(seed=[1, 2])  # nothing is remembered of what it was
 
@@ -114,19 +116,19 @@ def test_where_a_table_lacks_layouts_the_bank_makes_them(built, tmp_path, monkey
     env, _ = several(tmp_path, monkeypatch, num_envs=2, seeds=(0, 1))
     env.reset(seed=[1, 7])
     assert env.seeds.table is not None
-    assert env.seeds.table.state((1, 7)) == State.LACKING
-    found = env.seeds.find_starts(np.array([0, 1]), env.device)
-    assert_same(found, Starts.of([env.seeds.layouts(0, 1), env.seeds.layouts(1, 7)], "cpu"))
+    assert env.seeds.table.state((1, 7)) == LayoutStatus.MISSING
+    found = env.seeds.find_initial_states(np.array([0, 1]), env.device)
+    assert_same(found, InitialStates.of([env.seeds.layouts(0, 1), env.seeds.layouts(1, 7)], "cpu"))
 
 
 def test_one_env_that_keeps_its_objects_resets_from_a_table(built, monkeypatch):
     monkeypatch.setattr(cache, "sample_layout", None)
     made = gym.make("RoboCASPick-v1", layouts=built, reconfiguration_freq=0, seeds=(0, 2), **STATE_ONLY)
     env: Any = made.unwrapped
-    assert env.seeds.tabled is not None
+    assert env.seeds.initial_state_table is not None
     for seed in (2, 0):
         made.reset(seed=seed)
         wanted = read_layout(env.seeds.layouts.path(env.seeds.objects_seeds[0], seed))
-        torch.testing.assert_close(env.object_poses, Starts.of([wanted], "cpu").object_poses, atol=1e-6, rtol=0)
+        torch.testing.assert_close(env.object_poses, InitialStates.of([wanted], "cpu").object_poses, atol=1e-6, rtol=0)
         assert int(env.target_slot) == wanted.target
     made.close()

@@ -40,14 +40,14 @@ def test_inside_box_follows_the_frame(make):
     points = make([[1.15, 0, 0.1], [1.15, 0, 0.1], [1.0, 0.15, 0.1], [1.0, 0, -0.01]])
     position = make([[1.0, 0, 0]] * 4)
     quaternion = make([UPRIGHT, YAW_90, YAW_90, UPRIGHT])
-    assert terms.inside_box(points, position, quaternion, low, high).tolist() == [True, False, True, False]
+    assert terms.is_inside_box(points, position, quaternion, low, high).tolist() == [True, False, True, False]
 
 
 def test_inside_box_of_several_objects_an_env(make):
     low, high = make([-0.2, -0.1, 0.0]), make([0.2, 0.1, 0.3])
     points = make([[[1.15, 0, 0.1], [1.0, 0.15, 0.1], [0.85, 0.05, 0.2]]] * 2)
     position, quaternion = make([[1.0, 0, 0]] * 2), make([UPRIGHT, YAW_90])
-    inside = terms.inside_box(points, position, quaternion, low, high)
+    inside = terms.is_inside_box(points, position, quaternion, low, high)
     assert inside.tolist() == [[True, False, True], [False, True, False]]
 
 
@@ -55,7 +55,7 @@ def test_another_of_its_kind_is_neither_the_target_nor_of_another_kind(make):
     kinds = make([[0, 0, 2, 2], [0, 1, 0, 1], [0, 0, 2, 2]])
     marked = make([[True, False, True, True], [False, True, True, False], [True, False, False, True]])
     target = make([0, 0, 1])
-    assert terms.another_of_its_kind(marked, kinds, target).tolist() == [False, True, True]
+    assert terms.is_any_other_of_kind(marked, kinds, target).tolist() == [False, True, True]
 
 
 def test_finger_grasps_needs_both_fingers_pressed_apart(make):
@@ -63,13 +63,13 @@ def test_finger_grasps_needs_both_fingers_pressed_apart(make):
     left = make([[[0, 2.0, 0], [0, 2.0, 0], [0, 0.4, 0], [0, -2.0, 0], [3.0, 0.1, 0]]])
     right = make([[[0, -2.0, 0], [0, 0.0, 0], [0, -2.0, 0], [0, 2.0, 0], [-3.0, -0.1, 0]]])
     # held; one finger only; too weak on the left; pulled inwards; 88 degrees off the closing axis
-    assert terms.finger_grasps(left, right, closing).tolist() == [[True, False, False, False, False]]
+    assert terms.is_grasped(left, right, closing).tolist() == [[True, False, False, False, False]]
 
 
 def test_pressed_asks_for_both_fingers_but_no_direction(make):
     left = make([[[0, 2.0, 0], [0, 2.0, 0], [0, -2.0, 0]]])
     right = make([[[3.0, 0, 0], [0, 0.4, 0], [0, 0.0, 0]]])
-    assert terms.pressed(left, right).tolist() == [[True, False, False]]
+    assert terms.is_pressed(left, right).tolist() == [[True, False, False]]
 
 
 @pytest.mark.parametrize(("degrees", "shift", "expected"), [(29.0, 0.0, False), (31.0, 0.0, True), (0.0, 0.031, True)])
@@ -77,25 +77,25 @@ def test_disturbed_is_moved_or_fallen_over(make, degrees, shift, expected):
     half = math.radians(degrees) / 2
     start = make([[[1.0, 2.0, 3.0, *UPRIGHT]]])
     now = make([[[1.0 + shift, 2.0, 3.0, math.cos(half), 0, math.sin(half), 0]]])
-    assert terms.disturbed(now, start).tolist() == [[expected]]
+    assert terms.is_disturbed(now, start).tolist() == [[expected]]
 
 
 def test_disturbed_goes_with_what_objects_stand_on(make):
     start = make([[[1.0, 0, 0, *UPRIGHT], [1.0, 0, 0, *UPRIGHT]]])
     now = make([[[0.0, 1.0, 0, *YAW_90], [1.0, 0, 0, *UPRIGHT]]])  # the first went along, the second did not
     back = make([[[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]]), make([[0.0, 0, 0]])
-    assert terms.disturbed(now, start, back).tolist() == [[False, True]]
+    assert terms.is_disturbed(now, start, back).tolist() == [[False, True]]
 
 
 def test_a_drawer_is_brought_back(make):
     # a cabinet at (1, 2, 0), facing y; its drawer was 0.5 m along the cabinet's own x, and is out by another 0.2 m
     body, part = make([[1.0, 2, 0, *YAW_90]]), make([[1.0, 2.7, 0, *YAW_90]])
     before = make([[1.0, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-    turn, shift = terms.way_back(body, part, before)
+    turn, shift = terms.inverse_motion(body, part, before)
     assert abs(turn[0] - make([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])).max() < 1e-6
     assert abs(shift[0] - make([0.0, -0.2, 0])).max() < 1e-6
     # a door at the origin that has turned by 90 degrees about its hinge at (1, 0, 0)
-    turn, shift = terms.way_back(make([[0.0, 0, 0, *UPRIGHT]]), make([[1.0, 0, 0, *YAW_90]]), make(hinge_at_1()))
+    turn, shift = terms.inverse_motion(make([[0.0, 0, 0, *UPRIGHT]]), make([[1.0, 0, 0, *YAW_90]]), make(hinge_at_1()))
     on_the_door = turn[0] @ make([1.0, 0.4, 0]) + shift[0]
     assert abs(on_the_door - make([1.4, 0, 0])).max() < 1e-6
 
@@ -108,18 +108,18 @@ def test_touched_is_any_body(make):
     forces = torch.zeros(2, 3, 4, 3)
     forces[0, 2, 1, 0] = 0.5
     forces[1, 0, 3, 2] = 1e-4  # noise
-    assert terms.touched(make(forces)).tolist() == [[False, True, False, False], [False] * 4]
+    assert terms.is_touched(make(forces)).tolist() == [[False, True, False, False], [False] * 4]
 
 
 def test_lifted_needs_height_and_grasp(make):
     height, rest = make([[0.65, 0.65, 0.62]]), make([[0.61, 0.61, 0.61]])
-    assert terms.lifted(height, rest, make([[True, False, True]])).tolist() == [[True, False, False]]
+    assert terms.is_lifted(height, rest, make([[True, False, True]])).tolist() == [[True, False, False]]
 
 
 def test_at_rest_limits_both_velocities(make):
     linear = make([[0.02, 0, 0], [0.04, 0, 0], [0, 0, 0]])
     angular = make([[0.1, 0, 0], [0, 0, 0], [0, 0, 0.6]])
-    assert terms.at_rest(linear, angular).tolist() == [True, False, False]
+    assert terms.is_at_rest(linear, angular).tolist() == [True, False, False]
 
 
 @pytest.mark.parametrize("degrees", [0.0, 19.9, 20.1, 90.0, 180.0])
@@ -127,19 +127,19 @@ def test_basket_stands_up_to_20_degrees(make, degrees):
     half = math.radians(degrees) / 2
     tilted = make([[math.cos(half), math.sin(half), 0, 0]])
     upright, origin = make([UPRIGHT]), make([[0.0, 0, 0]])
-    assert terms.stands(origin, tilted, origin, upright).item() is (degrees <= 20)
+    assert terms.is_basket_standing(origin, tilted, origin, upright).item() is (degrees <= 20)
 
 
 def test_basket_stands_up_to_10_cm_and_may_turn(make):
     upright, turned = make([UPRIGHT]), make([YAW_90])
-    assert terms.stands(make([[0.06, 0.06, 0]]), turned, make([[0.0, 0, 0]]), upright).all()
-    assert not terms.stands(make([[0.08, 0.08, 0]]), upright, make([[0.0, 0, 0]]), upright).any()
+    assert terms.is_basket_standing(make([[0.06, 0.06, 0]]), turned, make([[0.0, 0, 0]]), upright).all()
+    assert not terms.is_basket_standing(make([[0.08, 0.08, 0]]), upright, make([[0.0, 0, 0]]), upright).any()
 
 
 def test_a_target_fell_off_below_what_it_stood_on_beside_the_basket_and_out_of_the_gripper(make):
     height = make([0.57, 0.54, 0.54, 0.54])  # of a surface at 0.6
     above, touched = make([False, False, True, False]), make([False, False, False, True])
-    assert terms.fell_off(height, 0.6, above, touched).tolist() == [False, True, False, False]
+    assert terms.has_target_fallen(height, 0.6, above, touched).tolist() == [False, True, False, False]
 
 
 @pytest.mark.parametrize(("degrees", "drop", "expected"), [(59, 0.09, False), (61, 0.0, True), (0, 0.11, True)])
@@ -147,9 +147,9 @@ def test_a_basket_has_fallen_when_it_lies_or_lies_lower(make, degrees, drop, exp
     half = math.radians(degrees) / 2
     tilted, upright = make([[math.cos(half), math.sin(half), 0, 0]]), make([UPRIGHT])
     at, before = make([[0.5, 0, 0.7 - drop]]), make([[0.0, 0, 0.7]])
-    assert terms.fell_over(at, tilted, before, upright).tolist() == [expected]
+    assert terms.has_basket_fallen(at, tilted, before, upright).tolist() == [expected]
 
 
 def test_of_target_picks_one_slot_per_env(make):
     values = make([[0, 1, 2], [3, 4, 5]])
-    assert terms.of_target(values, make([2, 0])).tolist() == [2, 3]
+    assert terms.select_target(values, make([2, 0])).tolist() == [2, 3]

@@ -29,7 +29,13 @@ from robocas_ms3.datasets.checks.scene import valid_values
 from robocas_ms3.datasets.images.image_files import Box
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.demos.recordings.subgoals import SubGoal
-from robocas_ms3.scenes.language.instructions import InstructionSlots, instruction, is_plural, part_name, template_ids
+from robocas_ms3.scenes.language.instructions import (
+    InstructionSlots,
+    is_plural,
+    make_instruction,
+    part_name,
+    template_ids,
+)
 
 PERSISTENT, EVENTS = "language_persistent", "language_events"
 Row = dict[str, Any]
@@ -91,7 +97,7 @@ def paraphrases(scene: Mapping[str, Any], text: str) -> list[str]:
         slots = InstructionSlots(
             task, target["name"], recorded["support"], relation=recorded.get("relation") or None, part=part
         )
-        texts = [instruction(slots, template).text for template in template_ids(task, "train")]
+        texts = [make_instruction(slots, template).text for template in template_ids(task, "train")]
     except (RobocasError, LookupError, AttributeError, TypeError):  # another version's task, relation or configuration
         return []
     return list(dict.fromkeys([text, *texts])) if texts else []

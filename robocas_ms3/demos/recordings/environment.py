@@ -20,7 +20,7 @@ from robocas_ms3.core.errors import DatasetError, ExtensionError
 from robocas_ms3.core.strict_model import StrictModel, list_invalid_values
 from robocas_ms3.robots.cameras import CameraSpec
 from robocas_ms3.robots.registry import RobotSpec, find_robot
-from robocas_ms3.scenes.config.load import load_config_of, shipped_configs
+from robocas_ms3.scenes.config.load import bundled_configs, load_config_for
 from robocas_ms3.scenes.task_specs import TASKS, TaskSpec
 
 _PREFIX = "robocas_ms3:"  # lets gymnasium import this package by itself: ManiSkill's own tools then work
@@ -91,13 +91,13 @@ class RecordedEnv:
 
     def cameras(self) -> tuple[CameraSpec, ...]:
         """Return the cameras of its task and robot; raises ``DatasetError`` if what it names is not installed."""
-        return load_config_of(self._task(), self.kwargs.get("config")).cameras_of(self.robot().description)
+        return load_config_for(self._task(), self.kwargs.get("config")).cameras_of(self.robot().description)
 
     def _task(self) -> TaskSpec:
         known, config = {spec.env_id: spec for spec in TASKS.values()}, self.kwargs.get("config")
         if self.env_id not in known:
             raise DatasetError("no such task", where="env_id", expected=f"one of {sorted(known)}", found=self.env_id)
-        if isinstance(config, str) and config not in shipped_configs():
+        if isinstance(config, str) and config not in bundled_configs():
             raise DatasetError("no such configuration", where="config", expected="a shipped one", found=config)
         return known[self.env_id]
 

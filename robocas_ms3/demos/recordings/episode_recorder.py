@@ -65,7 +65,7 @@ class EpisodeRecorder(gym.Wrapper):
     def _keep(self, observation: Any) -> None:
         steps = self._steps
         steps.states.append(self._base_env.bodies.read()[0].cpu().numpy())
-        steps.beside_bodies.append(_of_one_env(self._base_env.state_beside_bodies()))
+        steps.beside_bodies.append(_of_one_env(self._base_env.extra_state()))
         steps.observations.append(_of_one_env(observation))
 
     @property

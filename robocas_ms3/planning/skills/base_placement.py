@@ -20,16 +20,22 @@ from robocas_ms3.planning.skills.drive import (
     arm_base_in_world,
     base_at,
     best_route,
-    body_is_free,
     drive,
     free_route,
+    is_body_clear,
     places_before,
     surroundings,
 )
 from robocas_ms3.planning.skills.grasp import grasp
 from robocas_ms3.planning.skills.handles import Part, open_part, pull_share
 from robocas_ms3.planning.skills.place import attach_held, carry_to_basket, drop_poses, release_into_basket
-from robocas_ms3.scenes.grasp_checks import HALF_TURN, NEIGHBOURHOOD, PREGRASP_DISTANCE, directions_ok, gripper_is_clear
+from robocas_ms3.scenes.grasp_checks import (
+    HALF_TURN,
+    NEIGHBOURHOOD,
+    PREGRASP_DISTANCE,
+    check_directions,
+    is_gripper_clear,
+)
 
 KINDS = 4  # of grasps that attempts take one after the other
 PLACES = 3  # to do one thing from
@@ -105,7 +111,7 @@ def drive_to_handle(arm: Arm, *, elsewhere: bool = False) -> None:
 
     def share(goal: Array) -> float:
         frame = arm_base_in_world(arm, goal)
-        if not body_is_free(arm.robot, frame, swept):  # what opens would run into it
+        if not is_body_clear(arm.robot, frame, swept):  # what opens would run into it
             return 0.0
         return pull_share(arm, part, frame, seen_from(others, frame))
 
@@ -176,10 +182,10 @@ def clear_grasps(arm: Arm, slot: int) -> Array:
     object_in_world = base @ object_in_base
     notes = arm.env.object_assets[0][slot].annotations
     poses = object_in_world @ notes.grasps_tcp_in_object[:: max(1, len(notes.grasp_widths) // GRASPS_LOOKED_AT)]
-    tests = directions_ok(poses, np.ones(3), arm.approach)
+    tests = check_directions(poses, np.ones(3), arm.approach)
     poses = poses[np.all([passed for name, passed in tests.items() if name != SIDE], axis=0)]
     near = arm.scene.obstacles_in_base(without=slot, radius=NEIGHBOURHOOD, around=object_in_base[:3, 3])
-    return poses[gripper_is_clear(poses, transform_points(base, near))]
+    return poses[is_gripper_clear(poses, transform_points(base, near))]
 
 
 def reach_share(arm: Arm, base: Array, grasps: Array, others: list[Obstacle], *, thorough: bool = False) -> float:
@@ -215,4 +221,4 @@ def _poses_of_some(arm: Arm, frame: Array, grasps: Array, count: int) -> Array:
 
 def _from_here(arm: Arm, frame: Array, grasps: Array) -> Array:
     center = grasps[:, :3, 3].mean(axis=0) if len(grasps) else np.zeros(3)
-    return grasps[directions_ok(grasps, center - frame[:3, 3], arm.approach)[SIDE]]
+    return grasps[check_directions(grasps, center - frame[:3, 3], arm.approach)[SIDE]]

@@ -92,7 +92,7 @@ def best_route(
     best: tuple[float, list[Array]] = (0.0, [])
     tried = 0
     for goal in goals:
-        if not body_is_free(arm.robot, arm_base_in_world(arm, goal), around.cloud):
+        if not is_body_clear(arm.robot, arm_base_in_world(arm, goal), around.cloud):
             continue
         tried += 1
         if tried > TRIED:
@@ -133,7 +133,7 @@ def _leg_is_free(arm: Arm, start: Array, goal: Array, around: Surroundings) -> b
     width = arm.planner.finger_width
     for pose in np.linspace(start, goal, count)[1:]:
         frame = arm_base_in_world(arm, pose)
-        if not body_is_free(arm.robot, frame, around.cloud):
+        if not is_body_clear(arm.robot, frame, around.cloud):
             return False
         arm.planner.set_scene(seen_from(around.obstacles, frame))
         if arm.planner.collisions(arm.at, width):
@@ -141,8 +141,8 @@ def _leg_is_free(arm: Arm, start: Array, goal: Array, around: Surroundings) -> b
     return True
 
 
-def body_is_free(robot: RobotDescription, arm_base_in_world: Array, cloud: Array) -> bool:
+def is_body_clear(robot: RobotDescription, arm_base_in_world: Array, cloud: Array) -> bool:
     """Whether none of the points (P, 3), world, is where the body on the floor would be."""
     root = arm_base_in_world.copy()
     root[2, 3] -= robot.arm_base_height  # on the floor
-    return robot_placement.body_is_free(root, cloud)
+    return robot_placement.is_body_clear(root, cloud)

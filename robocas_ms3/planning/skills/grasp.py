@@ -17,7 +17,7 @@ from robocas_ms3.planning.grasp_choice import draw_order, filter_grasps, grip_ma
 from robocas_ms3.planning.protocol import Array, AttachedBody, Trajectory
 from robocas_ms3.planning.scene import SPACING
 from robocas_ms3.planning.skills.arm import ROOM, Arm, moved_back, raised
-from robocas_ms3.scenes.grasp_checks import NEIGHBOURHOOD, PREGRASP_DISTANCE, gripper_is_clear
+from robocas_ms3.scenes.grasp_checks import NEIGHBOURHOOD, PREGRASP_DISTANCE, is_gripper_clear
 
 GRASPS_CHECKED = 48  # grasps of which a check of collisions says whether to try them early
 CLEARED_AT_ONCE = 12
@@ -156,7 +156,7 @@ def _clear(tcp_in_base: Array, order: NDArray[np.int_], points_in_base: Array) -
     """Yield the grasps, in their order, whose gripper meets no point on its way in; a few are tested at a time."""
     for first in range(0, len(order), CLEARED_AT_ONCE):
         some = order[first : first + CLEARED_AT_ONCE]
-        yield from some[gripper_is_clear(tcp_in_base[some], points_in_base)].tolist()
+        yield from some[is_gripper_clear(tcp_in_base[some], points_in_base)].tolist()
 
 
 def _plan_way_in_and_out(

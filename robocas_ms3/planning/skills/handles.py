@@ -23,7 +23,7 @@ from robocas_ms3.planning.skills.arm import Arm, first_plan, moved_back, plan_st
 from robocas_ms3.planning.time_parameterization import through, timed
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.scenes.grasp_checks import HALF_TURN
-from robocas_ms3.scenes.lookup import OPENED_AT_MOST
+from robocas_ms3.scenes.lookup import MAX_OPENED_FRACTION
 from robocas_ms3.tasks import terms
 from robocas_ms3.tasks.bodies import contact_forces
 from robocas_ms3.tasks.open_pick import RoboCASOpenPickEnv
@@ -73,7 +73,7 @@ class Part:
 
     def way(self, arm: Arm) -> Array:
         """Return joint positions (T,) of a pull, from the present one to the greatest at which a pull ends."""
-        start, far = self.position(arm), OPENED_AT_MOST[self.joint.kind] * self.end
+        start, far = self.position(arm), MAX_OPENED_FRACTION[self.joint.kind] * self.end
         left = (far - start) * np.sign(far)
         if left < STEP[self.joint.kind]:
             raise PlanningError("pull", "at_the_end")
@@ -112,7 +112,7 @@ class Part:
         left, right = env.agent.finger1_link, env.agent.finger2_link
         forces = contact_forces(env.scene, [left, right], [link])
         closing = left.pose.to_transformation_matrix()[:, :3, 1]
-        return bool(terms.finger_grasps(forces[:, 0], forces[:, 1], closing)[0, 0])
+        return bool(terms.is_grasped(forces[:, 0], forces[:, 1], closing)[0, 0])
 
 
 def open_part(arm: Arm) -> None:

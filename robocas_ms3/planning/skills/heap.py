@@ -12,10 +12,10 @@ from robocas_ms3.core.errors import PlanningError, UnrecoverableError
 from robocas_ms3.planning.executor import OPEN
 from robocas_ms3.planning.protocol import Array
 from robocas_ms3.planning.skills.arm import Arm
-from robocas_ms3.planning.skills.look import hidden_share
+from robocas_ms3.planning.skills.look import hidden_fraction
 from robocas_ms3.planning.skills.push import push_away, surface_in_base
 from robocas_ms3.planning.skills.remove import blockers, clear_grasps, remove
-from robocas_ms3.tasks.occlusion import MAX_HIDDEN_SHARE
+from robocas_ms3.tasks.occlusion import MAX_HIDDEN_FRACTION
 from robocas_ms3.tasks.search import RoboCASSearchEnv
 from robocas_ms3.tasks.terms import FALLEN
 
@@ -61,7 +61,7 @@ class Heap:
     def visible(self) -> bool:
         """Whether the gripper's camera sees most of the target."""
         with self.arm.planning():
-            return hidden_share(self.arm, self.target) <= MAX_HIDDEN_SHARE
+            return hidden_fraction(self.arm, self.target) <= MAX_HIDDEN_FRACTION
 
     @property
     def uncovered(self) -> bool:
@@ -117,8 +117,8 @@ class Heap:
         """Return the time that the remaining obstacles may take, s."""
         with self.arm.planning():
             clutter = self.env.clutter()
-            hidden, obstacles = float(clutter.hidden_share[0]), int(clutter.obstacles[0].sum())
-            work = PER_OBSTACLE * max(0, obstacles - 1) + PER_HIDDEN_SHARE * max(0.0, hidden - MAX_HIDDEN_SHARE)
+            hidden, obstacles = float(clutter.hidden_fraction[0]), int(clutter.obstacles[0].sum())
+            work = PER_OBSTACLE * max(0, obstacles - 1) + PER_HIDDEN_SHARE * max(0.0, hidden - MAX_HIDDEN_FRACTION)
             return work + NO_GRASP * (not clear_grasps(self.arm, self.target))
 
     def check_surface(self) -> None:

@@ -12,7 +12,7 @@ from robocas_ms3.planning.protocol import Array, Trajectory
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.robots.cameras import CameraSpec
 from robocas_ms3.scenes.randomise import draw_camera_shift
-from robocas_ms3.scenes.visibility import PinholeCamera, Scenery, object_mesh, ray_scene
+from robocas_ms3.scenes.visibility import MeshScene, PinholeCamera, object_mesh, ray_scene
 
 FAR, NEAR = (0.4, 0.5), (0.2, 0.3)  # m from the camera to what it looks at: at first; between two removals (upstream's)
 ELEVATION_DEG = (60.0, 90.0)  # of the camera above what it looks at (upstream's)
@@ -54,7 +54,7 @@ def prepare_looks(arm: Arm) -> None:
             ray_scene(object_mesh(asset))
 
 
-def hidden_share(arm: Arm, slot: int) -> float:
+def hidden_fraction(arm: Arm, slot: int) -> float:
     """Return the share of an object that other objects hide from the gripper's camera; 1 where it is out of view.
 
     By ray casting, so that no renderer is needed; the robot is left out.
@@ -66,8 +66,8 @@ def hidden_share(arm: Arm, slot: int) -> float:
     camera = PinholeCamera(pose, config.width // scale, config.height // scale, float(config.fov or np.pi / 2))
     slots = np.flatnonzero(env.present[0].cpu().numpy()).tolist()
     poses = np.stack([arm.scene.arm_base_in_world @ arm.scene.object_in_base(s) for s in slots])
-    scenery = Scenery([object_mesh(env.object_assets[0][s]) for s in slots], poses)
-    share = float(scenery.visible_shares(camera)[slots.index(slot)])
+    scenery = MeshScene([object_mesh(env.object_assets[0][s]) for s in slots], poses)
+    share = float(scenery.visible_fractions(camera)[slots.index(slot)])
     return 1.0 if np.isnan(share) else 1.0 - share
 
 

@@ -154,7 +154,7 @@ def _ways_off(tcp_in_base: Array) -> list[Array]:
 
 
 def _why_not(arm: Arm) -> str:
-    for measure, reached in arm.env.target_measures().items():
+    for measure, reached in arm.env.success_conditions().items():
         if not bool(reached[0]):
             return f"not_{measure}"
     return "unstable"

@@ -17,7 +17,7 @@ from robocas_ms3.planning.skills.arm import Arm, first_plan, moved_back, plan_st
 from robocas_ms3.planning.skills.grasp import grasp
 from robocas_ms3.planning.skills.place import attach_held
 from robocas_ms3.planning.skills.push import surface_in_base
-from robocas_ms3.scenes.grasp_checks import MAX_WIDTH, directions_ok, gripper_is_clear
+from robocas_ms3.scenes.grasp_checks import MAX_WIDTH, check_directions, is_gripper_clear
 
 GRID = 0.04  # m between places tried
 TURNS = 8  # of the object about the vertical
@@ -68,7 +68,7 @@ def clear_grasps(arm: Arm, slot: int) -> int:
     """Return how many of an object's (sampled) grasps from above are clear."""
     grasps = _grasps_from_above(arm, slot)
     near = arm.scene.obstacles_in_base(without=slot)
-    return int(gripper_is_clear(grasps, near).sum())
+    return int(is_gripper_clear(grasps, near).sum())
 
 
 def blockers(arm: Arm, slot: int) -> list[int]:
@@ -76,7 +76,7 @@ def blockers(arm: Arm, slot: int) -> list[int]:
     grasps, in_the_way = _grasps_from_above(arm, slot), {}
     for other, used in enumerate(arm.env.present[0].tolist()):
         if used and other != slot:
-            in_the_way[other] = ~gripper_is_clear(grasps, arm.scene.object_surface(other))
+            in_the_way[other] = ~is_gripper_clear(grasps, arm.scene.object_surface(other))
     count = np.sum(list(in_the_way.values()), axis=0)
     score = {other: float(np.sum(blocked / np.maximum(count, 1) ** 2)) for other, blocked in in_the_way.items()}
     return sorted((other for other in score if score[other] > 0), key=lambda other: -score[other])
@@ -85,7 +85,7 @@ def blockers(arm: Arm, slot: int) -> list[int]:
 def _grasps_from_above(arm: Arm, slot: int) -> Array:
     notes, frame = arm.env.object_assets[0][slot].annotations, arm.scene.object_in_base(slot)
     grasps = frame @ notes.grasps_tcp_in_object
-    passed = np.logical_and.reduce(list(directions_ok(grasps, frame[:3, 3]).values()))
+    passed = np.logical_and.reduce(list(check_directions(grasps, frame[:3, 3]).values()))
     grasps = grasps[passed & (notes.grasp_widths <= MAX_WIDTH)]
     # evenly spread, not drawn: a look must not change what comes after it
     return grasps[np.linspace(0, len(grasps) - 1, min(len(grasps), GRASPS_LOOKED_AT)).astype(int)]

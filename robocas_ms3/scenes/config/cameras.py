@@ -66,7 +66,9 @@ def _check_names(cameras: dict[str, CameraConfig]) -> dict[str, CameraConfig]:
 CamerasConfig = Annotated[dict[str, CameraConfig], AfterValidator(_check_names)]
 
 
-def changed_cameras(cameras: tuple[CameraSpec, ...], changes: list[tuple[str, CameraConfig]]) -> tuple[CameraSpec, ...]:
+def apply_camera_changes(
+    cameras: tuple[CameraSpec, ...], changes: list[tuple[str, CameraConfig]]
+) -> tuple[CameraSpec, ...]:
     """Return cameras with changes, and the further ones, in this order.
 
     Raises:

@@ -24,12 +24,12 @@ _SUFFIXES = (".yaml", ".yml")
 _log = logging.getLogger(__name__)
 
 
-def shipped_configs() -> dict[str, Path]:
+def bundled_configs() -> dict[str, Path]:
     """Return name -> file of the configurations that are part of the package."""
     return {path.stem: path for path in sorted(task_configs_dir().glob("*.yaml"))}
 
 
-def load_config_of(spec: TaskSpec, config: str | Path | dict | TaskConfig | None = None) -> TaskConfig:
+def load_config_for(spec: TaskSpec, config: str | Path | dict | TaskConfig | None = None) -> TaskConfig:
     """Load a configuration of a task; see `load_task_config`.
 
     Args:
@@ -85,7 +85,7 @@ def load_task_config(
     return parsed
 
 
-def check_no_base(path: Path) -> None:
+def check_no_extends(path: Path) -> None:
     """Check that a file of a frozen protocol has no base, on which it would depend."""
     try:
         text = read_text(path, YAML_LIMIT)
@@ -156,7 +156,7 @@ def _read(path: Path) -> dict[Any, Any]:
 
 def _find(config: str | Path, folder: Path | None = None, where: str = "") -> Path:
     """Return the file of a name or path, which is relative to a folder where one is given."""
-    shipped, name = shipped_configs(), str(config)
+    shipped, name = bundled_configs(), str(config)
     if name in shipped:
         return shipped[name]
     path = Path(config) if folder is None else folder / config

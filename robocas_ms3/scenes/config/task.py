@@ -11,7 +11,7 @@ from robocas_ms3.core.extensions import load_object
 from robocas_ms3.core.strict_model import StrictModel
 from robocas_ms3.robots.cameras import CameraSpec
 from robocas_ms3.robots.description import RobotDescription
-from robocas_ms3.scenes.config.cameras import CameraConfig, CamerasConfig, changed_cameras
+from robocas_ms3.scenes.config.cameras import CameraConfig, CamerasConfig, apply_camera_changes
 from robocas_ms3.scenes.config.randomisation import RandomisationConfig
 from robocas_ms3.scenes.relations import RELATIONS, Relation
 from robocas_ms3.scenes.task_specs import TASKS
@@ -285,23 +285,23 @@ class TaskConfig(StrictModel):
             ConfigError: a camera that the robot does not have is not placed.
         """
         overview = [("static_camera", CameraConfig(overview=True))] if self.static_camera == "overview" else []
-        return changed_cameras(robot.cameras, [*overview, *self.cameras.items()])
+        return apply_camera_changes(robot.cameras, [*overview, *self.cameras.items()])
 
     @property
-    def leaves_slots_empty(self) -> bool:
+    def has_unused_slots(self) -> bool:
         """Whether an episode may use fewer objects than there are slots."""
         random, layout = self.randomisation, self.layout
         kept = isinstance(layout, OrderlyLayout) and layout.keep_what_fits
         return kept or bool(random.count or random.distractors)
 
 
-def has_basket(config: TaskConfig) -> None:
+def require_basket(config: TaskConfig) -> None:
     """Raise ValueError where there is no basket; a task names this function in its ``checks``."""
     if config.basket is None:
         raise ValueError(f"task {config.task} needs a `basket`")
 
 
-def has_copies(config: TaskConfig) -> None:
-    """Raise ValueError where there are no several objects of a kind, in rows; see `has_basket`."""
+def require_copies(config: TaskConfig) -> None:
+    """Raise ValueError where there are no several objects of a kind, in rows; see `require_basket`."""
     if not (isinstance(config.layout, OrderlyLayout) and config.layout.copies > 1):
         raise ValueError(f"task {config.task} needs layout.kind orderly with layout.copies > 1")

@@ -79,7 +79,7 @@ class Instruction:
     relation_phrase: str = ""
 
 
-def instruction(slots: InstructionSlots, template_id: str = "") -> Instruction:
+def make_instruction(slots: InstructionSlots, template_id: str = "") -> Instruction:
     """Return the instruction of a template in plain names; default: upstream's template.
 
     Raises:

@@ -19,7 +19,7 @@ from mani_skill.utils.registration import REGISTERED_ENVS
 
 from robocas_ms3.core.errors import VectorEnvCrashError, VectorEnvError
 from robocas_ms3.core.worker_process import NO_LIMITS, Limits, ProcessCrashError
-from robocas_ms3.tasks.seeds import following_seeds
+from robocas_ms3.tasks.seeds import consecutive_seeds
 from robocas_ms3.tasks.vector.pinned_workers import PinnedWorkers
 from robocas_ms3.tasks.vector.worker import EnvSettings, EnvWorker, Rows, join_rows, split_rows
 
@@ -222,7 +222,7 @@ class ProcessEnv(gym.Env):
         if seed is None:  # each env looks for a possible one itself
             return [(None, False)] * count
         if np.ndim(seed) == 0:
-            seeds = following_seeds(int(seed), count, self._seed_range)
+            seeds = consecutive_seeds(int(seed), count, self._seed_range)
             return [(one, i > 0) for i, one in enumerate(seeds)]
         if len(seed) != count:
             raise VectorEnvError("seeds don't fit", expected=f"{count}, or a single one", found=len(seed))

@@ -6,8 +6,8 @@ import pytest
 import yaml
 
 from robocas_ms3.core.errors import ConfigError
-from robocas_ms3.scenes.config import load_task_config, shipped_configs
-from robocas_ms3.scenes.config.load import CHAIN_LIMIT, check_no_base
+from robocas_ms3.scenes.config import bundled_configs, load_task_config
+from robocas_ms3.scenes.config.load import CHAIN_LIMIT, check_no_extends
 
 
 def write(folder, **files):
@@ -103,7 +103,7 @@ def test_a_wrong_key_names_the_file_of_the_chain_that_it_is_in(tmp_path):
 
 def test_a_mistake_of_several_files_names_all_of_them(tmp_path):
     path = write(tmp_path, mine={"extends": "pick_table_scattered", "surface": {"min_xy": [0.4, 0.0]}})
-    assert error_of(path).where == f"{path} (extends {shipped_configs()['pick_table_scattered']})"
+    assert error_of(path).where == f"{path} (extends {bundled_configs()['pick_table_scattered']})"
 
 
 @pytest.mark.parametrize(
@@ -158,6 +158,6 @@ def test_only_files_outside_of_protocols_extend():
         load_task_config({"extends": "pick_table_scattered"})
     error = error_of("pick_table_scattered", changes={"extends": "pick_table_scattered"})
     assert error.where == "changes"
-    check_no_base(shipped_configs()["pick_table_scattered"])
+    check_no_extends(bundled_configs()["pick_table_scattered"])
     with pytest.raises(ConfigError, match="not allowed in a protocol"):
-        check_no_base(shipped_configs()["pick_shelf_scattered"])
+        check_no_extends(bundled_configs()["pick_shelf_scattered"])

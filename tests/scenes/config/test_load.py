@@ -8,9 +8,9 @@ import pytest
 import yaml
 
 from robocas_ms3.core.errors import ConfigError
-from robocas_ms3.scenes.config import load_task_config, shipped_configs
+from robocas_ms3.scenes.config import bundled_configs, load_task_config
 
-SHIPPED = yaml.safe_load(shipped_configs()["pick_table_scattered"].read_text())
+SHIPPED = yaml.safe_load(bundled_configs()["pick_table_scattered"].read_text())
 
 
 def changed(path: str, value: Any) -> dict:
@@ -23,7 +23,7 @@ def changed(path: str, value: Any) -> dict:
     return data
 
 
-@pytest.mark.parametrize("name", sorted(shipped_configs()))
+@pytest.mark.parametrize("name", sorted(bundled_configs()))
 def test_shipped_configurations_load_and_load_again(name):
     config = load_task_config(name)
     assert config.description

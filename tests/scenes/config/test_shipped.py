@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from asset_tools.partnet.annotation import find_annotation
-from robocas_ms3.scenes.config import load_task_config, shipped_configs
+from robocas_ms3.scenes.config import bundled_configs, load_task_config
 
 FIRST, SECOND = ((0.0, -0.25), (0.3, 0.35)), ((0.0, -0.45), (0.3, 0.25))
 HEAP = ((-0.05, -0.25), (0.25, 0.15))
@@ -51,12 +51,12 @@ def test_evaluation_is_of_its_objects_any_of_which_is_the_target():
     assert search.target.weight == "uniform"
 
 
-TEMPLATES = [name for name in shipped_configs() if "partnet" in name]
+TEMPLATES = [name for name in bundled_configs() if "partnet" in name]
 
 
 @pytest.mark.parametrize("name", TEMPLATES)
 def test_surfaces_handles_and_joints_are_annotated(name):
-    assert "import-partnet" in shipped_configs()[name].read_text(encoding="utf-8")
+    assert "import-partnet" in bundled_configs()[name].read_text(encoding="utf-8")
     config = load_task_config(name)
     for key, item in config.furniture.items():
         pack, _, model = item.asset.rpartition("/")
@@ -82,7 +82,7 @@ def resolved_hash(name: str) -> str:
 
 
 def test_each_shipped_configuration_has_a_hash():
-    assert HASHES.keys() == shipped_configs().keys()
+    assert HASHES.keys() == bundled_configs().keys()
 
 
 @pytest.mark.parametrize("name", sorted(HASHES))
@@ -91,5 +91,5 @@ def test_the_resolved_configuration_is_unchanged(name):
 
 
 if __name__ == "__main__":
-    hashes = {name: resolved_hash(name) for name in sorted(shipped_configs())}
+    hashes = {name: resolved_hash(name) for name in sorted(bundled_configs())}
     STORED.write_text(json.dumps(hashes, indent=1) + "\n", encoding="utf-8")

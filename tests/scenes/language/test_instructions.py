@@ -5,15 +5,15 @@ import pytest
 
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.errors import AssetError, RobocasError
-from robocas_ms3.scenes.config import load_task_config, shipped_configs
+from robocas_ms3.scenes.config import bundled_configs, load_task_config
 from robocas_ms3.scenes.language.instructions import (
     SPLITS,
     Instruction,
     InstructionSlots,
     choose_instruction,
     could_mean,
-    instruction,
     is_plural,
+    make_instruction,
     part_name,
     template_ids,
 )
@@ -43,7 +43,7 @@ def choose(seed: int, about: InstructionSlots | None = None, split: Split = "tra
 )
 def test_defaults_are_upstreams_word_for_word(task, text):
     about = slots(task, "scissors")
-    found = instruction(about)
+    found = make_instruction(about)
     assert found.text == text
     assert (found.template_id, found.split, found.object_word) == (f"{task}/upstream/00", "upstream", "scissors")
     assert choose(5, about, "upstream") == found
@@ -64,14 +64,14 @@ def test_defaults_are_upstreams_word_for_word(task, text):
     ],
 )
 def test_relations(relation, phrase):
-    found = instruction(slots("select", "mug", "shelf", relation=relation))
+    found = make_instruction(slots("select", "mug", "shelf", relation=relation))
     assert found.text == f"grasp the {phrase} on the shelf and move it to the basket"
     assert found.relation_phrase == (phrase.replace("mug", "{object}") if relation else "")
 
 
 def test_number_and_preposition():
     def pick(object, support):
-        return instruction(slots("pick", object, support), "pick/train/05").text
+        return make_instruction(slots("pick", object, support), "pick/train/05").text
 
     assert pick("scissors", "cabinet") == "grab the scissors in the cabinet and put them in the basket"
     assert pick("pair of scissors", "shelf") == "grab the pair of scissors on the shelf and put it in the basket"
@@ -82,7 +82,7 @@ def test_number_and_preposition():
     assert not any("on the c" in text for text in texts)
 
 
-@pytest.mark.parametrize("name", sorted(shipped_configs()))
+@pytest.mark.parametrize("name", sorted(bundled_configs()))
 def test_goods_are_in_what_has_something_above_them_and_on_what_has_not(name):
     config = load_task_config(name)
     try:
@@ -170,11 +170,11 @@ def test_relation_and_part_belong_to_their_tasks(task, more):
 @pytest.mark.parametrize("template_id", ["pick/train/21", "pick/train/-1", "search/train/00", "pick/train", "7"])
 def test_unknown_templates(template_id):
     with pytest.raises(RobocasError) as caught:
-        instruction(slots(), template_id)
+        make_instruction(slots(), template_id)
     assert caught.value.where == template_id
 
 
 def test_unknown_objects_and_supports_go_by_their_own_names():
     about = slots(object="gizmo {0}", support="lectern")
     assert {choose(seed, about).object_word for seed in range(20)} == {"gizmo {0}"}
-    assert "on the lectern" in instruction(about, "pick/train/05").text
+    assert "on the lectern" in make_instruction(about, "pick/train/05").text

@@ -11,7 +11,7 @@ from robocas_ms3.scenes.language.instructions import (
     SPLITS,
     InstructionSlots,
     could_mean,
-    instruction,
+    make_instruction,
     template_ids,
 )
 from robocas_ms3.scenes.language.texts import (
@@ -61,7 +61,7 @@ def test_every_template_renders_for_every_builtin_object():
                 relation, part = "nearest" if task == "select" else None, "left door" if task == "open_pick" else ""
                 slots = InstructionSlots(task, word, "cabinet", relation, part)
                 found = [
-                    instruction(slots, template_id).text
+                    make_instruction(slots, template_id).text
                     for split in SPLITS
                     for template_id in template_ids(task, split)
                 ]
@@ -70,7 +70,9 @@ def test_every_template_renders_for_every_builtin_object():
     for relation in RELATIONS:
         slots = InstructionSlots("select", "mug", "cabinet", relation)
         texts += [
-            instruction(slots, template_id).text for split in SPLITS for template_id in template_ids("select", split)
+            make_instruction(slots, template_id).text
+            for split in SPLITS
+            for template_id in template_ids("select", split)
         ]
     assert not re.search(r"[{}]|  |^ | $|,,| ,|\ban? |\bthe the\b|\bNone\b", "\n".join(texts), re.MULTILINE)
 

@@ -225,7 +225,7 @@ def test_observations_are_seen_from_the_tcp(env):
 
 @pytest.mark.parametrize(
     ("env_id", "names"),
-    [("RoboCASSearch-v1", ["hidden_share"]), ("RoboCASOpenPick-v1", ["opened_share", "tcp_to_handle"])],
+    [("RoboCASSearch-v1", ["hidden_fraction"]), ("RoboCASOpenPick-v1", ["opened_fraction", "tcp_to_handle"])],
 )
 def test_tasks_add_what_is_theirs(env_id, names):
     config = {"RoboCASSearch-v1": "search_table_small_heap"}.get(env_id)
@@ -233,8 +233,8 @@ def test_tasks_add_what_is_theirs(env_id, names):
     obs, _ = env.reset(seed=3)
     base: Any = env.unwrapped
     assert list(obs["extra"])[-len(names) - 1 :] == [*names, "tcp_pose"]
-    if names[0] == "hidden_share":
-        assert obs["extra"]["hidden_share"].item() == pytest.approx(base.clutter().hidden_share.item())
+    if names[0] == "hidden_fraction":
+        assert obs["extra"]["hidden_fraction"].item() == pytest.approx(base.clutter().hidden_fraction.item())
         _, terms, info = reward_now(base)
         assert bool(info["obstacles_cleared"]) is (terms["reach"] > 0)
         for slot in range(len(base.objects)):
@@ -244,7 +244,7 @@ def test_tasks_add_what_is_theirs(env_id, names):
         assert terms["clear"] == terms["push_point"] == 1
         assert reward > 4 / 14
     else:
-        assert obs["extra"]["opened_share"].item() == pytest.approx(0, abs=1e-3)
+        assert obs["extra"]["opened_fraction"].item() == pytest.approx(0, abs=1e-3)
         furniture, joint = base._opening
         handle = base.handle_in_world()[0].copy()
         shut = reward_now(base)
