@@ -61,7 +61,7 @@ class Waving:
     def __init__(self) -> None:
         self._step, self._from = 0, np.zeros((0, 7))
 
-    def reset(self, starts: list[EpisodeSpec]) -> None:
+    def reset(self, episodes: list[EpisodeSpec]) -> None:
         """Begin anew, all envs at once."""
         self._step = 0
 
@@ -130,7 +130,7 @@ def alone(env: Any, seeds: list[int], steps: int) -> float:
 
 def evaluated(session: EvaluationSession, episodes: list[ProtocolEpisode], steps: int) -> float:
     """CPU seconds of the evaluation's loop from the first step on."""
-    batch = session.open(episodes[0], len(episodes), steps)
+    batch = session.open_batch(episodes[0], len(episodes), steps)
     policy = Counting(batch.env)
     ended = list(rollout(batch, policy, [session.episode_spec(one) for one in episodes]))
     assert [one.steps for one in ended] == [steps] * len(episodes)
@@ -144,9 +144,9 @@ class Counting(Waving):
         super().__init__()
         self.before, self._env = 0.0, env
 
-    def reset(self, starts: list[EpisodeSpec]) -> None:
+    def reset(self, episodes: list[EpisodeSpec]) -> None:
         """Begin anew, all envs at once."""
-        super().reset(starts)
+        super().reset(episodes)
         self.before = cpu(self._env)
 
 

@@ -54,7 +54,7 @@ class SlowPolicy:
     def __init__(self, seconds: float, spec: PolicySpec) -> None:
         self.seconds, self.spec = seconds, spec
 
-    def reset(self, starts: list[EpisodeSpec]) -> None:
+    def reset(self, episodes: list[EpisodeSpec]) -> None:
         """Keep no state."""
 
     def act(self, observations: Observations) -> np.ndarray:

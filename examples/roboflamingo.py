@@ -90,10 +90,10 @@ class RoboFlamingoPolicy:
         ranges = {"low": self._scale.low.tolist(), "high": self._scale.high.tolist()}
         return {"model": type(self._model).__qualname__, "horizon": HORIZON, "ranges": ranges}
 
-    def reset(self, starts: list[EpisodeSpec]) -> None:
-        """Forget the frames of the envs that start an episode."""
-        for start in starts:
-            self._frames[start.env] = deque(maxlen=HORIZON)
+    def reset(self, episodes: list[EpisodeSpec]) -> None:
+        """Forget the frames of the envs that episode an episode."""
+        for episode in episodes:
+            self._frames[episode.env] = deque(maxlen=HORIZON)
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
         """Return (E, 7) actions of the convention `robocas`."""

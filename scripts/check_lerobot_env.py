@@ -42,9 +42,9 @@ class Recorder(ScriptedPolicy):
         super().__init__("robocas")
         self.episodes, self.actions = {}, {}
 
-    def reset(self, starts):
-        super().reset(starts)
-        self.episodes.update({start.env: start.episode for start in starts})
+    def reset(self, episodes):
+        super().reset(episodes)
+        self.episodes.update({episode.env: episode.episode for episode in episodes})
 
     def act(self, observations):
         actions = super().act(observations)

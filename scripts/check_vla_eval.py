@@ -66,10 +66,10 @@ class Remembering(ScriptedPolicy):
         self.spec = dataclasses.replace(self.spec, cameras=cameras, language="text")
         self.kept: dict[int, list[dict[str, np.ndarray]]] = {}
 
-    def reset(self, starts: list[EpisodeSpec]) -> None:
+    def reset(self, episodes: list[EpisodeSpec]) -> None:
         """Plan the episode."""
-        super().reset(starts)
-        self.now = self.kept[starts[0].episode] = []
+        super().reset(episodes)
+        self.now = self.kept[episodes[0].episode] = []
 
     def act(self, observations: Observations) -> np.ndarray:
         """(1, 7)."""
@@ -147,7 +147,7 @@ def remember(out: Path, kept: Path) -> results.Result:
             arrays[f"{episode.config} {number} {key}"] = np.stack([step[key] for step in steps])
     policy.close()
     np.savez(kept, **arrays)
-    return results.read(out)
+    return results.read_result(out)
 
 
 def check_interface() -> None:
@@ -219,7 +219,7 @@ def compare(theirs: Path, ours: results.Result, heard: list) -> None:
     assert found.keys() == ours.outcomes.keys()
     assert len(heard) == len(found) == EACH * len(TASKS)
     for number, outcome in ours.outcomes.items():
-        for name, value in outcome.without_clock().items():
+        for name, value in outcome.reproducible_values().items():
             assert found[number][name] == value, (number, name, found[number][name], value)
         measures = ", ".join(f"{name} {value:g}" for name, value in outcome.measures.items())
         say(f"  episode {number}: {outcome.steps} steps, {outcome.failure_stage or 'success'}; {measures}")

@@ -191,10 +191,10 @@ class ChunkPolicy:
     def describe(self) -> dict[str, Any]:
         return self._about
 
-    def reset(self, starts: list[EpisodeSpec]) -> None:
-        for start in starts:
-            self._plans[start.env] = []
-            self._chunk_start.pop(start.env, None)
+    def reset(self, episodes: list[EpisodeSpec]) -> None:
+        for episode in episodes:
+            self._plans[episode.env] = []
+            self._chunk_start.pop(episode.env, None)
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
         tcp = from_wxyz(observations.tcp_in_base)

@@ -71,8 +71,8 @@ class RunPolicy:
     def describe(self) -> dict[str, Any]:
         return {**self._about, **getattr(self._policy, "describe", dict)()}
 
-    def reset(self, starts: list[EpisodeSpec]) -> None:
-        self._policy.reset(starts)
+    def reset(self, episodes: list[EpisodeSpec]) -> None:
+        self._policy.reset(episodes)
 
     def act(self, observations: Observations) -> Any:
         """Return actions, or chunks of them."""

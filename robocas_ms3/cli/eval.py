@@ -60,8 +60,8 @@ def run(settings: EvaluationSettings) -> int:
     from robocas_ms3.core.workers import use_one_torch_thread
     from robocas_ms3.evaluation.policies import find_policy, open_policy
     from robocas_ms3.evaluation.protocol import load_protocol
-    from robocas_ms3.evaluation.report.tables import markdown
-    from robocas_ms3.evaluation.results import read
+    from robocas_ms3.evaluation.report.tables import render_markdown
+    from robocas_ms3.evaluation.results import read_result
 
     find_policy(settings.policy)
     load_protocol(settings.protocol)
@@ -74,9 +74,9 @@ def run(settings: EvaluationSettings) -> int:
         for outcome in session.run(bar.start):
             outcomes.append(outcome)
             bar.advance()
-    result = read(session.folder)
-    print_text(markdown(result))
-    broken, succeeded = result.broken_off(), sum(outcome.success for outcome in outcomes)
+    result = read_result(session.folder)
+    print_text(render_markdown(result))
+    broken, succeeded = result.error_count(), sum(outcome.success for outcome in outcomes)
     errors = f", {broken} broken off by an error (--retry-errors runs them again)" if broken else ""
     total = format_count(len(result.outcomes), "episode")
     print_line(
@@ -94,7 +94,7 @@ def list_protocols(cfg: Protocols) -> int:
         protocol = load_protocol(name)
         count = format_count(len(protocol.episodes), "episode")
         print_line(f"{name}: {count}, {protocol.hash[:12]}: {protocol.rules.description}")
-        if files := protocol.train_files():
+        if files := protocol.training_configs():
             print_line(f"    to train on: {', '.join(map(str, files))}")
     return 0
 

@@ -85,10 +85,10 @@ class Videos:
 
 def report(cfg: Report) -> int:
     from robocas_ms3.cli.terminal import print_line, print_text
-    from robocas_ms3.evaluation.report.tables import markdown
+    from robocas_ms3.evaluation.report.tables import render_markdown
 
     result = _read(cfg.folders)
-    print_text(markdown(result))
+    print_text(render_markdown(result))
     if cfg.out is None and len(cfg.folders) > 1:
         print_line("Pass --out DIR for the page of several folders.")
     else:
@@ -98,10 +98,10 @@ def report(cfg: Report) -> int:
 
 def merge(cfg: Merge) -> int:
     from robocas_ms3.cli.terminal import print_line
-    from robocas_ms3.evaluation.results import merge as write
+    from robocas_ms3.evaluation.results import merge_results
 
     _check_folders(cfg.folders)
-    result = write(cfg.folders, cfg.out)
+    result = merge_results(cfg.folders, cfg.out)
     print_line(f"{cfg.out}: {format_count(len(result.outcomes), 'episode')}")
     write_pages(result, cfg.out, cfg.protocol)
     return 0
@@ -109,28 +109,28 @@ def merge(cfg: Merge) -> int:
 
 def compare(cfg: Compare) -> int:
     from robocas_ms3.cli.terminal import print_text
-    from robocas_ms3.evaluation.report.comparison import comparison, comparison_of_splits
-    from robocas_ms3.evaluation.results import parts_of, read
+    from robocas_ms3.evaluation.report.comparison import compare_results, compare_splits
+    from robocas_ms3.evaluation.results import group_partial_results, read_result
 
     _check_folders(cfg.folders)
-    groups = [[folder] for folder in cfg.folders] if len(cfg.folders) == 2 else parts_of(cfg.folders)
-    results = [read(*parts) for parts in groups]
+    groups = [[folder] for folder in cfg.folders] if len(cfg.folders) == 2 else group_partial_results(cfg.folders)
+    results = [read_result(*parts) for parts in groups]
     if len(results) == 1:
-        print_text(comparison_of_splits(results[0], _protocol_of(results[0], cfg.protocol)))
+        print_text(compare_splits(results[0], _protocol_of(results[0], cfg.protocol)))
     else:
-        print_text(comparison(results))
+        print_text(compare_results(results))
     return 0
 
 
 def verify(cfg: Verify) -> int:
     from robocas_ms3.cli.terminal import print_line
-    from robocas_ms3.evaluation.verify import problems
+    from robocas_ms3.evaluation.verify import find_violations
 
     result = _read(cfg.folders)
-    found = problems(result, _protocol_of(result, cfg.protocol))
+    found = find_violations(result, _protocol_of(result, cfg.protocol))
     for problem in found:
         print_line(problem)
-    if broken := result.broken_off():
+    if broken := result.error_count():
         print_line(f"note: broken off by an error: {format_count(broken, 'episode')}, counted as failed")
     valid = f"{format_count(len(result.outcomes), 'episode')} of {result.run.protocol}, all well"
     print_line(f"{', '.join(map(str, cfg.folders))}: {format_count(len(found), 'problem') if found else valid}")
@@ -151,12 +151,12 @@ def videos(cfg: Videos) -> int:
         fix = f"Name it yourself, if you trust it: --policy {name}"
         raise EvaluationError("this result is of a policy of somebody's own", where=cfg.folder, found=name, fix=fix)
     from robocas_ms3.core.workers import use_one_torch_thread
-    from robocas_ms3.evaluation.report.videos import failed_of_each_kind, film
+    from robocas_ms3.evaluation.report.videos import choose_failed_episodes, record_videos
 
     use_one_torch_thread()
-    numbers = failed_of_each_kind(result, cfg.count)
+    numbers = choose_failed_episodes(result, cfg.count)
     with open_policy(name) as policy, ProgressBar("episodes filmed") as bar:
-        for done, (path, same) in enumerate(film(result, protocol, policy, numbers), start=1):
+        for done, (path, same) in enumerate(record_videos(result, protocol, policy, numbers), start=1):
             print_line(str(path) + ("" if same else ": this time it came out differently"))
             bar.update(done, len(numbers))
     if not numbers:
@@ -189,10 +189,10 @@ def _check_folders(folders: tuple[Path, ...]) -> None:
 
 
 def _read(folders: tuple[Path, ...]) -> Result:
-    from robocas_ms3.evaluation.results import read
+    from robocas_ms3.evaluation.results import read_result
 
     _check_folders(folders)
-    return read(*folders)
+    return read_result(*folders)
 
 
 def _protocol_of(result: Result, given: str | None) -> LoadedProtocol:

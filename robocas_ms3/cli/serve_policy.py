@@ -49,7 +49,7 @@ def main(cfg: ServePolicy) -> int:
     if not cfg.host:
         raise EvaluationError("no address to listen on", where="--host", expected="such as 127.0.0.1 or ::1")
     packs = [load_protocol(folder).rules.pack for folder in cfg.protocol]
-    files = ServedFiles.of(cfg.protocol, packs)
+    files = ServedFiles.collect(cfg.protocol, packs)
     if not _is_loopback(strip_brackets(cfg.host)):
         print_line(f"{cfg.host} is no loopback address: whoever can reach it can ask this policy")
     with open_policy(cfg.policy) as policy:

@@ -19,14 +19,16 @@ from robocas_ms3.tasks import terms
 
 Stepping = Literal["timed", "upstream"]
 UPSTREAM_HZ = 5
-# evaluation_v0.md: the gripper first, until it stands, 5 control steps at most; then the motion, 2 at most
+# A policy step of RoboCAS-v0 (evaluation_v0.md): the gripper moves until it stops, at most 5 control steps; then the
+# arm moves, at most 2.
 _GRIPPER_STEPS, _MOTION_STEPS = 5, 2
-_STANDS = 0.0005  # m that the gripper's width changes in a control step; velocities shiver where fingers press
-_UNUSED = 8  # pixels per side of cameras that the policy does not use, which are rendered all the same
-_NEAR, _TURNED, _SPIN = 0.02, np.deg2rad(5), np.deg2rad(3)  # m, rad, rad/s: where upstream's motion ends early
-RAISED = 0.03  # m above where it stood (evaluation_v0.md)
-# Of the drive that keeps the rotation: 1/s^2 and 1/s, so that it is as stiff for a strawberry as for a bottle. Limits
-# of no width lock the translation; those of angles SAPIEN 3.0.3 does not keep.
+_STOPPED = 0.0005  # largest change in gripper width per control step, m; velocities jitter while the fingers press
+_UNUSED_SIZE = 8  # pixels per side of cameras that the policy does not use; they are rendered all the same
+# RoboCAS-v0's motion ends early within this distance (m) and angle (rad) of its goal, below this speed (rad/s).
+_ARRIVED_DISTANCE, _ARRIVED_ANGLE, _ARRIVED_SPIN = 0.02, np.deg2rad(5), np.deg2rad(3)
+RAISED_HEIGHT = 0.03  # m above the initial height (evaluation_v0.md)
+# The drive that holds the rotation, in acceleration units (1/s^2, 1/s): equally stiff for light and heavy objects.
+# Limits of zero width lock the translation; SAPIEN 3.0.3 does not enforce angular limits.
 _STIFFNESS, _DAMPING = 1e8, 1e5
 
 
@@ -98,10 +100,10 @@ class PolicyActionWrapper(gym.Wrapper):
         return (obs, *others, {**info, **self._measures(info)})
 
     def _act(self, actions: np.ndarray) -> tuple:
-        if self._convention.read is None:
+        if self._convention.decode is None:
             self._open = actions[:, 7] > 0
             return self._control(actions)
-        motion = self._convention.read(actions)
+        motion = self._convention.decode(actions)
         return self._timed(motion) if self._stepping == "timed" else self._upstream(motion)
 
     def _measures(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
@@ -109,25 +111,25 @@ class PolicyActionWrapper(gym.Wrapper):
 
     def _timed(self, motion: TcpMotion) -> tuple:
         start = self._tcp() if self._reference == "tcp" else self._target()
-        return self._go(*_moved(start, motion), motion.open)
+        return self._move_to(*_apply_motion(start, motion), motion.open)
 
     def _upstream(self, motion: TcpMotion) -> tuple:
         """Gripper, then motion; an env that is done with either waits."""
         result, here = None, self._target()
         turned = motion.open != self._open
         for _ in range(_GRIPPER_STEPS):
-            if not (turned | (self._width_change > _STANDS)).any():
+            if not (turned | (self._width_change > _STOPPED)).any():
                 break
-            result, turned = self._go(*here, motion.open), np.zeros_like(turned)
-        wanted = _moved(self._tcp() if self._reference == "tcp" else self._target(), motion)
+            result, turned = self._move_to(*here, motion.open), np.zeros_like(turned)
+        wanted = _apply_motion(self._tcp() if self._reference == "tcp" else self._target(), motion)
         for _ in range(_MOTION_STEPS):
-            result = self._go(*wanted, motion.open)
-            if self._is_there(*wanted).all():
+            result = self._move_to(*wanted, motion.open)
+            if self._has_arrived(*wanted).all():
                 break
         assert result is not None
         return result
 
-    def _go(self, position: np.ndarray, rotation: Rotation, opened: np.ndarray) -> tuple:
+    def _move_to(self, position: np.ndarray, rotation: Rotation, opened: np.ndarray) -> tuple:
         """Move TCPs toward poses in the arm's base frame, in one control step."""
         self._open = opened
         at, turn = self._target()
@@ -156,11 +158,11 @@ class PolicyActionWrapper(gym.Wrapper):
     def _width(self) -> np.ndarray:
         return self._base.agent.gripper_width.cpu().numpy()
 
-    def _is_there(self, position: np.ndarray, rotation: Rotation) -> np.ndarray:
+    def _has_arrived(self, position: np.ndarray, rotation: Rotation) -> np.ndarray:
         at, turn = self._tcp()
         spin = torch.linalg.vector_norm(self._base.agent.tcp.angular_velocity, dim=-1).cpu().numpy()
-        near = np.linalg.norm(position - at, axis=1) < _NEAR
-        return near & ((turn.inv() * rotation).magnitude() < _TURNED) & (spin < _SPIN)
+        near = np.linalg.norm(position - at, axis=1) < _ARRIVED_DISTANCE
+        return near & ((turn.inv() * rotation).magnitude() < _ARRIVED_ANGLE) & (spin < _ARRIVED_SPIN)
 
 
 class Weld:
@@ -185,7 +187,7 @@ class Weld:
         env = self._env
         forces = env.gripper_forces()
         touched = terms.is_touched(forces[:, :1]) & terms.is_touched(forces[:, 1:2])  # by the left finger, by the right
-        raised = env.object_poses[..., 2] - env.start_poses[..., 2] >= RAISED
+        raised = env.object_poses[..., 2] - env.start_poses[..., 2] >= RAISED_HEIGHT
         found = (touched & raised & env.present)[0].nonzero()
         if len(found):
             self._fix(env.objects[int(found[0])]._bodies[0])
@@ -231,7 +233,7 @@ def check_weld(stepping: str, backend: str) -> None:
 
 
 def control_mode(convention: str) -> str:
-    return "pd_joint_pos" if CONVENTIONS[convention].read is None else "pd_ee_delta_pose"
+    return "pd_joint_pos" if CONVENTIONS[convention].decode is None else "pd_ee_delta_pose"
 
 
 def env_kwargs(spec: PolicySpec, rate: int, *, renders: bool = False) -> dict[str, Any]:
@@ -252,7 +254,7 @@ def env_kwargs(spec: PolicySpec, rate: int, *, renders: bool = False) -> dict[st
         return {**common, "obs_mode": "state_dict", **({} if renders else {"render_backend": "none"})}
     modes = ["rgb", *(["depth"] if spec.depth else []), *(["state_dict"] if spec.state else [])]
     cameras = {name: {"width": width, "height": height} for name, (width, height) in spec.cameras.items()}
-    others = {"width": _UNUSED, "height": _UNUSED}
+    others = {"width": _UNUSED_SIZE, "height": _UNUSED_SIZE}
     return {**common, "obs_mode": "+".join(modes), "sensor_configs": {**others, **cameras}}
 
 
@@ -261,6 +263,6 @@ def _pose(pose: Pose) -> tuple[np.ndarray, Rotation]:
     return raw[:, :3], Rotation.from_quat(raw[:, [4, 5, 6, 3]])
 
 
-def _moved(start: tuple[np.ndarray, Rotation], motion: TcpMotion) -> tuple[np.ndarray, Rotation]:
+def _apply_motion(start: tuple[np.ndarray, Rotation], motion: TcpMotion) -> tuple[np.ndarray, Rotation]:
     position, turn = start
     return position + turn.apply(motion.translation), turn * motion.rotation

@@ -22,8 +22,8 @@ from robocas_ms3.evaluation.protocol import (
     CONFIG_NAME,
     CONFIGS,
     EPISODES,
+    INVALID_RULES,
     LAYOUTS,
-    NO_RULES,
     RULES,
     TRAIN,
     Protocol,
@@ -36,11 +36,11 @@ from robocas_ms3.scenes.layout_table import write_frozen_layouts
 from robocas_ms3.scenes.task_specs import TASKS
 from robocas_ms3.tasks.base import RoboCASEnv
 
-NO_PLAN = "no plan of a protocol"
+INVALID_PLAN = "no plan of a protocol"
 _WRONG = 300  # stream of the object that a wrong instruction names
 
 
-class Scene(StrictModel):
+class ConfigVariant(StrictModel):
     """A configuration with changes."""
 
     config: str = Field(description="name of a shipped configuration, or a YAML file, from the plan's folder")
@@ -51,7 +51,7 @@ class Scene(StrictModel):
     )
     change: dict[str, Any] = Field(default={}, description="keys that have other values, in the configuration's form")
 
-    def changed(self, overrides: Sequence[str] = ()) -> TaskConfig:
+    def resolve(self, overrides: Sequence[str] = ()) -> TaskConfig:
         """Return the resolved configuration: the file, with ``change`` and then ``overrides`` merged over it."""
         return load_task_config(self.config, self.change, overrides)
 
@@ -60,14 +60,15 @@ class Scene(StrictModel):
         return self.name or Path(self.config).stem
 
 
-class ProtocolPart(Scene):
+class ProtocolPart(ConfigVariant):
     """Episodes of one configuration."""
 
     count: int = Field(ge=1, description="how many episodes")
     first_seed: int = Field(ge=0, description="of which seeds; those without a layout are skipped, and more taken")
     split: str = "test"
-    words: Literal["asked", "wrong", "empty"] = Field(
-        default="asked", description="what the policy is told: what is meant, another object's name, or nothing"
+    instruction: Literal["correct", "wrong", "empty"] = Field(
+        default="correct",
+        description="the target's instruction, one that names another object, or an empty text",
     )
 
     @property
@@ -80,7 +81,7 @@ class ProtocolPlan(StrictModel):
 
     rules: dict[str, object] = Field(description="of `Protocol`, but for the pack's hash")
     parts: list[ProtocolPart]
-    train: list[Scene] = Field(default=[], description="configurations to train on")
+    train: list[ConfigVariant] = Field(default=[], description="configurations to train on")
     lists: dict[str, Any] = Field(default={}, description="for YAML's anchors: lists that changes refer to")
 
 
@@ -89,15 +90,15 @@ def read_plan(path: Path) -> ProtocolPlan:
     try:
         data = load_yaml(path)
     except (OSError, DocumentError) as error:
-        raise EvaluationError(NO_PLAN, where=path, found=error) from error
-    plan = parse(ProtocolPlan, data, EvaluationError, where=path, about=NO_PLAN)
+        raise EvaluationError(INVALID_PLAN, where=path, found=error) from error
+    plan = parse(ProtocolPlan, data, EvaluationError, where=path, about=INVALID_PLAN)
 
-    def located(scene: Scene) -> Scene:
+    def resolve_file(scene: ConfigVariant) -> ConfigVariant:
         file = path.parent / scene.config
         own = file.is_file() and scene.config not in bundled_configs()
         return scene.model_copy(update={"config": str(file)}) if own else scene
 
-    return plan.model_copy(update={name: list(map(located, getattr(plan, name))) for name in ("parts", "train")})
+    return plan.model_copy(update={name: list(map(resolve_file, getattr(plan, name))) for name in ("parts", "train")})
 
 
 def freeze(plan: ProtocolPlan, folder: Path, overrides: Sequence[str] = ()) -> Iterator[tuple[int, int]]:
@@ -107,7 +108,7 @@ def freeze(plan: ProtocolPlan, folder: Path, overrides: Sequence[str] = ()) -> I
     """
     pack = load_pack(str(plan.rules.get("pack", "builtin")))
     values = {**plan.rules, "pack_hash": sha256(pack.root / MANIFEST)}
-    rules = parse(Protocol, values, EvaluationError, where="rules", about=NO_RULES)
+    rules = parse(Protocol, values, EvaluationError, where="rules", about=INVALID_RULES)
     configs, train = _configs(plan.parts, overrides), _configs(plan.train, overrides)
     total, episodes = sum(part.count for part in plan.parts), []
     with atomic_folder(folder) as tmp:
@@ -129,10 +130,10 @@ def freeze(plan: ProtocolPlan, folder: Path, overrides: Sequence[str] = ()) -> I
         _write_yaml(rules.model_dump(mode="json", exclude={"robot"} if rules.robot == DEFAULT else None), tmp / RULES)
 
 
-def _configs(parts: Sequence[Scene], overrides: Sequence[str]) -> dict[str, TaskConfig]:
+def _configs(parts: Sequence[ConfigVariant], overrides: Sequence[str]) -> dict[str, TaskConfig]:
     found: dict[str, TaskConfig] = {}
     for part in parts:
-        config = part.changed(overrides)
+        config = part.resolve(overrides)
         if not re.fullmatch(CONFIG_NAME, part.file) or len(part.file) > MAX_NAME_BYTES:
             what, fix = "invalid name of a configuration", "Give it a `name`, and a plain `split`."
             expected = f"letters, digits, _ and -, at most {MAX_NAME_BYTES}"
@@ -179,9 +180,9 @@ def _episode(number: int, part: ProtocolPart, seed: int, layout: Layout, env: Ro
 
 
 def _instruction(part: ProtocolPart, env: RoboCASEnv, seed: int) -> str:
-    if part.words == "empty":
+    if part.instruction == "empty":
         return ""
-    if part.words == "asked":
+    if part.instruction == "correct":
         return env.instruction().text
     others = sorted(env.object_names() - {env.target_asset().asset.name})
     if not others:

@@ -21,8 +21,8 @@ SUMS = (*MEASURES, "v0_steps")  # columns of what is read
 _PATH, _IMPULSE, _DISTURBED, _FALLEN, _V0_STEPS = range(len(SUMS))
 # share of an object that another one hides from above, from which on it lies over it; what is measured of points is off
 # by 0.08 at the 95th percentile
-LIES_OVER = 0.1
-TOGETHER = 1.0  # s of the scene in which objects that are pushed as one begin to move
+COVER_THRESHOLD = 0.1
+SIMULTANEOUS_SECONDS = 1.0  # s of the scene in which objects that are pushed as one begin to move
 _NEVER = 2**30  # control steps
 
 
@@ -122,11 +122,11 @@ class RetrievalOrder:
 
     def _reset(self, envs: Tensor) -> None:
         env = self._env
-        over = env.pairwise_occlusion(envs) >= LIES_OVER
+        over = env.pairwise_occlusion(envs) >= COVER_THRESHOLD
         rows = torch.arange(len(over), device=env.device)
         over[rows, env.target_slot[envs]] = False  # what the target lies on need not wait for it
         first = env.clutter(envs).obstacles | over[rows, :, env.target_slot[envs]]
-        self._over[envs], self._needed[envs] = over, needed(first, over)
+        self._over[envs], self._needed[envs] = over, objects_to_move(first, over)
         some = to_native(envs)
         self._moved_at[some], self._moved_time[some], self._steps[some] = 0, _NEVER, 0
         self._held[some], self._found = False, None
@@ -152,7 +152,7 @@ class RetrievalOrder:
         """
         if self._found is not None:
             return self._found
-        second = round(TOGETHER / self._env.control_timestep)
+        second = round(SIMULTANEOUS_SECONDS / self._env.control_timestep)
         moved_at, time = as_tensor(self._moved_at), as_tensor(self._moved_time)
         late = time[:, :, None] > time[:, None] + second  # row later than column
         in_order = (moved_at > 0) & self._needed & ~(self._over & late).any(dim=1)
@@ -160,7 +160,7 @@ class RetrievalOrder:
         return self._found
 
 
-def needed(first: Tensor, over: Tensor) -> Tensor:
+def objects_to_move(first: Tensor, over: Tensor) -> Tensor:
     """Return which objects have to be moved: the ``first`` (N, K), those ``over`` them (row over column), and so on."""
     found = first
     for _ in range(first.shape[1]):

@@ -13,7 +13,7 @@ from pydantic import Field
 from robocas_ms3.scenes.task_specs import STAGES as DEFAULT_STAGES
 
 # evaluation_v0.md and the paper's table: reach, pick, recognise, clear
-STAGES = {"RA": "reached_any", "PA": "picked_any", "RR": "reached_target", "CO": "obstacles_cleared"}
+PAPER_STAGES = {"RA": "reached_any", "PA": "picked_any", "RR": "reached_target", "CO": "obstacles_cleared"}
 
 Measure = Annotated[int | float, Field(ge=0, le=1e12)]  # whole if the file has it whole, so that it is written the same
 Fraction = Annotated[int | float, Field(ge=0, le=1)]
@@ -21,7 +21,7 @@ Count = Annotated[int, Field(ge=0, le=10**12)]
 
 
 @dataclass(frozen=True)
-class Move:
+class MovedObject:
     """An object that was moved before the target: at which policy step, and whether it had to be and came in order."""
 
     object: str
@@ -43,13 +43,13 @@ class Retrieval:
             target was never held.
     """
 
-    moved: list[Move]
+    moved: list[MovedObject]
     needed: list[str]
     left: Count
     score: Fraction | None
 
     @classmethod
-    def of(
+    def from_record(
         cls, record: NDArray[np.integer], objects: Sequence[str], held_at: int | None, *, cleared: bool
     ) -> Retrieval:
         """Make it from a record (K, 3) of `metrics.RetrievalOrder.read`, and the ids of the objects by slot.
@@ -58,13 +58,15 @@ class Retrieval:
         cleared before.
         """
         slots: list[int] = [slot for slot in np.argsort(record[:, 0], kind="stable").tolist() if record[slot, 0]]
-        moved = [Move(objects[slot], int(record[slot, 0]), *(bool(x) for x in record[slot, 1:])) for slot in slots]
+        moved = [
+            MovedObject(objects[slot], int(record[slot, 0]), *(bool(x) for x in record[slot, 1:])) for slot in slots
+        ]
         left = 0 if cleared or held_at is None else int(((record[:, 0] == 0) & (record[:, 1] == 1)).sum())
         needed = [name for name, is_needed in zip(objects, record[:, 1], strict=False) if is_needed]
-        return cls(moved, needed, left, score_of(moved, left, held_at))
+        return cls(moved, needed, left, retrieval_score(moved, left, held_at))
 
 
-def score_of(moved: Sequence[Move], left: int, held_at: int | None) -> float | None:
+def retrieval_score(moved: Sequence[MovedObject], left: int, held_at: int | None) -> float | None:
     if held_at is None:
         return None
     right, total = sum(move.needed and move.in_order for move in moved), len(moved) + left
@@ -115,7 +117,7 @@ class Outcome:
     p_vis: Fraction | None = None
     retrieval: Retrieval | None = None
 
-    def without_clock(self) -> dict[str, Any]:
+    def reproducible_values(self) -> dict[str, Any]:
         """Return the values that are the same for the same seed and policy."""
         return {name: value for name, value in asdict(self).items() if name != "inference_ms"}
 

@@ -22,7 +22,7 @@ from robocas_ms3.robots.cameras import CAMERA_NAME
 from robocas_ms3.robots.quantities import QUANTITIES
 from robocas_ms3.robots.registry import DEFAULT
 
-ROBOT = {quantity.policy: quantity for quantity in QUANTITIES if quantity.policy}
+ROBOT_QUANTITIES = {quantity.policy: quantity for quantity in QUANTITIES if quantity.policy}
 """Quantities of the robot that policies observe, by their names there."""
 Language = Literal["none", "text", "embedding"]
 Reference = Literal["tcp", "target"]
@@ -45,7 +45,7 @@ class Convention:
     """A convention of actions: numbers per action, and how actions (E, size) become motions; None: joint targets."""
 
     size: int
-    read: Callable[[Array], TcpMotion] | None
+    decode: Callable[[Array], TcpMotion] | None
 
 
 def _motions(rotation: Callable[[Array], Rotation], open_above: float = 0.0) -> Callable[[Array], TcpMotion]:
@@ -149,7 +149,7 @@ class Observations:
         embeddings: (E, 384) float32 sentence embeddings, or None.
         images: by camera (E, H, W, 3) uint8.
         depths: by camera (E, H, W, 1) int16, mm.
-        robot: (E, D) by name, the quantities of `ROBOT`; they are attributes too, such as ``qpos``.
+        robot: (E, D) by name, the quantities of `ROBOT_QUANTITIES`; they are attributes too, such as ``qpos``.
         state: (E, D) privileged state, or None.
     """
 
@@ -162,12 +162,12 @@ class Observations:
     state: NDArray[np.float32] | None
 
     def __getattr__(self, name: str) -> NDArray[np.float32]:
-        if name not in ROBOT:
+        if name not in ROBOT_QUANTITIES:
             raise AttributeError(name)
         return self.robot[name]
 
 
-def privileged(extra: Mapping[str, Any]) -> NDArray[np.float32]:
+def privileged_state(extra: Mapping[str, Any]) -> NDArray[np.float32]:
     """Return the privileged state (N, D) of an environment's ``obs["extra"]``, arrays (N, ...)."""
     return np.concatenate([np.asarray(value) for name, value in extra.items() if name != "tcp_pose"], axis=1)
 
@@ -178,7 +178,7 @@ class Policy(Protocol):
     @property
     def spec(self) -> PolicySpec: ...
 
-    def reset(self, starts: list[EpisodeSpec]) -> None:
+    def reset(self, episodes: list[EpisodeSpec]) -> None:
         """Start episodes in some envs, and forget what was kept of these envs."""
         ...
 
@@ -187,7 +187,7 @@ class Policy(Protocol):
         ...
 
 
-def as_chunks(actions: ArrayLike, count: int, size: int | None, *, where: str = "") -> NDArray[np.float32]:
+def as_action_chunks(actions: ArrayLike, count: int, size: int | None, *, where: str = "") -> NDArray[np.float32]:
     """Return actions (E, A) or (E, H, A) of ``count`` envs as chunks (E, H, A).
 
     Raises:
@@ -209,7 +209,7 @@ class ExternalPolicy:
     def __init__(self, spec: PolicySpec) -> None:
         self.spec = spec
 
-    def reset(self, starts: list[EpisodeSpec]) -> None:
+    def reset(self, episodes: list[EpisodeSpec]) -> None:
         pass
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
@@ -224,19 +224,19 @@ def policy_spec_values(spec: PolicySpec) -> dict[str, Any]:
 
 def describe(policy: Policy) -> dict[str, Any]:
     """Return what a result says of a policy: class, specification, and the entries of its optional ``describe()``."""
-    where = f"policy {_class_of(policy)}, describe()"
-    with policy_code(policy):
+    where = f"policy {_class_name(policy)}, describe()"
+    with policy_exit_guard(policy):
         spec, added = policy_spec_values(policy.spec), getattr(policy, "describe", dict)()
     if not isinstance(added, dict):
         raise EvaluationError("invalid policy description", where=where, expected="a dict", found=type(added).__name__)
-    said = {"class": _class_of(policy), "spec": spec, **added}
+    said = {"class": _class_name(policy), "spec": spec, **added}
     return json.loads(json_text(said, where, error=EvaluationError))
 
 
-def policy_code(policy: Policy) -> AbstractContextManager[None]:
+def policy_exit_guard(policy: Policy) -> AbstractContextManager[None]:
     """Call a policy inside: if its code tries to end the process, that is an error (`forbid_exit`)."""
-    return forbid_exit(f"policy {_class_of(policy)}")
+    return forbid_exit(f"policy {_class_name(policy)}")
 
 
-def _class_of(policy: Policy) -> str:
+def _class_name(policy: Policy) -> str:
     return f"{type(policy).__module__}:{type(policy).__qualname__}"

@@ -35,7 +35,7 @@ from robocas_ms3.robots.registry import find_robot
 from robocas_ms3.scenes.config.load import check_no_extends, load_task_config
 from robocas_ms3.scenes.task_specs import TASKS
 
-NO_RULES = "no rules of a protocol"
+INVALID_RULES = "no rules of a protocol"
 DEFAULT_HZ = 20  # if neither protocol nor policy names a rate
 CONFIG_NAME = r"^[A-Za-z0-9_-]+$"
 RULES, EPISODES, CONFIGS, LAYOUTS, TRAIN = "protocol.yaml", "episodes.jsonl", "configs", "layouts", "train"
@@ -81,7 +81,7 @@ class Protocol(StrictModel):
             raise ValueError("stepping upstream needs max_steps: its steps take any time")
         return self
 
-    def steps(self, task: str, rate: int) -> int | None:
+    def step_limit(self, task: str, rate: int) -> int | None:
         """Return the maximum number of actions per episode of a task at a rate; None: no maximum."""
         seconds = self.max_seconds.get(task) if self.stepping == "timed" else None
         ends = [self.max_steps, None if seconds is None else round(seconds * rate)]
@@ -100,7 +100,7 @@ class Protocol(StrictModel):
             expected, found = f"{self.rate_hz} Hz", f"{spec.rate_hz:g} Hz"
             raise EvaluationError("the policy acts at another rate", where=self.name, expected=expected, found=found)
 
-    def rate(self, spec: PolicySpec) -> int:
+    def action_rate(self, spec: PolicySpec) -> int:
         """Return the number of actions per second."""
         rate = self.rate_hz or spec.rate_hz or DEFAULT_HZ
         if rate < 1 or rate != int(rate) or 100 % int(rate):
@@ -137,7 +137,7 @@ class LoadedProtocol:
     def hash(self) -> str:
         """Hex sha256 of its files, by their names."""
         digest = hashlib.sha256()
-        for path in files_of(self.folder):
+        for path in protocol_files(self.folder):
             try:
                 content = hashlib.sha256(read_bytes(path, ARRAYS_LIMIT)).hexdigest()
             except (OSError, DocumentError) as error:
@@ -145,7 +145,7 @@ class LoadedProtocol:
             digest.update(f"{path.relative_to(self.folder).as_posix()} {content}\n".encode())
         return digest.hexdigest()
 
-    def choose(self, settings: EvaluationSettings) -> list[ProtocolEpisode]:
+    def select_episodes(self, settings: EvaluationSettings) -> list[ProtocolEpisode]:
         """Return the episodes that settings choose, at least one."""
         splits = (settings.split,) if settings.split else ()
         for kind, names in (("task", settings.tasks), ("split", splits)):
@@ -178,7 +178,7 @@ class LoadedProtocol:
                     fix = did_you_mean(name, known)
                     raise EvaluationError("no such camera", where=where, expected=expected, found=name, fix=fix)
 
-    def check_one_configuration(self, episodes: Sequence[ProtocolEpisode], fix: str = "") -> None:
+    def check_same_configuration(self, episodes: Sequence[ProtocolEpisode], fix: str = "") -> None:
         """Check that episodes can run in one batch."""
         configs = list(dict.fromkeys(episode.config for episode in episodes))
         if len(configs) > 1:
@@ -191,12 +191,12 @@ class LoadedProtocol:
     def layouts_file(self, config: str) -> Path:
         return self.folder / LAYOUTS / f"{config}.npy"
 
-    def train_files(self) -> list[Path]:
+    def training_configs(self) -> list[Path]:
         """Return the configurations to train on; none if nothing is held out."""
         return sorted(self.folder.glob(f"{TRAIN}/*.yaml"))
 
 
-def files_of(folder: Path) -> list[Path]:
+def protocol_files(folder: Path) -> list[Path]:
     """Return the files that a protocol is made of, sorted."""
     patterns = (f"{CONFIGS}/*.yaml", f"{LAYOUTS}/*.npy", f"{TRAIN}/*.yaml")
     return sorted([folder / RULES, folder / EPISODES, *(path for name in patterns for path in folder.glob(name))])
@@ -224,20 +224,20 @@ def load_protocol(name: str | Path) -> LoadedProtocol:
     try:
         data = load_yaml(folder / RULES)
     except (OSError, DocumentError) as error:
-        raise EvaluationError(NO_RULES, where=folder / RULES, found=error) from error
-    rules = parse(Protocol, data, EvaluationError, where=folder / RULES, about=NO_RULES)
+        raise EvaluationError(INVALID_RULES, where=folder / RULES, found=error) from error
+    rules = parse(Protocol, data, EvaluationError, where=folder / RULES, about=INVALID_RULES)
     loaded = LoadedProtocol(folder, rules, tuple(_episodes(folder / EPISODES)))
     for task in {episode.task for episode in loaded.episodes}:
         if task not in TASKS:
             raise EvaluationError("no such task", where=folder / EPISODES, expected=", ".join(TASKS), found=task)
-        if rules.steps(task, 1) is None:
+        if rules.step_limit(task, 1) is None:
             fix = f"Give max_seconds.{task}, or max_steps."
             raise EvaluationError("episodes of this task would never end", where=folder / RULES, found=task, fix=fix)
     for config in {episode.config for episode in loaded.episodes}:
         for path in (loaded.config_file(config), loaded.layouts_file(config)):
             if not path.is_file():
                 raise EvaluationError("a protocol's file is not there", where=path)
-    for path in sorted((folder / CONFIGS).glob("*.yaml")) + loaded.train_files():
+    for path in sorted((folder / CONFIGS).glob("*.yaml")) + loaded.training_configs():
         check_no_extends(path)
     return loaded
 

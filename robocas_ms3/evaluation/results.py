@@ -5,7 +5,7 @@
     run.json            protocol and its hash, policy, versions, backend, packs, machine (`RunRecord`)
     episodes.jsonl      an `Outcome` per line, in any order; a line that a kill left half-written is dropped
 
-Parts of a result, such as shards, are read as one (`read`) or written as one (`merge`).
+Parts of a result, such as shards, are read as one (`read_result`) or written as one (`merge_results`).
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class PolicyRecord(BaseModel):
     server: dict[str, Any] | None = None
 
 
-class PartRecord(BaseModel):
+class MergedFolder(BaseModel):
     """One of the folders that were merged into a result."""
 
     model_config = ConfigDict(strict=True)
@@ -72,14 +72,14 @@ class RunRecord(BaseModel):
     versions: dict[str, str]
     pack_hashes: dict[str, str]
     machine: dict[str, Any] | None = None
-    parts: list[PartRecord] = []
+    merged_from: list[MergedFolder] = []
 
     @classmethod
-    def of(cls, values: dict[str, Any], where: object) -> RunRecord:
+    def from_values(cls, values: dict[str, Any], where: object) -> RunRecord:
         """Return the record of these values, which can be written and read back; ``where`` is for errors."""
         return parse(cls, values, EvaluationError, where=where, about="this evaluation can't be recorded")
 
-    def entries(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         return self.model_dump(exclude_unset=True)
 
     def identity(self) -> dict[str, Any]:
@@ -122,14 +122,14 @@ class Result:
         held = [getattr(one, name) if hasattr(one, name) else one.flags.get(name) is not None for one in chosen]
         return success_rate(sum(held), len(held))
 
-    def repeats(self) -> bool:
+    def repeats_scenes(self) -> bool:
         """Return whether a scene occurs several times, as in several splits: then episodes must not be pooled."""
         return len({(one.task, one.seed) for one in self.outcomes.values()}) < len(self.outcomes)
 
-    def broken_off(self) -> int:
+    def error_count(self) -> int:
         return sum(bool(one.error) for one in self.outcomes.values())
 
-    def by(self, name: str) -> dict[str, list[Outcome]]:
+    def group_by(self, name: str) -> dict[str, list[Outcome]]:
         """Return the outcomes by an attribute such as ``config``, sorted; splits in the protocol's order."""
         found: dict[str, list[Outcome]] = {}
         for outcome in self.outcomes.values():
@@ -150,7 +150,7 @@ def open_result(
         RobocasError: another process writes there; or somebody removed the folder.
     """
     with OutputFolder(folder, OUTPUT, run.settings(), overwrite=overwrite) as output:
-        output.start(output.recorded or run.entries())
+        output.start(output.recorded or run.to_dict())
         outcomes = _outcomes(folder)
         if retry_errors and any(one.error for one in outcomes.values()):
             outcomes = {number: one for number, one in outcomes.items() if not one.error}
@@ -158,12 +158,12 @@ def open_result(
         yield outcomes
 
 
-def append(folder: Path, outcome: Outcome) -> None:
+def append_outcome(folder: Path, outcome: Outcome) -> None:
     """Add an episode; on the disk when this returns."""
     _ledger(folder).append([outcome], sync=True)
 
 
-def read(*folders: Path) -> Result:
+def read_result(*folders: Path) -> Result:
     """Read a result, or parts of one, which may share episodes if their outcomes are the same."""
     parts = [_read(folder) for folder in folders]
     first, outcomes = parts[0], dict[int, Outcome]()
@@ -179,14 +179,15 @@ def read(*folders: Path) -> Result:
     run = first.run
     if len(parts) > 1:
         records = [
-            PartRecord(folder=str(part.folder), episodes=len(part.outcomes), machine=part.run.machine) for part in parts
+            MergedFolder(folder=str(part.folder), episodes=len(part.outcomes), machine=part.run.machine)
+            for part in parts
         ]
-        run = run.model_copy(update={"parts": records})
+        run = run.model_copy(update={"merged_from": records})
     return Result(first.folder, run, dict(sorted(outcomes.items())))
 
 
-def parts_of(folders: Iterable[Path]) -> list[list[Path]]:
-    """Group folders that `read` takes together: measured with the same, and of other episodes than those before."""
+def group_partial_results(folders: Iterable[Path]) -> list[list[Path]]:
+    """Group folders into partial results of one evaluation: same settings and disjoint episodes."""
     groups: list[tuple[dict[str, Any], set[int], list[Path]]] = []
     for folder in folders:
         part = _read(folder)
@@ -201,17 +202,17 @@ def parts_of(folders: Iterable[Path]) -> list[list[Path]]:
     return [group for _, _, group in groups]
 
 
-def merge(folders: Sequence[Path], out: Path) -> Result:
+def merge_results(folders: Sequence[Path], out: Path) -> Result:
     """Write parts of a result as one, into a folder that appears whole."""
-    result = read(*folders)
+    result = read_result(*folders)
     check_replaceable(out)
     with atomic_folder(out) as folder:
-        write_json(folder / RUN, result.run.entries())
+        write_json(folder / RUN, result.run.to_dict())
         _ledger(folder).rewrite(result.outcomes.values())
-    return read(out)
+    return read_result(out)
 
 
-def versions() -> dict[str, str]:
+def package_versions() -> dict[str, str]:
     return {name: version(name) for name in _PACKAGES}
 
 
@@ -241,8 +242,8 @@ def _outcomes(folder: Path) -> dict[int, Outcome]:
 
 def _add(outcomes: dict[int, Outcome], outcome: Outcome, where: str) -> None:
     """Add an episode, which may exist already with the same outcome."""
-    before = outcomes.setdefault(outcome.episode, outcome).without_clock()
-    now = outcome.without_clock()
+    before = outcomes.setdefault(outcome.episode, outcome).reproducible_values()
+    now = outcome.reproducible_values()
     if changes := [change for key in now for change in list_setting_changes(before[key], now[key], key)]:
         what = f"two outcomes of episode {outcome.episode} disagree"
         raise EvaluationError(what, where=where, found="; ".join(changes))

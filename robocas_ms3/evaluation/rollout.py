@@ -16,14 +16,14 @@ from robocas_ms3.evaluation.metrics import MEASURES, read_sum
 from robocas_ms3.evaluation.outcomes import Outcome, Retrieval, failure_stage
 from robocas_ms3.evaluation.policy import (
     CONVENTIONS,
-    ROBOT,
+    ROBOT_QUANTITIES,
     EpisodeSpec,
     Observations,
     Policy,
     PolicySpec,
-    as_chunks,
-    policy_code,
-    privileged,
+    as_action_chunks,
+    policy_exit_guard,
+    privileged_state,
 )
 from robocas_ms3.evaluation.protocol import ProtocolEpisode
 from robocas_ms3.scenes.language.embed import TextEmbedder
@@ -43,7 +43,7 @@ class Rollout:
         inference_seconds: clock time of the policy: of each batch the time per env.
     """
 
-    start: EpisodeSpec
+    spec: EpisodeSpec
     steps: int = 0
     seconds: float = 0.0
     flags: dict[str, int | None] = field(default_factory=dict)
@@ -59,7 +59,7 @@ class Rollout:
         flags, order = self.flags, None
         if self.retrieval is not None:
             cleared = flags.get("obstacles_cleared") is not None
-            order = Retrieval.of(self.retrieval, objects, flags.get("target_grasped"), cleared=cleared)
+            order = Retrieval.from_record(self.retrieval, objects, flags.get("target_grasped"), cleared=cleared)
         return Outcome(
             episode=episode.episode,
             task=episode.task,
@@ -143,7 +143,7 @@ class EpisodeBatch:
     def observe(self, envs: list[int]) -> Observations:
         obs, spec, index = self.obs, self._spec, np.array(envs)
         agent, cameras = obs["agent"], obs.get("sensor_data", {})
-        starts = [self.running[env].start for env in envs]
+        starts = [self.running[env].spec for env in envs]
         texts = [start.instruction if spec.language != "none" else "" for start in starts]
         return Observations(
             envs=index,
@@ -151,8 +151,8 @@ class EpisodeBatch:
             embeddings=self._embed(texts) if self._embed else None,
             images={name: cameras[name]["rgb"][index] for name in spec.cameras},
             depths={name: cameras[name]["depth"][index] for name in spec.cameras} if spec.depth else {},
-            robot={name: agent[quantity.name][index] for name, quantity in ROBOT.items()},
-            state=privileged(obs["extra"])[index] if spec.state else None,
+            robot={name: agent[quantity.name][index] for name, quantity in ROBOT_QUANTITIES.items()},
+            state=privileged_state(obs["extra"])[index] if spec.state else None,
         )
 
     def step(self, actions: NDArray[np.float32]) -> Iterator[Rollout]:
@@ -168,11 +168,11 @@ class EpisodeBatch:
         for env in [env for env, played in self.running.items() if self._is_over(played)]:
             yield self._end(env)
 
-    def lost(self, envs: Sequence[int], why: str) -> Iterator[Rollout]:
+    def fail_lost(self, envs: Sequence[int], why: str) -> Iterator[Rollout]:
         """Yield the running episodes of envs whose process died, as failures without measures."""
         for env in envs:
             if env in self.running:
-                played = Rollout(self.running[env].start, error=why)
+                played = Rollout(self.running[env].spec, error=why)
                 played.flags = played.flag_seconds = dict.fromkeys(self._flags)
                 played.measures = dict.fromkeys((*MEASURES, *([_WELDS] if _WELDS in self._info else [])), 0.0)
                 yield played
@@ -205,7 +205,7 @@ class EpisodeBatch:
         return float(self._info["elapsed_steps"][env]) * self._dt
 
     def _is_over(self, played: Rollout) -> bool:
-        ends, info, env = self._ends, self._info, played.start.env
+        ends, info, env = self._ends, self._info, played.spec.env
         v0 = ends.max_v0_steps is not None and read_sum(info, "v0_steps")[env] >= ends.max_v0_steps
         return v0 or played.steps >= ends.max_steps or any(info[name][env] for name in ends.ends_on if name in info)
 
@@ -222,7 +222,7 @@ def rollout(batch: EpisodeBatch, policy: Policy, episodes: Sequence[EpisodeSpec]
         if waiting and free and (batch.refill or not batch.running):
             starts = batch.start([(env, waiting.pop()) for env in free[: len(waiting)]])
             chunks.update({start.env: [] for start in starts})
-            with policy_code(policy):
+            with policy_exit_guard(policy):
                 policy.reset(starts)
         _request_actions(batch, policy, chunks)
         actions = np.zeros((batch.num_envs, batch.action_size), np.float32)
@@ -241,7 +241,7 @@ def _request_actions(batch: EpisodeBatch, policy: Policy, chunks: dict[int, list
     observations = batch.observe(envs)
     started = time.perf_counter()
     try:
-        with policy_code(policy):
+        with policy_exit_guard(policy):
             actions: Any = np.asarray(policy.act(observations))
     except PolicyError as failed:
         for env in envs if failed.actions is None else failed.reasons:
@@ -250,7 +250,7 @@ def _request_actions(batch: EpisodeBatch, policy: Policy, chunks: dict[int, list
             return
         actions = failed.actions
     seconds = (time.perf_counter() - started) / len(envs)
-    new = as_chunks(actions, len(envs), batch.action_size, where=type(policy).__name__)
+    new = as_action_chunks(actions, len(envs), batch.action_size, where=type(policy).__name__)
     period = policy.spec.observe_every
     if new.shape[1] > 1 and new.shape[1] % period:
         raise EvaluationError(

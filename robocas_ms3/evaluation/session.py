@@ -21,7 +21,7 @@ from robocas_ms3.datasets.conversion.env_renderer import require_renderer
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.action_wrapper import UPSTREAM_HZ, PolicyActionWrapper, check_weld, env_kwargs
 from robocas_ms3.evaluation.outcomes import Outcome
-from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, Policy, as_chunks, describe
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, Policy, as_action_chunks, describe
 from robocas_ms3.evaluation.protocol import ProtocolEpisode, load_protocol
 from robocas_ms3.evaluation.rollout import NOT_FINITE, EndConditions, EpisodeBatch, Rollout, rollout
 from robocas_ms3.evaluation.settings import EvaluationSettings
@@ -65,15 +65,15 @@ class EvaluationSession:
         self.protocol, self.spec = load_protocol(settings.protocol), policy.spec
         rules = self.protocol.rules
         rules.check_policy(self.spec)
-        self.rate = UPSTREAM_HZ if rules.stepping == "upstream" else rules.rate(self.spec)
+        self.rate = UPSTREAM_HZ if rules.stepping == "upstream" else rules.action_rate(self.spec)
         backend = choose_backend(settings.backend)
         if settings.weld:
             check_weld(rules.stepping, backend)
-        self.episodes = self.protocol.choose(settings)
+        self.episodes = self.protocol.select_episodes(settings)
         if self.spec.cameras:
             self.protocol.check_cameras(self.spec, self.episodes)
             require_renderer()
-        self.record = self._record(backend)
+        self.run_record = self._make_run_record(backend)
         self.folder = settings.folder(rules.name)
         self.outcomes: dict[int, Outcome] = {}
         objects = load_pack(rules.pack).objects
@@ -96,17 +96,17 @@ class EvaluationSession:
         """
         settings = self.settings
         opened = results.open_result(
-            self.folder, self.record, overwrite=settings.overwrite, retry_errors=settings.retry_errors
+            self.folder, self.run_record, overwrite=settings.overwrite, retry_errors=settings.retry_errors
         )
         with closing(self), opened as done:
             missing = [episode for episode in self.episodes if episode.episode not in done]
             on_start(len(missing))
-            for outcome in self.play(missing):
-                results.append(self.folder, outcome)
+            for outcome in self.run_episodes(missing):
+                results.append_outcome(self.folder, outcome)
                 yield outcome
 
     def max_steps(self, task: str) -> int:
-        steps = self.protocol.rules.steps(task, self.rate)
+        steps = self.protocol.rules.step_limit(task, self.rate)
         assert steps is not None  # `load_protocol` checks it
         return steps
 
@@ -124,7 +124,7 @@ class EvaluationSession:
             robot=self.protocol.rules.robot,
         )
 
-    def play(self, episodes: Sequence[ProtocolEpisode], max_steps: int | None = None) -> Iterator[Outcome]:
+    def run_episodes(self, episodes: Sequence[ProtocolEpisode], max_steps: int | None = None) -> Iterator[Outcome]:
         """Run episodes with the policy, configuration by configuration, and yield each outcome as its episode ends.
 
         ``max_steps`` replaces the protocol's maximum number of policy steps per episode.
@@ -134,7 +134,7 @@ class EvaluationSession:
         """
         try:
             for config in dict.fromkeys(episode.config for episode in episodes):
-                yield from self._play([one for one in episodes if one.config == config], max_steps)
+                yield from self._run_configuration([one for one in episodes if one.config == config], max_steps)
         except BaseException:
             self.close()
             raise
@@ -152,9 +152,9 @@ class EvaluationSession:
         if len(numbers) != count:
             raise EvaluationError("wrong number of episodes", where=where, expected=count, found=len(numbers))
         episodes = [known[number] for number in numbers]
-        self.protocol.check_one_configuration(episodes)
+        self.protocol.check_same_configuration(episodes)
         self._current, self.outcomes = episodes, {}
-        batch = self.open(episodes[0], count)
+        batch = self.open_batch(episodes[0], count)
         try:
             batch.start([(env, self.episode_spec(episode)) for env, episode in enumerate(episodes)])
         except Exception:
@@ -175,7 +175,7 @@ class EvaluationSession:
         batch = self._batch
         if batch is None or not batch.running:
             raise EvaluationError("no episode is running", fix="Call reset first.")
-        chunks = as_chunks(actions, batch.num_envs, batch.action_size, where="step")
+        chunks = as_action_chunks(actions, batch.num_envs, batch.action_size, where="step")
         seconds = (time.perf_counter() - self._observed) / len(batch.running)
         for env, running in batch.running.items():
             running.inference_seconds += seconds
@@ -187,7 +187,7 @@ class EvaluationSession:
                 rows = np.zeros((batch.num_envs, batch.action_size), np.float32)
                 rows[active] = chunks[active, step]
                 for ended in batch.step(rows):
-                    self.outcomes[ended.start.env] = self._outcome(ended, self._current[ended.start.env])
+                    self.outcomes[ended.spec.env] = self._outcome(ended, self._current[ended.spec.env])
                 if not batch.running:
                     return None
         except Exception:
@@ -200,7 +200,7 @@ class EvaluationSession:
         assert self._batch is not None
         return self._batch.obs
 
-    def open(self, episode: ProtocolEpisode, num_envs: int, max_steps: int | None = None) -> EpisodeBatch:
+    def open_batch(self, episode: ProtocolEpisode, num_envs: int, max_steps: int | None = None) -> EpisodeBatch:
         """Return envs for the episodes of the configuration of an episode; they are opened if needed."""
         steps = self.max_steps(episode.task) if max_steps is None else max_steps
         wanted, rules = (episode.config, num_envs, steps), self.protocol.rules
@@ -220,24 +220,24 @@ class EvaluationSession:
         if env is not None:
             env.close()
 
-    def _play(self, episodes: list[ProtocolEpisode], max_steps: int | None) -> Iterator[Outcome]:
+    def _run_configuration(self, episodes: list[ProtocolEpisode], max_steps: int | None) -> Iterator[Outcome]:
         left, deaths = {episode.episode: episode for episode in episodes}, Counter[int]()
         while left:
             batch = None
             try:
-                batch = self.open(episodes[0], min(self.settings.envs, len(left)), max_steps)
+                batch = self.open_batch(episodes[0], min(self.settings.envs, len(left)), max_steps)
                 for ended in rollout(batch, self.policy, [self.episode_spec(episode) for episode in left.values()]):
-                    yield self._outcome(ended, left.pop(ended.start.episode))
+                    yield self._outcome(ended, left.pop(ended.spec.episode))
             except VectorEnvCrashError as error:
                 self.close()
-                lost = [] if batch is None else list(batch.lost(error.envs, f"its process died: {error.found}"))
-                deaths.update([ended.start.episode for ended in lost] or [_NO_EPISODE])
+                lost = [] if batch is None else list(batch.fail_lost(error.envs, f"its process died: {error.found}"))
+                deaths.update([ended.spec.episode for ended in lost] or [_NO_EPISODE])
                 if deaths[_NO_EPISODE] == MAX_STARTS:
                     raise
                 if not lost:
                     _log.warning("environments are made again, without an episode lost: %s", error)
                 for ended in lost:
-                    number = ended.start.episode
+                    number = ended.spec.episode
                     if deaths[number] < MAX_STARTS:
                         _log.warning("episode %d: %s; it is started again", number, ended.error)
                     else:
@@ -278,7 +278,7 @@ class EvaluationSession:
             **render,
         )
 
-    def _record(self, backend: str) -> results.RunRecord:
+    def _make_run_record(self, backend: str) -> results.RunRecord:
         rules, name = self.protocol.rules, self.settings.policy
         pack = sha256(load_pack(rules.pack).root / MANIFEST)
         if pack != rules.pack_hash:
@@ -290,8 +290,8 @@ class EvaluationSession:
             "policy": {"name": name} | describe(self.policy) | {"name": name},  # a description may not rename it
             "weld": self.settings.weld,
             "backend": backend,
-            "versions": results.versions(),
+            "versions": results.package_versions(),
             "pack_hashes": {rules.pack: pack},
             "machine": {"processor": platform.machine(), "python": platform.python_version()},
         }
-        return results.RunRecord.of(values, f"policy {name}")
+        return results.RunRecord.from_values(values, f"policy {name}")

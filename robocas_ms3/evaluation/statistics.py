@@ -47,7 +47,7 @@ class Comparison:
     high: float
 
     @classmethod
-    def of(cls, both: int, only_a: int, only_b: int, neither: int) -> Comparison:
+    def from_counts(cls, both: int, only_a: int, only_b: int, neither: int) -> Comparison:
         limits = paired_interval(only_a, only_b, both + only_a + only_b + neither)
         return cls(both, only_a, only_b, neither, mcnemar(only_a, only_b), *limits)
 
@@ -124,7 +124,7 @@ def paired_interval(only_a: int, only_b: int, n: int) -> tuple[float, float]:
 def compare(a: ArrayLike, b: ArrayLike) -> Comparison:
     """Compare two runs by whether each succeeded in each scene, (n,) bool each, in the same order of scenes."""
     a, b = np.asarray(a, dtype=bool), np.asarray(b, dtype=bool)
-    return Comparison.of(*(int(cases.sum()) for cases in (a & b, a & ~b, ~a & b, ~a & ~b)))
+    return Comparison.from_counts(*(int(cases.sum()) for cases in (a & b, a & ~b, ~a & b, ~a & ~b)))
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
@@ -141,7 +141,7 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return adjusted.tolist()
 
 
-def success_by(values: ArrayLike, successes: ArrayLike, edges: Sequence[float]) -> list[SuccessRate | None]:
+def success_rates_by_bin(values: ArrayLike, successes: ArrayLike, edges: Sequence[float]) -> list[SuccessRate | None]:
     """Return success rates over bins of a number that each episode has, such as p_vis; None: an empty bin.
 
     Args:
@@ -193,7 +193,7 @@ def smallest_paired_difference(n: int, discordant: float, *, alpha: float = 0.05
     return None if missing(1.0) > 0 else float(root_scalar(missing, bracket=(0.0, 1.0)).root)
 
 
-def too_few(comparison: Comparison, *, alpha: float = 0.05) -> str | None:
+def power_warning(comparison: Comparison, *, alpha: float = 0.05) -> str | None:
     """Return a warning if the runs are not told apart at ``alpha``, with the difference that as many scenes would show.
 
     That difference assumes that the runs disagree in as many scenes as they did, so it is an estimate itself.

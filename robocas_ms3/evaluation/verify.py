@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from robocas_ms3.core.text import format_count
-from robocas_ms3.evaluation.outcomes import Outcome, failure_stage, score_of
+from robocas_ms3.evaluation.outcomes import Outcome, failure_stage, retrieval_score
 from robocas_ms3.evaluation.protocol import DEFAULT_HZ, LoadedProtocol, ProtocolEpisode
 from robocas_ms3.evaluation.results import Result, RunRecord
 from robocas_ms3.scenes.task_specs import TASKS
 
 
-def problems(result: Result, protocol: LoadedProtocol) -> list[str]:
+def find_violations(result: Result, protocol: LoadedProtocol) -> list[str]:
     """Return what is wrong with a result of a protocol; empty: nothing that its files show."""
     run, rules, count = result.run, protocol.rules, len(protocol.episodes)
     found = []
@@ -42,7 +42,7 @@ def _problems(outcome: Outcome, episode: ProtocolEpisode, protocol: LoadedProtoc
     if ("welds" in outcome.measures) != run.weld:
         yield f"it {'counts no welds' if run.weld else 'counts welds'}, the run says weld: {run.weld}"
     rate = rules.rate_hz or run.policy.spec.get("rate_hz") or DEFAULT_HZ
-    limit = rules.steps(outcome.task, rate)
+    limit = rules.step_limit(outcome.task, rate)
     if limit is not None and outcome.steps > limit:
         yield f"{steps}, {limit} allowed"
     if rules.stepping == "timed" and abs(outcome.seconds - outcome.steps / rate) > 1e-3:
@@ -81,6 +81,6 @@ def _problems_of_retrieval(outcome: Outcome) -> Iterator[str]:
     if order is None:
         return
     late = [move for move in order.moved if not 0 < move.step <= outcome.steps]
-    score = score_of(order.moved, order.left, outcome.flags.get("target_grasped"))
+    score = retrieval_score(order.moved, order.left, outcome.flags.get("target_grasped"))
     if "obstacles_cleared" not in outcome.flags or late or order.score != score:
         yield "its order of retrieval does not agree with itself"

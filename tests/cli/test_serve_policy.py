@@ -19,7 +19,7 @@ from robocas_ms3.evaluation.policy import PolicySpec
 
 class Up:
     spec = PolicySpec(convention="delta_quaternion", rate_hz=10)
-    def reset(self, starts): ...
+    def reset(self, episodes): ...
     def act(self, observations): return np.ones((len(observations.envs), 8))
     def close(self): print("closed")
 """
@@ -61,7 +61,7 @@ from robocas_ms3.evaluation.policy import PolicySpec
 
 class Slow:
     spec = PolicySpec()
-    def reset(self, starts): ...
+    def reset(self, episodes): ...
     def act(self, observations):
         print("acts", flush=True)
         time.sleep(300)

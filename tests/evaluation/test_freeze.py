@@ -45,7 +45,7 @@ def test_a_folder_that_is_there_is_refused_before_anything_is_drawn(made, tmp_pa
 def test_scenes_may_be_changed_and_misnamed(tmp_path):
     fewer = {"objects": {"count": 2}, "layout": {"kind": "orderly", "copies": 1, "rows": 1}}
     scene = {"config": "pick_table_scattered", "count": 1, "first_seed": 110010, "change": fewer}
-    parts = [{**scene, "split": words, "words": words, "name": "two"} for words in ("asked", "wrong", "empty")]
+    parts = [{**scene, "split": words, "instruction": words, "name": "two"} for words in ("correct", "wrong", "empty")]
     train = [{"config": "pick_table_scattered", "change": {"objects": {"count": 1}}, "name": "one"}] * 2
     list(freeze(ProtocolPlan.model_validate({**PLAN, "parts": parts, "train": train}), tmp_path / "out"))
     protocol = load_protocol(tmp_path / "out")
@@ -59,9 +59,9 @@ def test_scenes_may_be_changed_and_misnamed(tmp_path):
     assert asked.instruction == f"grasp the {names[asked.target]} on the table and move it to the basket"
     assert wrong.instruction == f"grasp the {names[other]} on the table and move it to the basket"
     assert (empty.instruction, empty.target) == ("", asked.target)
-    assert [path.name for path in protocol.train_files()] == ["one.yaml"]
+    assert [path.name for path in protocol.training_configs()] == ["one.yaml"]
     before = protocol.hash
-    protocol.train_files()[0].write_text("task: pick")
+    protocol.training_configs()[0].write_text("task: pick")
     assert load_protocol(tmp_path / "out").hash != before
 
 
@@ -96,7 +96,7 @@ FIRST = PLAN["parts"][0]
         {"parts": [FIRST, {**FIRST, "change": {"objects": {"count": 3}}}]},  # two configurations of one name
         {"parts": [{**FIRST, "change": {"objects": {"number": 3}}}]},
         {"parts": [{**FIRST, "config": "nothing"}]},
-        {"parts": [{**FIRST, "words": "wrong", "change": {"objects": {"count": 1}}}]},  # no other object to name
+        {"parts": [{**FIRST, "instruction": "wrong", "change": {"objects": {"count": 1}}}]},  # no other object to name
         *({"parts": [{**FIRST, "split": split}]} for split in ("../../evil", "x" * 300)),
         {"parts": [FIRST], "rules": PLAN["rules"] | {"name": "../../evil"}},
         {"train": [{"config": FIRST["config"], "change": {"objects": {"count": n}}} for n in (3, 4)]},

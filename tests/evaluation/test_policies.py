@@ -17,7 +17,7 @@ import numpy as np
 from robocas_ms3.evaluation.policy import PolicySpec
 class Mine:
     spec = PolicySpec()
-    def reset(self, starts): ...
+    def reset(self, episodes): ...
     def act(self, observations): return np.ones((len(observations.envs), 7))
 class Picky(Mine):
     def __init__(self, folder): ...
@@ -25,7 +25,7 @@ class Wishless(Mine):
     spec = {"convention": "robocas"}
 class Idle:
     spec = PolicySpec()
-    def reset(self, starts): ...
+    def reset(self, episodes): ...
 class Broken(Mine):
     def __init__(self): len(3)
 class LeavesMade(Mine):
@@ -139,15 +139,15 @@ def test_a_motion_is_read(name):
     numbers, opened, shut = SAID[name]
     convention = CONVENTIONS[name]
     assert len(numbers) + 1 == convention.size
-    assert convention.read is not None
-    motion = convention.read(np.array([[*numbers, opened], [*numbers, shut]]))
+    assert convention.decode is not None
+    motion = convention.decode(np.array([[*numbers, opened], [*numbers, shut]]))
     np.testing.assert_allclose(motion.translation, [[0.01, 0.02, 0.03]] * 2)
     np.testing.assert_allclose(motion.rotation.apply([1.0, 0, 0]), [[0, 1.0, 0]] * 2, atol=1e-12)
     assert motion.open.tolist() == [True, False]
 
 
 def test_euler_angles_are_about_fixed_axes_x_first_and_a_quaternion_of_zeros_is_no_turn():
-    euler, quaternion = (CONVENTIONS[name].read for name in ("robocas", "delta_quaternion"))
+    euler, quaternion = (CONVENTIONS[name].decode for name in ("robocas", "delta_quaternion"))
     assert euler is not None and quaternion is not None
     turn = euler(np.array([[0, 0, 0, QUARTER, 0, QUARTER, 1.0]])).rotation
     np.testing.assert_allclose(turn.apply([[0, 1.0, 0]]), [[0, 0, 1.0]], atol=1e-12)  # up by x, then z leaves it

@@ -108,7 +108,7 @@ def test_the_record_begins_where_the_policy_was(taken_over, generator, tmp_path)
     assert takeover.gripper == -1.0
     assert generator.generate(2, tmp_path, "two", takeover).success
     two = tmp_path / "two.h5"
-    assert actions_of(one) == actions_of(two)
+    assert parse_actions(one) == parse_actions(two)
     with h5py.File(one) as file:
         group = file["traj_0"]
         for name, left in numbers(takeover.state).items():
@@ -124,7 +124,7 @@ def test_the_record_begins_where_the_policy_was(taken_over, generator, tmp_path)
     assert [(played.success, played.state_error) for played in replay(ReplaySettings(one))] == [(True, 0.0)]
     saved = tmp_path / "saved.h5"
     assert [played.success for played in replay(ReplaySettings(one, use_env_states=True, save=saved))] == [True]
-    assert actions_of(saved) == actions_of(one)
+    assert parse_actions(saved) == parse_actions(one)
     with TrajectoryFile(saved) as file:
         assert file.entry(0).taken_over
     with pytest.raises(EvaluationError, match="begin where another policy was"):
@@ -169,6 +169,6 @@ def test_it_is_converted_from_where_the_policy_was(taken_over, tmp_path, needs_r
     np.testing.assert_allclose(first, tcp, atol=1e-5)
 
 
-def actions_of(path) -> str:
+def parse_actions(path) -> str:
     with h5py.File(path) as file:
         return hashlib.sha256(file["traj_0/actions"][()].tobytes()).hexdigest()

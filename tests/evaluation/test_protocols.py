@@ -10,7 +10,7 @@ import yaml
 
 from robocas_ms3.core.errors import ConfigError, EvaluationError
 from robocas_ms3.evaluation.policy import PolicySpec
-from robocas_ms3.evaluation.protocol import EPISODES, RULES, files_of, load_protocol, shipped_protocols
+from robocas_ms3.evaluation.protocol import EPISODES, RULES, load_protocol, protocol_files, shipped_protocols
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.task_specs import TASKS
 
@@ -75,9 +75,9 @@ def test_suites_train_on_what_is_seen_and_hold_something_out_of_each_task(name):
     for episode in protocol.episodes:
         configs.setdefault(episode.split == "seen", set()).add(protocol.config_file(episode.config))
     seen, held_out = ([load_task_config(path) for path in configs[side]] for side in (True, False))
-    train = {config.task: config for config in map(load_task_config, protocol.train_files())}
+    train = {config.task: config for config in map(load_task_config, protocol.training_configs())}
     assert {config.task: config for config in seen} == train
-    assert len(seen) == len(protocol.train_files())
+    assert len(seen) == len(protocol.training_configs())
     assert {config.task for config in held_out} == set(train)
 
 
@@ -85,7 +85,7 @@ def test_a_copy_has_the_same_hash_and_a_change_another(folder):
     mine = load_protocol(folder)
     before = load_protocol("smoke").hash
     assert mine.hash == before
-    for path in files_of(folder):
+    for path in protocol_files(folder):
         content = path.read_bytes()
         path.write_bytes(content + b"\n")
         assert replace(mine).hash != before, path
@@ -134,11 +134,11 @@ def test_damage_is_said_in_one_line(folder, damage, said):
 
 def test_an_episode_ends_by_actions_or_by_seconds_at_rates_at_which_physics_can_be_stopped():
     rules = load_protocol("smoke").rules
-    assert rules.steps("pick", 20) == 800
+    assert rules.step_limit("pick", 20) == 800
     assert rules.model_copy(update={"max_steps": 30}).steps("pick", 5) == 30
     assert rules.model_copy(update={"max_steps": 300}).steps("pick", 5) == 200
     upstream = load_protocol("paper-v1").rules
     assert upstream.steps("pick", 5) == upstream.steps("search", 5) == 150
-    assert [rules.rate(PolicySpec()), rules.rate(PolicySpec(rate_hz=10))] == [20, 10]
+    assert [rules.action_rate(PolicySpec()), rules.rate(PolicySpec(rate_hz=10))] == [20, 10]
     with pytest.raises(EvaluationError, match="divisor of 100"):
-        rules.rate(PolicySpec(rate_hz=30))
+        rules.action_rate(PolicySpec(rate_hz=30))

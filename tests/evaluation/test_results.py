@@ -7,28 +7,37 @@ from made_up_results import RUN_OF, outcome, write
 
 from robocas_ms3.core.errors import EvaluationError, OutputExistsError
 from robocas_ms3.evaluation.outcomes import failure_stage
-from robocas_ms3.evaluation.results import OUTCOMES, RUN, RunRecord, append, merge, open_result, parts_of, read
+from robocas_ms3.evaluation.results import (
+    OUTCOMES,
+    RUN,
+    RunRecord,
+    append_outcome,
+    group_partial_results,
+    merge_results,
+    open_result,
+    read_result,
+)
 
 SEARCH = dict.fromkeys(("obstacles_cleared", "reached_any", "target_grasped", "target_lifted", "success"))
 
 
 def start(folder, run=RUN_OF, new=(), **options):
     """Start or continue a result, add outcomes, and return the numbers of those that were there."""
-    with open_result(folder, RunRecord.of(run, folder / RUN), **options) as done:
+    with open_result(folder, RunRecord.from_values(run, folder / RUN), **options) as done:
         for one in new:
-            append(folder, one)
+            append_outcome(folder, one)
         return list(done)
 
 
 def test_what_is_appended_is_read_and_a_line_that_was_cut_is_written_over(tmp_path):
     start(tmp_path / "a", new=[outcome(3), outcome(1)])
-    assert read(tmp_path / "a").outcomes == {1: outcome(1), 3: outcome(3)}
-    assert read(tmp_path / "a").run == RunRecord.of(RUN_OF, "")
+    assert read_result(tmp_path / "a").outcomes == {1: outcome(1), 3: outcome(3)}
+    assert read_result(tmp_path / "a").run == RunRecord.from_values(RUN_OF, "")
     path = tmp_path / "a" / OUTCOMES
     path.write_bytes(path.read_bytes()[:-20])
-    assert list(read(tmp_path / "a").outcomes) == [3]
+    assert list(read_result(tmp_path / "a").outcomes) == [3]
     assert start(tmp_path / "a", new=[outcome(2)]) == [3]
-    assert list(read(tmp_path / "a").outcomes) == [2, 3]
+    assert list(read_result(tmp_path / "a").outcomes) == [2, 3]
 
 
 def test_a_damaged_line_is_an_error_with_its_number(tmp_path):
@@ -36,7 +45,7 @@ def test_a_damaged_line_is_an_error_with_its_number(tmp_path):
     with (tmp_path / "a" / OUTCOMES).open("a") as file:
         file.write('{"episode": 1}\n')
     with pytest.raises(EvaluationError, match=r"episodes.jsonl:2: no outcome"):
-        read(tmp_path / "a")
+        read_result(tmp_path / "a")
 
 
 @pytest.mark.parametrize("record", [None, {}, *({**RUN_OF, key: ["other"]} for key in ("protocol", "policy", "weld"))])
@@ -44,7 +53,7 @@ def test_a_folder_without_a_valid_record_is_no_result(tmp_path, record):
     if record is not None:
         (tmp_path / RUN).write_text(json.dumps(record))
     with pytest.raises(EvaluationError, match="no result of an evaluation"):
-        read(tmp_path)
+        read_result(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -62,8 +71,8 @@ def test_a_result_from_before_there_was_a_weld_is_one_without_it(tmp_path):
     run = {name: value for name, value in RUN_OF.items() if name != "weld"}
     start(tmp_path / "a", run, [outcome(0)])
     write(tmp_path / "b", [outcome(1)])
-    assert read(tmp_path / "a").run == RunRecord.of(RUN_OF, "")
-    assert list(read(tmp_path / "a", tmp_path / "b").outcomes) == [0, 1]
+    assert read_result(tmp_path / "a").run == RunRecord.from_values(RUN_OF, "")
+    assert list(read_result(tmp_path / "a", tmp_path / "b").outcomes) == [0, 1]
     assert start(tmp_path / "a") == [0]
     with pytest.raises(OutputExistsError, match="weld: false -> true"):
         start(tmp_path / "a", {**RUN_OF, "weld": True})
@@ -78,22 +87,22 @@ def test_parts_are_merged_whatever_the_clock_and_the_machine(tmp_path):
         [outcome(1), outcome(0, measures=counts, seconds=40, p_vis=1, flag_seconds={"fail": 5})],
         machine={"processor": "arm64"},
     )
-    both = merge([tmp_path / "a", tmp_path / "b"], tmp_path / "c")
+    both = merge_results([tmp_path / "a", tmp_path / "b"], tmp_path / "c")
     assert list(both.outcomes) == [0, 1]
-    assert [part.episodes for part in both.run.parts] == [1, 2]
+    assert [part.episodes for part in both.run.merged_from] == [1, 2]
     first, second, merged = ((tmp_path / name / OUTCOMES).read_text() for name in "abc")
     assert merged == first + second.splitlines(keepends=True)[0]
     assert '"fallen": 3,' in merged
     assert start(tmp_path / "c") == [0, 1]
     with pytest.raises(OutputExistsError):
-        merge([tmp_path / "a", tmp_path / "b"], tmp_path / "c")
+        merge_results([tmp_path / "a", tmp_path / "b"], tmp_path / "c")
 
 
 def test_parts_that_disagree_are_refused(tmp_path):
     write(tmp_path / "a", [outcome(0)])
     write(tmp_path / "b", [outcome(0, seconds=3.6)])
     with pytest.raises(EvaluationError, match=r"two outcomes of episode 0 disagree.*seconds: 3\.5 -> 3\.6"):
-        merge([tmp_path / "a", tmp_path / "b"], tmp_path / "both")
+        merge_results([tmp_path / "a", tmp_path / "b"], tmp_path / "both")
     with pytest.raises(EvaluationError, match=r"jsonl:2: two outcomes of episode 0 disagree"):
         write(tmp_path / "c", [outcome(0), outcome(0, came_to=3)])
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b", "c"]
@@ -116,8 +125,8 @@ def test_results_of_different_runs_are_neither_continued_nor_joined(tmp_path, ke
         start(tmp_path / "a", {**RUN_OF, key: OTHERS[key]})
     write(tmp_path / "b", [outcome(1)], **{key: OTHERS[key]})
     with pytest.raises(EvaluationError, match=f"another {key}.*{key}"):
-        merge([tmp_path / "a", tmp_path / "b"], tmp_path / "both")
-    assert parts_of([tmp_path / "a", tmp_path / "b"]) == [[tmp_path / "a"], [tmp_path / "b"]]
+        merge_results([tmp_path / "a", tmp_path / "b"], tmp_path / "both")
+    assert group_partial_results([tmp_path / "a", tmp_path / "b"]) == [[tmp_path / "a"], [tmp_path / "b"]]
     assert start(tmp_path / "a", {**RUN_OF, key: OTHERS[key]}, overwrite=True) == []
 
 
@@ -126,7 +135,7 @@ def test_what_was_played_twice_is_two_results(tmp_path):
     for name, numbers in (("a", (0, 1)), ("b", (2,)), ("c", (1, 2))):
         write(tmp_path / name, [outcome(number) for number in numbers])
     folders = [tmp_path / name for name in "abc"]
-    assert parts_of(folders) == [folders[:2], folders[2:]]
+    assert group_partial_results(folders) == [folders[:2], folders[2:]]
 
 
 @pytest.mark.parametrize(
@@ -155,10 +164,10 @@ def test_where_a_server_was_is_not_who_it_served(tmp_path):
     """As where each of two GPUs serves a shard."""
     write(tmp_path / "a", [outcome(0)], policy={"name": "ws://a:8001?connect_s=3", **SERVED})
     write(tmp_path / "b", [outcome(1)], policy={"name": "ws://b:8002", **SERVED})
-    assert list(read(tmp_path / "a", tmp_path / "b").outcomes) == [0, 1]
-    assert parts_of([tmp_path / "a", tmp_path / "b"]) == [[tmp_path / "a", tmp_path / "b"]]
+    assert list(read_result(tmp_path / "a", tmp_path / "b").outcomes) == [0, 1]
+    assert group_partial_results([tmp_path / "a", tmp_path / "b"]) == [[tmp_path / "a", tmp_path / "b"]]
     assert start(tmp_path / "a", {**RUN_OF, "policy": {"name": "ws://c:1", **SERVED}}) == [0]
-    assert read(tmp_path / "a").run.policy.name.startswith("ws://a")
+    assert read_result(tmp_path / "a").run.policy.name.startswith("ws://a")
     other = {**SERVED, "server": {"name": "other"}}
     with pytest.raises(OutputExistsError, match='policy.server.name: "mine" -> "other"'):
         start(tmp_path / "a", {**RUN_OF, "policy": {"name": "ws://c:1", **other}})
@@ -166,16 +175,16 @@ def test_where_a_server_was_is_not_who_it_served(tmp_path):
     write(tmp_path / "c", [outcome(0)], policy={"name": "ws://a:1", **silent})
     write(tmp_path / "d", [outcome(1)], policy={"name": "ws://a:2", **silent})
     with pytest.raises(EvaluationError, match="another policy"):
-        read(tmp_path / "c", tmp_path / "d")
+        read_result(tmp_path / "c", tmp_path / "d")
 
 
 def test_what_an_error_broke_off_is_played_again_if_that_is_asked_for(tmp_path):
     broken = outcome(1, 0, error="no server", failure_stage="error")
     write(tmp_path / "a", [outcome(0), broken, outcome(2)])
     assert start(tmp_path / "a") == [0, 1, 2]
-    assert read(tmp_path / "a").broken_off() == 1
+    assert read_result(tmp_path / "a").error_count() == 1
     assert start(tmp_path / "a", new=[outcome(1)], retry_errors=True) == [0, 2]
-    assert read(tmp_path / "a").outcomes[1].success
+    assert read_result(tmp_path / "a").outcomes[1].success
 
 
 @pytest.mark.parametrize("overwrite", [False, True])

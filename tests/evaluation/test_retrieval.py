@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from robocas_ms3.evaluation.metrics import RetrievalOrder, needed
+from robocas_ms3.evaluation.metrics import RetrievalOrder, objects_to_move
 from robocas_ms3.evaluation.outcomes import Retrieval
 
 TARGET, LID, CUP, PEAR = range(4)
@@ -52,15 +52,15 @@ def kept_of(moves: dict[int, int], held_at: int = 1000, steps: int = 200) -> np.
 
 
 def test_what_lies_on_what_lies_on_the_target_is_needed():
-    assert needed(OVER[:, :, TARGET] >= 0.1, OVER >= 0.1).tolist() == [[False, True, True, False]]
+    assert objects_to_move(OVER[:, :, TARGET] >= 0.1, OVER >= 0.1).tolist() == [[False, True, True, False]]
     hemmed_in = torch.tensor([[False, False, False, True]])
-    assert needed(hemmed_in, OVER >= 0.1).tolist() == [[False, False, False, True]]
+    assert objects_to_move(hemmed_in, OVER >= 0.1).tolist() == [[False, False, False, True]]
 
 
 def test_from_the_top_down():
     kept = kept_of({CUP: 10, LID: 60, PEAR: 81})
     assert kept.tolist() == [[0, 0, 0], [30, 1, 1], [5, 1, 1], [41, 0, 0]]
-    found = Retrieval.of(kept, NAMES, held_at=90, cleared=True)
+    found = Retrieval.from_record(kept, NAMES, held_at=90, cleared=True)
     assert [move.object for move in found.moved] == ["cup", "lid", "pear"]
     assert [move.needed for move in found.moved] == [True, True, False]
     assert (found.needed, found.left, found.score) == (["lid", "cup"], 0, 0.6667)
@@ -74,21 +74,21 @@ def test_what_is_pushed_as_one_moves_within_a_second_wherever_that_begins(start)
 
 def test_from_below_or_not_at_all():
     assert kept_of({LID: 20}).tolist()[LID] == [10, 1, 0]
-    found = Retrieval.of(kept_of({LID: 20}), NAMES, held_at=50, cleared=False)
+    found = Retrieval.from_record(kept_of({LID: 20}), NAMES, held_at=50, cleared=False)
     assert (found.left, found.score) == (1, 0.0)
-    assert Retrieval.of(kept_of({LID: 20}), NAMES, held_at=50, cleared=True).left == 0
+    assert Retrieval.from_record(kept_of({LID: 20}), NAMES, held_at=50, cleared=True).left == 0
 
 
 def test_what_moves_once_the_target_is_held_does_not_count():
-    found = Retrieval.of(kept_of({CUP: 10, LID: 60}, held_at=60), NAMES, held_at=30, cleared=True)
+    found = Retrieval.from_record(kept_of({CUP: 10, LID: 60}, held_at=60), NAMES, held_at=30, cleared=True)
     assert [move.object for move in found.moved] == ["cup"]
 
 
 def test_a_target_that_was_never_held_has_no_order():
-    found = Retrieval.of(kept_of({CUP: 10}), NAMES, held_at=None, cleared=False)
+    found = Retrieval.from_record(kept_of({CUP: 10}), NAMES, held_at=None, cleared=False)
     assert (found.score, found.left, len(found.moved)) == (None, 0, 1)
     nothing = np.zeros((4, 3), np.int16)
-    assert Retrieval.of(nothing, NAMES, held_at=5, cleared=True).score == 1.0
+    assert Retrieval.from_record(nothing, NAMES, held_at=5, cleared=True).score == 1.0
 
 
 def test_envs_begin_anew_on_their_own():

@@ -19,7 +19,7 @@ class Obedient:
     def __init__(self, chunk: int = 1) -> None:
         self.chunk, self.asked = chunk, []
 
-    def reset(self, starts: list[EpisodeSpec]) -> None:
+    def reset(self, episodes: list[EpisodeSpec]) -> None:
         pass
 
     def act(self, observations: Observations) -> np.ndarray:
@@ -41,9 +41,9 @@ def starts(*seeds: int) -> list[EpisodeSpec]:
 def test_every_episode_is_played_once_with_its_own_instruction(count, refill):
     env, policy = CountingEnv(count, None), Obedient()
     played = play(env, policy, starts(3, 9, 2, 5, 4, 1), 7, refill=refill)
-    assert sorted(one.start.episode for one in played) == list(range(6))
+    assert sorted(one.spec.episode for one in played) == list(range(6))
     for one in played:
-        seed = one.start.seed
+        seed = one.spec.seed
         assert one.steps == min(seed, 7)
         assert one.seconds == pytest.approx(0.05 * one.steps)
         assert one.flags["success"] == (seed if seed <= 7 else None)
@@ -57,7 +57,7 @@ def test_every_episode_is_played_once_with_its_own_instruction(count, refill):
 def test_chunks_are_played_to_their_end_before_the_policy_is_asked_again():
     policy = Obedient(chunk=3)
     played = play(CountingEnv(2, None), policy, starts(4, 7), 7)
-    assert {one.start.seed: one.steps for one in played} == {4: 4, 7: 7}
+    assert {one.spec.seed: one.steps for one in played} == {4: 4, 7: 7}
     assert policy.asked == [[0, 1], [0, 1], [1]]
 
 
@@ -86,7 +86,7 @@ def test_an_episode_whose_policy_fails_or_acts_by_nan_ends_alone(fails):
         return actions
 
     policy.act = sick
-    played = sorted(play(CountingEnv(2, None), policy, starts(4, 5, 3), 7), key=lambda one: one.start.seed)
+    played = sorted(play(CountingEnv(2, None), policy, starts(4, 5, 3), 7), key=lambda one: one.spec.seed)
     error = "no plan" if fails else "the policy's action is not finite"
     assert [(one.error, one.steps) for one in played] == [("", 3), (error, 0), ("", 5)]
     outcome = played[1].outcome(load_protocol("smoke").episodes[0], ())

@@ -17,7 +17,7 @@ from robocas_ms3.evaluation.policy import ExternalPolicy, PolicySpec
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
-from robocas_ms3.evaluation.verify import problems
+from robocas_ms3.evaluation.verify import find_violations
 
 SMOKE = load_protocol("smoke")
 AT_5_HZ = PolicySpec(rate_hz=5)
@@ -134,7 +134,7 @@ def test_settings_that_do_not_fit_are_refused_before_anything_is_written(monkeyp
 
 def test_episodes_are_chosen_by_task_count_and_shard():
     def chosen(protocol=SMOKE, **settings):
-        return [one.episode for one in protocol.choose(EvaluationSettings(**settings))]
+        return [one.episode for one in protocol.select_episodes(EvaluationSettings(**settings))]
 
     assert chosen(tasks=("search", "pick")) == [0, 1, 4, 5]
     assert chosen(episodes=1) == [0, 2, 4, 6]
@@ -149,7 +149,7 @@ def opened(folder, policy="random", **settings) -> EvaluationSession:
 
 def evaluate(folder, policy="random", **settings) -> dict[int, dict]:
     list(opened(folder, policy, **settings).run())
-    return {number: one.without_clock() for number, one in results.read(folder).outcomes.items()}
+    return {number: one.reproducible_values() for number, one in results.read_result(folder).outcomes.items()}
 
 
 @pytest.mark.parametrize("times", [1, 2])
@@ -173,10 +173,14 @@ def test_an_episode_whose_process_dies_runs_again_once_and_then_counts_as_failed
         "episode 1: its process died: SIGSEGV; it is started again"
     ]
     assert all(env.closed for env in made)
-    assert not [one for one in problems(results.read(out), protocol) if one.startswith("episode 1:") and times == 2]
+    assert not [
+        one
+        for one in find_violations(results.read_result(out), protocol)
+        if one.startswith("episode 1:") and times == 2
+    ]
     command = ["eval", "--policy", "noop", "--protocol", short, "--backend", "processes", "--out", out]
     assert cli([str(word) for word in command]) == times - 1  # continues, and does not run the failed episode again
-    assert results.read(out).broken_off() == times - 1
+    assert results.read_result(out).error_count() == times - 1
 
 
 @pytest.mark.parametrize("times", [1, 2])

@@ -15,10 +15,10 @@ from robocas_ms3.evaluation.statistics import (
     mcnemar,
     mcnemar_power,
     paired_interval,
+    power_warning,
     smallest_paired_difference,
-    success_by,
     success_rate,
-    too_few,
+    success_rates_by_bin,
 )
 
 Z2 = norm.isf(0.025) ** 2
@@ -106,7 +106,10 @@ def test_paired_interval_covers_about_as_often_as_it_says(n, worst):
 @given(COUNTS)
 def test_swapping_the_runs_swaps_signs(counts):
     both, only_a, only_b, neither = counts
-    ours, swapped = Comparison.of(both, only_a, only_b, neither), Comparison.of(both, only_b, only_a, neither)
+    ours, swapped = (
+        Comparison.from_counts(both, only_a, only_b, neither),
+        Comparison.from_counts(both, only_b, only_a, neither),
+    )
     assert ours.p_value == swapped.p_value
     assert ours.difference == -swapped.difference
     assert (ours.low, ours.high) == pytest.approx((-swapped.high, -swapped.low), abs=1e-9)
@@ -120,7 +123,7 @@ def test_runs_are_compared_scene_by_scene():
     found = compare(a, b)
     assert (found.both, found.only_a, found.only_b, found.neither) == (2, 3, 1, 2)
     assert (found.successes_a, found.successes_b, found.n, found.difference) == (5, 3, 8, 0.25)
-    assert found == Comparison.of(2, 3, 1, 2)
+    assert found == Comparison.from_counts(2, 3, 1, 2)
     assert found.p_value == pytest.approx(2 * (1 + 4) / 2**4)
     assert compare(a.tolist(), a.tolist()).p_value == 1
 
@@ -135,7 +138,7 @@ def test_holm_by_hand():
 def test_bins_hold_their_lower_edge_and_the_last_one_both():
     values = [0.0, 0.2, 0.5, 0.5, 0.9, 1.0]
     successes = [False, True, True, False, True, True]
-    found = success_by(values, successes, [0, 0.5, 0.75, 0.8, 1])
+    found = success_rates_by_bin(values, successes, [0, 0.5, 0.75, 0.8, 1])
     assert found == [success_rate(1, 2), success_rate(1, 2), None, success_rate(2, 2)]
 
 
@@ -164,12 +167,12 @@ def test_the_smallest_difference_has_the_power_asked_for(n, discordant):
 
 
 def test_a_warning_says_what_would_show():
-    assert too_few(Comparison.of(20, 8, 5, 7)) == (
+    assert power_warning(Comparison.from_counts(20, 8, 5, 7)) == (
         "not told apart: 40 episodes show differences of 26 points or more (80 % power)"
     )
-    assert "5 episodes show no difference, however large" in (too_few(Comparison.of(0, 5, 0, 0)) or "")
-    assert too_few(Comparison.of(0, 6, 0, 0)) is None  # p = 1/32
-    assert too_few(Comparison.of(0, 6, 0, 0), alpha=0.05 / 2) is not None  # one of two comparisons
+    assert "5 episodes show no difference, however large" in (power_warning(Comparison.from_counts(0, 5, 0, 0)) or "")
+    assert power_warning(Comparison.from_counts(0, 6, 0, 0)) is None  # p = 1/32
+    assert power_warning(Comparison.from_counts(0, 6, 0, 0), alpha=0.05 / 2) is not None  # one of two comparisons
 
 
 def test_another_package_says_the_same():
@@ -183,7 +186,7 @@ def test_another_package_says_the_same():
             )
     for counts in [(20, 8, 5, 7), (59, 6, 16, 80), (0, 12, 0, 0), (9, 0, 0, 4), (3, 0, 6, 1), (0, 4, 4, 0)]:
         table = robostats.PairedResult("a", "b", *counts, tuple(map(str, range(sum(counts)))), 0, 0, ("",), ("",), None)
-        theirs, ours = robostats.compare(table), Comparison.of(*counts)
+        theirs, ours = robostats.compare(table), Comparison.from_counts(*counts)
         assert ours.p_value == pytest.approx(theirs.p_value, abs=1e-12)
         assert (ours.low, ours.high) == pytest.approx((theirs.interval.lower, theirs.interval.upper), abs=1e-10)
     kmodel = pytest.importorskip("robostats.kmodel")

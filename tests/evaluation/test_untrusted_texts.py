@@ -13,7 +13,7 @@ from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.policy import EpisodeSpec, PolicySpec, describe
 from robocas_ms3.evaluation.remote.server import PolicyServer
 from robocas_ms3.evaluation.report import write_report
-from robocas_ms3.evaluation.report.comparison import comparison
+from robocas_ms3.evaluation.report.comparison import compare_results
 from robocas_ms3.evaluation.rollout import Rollout
 from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
@@ -57,8 +57,8 @@ def test_what_a_description_says_is_read_back_and_does_not_rename_the_policy(tmp
     policy = Policy({"name": 5, "sizes": (1, 2), "note": HOSTILE})
     run = EvaluationSession(policy, EvaluationSettings(policy="mine", protocol="smoke", backend="processes")).record
     with results.open_result(tmp_path / "out", run):
-        results.append(tmp_path / "out", outcome(0))
-    assert results.read(tmp_path / "out").run.policy.name == "mine"
+        results.append_outcome(tmp_path / "out", outcome(0))
+    assert results.read_result(tmp_path / "out").run.policy.name == "mine"
     with results.open_result(tmp_path / "out", run) as done:  # what was written is what is asked for again
         assert list(done) == [0]
 
@@ -69,8 +69,8 @@ def test_an_error_text_of_a_policy_is_read_back(tmp_path):
     made = Rollout(start, error=f"{HOSTILE}\udcff").outcome(episode, [])
     assert made.error.isprintable()
     write(tmp_path / "out", [])
-    results.append(tmp_path / "out", made)
-    assert asdict(results.read(tmp_path / "out").outcomes[0]) == asdict(made)
+    results.append_outcome(tmp_path / "out", made)
+    assert asdict(results.read_result(tmp_path / "out").outcomes[0]) == asdict(made)
 
 
 def test_reports_show_texts_as_they_are(tmp_path):
@@ -80,7 +80,7 @@ def test_reports_show_texts_as_they_are(tmp_path):
     found = write(tmp_path / "out", outcomes, **run, protocol_hash=HOSTILE)
     write_report(found, tmp_path / "report")
     reports = {name: (tmp_path / "report" / name).read_text(encoding="utf-8") for name in ("report.md", "report.html")}
-    reports["comparison"] = comparison([found, found])
+    reports["comparison"] = compare_results([found, found])
     for name, text in reports.items():
         assert all(character.isprintable() or character in "\n\t" for character in text), name
         assert "<script>alert" not in text.replace("\\<", "")

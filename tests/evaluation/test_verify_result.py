@@ -11,8 +11,8 @@ from made_up_results import of_protocol
 from robocas_ms3.cli.eval_results import Verify, verify
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.protocol import load_protocol
-from robocas_ms3.evaluation.results import OUTCOMES, RUN, read
-from robocas_ms3.evaluation.verify import problems
+from robocas_ms3.evaluation.results import OUTCOMES, RUN, read_result
+from robocas_ms3.evaluation.verify import find_violations
 from robocas_ms3.scenes.task_specs import TASKS
 
 
@@ -65,9 +65,9 @@ def tamper_run(folder, **values):
     ],
 )
 def test_a_changed_episode_is_found(folder, protocol, values, said):
-    assert problems(read(folder), protocol) == []
+    assert find_violations(read_result(folder), protocol) == []
     tamper(folder, 0, **values)
-    found = problems(read(folder), protocol)
+    found = find_violations(read_result(folder), protocol)
     assert said in found
     assert ("missing: 1 of 8 episodes" in found) == ("episode" in values)
 
@@ -86,19 +86,19 @@ def test_a_changed_episode_is_found(folder, protocol, values, said):
 def test_a_value_out_of_range_makes_no_result(folder, values):
     tamper(folder, 0, **values)
     with pytest.raises(EvaluationError, match=f"{OUTCOMES}:1: "):
-        read(folder)
+        read_result(folder)
 
 
 def test_another_protocol_or_pack_or_a_weld_where_none_can_be_is_found(folder, protocol):
-    tamper(folder, 0, measures=read(folder).outcomes[0].measures | {"welds": 1.0})
-    assert problems(read(folder), protocol) == ["episode 0: it counts welds, the run says weld: False"]
+    tamper(folder, 0, measures=read_result(folder).outcomes[0].measures | {"welds": 1.0})
+    assert find_violations(read_result(folder), protocol) == ["episode 0: it counts welds, the run says weld: False"]
     tamper_run(folder, weld=True)
-    found = problems(read(folder), protocol)
+    found = find_violations(read_result(folder), protocol)
     assert "it was measured with upstream's weld, which does not belong to this protocol's steps" in found
     assert "episode 1: it counts no welds, the run says weld: True" in found
     assert len(found) == 8
     tamper_run(folder, protocol_hash="ef" * 32, pack_hashes={"builtin": "00"})
-    protocol_and_pack = problems(read(folder), protocol)[:2]
+    protocol_and_pack = find_violations(read_result(folder), protocol)[:2]
     assert [problem.split(" than")[0].split(":")[0] for problem in protocol_and_pack] == [
         "it is of another protocol",
         "it was measured with another pack",
@@ -110,12 +110,14 @@ def test_another_protocol_or_pack_or_a_weld_where_none_can_be_is_found(folder, p
 )
 def test_an_order_of_retrieval_agrees_with_itself(folder, protocol, changed, well):
     """Whatever the task is called, there were obstacles to clear."""
-    before = read(folder).outcomes[0]
+    before = read_result(folder).outcomes[0]
     flags, seconds = before.flags | {"obstacles_cleared": 20}, before.flag_seconds | {"obstacles_cleared": 1.0}
     tamper(folder, 0, flags=flags, flag_seconds=seconds, retrieval={**ORDER, **changed})
-    assert len(problems(read(folder), protocol)) == (0 if well else 1)
+    assert len(find_violations(read_result(folder), protocol)) == (0 if well else 1)
     tamper(folder, 1, retrieval=ORDER)
-    assert "episode 1: its order of retrieval does not agree with itself" in problems(read(folder), protocol)
+    assert "episode 1: its order of retrieval does not agree with itself" in find_violations(
+        read_result(folder), protocol
+    )
 
 
 def test_the_stages_of_an_episode_are_those_of_its_task(folder, protocol, monkeypatch):
@@ -126,9 +128,11 @@ def test_the_stages_of_an_episode_are_those_of_its_task(folder, protocol, monkey
     tamper(
         folder, 0, flags=flags, flag_seconds=dict.fromkeys(flags, 0.5) | {"aligned": None, "success": None}, **failed
     )
-    assert problems(read(folder), protocol) == []
+    assert find_violations(read_result(folder), protocol) == []
     monkeypatch.undo()
-    assert problems(read(folder), protocol) == ["episode 0: failure_stage is aligned, by its flags placed"]
+    assert find_violations(read_result(folder), protocol) == [
+        "episode 0: failure_stage is aligned, by its flags placed"
+    ]
 
 
 def test_the_command_fails_where_something_is_wrong_and_a_result_chooses_no_folder(

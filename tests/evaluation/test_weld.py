@@ -19,7 +19,7 @@ from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
-from robocas_ms3.evaluation.verify import problems
+from robocas_ms3.evaluation.verify import find_violations
 from robocas_ms3.robots.description import MOBILE_PANDA
 
 OPEN, CLOSE = 1.0, 0.0
@@ -182,6 +182,6 @@ def test_an_evaluation_with_it_counts_it_and_says_so(tmp_path):
     settings = EvaluationSettings(("pick",), name, str(protocol.folder), folder, **settings)
     (outcome,) = EvaluationSession(make_policy(name), settings).run()
     assert outcome.success and outcome.measures["welds"] == 1
-    result = results.read(folder)
+    result = results.read_result(folder)
     assert result.run.weld
-    assert problems(result, protocol) == ["missing: 399 of 400 episodes"]
+    assert find_violations(result, protocol) == ["missing: 399 of 400 episodes"]

@@ -54,7 +54,7 @@ from robocas_ms3.evaluation.remote.messages import observation_message, read_obs
 class Sees:
     spec = PolicySpec(rate_hz=5, cameras={"side_camera": (32, 24)}, language="none")
 
-    def reset(self, starts):
+    def reset(self, episodes):
         pass
 
     def act(self, seen):

@@ -12,7 +12,7 @@ from robocas_ms3.cli.list import collect
 from robocas_ms3.core.errors import EvaluationError, ExtensionError
 from robocas_ms3.core.extensions import Registry
 from robocas_ms3.evaluation import policies, results
-from robocas_ms3.evaluation.policies import GROUP, make_policy
+from robocas_ms3.evaluation.policies import POLICY_GROUP, make_policy
 from robocas_ms3.evaluation.protocol import load_protocol
 
 
@@ -47,7 +47,7 @@ def test_a_broken_one_is_an_error_only_when_it_is_chosen(site, module, error):
     about = site / "spoilt_policies-1.0.dist-info"
     about.mkdir()
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: spoilt-policies\nVersion: 1.0\n")
-    (about / "entry_points.txt").write_text(f"[{GROUP}]\nit = spoilt_policies:It\n")
+    (about / "entry_points.txt").write_text(f"[{POLICY_GROUP}]\nit = spoilt_policies:It\n")
     (site / "spoilt_policies.py").write_text(module)
     assert "it" in {row["name"] for row in collect()["policies"]}
     assert type(make_policy("descend")).__name__ == "Descend"
@@ -64,7 +64,7 @@ def test_it_is_measured_by_its_name(site, tmp_path):
     (line,) = [line for line in PAGE.splitlines() if line.startswith("robocas eval") and "descend" in line]
     command = line.replace("robocas eval", "eval").replace("smoke", str(protocol)).split()
     robocas(site, *command, "--backend", "processes", "--envs", 1, cwd=tmp_path)
-    result = results.read(tmp_path / "eval" / "descend")
+    result = results.read_result(tmp_path / "eval" / "descend")
     assert result.run.policy.name == "descend"
     assert result.run.policy.model_dump()["class"] == "my_policies:Descend"
     (outcome,) = result.outcomes.values()

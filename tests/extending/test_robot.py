@@ -176,7 +176,7 @@ def test_an_evaluation_is_of_the_robot_that_its_protocol_names(site, tmp_path):
         rules.write("robot: twin\n")
     words = ["--policy", "scripted", "--protocol", protocol, "--episodes", 1, "--out", tmp_path / "eval"]
     robocas(site, "eval", "pick", *words, "--backend", "processes", "--envs", 1)
-    (outcome,) = results.read(tmp_path / "eval").outcomes.values()
+    (outcome,) = results.read_result(tmp_path / "eval").outcomes.values()
     assert outcome.error == ""
     assert outcome.success
 

@@ -40,9 +40,9 @@ from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.demos.trajectory_replay import Recorded
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
-from robocas_ms3.evaluation.report.comparison import comparison
-from robocas_ms3.evaluation.report.page import page
-from robocas_ms3.evaluation.report.tables import markdown
+from robocas_ms3.evaluation.report.comparison import compare_results
+from robocas_ms3.evaluation.report.page import render_page
+from robocas_ms3.evaluation.report.tables import render_markdown
 from robocas_ms3.plans.folder import OUTCOME, OUTCOMES, PLAN, Outcome, PlanFolder, WorkUnit, read_plan
 from robocas_ms3.plans.load import load_plan, shipped_plans
 from robocas_ms3.plans.status import read_status
@@ -206,11 +206,11 @@ def read_hull_file(root):
 
 
 def read_result(root):
-    found = results.read(root)
-    assert markdown(found)
-    assert page(found)
-    assert comparison([found, found])
-    results.parts_of([root])
+    found = results.read_result(root)
+    assert render_markdown(found)
+    assert render_page(found)
+    assert compare_results([found, found])
+    results.group_partial_results([root])
 
 
 def read_plan_folder(root):

@@ -92,7 +92,7 @@ def content(command, out):
                 for seed, one in ((one["episode_seed"], one) for one in episodes)
             ]
     elif command.name == "eval":
-        found = [(number, one.without_clock()) for number, one in results.read(out).outcomes.items()]
+        found = [(number, one.reproducible_values()) for number, one in results.read_result(out).outcomes.items()]
     elif command.name == "convert":
         found = [(path.name, files_of(path)) for path in sorted(out.glob("episode_*"))]
     else:  # by seed: where one was left out, the numbers of others are others, which their scenes say

@@ -68,7 +68,7 @@ class MadeUpModel(torch.nn.Module):
 class MadeUpPolicy:
     spec = PolicySpec(language="none")
 
-    def reset(self, starts):
+    def reset(self, episodes):
         pass
 
     def act(self, observations):

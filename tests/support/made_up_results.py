@@ -10,7 +10,7 @@ from typing import Any
 
 from robocas_ms3.evaluation.outcomes import Outcome, failure_stage
 from robocas_ms3.evaluation.protocol import LoadedProtocol
-from robocas_ms3.evaluation.results import OUTCOMES, RUN, Result, read
+from robocas_ms3.evaluation.results import OUTCOMES, RUN, Result, read_result
 
 STAGES = ("reached_any", "picked_any", "reached_target", "target_grasped", "target_lifted", "target_in_basket")
 RUN_OF = {
@@ -56,7 +56,7 @@ def write(folder: Path, outcomes: Iterable[Outcome], **run: Any) -> Result:
     folder.mkdir(parents=True)
     (folder / RUN).write_text(json.dumps({**RUN_OF, **run}))
     (folder / OUTCOMES).write_text("".join(json.dumps(asdict(one)) + "\n" for one in outcomes))
-    return read(folder)
+    return read_result(folder)
 
 
 def of_protocol(folder: Path, protocol: LoadedProtocol) -> Result:

@@ -99,11 +99,11 @@ class LeRobotPolicy:
     def describe(self) -> dict[str, Any]:
         return self._about
 
-    def reset(self, starts: list[EpisodeSpec]) -> None:
-        """Start episodes: queues are emptied, noise starts with the episode's seed."""
-        for start in starts:
-            self._models[start.env] = _copy_with_queues(self._model)
-            self._draws[start.env] = np.random.default_rng([start.seed, start.episode])
+    def reset(self, episodes: list[EpisodeSpec]) -> None:
+        """Start episodes: queues are emptied, noise episodes with the episode's seed."""
+        for episode in episodes:
+            self._models[episode.env] = _copy_with_queues(self._model)
+            self._draws[episode.env] = np.random.default_rng([episode.seed, episode.episode])
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
         """Return actions (E, 7), of each env by itself, so that they do not depend on the other envs."""

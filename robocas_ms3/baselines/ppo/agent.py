@@ -85,7 +85,7 @@ class PpoPolicy:
         )
         self._agent, self._size = agent, facts["observed"]
 
-    def reset(self, starts: list[EpisodeSpec]) -> None:
+    def reset(self, episodes: list[EpisodeSpec]) -> None:
         pass
 
     def act(self, observations: Observations) -> NDArray[np.floating]:

@@ -45,10 +45,10 @@ class RT1Policy:
         name = path.name if path is not None and bool(self._model.from_imagenet) else "from scratch"
         return {"image_weights": name}
 
-    def reset(self, starts: list[EpisodeSpec]) -> None:
-        for start in starts:
-            self._frames.pop(start.env, None)
-            self._final.pop(start.env, None)
+    def reset(self, episodes: list[EpisodeSpec]) -> None:
+        for episode in episodes:
+            self._frames.pop(episode.env, None)
+            self._final.pop(episode.env, None)
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
         """Return actions (E, 7), of each env by itself: in a batch their last bits depend on the other rows."""

@@ -44,7 +44,7 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         self._episodes = self._session.episodes
         if settings.envs > 1:
             splits = ", ".join(dict.fromkeys(episode.split for episode in self._episodes))
-            self._session.protocol.check_one_configuration(
+            self._session.protocol.check_same_configuration(
                 self._episodes, f"Choose one of the splits {splits}, or use one env."
             )
         self._task = self._episodes[0].task
@@ -53,7 +53,7 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         self._folder, self._recorded = settings.out, set[int]()  # episodes that the result has
         if (folder := settings.out) is not None:
             with ExitStack() as lock:
-                if lock.enter_context(results.open_result(folder, self._session.record)):
+                if lock.enter_context(results.open_result(folder, self._session.run_record)):
                     raise EvaluationError("there is a result already", where=folder, fix="Choose another folder.")
                 self._lock = lock.pop_all()  # held until `close`
         self._convention = CONVENTIONS[spec.convention]
@@ -140,9 +140,9 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         self._lock.close()
 
     def _commands(self, actions: NDArray[np.float32]) -> list[float]:
-        if self._convention.read is None:
+        if self._convention.decode is None:
             return actions[:, -1].tolist()
-        opened = self._convention.read(np.nan_to_num(actions.astype(np.float64))).open
+        opened = self._convention.decode(np.nan_to_num(actions.astype(np.float64))).open
         return np.where(opened, 1.0, -1.0).tolist()
 
     def _by_env(self, holds: Callable[[Outcome], bool]) -> NDArray[np.bool_]:
@@ -154,7 +154,7 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         """Write the outcomes of envs into the result, each episode once."""
         for outcome in (self._session.outcomes[env] for env in envs):
             if self._folder is not None and outcome.episode not in self._recorded:
-                results.append(self._folder, outcome)
+                results.append_outcome(self._folder, outcome)
                 self._recorded.add(outcome.episode)
 
     def _read(self, envs: list[int]) -> None:

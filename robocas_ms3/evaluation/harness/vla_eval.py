@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.harness.proprioception import WIDTHS, Proprioception
 from robocas_ms3.evaluation.metrics import MEASURES
-from robocas_ms3.evaluation.outcomes import STAGES
+from robocas_ms3.evaluation.outcomes import PAPER_STAGES
 from robocas_ms3.evaluation.policy import ExternalPolicy, Observations
 from robocas_ms3.evaluation.protocol import ProtocolEpisode
-from robocas_ms3.evaluation.remote.messages import actions_of, read_policy_spec
+from robocas_ms3.evaluation.remote.messages import parse_actions, read_policy_spec
 from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
 
@@ -85,7 +85,7 @@ class RoboCAS:
 
     def get_metric_keys(self) -> dict[str, str]:
         """Return the entries of results that are averaged over episodes."""
-        names = ("success", "success_at_end", "success_v0", *STAGES.values(), "seconds", *MEASURES)
+        names = ("success", "success_at_end", "success_v0", *PAPER_STAGES.values(), "seconds", *MEASURES)
         return dict.fromkeys(names, "mean")
 
     def get_action_spec(self) -> dict[str, Any]:
@@ -126,7 +126,7 @@ class RoboCAS:
 
     async def apply_action(self, action: Mapping[str, Any]) -> None:
         """Execute an action, or all of a chunk."""
-        actions = actions_of({"actions": action.get("actions", action.get("action"))}, self._spec.convention)
+        actions = parse_actions({"actions": action.get("actions", action.get("action"))}, self._spec.convention)
         self._seen = self._session.step(actions[None])
         self._record()
 
@@ -160,7 +160,7 @@ class RoboCAS:
             **outcome.measures,
             **asdict(outcome),
             "instruction": episode.instruction,
-            **self._session.record.model_dump(include={"protocol", "protocol_hash", "versions"}),
+            **self._session.run_record.model_dump(include={"protocol", "protocol_hash", "versions"}),
         }
 
     def cleanup(self) -> None:

@@ -1,7 +1,8 @@
-"""Policies by name: builtin ones, those of installed packages, ``replay:DATASET``, ``module:Class``, ``ws://host:port``.
+"""Registry of policies: built-in, of installed packages, ``replay:DATASET``, ``module:Class``, ``ws://host:port``.
 
-A package offers policies as entry points of the group `GROUP`: see docs/extending.md. Folders that hold a policy, such
-as the runs of `robocas train`, are opened by entry points of the group `FOLDERS_GROUP`, named by a file in them.
+A package registers policies as entry points of the group `POLICY_GROUP` (docs/extending.md). A folder that holds a
+policy, such as a run of `robocas train`, is opened by an entry point of the group `POLICY_FOLDER_GROUP`; the name of
+the entry point is the name of a file in the folder.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ from robocas_ms3.core.strict_model import did_you_mean
 from robocas_ms3.evaluation.policies.plain import NoopPolicy, RandomPolicy
 from robocas_ms3.evaluation.policy import Policy, PolicySpec
 
-GROUP = "robocas_ms3.policies"
-FOLDERS_GROUP = "robocas_ms3.policy_folders"
+POLICY_GROUP = "robocas_ms3.policies"
+POLICY_FOLDER_GROUP = "robocas_ms3.policy_folders"
 
 
 def _scripted(convention: Literal["joint_positions", "robocas"], *, perturbed: bool = False) -> Policy:
@@ -47,7 +48,7 @@ def _replay(trajectory: str) -> Policy:
 
 POLICIES: Registry[Callable[[], Policy]] = Registry(
     "policy",
-    GROUP,
+    POLICY_GROUP,
     Callable,
     {
         "scripted": partial(_scripted, "joint_positions"),
@@ -57,9 +58,11 @@ POLICIES: Registry[Callable[[], Policy]] = Registry(
         "noop": NoopPolicy,
     },
 )
-"""By name, what makes them."""
-FOLDERS: Registry[Callable[[Path], Policy]] = Registry("kind of policy folder", FOLDERS_GROUP, Callable, {})
-"""By a file that such a folder holds, what opens it."""
+"""Factories of policies by name."""
+POLICY_FOLDERS: Registry[Callable[[Path], Policy]] = Registry(
+    "kind of policy folder", POLICY_FOLDER_GROUP, Callable, {}
+)
+"""Functions that open a policy folder, by the name of a file in the folder."""
 
 
 def find_policy(name: str) -> Callable[[], Policy]:
@@ -72,9 +75,9 @@ def find_policy(name: str) -> Callable[[], Policy]:
     if kind == "replay" and rest:
         return partial(_replay, rest)
     folder = Path(name)
-    for file in FOLDERS.entry_points if folder.is_dir() else ():
+    for file in POLICY_FOLDERS.entry_points if folder.is_dir() else ():
         if (folder / file).is_file():
-            return lambda: FOLDERS[file](folder)
+            return lambda: POLICY_FOLDERS[file](folder)
     if re.fullmatch(r"\w+(\.\w+)*", kind) and rest.isidentifier():
         return partial(_make_own, name, kind, rest)
     expected = f"{', '.join(known)}, a folder of robocas train, replay:TRAJECTORY.h5, module:Class or ws://host:port"

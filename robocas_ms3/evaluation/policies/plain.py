@@ -16,7 +16,7 @@ class NoopPolicy:
 
     spec = PolicySpec(reference="tcp", language="none")
 
-    def reset(self, starts: list[EpisodeSpec]) -> None:
+    def reset(self, episodes: list[EpisodeSpec]) -> None:
         pass
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
@@ -32,10 +32,10 @@ class RandomPolicy:
         self._generators: dict[int, np.random.Generator] = {}
         self._open: dict[int, bool] = {}
 
-    def reset(self, starts: list[EpisodeSpec]) -> None:
-        for start in starts:
-            self._generators[start.env] = np.random.default_rng([start.seed, start.episode])
-            self._open[start.env] = True
+    def reset(self, episodes: list[EpisodeSpec]) -> None:
+        for episode in episodes:
+            self._generators[episode.env] = np.random.default_rng([episode.seed, episode.episode])
+            self._open[episode.env] = True
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
         return np.stack([self._draw(env) for env in observations.envs.tolist()])

@@ -53,7 +53,7 @@ class PoseTrack:
     step: int = 0
 
     @classmethod
-    def of(cls, robot: RobotSpec, robot_states: Array, gripper: Array, stride: int) -> PoseTrack:
+    def from_recording(cls, robot: RobotSpec, robot_states: Array, gripper: Array, stride: int) -> PoseTrack:
         """Return the track of a recording, one pose per ``stride`` control steps.
 
         ``robot_states`` (S + 1, 37) after the reset and each control step; ``gripper`` (S,) commands in [-1, 1].
@@ -83,11 +83,11 @@ class TrackPolicy(ABC):
         self._tracks: dict[int, JointTrack | PoseTrack] = {}  # by env
 
     @abstractmethod
-    def track(self, start: EpisodeSpec) -> JointTrack | PoseTrack:
+    def track(self, episode: EpisodeSpec) -> JointTrack | PoseTrack:
         pass
 
-    def reset(self, starts: list[EpisodeSpec]) -> None:
-        self._tracks |= {start.env: self.track(start) for start in starts}
+    def reset(self, episodes: list[EpisodeSpec]) -> None:
+        self._tracks |= {episode.env: self.track(episode) for episode in episodes}
 
     def act(self, observations: Observations) -> Array:
         """Return (E, A) actions."""
@@ -122,10 +122,10 @@ class ReplayPolicy(TrackPolicy):
     def describe(self) -> dict[str, Any]:
         return {"trajectory": self._trajectory.name, "episodes": len(self._episodes)}
 
-    def track(self, start: EpisodeSpec) -> JointTrack:
-        if start.seed not in self._episodes:
+    def track(self, episode: EpisodeSpec) -> JointTrack:
+        if episode.seed not in self._episodes:
             return JointTrack(np.zeros((0, 8)))
-        number = self._episodes[start.seed]
+        number = self._episodes[episode.seed]
         with open_trajectory(self._trajectory) as file:
             actions = read_actions(open_episode(file, number))
         if (found := actions.shape[1]) != 8:

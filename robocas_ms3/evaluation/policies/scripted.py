@@ -45,43 +45,43 @@ class ScriptedPolicy(TrackPolicy):
         self.spec = PolicySpec(convention, reference="tcp", rate_hz=rate, language="none")
         self._generators: dict[EpisodeSettings, EpisodeGenerator] = {}  # the one used last is the last
 
-    def track(self, start: EpisodeSpec) -> JointTrack | PoseTrack:
+    def track(self, episode: EpisodeSpec) -> JointTrack | PoseTrack:
         """Plan an episode, which takes seconds."""
         actions, states = np.zeros((0, 8)), np.zeros((1, 37))
-        generator = self._generator_of(start)
+        generator = self._generator_of(episode)
         with tempfile.TemporaryDirectory() as folder:
-            if generator.generate(start.seed, Path(folder), "episode").success:
+            if generator.generate(episode.seed, Path(folder), "episode").success:
                 with open_trajectory(Path(folder) / "episode.h5") as file:
-                    actions, found = read_steps(open_episode(file, 0), body=start.robot)
-                actions, states = actions[:, :8], found["articulations"][start.robot]
+                    actions, found = read_steps(open_episode(file, 0), body=episode.robot)
+                actions, states = actions[:, :8], found["articulations"][episode.robot]
         if self.spec.convention == "joint_positions":
             return JointTrack(actions)
-        track = PoseTrack.of(find_robot(start.robot), states, actions[:, 7], sample_stride(_FREQ, 5))
+        track = PoseTrack.from_recording(find_robot(episode.robot), states, actions[:, 7], sample_stride(_FREQ, 5))
         if self._perturbed:
-            track.poses[:, :2, 3] += offset(start.seed)
+            track.poses[:, :2, 3] += offset(episode.seed)
         return track
 
     def close(self) -> None:
         for generator in self._generators.values():
             generator.close()
 
-    def _generator_of(self, start: EpisodeSpec) -> EpisodeGenerator:
+    def _generator_of(self, episode: EpisodeSpec) -> EpisodeGenerator:
         """Return the generator of an episode's scenes; the one used longest ago is closed if there are too many."""
         for name in ("config_file", "layouts_file", "pack"):
-            if not getattr(start, name):
+            if not getattr(episode, name):
                 what, fix = "unknown configuration or scene", "Start the server with --protocol FOLDER."
                 expected = "a file of a shipped protocol, or of one that the server was started with"
                 raise EvaluationError(what, where=f"start.{name}", expected=expected, fix=fix)
-        TASKS.find(start.task, where="start.task")
-        find_robot(start.robot, where="start.robot")
+        TASKS.find(episode.task, where="start.task")
+        find_robot(episode.robot, where="start.robot")
         settings = EpisodeSettings(
-            start.task,
-            start.config_file,
-            start.pack,
+            episode.task,
+            episode.config_file,
+            episode.pack,
             control_freq=_FREQ,
             check_rate=0,
-            layouts=start.layouts_file,
-            robot=start.robot,
+            layouts=episode.layouts_file,
+            robot=episode.robot,
         )
         generator = self._generators.pop(settings, None) or EpisodeGenerator(settings)
         self._generators[settings] = generator

@@ -18,7 +18,7 @@ from robocas_ms3.core.errors import EvaluationError, PolicyError, WireError
 from robocas_ms3.core.text import one_line
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.evaluation.remote.connection import (
-    LOST,
+    CONNECTION_ERRORS,
     close_connection,
     open_connection,
     read_address,
@@ -31,9 +31,9 @@ from robocas_ms3.evaluation.remote.messages import (
     LARGEST_BATCH,
     PREFIX,
     ServerMetadata,
-    actions_of,
-    batch_of,
     observation_message,
+    parse_actions,
+    parse_batch,
     read_policy_spec,
 )
 from robocas_ms3.evaluation.remote.wire import pack
@@ -94,9 +94,9 @@ class RemotePolicy:
         rename = {"rename": self._address.rename} if self._address.rename else {}
         return {"server": self._metadata.policy, "play": self._address.play, **rename}
 
-    def reset(self, starts: list[EpisodeSpec]) -> None:
+    def reset(self, episodes: list[EpisodeSpec]) -> None:
         """Start episodes; the server learns of them with their first observation."""
-        self._starts |= {start.env: start for start in starts}
+        self._starts |= {episode.env: episode for episode in episodes}
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
         """Return (E, H, A) chunks."""
@@ -146,7 +146,7 @@ class RemotePolicy:
     def _chunk(self, answer: Any) -> NDArray[np.float32]:
         if isinstance(answer, EvaluationError):
             raise answer
-        chunk = actions_of(answer, self.spec.convention)[: self._address.play]
+        chunk = parse_actions(answer, self.spec.convention)[: self._address.play]
         self._chunk_length = self._chunk_length or len(chunk)
         if len(chunk) != self._chunk_length:
             raise WireError("chunks differ in length", expected=self._chunk_length, found=len(chunk))
@@ -199,7 +199,7 @@ class RemotePolicy:
                 answers = [await self._answer(connection.socket, messages[rows[0]])]
             else:
                 answer = await self._answer(connection.socket, {BATCH: [messages[row] for row in rows]})
-                answers = [_without_error(one) for one in batch_of(answer, len(rows), len(rows))]
+                answers = [_without_error(one) for one in parse_batch(answer, len(rows), len(rows))]
         except EvaluationError as error:
             await self._close(key)
             return dict.fromkeys(rows, error)
@@ -226,7 +226,7 @@ class RemotePolicy:
                 await asyncio.wait({answer}, timeout=left)
             self._last_answer = time.monotonic()
             return read_message(answer.result())
-        except LOST as error:
+        except CONNECTION_ERRORS as error:
             raise _ConnectionLost(f"the connection is lost: {one_line(error, 300)}") from error
         finally:
             answer.cancel()

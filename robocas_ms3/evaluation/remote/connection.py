@@ -28,7 +28,7 @@ PING_INTERVAL = 10.0  # s
 PING_TIMEOUT = 60.0  # s without an answer to a ping
 TCP_OPTIONS = {"TCP_KEEPIDLE": 30, "TCP_KEEPINTVL": 10, "TCP_KEEPCNT": 3}  # s, s, probes without an answer
 MAX_ANSWER = 16 * 2**20  # bytes
-LOST = (OSError, EOFError, asyncio.TimeoutError, WebSocketException)
+CONNECTION_ERRORS = (OSError, EOFError, asyncio.TimeoutError, WebSocketException)
 """Errors of a connection that is closed or can't be opened."""
 _RETRY_S = 0.2  # between attempts to connect
 _CLOSE_S = 1.0  # for a server's answer to a close frame
@@ -120,7 +120,7 @@ async def open_connection(url: str, connect_s: float, *, pings: bool) -> tuple[C
         try:
             connection, first = await asyncio.wait_for(_handshake(url, pings), max(deadline - time.monotonic(), 0.01))
             break
-        except LOST as error:
+        except CONNECTION_ERRORS as error:
             if deadline - time.monotonic() < _RETRY_S:
                 what, fix = f"no server within {connect_s:g} s", "Start it, then run the command again."
                 raise EvaluationError(what, where=url, found=one_line(error, 300), fix=fix) from error
@@ -139,7 +139,7 @@ async def close_connection(connection: ClientConnection) -> None:
     """Close a connection within 2 s, whatever the server does."""
     try:
         await asyncio.wait_for(connection.close(), 2 * _CLOSE_S)
-    except LOST:
+    except CONNECTION_ERRORS:
         connection.transport.abort()
 
 

@@ -21,7 +21,7 @@ from robocas_ms3.core.errors import EvaluationError, WireError
 from robocas_ms3.core.paths import protocols_dir
 from robocas_ms3.core.strict_model import error_from_validation
 from robocas_ms3.core.text import one_line
-from robocas_ms3.evaluation.policy import CONVENTIONS, ROBOT, EpisodeSpec, Observations, PolicySpec
+from robocas_ms3.evaluation.policy import CONVENTIONS, ROBOT_QUANTITIES, EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.evaluation.remote.wire import MAX_BYTES
 from robocas_ms3.robots.registry import DEFAULT
 
@@ -167,7 +167,7 @@ def read_observations(messages: Sequence[Mapping[str, Any]], envs: Sequence[int]
         embeddings=stack("embedding", "float32", None) if spec.language == "embedding" else None,
         images={name: stack(name, "uint8", *size, 3) for name, size in sizes.items()},
         depths={name: stack(f"{name}_depth", "int16", *size, 1) for name, size in sizes.items()} if spec.depth else {},
-        robot={name: stack(name, "float32", quantity.width) for name, quantity in ROBOT.items()},
+        robot={name: stack(name, "float32", quantity.width) for name, quantity in ROBOT_QUANTITIES.items()},
         state=stack("simulator_state", "float32", None) if spec.state else None,
     )
 
@@ -180,7 +180,7 @@ def file_name(path: str) -> str:
     return "/".join(parts)
 
 
-def actions_of(answer: Any, convention: str) -> NDArray[np.float32]:
+def parse_actions(answer: Any, convention: str) -> NDArray[np.float32]:
     """Return the (H, A) actions of an answer, which may have (A,).
 
     Raises:
@@ -201,7 +201,7 @@ def actions_of(answer: Any, convention: str) -> NDArray[np.float32]:
     return actions.reshape(-1, size).astype(np.float32)
 
 
-def batch_of(message: Any, least: int, most: int) -> list[dict[str, Any]]:
+def parse_batch(message: Any, least: int, most: int) -> list[dict[str, Any]]:
     """Return the maps of a batched request, or of the answer to it, ``least`` to ``most`` of them."""
     batch = message.get(BATCH) if isinstance(message, dict) else None
     if not isinstance(batch, list) or not all(isinstance(one, dict) for one in batch):
@@ -211,7 +211,7 @@ def batch_of(message: Any, least: int, most: int) -> list[dict[str, Any]]:
     return batch
 
 
-def message_bytes(spec: PolicySpec, max_batch: int = 1) -> int:
+def request_size_limit(spec: PolicySpec, max_batch: int = 1) -> int:
     """Return the size limit of a request: 8 MiB, and the images of all envs or four times those of one."""
     return min(MAX_BYTES, _OTHER_BYTES + max(4, max_batch) * _image_bytes(spec))
 

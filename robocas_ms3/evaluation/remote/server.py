@@ -28,9 +28,9 @@ from robocas_ms3.evaluation.policy import (
     EpisodeSpec,
     Observations,
     Policy,
-    as_chunks,
+    as_action_chunks,
     describe,
-    policy_code,
+    policy_exit_guard,
     policy_spec_values,
 )
 from robocas_ms3.evaluation.remote import connection
@@ -44,10 +44,10 @@ from robocas_ms3.evaluation.remote.messages import (
     RESET,
     ServerMetadata,
     batch_limit,
-    batch_of,
-    message_bytes,
+    parse_batch,
     read_observations,
     read_request,
+    request_size_limit,
 )
 from robocas_ms3.evaluation.remote.wire import pack, unpack
 
@@ -57,7 +57,7 @@ _log = logging.getLogger(__name__)
 _MAX_ENVS = 1024  # of all clients
 _IDLE = 3600.0  # s without a message, after which a connection is closed
 _STOP_S = 5.0  # for the network's thread to end
-_FAILED, _GARBAGE, _FULL = 1011, 1008, 1013  # close codes
+_FAILED, _INVALID, _FULL = 1011, 1008, 1013  # close codes
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class ServedFiles:
     packs: frozenset[str]
 
     @classmethod
-    def of(cls, protocols: Iterable[Path] = (), packs: Iterable[str] = ()) -> ServedFiles:
+    def collect(cls, protocols: Iterable[Path] = (), packs: Iterable[str] = ()) -> ServedFiles:
         """Collect the files of shipped protocols and installed packs, and of other protocols and their packs."""
         folders = {folder.name: folder for folder in protocols_dir().iterdir()}
         for folder in protocols:
@@ -89,7 +89,7 @@ class ServedFiles:
         names = {folder.name for parent in installed if parent.is_dir() for folder in parent.iterdir()}
         return cls(files, frozenset({*names, *packs}))
 
-    def resolved(self, start: EpisodeSpec) -> EpisodeSpec:
+    def resolve(self, start: EpisodeSpec) -> EpisodeSpec:
         """Return a client's episode with paths of this machine; empty: files and packs that are not served."""
         config, layouts = (self.files.get(name, "") for name in (start.config_file, start.layouts_file))
         pack = start.pack if start.pack in self.packs else ""
@@ -119,10 +119,10 @@ class PolicyServer:
         max_batch: int = DEFAULT_BATCH,
     ) -> None:
         self._host, self._port = strip_brackets(host), port
-        with policy_code(policy):
+        with policy_exit_guard(policy):
             spec = policy.spec
         max_batch = batch_limit(spec, max_batch)
-        self._max_bytes = message_bytes(spec, max_batch)
+        self._max_bytes = request_size_limit(spec, max_batch)
         metadata = ServerMetadata(
             robocas_spec=policy_spec_values(spec),
             robocas_policy={**describe(policy), "robocas_ms3": __version__},
@@ -130,7 +130,7 @@ class PolicyServer:
             robocas_answers_pings=True,
         )
         self._metadata = pack(metadata.model_dump(by_alias=True))
-        self._answers = _Answers(policy, files or ServedFiles.of(), max_batch)
+        self._handler = _RequestHandler(policy, files or ServedFiles.collect(), max_batch)
         self._calls: SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None] = SimpleQueue()
         self._connections = 0
 
@@ -168,10 +168,10 @@ class PolicyServer:
     async def _listen(self, started: Future[tuple[str, Callable[[], object]]]) -> None:
         loop, ended = asyncio.get_running_loop(), asyncio.Event()
         server = serve(
-            self._talk,
+            self._serve_client,
             self._host,
             self._port,
-            process_request=_health,
+            process_request=_answer_health_check,
             origins=[None],  # no web page may talk to a server on its reader's machine
             compression=None,
             max_size=self._max_bytes,
@@ -189,7 +189,7 @@ class PolicyServer:
             started.set_result((url, lambda: loop.call_soon_threadsafe(ended.set)))
             await ended.wait()
 
-    async def _talk(self, client: ServerConnection) -> None:
+    async def _serve_client(self, client: ServerConnection) -> None:
         if self._connections >= MAX_CONNECTIONS:
             return await client.close(_FULL, "too many clients")
         self._connections += 1
@@ -214,7 +214,7 @@ class PolicyServer:
         finally:
             closed.cancel()
             self._connections -= 1
-            self._submit(partial(self._answers.release, envs))
+            self._submit(partial(self._handler.release, envs))
 
     def _submit(self, work: Callable[[], Any]) -> Future[Any]:
         future: Future[Any] = Future()
@@ -225,15 +225,15 @@ class PolicyServer:
         """Return an answer, and the code to close the connection with; 0: it stays open."""
         try:
             value = unpack(message, self._max_bytes) if isinstance(message, bytes) else None
-            return pack(self._answers.answer(value, envs)), 0
+            return pack(self._handler.answer(value, envs)), 0
         except WireError as error:
             _log.warning("a client sent an invalid message: %s", error)
-            return format_error(error, 300), _GARBAGE
+            return format_error(error, 300), _INVALID
         except Exception as error:  # a policy may raise anything; other clients are still served
             return _log_failure(error), _FAILED
 
 
-class _Answers:
+class _RequestHandler:
     """Convert requests to calls of a policy, and actions to answers.
 
     A batched request is one call of ``reset`` with all episodes that start and one call of ``act`` with all
@@ -244,7 +244,7 @@ class _Answers:
 
     def __init__(self, policy: Policy, files: ServedFiles, max_batch: int) -> None:
         self._policy, self._files, self._max_batch = policy, files, max_batch
-        with policy_code(policy):
+        with policy_exit_guard(policy):
             self._spec = policy.spec
         self._used: set[int] = set()  # envs of the policy
 
@@ -257,7 +257,7 @@ class _Answers:
             raise WireError("no observation", expected="a map")
         if BATCH not in message:
             return {ACTIONS: self._act(*self._read([message], envs))[0]}
-        observations, starts = self._read(batch_of(message, 1, self._max_batch), envs)
+        observations, starts = self._read(parse_batch(message, 1, self._max_batch), envs)
         actions, reasons = self._act_or_explain(observations, starts)
         rows = enumerate(observations.envs.tolist())
         return {BATCH: [{ERROR: reasons[env]} if env in reasons else {ACTIONS: actions[row]} for row, env in rows]}
@@ -272,7 +272,7 @@ class _Answers:
             number, is_new = self._env(request.env_id, request.reset, envs)
             numbers.append(number)
             if is_new or request.reset:
-                starts.append(self._files.resolved(request.episode_spec(number)))
+                starts.append(self._files.resolve(request.episode_spec(number)))
         if len(set(numbers)) < len(numbers):
             raise WireError("invalid batch", where=ENV, expected="each env once", found=sorted(numbers))
         return read_observations(messages, numbers, self._spec), starts
@@ -292,10 +292,10 @@ class _Answers:
 
     def _act(self, observations: Observations, starts: list[EpisodeSpec]) -> NDArray[Any]:
         """Return the policy's (E, H, A) actions."""
-        with policy_code(self._policy):
+        with policy_exit_guard(self._policy):
             if starts:
                 self._policy.reset(starts)
-            return as_chunks(self._policy.act(observations), len(observations.envs), None)
+            return as_action_chunks(self._policy.act(observations), len(observations.envs), None)
 
     def _act_or_explain(self, observations: Observations, starts: list[EpisodeSpec]) -> tuple[Any, dict[int, str]]:
         """Return the policy's (E, H, A) actions, and by env why it has none; an error without an env is that of all."""
@@ -306,7 +306,7 @@ class _Answers:
             text = _log_failure(failed)
             reasons = {env: one_line(reason, 300) for env, reason in failed.reasons.items()}
             if failed.actions is not None:
-                return as_chunks(failed.actions, len(observations.envs), None), reasons
+                return as_action_chunks(failed.actions, len(observations.envs), None), reasons
         except Exception as error:  # a policy may raise anything; other clients are still served
             text = _log_failure(error)
         return None, {env: reasons.get(env, text) for env in observations.envs.tolist()}
@@ -327,5 +327,5 @@ def _log_failure(error: Exception) -> str:
     return format_error(error, 300)
 
 
-def _health(client: ServerConnection, request: Request) -> Response | None:
+def _answer_health_check(client: ServerConnection, request: Request) -> Response | None:
     return client.respond(http.HTTPStatus.OK, "OK\n") if request.path == HEALTH else None

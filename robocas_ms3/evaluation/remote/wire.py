@@ -34,7 +34,7 @@ def pack(value: Any) -> bytes:
 
 
 def unpack(data: bytes, max_bytes: int = MAX_BYTES) -> Any:
-    """Return the value of bytes; arrays are writable copies in native byte order, NumPy scalars become Python's.
+    """Return the value of bytes; arrays are writable copies in to_native byte order, NumPy scalars become Python's.
 
     Raises:
         WireError: they are no message, or one beyond the limits.

@@ -9,8 +9,8 @@ from pathlib import Path
 from robocas_ms3.core.files import atomic_file, make_folder
 from robocas_ms3.core.text import escape_controls
 from robocas_ms3.evaluation.protocol import LoadedProtocol
-from robocas_ms3.evaluation.report.page import page
-from robocas_ms3.evaluation.report.tables import markdown
+from robocas_ms3.evaluation.report.page import render_page
+from robocas_ms3.evaluation.report.tables import render_markdown
 from robocas_ms3.evaluation.results import Result
 
 MARKDOWN, PAGE, PARQUET = "report.md", "report.html", "episodes.parquet"
@@ -30,7 +30,7 @@ def write_report(result: Result, folder: Path, protocol: LoadedProtocol | None =
     """
     make_folder(folder)
     written = []
-    for name, text in ((MARKDOWN, markdown(result)), (PAGE, page(result, folder, protocol))):
+    for name, text in ((MARKDOWN, render_markdown(result)), (PAGE, render_page(result, folder, protocol))):
         written.append(folder / name)
         with atomic_file(folder / name) as tmp:
             tmp.write_text(escape_controls(text, lines=True), encoding="utf-8")

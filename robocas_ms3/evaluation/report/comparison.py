@@ -10,7 +10,7 @@ from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.text import escape_markdown, format_count
 from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.results import Result
-from robocas_ms3.evaluation.statistics import Comparison, compare, holm, too_few
+from robocas_ms3.evaluation.statistics import Comparison, compare, holm, power_warning
 
 _ALPHA = 0.05
 ALL = "all"
@@ -25,7 +25,7 @@ class Row:
     found: Comparison
 
 
-def comparison(results: Sequence[Result]) -> str:
+def compare_results(results: Sequence[Result]) -> str:
     """Return the comparison of two or more results, over the episodes that all have, as Markdown."""
     first = results[0]
     for other in results[1:]:
@@ -61,7 +61,7 @@ def comparison(results: Sequence[Result]) -> str:
     return _table(head, "configuration", rows)
 
 
-def comparison_of_splits(result: Result, protocol: LoadedProtocol) -> str:
+def compare_splits(result: Result, protocol: LoadedProtocol) -> str:
     """Return the comparison of a result's splits with the same scenes, each with the first one, as Markdown."""
     if (found := result.run.protocol_hash) != protocol.hash:
         raise EvaluationError("it is of another protocol", where=result.folder, expected=protocol.hash, found=found)
@@ -107,7 +107,7 @@ def _table(head: str, where: str, rows: list[Row]) -> str:
         counts = (c.n, c.successes_b, c.successes_a, c.only_b, c.only_a, change, f"{c.p_value:.3g}", f"{p:.3g}")
         names = (escape_markdown(row.where), escape_markdown(", ".join(row.pair)))
         lines.append(f"| {' | '.join(map(str, (*names, *counts)))} |")
-        warning = None if p <= _ALPHA else too_few(c, alpha=_ALPHA / claims)
+        warning = None if p <= _ALPHA else power_warning(c, alpha=_ALPHA / claims)
         if warning:
             pair = "" if len({row.pair for row in rows}) == 1 else f", {', '.join(row.pair)}"
             warnings.append(f"- {escape_markdown(f'{row.where}{pair}')}: {warning}")

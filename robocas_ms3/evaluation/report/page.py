@@ -14,7 +14,16 @@ import numpy as np
 from robocas_ms3.core.text import format_count
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.protocol import LoadedProtocol
-from robocas_ms3.evaluation.report.tables import WELDED, Cell, Fraction, Table, failure_name, mean, stages_of, tables
+from robocas_ms3.evaluation.report.tables import (
+    WELD_NOTE,
+    Cell,
+    FailureCount,
+    Table,
+    failure_name,
+    mean,
+    stage_names,
+    tables,
+)
 from robocas_ms3.evaluation.report.tables import title as title_of
 from robocas_ms3.evaluation.results import Result
 from robocas_ms3.evaluation.statistics import SuccessRate, success_rate
@@ -26,7 +35,7 @@ def video_name(episode: int) -> str:
     return f"episode_{episode:05d}.mp4"
 
 
-def page(result: Result, folder: Path | None = None, protocol: LoadedProtocol | None = None) -> str:
+def render_page(result: Result, folder: Path | None = None, protocol: LoadedProtocol | None = None) -> str:
     """Return the page of a result, for a folder that may have ``videos``; see `write_report`."""
     here = files("robocas_ms3.evaluation.report")
     style, script = ((here / name).read_text(encoding="utf-8") for name in ("style.css", "script.js"))
@@ -47,14 +56,14 @@ def _lead(result: Result, protocol: LoadedProtocol | None) -> str:
     count = len(result.outcomes)
     total = count if protocol is None else len(protocol.episodes)
     episodes = format_count(count, "episode") if protocol is None else f"{count} of {format_count(total, 'episode')}"
-    notes = [WELDED] if result.run.weld else []
+    notes = [WELD_NOTE] if result.run.weld else []
     if protocol is not None and count < total:
         missing = Counter(episode.config for episode in protocol.episodes if episode.episode not in result.outcomes)
         of = ", ".join(f"{many} of {escape(config)}" for config, many in missing.items())
         notes.append(
             f"Missing of the protocol: {format_count(missing.total(), 'episode')} ({of}). This is no whole result."
         )
-    if broken := result.broken_off():
+    if broken := result.error_count():
         notes.append(f"Broken off by an error: {format_count(broken, 'episode')}, counted as failed.")
     lead = f"{episodes}, protocol hash <code>{escape(result.run.protocol_hash[:16])}</code>."
     return f'<p class="lead">{lead}</p>\n' + "".join(f'<p class="note">{note}</p>\n' for note in notes)
@@ -62,9 +71,9 @@ def _lead(result: Result, protocol: LoadedProtocol | None) -> str:
 
 def _funnels(result: Result) -> str:
     cards = []
-    for config, outcomes in result.by("config").items():
+    for config, outcomes in result.group_by("config").items():
         rows = []
-        for stage, name in stages_of(outcomes[0].task).items():
+        for stage, name in stage_names(outcomes[0].task).items():
             if any(stage in outcome.flags for outcome in outcomes):
                 rate = result.rate(stage, outcomes)
                 shown = _bar(rate, "good" if stage == "success" else "")
@@ -79,7 +88,7 @@ def _funnels(result: Result) -> str:
 def _seconds(result: Result) -> str:
     taken = {
         config: [s for one in outcomes if (s := one.flag_seconds.get("success")) is not None]
-        for config, outcomes in result.by("config").items()
+        for config, outcomes in result.group_by("config").items()
     }
     if not any(taken.values()):
         return ""
@@ -95,7 +104,7 @@ def _seconds(result: Result) -> str:
 
 def _effort(result: Result) -> Table:
     rows = []
-    for config, outcomes in result.by("config").items():
+    for config, outcomes in result.group_by("config").items():
 
         def of(name: str, outcomes: list[Outcome] = outcomes) -> list[float]:
             return [outcome.measures.get(name, np.nan) for outcome in outcomes]
@@ -131,9 +140,9 @@ def _record(result: Result, protocol: LoadedProtocol | None) -> str:
     pairs += [("policy", policy.name), *((f"policy, {name}", _plain(value)) for name, value in entries.items())]
     pairs += [("upstream's weld", "yes" if run.weld else "no"), ("backend", run.backend)]
     pairs += [("versions", _plain(run.versions)), *((f"pack {name}", hash_) for name, hash_ in run.pack_hashes.items())]
-    machines = {_plain(part.machine) for part in run.parts} or {_plain(run.machine or {})}
+    machines = {_plain(part.machine) for part in run.merged_from} or {_plain(run.machine or {})}
     pairs += [("machine", machine) for machine in sorted(machines)]
-    rows = [[escape(part.folder), str(part.episodes)] for part in run.parts]
+    rows = [[escape(part.folder), str(part.episodes)] for part in run.merged_from]
     parts = _html_table(("part", "episodes#"), rows) if rows else ""
     return _section("What it was measured with", "", _facts(pairs) + parts)
 
@@ -270,7 +279,7 @@ def _cells(cell: Cell, head: str) -> list[str]:
     if isinstance(cell, SuccessRate):
         rate = f"{100 * cell.rate:.0f} %<small>{100 * cell.low:.0f} to {100 * cell.high:.0f}</small>"
         return [rate, _bar(cell, "good")] if head.endswith("%") else [rate]
-    if isinstance(cell, Fraction):
+    if isinstance(cell, FailureCount):
         return [f'<span class="heat" style="--fraction: {100 * cell.count / cell.n:.0f}%">{cell.count or ""}</span>']
     if cell is None:
         return ['<span class="faint">none</span>', *([""] if head.endswith("%") else [])]

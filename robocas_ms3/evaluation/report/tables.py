@@ -7,14 +7,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from robocas_ms3.core.text import escape_markdown, format_count
-from robocas_ms3.evaluation.outcomes import STAGES, Outcome
+from robocas_ms3.evaluation.outcomes import PAPER_STAGES, Outcome
 from robocas_ms3.evaluation.results import Result
-from robocas_ms3.evaluation.statistics import SuccessRate, success_by
+from robocas_ms3.evaluation.statistics import SuccessRate, success_rates_by_bin
 from robocas_ms3.scenes.task_specs import STAGES as DEFAULT_STAGES
 from robocas_ms3.scenes.task_specs import TASKS
 
 P_VIS_EDGES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
-WELDED = (
+WELD_NOTE = (
     "With upstream's weld: what closed fingers had lifted hung on the hand until the gripper was told to open. "
     "Never compare this with results without it."
 )
@@ -40,14 +40,14 @@ FAILURE_NAMES = {
 
 
 @dataclass(frozen=True)
-class Fraction:
+class FailureCount:
     """A count out of n, shown as the count on a background as strong as its share."""
 
     count: int
     n: int
 
 
-Cell = str | SuccessRate | Fraction | None
+Cell = str | SuccessRate | FailureCount | None
 
 
 @dataclass(frozen=True)
@@ -70,22 +70,22 @@ class Table:
 def tables(result: Result) -> Iterator[Table]:
     """Yield the tables of a result with at least one episode."""
     yield _success(result)
-    if len(result.by("split")) > 1:
+    if len(result.group_by("split")) > 1:
         yield _splits(result)
     yield _failures(result)
-    hidden = [one for one in first_splits(result) if one.p_vis is not None]
+    hidden = [one for one in outcomes_of_first_split(result) if one.p_vis is not None]
     if hidden:
         yield _occlusion(hidden)
     yield from _retrieval(result)
 
 
-def markdown(result: Result) -> str:
-    run, broken = result.run, result.broken_off()
+def render_markdown(result: Result) -> str:
+    run, broken = result.run, result.error_count()
     versions = ", ".join(f"{name} {number}" for name, number in run.versions.items())
     lines = [
         f"# {escape_markdown(title(result))}",
         "",
-        *([f"**{WELDED}**", ""] if run.weld else []),
+        *([f"**{WELD_NOTE}**", ""] if run.weld else []),
         f"Protocol hash {escape_markdown(run.protocol_hash[:16])}, {format_count(len(result.outcomes), 'episode')}, "
         f"{escape_markdown(run.backend)}; {escape_markdown(versions)}. "
         f"Intervals are Clopper-Pearson's, 95 %. {_STAGE_NOTE}",
@@ -105,7 +105,7 @@ def title(result: Result) -> str:
     return f"{result.run.policy.name} by {result.run.protocol}{weld}"
 
 
-def stages_of(task: str) -> dict[str, str]:
+def stage_names(task: str) -> dict[str, str]:
     """Return the names of a task's stages in their order; stages of another package by their own names."""
     row = TASKS.get(task)
     if row is None or row.stages == DEFAULT_STAGES:
@@ -117,9 +117,9 @@ def failure_name(stage: str) -> str:
     return FAILURE_NAMES.get(stage, stage.replace("_", " "))
 
 
-def first_splits(result: Result) -> list[Outcome]:
+def outcomes_of_first_split(result: Result) -> list[Outcome]:
     """Return the outcomes; if scenes occur several times, those of each task's first split."""
-    if not result.repeats():
+    if not result.repeats_scenes():
         return list(result.outcomes.values())
     first: dict[str, str] = {}
     for one in result.outcomes.values():
@@ -134,28 +134,28 @@ def mean(values: Sequence[float]) -> float:
 def _success(result: Result) -> Table:
     def rate(flag: str, outcomes: list[Outcome]) -> SuccessRate | None:
         known = [one for one in outcomes if flag in one.flags]  # tasks without obstacles have no stage for them
-        broken_off = [one for one in outcomes if one.error and not one.flags]
-        return result.rate(flag, known + broken_off) if known else None
+        error_count = [one for one in outcomes if one.error and not one.flags]
+        return result.rate(flag, known + error_count) if known else None
 
-    groups, rows = result.by("config"), []
-    for config, outcomes in groups.items() if result.repeats() else _with_all(groups):
+    groups, rows = result.group_by("config"), []
+    for config, outcomes in groups.items() if result.repeats_scenes() else _with_all(groups):
         ends = (result.rate("success_at_end", outcomes), rate("success_v0", outcomes))
-        stages = (rate(stage, outcomes) for stage in STAGES.values())
+        stages = (rate(stage, outcomes) for stage in PAPER_STAGES.values())
         steps, seconds = mean([one.steps for one in outcomes]), mean([one.seconds for one in outcomes])
         overall = result.rate("success", outcomes)
         rows.append((config, str(overall.n), overall, *ends, *stages, f"{steps:.0f}", f"{seconds:.1f}"))
     note = (
         f"Success held at some step; at the last one; upstream's rule at the last one. {_STAGE_NOTE} Intervals are "
         "Clopper and Pearson's, 95 %. Steps and seconds of the scene are means over all episodes"
-        + ("." if result.repeats() else ", as is the last row.")
+        + ("." if result.repeats_scenes() else ", as is the last row.")
     )
-    heads = ("configuration", "n#", "success%", "at the end#", "upstream's#", *(f"{name}#" for name in STAGES))
+    heads = ("configuration", "n#", "success%", "at the end#", "upstream's#", *(f"{name}#" for name in PAPER_STAGES))
     return Table("Success", note, (*heads, "steps#", "s#"), rows)
 
 
 def _splits(result: Result) -> Table:
-    splits, rows = result.by("split"), []
-    for task, outcomes in _with_all(result.by("task")):
+    splits, rows = result.group_by("split"), []
+    for task, outcomes in _with_all(result.group_by("task")):
         row: list[Cell] = [task]
         for split in splits:
             chosen = [outcome for outcome in outcomes if outcome.split == split]
@@ -166,14 +166,14 @@ def _splits(result: Result) -> Table:
 
 
 def _failures(result: Result) -> Table:
-    groups = result.by("config")
+    groups = result.group_by("config")
     counts = {config: Counter(one.failure_stage for one in outcomes) for config, outcomes in groups.items()}
     found = {stage for count in counts.values() for stage in count} - {""}
     stages = [*(stage for stage in FAILURE_NAMES if stage in found), *sorted(found - FAILURE_NAMES.keys())]
     rows = []
     for config, count in counts.items():
         n = count.total()
-        cells = (Fraction(count[stage], n) for stage in stages)
+        cells = (FailureCount(count[stage], n) for stage in stages)
         rows.append((config, str(n), str(n - count[""]), *cells))
     heads = ("configuration", "n#", "failed#", *(f"{failure_name(stage)}#" for stage in stages))
     note = "Episodes by the first stage not reached after the furthest one that was reached."
@@ -181,7 +181,7 @@ def _failures(result: Result) -> Table:
 
 
 def _occlusion(hidden: list[Outcome]) -> Table:
-    bins = success_by([one.p_vis or 0.0 for one in hidden], [one.success for one in hidden], P_VIS_EDGES)
+    bins = success_rates_by_bin([one.p_vis or 0.0 for one in hidden], [one.success for one in hidden], P_VIS_EDGES)
     edges = zip(P_VIS_EDGES[:-1], P_VIS_EDGES[1:], bins, strict=True)
     rows = [(f"{low:g} to {high:g}", str(rate.n if rate else 0), rate) for low, high, rate in edges]
     configs = ", ".join(sorted({outcome.config for outcome in hidden}))
@@ -191,7 +191,7 @@ def _occlusion(hidden: list[Outcome]) -> Table:
 
 def _retrieval(result: Result) -> Iterator[Table]:
     rows = []
-    for config, outcomes in result.by("config").items():
+    for config, outcomes in result.group_by("config").items():
         orders = [one.retrieval for one in outcomes if one.retrieval is not None]
         held = [(order, order.score) for order in orders if order.score is not None]
         if held:
@@ -220,4 +220,4 @@ def _markdown_cell(cell: Cell, head: str) -> str:
     if isinstance(cell, SuccessRate):
         text = f"{100 * cell.rate:.0f} %"
         return f"{text} ({100 * cell.low:.0f} to {100 * cell.high:.0f})" if head.endswith("%") else text
-    return escape_markdown(str(cell.count or "") if isinstance(cell, Fraction) else cell or "")
+    return escape_markdown(str(cell.count or "") if isinstance(cell, FailureCount) else cell or "")

@@ -26,7 +26,7 @@ _FRAMES = 5  # a second of the scene
 _SPEED = 4  # times as fast as the scene
 
 
-def failed_of_each_kind(result: Result, count: int) -> list[int]:
+def choose_failed_episodes(result: Result, count: int) -> list[int]:
     """Return numbers of failed episodes: of each configuration in turn, and there of each failure stage in turn."""
     groups: dict[str, dict[str, list[int]]] = {}
     for outcome in result.outcomes.values():
@@ -39,7 +39,7 @@ def _in_turn(lists: list[list[int]]) -> list[int]:
     return [number for row in zip_longest(*lists) for number in row if number is not None]
 
 
-def film(
+def record_videos(
     result: Result, protocol: LoadedProtocol, policy: Policy, episodes: Sequence[int]
 ) -> Iterator[tuple[Path, bool]]:
     """Run episodes again, in processes, and write videos into the result's ``videos``.
@@ -62,8 +62,8 @@ def film(
             # As long as the first time, so that it is the same episode whatever ended it.
             fps = session.rate / recorder.period * _SPEED
             with atomic_file(path) as tmp, open_video(tmp, fps, quality=6) as recorder.writer:
-                (outcome,) = session.play([protocol.episodes[number]], before.steps)
-            yield path, outcome.without_clock() == before.without_clock()
+                (outcome,) = session.run_episodes([protocol.episodes[number]], before.steps)
+            yield path, outcome.reproducible_values() == before.reproducible_values()
 
 
 class _VideoRecorder:

@@ -40,7 +40,7 @@ def test_five_numbers_are_seven():
 def test_actions_are_the_same_in_evaluation_and_training():
     policy = policy_with([0.5, -1.0, 0.3, 0.4, -0.2])
     assert control_mode(policy.spec.convention) == "pd_ee_delta_pose"
-    motion = CONVENTIONS[policy.spec.convention].read(policy.act(see(1)))
+    motion = CONVENTIONS[policy.spec.convention].decode(policy.act(see(1)))
     assert isinstance(motion.rotation, Rotation)
     assert motion.open.tolist() == [False]
     again = to_ee_delta_action(motion.translation, motion.rotation)

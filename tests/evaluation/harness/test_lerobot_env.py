@@ -89,7 +89,7 @@ def test_lerobots_rollout_reads_success_tasks_and_ends(made, tmp_path):
     assert found["done"].tolist() == [[False, True, True, True, True], [False, False, False, False, True]]
     assert found["success"].tolist() == found["done"].tolist()
     assert found["reward"].sum(1).tolist() == [1.0, 1.0]
-    outcomes = results.read(tmp_path / "results" / "search").outcomes
+    outcomes = results.read_result(tmp_path / "results" / "search").outcomes
     assert {number: one.steps for number, one in outcomes.items()} == {4: 2, 5: 5}
     tasks = policy.seen[0]["task"]
     assert len(set(tasks)) == 2 and all(isinstance(task, str) for task in tasks)

@@ -122,7 +122,7 @@ def test_outcomes_are_written_once_per_episode(make, tmp_path):
             while not env.step(act(1))[2].all():
                 pass
     env.close()
-    result = results.read(tmp_path / "result")
+    result = results.read_result(tmp_path / "result")
     assert sorted(result.outcomes) == [0, 1] and result.run.policy.name == "mine"
     for _ in range(2):  # a refused environment does not keep the lock
         with pytest.raises(EvaluationError, match="there is a result already"):
@@ -152,7 +152,7 @@ def test_real_episodes_have_the_outcomes_and_images_of_robocas_eval(needs_render
         def __init__(self) -> None:
             self.spec, self.seen = spec, []
 
-        def reset(self, starts) -> None:
+        def reset(self, episodes) -> None:
             pass
 
         def act(self, observations) -> np.ndarray:
@@ -171,6 +171,8 @@ def test_real_episodes_have_the_outcomes_and_images_of_robocas_eval(needs_render
         done = terminated | truncated
     env.close()
     assert seen == policy.seen and truncated.all()
-    ours, theirs = (results.read(tmp_path / name).outcomes for name in ("ours", "theirs"))
-    assert {n: one.without_clock() for n, one in ours.items()} == {n: one.without_clock() for n, one in theirs.items()}
+    ours, theirs = (results.read_result(tmp_path / name).outcomes for name in ("ours", "theirs"))
+    assert {n: one.reproducible_values() for n, one in ours.items()} == {
+        n: one.reproducible_values() for n, one in theirs.items()
+    }
     assert all(one.measures["path_length"] > 0.05 for one in theirs.values())

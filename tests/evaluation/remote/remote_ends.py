@@ -49,8 +49,8 @@ class Told:
         self.starts: list[EpisodeSpec] = []
         self.seen: list[Observations] = []
 
-    def reset(self, starts: list[EpisodeSpec]) -> None:
-        self.starts += starts
+    def reset(self, episodes: list[EpisodeSpec]) -> None:
+        self.episodes += episodes
 
     def act(self, observations: Observations) -> np.ndarray:
         self.seen.append(observations)

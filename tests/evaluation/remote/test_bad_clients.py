@@ -38,9 +38,9 @@ class Failing(Told):
 class Reading(Told):
     """A policy that reads the episode's configuration, as the scripted ones do."""
 
-    def reset(self, starts):
-        super().reset(starts)
-        ScriptedPolicy().reset(starts)
+    def reset(self, episodes):
+        super().reset(episodes)
+        ScriptedPolicy().reset(episodes)
 
 
 def message(env=0, start=None, **more):
@@ -84,15 +84,15 @@ def test_shipped_files_and_those_of_the_servers_own_protocols_are_served(tmp_pat
     for name in (theirs.config_file, theirs.layouts_file):
         (tmp_path / name).parent.mkdir(parents=True)
         (tmp_path / name).touch()
-    ours = ServedFiles.of([tmp_path / "mine"], ["packs/own"]).resolved(theirs)
+    ours = ServedFiles.collect([tmp_path / "mine"], ["packs/own"]).resolve(theirs)
     assert Path(ours.config_file) == tmp_path / theirs.config_file
     assert Path(ours.layouts_file) == tmp_path / theirs.layouts_file
     assert ours.pack == "packs/own"
-    assert ServedFiles.of().resolved(theirs) == replace(theirs, config_file="", layouts_file="", pack="")
+    assert ServedFiles.collect().resolve(theirs) == replace(theirs, config_file="", layouts_file="", pack="")
     assert file_name(a_start().config_file) == "smoke/configs/pick_table_scattered.yaml"
     (tmp_path / "smoke").mkdir()
     with pytest.raises(EvaluationError):
-        ServedFiles.of([tmp_path / "smoke"])
+        ServedFiles.collect([tmp_path / "smoke"])
     like_a_shipped_one = str(tmp_path / "smoke/configs/pick_table_scattered.yaml")
     assert file_name(like_a_shipped_one) == like_a_shipped_one
 

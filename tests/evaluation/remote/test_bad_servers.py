@@ -149,7 +149,7 @@ def test_a_run_continues_after_episodes_in_which_the_policy_fails_and_ends_witho
     env, starts = CountingEnv(1, 4, steps=True), [a_start(-1, episode=number) for number in range(7)]
     with serving(Stumbling()) as url:
         remote = RemotePolicy(f"{url}?{IN_A_HURRY}")
-        played = {one.start.episode: one for one in play(env, remote, starts, 10)}
+        played = {one.spec.episode: one for one in play(env, remote, starts, 10)}
     assert {number: one.steps for number, one in played.items()} == {0: 4, 1: 4, 2: 0, 3: 4, 4: 4, 5: 0, 6: 4}
     assert {number for number, one in played.items() if one.error} == {2, 5}
     assert played[2].error == "the server failed: RuntimeError: out of memory"

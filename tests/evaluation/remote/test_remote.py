@@ -22,7 +22,7 @@ from robocas_ms3.evaluation.policies import make_policy
 from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.remote.client import RemotePolicy
 from robocas_ms3.evaluation.remote.connection import Address, read_address
-from robocas_ms3.evaluation.remote.messages import batch_limit, message_bytes, observation_message, read_request
+from robocas_ms3.evaluation.remote.messages import batch_limit, observation_message, read_request, request_size_limit
 from robocas_ms3.evaluation.remote.server import PolicyServer, ServedFiles
 from robocas_ms3.evaluation.remote.wire import MAX_BYTES
 
@@ -57,10 +57,10 @@ class SharedNoise(Told):
         self._rng = np.random.default_rng(0)
         self._started: list[int] = []
 
-    def reset(self, starts):
-        super().reset(starts)
-        self._started = [start.env for start in starts]
-        self._rng.bytes(len(starts))
+    def reset(self, episodes):
+        super().reset(episodes)
+        self._started = [episode.env for episode in episodes]
+        self._rng.bytes(len(episodes))
 
     def act(self, observations):
         self.calls.append((self._started, observations.envs.tolist()))
@@ -95,7 +95,7 @@ def test_a_batch_of_the_announced_size_fits_in_a_message():
         spec = PolicySpec(cameras=dict.fromkeys(("base_camera", "gripper_camera", "static_camera"), camera), depth=True)
         envs = batch_limit(spec, 256)
         images = 3 * camera[0] * camera[1] * 5
-        assert envs == 1 or envs * images + 4 * 2**20 <= message_bytes(spec, envs) <= MAX_BYTES
+        assert envs == 1 or envs * images + 4 * 2**20 <= request_size_limit(spec, envs) <= MAX_BYTES
         assert batch_limit(spec, 1) == 1
 
 
@@ -223,7 +223,7 @@ def test_a_start_names_the_robot_where_it_is_another():
         start = replace(a_start(), robot=robot)
         message = observation_message(some_observations(0), 0, start, reset=True)
         assert message["start"].keys() & {"robot"} == keys
-        assert ServedFiles.of().resolved(read_request(message).episode_spec(0)) == start
+        assert ServedFiles.collect().resolve(read_request(message).episode_spec(0)) == start
 
 
 def test_openpis_client_asks_our_server():

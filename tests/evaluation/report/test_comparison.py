@@ -7,7 +7,7 @@ from made_up_results import outcome, write
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.protocol import EPISODES, load_protocol, shipped_protocols
-from robocas_ms3.evaluation.report.comparison import comparison, comparison_of_splits
+from robocas_ms3.evaluation.report.comparison import compare_results, compare_splits
 from robocas_ms3.evaluation.statistics import holm, mcnemar
 
 
@@ -19,7 +19,7 @@ def rows(said: str) -> list[list[str]]:
 def test_it_takes_the_episodes_that_both_have(tmp_path):
     one = write(tmp_path / "a", [outcome(number, came_to=0) for number in range(8)])
     other = write(tmp_path / "b", [outcome(number) for number in range(1, 9)], policy={"name": "better"})
-    said = comparison([one, other])
+    said = compare_results([one, other])
     assert said.startswith(f"A: mine ({one.folder}), B: better ({other.folder}); 7 episodes of made_up that both have.")
     ((config, pair, *counts, change, p, adjusted),) = rows(said)
     assert (config, pair, counts) == ("table", "A, B", ["7", "0", "7", "0", "7"])
@@ -34,7 +34,7 @@ def test_several_claims_are_adjusted_by_holm(tmp_path):
         outcomes = [outcome(n, 7 if n % 20 < good else 0, config="left" if n < 20 else "right") for n in range(40)]
         return write(tmp_path / name, outcomes, policy={"name": name})
 
-    found = rows(comparison([result("bad", 2), result("better", 9), result("best", 18)]))
+    found = rows(compare_results([result("bad", 2), result("better", 9), result("best", 18)]))
     assert [row[:2] for row in found] == [
         [where, pair] for where in ("left", "right", "all") for pair in ("A, B", "A, C", "B, C")
     ]
@@ -54,7 +54,7 @@ def test_too_few_for_several_claims_though_enough_for_one(tmp_path):
             tmp_path / name, [outcome(n, came_to if n < 6 else 7, config="ab"[n % 2 * (n > 5)]) for n in range(8)]
         )
 
-    said = comparison([result("one", 0), result("two", 7)])
+    said = compare_results([result("one", 0), result("two", 7)])
     (a, b, both) = rows(said)
     assert (a[0], a[-2], a[-1]) == ("a", "0.0312", "0.0625")
     assert (b[0], both[0], both[-1]) == ("b", "all", "0.0312")
@@ -64,7 +64,7 @@ def test_too_few_for_several_claims_though_enough_for_one(tmp_path):
 
 def test_scenes_that_occur_several_times_are_not_pooled_and_other_backends_are_named(tmp_path):
     outcomes = [outcome(n, seed=n % 4, config="ab"[n // 4], split="ab"[n // 4]) for n in range(8)]
-    said = comparison([write(tmp_path / name, outcomes, backend=name) for name in ("gpu", "processes")])
+    said = compare_results([write(tmp_path / name, outcomes, backend=name) for name in ("gpu", "processes")])
     assert [row[0] for row in rows(said)] == ["a", "b"]
     assert "**Measured with different backend.**" in said
 
@@ -72,14 +72,14 @@ def test_scenes_that_occur_several_times_are_not_pooled_and_other_backends_are_n
 def test_results_that_can_not_be_compared(tmp_path):
     one, other = write(tmp_path / "a", [outcome(0)]), write(tmp_path / "b", [outcome(0)], protocol_hash="ef" * 32)
     with pytest.raises(EvaluationError, match="different protocols"):
-        comparison([one, one, other])
+        compare_results([one, one, other])
     with pytest.raises(EvaluationError, match="no episodes in common"):
-        comparison([one, write(tmp_path / "c", [outcome(1)])])
+        compare_results([one, write(tmp_path / "c", [outcome(1)])])
     welded = write(tmp_path / "d", [outcome(0)], weld=True)
-    assert "1 episode of made_up with upstream's weld that both have" in comparison([welded, welded])
+    assert "1 episode of made_up with upstream's weld that both have" in compare_results([welded, welded])
     for pair in ([one, welded], [welded, one]):
         with pytest.raises(EvaluationError, match=r"/d: a result with upstream's weld can't be compared"):
-            comparison(pair)
+            compare_results(pair)
 
 
 def of_suite(folder, name, succeeds):
@@ -96,9 +96,7 @@ def of_suite(folder, name, succeeds):
 
 def test_splits_over_the_same_scenes(tmp_path):
     found = rows(
-        comparison_of_splits(
-            *of_suite(tmp_path / "a", "instructions-v1", lambda one: one.split in {"seen", "paraphrase"})
-        )
+        compare_splits(*of_suite(tmp_path / "a", "instructions-v1", lambda one: one.split in {"seen", "paraphrase"}))
     )
     assert [row[:2] for row in found] == [
         [task, f"seen, {split}"] for task in ("pick", "select", "search") for split in ("paraphrase", "wrong", "empty")
@@ -117,7 +115,7 @@ def test_a_split_may_have_several_configurations(tmp_path):
         same = {name: getattr(one, name) for name in ("task", "config", "seed", "split")}
         succeeds = one.split == "seen" or one.config == "select_table_orderly-far"
         outcomes.append(outcome(one.episode, 7 if succeeds else 0, **same))
-    found = rows(comparison_of_splits(write(tmp_path / "r", outcomes, protocol_hash=protocol.hash), protocol))
+    found = rows(compare_splits(write(tmp_path / "r", outcomes, protocol_hash=protocol.hash), protocol))
     assert [row[1:5] for row in found] == [
         [f"seen, {split}", "50", "50", second]
         for split, second in (("near", "0"), ("far", "0"), ("near", "0"), ("far", "50"))
@@ -127,6 +125,6 @@ def test_a_split_may_have_several_configurations(tmp_path):
 def test_splits_over_other_scenes_are_no_pairs(tmp_path):
     result, _ = of_suite(tmp_path / "b", "instructions-v1", lambda one: True)
     with pytest.raises(EvaluationError, match="another protocol"):
-        comparison_of_splits(result, load_protocol("cameras-v1"))
+        compare_splits(result, load_protocol("cameras-v1"))
     with pytest.raises(EvaluationError, match="no two splits of this result have the same scenes"):
-        comparison_of_splits(*of_suite(tmp_path / "a", "objects-v1", lambda one: True))
+        compare_splits(*of_suite(tmp_path / "a", "objects-v1", lambda one: True))

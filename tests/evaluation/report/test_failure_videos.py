@@ -11,7 +11,7 @@ from robocas_ms3.cli.eval_results import Videos, videos
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.policies.plain import RandomPolicy
 from robocas_ms3.evaluation.protocol import load_protocol
-from robocas_ms3.evaluation.report.videos import SIZE, failed_of_each_kind, film
+from robocas_ms3.evaluation.report.videos import SIZE, choose_failed_episodes, record_videos
 from robocas_ms3.evaluation.settings import EvaluationSettings
 
 
@@ -19,17 +19,17 @@ def test_all_kinds_of_failures_have_their_turn(tmp_path):
     came_to = [0, 0, 0, 3, 7, 3]
     table = [outcome(number, came) for number, came in enumerate(came_to)]
     result = write(tmp_path / "a", [*table, outcome(6, 0, config="heap")])
-    assert failed_of_each_kind(result, 2) == [0, 6]
-    assert failed_of_each_kind(result, 3) == [0, 3, 6]
-    assert failed_of_each_kind(result, 5) == [0, 1, 3, 5, 6]
-    assert failed_of_each_kind(result, 99) == [0, 1, 2, 3, 5, 6]
+    assert choose_failed_episodes(result, 2) == [0, 6]
+    assert choose_failed_episodes(result, 3) == [0, 3, 6]
+    assert choose_failed_episodes(result, 5) == [0, 1, 3, 5, 6]
+    assert choose_failed_episodes(result, 99) == [0, 1, 2, 3, 5, 6]
 
 
 def test_another_protocol_is_refused(tmp_path):
     result = of_protocol(tmp_path / "a", load_protocol("smoke"))
     result.run.protocol_hash = "0"
     with pytest.raises(EvaluationError, match="another protocol"):
-        next(film(result, load_protocol("smoke"), RandomPolicy(), [0]))
+        next(record_videos(result, load_protocol("smoke"), RandomPolicy(), [0]))
 
 
 @pytest.mark.parametrize("installed", ["random", "small"])

@@ -14,7 +14,7 @@ SHOWN = (
 
 
 @pytest.fixture(scope="module")
-def page():
+def render_page():
     with open_page() as page:
         yield page
 

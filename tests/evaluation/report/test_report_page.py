@@ -14,13 +14,13 @@ from robocas_ms3.cli.eval_results import Compare, Merge, Report, Verify, compare
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.report import PARQUET, write_report
-from robocas_ms3.evaluation.report.page import page, video_name
+from robocas_ms3.evaluation.report.page import render_page, video_name
 
 VOID = {"meta", "rect", "path"}  # of HTML, and those that SVG closes at once
 
 
 class Reader(HTMLParser):
-    """Sees that elements end as they began, and keeps what they say and where they lead to."""
+    """Sees that elements end as they began, and keeps what they print_line and where they lead to."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -60,7 +60,7 @@ def result(tmp_path):
 
 
 def test_numbers_stages_failures_and_the_record(result):
-    read = Reader(page(result))
+    read = Reader(render_page(result))
     # 2 of 4, 6.8 to 93.2; 2 of 2, 0.025 ** (1 / 2) = 15.8
     assert read.after("table", 3) == ["4", "50 %", "7 to 93"]
     assert read.after("heap", 3) == ["2", "100 %", "16 to 100"]
@@ -75,36 +75,36 @@ def test_numbers_stages_failures_and_the_record(result):
 
 
 def test_it_names_the_weld(result, tmp_path):
-    reader = Reader(page(write(tmp_path / "welded", result.outcomes.values(), weld=True)))
+    reader = Reader(render_page(write(tmp_path / "welded", result.outcomes.values(), weld=True)))
     assert any(text.startswith("With upstream's weld: ") for text in reader.texts)
     assert reader.after("upstream's weld", 1) == ["yes"]
-    assert Reader(page(result)).after("upstream's weld", 1) == ["no"]
+    assert Reader(render_page(result)).after("upstream's weld", 1) == ["no"]
 
 
 def test_it_leads_nowhere_but_to_its_own_videos(result):
-    text = page(result, result.folder)
+    text = render_page(result, result.folder)
     assert Reader(text).links == []
     assert "robocas eval videos" in text
     assert not re.search(r"https?:|//[a-z]|@import|url\(", text)
     (result.folder / "videos").mkdir()
     (result.folder / "videos" / video_name(3)).touch()
-    assert Reader(page(result, result.folder)).links == ["videos/episode_00003.mp4"]
+    assert Reader(render_page(result, result.folder)).links == ["videos/episode_00003.mp4"]
 
 
 def test_a_result_that_lacks_episodes_says_so(tmp_path):
     protocol = load_protocol("smoke")
     whole = of_protocol(tmp_path / "whole", protocol)
-    assert "8 of 8 episodes" in page(whole, protocol=protocol)
+    assert "8 of 8 episodes" in render_page(whole, protocol=protocol)
     part = write(tmp_path / "part", list(whole.outcomes.values())[:5])
     configs = Counter(outcome.config for outcome in list(whole.outcomes.values())[5:])
     of = ", ".join(f"{many} of {config}" for config, many in configs.items())
-    assert f"Missing of the protocol: 3 episodes ({of}). This" in page(part, protocol=protocol)
+    assert f"Missing of the protocol: 3 episodes ({of}). This" in render_page(part, protocol=protocol)
 
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_small_results(tmp_path, count):
-    Reader(page(write(tmp_path / "a", [outcome(0)][:count])))
-    Reader(page(write(tmp_path / "b", [outcome(0, came_to=0)][:count])))
+    Reader(render_page(write(tmp_path / "a", [outcome(0)][:count])))
+    Reader(render_page(write(tmp_path / "b", [outcome(0, came_to=0)][:count])))
 
 
 def test_columns(result, monkeypatch, capsys):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 from made_up_results import outcome, write
 
-from robocas_ms3.evaluation.report.tables import markdown
+from robocas_ms3.evaluation.report.tables import render_markdown
 
 
 @pytest.fixture
@@ -24,33 +24,33 @@ def row(text: str, first: str) -> list[str]:
 def test_successes_failures_and_occlusion(result, tmp_path):
     # 2 of 4: Clopper and Pearson 6.8 to 93.2; steps (70 + 70 + 800 + 800) / 4; RA 3 of 4; no obstacles
     expected = ["table", "4", "50 % (7 to 93)", "50 %", "50 %", "75 %", "75 %", "75 %", "", "435", "21.8"]
-    assert row(markdown(result), "table") == expected
-    said = markdown(result).partition("Where episodes failed")[2]
+    assert row(render_markdown(result), "table") == expected
+    said = render_markdown(result).partition("Where episodes failed")[2]
     assert row(said, "configuration") == ["configuration", "n", "failed", "an object touched", "placed, at rest"]
     assert row(said, "table") == ["table", "4", "2", "1", "1"]
-    assert "weld" not in markdown(result)
-    assert "**With upstream's weld: " in markdown(write(tmp_path / "b", [outcome(0)], weld=True))
+    assert "weld" not in render_markdown(result)
+    assert "**With upstream's weld: " in render_markdown(write(tmp_path / "b", [outcome(0)], weld=True))
     # of one episode 2.5 or 97.5 %, rounded up
-    assert row(markdown(result), "0.2 to 0.4") == ["0.2 to 0.4", "1", "100 % (3 to 100)"]
-    assert row(markdown(result), "0.8 to 1") == ["0.8 to 1", "1", "0 % (0 to 98)"]
-    assert row(markdown(result), "0 to 0.2") == ["0 to 0.2", "0", ""]
+    assert row(render_markdown(result), "0.2 to 0.4") == ["0.2 to 0.4", "1", "100 % (3 to 100)"]
+    assert row(render_markdown(result), "0.8 to 1") == ["0.8 to 1", "1", "0 % (0 to 98)"]
+    assert row(render_markdown(result), "0 to 0.2") == ["0 to 0.2", "0", ""]
 
 
 def test_stages_are_shares_of_the_episodes_that_have_them(tmp_path):
     made = outcome(1)
     cleared = replace(made, config="heap", flags={**made.flags, "obstacles_cleared": 20})
     broken = replace(outcome(2), config="heap", flags={}, error="out of memory")  # before its first step
-    text = markdown(write(tmp_path / "a", [outcome(0), cleared, broken]))
+    text = render_markdown(write(tmp_path / "a", [outcome(0), cleared, broken]))
     assert [row(text, name)[-3] for name in ("table", "heap", "all together")] == ["", "50 %", "50 %"]
 
 
 def test_splits_are_side_by_side(tmp_path):
     outcomes = [outcome(0), outcome(1, 0), outcome(2, 0, split="new"), outcome(3, task="select", split="new")]
-    said = markdown(write(tmp_path / "a", outcomes)).partition("## Splits")[2]
+    said = render_markdown(write(tmp_path / "a", outcomes)).partition("## Splits")[2]
     assert "| task | test, n | test | new, n | new |" in said  # in the protocol's order
     assert row(said, "pick") == ["pick", "2", "50 % (1 to 99)", "1", "0 % (0 to 98)"]
     assert row(said, "select") == ["select", "0", "", "1", "100 % (3 to 100)"]
-    assert "Splits" not in markdown(write(tmp_path / "b", outcomes[:2]))
+    assert "Splits" not in render_markdown(write(tmp_path / "b", outcomes[:2]))
 
 
 def test_objects_moved_before_the_target_are_summed_up(tmp_path):
@@ -59,6 +59,6 @@ def test_objects_moved_before_the_target_are_summed_up(tmp_path):
     other = {**order, "moved": [move], "left": 1, "score": 1.0}
     never_held = {**other, "score": None}
     orders = [outcome(number, retrieval=one) for number, one in enumerate((order, other, never_held))]
-    said = markdown(write(tmp_path / "a", [*orders, outcome(3)]))
+    said = render_markdown(write(tmp_path / "a", [*orders, outcome(3)]))
     assert row(said.partition("Retrieval order")[2], "table") == ["table", "2", "0.75", "1.5", "67 %", "0.5"]
-    assert "Retrieval order" not in markdown(write(tmp_path / "b", [outcome(1)]))
+    assert "Retrieval order" not in render_markdown(write(tmp_path / "b", [outcome(1)]))

@@ -15,13 +15,13 @@ from robocas_ms3.tasks.vector import RoboCASVectorEnv
 slow = pytest.mark.slow
 
 
-def actions_of(seed: int, steps: int) -> np.ndarray:
+def parse_actions(seed: int, steps: int) -> np.ndarray:
     return np.random.default_rng(seed).uniform(-1, 1, (steps, 8)).astype(np.float32)
 
 
 def episodes(env, num_envs: int, first_seed: int, steps: int) -> list[list[bytes]]:
     """What each env observes at its reset and each of its steps, over the ends of episodes, and its instruction."""
-    actions = np.stack([actions_of(first_seed + i, steps) for i in range(num_envs)], 1)
+    actions = np.stack([parse_actions(first_seed + i, steps) for i in range(num_envs)], 1)
     obs, _ = env.reset(seed=first_seed)
     seen = [[row.numpy().tobytes()] for row in obs]
     for action in actions:
@@ -63,7 +63,7 @@ def test_an_env_is_what_gym_makes(four):
     env = gym.make("RoboCASPick-v1", max_episode_steps=HORIZON, **STATE_ONLY)
     obs, _ = env.reset(seed=23)
     plain = [obs[0].numpy().tobytes()]
-    for action in actions_of(23, steps):
+    for action in parse_actions(23, steps):
         obs, _, _, truncated, _ = env.step(action)
         plain.append(obs[0].numpy().tobytes())
         if truncated:
