@@ -64,12 +64,12 @@ class StandIn:
 
     def frames(self, _recording: Any, samples: np.ndarray) -> Iterator[Any]:
         """A ramp that moves."""
-        from robocas_ms3.datasets.sources.episode_source import Frame
+        from robocas_ms3.datasets.sources.episode_source import StepImages
 
         for sample in samples:
             rgb = {name: np.roll(self.rgb, sample, 1) for name in self.image_options.cameras}
             depth = {name: np.roll(self.depth, sample, 1) for name in self.image_options.cameras}
-            yield Frame(rgb, depth)
+            yield StepImages(rgb, depth)
 
     def cameras(self) -> dict[str, Any]:
         """All in one place."""

@@ -22,7 +22,7 @@ import tyro
 from robocas_ms3.datasets import ConversionSettings, Dataset, LeRobotDataset, convert, convert_lerobot, schema, validate
 from robocas_ms3.datasets.lerobot.check import check_lerobot
 from robocas_ms3.datasets.lerobot.variants import NEWEST, VARIANTS
-from robocas_ms3.datasets.manage.copy_episodes import CopyOptions, open_finished
+from robocas_ms3.datasets.manage.copy_episodes import CopyOptions, open_finished_dataset
 from robocas_ms3.datasets.manage.import_robocas import import_robocas
 from robocas_ms3.datasets.manage.merge import merge
 from robocas_ms3.datasets.manage.split import split_by_value, write_split
@@ -58,7 +58,7 @@ def main(cfg: Benchmark) -> None:
         merge(roots, merged)
     report["merge"]["violations"] = len(validate(merged).violations)
     with _timed(report, "split"):
-        source = open_finished(merged)
+        source = open_finished_dataset(merged)
         pieces = split_by_value(source.dataset, "task", None)
         write_split(source, {cfg.out / "split" / name: sides for name, sides in pieces.items()}, None)
     report["split"]["episodes_changed"] = sum(

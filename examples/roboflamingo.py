@@ -126,4 +126,6 @@ def load_scale(data_info: Path) -> ActionScale:
         info = load_json(data_info)
     except (OSError, ValueError) as error:
         raise EvaluationError("no data_info.json of a RoboCAS dataset", where=data_info, found=error) from error
-    return ActionScale.of(info.get("action_space", {}) if isinstance(info, dict) else {}, where=data_info)
+    return ActionScale.from_action_space(
+        info.get("action_space", {}) if isinstance(info, dict) else {}, where=data_info
+    )

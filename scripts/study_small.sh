@@ -40,7 +40,7 @@ for what in "${whats[@]}"; do
         *)
             data=$out/data/part_0
             read -r share rest < <(awk -v part="$what" -v all="$count" 'BEGIN { printf "%.9f %.9f\n", part / all, 1 - part / all }')
-            timed "$robocas" split "$made" --parts "$share" "$rest" --out "$out/data"
+            timed "$robocas" split "$made" --fractions "$share" "$rest" --out "$out/data"
             ;;
     esac
     timed "$robocas" train small --data "$data" --out "$out/run" --steps "$steps" "${more[@]}"

@@ -20,11 +20,11 @@ def main(settings: ConversionSettings) -> int:
     from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.cli.terminal import print_line
 
-    write: Callable[..., Conversion] = _find_format(settings).part("writer")
+    write: Callable[..., Conversion] = _find_format(settings).load("writer")
     with ProgressBar("episodes written") as bar:
         done = write(settings, on_start=bar.start, on_episode=bar.advance)
     count = len(done.episodes)
-    words = [f"{settings.out}: {format_count(count, 'episode')}"] + ([f"{done.kept} kept"] if done.kept else [])
+    words = [f"{settings.out}: {format_count(count, 'episode')}"] + ([f"{done.existing} kept"] if done.existing else [])
     if count:
         megabytes = sum(episode.size for episode in done.episodes) / 1e6
         steps = format_count(sum(episode.steps for episode in done.episodes), "step")

@@ -1,4 +1,4 @@
-"""``robocas split``: write several datasets of one."""
+"""``robocas split``: split a dataset into several datasets."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ from robocas_ms3.cli.options import Maybe, Several
 
 @dataclass
 class Split:
-    """Split a dataset into several, or choose its training and validation episodes again.
+    """Split a dataset into several datasets, or choose its training and validation episodes again.
 
     - --out-train T --out-val V: training and validation episodes as two datasets
-    - --parts 0.8 0.2 --out O: datasets O/part_0, O/part_1, ... with these fractions
-    - --by task --out O: one dataset per task (or target)
-    - --in-place --val-share 0.2: write only data_info.json; without --val-share, rebuild it from the episodes on disk
+    - --fractions 0.8 0.2 --out O: datasets O/part_0, O/part_1, ... with these fractions of the episodes
+    - --group-by task --out O: one dataset per task (or target)
+    - --in-place --val-fraction 0.2: choose the validation episodes again, without copying
+    - --in-place: rebuild data_info.json from the episodes on disk
 
     Example: robocas split datasets/pick --out-train datasets/train --out-val datasets/val
     """
@@ -26,23 +27,23 @@ class Split:
     dataset: Annotated[Path, tyro.conf.Positional]
     """Folder of the dataset."""
     out_train: Maybe[Path] = None
-    """Folder of the training episodes."""
+    """Output folder of the training episodes."""
     out_val: Maybe[Path] = None
-    """Folder of the validation episodes."""
-    parts: Several[float] = ()
-    """Fractions of the parts; they sum to 1."""
+    """Output folder of the validation episodes."""
+    fractions: Several[float] = ()
+    """Fractions of the episodes, one per new dataset; they sum to 1."""
     out: Maybe[Path] = None
-    """Folder for the folders of the parts."""
+    """Folder in which the folders of the new datasets are made."""
     in_place: bool = False
-    """Write only data_info.json."""
-    val_share: Maybe[float] = None
-    """Choose training and validation again, with this fraction for validation. Default: each episode keeps its side."""
-    by: Maybe[Literal["seed", "target", "task"]] = None
-    """Episodes that stay together: of one seed (default), target object or task."""
+    """Rewrite data_info.json of the dataset instead of writing new datasets."""
+    val_fraction: Maybe[float] = None
+    """Fraction of the episodes for validation, chosen again. Default: each episode stays in training or validation."""
+    group_by: Maybe[Literal["seed", "target", "task"]] = None
+    """Keep episodes with the same seed (default), target object or task together."""
     copy: bool = False
     """Copy files instead of hard-linking them."""
     overwrite: bool = False
-    """Start again. Default: continue a split of the same inputs that was interrupted."""
+    """Start again. Default: continue an interrupted split of the same inputs."""
 
 
 def main(cfg: Split) -> int:
@@ -50,46 +51,58 @@ def main(cfg: Split) -> int:
     from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.core.text import format_count
     from robocas_ms3.datasets.manage import split
-    from robocas_ms3.datasets.manage.copy_episodes import CopyOptions, open_finished
+    from robocas_ms3.datasets.manage.copy_episodes import CopyOptions, open_finished_dataset
 
     _check(cfg)
-    by = cfg.by or "seed"
-    whole = cfg.out is not None and not cfg.parts  # each part is one task or target, which can't be cut by itself
-    share = None if cfg.val_share is None else split.Share(cfg.val_share, "seed" if whole else by)
+    group_by = cfg.group_by or "seed"
+    by_value = cfg.out is not None and not cfg.fractions  # a dataset of one task or target has only one such group
+    options = (
+        None if cfg.val_fraction is None else split.SplitOptions(cfg.val_fraction, "seed" if by_value else group_by)
+    )
     if cfg.in_place:
-        train, val = split.resplit(cfg.dataset, share)
+        train, val = split.resplit(cfg.dataset, options)
         print_line(f"{cfg.dataset}: {format_count(len(train), 'episode')} for training, {len(val)} for validation")
         return 0
-    source = open_finished(cfg.dataset)
+    source = open_finished_dataset(cfg.dataset)
     if cfg.out_train and cfg.out_val:
-        pieces = split.split_by_side(source, share, cfg.out_train, cfg.out_val)
+        pieces = split.split_train_val(source, options, cfg.out_train, cfg.out_val)
     else:
         assert cfg.out is not None
         named = (
-            split.split_by_fractions(source.dataset, cfg.parts, by, share)
-            if cfg.parts
-            else split.split_by_value(source.dataset, by, share)
+            split.split_by_fractions(source.dataset, cfg.fractions, group_by, options)
+            if cfg.fractions
+            else split.split_by_value(source.dataset, group_by, options)
         )
-        pieces = {cfg.out / name: sides for name, sides in named.items()}
+        pieces = {cfg.out / name: episodes for name, episodes in named.items()}
     with ProgressBar("episodes written") as bar:
-        options = CopyOptions(not cfg.copy, cfg.overwrite, bar.start, bar.advance)
-        done = split.write_split(source, pieces, share, options)
-    for written in done:
-        print_line(str(written))
+        copy_options = CopyOptions(not cfg.copy, cfg.overwrite, bar.start, bar.advance)
+        done = split.write_split(source, pieces, options, copy_options)
+    for result in done:
+        print_line(str(result))
     return 0
 
 
 def _check(cfg: Split) -> None:
     from robocas_ms3.core.errors import DatasetError
+    from robocas_ms3.datasets.manage.split import check_fractions
 
-    sides = cfg.out_train is not None or cfg.out_val is not None
-    ways = [cfg.in_place, sides, cfg.out is not None]
-    if sum(ways) != 1 or (sides and (cfg.out_train is None or cfg.out_val is None)):
-        ways = "one of --in-place, --out-train T --out-val V, --parts ... --out O, --by ... --out O"
-        raise DatasetError("how to split?", expected=ways)
-    if cfg.parts and cfg.out is None:
-        raise DatasetError("parts need a folder", expected="--out")
-    if cfg.out is not None and not cfg.parts and cfg.by in (None, "seed"):
-        raise DatasetError("what is a part?", expected="--parts, or --by task or target")
-    if cfg.in_place and cfg.by and cfg.val_share is None:
-        raise DatasetError("how much validates?", expected="--val-share")
+    train_val = cfg.out_train is not None or cfg.out_val is not None
+    modes = {"--in-place": cfg.in_place, "--out-train and --out-val": train_val, "--out": cfg.out is not None}
+    chosen = [name for name, is_chosen in modes.items() if is_chosen]
+    if cfg.fractions:
+        check_fractions(cfg.fractions, "--fractions")
+        if cfg.out is None:
+            raise DatasetError("missing output folder", where="--fractions", expected="--out DIR")
+    if len(chosen) != 1:
+        what, expected = "choose one way to split", "--in-place, --out-train DIR --out-val DIR, or --out DIR"
+        raise DatasetError(what, where="--out", expected=expected, found=", ".join(chosen) or "none")
+    if train_val and (cfg.out_train is None or cfg.out_val is None):
+        where, expected = ("--out-train", "--out-val DIR") if cfg.out_train else ("--out-val", "--out-train DIR")
+        raise DatasetError("missing second output folder", where=where, expected=expected)
+    if cfg.out is not None and not cfg.fractions and cfg.group_by in (None, "seed"):
+        raise DatasetError("unclear how to split", where="--out", expected="--fractions, or --group-by task or target")
+    if cfg.in_place and cfg.group_by and cfg.val_fraction is None:
+        raise DatasetError("missing fraction", where="--group-by", expected="--val-fraction F")
+    if cfg.val_fraction is not None and not 0 < cfg.val_fraction < 1:
+        expected = "> 0 and < 1"
+        raise DatasetError("invalid fraction", where="--val-fraction", expected=expected, found=cfg.val_fraction)

@@ -16,7 +16,7 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.text import format_count
 
 if TYPE_CHECKING:
-    from robocas_ms3.datasets.checks.dataset import Report
+    from robocas_ms3.datasets.checks.dataset import ValidationReport
     from robocas_ms3.datasets.checks.replay import ReplayReport
 
 
@@ -25,7 +25,7 @@ class Validate:
     """Check a dataset of any format and list every violation of the format; exit code 1 if there is one.
 
     With --replay, each episode is also replayed open loop from its 7-D actions in its rebuilt scene. The report says
-    how many succeed again and how far the gripper deviates. This changes the exit code only with --min-share.
+    how many succeed again and how far the gripper deviates. This changes the exit code only with --min-success.
 
     Example: robocas validate datasets/pick --replay
     """
@@ -34,7 +34,7 @@ class Validate:
     """Folder of the dataset."""
     replay: bool = False
     """Replay the actions too (RoboCAS folders; simulated, not rendered)."""
-    min_share: Maybe[float] = None
+    min_success: Maybe[float] = None
     """With --replay: exit code 1 if a smaller fraction of the episodes of a task succeeds again (0 to 1), or if none of
     them could be replayed."""
     pack: Maybe[str] = None
@@ -45,18 +45,18 @@ class Validate:
 
 def main(cfg: Validate) -> int:
     from robocas_ms3.datasets.checks.dataset import validate
-    from robocas_ms3.datasets.formats import format_of
+    from robocas_ms3.datasets.formats import detect_format
 
-    if cfg.min_share is not None and not cfg.replay:
-        raise DatasetError("a share of replayed episodes needs --replay", where="--min-share")
-    if cfg.min_share is not None and not 0 <= cfg.min_share <= 1:
-        raise DatasetError("no such share", where="--min-share", expected="0 to 1", found=cfg.min_share)
-    found = format_of(cfg.dataset)
+    if cfg.min_success is not None and not cfg.replay:
+        raise DatasetError("a share of replayed episodes needs --replay", where="--min-success")
+    if cfg.min_success is not None and not 0 <= cfg.min_success <= 1:
+        raise DatasetError("no such share", where="--min-success", expected="0 to 1", found=cfg.min_success)
+    found = detect_format(cfg.dataset)
     if found and found.name != "robocas" and cfg.replay:
         raise DatasetError("only RoboCAS folders can be replayed", where=cfg.dataset)
     with ProgressBar("episodes checked", transient=True) as bar:
-        check = found.part("checker") if found and found.checker else validate
-        report: Report = check(cfg.dataset, on_episode=bar.update)
+        check = found.load("checker") if found and found.checker else validate
+        report: ValidationReport = check(cfg.dataset, on_episode=bar.update)
     if not cfg.json:
         for violation in report.violations:
             print_line(str(violation))
@@ -67,7 +67,7 @@ def main(cfg: Validate) -> int:
     if cfg.replay:
         replays = _replay(cfg.dataset, cfg.pack)
         content["replay"] = replays.as_json()
-        least = cfg.min_share or 0.0
+        least = cfg.min_success or 0.0
         wrong |= any((of_task["share"] or 0.0) < least for of_task in replays.by_task().values())
         if not cfg.json:
             for line in _lines(replays):

@@ -39,9 +39,9 @@ class View:
 
 def main(cfg: View) -> int:
     from robocas_ms3.cli.terminal import print_line
-    from robocas_ms3.viewer.source import open_source
+    from robocas_ms3.viewer.source import open_content
 
-    source = open_source(cfg.path)
+    source = open_content(cfg.path)
     if cfg.static is not None:
         return _write(cfg, cfg.static, source)
     import signal

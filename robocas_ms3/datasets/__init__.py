@@ -9,7 +9,7 @@ from robocas_ms3.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from robocas_ms3.datasets.actions import ActionScale as ActionScale
-    from robocas_ms3.datasets.checks.dataset import Report as Report
+    from robocas_ms3.datasets.checks.dataset import ValidationReport as ValidationReport
     from robocas_ms3.datasets.checks.dataset import validate as validate
     from robocas_ms3.datasets.checks.violation import Violation as Violation
     from robocas_ms3.datasets.conversion.convert import convert as convert
@@ -31,7 +31,7 @@ __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
     {
         "robocas_ms3.datasets.actions": ["ActionScale"],
-        "robocas_ms3.datasets.checks.dataset": ["Report", "validate"],
+        "robocas_ms3.datasets.checks.dataset": ["ValidationReport", "validate"],
         "robocas_ms3.datasets.checks.violation": ["Violation"],
         "robocas_ms3.datasets.conversion.convert": ["convert"],
         "robocas_ms3.datasets.conversion.settings": ["Conversion", "ConversionSettings", "WrittenEpisode"],

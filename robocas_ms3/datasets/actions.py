@@ -30,7 +30,7 @@ def episode_actions(arrays: Mapping[str, NDArray]) -> NDArray[np.float32]:
     return stored_actions(arrays["rel_pos"], arrays["rel_orn"], arrays["gripper_status"])
 
 
-def checked_actions(arrays: Mapping[str, NDArray], where: str) -> NDArray[np.float32]:
+def require_actions(arrays: Mapping[str, NDArray], where: str) -> NDArray[np.float32]:
     """Return `episode_actions` of arrays that may be damaged, or raise DatasetError."""
     check_finite(arrays, where)
     try:
@@ -68,7 +68,7 @@ class ActionScale:
     high: NDArray[np.float64]
 
     @classmethod
-    def of(cls, action_space: Mapping[str, Any], where: object = "action_space") -> ActionScale:
+    def from_action_space(cls, action_space: Mapping[str, Any], where: object = "action_space") -> ActionScale:
         """Return the scale of ``action_space`` of ``data_info.json``."""
         try:
             rows = [np.asarray(action_space[key], float) for key in ("relative_position", "relative_rotation")]

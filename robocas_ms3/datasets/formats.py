@@ -30,23 +30,23 @@ class Format:
     Attributes:
         name: of ``robocas convert --to``.
         title: for people.
-        holds: whether a path holds such episodes, whole or not; reads little.
+        matches: whether a path matches such episodes, whole or not; reads little.
         reader: (path, *, rate_hz=None, include_failed=False) -> `EpisodeSource`.
         writer: (`writing.settings.ConversionSettings`, *, on_start=None, on_episode=None) -> `Conversion`, see
             `writing.convert.convert`; empty: it can't be written.
-        checker: (root, *, on_episode=None) -> `checks.dataset.Report`; empty: there is none.
+        checker: (root, *, on_episode=None) -> `checks.dataset.ValidationReport`; empty: there is none.
         options: flags of ``robocas convert`` that not every format has, of those that the writer heeds.
     """
 
     name: str
     title: str
-    holds: Callable[[Path], bool]
+    matches: Callable[[Path], bool]
     reader: str
     writer: str = ""
     checker: str = ""
     options: tuple[str, ...] = ()
 
-    def part(self, name: str) -> Callable[..., Any]:
+    def load(self, name: str) -> Callable[..., Any]:
         path: str = getattr(self, name)
         if not path:
             raise DatasetError(f"this format has no {name}", where=self.title)
@@ -78,7 +78,7 @@ _BUILTIN = (
         f"{_PACKAGE}.lerobot.reader:open_lerobot",
         f"{_PACKAGE}.lerobot.convert:convert_lerobot",
         f"{_PACKAGE}.lerobot.check:check_lerobot",
-        ("codec", "lerobot_version", "leave_out"),
+        ("codec", "lerobot_version", "skip_errors"),
     ),
     Format(
         "robocas",
@@ -87,21 +87,21 @@ _BUILTIN = (
         f"{_PACKAGE}.sources.reader:open_folder",
         f"{_PACKAGE}.conversion.convert:convert",
         f"{_PACKAGE}.checks.dataset:validate",
-        ("append", "image_format", "leave_out"),
+        ("append", "image_format", "skip_errors"),
     ),
 )
 FORMATS: Registry[Format] = Registry("dataset format", GROUP, Format, {one.name: one for one in _BUILTIN})
 """Formats by name."""
 
 
-def format_of(path: Path) -> Format | None:
+def detect_format(path: Path) -> Format | None:
     """Return the format of a path, None if it has none; formats of other packages are asked first."""
     for name in reversed(list(FORMATS)):
         try:
-            if FORMATS[name].holds(path):
+            if FORMATS[name].matches(path):
                 return FORMATS[name]
         except Exception as error:  # another package's, of a path that it did not think of
-            _log.debug("%s: whether it holds %s can't be told: %s", name, path, error)
+            _log.debug("%s: whether it matches %s can't be told: %s", name, path, error)
     return None
 
 
@@ -114,5 +114,5 @@ def open_source(path: Path | str, *, rate_hz: float | None = None, include_faile
         DatasetError: it can't be read, or the dataset is of another rate.
     """
     path = Path(path)
-    found = format_of(path) or FORMATS["robocas"]  # which says what is wrong, and what may have been meant
-    return found.part("reader")(path, rate_hz=rate_hz, include_failed=include_failed)
+    found = detect_format(path) or FORMATS["robocas"]  # which says what is wrong, and what may have been meant
+    return found.load("reader")(path, rate_hz=rate_hz, include_failed=include_failed)

@@ -21,7 +21,7 @@ from robocas_ms3.core.text import format_count, one_line
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.conversion.data_info import write_info
 from robocas_ms3.datasets.conversion.episode_plan import dataset_settings, header
-from robocas_ms3.datasets.manage.split import Share, cut, groups_of
+from robocas_ms3.datasets.manage.split import SplitOptions, cut, group_episodes
 from robocas_ms3.datasets.sources.provenance import recording_entry
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.split import SPLIT_RULE, split_by_seed
@@ -189,7 +189,7 @@ def _set_source(path: Path, source: dict[str, Any]) -> None:
 
 def split_rule(plan: Plan) -> str:
     """Return in words which episodes validate, for ``conversion.json``."""
-    rule = Share(plan.split.val_fraction, plan.split.group_by).rule if plan.split else SPLIT_RULE
+    rule = SplitOptions(plan.split.val_fraction, plan.split.group_by).rule if plan.split else SPLIT_RULE
     named = [f"{part.name}: {part.split}" for part in plan.parts if part.split]
     return "; ".join([*named, *([rule] if len(named) < len(plan.parts) else [])])
 
@@ -204,7 +204,7 @@ def split_episodes(plan: Plan, root: Path) -> tuple[list[int], list[int]]:
         chosen = {None: free, "train": train, "val": val}[part.split]
         chosen += range(first, first + part.episodes)
     by = plan.split.group_by if plan.split else "seed"
-    among, found = set(free), groups_of(Dataset(root), by) if free else {}
+    among, found = set(free), group_episodes(Dataset(root), by) if free else {}
     groups = {number: group for number, group in found.items() if number in among}
     if plan.split is None:
         by_rule = split_by_seed({number: int(group) for number, group in groups.items()})

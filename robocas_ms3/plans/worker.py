@@ -157,7 +157,7 @@ class Renderer:
                 open_renderer=self._open,
             )
         else:
-            self._source.turn_to(files.recording)
+            self._source.switch_file(files.recording)
         return self._source
 
     def _open(self, env: RecordedEnv, control_mode: str, image_options: ImageOptions) -> EnvRenderer:

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.text import format_object_name
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.sources.episode_source import EpisodeSource, Kind
+from robocas_ms3.datasets.sources.episode_source import EpisodeSource, ImageKind
 from robocas_ms3.demos.failures import Failure
 from robocas_ms3.demos.recordings.trajectory_json import one_seed
-from robocas_ms3.viewer.damage import attempt, join_reasons, read_scene, readable
-from robocas_ms3.viewer.episode import facts_of, rounded, show_arrays
+from robocas_ms3.viewer.damage import as_dataset_error, join_reasons, read_or_default, read_scene
+from robocas_ms3.viewer.episode import facts_of, round_values, show_arrays
 from robocas_ms3.viewer.episode_table import Failures, Row, describe, stages
 from robocas_ms3.viewer.images import EncodedImage, encode_jpeg
 
@@ -49,10 +49,10 @@ class PageContent:
         Seeds without an episode, from ``failures.jsonl``, come last.
         """
         source, split = self.source, self._sides()
-        lengths, _ = attempt(lambda: source.lengths, {})
+        lengths, _ = read_or_default(lambda: source.lengths, {})
         found = [self._row(number, lengths.get(number, 0), split.get(number, "")) for number in source.numbers]
         rows = [row for row, _ in found]
-        rows += self.failures.given_up(rows, [env_info for _, env_info in found])
+        rows += self.failures.skipped_seeds(rows, [env_info for _, env_info in found])
         path = self.root.resolve()
         return {
             "name": path.name if path.is_dir() else f"{path.parent.name}/{path.name}",
@@ -66,7 +66,7 @@ class PageContent:
 
     def episode(self, number: int) -> dict[str, Any]:
         where = f"{self.root.name}, episode {number}"
-        with readable(where):
+        with as_dataset_error(where):
             scene, _ = self._scene(number)  # the table says what is wrong
             shown = {"facts": facts_of(scene), **self._show(number, scene)}
             if shown["steps"] < 1:
@@ -74,7 +74,7 @@ class PageContent:
             return {
                 **shown,
                 "n": number,
-                "times": rounded(np.arange(shown["steps"]) / self.source.rate_hz),
+                "times": round_values(np.arange(shown["steps"]) / self.source.rate_hz),
                 "plots": [one for one in shown["plots"] if one["series"]],
                 "facts": {name: value for name, value in shown["facts"].items() if value not in (None, "", {}, [])},
                 "failures": describe(self._failures(scene), scene.get("recorded") or {}),
@@ -92,8 +92,8 @@ class PageContent:
         entry, wrong_entry = read_scene(lambda: self._entry(number), self.entry_name)
         wrong_steps = ""
         if steps < 1:
-            steps, wrong_steps = attempt(lambda: self.source.episode(number).steps, 0)
-        instruction, _ = attempt(lambda: self.source.episode(number).instruction, "")
+            steps, wrong_steps = read_or_default(lambda: self.source.episode(number).steps, 0)
+        instruction, _ = read_or_default(lambda: self.source.episode(number).instruction, "")
         recorded = scene.get("recorded") or {}
         scene = {**entry, **scene}
         target = scene.get("target") or entry.get("target") or {}
@@ -122,8 +122,8 @@ class PageContent:
         return {key: entry[key] for key in known if key in entry} if isinstance(entry, Mapping) else entry
 
     def _sides(self) -> Mapping[int, str]:
-        train, _ = attempt(lambda: self.source.split("train"), [])
-        val, _ = attempt(lambda: self.source.split("val"), [])
+        train, _ = read_or_default(lambda: self.source.split("train"), [])
+        val, _ = read_or_default(lambda: self.source.split("val"), [])
         return {**dict.fromkeys(train, "train"), **dict.fromkeys(val, "val")}
 
     def _failures(self, scene: Mapping[str, Any]) -> Sequence[Failure]:
@@ -133,7 +133,7 @@ class PageContent:
         """Return what is shown of an episode, see `show_arrays`; may replace ``facts``."""
         return show_arrays(self.source.episode(number).arrays, scene)
 
-    def _image(self, number: int, camera: str, kind: Kind, step: int) -> NDArray:
-        with readable(f"{self.root.name}, episode {number}"), self._reading:
+    def _image(self, number: int, camera: str, kind: ImageKind, step: int) -> NDArray:
+        with as_dataset_error(f"{self.root.name}, episode {number}"), self._reading:
             episode = self.source.episode(number)
             return episode.rgb(camera, step) if kind == "rgb" else episode.depth(camera, step)

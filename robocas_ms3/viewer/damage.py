@@ -18,7 +18,7 @@ _WRONG = (*DAMAGED_FILE_ERRORS, ArithmeticError, AttributeError, AssertionError,
 
 
 @contextmanager
-def readable(where: object) -> Iterator[None]:
+def as_dataset_error(where: object) -> Iterator[None]:
     """Turn any error that damage may raise into a DatasetError that says where it is."""
     try:
         yield
@@ -27,10 +27,10 @@ def readable(where: object) -> Iterator[None]:
         raise DatasetError(what, where=where, found=found, fix=SEE_VALIDATE) from error
 
 
-def attempt(read: Callable[[], T], otherwise: T) -> tuple[T, str]:
+def read_or_default(read: Callable[[], T], otherwise: T) -> tuple[T, str]:
     """Return the result and an empty text; if it can't be read, the other value and what is wrong."""
     try:
-        with readable(""):
+        with as_dataset_error(""):
             return read(), ""
     except DatasetError as error:
         return otherwise, reason(error)
@@ -48,7 +48,7 @@ def join_reasons(*reasons: str) -> str:
 def read_object(read: Callable[[], Any], name: str) -> tuple[dict[Any, Any], str]:
     """Return a JSON object of a dataset, and a note; an empty object if it is damaged."""
     try:
-        with readable(name):
+        with as_dataset_error(name):
             found = read()
     except DatasetError as error:
         return {}, f"`{name}` is damaged: {error.found}."
@@ -57,5 +57,5 @@ def read_object(read: Callable[[], Any], name: str) -> tuple[dict[Any, Any], str
 
 def read_scene(read: Callable[[], Any], name: str) -> tuple[dict[str, Any], str]:
     """Return the valid values of a ``scene.json``, or of what has some of its keys, and what is wrong with the rest."""
-    (found, wrong), failed = attempt(lambda: valid_values(read(), name), ({}, ""))
+    (found, wrong), failed = read_or_default(lambda: valid_values(read(), name), ({}, ""))
     return found, f"{name}: {failed}" if failed else wrong

@@ -72,9 +72,9 @@ def show_arrays(
             *(base_plot(a["agv_pose"]) if "agv_pose" in a else []),
         ],
         "trace": {
-            "tcp": rounded(tcp[:, :3, 3]),
-            "approach": rounded(tcp[:, :3, 2]),
-            "objects": [{**thing, "path": rounded(thing["path"])} for thing in objects],
+            "tcp": round_values(tcp[:, :3, 3]),
+            "approach": round_values(tcp[:, :3, 2]),
+            "objects": [{**thing, "path": round_values(thing["path"])} for thing in objects],
             "moving": moving is not None,
         },
     }
@@ -133,12 +133,12 @@ def base_plot(pose: NDArray) -> list[Plot]:
 def plot(title: str, unit: str, names: Sequence[str], values: NDArray, *, steps: bool = False) -> Plot:
     """Return a plot of (T, N) values; ``steps`` draws each value until the next one."""
     columns = np.atleast_2d(np.asarray(values, float).T)
-    series = [{"name": name, "values": rounded(column)} for name, column in zip(names, columns, strict=True)]
+    series = [{"name": name, "values": round_values(column)} for name, column in zip(names, columns, strict=True)]
     return {"title": title, "unit": unit, "series": series, "steps": steps}
 
 
-def rounded(values: Any) -> list:
-    """Return nested lists of rounded numbers; NaN and infinity, which JSON does not have, become None."""
+def round_values(values: Any) -> list:
+    """Return nested lists of round_values numbers; NaN and infinity, which JSON does not have, become None."""
     array = np.round(np.asarray(values, float), 5) + 0.0  # + 0.0: no -0.0
     if np.isfinite(array).all():
         return array.tolist()

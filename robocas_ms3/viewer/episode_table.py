@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.core.json_lines import JsonLinesFile
-from robocas_ms3.datasets.sources.provenance import environment_of
+from robocas_ms3.datasets.sources.provenance import environment_id
 from robocas_ms3.demos.failures import FAILURES_FILE, Failure
 
 
@@ -43,7 +43,7 @@ class FailedAttempt(Failure):
     def is_of(self, env_info: Any) -> bool:
         if not self.environment or not isinstance(env_info, Mapping):
             return True
-        return environment_of(env_info) in ("", self.environment)
+        return environment_id(env_info) in ("", self.environment)
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Failures:
         """Return the failures of a seed in an environment; none if the seed is unknown."""
         return [] if seed is None else [failure for failure in self.by_seed.get(seed, []) if failure.is_of(env_info)]
 
-    def given_up(self, rows: Sequence[Row], env_infos: Sequence[Any]) -> list[Row]:
+    def skipped_seeds(self, rows: Sequence[Row], env_infos: Sequence[Any]) -> list[Row]:
         """Return rows of the seeds that were given up and have no episode."""
         environments: dict[int | None, list[Any]] = defaultdict(list)
         for row, env_info in zip(rows, env_infos, strict=True):

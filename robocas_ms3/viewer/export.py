@@ -10,7 +10,7 @@ from typing import Any
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import atomic_folder, make_folder
 from robocas_ms3.viewer.content import PageContent
-from robocas_ms3.viewer.damage import join_reasons, readable, reason
+from robocas_ms3.viewer.damage import as_dataset_error, join_reasons, reason
 from robocas_ms3.viewer.images import EncodedImage, depth_image, shrink_image
 from robocas_ms3.viewer.routes import PAGE_FILES, make_thumbnail, page_file, script
 
@@ -77,7 +77,7 @@ def _write_episode(source: PageContent, index: dict[str, Any], number: int, fold
 def _write(path: Path, make: Callable[[], EncodedImage]) -> str:
     """Write an image, or return why there is none."""
     try:
-        with readable(path.name):
+        with as_dataset_error(path.name):
             image = make()
     except DatasetError as error:
         return f"images: {error.what}"

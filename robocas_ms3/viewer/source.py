@@ -14,15 +14,15 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import from_xyzw, inverse, transform_points
 from robocas_ms3.core.text import format_object_name
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.formats import format_of
+from robocas_ms3.datasets.formats import detect_format
 from robocas_ms3.datasets.images.image_headers import read_image_bytes
-from robocas_ms3.datasets.sources.episode_source import Kind
-from robocas_ms3.datasets.sources.provenance import task_of, unread_entry
+from robocas_ms3.datasets.sources.episode_source import ImageKind
+from robocas_ms3.datasets.sources.provenance import entry_without_fingerprint, task_of
 from robocas_ms3.datasets.sources.reader import DEFAULT_RATE, Dataset
 from robocas_ms3.datasets.sources.trajectory import TrajectorySource
 from robocas_ms3.demos.recordings.trajectory_file import Recording, TrajectoryFile
 from robocas_ms3.viewer.content import PageContent
-from robocas_ms3.viewer.damage import attempt, read_object, readable
+from robocas_ms3.viewer.damage import as_dataset_error, read_object, read_or_default
 from robocas_ms3.viewer.episode import ARM, ROLL_PITCH_YAW, XYZ, Plot, facts_of, plot, show_arrays
 from robocas_ms3.viewer.images import EncodedImage, check_inside
 
@@ -34,12 +34,12 @@ _AT_ONCE = 8  # images decoded together: a video opens and seeks slowly, and the
 _CACHE_BYTES = 128e6  # of decoded images
 
 
-def open_source(path: Path | str) -> PageContent:
+def open_content(path: Path | str) -> PageContent:
     """Open a trajectory file or its folder, a RoboCAS folder, a LeRobot folder, or another package's format."""
     path = Path(path)
     inside = path / "trajectory.h5"
     path = inside if inside.is_file() else path
-    found = format_of(path)
+    found = detect_format(path)
     other_file = found is None or (found.name == "trajectory" and path.suffix not in (".h5", ".hdf5"))
     if other_file and not path.is_dir():
         raise DatasetError(
@@ -54,7 +54,7 @@ def open_source(path: Path | str) -> PageContent:
         return TrajectoryContent(path)
     if found.name == "lerobot":
         return LeRobotContent(path)
-    return PageContent(found.part("reader")(path), found.title)
+    return PageContent(found.load("reader")(path), found.title)
 
 
 class FolderContent(PageContent):
@@ -65,14 +65,14 @@ class FolderContent(PageContent):
         # damaged values of the overviews are left out from here on
         dataset.settings, wrong_settings = read_object(lambda: dataset.settings, schema.CONVERSION_FILE)
         dataset.info, wrong_info = read_object(lambda: dataset.info, schema.DATA_INFO_FILE)
-        dataset.rate_hz, wrong = attempt(lambda: dataset.rate_hz, DEFAULT_RATE)
+        dataset.rate_hz, wrong = read_or_default(lambda: dataset.rate_hz, DEFAULT_RATE)
         assumed = f"`rate_hz` of `{schema.CONVERSION_FILE}`: {wrong}; {DEFAULT_RATE:g} Hz is assumed."
-        dataset.cameras, _ = attempt(lambda: dataset.cameras, dataset.episode(dataset.numbers[0]).cameras)
+        dataset.cameras, _ = read_or_default(lambda: dataset.cameras, dataset.episode(dataset.numbers[0]).cameras)
         notes = wrong_settings, assumed if wrong else "", wrong_info
         super().__init__(dataset, "RoboCAS folder", notes)
 
     def _sides(self) -> Mapping[int, str]:
-        sides, _ = attempt(lambda: self.dataset.sides, ([], []))  # also of episodes that are not there
+        sides, _ = read_or_default(lambda: self.dataset.splits, ([], []))  # also of episodes that are not there
         return {number: side for side, listed in zip(("train", "val"), sides, strict=True) for number in listed}
 
     def rgb(self, number: int, camera: str, step: int) -> EncodedImage:
@@ -95,10 +95,12 @@ class TrajectoryContent(PageContent):
     scene_name = entry_name = "its entry of the JSON"
 
     def __init__(self, path: Path) -> None:
-        with readable(path):
+        with as_dataset_error(path):
             with TrajectoryFile(path) as file:
                 task = task_of(file.env_info["env_id"])
-                self._entries = [{"task": task, **unread_entry(file, index)} for index in range(len(file.episodes))]
+                self._entries = [
+                    {"task": task, **entry_without_fingerprint(file, index)} for index in range(len(file.episodes))
+                ]
             self.recordings = TrajectorySource(path, rate_hz=file.control_freq, include_failed=True)
         super().__init__(self.recordings, "trajectory file", [_NO_IMAGES.format(name=path.name)])
 
@@ -124,20 +126,20 @@ class LeRobotContent(PageContent):
         from robocas_ms3.datasets.lerobot import schema as lerobot  # needs the extra `lerobot`
         from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 
-        with readable(root):
+        with as_dataset_error(root):
             self.dataset = dataset = LeRobotDataset(root)
-            _ = dataset.is_ours, dataset.lengths, dataset.rate_hz, dataset.cameras, dataset.has_depth
+            _ = dataset.is_robocas, dataset.lengths, dataset.rate_hz, dataset.cameras, dataset.has_depth
         self.entry_name, self._indices = lerobot.CONVERSION_FILE, {*lerobot.INDICES, lerobot.SUBTASK_INDEX.key}
         settings, wrong_settings = read_object(lambda: dataset.settings, lerobot.CONVERSION_FILE)
         dataset.settings = settings or {"train_eps": []}
-        dataset.described, wrong_scenes = read_object(lambda: dataset.described, lerobot.SCENES_FILE)
+        dataset.scene_texts, wrong_scenes = read_object(lambda: dataset.scene_texts, lerobot.SCENES_FILE)
         notes = wrong_scenes, wrong_settings
         super().__init__(dataset, "LeRobot dataset", notes)
-        self._decoded: OrderedDict[tuple[int, str, Kind, int], NDArray] = OrderedDict()  # the last used is last
+        self._decoded: OrderedDict[tuple[int, str, ImageKind, int], NDArray] = OrderedDict()  # the last used is last
 
     def _show(self, number: int, scene: Mapping[str, Any]) -> dict[str, Any]:
         """Show ours like a RoboCAS folder, others by a plot per numeric column."""
-        if self.dataset.is_ours:
+        if self.dataset.is_robocas:
             return super()._show(number, scene)
         episode = self.dataset.episode(number)
         features = self.dataset.info["features"]
@@ -155,7 +157,7 @@ class LeRobotContent(PageContent):
             "facts": {"Robot": self.dataset.info.get("robot_type")},
         }
 
-    def _image(self, number: int, camera: str, kind: Kind, step: int) -> NDArray:
+    def _image(self, number: int, camera: str, kind: ImageKind, step: int) -> NDArray:
         episode = self.dataset.episode(number)
         if not 0 <= step < episode.steps:
             raise DatasetError("no such step", where=f"{self.root}, episode {number}", found=step)

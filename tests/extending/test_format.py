@@ -15,7 +15,7 @@ from robocas_ms3.core.extensions import Registry
 from robocas_ms3.datasets import RoboCASDataset, formats
 from robocas_ms3.datasets.conversion import convert as conversion
 from robocas_ms3.datasets.conversion.settings import ConversionSettings
-from robocas_ms3.datasets.formats import format_of, open_source
+from robocas_ms3.datasets.formats import detect_format, open_source
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.training.options import SampleOptions
 
@@ -47,7 +47,7 @@ def both(stranger, tmp_path, capsys):
 def test_it_is_three_files_and_known_by_them(both):
     toy, folder = both
     assert sorted(path.name for path in toy.iterdir()) == ["about.json", "arrays.npz", "images.npz"]
-    assert (format_of(toy).name, format_of(folder).name) == ("toy", "robocas")
+    assert (detect_format(toy).name, detect_format(folder).name) == ("toy", "robocas")
 
 
 def test_it_trains_as_a_robocas_folder_does(both):
@@ -105,6 +105,6 @@ def test_a_format_that_there_is_not(stranger, tmp_path, capsys):
 def test_a_format_that_fails_at_a_path_holds_it_not(both, monkeypatch):
     """One that looks for files in what is no folder, say."""
     toy = formats.FORMATS["toy"]
-    monkeypatch.setitem(formats.FORMATS._loaded, "toy", replace(toy, holds=lambda path: any(path.iterdir())))
+    monkeypatch.setitem(formats.FORMATS._loaded, "toy", replace(toy, matches=lambda path: any(path.iterdir())))
     trajectory = both[0].with_name("F.h5")
-    assert format_of(trajectory).name == "trajectory"
+    assert detect_format(trajectory).name == "trajectory"

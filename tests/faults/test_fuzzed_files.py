@@ -50,7 +50,7 @@ from robocas_ms3.robots.cameras import STANDARD_NAMES
 from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.scenes.layout_table import FrozenLayouts, LayoutTable, write_frozen_layouts, write_table
 from robocas_ms3.viewer.routes import Routes
-from robocas_ms3.viewer.source import open_source as open_page
+from robocas_ms3.viewer.source import open_content as open_page
 
 PACK = builtin_packs_dir() / "builtin"
 OBJECT = min(PACK.glob("*/annotations.npz")).parent

@@ -32,7 +32,7 @@ def of(monkeypatch):
         task = {n: "select" if 20 <= n < 25 else "pick" for n in numbers}
         return {"seed": {n: str(7 * n) for n in numbers}, "target": {n: str(n % 4) for n in numbers}, "task": task}[by]
 
-    monkeypatch.setattr(splits, "groups_of", groups)
+    monkeypatch.setattr(splits, "group_episodes", groups)
     monkeypatch.setattr(splits, "Dataset", lambda root: root)
     return lambda plan: splits.split_episodes(plan, "somewhere")
 
@@ -57,7 +57,7 @@ def test_other_parts_go_by_the_rule(of):
     assert set(range(20, 25)) < set(val)
     free = set(val) - set(range(20, 25))
     assert {n % 4 for n in free}.isdisjoint({n % 4 for n in train})  # a target is on one side
-    assert splits.split_rule(plan) == f"b: val; {split.Share(0.2, 'target').rule}"
+    assert splits.split_rule(plan) == f"b: val; {split.SplitOptions(0.2, 'target').rule}"
 
 
 def test_all_of_one_kind_train(of, caplog):

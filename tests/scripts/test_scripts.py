@@ -95,7 +95,7 @@ def test_a_study_trains_on_what_is_there_and_on_parts_of_it(tmp_path, what):
     assert played[played.index("--policy") + 1] == train[train.index("--out") + 1]
     assert played[played.index("--episodes") + 1] == "7"
     if not whole:
-        shares = [float(share) for share in calls[0][calls[0].index("--parts") + 1 :][:2]]
+        shares = [float(share) for share in calls[0][calls[0].index("--fractions") + 1 :][:2]]
         assert shares == [0.25, 0.75]
 
 

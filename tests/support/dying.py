@@ -30,8 +30,8 @@ def lerobot_places():
 
     lerobot.convert_lerobot = render_by(RayCaster, lerobot.convert_lerobot)
     return {
-        "frame": (video.Encoder, "add", 50),  # in the second episode
-        "join": (video.Joiner, "add", 7),
+        "frame": (video.VideoEncoder, "add", 50),  # in the second episode
+        "join": (video.VideoJoiner, "add", 7),
         "table": (writer.RollingTable, "add", 4),
         "folders": (lerobot.os, "replace", 3),  # plan, data, videos: the third
         "joined": (Path, "rmdir", 1),

@@ -9,8 +9,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from robocas_ms3.datasets.images.image_files import ImageOptions, box_of
-from robocas_ms3.datasets.sources.episode_source import CameraModel, Frame
+from robocas_ms3.datasets.images.image_files import ImageOptions, bounding_box
+from robocas_ms3.datasets.sources.episode_source import CameraModel, StepImages
 from robocas_ms3.robots.cameras import STANDARD_NAMES, standard_parent
 from robocas_ms3.robots.description import MOBILE_PANDA
 
@@ -94,8 +94,8 @@ class RayCaster:
             shots = {n: self.shoot(parents[n] @ camera, boxes) for n, camera in wanted.items()}
             depth = {n: p[1] for n, p in shots.items() if self.image_options.depth}
             masks = {n: p[2] == 2 for n, p in shots.items() if self.image_options.boxes}  # behind the table: the target
-            found = {n: box for n, mask in masks.items() if (box := box_of(mask))}
-            yield Frame({n: p[0] for n, p in shots.items()}, depth, found)
+            found = {n: box for n, mask in masks.items() if (box := bounding_box(mask))}
+            yield StepImages({n: p[0] for n, p in shots.items()}, depth, found)
 
     def shoot(self, camera_in_world, boxes):
         width, height = self.size

@@ -10,7 +10,7 @@ from robocas_ms3.cli.view import View, main
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.viewer.episode_table import Failures
 from robocas_ms3.viewer.routes import Routes, script
-from robocas_ms3.viewer.source import open_source
+from robocas_ms3.viewer.source import open_content
 
 
 def shown(source, numbers=(0, 1, 2)):
@@ -43,17 +43,17 @@ def spoilt(folder, tmp_path):
 )
 def test_the_row_says_what_is_wrong(spoilt, new, damage):
     change(spoilt / "episode_0000001/scene.json", **new)
-    (_, row, _, _) = open_source(spoilt).index()["episodes"]
+    (_, row, _, _) = open_content(spoilt).index()["episodes"]
     assert row["damage"].startswith(damage)
     assert (row["object"], row["seed"], row["success"]) == ("cube 4 (cube)", 4, False)  # of the overview or the scene
-    assert open_source(spoilt).episode(1)["n"] == 1
+    assert open_content(spoilt).episode(1)["n"] == 1
 
 
 @pytest.mark.parametrize("text", ["[1]", "null", "{", "\xff"])
 @pytest.mark.parametrize("name", ["episode_0000001/scene.json", "conversion.json", "data_info.json"])
 def test_files_that_hold_something_else(spoilt, name, text):
     (spoilt / name).write_bytes(text.encode("latin-1"))
-    index, statuses = shown(open_source(spoilt))
+    index, statuses = shown(open_content(spoilt))
     assert statuses == [200, 200, 200]
     if "/" in name:
         assert index["episodes"][1]["damage"].startswith("scene.json: ")
@@ -63,12 +63,12 @@ def test_files_that_hold_something_else(spoilt, name, text):
 
 def test_an_episode_that_is_gone_costs_the_others_no_side(spoilt):
     change(spoilt / "data_info.json", train_eps=[0, 1, 9], val_eps=[2])
-    assert [row["split"] for row in open_source(spoilt).index()["episodes"]][:3] == ["train", "train", "val"]
+    assert [row["split"] for row in open_content(spoilt).index()["episodes"]][:3] == ["train", "train", "val"]
 
 
 def test_a_rate_of_zero_is_replaced_with_a_note(spoilt):
     change(spoilt / "conversion.json", rate_hz=0)
-    index = open_source(spoilt).index()
+    index = open_content(spoilt).index()
     assert index["rate_hz"] == 5
     assert index["note"].startswith("`rate_hz` of `conversion.json`")
 
@@ -80,7 +80,7 @@ def test_damaged_arrays_are_an_error_of_that_episode_alone(spoilt):
     np.savez(path, **{**arrays, "rel_pos": arrays["rel_pos"][:3]})
     (spoilt / "episode_0000000/episode_info.npz").write_bytes(b"PK\x03\x04 cut")
     (spoilt / "episode_0000000/scene.json").write_text("{")
-    source = open_source(spoilt)
+    source = open_content(spoilt)
     index, statuses = shown(source)
     assert statuses == [404, 404, 200]
     assert index["episodes"][0]["damage"].startswith("scene.json: this JSON is damaged")
@@ -103,17 +103,17 @@ def test_a_damaged_trajectory(run_folder, tmp_path):
 
     said = whole["episodes"][1]["robocas"]
     write({**said, "target": "cube"})
-    (_, row, *_) = shown(open_source(folder), [0, 1])[0]["episodes"]
+    (_, row, *_) = shown(open_content(folder), [0, 1])[0]["episodes"]
     assert row["damage"] == 'its entry of the JSON, target: expected an object, found "cube"'
     assert row["instruction"].startswith("grasp the cube 4")
     write({"instruction": 3, "target": said["target"]})
-    (_, row, *_) = shown(open_source(folder), [0, 1])[0]["episodes"]
+    (_, row, *_) = shown(open_content(folder), [0, 1])[0]["episodes"]
     assert row["damage"].startswith("its entry of the JSON: the JSON's entry: ")
     assert (row["object"], row["seed"], row["success"], row["stages"]) == ("cube 4 (cube)", 4, False, ["grasp"])
     for spoilt in ({"episodes": 3}, {"episodes": ["x"]}, {"env_info": {"env_id": 3, "env_kwargs": 4}}, {"robocas": []}):
         path.write_text(json.dumps({**whole, **spoilt}))
         with pytest.raises(DatasetError):
-            open_source(folder)
+            open_content(folder)
 
 
 def test_a_damaged_lerobot_dataset(lerobot, tmp_path):
@@ -129,19 +129,19 @@ def test_a_damaged_lerobot_dataset(lerobot, tmp_path):
     for wrong in ("[1]", "{", json.dumps({**json.loads(texts[1]), "recorded": [], "target": "x"})):
         column = pa.array([texts[0], wrong, texts[2]], pa.string())
         pq.write_table(scenes.set_column(scenes.column_names.index("scene"), "scene", column), path)
-        index, statuses = shown(open_source(spoilt))
+        index, statuses = shown(open_content(spoilt))
         assert [statuses[0], statuses[2]] == [200, 200]
         assert [bool(row["damage"]) for row in index["episodes"][:3]] == [False, True, False]
     path.write_bytes(b"PAR1")
-    assert "`meta/robocas/episodes.parquet` is damaged" in open_source(spoilt).index()["note"]
+    assert "`meta/robocas/episodes.parquet` is damaged" in open_content(spoilt).index()["note"]
     settings = spoilt / theirs.CONVERSION_FILE
     for text in ("{", '{"episodes": {}, "val_eps": 3}', '{"episodes": ["x", 7, {"seed": []}], "val_eps": null}'):
         settings.write_text(text)
-        index, _ = shown(open_source(spoilt))
+        index, _ = shown(open_content(spoilt))
         assert [row["n"] for row in index["episodes"][:3]] == [0, 1, 2]
     (spoilt / "meta/info.json").write_text('{"codebase_version": "v3.0", "features": 3}')
     with pytest.raises(DatasetError):
-        open_source(spoilt)
+        open_content(spoilt)
 
 
 def test_a_static_page_of_a_damaged_dataset(spoilt, tmp_path, capsys):
@@ -184,10 +184,10 @@ def test_damaged_lines_of_failures_are_left_out_with_a_note(tmp_path, spoilt):
     assert read.note == "Damaged and left out: line 2, 3, 4, 5, 6, ... of `failures.jsonl`."
     with (spoilt / "failures.jsonl").open("a") as file:
         file.write('{"seed": 12, "att')
-    index = open_source(spoilt).index()
+    index = open_content(spoilt).index()
     assert index["note"] == "Damaged and left out: line 4 of `failures.jsonl`."
     assert [row["seed"] for row in index["episodes"]] == [3, 4, 5, 9]
     (spoilt / "failures.jsonl").unlink()
     (spoilt / "failures.jsonl").mkdir()
-    index = open_source(spoilt).index()
+    index = open_content(spoilt).index()
     assert (len(index["episodes"]), index["note"]) == (3, "`failures.jsonl` can't be read: Is a directory.")

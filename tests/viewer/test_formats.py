@@ -11,7 +11,7 @@ from robocas_ms3.datasets import formats
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.viewer.images import decode
 from robocas_ms3.viewer.routes import Routes
-from robocas_ms3.viewer.source import open_source
+from robocas_ms3.viewer.source import open_content
 
 MAX_DEPTH_MM = 4095  # of LeRobot's depth videos
 SOURCE = ("rate_hz", "numbers", "lengths", "cameras", "has_depth", "has_embeddings", "split", "entry", "action_space")
@@ -44,25 +44,25 @@ def open_toy(folder, monkeypatch, broken=()):
     with monkeypatch.context() as patch:
         patch.setattr(formats.Format, "part", lambda self, name: read)
         patch.setattr(formats, "FORMATS", {"toy": toy})
-        return open_source(folder)
+        return open_content(folder)
 
 
 @pytest.fixture(params=["LeRobot dataset", "toy dataset"])
 def page(request, folder, monkeypatch):
     toy = request.param == "toy dataset"
-    opened = open_toy(folder, monkeypatch) if toy else open_source(request.getfixturevalue("lerobot"))
+    opened = open_toy(folder, monkeypatch) if toy else open_content(request.getfixturevalue("lerobot"))
     assert opened.index()["kind"] == request.param
     return opened
 
 
 def test_it_lists_what_the_folder_lists(page, folder):
-    index, wanted = page.index(), open_source(folder).index()
+    index, wanted = page.index(), open_content(folder).index()
     for key in wanted.keys() - {"kind", "name"}:
         assert index[key] == wanted[key], key
 
 
 def test_it_shows_what_the_folder_shows(page, folder):
-    episode, wanted = page.episode(1), open_source(folder).episode(1)
+    episode, wanted = page.episode(1), open_content(folder).episode(1)
     for key in ("instruction", "steps", "times", "subgoals", "facts", "failures"):
         assert episode[key] == wanted[key], key
     for mine, theirs in zip(episode["plots"], wanted["plots"], strict=True):
@@ -90,7 +90,7 @@ def test_there_is_no_such_episode_or_step(page):
 
 def test_what_is_damaged_of_a_source_is_left_out(folder, monkeypatch):
     index = open_toy(folder, monkeypatch, ("lengths", "split", "entry")).index()
-    (row, *_), (wanted, *_) = index["episodes"], open_source(folder).index()["episodes"]
+    (row, *_), (wanted, *_) = index["episodes"], open_content(folder).index()["episodes"]
     assert row["damage"] == "conversion.json: damaged"
     assert {**row, "damage": ""} == {**wanted, "split": ""}
 
@@ -101,7 +101,7 @@ def test_the_memory_of_decoded_images_is_bounded(lerobot, monkeypatch):
     decoded, frames = [], LeRobotEpisode.frames
     monkeypatch.setattr(LeRobotEpisode, "frames", lambda self, *key: decoded.append(self.number) or frames(self, *key))
     monkeypatch.setattr("robocas_ms3.viewer.source._CACHE_BYTES", 2 * 7 * 64 * 48 * 3)  # two episodes of a camera
-    source = open_source(lerobot)
+    source = open_content(lerobot)
     for number in (0, 1, 0, 2, 0, 1):
         source.rgb(number, "base_camera", 3)
     assert decoded == [0, 1, 2, 1]
@@ -113,7 +113,7 @@ def test_another_makers_lerobot_dataset_shows_its_columns(lerobot, tmp_path):
     info = json.loads((other / "meta/info.json").read_text())
     del info["features"]["observation.arm_base"]
     (other / "meta/info.json").write_text(json.dumps(info))
-    source = open_source(other)
+    source = open_content(other)
     (row, *_) = source.index()["episodes"]
     assert (row["steps"], row["success"]) == (7, None)
     assert row["instruction"] == "grasp the cube 3 on the table and move it to the basket"

@@ -11,7 +11,7 @@ from browser import open_page, wait
 
 from robocas_ms3.viewer.export import export
 from robocas_ms3.viewer.server import Viewer
-from robocas_ms3.viewer.source import open_source
+from robocas_ms3.viewer.source import open_content
 
 pytestmark = pytest.mark.slow
 LOADED = "document.querySelector('#episode')?.hidden === false && document.querySelector('#instruction').textContent"
@@ -53,8 +53,8 @@ def serve():
 @pytest.fixture(scope="module")
 def urls(folder, serve, tmp_path_factory):
     out = tmp_path_factory.mktemp("static") / "page"
-    assert export(open_source(folder), out, width=32) == (3, {})
-    return {"server": serve(open_source(folder)).url, "files": (out / "index.html").as_uri()}
+    assert export(open_content(folder), out, width=32) == (3, {})
+    return {"server": serve(open_content(folder)).url, "files": (out / "index.html").as_uri()}
 
 
 def load(browser, url):
@@ -234,7 +234,7 @@ def test_deep_links(any_page):
 
 
 def test_a_trajectory_shows_traces_and_says_how_to_get_images(opened, serve, run_folder):
-    page = load(opened, serve(open_source(run_folder)).url)
+    page = load(opened, serve(open_content(run_folder)).url)
     assert "robocas convert trajectory.h5" in page.text_content("#note")
     assert page.evaluate("document.querySelector('#cameras').hidden && document.querySelector('#views').hidden")
     assert page.evaluate(ROWS) == "0,1,2,none"
@@ -250,7 +250,7 @@ def test_a_damaged_episode_is_shown_as_such(opened, serve, folder, tmp_path):
         path.write_text(json.dumps({**json.loads(path.read_text()), **new}))
     (spoilt / "episode_0000002/scene.json").write_text("[]")
     (spoilt / "episode_0000002/episode_info.npz").write_bytes(b"PK")
-    page = load(opened, serve(open_source(spoilt)).url)
+    page = load(opened, serve(open_content(spoilt)).url)
     assert page.text_content("#damage") == (
         "Damaged and left out: scene.json, layout.poses: expected a list, found 3;"
         ' scene.json, recorded: expected an object, found "x"'
@@ -272,7 +272,7 @@ def test_a_damaged_episode_is_shown_as_such(opened, serve, folder, tmp_path):
 
 
 def test_of_a_thousand_episodes_only_visible_rows_are_made(opened, serve, folder, monkeypatch):
-    source = open_source(folder)
+    source = open_content(folder)
     index = source.index()
     lines = [{**index["episodes"][n % 3], "n": n, "seed": n} for n in range(1000)]
     monkeypatch.setattr(source, "index", lambda: {**index, "episodes": lines})
@@ -293,7 +293,7 @@ def test_another_dataset_at_the_same_port_shows_its_own_images(opened, folder, t
         cv2.imwrite(str(path), np.full((12, 16, 3), 200, np.uint8))
     port, widths = 0, []
     for path in (folder, other):
-        with Viewer(open_source(path), port) as server:
+        with Viewer(open_content(path), port) as server:
             threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
             port = server.server_port
             page = load(opened, server.url)

@@ -12,12 +12,12 @@ import pytest
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.viewer.routes import PAGE_FILES, Routes
 from robocas_ms3.viewer.server import HOST, Viewer
-from robocas_ms3.viewer.source import open_source
+from robocas_ms3.viewer.source import open_content
 
 
 @pytest.fixture(scope="module")
 def server(folder):
-    with Viewer(open_source(folder)) as running:
+    with Viewer(open_content(folder)) as running:
         threading.Thread(target=running.serve_forever, args=(0.02,), daemon=True).start()
         yield running
         running.shutdown()
@@ -121,7 +121,7 @@ def test_it_takes_no_orders(server):
 
 def test_it_ends_though_a_browser_keeps_its_connection(folder):
     before = set(threading.enumerate())
-    with Viewer(open_source(folder)) as server:
+    with Viewer(open_content(folder)) as server:
         server.warm_up()
         serving = threading.Thread(target=server.serve_forever, args=(0.02,))
         serving.start()
@@ -138,7 +138,7 @@ def test_it_ends_though_a_browser_keeps_its_connection(folder):
 
 def test_the_number_of_connections_is_bounded(folder, monkeypatch):
     monkeypatch.setattr("robocas_ms3.viewer.server.MAX_CONNECTIONS", 2)
-    with Viewer(open_source(folder)) as server:
+    with Viewer(open_content(folder)) as server:
         threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
         address = HOST, server.server_port
         connect = socket.create_connection
@@ -161,6 +161,6 @@ def test_a_port_that_is_taken(folder):
         taken.bind((HOST, 0))
         taken.listen()
         with pytest.raises(RobocasError, match="can't listen"):
-            Viewer(open_source(folder), taken.getsockname()[1])
+            Viewer(open_content(folder), taken.getsockname()[1])
     with pytest.raises(RobocasError, match="can't listen"):
-        Viewer(open_source(folder), 70_000)
+        Viewer(open_content(folder), 70_000)

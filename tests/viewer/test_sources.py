@@ -11,8 +11,8 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.conversion.convert import convert
 from robocas_ms3.datasets.conversion.settings import ConversionSettings
 from robocas_ms3.datasets.sources.reader import Dataset
-from robocas_ms3.viewer.episode import base_plot, continuous, plot, rounded
-from robocas_ms3.viewer.source import open_source
+from robocas_ms3.viewer.episode import base_plot, continuous, plot, round_values
+from robocas_ms3.viewer.source import open_content
 
 ROW = {"n", "steps", "instruction", "task", "object", "seed", "success", "split", "stages", "attempts", "damage"}
 CAMERAS = ("base_camera", "gripper_camera", "static_camera")
@@ -25,14 +25,14 @@ def series(episode, title):
 
 
 def test_numbers_are_rounded_and_what_json_lacks_becomes_none():
-    assert rounded([[1.000001, -0.000001]]) == [[1.0, 0.0]]
-    assert str(rounded([-0.000001])) == "[0.0]"
-    assert rounded([0.5, np.nan, np.inf]) == [0.5, None, None]
+    assert round_values([[1.000001, -0.000001]]) == [[1.0, 0.0]]
+    assert str(round_values([-0.000001])) == "[0.0]"
+    assert round_values([0.5, np.nan, np.inf]) == [0.5, None, None]
     assert plot("p", "m", ("x",), np.array([[1.0], [2.0]]))["series"] == [{"name": "x", "values": [1.0, 2.0]}]
 
 
 def test_camera_names_that_would_be_paths_are_left_out(folder):
-    page = open_source(folder)
+    page = open_content(folder)
     page.source.cameras = ("base_camera", "..", "../x", "a/b", "", "cam-1.left", "x" * 81)
     assert page.index()["cameras"] == ["base_camera", "cam-1.left"]
 
@@ -48,7 +48,7 @@ def test_orientation_and_yaw_do_not_jump():
 
 @pytest.mark.parametrize("made", ["run_folder", "folder"])  # the run's folder is its trajectory
 def test_episodes_and_seeds_that_were_given_up_are_listed(request, made):
-    index = open_source(request.getfixturevalue(made)).index()
+    index = open_content(request.getfixturevalue(made)).index()
     assert index == json.loads(json.dumps(index, allow_nan=False))
     rows = {key: [row[key] for row in index["episodes"]] for key in ROW}
     assert rows["n"] == [0, 1, 2, None]
@@ -67,7 +67,7 @@ def test_episodes_and_seeds_that_were_given_up_are_listed(request, made):
 
 
 def test_an_episode_of_a_trajectory(run_folder):
-    episode = open_source(run_folder / "trajectory.h5").episode(1)
+    episode = open_content(run_folder / "trajectory.h5").episode(1)
     states = make_states(4)
     assert set(episode) == EPISODE
     steps = STEPS + 1
@@ -103,7 +103,7 @@ def test_objects_are_called_the_same_in_a_recording_and_in_its_dataset(run_folde
     scene["layout"]["poses"] = [[0.1 * slot, 0, 0.7, 1, 0, 0, 0] for slot in range(3)]
     converted.write_text(json.dumps(scene))
     for path, others in ((recorded.with_suffix(".h5"), {"some thing"}), (converted.parents[1], {"cube"})):
-        called = {thing["name"] for thing in open_source(path).episode(0)["trace"]["objects"]}
+        called = {thing["name"] for thing in open_content(path).episode(0)["trace"]["objects"]}
         assert called - {"cube 3 (cube)"} == {"white toy airplane (toy airplane c)"} | others
 
 
@@ -113,11 +113,11 @@ def test_an_episode_that_is_not_listed_is_on_no_side(folder, tmp_path):
     info = json.loads((other / "data_info.json").read_text())
     for train, val, shown in (([0], [2], ["train", "", "val"]), ([], [], [""] * 3), (["x"], 3, [""] * 3)):
         (other / "data_info.json").write_text(json.dumps({**info, "train_eps": train, "val_eps": val}))
-        assert [row["split"] for row in open_source(other).index()["episodes"]] == [*shown, ""]
+        assert [row["split"] for row in open_content(other).index()["episodes"]] == [*shown, ""]
 
 
 def test_an_episode_of_a_folder(folder):
-    episode, arrays = open_source(folder).episode(1), Dataset(folder).episode(1).arrays
+    episode, arrays = open_content(folder).episode(1), Dataset(folder).episode(1).arrays
     assert set(episode) == EPISODE
     np.testing.assert_allclose(series(episode, "TCP position"), arrays["ee_pos"], atol=1e-5)
     np.testing.assert_allclose(series(episode, "Action: TCP translation"), arrays["rel_pos"] * 1000, atol=1e-5)
@@ -144,7 +144,7 @@ def test_a_seed_means_a_scene_of_its_own_environment_only(run_folder, folder, tm
     for scene in both.glob("*/scene.json"):  # the frames' source has one task
         change = {"task": "open_pick"} if "OpenPick" in scene.read_text() else {}
         scene.write_text(json.dumps({**json.loads(scene.read_text()), **change}))
-    source = open_source(both)
+    source = open_content(both)
     rows = source.index()["episodes"]
     assert [(row["n"], row["seed"]) for row in rows] == [(0, 3), (1, 4), (2, 5), (3, 4), (4, 9), (None, 9)]
     assert [row["stages"] for row in rows] == [[], ["grasp"], [], ["pull"], [], ["reach"]]
@@ -156,7 +156,7 @@ def test_a_folder_without_our_additions_is_shown_too(folder, tmp_path):
     bare = shutil.copytree(folder, tmp_path / "bare")
     for path in (*bare.glob("*.json*"), *bare.glob("*/scene.json")):
         path.unlink()
-    source = open_source(bare)
+    source = open_content(bare)
     (row, *_) = source.index()["episodes"]
     assert (row["steps"], row["success"], row["seed"], row["split"]) == (7, None, None, "")
     episode = source.episode(0)
@@ -172,7 +172,7 @@ def test_a_link_that_leads_out_is_refused(folder, tmp_path):
         path = spoilt / f"episode_0000001/base_camera/{kind}/0002.png"
         path.unlink()
         path.symlink_to(secret)
-    source = open_source(spoilt)
+    source = open_content(spoilt)
     for read in (source.rgb, source.depth):
         with pytest.raises(DatasetError, match="leads out"):
             read(1, "base_camera", 2)
@@ -182,4 +182,4 @@ def test_nothing_to_view(tmp_path):
     (tmp_path / "notes.txt").write_text("hello")
     for path in (tmp_path, tmp_path / "notes.txt", tmp_path / "x"):
         with pytest.raises(DatasetError):
-            open_source(path)
+            open_content(path)

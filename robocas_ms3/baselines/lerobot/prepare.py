@@ -92,7 +92,7 @@ def _open(source: Path) -> LeRobotDataset:
         dataset = LeRobotDataset(source)
     except DatasetError as error:
         raise DatasetError(what, where=source, found=error, fix=fix) from error
-    if dataset.layout is not V3 or not dataset.is_ours or not dataset.cameras:
+    if dataset.layout is not V3 or not dataset.is_robocas or not dataset.cameras:
         expected, version = f"{V3.codebase_version}, our columns, a camera", dataset.info["codebase_version"]
         raise DatasetError(what, where=source, expected=expected, found=version, fix=fix)
     return dataset

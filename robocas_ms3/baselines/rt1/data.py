@@ -47,7 +47,7 @@ class RT1Samples:
         )
         self._lengths, self._terminate = source.lengths, config.terminate_steps
         self.episodes = len(self._data.episodes)
-        scale = ActionScale.of(source.action_space(), folder)
+        scale = ActionScale.from_action_space(source.action_space(), folder)
         for done, number in enumerate(self._data.episodes, start=1):  # damage is found before hours of training
             read_episode(source, number, self._data.options)
             on_read(done, self.episodes)

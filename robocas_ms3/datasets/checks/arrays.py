@@ -42,7 +42,7 @@ def check_keys(stored: EpisodeArrays) -> Iterator[Violation]:
         if spec.name not in there and not spec.optional and (embedded or not spec.embedding):
             yield Violation(stored.file, spec.name, "this key", "no such key", "missing")
     for key in sorted(there - set(SPECS)):
-        yield Violation(stored.file, key, "keys of the schema only", "an unknown key", "surplus")
+        yield Violation(stored.file, key, "keys of the schema only", "an unknown key", "unexpected")
 
 
 def check_shapes(stored: EpisodeArrays) -> Iterator[Violation]:

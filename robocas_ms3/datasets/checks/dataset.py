@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.actions import action_space
-from robocas_ms3.datasets.checks import arrays as laws
+from robocas_ms3.datasets.checks import arrays as array_checks
 from robocas_ms3.datasets.checks.images import Sizes, check_cameras, check_depth, check_images
-from robocas_ms3.datasets.checks.scene import check_ledger, read_settings
+from robocas_ms3.datasets.checks.scene import check_entries, read_settings
 from robocas_ms3.datasets.checks.violation import Violation, read_object
 from robocas_ms3.datasets.conversion.episode_plan import MARKS
 from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.datasets.sources.arrays import SPECS, EpisodeArrays, is_declared, read_arrays
 from robocas_ms3.datasets.sources.file_models import DataInfoRecord, SceneRecord
-from robocas_ms3.datasets.sources.files import no_dataset
+from robocas_ms3.datasets.sources.files import no_dataset_error
 
 INFO = schema.DATA_INFO_FILE
 _EMBEDDINGS = {spec.name for spec in schema.EPISODE_INFO if spec.embedding}
@@ -30,7 +30,7 @@ _Arrays = Mapping[str, NDArray]
 
 
 @dataclass(frozen=True)
-class Report:
+class ValidationReport:
     """Numbers of episodes and steps that were checked, and all violations."""
 
     episodes: int
@@ -46,7 +46,7 @@ class Report:
         }
 
 
-def validate(root: str | Path, *, on_episode: Callable[[int, int], None] | None = None) -> Report:
+def validate(root: str | Path, *, on_episode: Callable[[int, int], None] | None = None) -> ValidationReport:
     """Check a dataset; ``on_episode`` is called with (done, all) after each episode.
 
     Raises:
@@ -58,7 +58,7 @@ def validate(root: str | Path, *, on_episode: Callable[[int, int], None] | None 
     marked = any((root / mark).exists() for mark in MARKS)
     numbers = {n: folder for folder in sorted(root.iterdir()) if (n := schema.episode_number(folder.name)) is not None}
     if not (numbers or marked) and any(root.iterdir()):
-        raise no_dataset(root, "folders episode_0000000, ...")
+        raise no_dataset_error(root, "folders episode_0000000, ...")
     settings, image_options, violations = read_settings(root)
     episodes: dict[int, tuple[EpisodeArrays, dict[str, Any]]] = {}
     sizes: Sizes = {}
@@ -74,21 +74,26 @@ def validate(root: str | Path, *, on_episode: Callable[[int, int], None] | None 
             on_episode(done, len(numbers))
     if len(embedded) > 1:
         violations.append(Violation("", "language_embedding", "in all episodes or none", "in some"))
-    violations += check_ledger(settings, episodes)
+    violations += check_entries(settings, episodes)
     violations += check_info(root, {number: stored.arrays for number, (stored, _) in episodes.items()})
     positions = (stored.arrays.get("ee_pos") for stored, _ in episodes.values())
-    return Report(len(numbers), sum(len(found) for found in positions if found is not None and found.ndim), violations)
+    return ValidationReport(
+        len(numbers), sum(len(found) for found in positions if found is not None and found.ndim), violations
+    )
 
 
 def check_episode(folder: Path, stored: EpisodeArrays, image_options: ImageOptions, sizes: Sizes) -> list[Violation]:
-    wrong, values = list(laws.violations_of(stored, laws.FORM)), []
+    wrong, values = list(array_checks.violations_of(stored, array_checks.FORM)), []
     if not wrong:
-        wrong, values = list(laws.check_units(stored)), list(laws.violations_of(stored, laws.CONTENT))
+        wrong, values = (
+            list(array_checks.check_units(stored)),
+            list(array_checks.violations_of(stored, array_checks.CONTENT)),
+        )
     wrong += check_cameras(folder, image_options)
     if "" in stored.unreadable:
         return wrong  # the number of images is unknown
     images = list(check_images(folder, image_options, stored.steps, sizes))
-    if image_options.depth and not wrong and all(image.kind == "surplus" for image in images):
+    if image_options.depth and not wrong and all(image.kind == "unexpected" for image in images):
         images += check_depth(folder, stored, image_options)
     return [*wrong, *values, *images]
 

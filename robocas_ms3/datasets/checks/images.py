@@ -23,7 +23,7 @@ from robocas_ms3.datasets.sources.arrays import EpisodeArrays
 from robocas_ms3.datasets.sources.files import CAMERA_LIMIT
 from robocas_ms3.robots.cameras import Parent
 
-_SURPLUS = "a file beyond them"
+_UNEXPECTED = "a file beyond them"
 _SOUND = "a sound image"
 _GEOMETRY_STEPS = 3  # whose depth is decoded
 _READERS = 4  # threads: reading and checksums run outside of Python's lock
@@ -86,14 +86,14 @@ def check_images(
     with ThreadPoolExecutor(_READERS) as pool:
         headers = list(pool.map(partial(_read_headers, folder, image_options.image_format, steps, read), places))
     for (camera, kind), found in zip(places, headers, strict=True):
-        wanted = [name for name, header in found.items() if header != _SURPLUS]
+        wanted = [name for name, header in found.items() if header != _UNEXPECTED]
         for name, header in found.items():
             file = f"{folder.name}/{camera}/{kind}/{name}"
             if header == NO_FILE:
                 yield Violation(file, "", "an image of every step", NO_FILE, "missing")
-            elif header == _SURPLUS:
+            elif header == _UNEXPECTED:
                 expected = f"{format_count(len(wanted), 'image')} from {min(wanted, default='none')}"
-                yield Violation(file, "", expected, _SURPLUS, "surplus")
+                yield Violation(file, "", expected, _UNEXPECTED, "unexpected")
             elif isinstance(header, str):
                 yield Violation(file, "", _SOUND, header)
             elif header is not None:
@@ -115,7 +115,7 @@ def _read_headers(
             found[name] = read(first.with_name(name)) if name in there else NO_FILE
         except (OSError, ValueError) as error:
             found[name] = getattr(error, "strerror", None) or one_line(error)
-    return {**found, **dict.fromkeys(sorted(there - set(wanted)), _SURPLUS)}
+    return {**found, **dict.fromkeys(sorted(there - set(wanted)), _UNEXPECTED)}
 
 
 def check_depth(folder: Path, stored: EpisodeArrays, image_options: ImageOptions) -> Iterator[Violation]:

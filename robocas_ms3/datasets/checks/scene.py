@@ -12,7 +12,7 @@ from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.violation import Violation, check_form, read_object, shorten
 from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.datasets.sources.arrays import EpisodeArrays, arrays_fingerprint
-from robocas_ms3.datasets.sources.file_models import ConversionRecord, SceneRecord, with_unknown
+from robocas_ms3.datasets.sources.file_models import ConversionRecord, SceneRecord, fill_unknown_keys
 from robocas_ms3.demos.recordings.trajectory_json import one_seed
 from robocas_ms3.robots.cameras import STANDARD_NAMES
 
@@ -24,7 +24,7 @@ def valid_values(scene: Any, file: str = schema.SCENE_FILE) -> tuple[dict[str, A
     """Return the usable part of a ``scene.json``, and what is wrong with the rest; missing keys are allowed."""
     if not isinstance(scene, Mapping):
         return {}, "" if scene is None else f"{file}: expected an object, found {shorten(scene)}"
-    wrong = check_form(SceneRecord, with_unknown(scene), file)
+    wrong = check_form(SceneRecord, fill_unknown_keys(scene), file)
     return _usable(scene, wrong), "; ".join(map(str, wrong))
 
 
@@ -59,7 +59,7 @@ def read_settings(root: Path) -> tuple[dict[str, Any], ImageOptions, list[Violat
     return usable, image_options, wrong
 
 
-def check_ledger(
+def check_entries(
     settings: Mapping[str, Any], episodes: Mapping[int, tuple[EpisodeArrays, dict[str, Any]]]
 ) -> Iterator[Violation]:
     """Check that the settings list the episodes on disk as they are, and that no two have the same arrays."""

@@ -26,7 +26,7 @@ class Violation:
     key: str
     expected: str
     found: str
-    kind: Literal["", "missing", "surplus"] = ""
+    kind: Literal["", "missing", "unexpected"] = ""
 
     @property
     def where(self) -> str:

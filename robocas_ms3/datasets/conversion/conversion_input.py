@@ -20,7 +20,7 @@ from robocas_ms3.datasets.conversion.settings import ConversionSettings
 from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.datasets.sources.arrays import arrays_fingerprint
-from robocas_ms3.datasets.sources.episode_source import EpisodeSource, Frame, SourceEpisode
+from robocas_ms3.datasets.sources.episode_source import EpisodeSource, SourceEpisode, StepImages
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 
 NEEDED = frozenset(spec.name for spec in schema.EPISODE_INFO if not (spec.embedding or spec.optional)) - {
@@ -76,10 +76,10 @@ class ConversionInput:
             "seed": scene.get("seed", known.get("seed")),
             "success": success,
             "target": scene.get("target", known.get("target")),
-            "recording": recording or f"arrays {arrays_fingerprint(complete_arrays(episode))}",
+            "recording": recording or f"arrays {arrays_fingerprint(require_complete_arrays(episode))}",
         }
 
-    def frames(self, episode: SourceEpisode) -> Generator[Frame, None, None]:
+    def frames(self, episode: SourceEpisode) -> Generator[StepImages, None, None]:
         """Yield the images of every step; close the generator unless it is read to the end."""
         with closing(episode.images(self.image_options)) as frames:
             for step, frame in enumerate(frames):
@@ -123,7 +123,7 @@ def open_trajectory(settings: ConversionSettings) -> RenderedSource:
     )
 
 
-def complete_arrays(episode: SourceEpisode) -> dict[str, NDArray]:
+def require_complete_arrays(episode: SourceEpisode) -> dict[str, NDArray]:
     """Return the arrays of an episode, or raise DatasetError if it lacks any that it must have."""
     try:
         arrays = episode.arrays

@@ -26,17 +26,17 @@ from robocas_ms3.datasets.conversion.episode_plan import (
     dataset_settings,
     missing_episodes,
     plan_episodes,
-    planned_sides,
-    without_unwritten,
+    planned_split,
+    remove_unwritten,
 )
 from robocas_ms3.datasets.conversion.rendered_source import RenderedSource
 from robocas_ms3.datasets.conversion.settings import Conversion, ConversionSettings, WrittenEpisode
-from robocas_ms3.datasets.conversion.workers import WriteJob, write_episodes
-from robocas_ms3.datasets.images.video import FEW, finish_previews, on_sheet
+from robocas_ms3.datasets.conversion.workers import PendingEpisodes, write_episodes
+from robocas_ms3.datasets.images.video import MAX_PREVIEWS, finish_previews, sheet_episodes
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.demos.recordings.trajectory_json import versions
 
-_FIX = "The dataset is complete without, and valid; the same command tries again, --leave-out takes it as it is."
+_FIX = "The dataset is complete without, and valid; the same command tries again, --skip-errors takes it as it is."
 _log = logging.getLogger(__name__)
 
 
@@ -84,22 +84,22 @@ def convert(
         if on_start:
             on_start(len(missing))
         sheet = None
-        if settings.video and (settings.all_videos or len(tasks) <= FEW):
-            sheet = on_sheet(map(int, content["episodes"]))
-        job = WriteJob(settings, FolderWriter(out, embed, sheet), missing, len(missing) < len(tasks), _FIX)
+        if settings.video and (settings.all_videos or len(tasks) <= MAX_PREVIEWS):
+            sheet = sheet_episodes(map(int, content["episodes"]))
+        job = PendingEpisodes(settings, FolderWriter(out, embed, sheet), missing, len(missing) < len(tasks), _FIX)
         try:
             written, incomplete = write_episodes(job, output, on_episode)
         finally:
             for folder in (out, out / schema.PREVIEW_FOLDER):
                 remove_leftovers(folder)  # left by workers that died; others wrote it again
         if incomplete:
-            write_json(out / schema.CONVERSION_FILE, without_unwritten(out, content, incomplete.reasons))
+            write_json(out / schema.CONVERSION_FILE, remove_unwritten(out, content, incomplete.reasons))
         add_failures(settings.source.parent, out, source.file.env_info)
-        write_info(out, planned_sides(content, before))
+        write_info(out, planned_split(content, before))
         if sheet is not None:
             rows = {episode.number: episode.row for episode in written if episode.row is not None}
             finish_previews(Dataset(out), rows)
-        if incomplete and not settings.leave_out:
+        if incomplete and not settings.skip_errors:
             raise incomplete
         if incomplete:
             _log.warning("%s", incomplete)
@@ -112,7 +112,7 @@ def _split_before(out: Path) -> tuple[list[int], list[int]]:
     if not (out / schema.DATA_INFO_FILE).is_file():
         return [], []
     try:
-        return Dataset(out).sides
+        return Dataset(out).splits
     except DatasetError as error:
         fix = "Delete it, and it is made anew; where there was an --append, episodes may change sides."
         where = out / schema.DATA_INFO_FILE

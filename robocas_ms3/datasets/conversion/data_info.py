@@ -18,7 +18,7 @@ from robocas_ms3.datasets.actions import action_space
 from robocas_ms3.datasets.sources.arrays import read_arrays
 from robocas_ms3.datasets.sources.file_models import DataInfoRecord
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
-from robocas_ms3.datasets.sources.provenance import environment_of, task_of
+from robocas_ms3.datasets.sources.provenance import environment_id, task_of
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.demos.failures import FAILURES_FILE
@@ -28,10 +28,10 @@ _NEEDED = ("episode_length", "language_goal", "step_goal_type", "step_lang_goals
 
 
 def write_info(root: Path, before: tuple[Iterable[int], Iterable[int]] = ((), ())) -> None:
-    write_json(root / schema.DATA_INFO_FILE, info_of(root, before))
+    write_json(root / schema.DATA_INFO_FILE, build_info(root, before))
 
 
-def info_of(root: Path, before: tuple[Iterable[int], Iterable[int]] = ((), ())) -> dict[str, Any]:
+def build_info(root: Path, before: tuple[Iterable[int], Iterable[int]] = ((), ())) -> dict[str, Any]:
     """Return ``data_info.json``; ``before``: both sides so far, see `split_by_seed`."""
     dataset = Dataset(root)
     seeds, lengths, instructions, goals = {}, {}, {}, {}
@@ -71,7 +71,7 @@ def info_of(root: Path, before: tuple[Iterable[int], Iterable[int]] = ((), ())) 
 
 def add_failures(run: Path, out: Path, env_info: Mapping[str, Any]) -> None:
     """Add the failures of the run in a folder to a dataset, each once, with task and environment."""
-    made_in = {"task": task_of(str(env_info.get("env_id"))), "environment": environment_of(env_info)}
+    made_in = {"task": task_of(str(env_info.get("env_id"))), "environment": environment_id(env_info)}
     there: JsonLinesFile[dict[str, Any]] = JsonLinesFile(out / FAILURES_FILE, dict[str, Any])
     failures: JsonLinesFile[dict[str, Any]] = JsonLinesFile(run / FAILURES_FILE, dict[str, Any])
     known = {_key(line) for line in there.read()}

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import inverse
-from robocas_ms3.datasets.images.image_files import Box, ImageOptions, box_of
-from robocas_ms3.datasets.sources.episode_source import CameraModel, Frame
+from robocas_ms3.datasets.images.image_files import Box, ImageOptions, bounding_box
+from robocas_ms3.datasets.sources.episode_source import CameraModel, StepImages
 from robocas_ms3.demos.recordings.environment import RecordedEnv
 from robocas_ms3.demos.recordings.trajectory_file import Recording
 
@@ -72,16 +72,16 @@ class EnvRenderer:
         if instruction != recording.instruction:
             refuse("", recording.instruction, instruction)
 
-    def frames(self, recording: Recording, samples: NDArray[np.int64]) -> Iterator[Frame]:
+    def frames(self, recording: Recording, samples: NDArray[np.int64]) -> Iterator[StepImages]:
         for index in samples:
             yield self._frame(recording.state(int(index)))
 
-    def _frame(self, state: dict[str, dict[str, NDArray[np.float32]]]) -> Frame:
+    def _frame(self, state: dict[str, dict[str, NDArray[np.float32]]]) -> StepImages:
         tensors = {kind: {k: torch.from_numpy(v) for k, v in arrays.items()} for kind, arrays in state.items()}
         self._base.set_state_dict(tensors)
         textures = self._base._get_obs_sensor_data(apply_texture_transforms=False)
         shaders = {name: self._base._sensors[name].config.shader_config for name in self._image_options.cameras}
-        return Frame(
+        return StepImages(
             rgb={name: _rgb_of(textures[name], shader) for name, shader in shaders.items()},
             depth={
                 name: _depth_of(textures[name], shader) for name, shader in shaders.items() if self._image_options.depth
@@ -94,7 +94,7 @@ class EnvRenderer:
         slot = int(self._base.target_slot[0])
         number = int(self._base.scene.actors[f"object_{slot}"].per_scene_id[0])
         masks = {name: _segmentation_of(textures[name], shader) == number for name, shader in shaders.items()}
-        return {name: box for name, mask in masks.items() if (box := box_of(mask)) is not None}
+        return {name: box for name, mask in masks.items() if (box := bounding_box(mask)) is not None}
 
     def cameras(self) -> dict[str, CameraModel]:
         agent = self._base.agent

@@ -18,13 +18,13 @@ from robocas_ms3.core.files import json_text
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.images import check_cameras, check_images
 from robocas_ms3.datasets.checks.violation import read_object
-from robocas_ms3.datasets.conversion.workers import EpisodeWriter, GivenEpisode
+from robocas_ms3.datasets.conversion.workers import EpisodeWriter, InputEpisode
 from robocas_ms3.datasets.images.image_files import ImageOptions, write_image
 from robocas_ms3.datasets.images.image_headers import check_ends
 from robocas_ms3.datasets.images.preview_frames import EpisodeDrawing
 from robocas_ms3.datasets.images.video import open_preview
-from robocas_ms3.datasets.sources.arrays import read_arrays, with_embeddings
-from robocas_ms3.datasets.sources.episode_source import CameraModel, Frame
+from robocas_ms3.datasets.sources.arrays import add_embeddings, read_arrays
+from robocas_ms3.datasets.sources.episode_source import CameraModel, StepImages
 
 ENCODERS = 2  # threads; ISA-L and OpenCV work outside Python's lock
 _MAX_WAITING = 24  # images, which bounds memory
@@ -42,7 +42,7 @@ class FolderWriter(EpisodeWriter):
         return self.out / schema.episode_folder(number)
 
     def write_files(
-        self, folder: Path, wanted: GivenEpisode, frames: Generator[Frame, None, None]
+        self, folder: Path, wanted: InputEpisode, frames: Generator[StepImages, None, None]
     ) -> NDArray[np.uint8] | None:
         episode, image_options, arrays, preview = wanted.episode, wanted.given.image_options, wanted.arrays, None
         for camera in image_options.cameras:
@@ -63,7 +63,7 @@ class FolderWriter(EpisodeWriter):
                 if preview:
                     in_order(preview.add, step, frame.rgb)
         cameras = {name: episode.camera(name) for name in image_options.cameras}
-        arrays = with_embeddings(arrays, self.embed) if self.embed else arrays
+        arrays = add_embeddings(arrays, self.embed) if self.embed else arrays
         write_episode_files(folder, arrays, cameras, episode.scene)
         return preview and preview.row
 
@@ -113,6 +113,6 @@ def find_damaged(folder: Path, image_options: ImageOptions) -> Path | None:
         *check_cameras(folder, image_options),
         *check_images(folder, image_options, int(steps), {}, check_ends),
     ):
-        if wrong.kind != "surplus" and not (root / wrong.file).is_dir():  # the folder of a camera too many
+        if wrong.kind != "unexpected" and not (root / wrong.file).is_dir():  # the folder of a camera too many
             return root / wrong.file
     return None

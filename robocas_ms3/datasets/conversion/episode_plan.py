@@ -24,20 +24,20 @@ Entries = Sequence[dict[str, Any]]
 """See `inputs.ConversionInput.entries`."""
 SETTINGS = tuple(SettingsRecord.model_fields)
 """Keys of the settings."""
-LEFT_OUT = "left_out"
+SKIPPED = "left_out"
 """Key of the episodes that could not be written, each with ``why``; a continued conversion tries them again."""
 MARKS = (schema.CONVERSION_FILE, schema.DATA_INFO_FILE)
 """A folder with one of these is a RoboCAS dataset, whole or not."""
 
 
-def with_versions(record: dict[str, Any]) -> dict[str, Any]:
+def add_versions(record: dict[str, Any]) -> dict[str, Any]:
     """Return a record with the versions of today if it does not name them all, as that of merged datasets."""
     now, made_with = versions(), record.get("made_with")
     is_whole = isinstance(made_with, dict) and now.keys() <= made_with.keys()
     return record if is_whole else {**record, "made_with": now}
 
 
-DATASET = FolderKind("robocas convert", (schema.CONVERSION_FILE,), "rate_hz", marks=MARKS, upgrade=with_versions)
+DATASET = FolderKind("robocas convert", (schema.CONVERSION_FILE,), "rate_hz", marks=MARKS, upgrade=add_versions)
 
 
 def dataset_settings(rate_hz: float, image_options: ImageOptions, embeddings: bool) -> dict[str, Any]:
@@ -72,7 +72,7 @@ def plan_episodes(
     else:
         schema.check_version(content.get("schema_version", 1), path)
         parse(ConversionRecord, content, DatasetError, where=path)
-    episodes, left_out = dict(content.get("episodes", {})), dict(content.get(LEFT_OUT, {}))
+    episodes, left_out = dict(content.get("episodes", {})), dict(content.get(SKIPPED, {}))
     planned = {entry["recording"]: number for number, entry in episodes.items() if entry.get("recording")}
     unread = {number: entry for number, entry in episodes.items() if not entry.get("recording")}
     again = {_place(entry): number for number, entry in {**unread, **left_out}.items()}
@@ -92,9 +92,9 @@ def plan_episodes(
     return json.loads(json.dumps(_content(content, episodes, left_out))), tasks
 
 
-def without_unwritten(out: Path, content: Mapping[str, Any], reasons: Mapping[str, str]) -> dict[str, Any]:
+def remove_unwritten(out: Path, content: Mapping[str, Any], reasons: Mapping[str, str]) -> dict[str, Any]:
     """Return ``conversion.json`` without the episodes that could not be written; reasons by name of their folder."""
-    episodes, left_out = dict(content["episodes"]), dict(content.get(LEFT_OUT, {}))
+    episodes, left_out = dict(content["episodes"]), dict(content.get(SKIPPED, {}))
     for folder, why in reasons.items():
         if not (out / folder).is_dir():
             number = str(schema.episode_number(folder))
@@ -103,9 +103,9 @@ def without_unwritten(out: Path, content: Mapping[str, Any], reasons: Mapping[st
 
 
 def _content(content: Mapping[str, Any], episodes: Mapping[str, Any], left_out: Mapping[str, Any]) -> dict[str, Any]:
-    lists = {"episodes": episodes, **({LEFT_OUT: left_out} if left_out else {})}
+    lists = {"episodes": episodes, **({SKIPPED: left_out} if left_out else {})}
     in_order = {key: {number: entries[number] for number in sorted(entries, key=int)} for key, entries in lists.items()}
-    return {key: value for key, value in content.items() if key not in ("episodes", LEFT_OUT)} | in_order
+    return {key: value for key, value in content.items() if key not in ("episodes", SKIPPED)} | in_order
 
 
 def _place(entry: Mapping[str, Any]) -> str:
@@ -113,7 +113,7 @@ def _place(entry: Mapping[str, Any]) -> str:
     return json.dumps([entry.get(key) for key in ("trajectory", "trajectory_episode", "seed")])
 
 
-def planned_sides(content: Mapping[str, Any], before: tuple[list[int], list[int]]) -> tuple[list[int], list[int]]:
+def planned_split(content: Mapping[str, Any], before: tuple[list[int], list[int]]) -> tuple[list[int], list[int]]:
     """Return the split of all planned episodes, so that missing ones change the side of no other."""
     return split_by_seed({int(number): entry.get("seed") for number, entry in content["episodes"].items()}, before)
 

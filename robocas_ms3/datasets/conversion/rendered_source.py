@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.images.image_files import ImageOptions
-from robocas_ms3.datasets.sources.episode_source import CameraModel, Frame
-from robocas_ms3.datasets.sources.provenance import recording_entry, scene_record, unread_entry
+from robocas_ms3.datasets.sources.episode_source import CameraModel, StepImages
+from robocas_ms3.datasets.sources.provenance import entry_without_fingerprint, recording_entry, scene_record
 from robocas_ms3.datasets.sources.trajectory import RecordedEpisode, TrajectorySource
 from robocas_ms3.demos.recordings.environment import RecordedEnv
 from robocas_ms3.demos.recordings.motion import sample_states
@@ -49,7 +49,7 @@ class RenderedSource(TrajectorySource):
         self._renderer: EnvRenderer | None = None
         self._control_mode = ""
 
-    def turn_to(self, path: Path) -> None:
+    def switch_file(self, path: Path) -> None:
         """Read another file of the same environment, which stays open."""
         env, control_freq = self.file.env, self.file.control_freq
         with TrajectoryFile(path, pack=self._pack) as file:
@@ -62,7 +62,7 @@ class RenderedSource(TrajectorySource):
             try:
                 return recording_entry(file, number)
             except DatasetError:
-                return unread_entry(file, number)
+                return entry_without_fingerprint(file, number)
 
     def texts(self, number: int) -> list[str]:
         """Return the instruction of an episode and the texts of its sub-goals."""
@@ -99,7 +99,7 @@ class RenderedEpisode(RecordedEpisode):
     def recording(self, *, bodies: bool = True) -> Recording:
         return self._recording
 
-    def images(self, image_options: ImageOptions) -> Generator[Frame, None, None]:
+    def images(self, image_options: ImageOptions) -> Generator[StepImages, None, None]:
         samples = sample_states(self._recording.control_steps, self._source.stride)
         yield from self._renderer.frames(self._recording, samples)
 

@@ -63,7 +63,7 @@ class ConversionSettings:
     """Start again. Default: continue a conversion with the same settings that was interrupted."""
     append: bool = False
     """Add to the dataset that is there; its episodes keep their numbers and their side of the split."""
-    leave_out: bool = False
+    skip_errors: bool = False
     """Warn of episodes that can't be written, in place of an error in the end; LeRobot datasets are joined without."""
     jobs: int = 1
     """Processes that render."""
@@ -110,9 +110,9 @@ class ConversionSettings:
 
     @property
     def is_trajectory(self) -> bool:
-        from robocas_ms3.datasets.formats import format_of
+        from robocas_ms3.datasets.formats import detect_format
 
-        found = format_of(self.source)
+        found = detect_format(self.source)
         return found.name == "trajectory" if found else not self.source.is_dir()
 
     @property
@@ -141,6 +141,6 @@ class Conversion:
     """Result of a conversion: new episodes by number, number of those that were there, wall-clock time."""
 
     episodes: list[WrittenEpisode]
-    kept: int
+    existing: int
     seconds: float
     previews: bool = False

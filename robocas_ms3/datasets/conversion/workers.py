@@ -21,10 +21,10 @@ from robocas_ms3.core.output_folder import OutputFolder
 from robocas_ms3.core.remote_errors import RemoteError
 from robocas_ms3.core.text import format_count, format_error
 from robocas_ms3.core.workers import NO_LIMITS, WorkerPool, use_one_torch_thread
-from robocas_ms3.datasets.conversion.conversion_input import ConversionInput, complete_arrays, open_input
+from robocas_ms3.datasets.conversion.conversion_input import ConversionInput, open_input, require_complete_arrays
 from robocas_ms3.datasets.conversion.settings import ConversionSettings, WrittenEpisode
 from robocas_ms3.datasets.schema import episode_folder
-from robocas_ms3.datasets.sources.episode_source import Frame, SourceEpisode
+from robocas_ms3.datasets.sources.episode_source import SourceEpisode, StepImages
 
 _ENOUGH = 3  # failures before any success: the other episodes would fail too
 _LISTED = 5  # failures that an error lists
@@ -35,7 +35,7 @@ Task = tuple[int, int]
 
 
 @dataclass(frozen=True)
-class GivenEpisode:
+class InputEpisode:
     """An episode that is being written: its number in the dataset, and all arrays that it must have."""
 
     number: int
@@ -53,7 +53,7 @@ class EpisodeWriter(ABC):
 
     @abstractmethod
     def write_files(
-        self, folder: Path, wanted: GivenEpisode, frames: Generator[Frame, None, None]
+        self, folder: Path, wanted: InputEpisode, frames: Generator[StepImages, None, None]
     ) -> NDArray[np.uint8] | None:
         """Write an episode into a folder; return its row of the contact sheet, if there is one."""
 
@@ -61,7 +61,7 @@ class EpisodeWriter(ABC):
         """Write episode ``source`` of the input as episode ``number`` of the dataset."""
         with atomic_folder(self.folder(number), sync=True) as folder:
             episode = given.source.episode(source)
-            wanted = GivenEpisode(number, episode, complete_arrays(episode), given)
+            wanted = InputEpisode(number, episode, require_complete_arrays(episode), given)
             with closing(given.frames(episode)) as frames:
                 row = self.write_files(folder, wanted, frames)
             size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
@@ -69,7 +69,7 @@ class EpisodeWriter(ABC):
 
 
 @dataclass(frozen=True)
-class WriteJob:
+class PendingEpisodes:
     """The episodes of a conversion that are missing; ``continued``: whether there are others already."""
 
     settings: ConversionSettings
@@ -80,7 +80,7 @@ class WriteJob:
 
 
 def write_episodes(
-    job: WriteJob, output: OutputFolder, on_episode: Callable[[WrittenEpisode], None] | None
+    job: PendingEpisodes, output: OutputFolder, on_episode: Callable[[WrittenEpisode], None] | None
 ) -> tuple[list[WrittenEpisode], IncompleteDatasetError | None]:
     """Write episodes; return them by number, and an error that names those that can't be written.
 
@@ -133,7 +133,7 @@ def _death(task: Task, why: str) -> _Failure:
     return _Failure(episode, RemoteError.of(DatasetError(f"its process died twice: {why}", where=episode), "a worker"))
 
 
-def _incomplete(failures: list[_Failure], job: WriteJob) -> IncompleteDatasetError:
+def _incomplete(failures: list[_Failure], job: PendingEpisodes) -> IncompleteDatasetError:
     reasons = {one.episode: one.reason for one in sorted(failures, key=lambda one: one.episode)}
     listed = [why if why.startswith(f"{one}: ") else f"{one}: {why}" for one, why in reasons.items()]
     more = f"; and {len(listed) - _LISTED} more" if len(listed) > _LISTED else ""
@@ -146,7 +146,7 @@ def _incomplete(failures: list[_Failure], job: WriteJob) -> IncompleteDatasetErr
 class _EpisodeWorker:
     """Writes the episodes of one process. The source stays open, and is opened again after a failure."""
 
-    def __init__(self, job: WriteJob, *, one_rasterizer_thread: bool, shared: bool) -> None:
+    def __init__(self, job: PendingEpisodes, *, one_rasterizer_thread: bool, shared: bool) -> None:
         if job.settings.is_trajectory and not shared:
             if one_rasterizer_thread:  # processes that render in software on all cores get in each other's way
                 os.environ.setdefault("LP_NUM_THREADS", "1")

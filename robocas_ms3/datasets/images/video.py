@@ -17,13 +17,13 @@ from robocas_ms3.core.files import atomic_file, make_folder
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.images.png import encode_png
 from robocas_ms3.datasets.images.preview_frames import EpisodeDrawing, Images
-from robocas_ms3.datasets.sources.episode_source import EpisodeSource, Kind, shots
+from robocas_ms3.datasets.sources.episode_source import EpisodeSource, ImageKind, iter_images
 
 PANEL, PREVIEW_PANEL = (426, 320), (320, 240)
 """Width and height of one camera's image in a video, and in a preview."""
-SHEET = 10
+SHEET_EPISODES = 10
 """Episodes on a contact sheet."""
-FEW = 20
+MAX_PREVIEWS = 20
 """Up to so many episodes have previews by default."""
 _NEAR_MM, _FAR_MM = 30, 5000  # colours of depth
 # Of a preview x264's default preset takes three times as long, and its threads get in the renderer's way.
@@ -48,7 +48,7 @@ def open_video(path: Path, fps: float, *options: str, quality: float = 8) -> Ite
 
 
 def write_video(
-    dataset: EpisodeSource, number: int, path: Path | str, *, speed: float = 1.0, kind: Kind = "rgb"
+    dataset: EpisodeSource, number: int, path: Path | str, *, speed: float = 1.0, kind: ImageKind = "rgb"
 ) -> Path:
     """Write an episode as MP4 (H.264, yuv420p): the cameras side by side, instruction and sub-goal below.
 
@@ -65,7 +65,7 @@ def write_video(
     with (
         atomic_file(path) as tmp,
         open_video(tmp, dataset.rate_hz * speed) as video,
-        closing(shots(episode, episode.cameras, kind)) as run,
+        closing(iter_images(episode, episode.cameras, kind)) as run,
     ):
         for step, images in enumerate(run):
             video.append_data(drawing.frame(step, _coloured(images, kind), PANEL))
@@ -73,10 +73,10 @@ def write_video(
 
 
 def contact_sheet(
-    dataset: EpisodeSource, out: Path | str, *, episodes: Sequence[int] | None = None, kind: Kind = "rgb"
+    dataset: EpisodeSource, out: Path | str, *, episodes: Sequence[int] | None = None, kind: ImageKind = "rgb"
 ) -> Path:
     """Write a PNG with a row for each episode (default: the first ten) and camera, of evenly spaced steps."""
-    numbers = dataset.numbers[:SHEET] if episodes is None else list(episodes)
+    numbers = dataset.numbers[:SHEET_EPISODES] if episodes is None else list(episodes)
     return _write_sheet([_row(dataset, number, kind) for number in numbers], out)
 
 
@@ -105,19 +105,19 @@ def open_preview(root: Path, drawing: EpisodeDrawing, *, row: bool) -> Iterator[
         yield Preview(video, drawing, row=row)
 
 
-def on_sheet(numbers: Iterable[int]) -> tuple[int, ...]:
-    return tuple(sorted(numbers)[:SHEET])
+def sheet_episodes(numbers: Iterable[int]) -> tuple[int, ...]:
+    return tuple(sorted(numbers)[:SHEET_EPISODES])
 
 
 def finish_previews(dataset: EpisodeSource, rows: dict[int, NDArray[np.uint8]]) -> None:
     """Write the contact sheet of a dataset, from rows of new episodes and stored images of the others, if it is new."""
     path = dataset.root / schema.PREVIEW_FOLDER / "contact_sheet.png"
     if rows or not path.is_file():
-        numbers = on_sheet(dataset.numbers)
+        numbers = sheet_episodes(dataset.numbers)
         _write_sheet([rows[number] if number in rows else _row(dataset, number) for number in numbers], path)
 
 
-def _row(dataset: EpisodeSource, number: int, kind: Kind = "rgb") -> NDArray[np.uint8]:
+def _row(dataset: EpisodeSource, number: int, kind: ImageKind = "rgb") -> NDArray[np.uint8]:
     episode, shown = dataset.episode(number), {}
     drawing = EpisodeDrawing(number, episode.arrays, dataset.rate_hz)
     image = episode.rgb if kind == "rgb" else episode.depth
@@ -141,5 +141,5 @@ def colour_depth(depth: NDArray[np.uint16]) -> NDArray[np.uint8]:
     return colours.astype(np.uint8)
 
 
-def _coloured(images: Mapping[str, NDArray], kind: Kind) -> Images:
+def _coloured(images: Mapping[str, NDArray], kind: ImageKind) -> Images:
     return {camera: image if kind == "rgb" else colour_depth(image) for camera, image in images.items()}

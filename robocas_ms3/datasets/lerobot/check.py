@@ -11,10 +11,10 @@ import numpy as np
 from robocas_ms3.core.documents import DocumentError
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.text import one_line
-from robocas_ms3.datasets.checks.dataset import Report
+from robocas_ms3.datasets.checks.dataset import ValidationReport
 from robocas_ms3.datasets.checks.violation import Violation, check_form, read_object
 from robocas_ms3.datasets.lerobot import schema
-from robocas_ms3.datasets.lerobot.check_frames import TOLERANCE, Fault, Ranges, check_data, surplus_files
+from robocas_ms3.datasets.lerobot.check_frames import TOLERANCE, KeyViolation, Ranges, check_data, unexpected_files
 from robocas_ms3.datasets.lerobot.file_models import MAX_EPISODES, MAX_FRAMES, InfoRecord, StatsLine, read_lines
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.stats import QUANTILES
@@ -28,7 +28,7 @@ _MOST = {"total_episodes": MAX_EPISODES, "total_tasks": MAX_EPISODES, "total_fra
 
 def check_lerobot(
     root: str | Path, *, decode: bool = False, on_episode: Callable[[int, int], None] | None = None
-) -> Report:
+) -> ValidationReport:
     """Check a dataset; datasets made elsewhere are checked as far as they have what ours have.
 
     ``decode`` decodes every frame; otherwise frames are counted. FFmpeg's decoders conceal damage inside a video, which
@@ -41,11 +41,11 @@ def check_lerobot(
     root = Path(root)
     info, wrong = read_object(root, schema.INFO_FILE, InfoRecord, absent="JSON")
     features = {} if wrong else info["features"]
-    for own in schema.FEATURES if set(schema.OUR_KEYS) <= set(features) else ():
+    for own in schema.FEATURES if set(schema.ROBOCAS_KEYS) <= set(features) else ():
         if (shape := features[own.key]["shape"]) != [own.width]:
             wrong.append(Violation(schema.INFO_FILE, f"features.{own.key}.shape", str([own.width]), str(shape)))
     if wrong:
-        return Report(0, 0, wrong)
+        return ValidationReport(0, 0, wrong)
     try:
         dataset = LeRobotDataset(root)
         wrong = list(_check_totals(dataset))
@@ -53,7 +53,7 @@ def check_lerobot(
         if schema.SUBTASK_INDEX.key in features:
             texts[schema.SUBTASK_INDEX.key] = dataset.subtasks
     except DatasetError as error:
-        return Report(0, 0, [Violation("meta", "", "readable tables", one_line(error))])
+        return ValidationReport(0, 0, [Violation("meta", "", "readable tables", one_line(error))])
     data, ranges = check_data(dataset, texts, on_episode or (lambda *_: None))
     violations = [
         *wrong,
@@ -63,7 +63,7 @@ def check_lerobot(
         *_check_our_files(dataset),
         *_check_checksums(root),
     ]
-    return Report(len(dataset.rows), dataset.info["total_frames"], violations)
+    return ValidationReport(len(dataset.rows), dataset.info["total_frames"], violations)
 
 
 def _check_totals(dataset: LeRobotDataset) -> Iterator[Violation]:
@@ -97,10 +97,10 @@ def _check_videos(dataset: LeRobotDataset, key: str, decode: bool) -> Iterator[V
         for path, inside in by_file.items():
             yield from _check_times(inside, prefix, fps)
             frames, name = sum(row["length"] for row in inside), str(path.relative_to(root))
-            yield from (Violation(name, *fault) for fault in _video_faults(path, frames, fps, size, decode))
+            yield from (Violation(name, *fault) for fault in _video_violations(path, frames, fps, size, decode))
         folder = layout.path(root, prefix, 0, 0).parent  # chunk-000, or below it
         chunks = folder.parent.parent.glob(f"*/{folder.name}") if layout.one_file_per_episode else [folder.parent]
-        yield from surplus_files(root, chunks, by_file)
+        yield from unexpected_files(root, chunks, by_file)
 
 
 def _check_times(rows: list[dict[str, Any]], prefix: str, fps: int) -> Iterator[Violation]:
@@ -114,7 +114,7 @@ def _check_times(rows: list[dict[str, Any]], prefix: str, fps: int) -> Iterator[
         first += row["length"]
 
 
-def _video_faults(path: Path, frames: int, fps: int, size: list[int], decode: bool) -> Iterator[Fault]:
+def _video_violations(path: Path, frames: int, fps: int, size: list[int], decode: bool) -> Iterator[KeyViolation]:
     try:
         times, about = packet_times(path, frames)
         if decode and len(times) == frames:
@@ -143,11 +143,11 @@ def _check_statistics(dataset: LeRobotDataset, ranges: Ranges) -> Iterator[Viola
     yield from wrong
     for key, feature in dataset.info["features"].items() if not wrong else ():
         if feature["dtype"] not in ("string", "language"):
-            for name, expected, found in _statistics_faults(stats.get(key), feature, ranges.get(key)):
+            for name, expected, found in _statistics_violations(stats.get(key), feature, ranges.get(key)):
                 yield Violation(schema.STATS_FILE, f"{key}, {name}" if name else key, expected, found)
 
 
-def _statistics_faults(found: Any, feature: Mapping[str, Any], seen: Any) -> Iterator[Fault]:
+def _statistics_violations(found: Any, feature: Mapping[str, Any], seen: Any) -> Iterator[KeyViolation]:
     """Yield name, expected and found of wrong statistics of a feature; ``seen`` is its entry in the ranges."""
     try:
         values = {name: np.asarray(found[name], np.float64) for name in (*_STATISTICS, *QUANTILES)}
@@ -192,19 +192,19 @@ def _check_lines(dataset: LeRobotDataset) -> Iterator[Violation]:
 
 def _check_our_files(dataset: LeRobotDataset) -> Iterator[Violation]:
     """Check how the dataset was made, and scenes and cameras of the episodes, where the dataset says so."""
-    name, described = schema.SCENES_FILE, {}
+    name, scene_texts = schema.SCENES_FILE, {}
     try:
         _ = dataset.split("train"), dataset.split("val")
     except DatasetError as error:
         yield Violation(schema.CONVERSION_FILE, "", "valid content", one_line(error))
     try:
-        described = dataset.described
+        scene_texts = dataset.scene_texts
     except DatasetError as error:
         yield Violation(name, "", "valid content", one_line(error))
-    if described and described.keys() != dataset.row_of.keys():
-        found = sorted(described.keys() ^ dataset.row_of.keys())[:5]
+    if scene_texts and scene_texts.keys() != dataset.row_of.keys():
+        found = sorted(scene_texts.keys() ^ dataset.row_of.keys())[:5]
         yield Violation(name, "episode_index", "the episodes of the dataset", f"{found} more or missing")
-    for number in sorted(described.keys() & dataset.row_of.keys()):
+    for number in sorted(scene_texts.keys() & dataset.row_of.keys()):
         try:
             episode = dataset.episode(number)
             yield from check_form(SceneRecord, episode.scene, f"{name}, episode {number}")

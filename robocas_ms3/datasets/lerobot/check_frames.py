@@ -14,14 +14,14 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.text import format_count, one_line
-from robocas_ms3.datasets.checks import arrays as laws
+from robocas_ms3.datasets.checks import arrays as array_checks
 from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.arrays import frame_columns, robocas_arrays
 from robocas_ms3.datasets.lerobot.file_models import declared_columns
 from robocas_ms3.datasets.lerobot.language import EVENTS, PERSISTENT, Row, box_in, read_rows_of
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
-from robocas_ms3.datasets.lerobot.tables import faults, numbers, open_table, read_rows
+from robocas_ms3.datasets.lerobot.tables import column_violations, numbers, open_table, read_rows
 from robocas_ms3.datasets.sources.arrays import EpisodeArrays
 
 TOLERANCE = 1e-4
@@ -31,7 +31,7 @@ Ranges = dict[str, tuple[NDArray, NDArray, int]]
 Texts = Mapping[str, list[str]]
 """Name of an index column, such as ``task_index`` -> the texts that it numbers."""
 Columns = Mapping[str, NDArray]
-Fault = tuple[str, str, str]
+KeyViolation = tuple[str, str, str]
 """Key, expected and found."""
 _PERSISTENT_STYLES = {"subtask", "plan", "memory", "motion", "task_aug"}
 _EVENT_STYLES = {"interjection", "vqa", "trace", None}
@@ -49,11 +49,11 @@ def check_data(
     for path, rows in by_file.items():
         name = str(path.relative_to(root))
         try:
-            wrong = list(_file_faults(path, rows, features))
+            wrong = list(_file_violations(path, rows, features))
             violations += [Violation(name, *fault) for fault in wrong]
             for row in [] if wrong else rows:  # one at a time: memory does not grow with the file
                 table, where = read_rows(path, row["episode_index"]), f"episode {row['episode_index']}"
-                if wrong := list(faults(table, declared_columns(features))):
+                if wrong := list(column_violations(table, declared_columns(features))):
                     violations += [Violation(name, *fault) for fault in wrong]
                     break
                 numeric = [key for key, feature in features.items() if feature["dtype"] not in schema.NOT_NUMERIC]
@@ -70,16 +70,16 @@ def check_data(
                 on_episode(done, len(dataset.rows))
         except DatasetError as error:
             violations.append(Violation(name, "", "a readable table", one_line(error)))
-    return [*violations, *surplus_files(root, [root / "data"], by_file)], ranges
+    return [*violations, *unexpected_files(root, [root / "data"], by_file)], ranges
 
 
-def surplus_files(root: Path, folders: Iterable[Path], known: Container[Path]) -> Iterator[Violation]:
+def unexpected_files(root: Path, folders: Iterable[Path], known: Container[Path]) -> Iterator[Violation]:
     for path in sorted(path for folder in folders for path in folder.rglob("*") if path.is_file()):
         if path not in known:
             yield Violation(str(path.relative_to(root)), "", "files of episodes only", "of none")
 
 
-def _file_faults(path: Path, rows: list[dict[str, Any]], features: Mapping[str, Any]) -> Iterator[Fault]:
+def _file_violations(path: Path, rows: list[dict[str, Any]], features: Mapping[str, Any]) -> Iterator[KeyViolation]:
     wanted = sorted(key for key, feature in features.items() if feature["dtype"] != "video")
     count = sum(row["length"] for row in rows)
     with open_table(path) as file:
@@ -93,12 +93,12 @@ def _file_faults(path: Path, rows: list[dict[str, Any]], features: Mapping[str, 
 def _widen(ranges: Ranges, columns: Columns, features: Mapping[str, Any]) -> None:
     """Extend the ranges by an episode; features with NaN or infinite values are ignored."""
     for key, values in columns.items():
-        if len(values) and not _number_fault(values, features[key]):
+        if len(values) and not _number_violation(values, features[key]):
             low, high, count = ranges.get(key, (values[0], values[0], 0))
             ranges[key] = np.minimum(low, values.min(axis=0)), np.maximum(high, values.max(axis=0)), count + len(values)
 
 
-def _number_fault(values: NDArray, feature: Mapping[str, Any]) -> tuple[str, str] | None:
+def _number_violation(values: NDArray, feature: Mapping[str, Any]) -> tuple[str, str] | None:
     """Return expected and found, if the width is wrong or a number is NaN or infinite."""
     if values.shape[1] != int(np.prod(feature["shape"])):
         return f"{feature['shape']} numbers", str(values.shape[1])
@@ -108,13 +108,15 @@ def _number_fault(values: NDArray, feature: Mapping[str, Any]) -> tuple[str, str
 
 def _check_episode(
     table: pa.Table, columns: Columns, row: Mapping[str, Any], info: Mapping[str, Any], texts: Texts
-) -> Iterator[Fault]:
+) -> Iterator[KeyViolation]:
     """Check indices, timestamps, texts and outcome of an episode, and that features are consistent."""
     length = row["length"]
     if len(table) != length:
         yield "", format_count(length, "frame"), str(len(table))
         return
-    wrong = [(key, *fault) for key, found in columns.items() if (fault := _number_fault(found, info["features"][key]))]
+    wrong = [
+        (key, *fault) for key, found in columns.items() if (fault := _number_violation(found, info["features"][key]))
+    ]
     yield from wrong
     steps = np.arange(length)
     expected = {
@@ -138,7 +140,7 @@ def _check_episode(
         yield from _check_content(columns, types, next(iter(row["tasks"]), ""))
 
 
-def _check_outcome(columns: Columns) -> Iterator[Fault]:
+def _check_outcome(columns: Columns) -> Iterator[KeyViolation]:
     if any(feature.key not in columns for feature in schema.OUTCOME):
         return
     reward, success, done = (columns[feature.key][:, 0] for feature in schema.OUTCOME)
@@ -151,7 +153,7 @@ def _check_outcome(columns: Columns) -> Iterator[Fault]:
         yield schema.REWARD.key, "1 where next.success, else 0", "another"
 
 
-def _check_texts(columns: Columns, tasks: list[str], texts: Texts) -> Iterator[Fault]:
+def _check_texts(columns: Columns, tasks: list[str], texts: Texts) -> Iterator[KeyViolation]:
     for key, known in texts.items():
         used = set(columns[key][:, 0].tolist()) if key in columns else set()
         if not used <= set(range(len(known))):
@@ -160,10 +162,10 @@ def _check_texts(columns: Columns, tasks: list[str], texts: Texts) -> Iterator[F
             yield key, f"the tasks of meta/episodes, {tasks}", str([known[i] for i in used])
 
 
-def _check_content(columns: Columns, types: list[Any], instruction: str) -> Iterator[Fault]:
+def _check_content(columns: Columns, types: list[Any], instruction: str) -> Iterator[KeyViolation]:
     """Check the values by the rules for RoboCAS folders, and that each action leads to the next state."""
     arrays: dict[str, NDArray] = {"step_goal_type": np.array([str(kind) for kind in types], np.str_)}
-    if set(schema.OUR_KEYS) <= set(columns):
+    if set(schema.ROBOCAS_KEYS) <= set(columns):
         try:
             arrays = robocas_arrays(dict(columns), instruction, [], arrays["step_goal_type"].tolist())
         except ValueError as error:  # a quaternion of length 0
@@ -175,12 +177,14 @@ def _check_content(columns: Columns, types: list[Any], instruction: str) -> Iter
         if not np.array_equal(columns["action.joint"], again["action.joint"]):
             yield "action.joint", "the next step's joints and gripper", "others"
         arrays["rel_orn"] = Rotation.from_euler("xyz", command[:, 3:6]).as_quat()
-    for wrong in laws.violations_of(EpisodeArrays(Path(), arrays), (laws.check_units, *laws.CONTENT)):
+    for wrong in array_checks.violations_of(
+        EpisodeArrays(Path(), arrays), (array_checks.check_units, *array_checks.CONTENT)
+    ):
         key = schema.SUBGOAL_TYPE.key if wrong.key == "step_goal_type" else wrong.key
         yield key, wrong.expected, wrong.found
 
 
-def check_language(table: pa.Table, file: str, info: Mapping[str, Any]) -> Iterator[Fault]:
+def check_language(table: pa.Table, file: str, info: Mapping[str, Any]) -> Iterator[KeyViolation]:
     """Check the language rows of an episode, those of ``lerobot-annotate`` too."""
     persistent, events = (read_rows_of(table, key, file) for key in (PERSISTENT, EVENTS))
     if any(rows != persistent[0] for rows in persistent[1:]):
@@ -193,7 +197,7 @@ def check_language(table: pa.Table, file: str, info: Mapping[str, Any]) -> Itera
             yield f"{EVENTS}, frame {step}", expected, found
 
 
-def _check_persistent(rows: list[Row], count: int, fps: int) -> Iterator[Fault]:
+def _check_persistent(rows: list[Row], count: int, fps: int) -> Iterator[KeyViolation]:
     for row in rows:
         if row["style"] not in _PERSISTENT_STYLES:
             yield "style", ", ".join(sorted(_PERSISTENT_STYLES)), str(row["style"])

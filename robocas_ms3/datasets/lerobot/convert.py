@@ -19,9 +19,9 @@ from robocas_ms3.core.output_folder import FolderKind, OutputFolder, remove_left
 from robocas_ms3.core.strict_model import parse
 from robocas_ms3.core.text import format_count
 from robocas_ms3.datasets.conversion.conversion_input import ConversionInput, open_input
-from robocas_ms3.datasets.conversion.episode_plan import LEFT_OUT, with_versions
+from robocas_ms3.datasets.conversion.episode_plan import SKIPPED, add_versions
 from robocas_ms3.datasets.conversion.settings import Conversion, ConversionSettings, WrittenEpisode
-from robocas_ms3.datasets.conversion.workers import WriteJob, write_episodes
+from robocas_ms3.datasets.conversion.workers import PendingEpisodes, write_episodes
 from robocas_ms3.datasets.lerobot.schema import (
     CONTENT,
     CONVERSION_FILE,
@@ -44,10 +44,10 @@ _OUTPUT = FolderKind(
     (f"{_PARTS}/plan.json", CONVERSION_FILE),
     "settings",
     marks=(INFO_FILE, _PARTS),
-    upgrade=with_versions,
+    upgrade=add_versions,
 )
 _FOLDERS = (*CONTENT, STAGING, "meta")  # meta comes last: where it is, the dataset is whole
-_FIX = "The same command tries again; with --leave-out, the others make the dataset where that fails."
+_FIX = "The same command tries again; with --skip-errors, the others make the dataset where that fails."
 _log = logging.getLogger(__name__)
 
 
@@ -90,7 +90,7 @@ def convert_lerobot(
                 if on_start:
                     on_start(len(job.tasks))
                 written, incomplete = write_episodes(job, output, on_episode)
-                if incomplete and not settings.leave_out:
+                if incomplete and not settings.skip_errors:
                     raise incomplete
                 if incomplete:
                     _log.warning("%s", incomplete)
@@ -134,7 +134,7 @@ def _check_episodes(output: OutputFolder, plan: Mapping[str, Any]) -> None:
         return
     parse(ConversionRecord, output.recorded, DatasetError, where=output.path)
     recorded, now = output.recorded.get("episodes", []), plan["episodes"]
-    listed = sorted([*recorded, *output.recorded.get(LEFT_OUT, [])], key=lambda entry: entry.get("source") or 0)
+    listed = sorted([*recorded, *output.recorded.get(SKIPPED, [])], key=lambda entry: entry.get("source") or 0)
     if len(listed) != len(now) or not all(map(_is_same, listed, now)):
         what, expected = "a dataset of other episodes", format_count(len(recorded), "episode")
         fix = "Choose another folder, or pass --overwrite to start again."
@@ -148,19 +148,19 @@ def _is_same(before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
     return all(before.get(key) == now[key] for key in keys)
 
 
-def _missing_parts(settings: ConversionSettings, variant: Variant, episodes: list[dict[str, Any]]) -> WriteJob:
-    from robocas_ms3.datasets.lerobot.parts import Part, PartWriter
+def _missing_parts(settings: ConversionSettings, variant: Variant, episodes: list[dict[str, Any]]) -> PendingEpisodes:
+    from robocas_ms3.datasets.lerobot.parts import EpisodePart, PartWriter
 
     writer = PartWriter(settings.out / _PARTS, settings.codec, variant)
     missing = []
     for number, entry in enumerate(episodes):
         folder = writer.folder(number)
-        if folder.is_dir() and not Part(folder).is_whole:
+        if folder.is_dir() and not EpisodePart(folder).is_whole:
             _log.warning("%s: damaged since it was written; it is written again", folder)
             shutil.rmtree(folder)
         if not folder.is_dir():
             missing.append((number, entry["source"]))
-    return WriteJob(settings, writer, missing, len(missing) < len(episodes), _FIX)
+    return PendingEpisodes(settings, writer, missing, len(missing) < len(episodes), _FIX)
 
 
 def _without_missing(plan: dict[str, Any], parts: Path, incomplete: IncompleteDatasetError) -> dict[str, Any]:
@@ -171,7 +171,7 @@ def _without_missing(plan: dict[str, Any], parts: Path, incomplete: IncompleteDa
     sides = {side: [place[number] for number in plan[side] if number in place] for side in ("train_eps", "val_eps")}
     reasons = incomplete.reasons
     left_out = [{**entry, "why": reasons.get(episode_folder(n))} for n, entry in episodes if n not in place]
-    return {**plan, **sides, "episodes": [entry for n, entry in episodes if n in place], LEFT_OUT: left_out}
+    return {**plan, **sides, "episodes": [entry for n, entry in episodes if n in place], SKIPPED: left_out}
 
 
 def _join(out: Path, plan: Mapping[str, Any]) -> None:

@@ -161,7 +161,7 @@ class CameraRecord(_Record):
     parent: Parent | None = Field(default=None, description="None: that of the standard camera of this name")
 
     @classmethod
-    def of(cls, name: str, model: CameraModel) -> CameraRecord:
+    def from_model(cls, name: str, model: CameraModel) -> CameraRecord:
         intrinsic, pose = (np.asarray(array).tolist() for array in (model.intrinsic, model.camera_in_parent))
         parent = None if model.parent == standard_parent(name) else model.parent
         return cls(intrinsic=intrinsic, camera_in_parent=pose, parent=parent)

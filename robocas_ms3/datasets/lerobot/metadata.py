@@ -89,7 +89,7 @@ class Metadata:
         return schema.LANGUAGE_COLUMNS[0] in self.info["features"]
 
     @property
-    def is_ours(self) -> bool:
+    def is_robocas(self) -> bool:
         """Whether it has all columns of a dataset that ``robocas convert`` writes."""
         features = self.info["features"]
         return all(features.get(own.key, {}).get("shape") == [own.width] for own in schema.FEATURES)
@@ -161,7 +161,7 @@ class Metadata:
         return read_texts(self.root / schema.SUBTASKS_FILE, "subtask_index", self.info["total_frames"])
 
     @cached_property
-    def described(self) -> dict[int, dict[str, str]]:
+    def scene_texts(self) -> dict[int, dict[str, str]]:
         """Number -> ``scene`` and ``cameras``, JSON, by ``meta/robocas/episodes.parquet``; empty without."""
         path = self.root / schema.SCENES_FILE
         rows = read_objects(path, SCENES, most_rows=self.info["total_episodes"]).to_pylist() if path.exists() else []

@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict
 from robocas_ms3.core.documents import JSON_LIMIT, read_text
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import json_text
-from robocas_ms3.datasets.conversion.workers import EpisodeWriter, GivenEpisode
+from robocas_ms3.datasets.conversion.workers import EpisodeWriter, InputEpisode
 from robocas_ms3.datasets.images.image_files import Box
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.arrays import frame_columns
@@ -31,12 +31,12 @@ from robocas_ms3.datasets.lerobot.language import (
     paraphrases,
     persistent_rows,
 )
-from robocas_ms3.datasets.lerobot.stats import Levels
+from robocas_ms3.datasets.lerobot.stats import LevelHistogram
 from robocas_ms3.datasets.lerobot.tables import as_column
 from robocas_ms3.datasets.lerobot.variants import Variant
-from robocas_ms3.datasets.lerobot.video import Encoder, coding_of, to_levels
+from robocas_ms3.datasets.lerobot.video import VideoEncoder, find_codec, to_levels
 from robocas_ms3.datasets.schema import episode_folder
-from robocas_ms3.datasets.sources.episode_source import Frame, Kind
+from robocas_ms3.datasets.sources.episode_source import ImageKind, StepImages
 from robocas_ms3.demos.recordings.subgoals import subgoal_runs
 
 FRAMES_FILE, EPISODE_FILE = "frames.parquet", "episode.json"
@@ -44,7 +44,7 @@ SUBGOAL = "subgoal"  # column of texts, which become numbers when parts are join
 
 
 class EpisodeRecord(BaseModel):
-    """``episode.json`` of a part: ``levels`` as in `stats.Levels` per video feature, ``sizes`` bytes of its files."""
+    """Content of ``episode.json``: ``levels`` are counts per video feature, ``sizes`` the bytes of the files."""
 
     model_config = ConfigDict(strict=True)
 
@@ -57,8 +57,8 @@ class EpisodeRecord(BaseModel):
     sizes: dict[str, int]
 
 
-def video_name(camera: str, kind: Kind, codec: str, variant: Variant) -> str:
-    return f"{kind}_{camera}{coding_of(kind, codec, variant).suffix}"
+def video_name(camera: str, kind: ImageKind, codec: str, variant: Variant) -> str:
+    return f"{kind}_{camera}{find_codec(kind, codec, variant).suffix}"
 
 
 def _sizes(folder: Path) -> dict[str, int]:
@@ -76,11 +76,11 @@ class PartWriter(EpisodeWriter):
     def folder(self, number: int) -> Path:
         return self.parts / episode_folder(number)
 
-    def write_files(self, folder: Path, wanted: GivenEpisode, frames: Generator[Frame, None, None]) -> None:
+    def write_files(self, folder: Path, wanted: InputEpisode, frames: Generator[StepImages, None, None]) -> None:
         episode, arrays, image_options = wanted.episode, wanted.arrays, wanted.given.image_options
         fps, steps = schema.whole_rate(wanted.given.source.rate_hz), int(arrays["episode_length"])
-        encoders: dict[str, Encoder] = {}  # opened with the first frame
-        levels: dict[str, Levels] = {}
+        encoders: dict[str, VideoEncoder] = {}  # opened with the first frame
+        levels: dict[str, LevelHistogram] = {}
         boxes: list[dict[str, Box]] = []
         clipped = False
         with ExitStack() as stack:
@@ -88,15 +88,15 @@ class PartWriter(EpisodeWriter):
                 boxes.append(frame.boxes)
                 for camera, kind, image in _images(frame):
                     if kind == "rgb":
-                        levels.setdefault(schema.image_key(camera), Levels.rgb()).add(image)
+                        levels.setdefault(schema.image_key(camera), LevelHistogram.rgb()).add(image)
                     elif self.variant.native_depth:
                         clipped = clipped or bool(image.max() > schema.MAX_DEPTH_MM)
                         image = to_levels(image)  # noqa: PLW2901
-                        levels.setdefault(schema.depth_key(camera), Levels.depth()).add(image)
+                        levels.setdefault(schema.depth_key(camera), LevelHistogram.depth()).add(image)
                     name = video_name(camera, kind, self.codec, self.variant)
                     if name not in encoders:
-                        coding, size = coding_of(kind, self.codec, self.variant), (image.shape[1], image.shape[0])
-                        encoders[name] = stack.enter_context(Encoder(folder / name, coding, fps, size))
+                        coding, size = find_codec(kind, self.codec, self.variant), (image.shape[1], image.shape[0])
+                        encoders[name] = stack.enter_context(VideoEncoder(folder / name, coding, fps, size))
                     encoders[name].add(image)
         if len(boxes) != steps:
             what = "images and arrays differ in length"
@@ -106,7 +106,7 @@ class PartWriter(EpisodeWriter):
         record = EpisodeRecord(
             instruction=str(arrays["language_goal"]),
             scene=scene,
-            cameras={name: CameraRecord.of(name, episode.camera(name)) for name in image_options.cameras},
+            cameras={name: CameraRecord.from_model(name, episode.camera(name)) for name in image_options.cameras},
             depth=image_options.depth,
             depth_clipped=clipped,
             levels={key: counted.counts.tolist() for key, counted in levels.items()},
@@ -132,7 +132,7 @@ class PartWriter(EpisodeWriter):
         return pa.table(columns)
 
 
-def _images(frame: Frame) -> Iterator[tuple[str, Kind, NDArray]]:
+def _images(frame: StepImages) -> Iterator[tuple[str, ImageKind, NDArray]]:
     for camera, image in frame.rgb.items():
         yield camera, "rgb", image
     for camera, image in frame.depth.items():
@@ -140,7 +140,7 @@ def _images(frame: Frame) -> Iterator[tuple[str, Kind, NDArray]]:
 
 
 @dataclass(frozen=True)
-class Part:
+class EpisodePart:
     """An episode that was written by itself."""
 
     folder: Path

@@ -24,7 +24,7 @@ from robocas_ms3.datasets.lerobot.language import EVENTS, PERSISTENT, boxes_of, 
 from robocas_ms3.datasets.lerobot.metadata import Metadata
 from robocas_ms3.datasets.lerobot.tables import INTEGER, Column, check_columns, is_numeric, numbers, read_rows
 from robocas_ms3.datasets.lerobot.video import read_frames, to_depth
-from robocas_ms3.datasets.sources.episode_source import EpisodeSource, Kind, Side, SourceEpisode
+from robocas_ms3.datasets.sources.episode_source import EpisodeSource, ImageKind, SourceEpisode, Split
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 from robocas_ms3.datasets.sources.reader import check_rate
 from robocas_ms3.demos.recordings.subgoals import SubGoal, subgoal_runs
@@ -53,7 +53,7 @@ class LeRobotDataset(Metadata, EpisodeSource):
     def lengths(self) -> dict[int, int]:
         return {number: int(row["length"]) for number, row in self.row_of.items()}
 
-    def split(self, side: Side) -> list[int]:
+    def split(self, side: Split) -> list[int]:
         """Return the numbers of one side; all episodes of a dataset made elsewhere train."""
         if side == "all" or (side == "train" and "train_eps" not in self.settings):
             return self.numbers
@@ -119,8 +119,8 @@ class LeRobotEpisode(SourceEpisode):
 
     @cached_property
     def arrays(self) -> dict[str, NDArray]:
-        if not self.dataset.is_ours:
-            raise DatasetError("not of our columns", where=self.where, expected=", ".join(schema.OUR_KEYS))
+        if not self.dataset.is_robocas:
+            raise DatasetError("not of our columns", where=self.where, expected=", ".join(schema.ROBOCAS_KEYS))
         types, texts = self._subgoals()
         for feature in schema.FEATURES:
             values = self.columns[feature.key]
@@ -135,7 +135,7 @@ class LeRobotEpisode(SourceEpisode):
     @property
     def goals(self) -> list[SubGoal]:
         """Sub-goals over the steps; empty for datasets made elsewhere."""
-        return subgoal_runs(*self._subgoals()) if self.dataset.is_ours else []
+        return subgoal_runs(*self._subgoals()) if self.dataset.is_robocas else []
 
     def _subgoals(self) -> tuple[list[str], list[str]]:
         key, columns = schema.SUBTASK_INDEX.key, declared_columns(self.dataset.info["features"])
@@ -164,7 +164,7 @@ class LeRobotEpisode(SourceEpisode):
         return self._described("cameras", CamerasText).root
 
     def _described(self, key: str, model: type[_Text]) -> _Text:
-        text, where = self.dataset.described.get(self.number, {}).get(key, "{}"), f"{schema.SCENES_FILE}, {key}"
+        text, where = self.dataset.scene_texts.get(self.number, {}).get(key, "{}"), f"{schema.SCENES_FILE}, {key}"
         return parse_json(model, text, DatasetError, where=f"{self.where}, {where}", about="damaged")
 
     def _camera(self, name: str) -> CameraRecord:
@@ -181,7 +181,7 @@ class LeRobotEpisode(SourceEpisode):
     def camera_parent(self, camera: str) -> Parent:
         return self._camera(camera).parent or standard_parent(camera)
 
-    def video(self, camera: str, kind: Kind) -> tuple[Path, int]:
+    def video(self, camera: str, kind: ImageKind) -> tuple[Path, int]:
         """Return the file of a camera's video and the number of its first frame there."""
         prefix = f"videos/{schema.image_key(camera)}"
         if kind == "depth":
@@ -191,7 +191,7 @@ class LeRobotEpisode(SourceEpisode):
         return path, round(self.row[f"{prefix}/from_timestamp"] * self.dataset.info["fps"])
 
     def frames(
-        self, camera: str, kind: Kind = "rgb", first: int = 0, count: int | None = None
+        self, camera: str, kind: ImageKind = "rgb", first: int = 0, count: int | None = None
     ) -> Generator[NDArray, None, None]:
         path, start = self.video(camera, kind)
         count = self.steps - first if count is None else count

@@ -77,7 +77,7 @@ FEATURES: tuple[Feature, ...] = (
 )
 """Numeric features, see docs/lerobot.md."""
 
-OUR_KEYS = tuple(feature.key for feature in FEATURES)
+ROBOCAS_KEYS = tuple(feature.key for feature in FEATURES)
 """A dataset with these keys was written here."""
 
 SUBGOAL_TYPE = Feature("subgoal_type", dtype="string")

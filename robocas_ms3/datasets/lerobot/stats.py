@@ -37,7 +37,7 @@ def joined_stats(episodes: Sequence[NDArray]) -> Stats:
     return {name: found[0][name] if name == "count" else [one[name][0] for one in found] for name in found[0]}
 
 
-class Levels:
+class LevelHistogram:
     """Counts (channels, levels) of the levels of a number of images: exact statistics, however many they are.
 
     RGB images have 3 channels, with statistics between 0 and 1; depth images have one, with statistics in mm.
@@ -48,11 +48,11 @@ class Levels:
         self._unit = 1.0 if len(self.counts) == 1 else 1 / 255
 
     @classmethod
-    def rgb(cls) -> Levels:
+    def rgb(cls) -> LevelHistogram:
         return cls(np.zeros((3, 256)))
 
     @classmethod
-    def depth(cls) -> Levels:  # 12 bits
+    def depth(cls) -> LevelHistogram:  # 12 bits
         return cls(np.zeros((1, 4096)))
 
     def add(self, image: NDArray) -> None:
@@ -65,7 +65,7 @@ class Levels:
             self.counts[channel] += np.bincount(thinned[:, channel], minlength=levels)
         self.images += 1
 
-    def merge(self, other: Levels) -> None:
+    def merge(self, other: LevelHistogram) -> None:
         self.counts += other.counts
         self.images += other.images
 

@@ -52,7 +52,7 @@ class Column:
         return None
 
 
-def faults(table: pa.Table, columns: Mapping[str, Column]) -> Iterator[tuple[str, str, str]]:
+def column_violations(table: pa.Table, columns: Mapping[str, Column]) -> Iterator[tuple[str, str, str]]:
     """Yield key, expected and found of columns that are missing or break their declaration."""
     for key, column in columns.items():
         if key not in table.column_names:
@@ -127,7 +127,7 @@ def read_objects(path: Path, columns: Mapping[str, Column], *, most_rows: float 
 
 
 def check_columns(table: pa.Table, columns: Mapping[str, Column], path: Path) -> None:
-    for key, expected, found in faults(table, columns):
+    for key, expected, found in column_violations(table, columns):
         what = "wrong column of a table"
         raise DatasetError(what, where=f"{path}, {key}", expected=expected, found=found, fix=SEE_VALIDATE)
 

@@ -27,11 +27,11 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.strict_model import parse
 from robocas_ms3.datasets.lerobot.schema import MAX_DEPTH_MM, check_video_size
 from robocas_ms3.datasets.lerobot.variants import CHUNK_FILES, Variant
-from robocas_ms3.datasets.sources.episode_source import Kind
+from robocas_ms3.datasets.sources.episode_source import ImageKind
 
 
 @dataclass(frozen=True)
-class Coding:
+class VideoCodec:
     """FFmpeg's encoder, pixel format, suffix of the file, options of the encoder."""
 
     encoder: str
@@ -42,16 +42,16 @@ class Coding:
 
 # A key frame every second one, as LeRobot has it: a random frame costs at most two. No B-frames, so that the order of
 # packets is that of frames and parts join without edit lists. Fixed threads: the same images give the same bytes.
-CODINGS = {
-    "h264": Coding(
+VIDEO_CODECS = {
+    "h264": VideoCodec(
         "libx264",
         "yuv420p",
         ".mp4",
         {"g": "2", "crf": "20", "preset": "veryfast", "bf": "0", "rc-lookahead": "0", "threads": "1"},
     ),
-    "av1": Coding("libsvtav1", "yuv420p", ".mp4", {"g": "2", "crf": "30", "preset": "10", "svtav1-params": "lp=1"}),
+    "av1": VideoCodec("libsvtav1", "yuv420p", ".mp4", {"g": "2", "crf": "30", "preset": "10", "svtav1-params": "lp=1"}),
     # Lossless, 12 bits, the codec of LeRobot's depth. Slower presets take three times as long for half the size.
-    "depth12": Coding(
+    "depth12": VideoCodec(
         "libx265",
         "gray12le",
         ".mp4",
@@ -63,7 +63,7 @@ CODINGS = {
         },
     ),
     # Lossless, 16 bits, a checksum in every slice, every frame by itself.
-    "depth": Coding("ffv1", "gray16le", ".mkv", {"level": "3", "slices": "4", "slicecrc": "1", "g": "1"}),
+    "depth": VideoCodec("ffv1", "gray16le", ".mkv", {"level": "3", "slices": "4", "slicecrc": "1", "g": "1"}),
 }
 _MAX_PIXELS = 2**26  # of a frame that is decoded: 8192 x 8192
 _GREY = ("gray16le", "gray12le")
@@ -107,14 +107,14 @@ class _Range(BaseModel):
         return self
 
 
-def coding_of(kind: Kind, codec: str, variant: Variant) -> Coding:
-    return CODINGS[codec if kind == "rgb" else "depth12" if variant.native_depth else "depth"]
+def find_codec(kind: ImageKind, codec: str, variant: Variant) -> VideoCodec:
+    return VIDEO_CODECS[codec if kind == "rgb" else "depth12" if variant.native_depth else "depth"]
 
 
-class Encoder:
+class VideoEncoder:
     """Writes one video of a width and height in pixels; use it in a ``with`` statement."""
 
-    def __init__(self, path: Path, coding: Coding, fps: int, size: tuple[int, int]) -> None:
+    def __init__(self, path: Path, coding: VideoCodec, fps: int, size: tuple[int, int]) -> None:
         width, height = size
         if coding.pixels == "yuv420p":
             check_video_size(size)
@@ -129,7 +129,7 @@ class Encoder:
         stream.width, stream.height, stream.pix_fmt = width, height, coding.pixels
         self._stream, self._time_base = stream, Fraction(1, fps)
 
-    def __enter__(self) -> Encoder:
+    def __enter__(self) -> VideoEncoder:
         return self
 
     def __exit__(self, kind: object, *_: object) -> None:
@@ -151,7 +151,7 @@ class Encoder:
         self.frames += 1
 
 
-class Joiner:
+class VideoJoiner:
     """Copies videos one after the other into files ``path(chunk, number)``; only the one being written is open."""
 
     def __init__(self, path: Callable[[int, int], Path], fps: int, limit_mb: float, limit_seconds: float) -> None:

@@ -20,13 +20,13 @@ from robocas_ms3.core.files import write_json
 from robocas_ms3.core.text import format_count
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.language import EVENTS, EVENTS_TYPE, PERSISTENT, PERSISTENT_TYPE, Row
-from robocas_ms3.datasets.lerobot.parts import FRAMES_FILE, SUBGOAL, EpisodeRecord, Part, video_name
+from robocas_ms3.datasets.lerobot.parts import FRAMES_FILE, SUBGOAL, EpisodePart, EpisodeRecord, video_name
 from robocas_ms3.datasets.lerobot.schema import FileLimits
-from robocas_ms3.datasets.lerobot.stats import Levels, Stats, joined_stats, vector_stats
+from robocas_ms3.datasets.lerobot.stats import LevelHistogram, Stats, joined_stats, vector_stats
 from robocas_ms3.datasets.lerobot.tables import as_column, numbers, write_texts
 from robocas_ms3.datasets.lerobot.variants import CHUNK_FILES, Variant, find_variant
-from robocas_ms3.datasets.lerobot.video import DEPTH_INFO, Joiner, packet_times
-from robocas_ms3.datasets.sources.episode_source import Kind
+from robocas_ms3.datasets.lerobot.video import DEPTH_INFO, VideoJoiner, packet_times
+from robocas_ms3.datasets.sources.episode_source import ImageKind
 
 _GROUP = 64  # episodes per row group of the tables about episodes
 _log = logging.getLogger(__name__)
@@ -34,10 +34,10 @@ _log = logging.getLogger(__name__)
 
 def join_parts(folders: Sequence[Path], plan: Mapping[str, Any], root: Path, limits: FileLimits) -> None:
     """Write a dataset into an empty folder from all parts of a plan, the content of ``conversion.json``."""
-    writer = LeRobotWriter(root, plan, limits, Part(folders[0]).record)
+    writer = LeRobotWriter(root, plan, limits, EpisodePart(folders[0]).record)
     with writer:
         for folder, entry in zip(folders, plan["episodes"], strict=True):
-            writer.add_episode(Part(folder), entry)
+            writer.add_episode(EpisodePart(folder), entry)
     writer.finalize()
 
 
@@ -50,11 +50,11 @@ class LeRobotWriter:
         self._layout, self._fps = self._variant.layout, int(plan["settings"]["rate_hz"])
         single = (feature.key for feature in schema.single_features(self._variant) if feature.dtype != "string")
         self._numbers: dict[str, list[NDArray]] = {
-            key: [] for key in (*schema.OUR_KEYS, *single, *schema.INDICES)
+            key: [] for key in (*schema.ROBOCAS_KEYS, *single, *schema.INDICES)
         }  # numeric features of each episode, about 300 bytes per frame
         self._tasks: dict[str, int] = {}
         self._subgoals: dict[str, int] = {}
-        self._levels: dict[str, Levels] = {}
+        self._levels: dict[str, LevelHistogram] = {}
         self._episodes_done = self._frames = self._clipped = 0
         self._stack = ExitStack()
 
@@ -74,17 +74,17 @@ class LeRobotWriter:
 
     def _open_streams(self, limit_mb: float) -> Iterable[_Stream]:
         variant, codec = self._variant, self._plan["settings"]["codec"]
-        kinds: tuple[Kind, ...] = ("rgb", "depth") if self._first.depth else ("rgb",)
+        kinds: tuple[ImageKind, ...] = ("rgb", "depth") if self._first.depth else ("rgb",)
         for camera in self._first.cameras:
             for kind in kinds:
                 key = schema.image_key(camera) if kind == "rgb" else schema.depth_key(camera)
                 prefix = f"videos/{key}" if kind == "rgb" or variant.native_depth else f"depth/{camera}"
                 path = partial(self._layout.path, self._root, prefix)
-                joiner = Joiner(path, self._fps, limit_mb, self._limits.video_seconds)
+                joiner = VideoJoiner(path, self._fps, limit_mb, self._limits.video_seconds)
                 self._stack.enter_context(closing(joiner))
                 yield _Stream(kind, prefix, video_name(camera, kind, codec, variant), joiner)
 
-    def add_episode(self, part: Part, entry: Mapping[str, Any]) -> None:
+    def add_episode(self, part: EpisodePart, entry: Mapping[str, Any]) -> None:
         record, steps, variant, fps = part.record, len(part.table), self._variant, self._fps
         index, start = self._episodes_done, self._frames
         columns = self._columns(part, index, start, succeeded=entry.get("success") is True)
@@ -93,9 +93,9 @@ class LeRobotWriter:
         for key, values in columns.items():
             self._numbers[key].append(values)
         for key, counts in record.levels.items():
-            levels = Levels(counts, steps)
+            levels = LevelHistogram(counts, steps)
             stats[key] = levels.stats()
-            self._levels.setdefault(key, Levels(np.zeros_like(counts))).merge(levels)
+            self._levels.setdefault(key, LevelHistogram(np.zeros_like(counts))).merge(levels)
         chunk, file = self._data.place((part.folder / FRAMES_FILE).stat().st_size)
         self._data.add(self._frame_table(part, columns, persistent))
         row = {
@@ -139,7 +139,7 @@ class LeRobotWriter:
             numbers = {f"stats/{key}/{name}": value for key, found in stats.items() for name, value in found.items()}
             self._episodes.add(pa.Table.from_pylist([{**row, **places, **numbers}]))
 
-    def _columns(self, part: Part, index: int, start: int, *, succeeded: bool) -> dict[str, NDArray]:
+    def _columns(self, part: EpisodePart, index: int, start: int, *, succeeded: bool) -> dict[str, NDArray]:
         """Return the numeric features (T, D), with the numbers that depend on the episodes before."""
         steps, task = len(part.table), self._tasks.setdefault(part.record.instruction, len(self._tasks))
         last = np.arange(steps)[:, None] == steps - 1
@@ -156,9 +156,9 @@ class LeRobotWriter:
         }
         return {key: made[key] if key in made else numbers(part.table.column(key)) for key in self._numbers}
 
-    def _frame_table(self, part: Part, columns: dict[str, NDArray], persistent: list[Row]) -> pa.Table:
+    def _frame_table(self, part: EpisodePart, columns: dict[str, NDArray], persistent: list[Row]) -> pa.Table:
         made: dict[str, Any] = {}
-        for key in (*schema.OUR_KEYS, *(feature.key for feature in schema.single_features(self._variant))):
+        for key in (*schema.ROBOCAS_KEYS, *(feature.key for feature in schema.single_features(self._variant))):
             made[key] = as_column(columns[key]) if key in columns else part.table.column(key)
         if self._variant.language:
             same = pa.array(np.zeros(len(part.table), np.int64))  # every frame has all rows of its episode
@@ -232,10 +232,10 @@ class LeRobotWriter:
 class _Stream:
     """The videos of a camera; ``prefix`` is that of the columns of ``meta/episodes``."""
 
-    kind: Kind
+    kind: ImageKind
     prefix: str
     part_name: str
-    joiner: Joiner
+    joiner: VideoJoiner
 
 
 class RollingTable:

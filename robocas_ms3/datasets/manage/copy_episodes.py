@@ -19,7 +19,7 @@ from robocas_ms3.core.output_folder import OutputFolder
 from robocas_ms3.core.strict_model import parse
 from robocas_ms3.core.text import format_count, format_ranges
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.checks import arrays as laws
+from robocas_ms3.datasets.checks import arrays as array_checks
 from robocas_ms3.datasets.checks.images import check_cameras, check_images
 from robocas_ms3.datasets.checks.scene import read_settings
 from robocas_ms3.datasets.checks.violation import Violation, read_object
@@ -36,7 +36,7 @@ _NO_LINKS = {errno.EXDEV, errno.EPERM, errno.EACCES, errno.EMLINK, errno.EOPNOTS
 
 @dataclass(frozen=True)
 class FinishedDataset:
-    """A dataset whose files all list the same episodes, its name, and its recordings; see `open_finished`."""
+    """A dataset whose files all list the same episodes, its name, and its recordings; see `open_finished_dataset`."""
 
     dataset: Dataset
     name: str
@@ -57,14 +57,14 @@ def schema_version(dataset: Dataset) -> object:
     return dataset.settings.get("schema_version", 1) if dataset.settings else 0
 
 
-def open_finished(root: Path, name: str = "") -> FinishedDataset:
+def open_finished_dataset(root: Path, name: str = "") -> FinishedDataset:
     """Open a dataset to copy episodes from, or raise DatasetError if it is unfinished or contradicts itself."""
     dataset = Dataset(root)
     schema.check_version(schema_version(dataset), root)
     if not dataset.info:
         path, fix = root / schema.DATA_INFO_FILE, "Run the same robocas convert again first."
         raise DatasetError("this dataset is not finished", where=path, found="no file", fix=fix)
-    listed = [number for side in dataset.sides for number in side]
+    listed = [number for side in dataset.splits for number in side]
     if sorted(listed) != dataset.numbers:
         found = f"{format_ranges(set(listed) ^ set(dataset.numbers)) or 'some'} missing, twice, or not on disk"
         fix = "Finish it with robocas convert, or accept what is there with robocas split --in-place."
@@ -110,13 +110,13 @@ class CopyResult:
 
     out: Path
     episodes: int
-    kept: int
+    existing: int
     linked: int
     copied: int
     skipped: int = 0
 
     def __str__(self) -> str:
-        kept = f", {self.kept} of them were there" if self.kept else ""
+        kept = f", {self.existing} of them were there" if self.existing else ""
         linked = f"{format_count(self.linked, 'file')} linked, {self.copied} copied"
         skipped = f", {format_count(self.skipped, 'duplicate')} left out" if self.skipped else ""
         return f"{self.out}: {format_count(self.episodes, 'episode')}{kept}, {linked}{skipped}"
@@ -202,16 +202,18 @@ def _check_episodes(root: Path, numbers: Iterable[int]) -> None:
         missing = source.get("missing") if isinstance(source, dict) else None
         lacking = missing if isinstance(missing, list) else []
         for wrong in (
-            *(wrong for wrong in laws.check_keys(stored) if wrong.key not in lacking),
-            *laws.violations_of(stored, (laws.check_file, laws.check_shapes, laws.check_finite)),
+            *(wrong for wrong in array_checks.check_keys(stored) if wrong.key not in lacking),
+            *array_checks.violations_of(
+                stored, (array_checks.check_file, array_checks.check_shapes, array_checks.check_finite)
+            ),
             *check_cameras(folder, image_options),
             *check_images(folder, image_options, stored.steps, {}, check_ends),
         ):
-            if wrong.kind != "surplus":
-                raise damaged_episode(root, wrong)
+            if wrong.kind != "unexpected":
+                raise damaged_episode_error(root, wrong)
 
 
-def damaged_episode(root: Path, wrong: Violation) -> DatasetError:
+def damaged_episode_error(root: Path, wrong: Violation) -> DatasetError:
     where, fix = root / wrong.where, f"robocas validate {root} lists all."
     return DatasetError("this episode is damaged", where=where, expected=wrong.expected, found=wrong.found, fix=fix)
 

@@ -29,7 +29,7 @@ from robocas_ms3.datasets.manage.copy_episodes import (
 )
 from robocas_ms3.datasets.manage.repairs import EMBEDDINGS, ImportedEpisode
 from robocas_ms3.datasets.manage.survey import Survey, read_episode, read_info
-from robocas_ms3.datasets.sources.arrays import SPECS, EpisodeArrays, with_embeddings
+from robocas_ms3.datasets.sources.arrays import SPECS, EpisodeArrays, add_embeddings
 from robocas_ms3.datasets.sources.episode_source import CameraModel
 from robocas_ms3.datasets.sources.file_models import SCENE_KEYS, EpisodesRecord
 from robocas_ms3.datasets.sources.reader import Dataset, Episode
@@ -103,7 +103,7 @@ def _embedded(episode: ImportedEpisode, wanted: bool, embed: Embed | None) -> Ep
         return stored
     assert embed is not None
     derived = {"language_embedding": "language_goal", "step_goal_embs": "step_lang_goals"}
-    return replace(stored, arrays=with_embeddings(stored.arrays, embed), derived={**stored.derived, **derived})
+    return replace(stored, arrays=add_embeddings(stored.arrays, embed), derived={**stored.derived, **derived})
 
 
 def _write(folder: Path, source: Episode, episode: ImportedEpisode, surveyed: Survey, placer: FilePlacer) -> None:
@@ -130,7 +130,7 @@ def _scene(source: Episode, episode: ImportedEpisode, surveyed: Survey) -> dict[
     """Return the content of ``scene.json``; most is unknown, unless the episode has such a file."""
     before = source.scene if source.scene.get("schema_version") == schema.SCHEMA_VERSION else {}
     wanted = (spec.name for spec in schema.EPISODE_INFO if not spec.embedding)
-    repaired = (found for found in episode.findings if found.outcome == "mended")
+    repaired = (found for found in episode.findings if found.outcome == "repaired")
     made = {
         "recording": None,
         **(before.get("source") or {}),
@@ -139,7 +139,7 @@ def _scene(source: Episode, episode: ImportedEpisode, surveyed: Survey) -> dict[
         "episode": episode.number,
         "derived": episode.stored.derived,
         "missing": [key for key in wanted if key not in episode.stored.arrays],
-        "mended": [f"{found.violation.where.split('/', 1)[1]}: {found.problem}" for found in repaired],
+        "repaired": [f"{found.violation.where.split('/', 1)[1]}: {found.problem}" for found in repaired],
     }
     known = {"schema_version": schema.SCHEMA_VERSION, "rate_hz": float(surveyed.rate_hz), "source": made}
     return {key: known.get(key, before.get(key)) for key in SCENE_KEYS}

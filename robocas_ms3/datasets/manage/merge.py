@@ -16,7 +16,7 @@ from robocas_ms3.datasets.manage.copy_episodes import (
     CopyResult,
     FinishedDataset,
     copy_episodes,
-    open_finished,
+    open_finished_dataset,
 )
 
 
@@ -32,12 +32,12 @@ def merge(
     """
     if not roots:
         raise DatasetError("nothing to merge", expected="folders of datasets", fix="robocas merge A B --out C")
-    sources = [open_finished(root, name) for root, name in zip(roots, _distinct_names(roots), strict=True)]
+    sources = [open_finished_dataset(root, name) for root, name in zip(roots, _distinct_names(roots), strict=True)]
     _check_settings(sources)
     members: dict[str, CopiedEpisode] = {}
     duplicates: list[tuple[CopiedEpisode, CopiedEpisode]] = []
     for source in sources:
-        validates = set(source.dataset.sides[1])
+        validates = set(source.dataset.splits[1])
         for number in source.dataset.numbers:
             member = CopiedEpisode(source, number, "val" if number in validates else "train")
             first = members.setdefault(source.identity(number), member)

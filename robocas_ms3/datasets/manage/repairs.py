@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.checks import arrays as laws
+from robocas_ms3.datasets.checks import arrays as array_checks
 from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.datasets.sources.arrays import SPECS, EpisodeArrays, motion_arrays
@@ -22,7 +22,7 @@ EMBEDDINGS = tuple(spec.name for spec in schema.EPISODE_INFO if spec.embedding)
 _ESSENTIAL = ("ee_pos", "ee_orn", "gripper_status", "language_goal", "step_lang_goals", "step_goal_type")
 _CAMERA_OFFSET = (0.03, 0.07)  # m: the gripper camera is 0.05 m from the axis of the hand
 
-Outcome = Literal["left out", "mended", "noted"]
+Outcome = Literal["left out", "repaired", "noted"]
 """The episode is skipped; the fault is repaired; the episode is taken with the fault."""
 Keys = tuple[str, str, str, str]
 """One of ``schema.RELATIVE_PAIRS``."""
@@ -73,13 +73,13 @@ class ImportedEpisode:
         self.stored = _with(self.stored, arrays)
 
 
-def note_keys(episode: ImportedEpisode, loaded: EpisodeArrays) -> None:
+def add_key_findings(episode: ImportedEpisode, loaded: EpisodeArrays) -> None:
     """Note missing, unreadable and unknown keys of what was read, before it was completed."""
-    for wrong in (*laws.check_file(loaded), *laws.check_keys(loaded)):
-        if wrong.kind == "surplus":
+    for wrong in (*array_checks.check_file(loaded), *array_checks.check_keys(loaded)):
+        if wrong.kind == "unexpected":
             episode.note(wrong, "noted", "not taken")
         elif wrong.key in episode.stored.derived:
-            episode.note(wrong, "mended", f"made of {episode.stored.derived[wrong.key]}")
+            episode.note(wrong, "repaired", f"made of {episode.stored.derived[wrong.key]}")
         elif wrong.key in EMBEDDINGS:
             episode.note(wrong, "noted", "not taken")
         elif wrong.kind != "missing" or wrong.key in _ESSENTIAL:
@@ -97,16 +97,16 @@ def repair_arrays(episode: ImportedEpisode) -> None:
 
 def _repair_shapes(episode: ImportedEpisode) -> None:
     stored = episode.stored
-    for wrong in [*laws.check_shapes(stored), *laws.check_finite(stored)]:
+    for wrong in [*array_checks.check_shapes(stored), *array_checks.check_finite(stored)]:
         if wrong.key == "episode_length" and 0 < stored.steps <= schema.MAX_STEPS:
             episode.put({wrong.key: SPECS[wrong.key].cast(stored.steps)})
-            episode.note(wrong, "mended")
+            episode.note(wrong, "repaired")
         else:
             _drop(episode, wrong)
 
 
 def _repair_units(episode: ImportedEpisode) -> None:
-    for wrong in [*laws.check_units(episode.stored)]:
+    for wrong in [*array_checks.check_units(episode.stored)]:
         _drop(episode, wrong)
 
 
@@ -123,22 +123,22 @@ def _drop(episode: ImportedEpisode, wrong: Violation) -> None:
 def _repair_content(episode: ImportedEpisode) -> None:
     for keys in schema.RELATIVE_PAIRS:
         _repair_motion(episode, keys)
-    for wrong in [*laws.check_base_motion(episode.stored)]:
+    for wrong in [*array_checks.check_base_motion(episode.stored)]:
         episode.put({wrong.key: SPECS[wrong.key].cast(planar_motion(episode.stored.arrays["agv_pose"]))})
-        episode.note(wrong, "mended", "made of agv_pose")
-    for wrong in laws.check_values(episode.stored):
+        episode.note(wrong, "repaired", "made of agv_pose")
+    for wrong in array_checks.check_values(episode.stored):
         episode.note(wrong, "left out" if wrong.key == "language_goal" else "noted")
 
 
 def _repair_motion(episode: ImportedEpisode, keys: Keys) -> None:
     """Convert relative motion from the convention by which it agrees with the poses."""
     stored = episode.stored
-    found = list(laws.check_pair(stored, keys))
+    found = list(array_checks.check_pair(stored, keys))
     for repair, converted, repaired in _CONVENTIONS if found else ():
-        if not any(laws.check_pair(_with(stored, converted(stored.arrays, keys)), keys)):
+        if not any(array_checks.check_pair(_with(stored, converted(stored.arrays, keys)), keys)):
             episode.put(repaired(stored.arrays, keys))
             for wrong in found:
-                episode.note(wrong, "mended", repair)
+                episode.note(wrong, "repaired", repair)
             return
     for wrong in found:
         episode.note(wrong, "left out")
@@ -189,4 +189,4 @@ def turn_eef_frame(episode: ImportedEpisode, degrees: int) -> None:
     episode.put({**arrays, **motion_arrays(arrays, schema.RELATIVE_PAIRS[0])})
     episode.turn_deg = degrees
     wrong = Violation(episode.stored.file, "ee_orn, rel_pos, rel_orn", "ManiSkill's TCP frame", "another frame")
-    episode.note(wrong, "mended", f"turned by {degrees} degrees about z")
+    episode.note(wrong, "repaired", f"turned by {degrees} degrees about z")

@@ -20,13 +20,13 @@ from robocas_ms3.datasets.manage.repairs import (
     EMBEDDINGS,
     Finding,
     ImportedEpisode,
+    add_key_findings,
     eef_turn,
-    note_keys,
     repair_arrays,
     turn_eef_frame,
 )
-from robocas_ms3.datasets.sources.arrays import EpisodeArrays, arrays_fingerprint, completed, load_arrays
-from robocas_ms3.datasets.sources.files import said_of
+from robocas_ms3.datasets.sources.arrays import EpisodeArrays, arrays_fingerprint, derive_missing_arrays, load_arrays
+from robocas_ms3.datasets.sources.files import episode_info
 from robocas_ms3.datasets.sources.reader import Dataset, Episode
 from robocas_ms3.robots.cameras import EE_CAMERA
 
@@ -86,7 +86,7 @@ def survey(
     info, findings = read_info(dataset)
     if not dataset.settings:
         wrong = Violation(schema.CONVERSION_FILE, "", "this file", NO_FILE)
-        findings.append(Finding(None, wrong, "mended", f"made of the episodes, {rate_hz:g} steps a second"))
+        findings.append(Finding(None, wrong, "repaired", f"made of the episodes, {rate_hz:g} steps a second"))
     usable: list[ImportedEpisode] = []
     fingerprints: dict[int, str] = {}
     for done, number in enumerate(dataset.numbers, start=1):
@@ -118,7 +118,7 @@ def survey(
     if lacking and len(lacking) < len(taken):
         found = f"{format_count(len(lacking), 'episode')} without"
         wrong = Violation(schema.EPISODE_FILE, "embeddings", "in all episodes or none", found)
-        findings.append(Finding(None, wrong, "mended", "not taken"))
+        findings.append(Finding(None, wrong, "repaired", "not taken"))
     findings = sorted(_merged(findings, taken), key=lambda f: -1 if f.episode is None else f.episode)
     lengths = {number: episode.stored.steps for number, episode in taken.items()}
     embedded = bool(taken) and not lacking
@@ -146,7 +146,7 @@ def read_episode(
     dataset: Dataset, number: int, info: Mapping[str, Any], rate_hz: float, turn_eef: bool
 ) -> ImportedEpisode:
     """Read and repair the arrays of an episode, and check its cameras; see `survey`."""
-    source, said = dataset.episode(number), said_of(info, number)
+    source, said = dataset.episode(number), episode_info(info, number)
     path = source.folder / schema.EPISODE_FILE
     episode = ImportedEpisode(number, EpisodeArrays(path, {}))
     try:
@@ -154,15 +154,15 @@ def read_episode(
     except DatasetError as error:
         episode.note(_unreadable(f"{source.folder.name}/{path.name}", "a numpy archive", error), "left out")
         return episode
-    episode.stored = completed(loaded, said, rate_hz)
-    note_keys(episode, loaded)
+    episode.stored = derive_missing_arrays(loaded, said, rate_hz)
+    add_key_findings(episode, loaded)
     repair_arrays(episode)
     if episode.usable:
         arrays, file = episode.stored.arrays, episode.stored.file
         for key, value in (("ep_length", episode.stored.steps), ("language_goal", str(arrays["language_goal"]))):
             if said.get(key, value) != value:
                 wrong = Violation(file, key, f"{said[key]!r} ({schema.DATA_INFO_FILE})", repr(value))
-                episode.note(wrong, "mended", "the array counts")
+                episode.note(wrong, "repaired", "the array counts")
         _check_files(episode, source)
     if episode.usable and turn_eef and EE_CAMERA in source.cameras and not source.scene.get("env_info"):
         turn = eef_turn(source.camera_in_parent(EE_CAMERA))
@@ -196,7 +196,7 @@ def _check_files(episode: ImportedEpisode, source: Episode) -> None:
         for file, other in zip(files, files[::-1], strict=True):
             if not (source.folder / camera / file).is_file():
                 wrong = Violation(f"{name}/{camera}/{file}", "", "this file", NO_FILE)
-                episode.note(wrong, "mended", f"a copy of {other}")
+                episode.note(wrong, "repaired", f"a copy of {other}")
     if not (source.folder / schema.SCENE_FILE).is_file():
         wrong = Violation(f"{name}/{schema.SCENE_FILE}", "", "this file", NO_FILE)
         episode.note(wrong, "noted", "seed, target, layout and configuration are not known")
@@ -208,10 +208,10 @@ def _check_images(episode: ImportedEpisode, source: Episode) -> None:
     sizes: Sizes = {}
     folders: dict[tuple[str, bool], list[Violation]] = {}
     for wrong in check_images(source.folder, image_options, episode.stored.steps, sizes):
-        folders.setdefault((wrong.file.rpartition("/")[0], wrong.kind == "surplus"), []).append(wrong)
+        folders.setdefault((wrong.file.rpartition("/")[0], wrong.kind == "unexpected"), []).append(wrong)
     for found in folders.values():
         more = f"and {format_count(len(found) - 1, 'other')}" if len(found) > 1 else ""
-        episode.note(found[0], "noted" if found[0].kind == "surplus" else "left out", more)
+        episode.note(found[0], "noted" if found[0].kind == "unexpected" else "left out", more)
     different = set(sizes.values())
     size = None if len(different) != 1 or _FULL_SIZE in different else different.pop()
     try:
@@ -233,10 +233,10 @@ def read_info(dataset: Dataset) -> tuple[dict[str, Any], list[Finding]]:
     try:
         info = dataset.info
     except DatasetError as error:
-        return {}, [Finding(None, Violation(file, "", "JSON", str(error.found)), "mended", "made of the episodes")]
+        return {}, [Finding(None, Violation(file, "", "JSON", str(error.found)), "repaired", "made of the episodes")]
     if not info:
         repair = "made of the episodes, with a split of its own"
-        return {}, [Finding(None, Violation(file, "", "this file", NO_FILE), "mended", repair)]
+        return {}, [Finding(None, Violation(file, "", "this file", NO_FILE), "repaired", repair)]
     there, train, val = set(dataset.numbers), _numbers(info.get("train_eps")), _numbers(info.get("val_eps"))
     listed = Counter([*train, *val])
     wrong = [
@@ -245,7 +245,7 @@ def read_info(dataset: Dataset) -> tuple[dict[str, Any], list[Finding]]:
         *((n, "the episodes on disk", "an episode that is not listed", "added") for n in sorted(there - set(listed))),
     ]
     findings = [
-        Finding(n, Violation(file, "train_eps, val_eps", expected, found), "mended", repair)
+        Finding(n, Violation(file, "train_eps, val_eps", expected, found), "repaired", repair)
         for n, expected, found, repair in wrong
     ]
     sides = {"train_eps": [n for n in train if n in there], "val_eps": [n for n in val if n in there - set(train)]}

@@ -33,7 +33,7 @@ class EpisodeArrays:
 
     Attributes:
         unreadable: key -> why it could not be read; "": the file as a whole.
-        derived: key -> what it was made of, see `completed`.
+        derived: key -> what it was made of, see `derive_missing_arrays`.
         ignored: keys that were not asked for.
     """
 
@@ -134,7 +134,7 @@ def is_declared(key: str, array: NDArray) -> bool:
     return SPECS[key].has_dtype(array) and array.ndim == len(SPECS[key].shape)
 
 
-def completed(loaded: EpisodeArrays, said: Mapping[str, Any], rate_hz: float) -> EpisodeArrays:
+def derive_missing_arrays(loaded: EpisodeArrays, said: Mapping[str, Any], rate_hz: float) -> EpisodeArrays:
     """Return the arrays with what is missing made of others and of ``said``, the entries of ``data_info.json``."""
     arrays, derived = dict(loaded.arrays), dict(loaded.derived)
 
@@ -224,7 +224,7 @@ def episode_arrays(motion: Motion, instruction: str, subgoals: Sequence[SubGoal]
     return {spec.name: spec.cast(values[spec.name]) for spec in schema.EPISODE_INFO if spec.name in values}
 
 
-def with_embeddings(arrays: Mapping[str, NDArray], embed: Callable[[list[str]], NDArray]) -> dict[str, NDArray]:
+def add_embeddings(arrays: Mapping[str, NDArray], embed: Callable[[list[str]], NDArray]) -> dict[str, NDArray]:
     """Return the arrays and the embeddings of their texts, by ``embed``: texts -> (N, 384)."""
     made = {
         **arrays,

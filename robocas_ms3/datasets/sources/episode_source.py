@@ -24,9 +24,9 @@ from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.demos.recordings.subgoals import SubGoal, subgoal_runs
 from robocas_ms3.robots.cameras import Parent, standard_parent
 
-Side = Literal["train", "val", "all"]
+Split = Literal["train", "val", "all"]
 """Of the split into training and validation."""
-Kind = Literal["rgb", "depth"]
+ImageKind = Literal["rgb", "depth"]
 """Of image."""
 
 
@@ -40,7 +40,7 @@ class CameraModel:
 
 
 @dataclass(frozen=True)
-class Frame:
+class StepImages:
     """The images of one step: camera -> (H, W, 3) uint8, (H, W) uint16 in mm, box of the target's visible pixels."""
 
     rgb: dict[str, NDArray[np.uint8]]
@@ -112,7 +112,7 @@ class SourceEpisode(ABC):
         raise _no_images(self)
 
     def frames(
-        self, camera: str, kind: Kind = "rgb", first: int = 0, count: int | None = None
+        self, camera: str, kind: ImageKind = "rgb", first: int = 0, count: int | None = None
     ) -> Generator[NDArray, None, None]:
         """Yield the images of ``count`` steps; close the generator unless it is read to the end.
 
@@ -122,17 +122,17 @@ class SourceEpisode(ABC):
         for step in range(first, self.steps if count is None else first + count):
             yield image(camera, step)
 
-    def images(self, image_options: ImageOptions) -> Generator[Frame, None, None]:
+    def images(self, image_options: ImageOptions) -> Generator[StepImages, None, None]:
         """Yield the images of every step; close the generator unless it is read to the end."""
         boxes = self.target_boxes if image_options.boxes else []
-        with closing(shots(self, image_options.cameras, "rgb")) as rgb, ExitStack() as stack:
+        with closing(iter_images(self, image_options.cameras, "rgb")) as rgb, ExitStack() as stack:
             depth = (
-                stack.enter_context(closing(shots(self, image_options.cameras, "depth")))
+                stack.enter_context(closing(iter_images(self, image_options.cameras, "depth")))
                 if image_options.depth
                 else None
             )
             for step, images in enumerate(rgb):
-                yield Frame(images, next(depth) if depth else {}, boxes[step] if boxes else {})
+                yield StepImages(images, next(depth) if depth else {}, boxes[step] if boxes else {})
 
     def intrinsic(self, camera: str) -> NDArray[np.float64]:
         """(4,) fx, fy, cx, cy in pixels."""
@@ -155,8 +155,8 @@ def _no_images(episode: SourceEpisode) -> DatasetError:
     return DatasetError("this episode has no images", where=episode.where, fix=fix)
 
 
-def shots(
-    episode: SourceEpisode, cameras: Sequence[str], kind: Kind = "rgb"
+def iter_images(
+    episode: SourceEpisode, cameras: Sequence[str], kind: ImageKind = "rgb"
 ) -> Generator[dict[str, NDArray], None, None]:
     """Yield the images of every step, by camera; close the generator unless it is read to the end."""
     steps = episode.steps
@@ -190,7 +190,7 @@ class EpisodeSource(ABC):
         """Number -> T."""
         return {number: self.episode(number).steps for number in self.numbers}
 
-    def split(self, side: Side) -> list[int]:
+    def split(self, side: Split) -> list[int]:
         """Return the numbers of the episodes of one side; here by seed, or by number where there is none."""
         if side == "all":
             return self.numbers

@@ -32,7 +32,7 @@ def _seed(value: Any) -> Any:
     return value
 
 
-Rate = Annotated[FiniteFloat, Field(gt=0)]
+RateHz = Annotated[FiniteFloat, Field(gt=0)]
 CameraName = Annotated[str, StringConstraints(pattern=f"^{CAMERA_NAME}$")]
 EpisodeNumber = Annotated[str, StringConstraints(pattern=r"^[0-9]{1,7}$")]
 """A key of JSON."""
@@ -128,7 +128,7 @@ class EpisodesRecord(_Part):
 class SettingsRecord(_Part):
     """The settings of ``conversion.json``, which all episodes of a dataset share."""
 
-    rate_hz: Rate
+    rate_hz: RateHz
     cameras: Annotated[list[CameraName], Field(min_length=1)]
     image_size: Annotated[list[int], Field(min_length=2, max_length=2)] | None
     image_format: schema.ImageFormat
@@ -186,8 +186,8 @@ class SceneRecord(_Part):
     target: Target | None = Field(description="{slot, asset_id, name}")
     success: bool | None = Field(description="whether the recording ended in success")
     control_mode: str | None = Field(description="of the recorded actions")
-    control_freq: Rate | None = Field(description="of the recorded actions, Hz")
-    rate_hz: Rate = Field(description="of this dataset")
+    control_freq: RateHz | None = Field(description="of the recorded actions, Hz")
+    rate_hz: RateHz = Field(description="of this dataset")
     source: _Source = Field(
         description="{trajectory, episode_id, recording: SHA-256 of seed, control mode, instruction and actions}"
     )
@@ -201,7 +201,7 @@ SCENE_KEYS = tuple(SceneRecord.model_fields)
 _UNKNOWN = {**dict.fromkeys(SCENE_KEYS), "schema_version": schema.SCHEMA_VERSION, "rate_hz": 1.0, "source": {}}
 
 
-def with_unknown(scene: Mapping[str, Any]) -> dict[str, Any]:
+def fill_unknown_keys(scene: Mapping[str, Any]) -> dict[str, Any]:
     """Return the content of ``scene.json`` with the keys that an older or foreign file lacks."""
     return {**_UNKNOWN, **scene}
 
@@ -209,7 +209,7 @@ def with_unknown(scene: Mapping[str, Any]) -> dict[str, Any]:
 def read_scene(scene: Mapping[str, Any], where: object) -> SceneRecord:
     """Return the content of ``scene.json`` as a record, or raise DatasetError; keys may be missing."""
     try:
-        return SceneRecord.model_validate(with_unknown(scene))
+        return SceneRecord.model_validate(fill_unknown_keys(scene))
     except ValidationError as problem:
         about = "this description of a scene is damaged"
         raise error_from_validation(

@@ -19,7 +19,7 @@ CAMERA_LIMIT = 2**22
 SEE_VALIDATE = "robocas validate lists all that is wrong."
 
 
-def no_dataset(root: Path, expected: str) -> DatasetError:
+def no_dataset_error(root: Path, expected: str) -> DatasetError:
     """Return an error for a folder that is no dataset, with what may have been meant."""
     if (root / "meta" / "info.json").is_file():
         return DatasetError("a LeRobot dataset; this takes RoboCAS folders", where=root)
@@ -33,7 +33,7 @@ def no_dataset(root: Path, expected: str) -> DatasetError:
     return DatasetError("no dataset here", where=root, expected=expected, fix=fix)
 
 
-def said_of(info: Mapping[str, Any], number: int | None) -> dict[str, Any]:
+def episode_info(info: Mapping[str, Any], number: int | None) -> dict[str, Any]:
     """Return the entries of an episode in ``data_info.json``, by their keys."""
     tables = {key: info.get(key) for key in ("ep_length", "language_goal", "step_goals")}
     return {k: table[str(number)] for k, table in tables.items() if isinstance(table, dict) and str(number) in table}

@@ -25,10 +25,10 @@ def fingerprint(recording: Recording) -> str:
 
 def recording_entry(file: TrajectoryFile, index: int) -> dict[str, Any]:
     """Which recording an episode is of, as ``conversion.json`` has it."""
-    return {**unread_entry(file, index), "recording": fingerprint(file.recording(index, bodies=False))}
+    return {**entry_without_fingerprint(file, index), "recording": fingerprint(file.recording(index, bodies=False))}
 
 
-def unread_entry(file: TrajectoryFile, index: int) -> dict[str, Any]:
+def entry_without_fingerprint(file: TrajectoryFile, index: int) -> dict[str, Any]:
     """The same of one that can't be read, which has no fingerprint."""
     episode = file.episodes[index]
     said = episode.get("robocas")
@@ -36,7 +36,7 @@ def unread_entry(file: TrajectoryFile, index: int) -> dict[str, Any]:
         "trajectory": file.path.name,
         "trajectory_episode": episode["episode_id"],
         "seed": episode.get("episode_seed"),
-        "success": succeeded(episode),
+        "success": is_success(episode),
         "target": said.get("target") if isinstance(said, dict) else None,
         "recording": None,
     }
@@ -53,7 +53,7 @@ def recorded_scene(file: TrajectoryFile, index: int) -> dict[str, Any]:
         "seed": entry.seed,
         "reset_options": entry.reset_options,
         "target": said.get("target"),
-        "success": succeeded(file.episodes[index]),
+        "success": is_success(file.episodes[index]),
         "control_mode": entry.control_mode,
         "control_freq": file.control_freq,
         "source": {"trajectory": file.path.name, "episode_id": entry.episode_id},
@@ -71,7 +71,7 @@ def scene_record(
     return {key: record.get(key) for key in SCENE_KEYS}
 
 
-def succeeded(episode: dict[str, Any]) -> bool:
+def is_success(episode: dict[str, Any]) -> bool:
     found = episode.get("success", False)
     return found is True or (isinstance(found, list) and bool(found) and all(one is True for one in found))
 
@@ -82,7 +82,7 @@ def task_of(env_id: str | None) -> str | None:
     return "_".join(re.findall("[A-Z][a-z]*", match[1])).lower() if match else None
 
 
-def environment_of(env_info: Mapping[str, Any] | None) -> str:
+def environment_id(env_info: Mapping[str, Any] | None) -> str:
     """What tells an environment from others of another task, configuration or pack; empty where it is not known."""
     if not env_info or not env_info.get("env_id"):
         return ""

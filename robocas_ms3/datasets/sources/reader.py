@@ -1,7 +1,7 @@
 """Opens a RoboCAS folder: its overviews, and its episodes by number.
 
 Episodes in the format of RoboCAS-v0 open too: other types are cast to the schema's, what is missing is made of what is
-there (`arrays.completed`), and either name of a camera's pose will do.
+there (`arrays.derive_missing_arrays`), and either name of a camera's pose will do.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from pydantic import BeforeValidator, TypeAdapter, ValidationError
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.images.image_files import read_image
-from robocas_ms3.datasets.sources.arrays import completed, is_declared, load_arrays, read_arrays
-from robocas_ms3.datasets.sources.episode_source import EpisodeSource, Side, SourceEpisode
-from robocas_ms3.datasets.sources.file_models import CameraName, Rate
-from robocas_ms3.datasets.sources.files import SEE_VALIDATE, no_dataset, read_array, read_json, said_of
+from robocas_ms3.datasets.sources.arrays import derive_missing_arrays, is_declared, load_arrays, read_arrays
+from robocas_ms3.datasets.sources.episode_source import EpisodeSource, SourceEpisode, Split
+from robocas_ms3.datasets.sources.file_models import CameraName, RateHz
+from robocas_ms3.datasets.sources.files import SEE_VALIDATE, episode_info, no_dataset_error, read_array, read_json
 from robocas_ms3.demos.recordings.subgoals import SubGoal, read_subgoals
 from robocas_ms3.robots.cameras import Parent
 
 DEFAULT_RATE = 5.0  # upstream's, Hz
-_SPLIT = "robocas split --in-place --val-share 0.1 makes a new one."
+_SPLIT = "robocas split --in-place --val-fraction 0.1 makes a new one."
 
 
 def _number(value: Any) -> int:
@@ -40,7 +40,7 @@ def _number(value: Any) -> int:
 EpisodeIndex = Annotated[int, BeforeValidator(_number)]
 
 
-_RATE, _CAMERAS = TypeAdapter(Rate), TypeAdapter(list[CameraName])
+_RATE, _CAMERAS = TypeAdapter(RateHz), TypeAdapter(list[CameraName])
 _NUMBERS, _LENGTHS = TypeAdapter(list[EpisodeIndex]), TypeAdapter(dict[int, int])
 
 
@@ -56,7 +56,7 @@ class Episode(SourceEpisode):
         path = self.folder / schema.EPISODE_FILE
         loaded = load_arrays(path)
         if any(spec.name not in loaded.arrays for spec in schema.EPISODE_INFO if not spec.embedding):
-            loaded = completed(loaded, self._said(), self.dataset.rate_hz)
+            loaded = derive_missing_arrays(loaded, self._said(), self.dataset.rate_hz)
         for key in set(loaded.unreadable) - set(loaded.derived):
             where, found = f"{path}, {key}", loaded.reason(key)
             raise DatasetError("this array can't be read", where=where, found=found, fix=SEE_VALIDATE)
@@ -74,7 +74,7 @@ class Episode(SourceEpisode):
         return read_subgoals(self._said().get("step_goals", []), where)
 
     def _said(self) -> dict[str, Any]:
-        return said_of(self.dataset.info, schema.episode_number(self.folder.name))
+        return episode_info(self.dataset.info, schema.episode_number(self.folder.name))
 
     @property
     def where(self) -> Path:
@@ -140,7 +140,7 @@ class Dataset(EpisodeSource):
     def __init__(self, root: Path) -> None:
         self.root = root
         if next(self._found(), None) is None:
-            raise no_dataset(self.root, "folders episode_0000000, ...")
+            raise no_dataset_error(self.root, "folders episode_0000000, ...")
 
     def _found(self) -> Iterator[int]:
         if not self.root.is_dir():
@@ -178,7 +178,7 @@ class Dataset(EpisodeSource):
             raise DatasetError("this value is damaged", where=where, expected=expected, found=found, fix=fix) from error
 
     @cached_property
-    def sides(self) -> tuple[list[int], list[int]]:
+    def splits(self) -> tuple[list[int], list[int]]:
         """Training and validation episodes, as ``data_info.json`` lists them; numbers written as texts count too."""
         train, val = (self._value(schema.DATA_INFO_FILE, key, _NUMBERS, [], _SPLIT) for key in ("train_eps", "val_eps"))
         return train, val
@@ -206,15 +206,15 @@ class Dataset(EpisodeSource):
             if self.settings:
                 fix = "Run the same robocas convert again."
                 raise DatasetError("this dataset is not finished", where=self.root, fix=fix)
-            raise no_dataset(self.root, f"a folder with {schema.DATA_INFO_FILE}, or a trajectory.h5")
+            raise no_dataset_error(self.root, f"a folder with {schema.DATA_INFO_FILE}, or a trajectory.h5")
         missing = [key for key in ("ep_length", "train_eps", "val_eps") if key not in self.info]
         if missing:
             where, expected = self.root / schema.DATA_INFO_FILE, ", ".join(missing)
             raise DatasetError("this overview lacks keys", where=where, expected=expected, fix=SEE_VALIDATE)
         return self._value(schema.DATA_INFO_FILE, "ep_length", _LENGTHS, {})
 
-    def split(self, side: Side) -> list[int]:
-        numbers = sorted(self.lengths) if side == "all" else self.sides[side == "val"]
+    def split(self, side: Split) -> list[int]:
+        numbers = sorted(self.lengths) if side == "all" else self.splits[side == "val"]
         unknown = [number for number in numbers if number not in self.lengths]
         if unknown:
             raise DatasetError("episodes of unknown length", where=self.root / schema.DATA_INFO_FILE, found=unknown[:5])

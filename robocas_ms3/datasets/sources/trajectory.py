@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from robocas_ms3.assets.pack import load_pack, pack_folders
 from robocas_ms3.core.errors import AssetError, DatasetError, RobocasError
 from robocas_ms3.datasets.sources.arrays import episode_arrays
-from robocas_ms3.datasets.sources.episode_source import EpisodeSource, Side, SourceEpisode
-from robocas_ms3.datasets.sources.provenance import recorded_scene, recording_entry, succeeded
+from robocas_ms3.datasets.sources.episode_source import EpisodeSource, SourceEpisode, Split
+from robocas_ms3.datasets.sources.provenance import is_success, recorded_scene, recording_entry
 from robocas_ms3.datasets.sources.reader import DEFAULT_RATE
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.demos.recordings.motion import sample_states, sample_stride
@@ -47,7 +47,7 @@ class TrajectorySource(EpisodeSource):
         self.root, self.rate_hz = path, float(DEFAULT_RATE if rate_hz is None else rate_hz)
         with TrajectoryFile(path, pack=pack) as file:
             self.stride = sample_stride(file.control_freq, self.rate_hz)
-            self.index = [n for n, e in enumerate(file.episodes) if include_failed or succeeded(e)]
+            self.index = [n for n, e in enumerate(file.episodes) if include_failed or is_success(e)]
             self._entries = [_read_entry(file, index) for index in self.index]
         self.numbers, self.file = list(range(len(self.index))), file
 
@@ -68,7 +68,7 @@ class TrajectorySource(EpisodeSource):
     def lengths(self) -> dict[int, int]:
         return {number: self.steps(number) for number in self.numbers}
 
-    def split(self, side: Side) -> list[int]:
+    def split(self, side: Split) -> list[int]:
         if side == "all":
             return self.numbers
         return split_by_seed({number: self.info(number).seed for number in self.numbers})[side == "val"]

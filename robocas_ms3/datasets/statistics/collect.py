@@ -1,4 +1,4 @@
-"""What is in a dataset: lengths, objects, layouts, instructions, actions, sub-goals, counted in one pass."""
+"""What is in a dataset: lengths, objects, layouts, instructions, actions, sub-goals, sort_counts in one pass."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.text import format_count, format_error
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.actions import ACTION_ARRAYS, ACTION_NAMES, checked_actions
+from robocas_ms3.datasets.actions import ACTION_ARRAYS, ACTION_NAMES, require_actions
 from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.datasets.sources.episode_source import SourceEpisode
 from robocas_ms3.datasets.sources.file_models import Layout, Recorded, SceneRecord, read_scene
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 from robocas_ms3.datasets.sources.provenance import task_of
-from robocas_ms3.datasets.statistics.layouts import LayoutMap, Placement, layout_map, rounded, surface_of
+from robocas_ms3.datasets.statistics.layouts import LayoutMap, Placement, layout_map, round_values, surface_of
 
 NOOP = (1e-3, np.deg2rad(0.5))  # m and rad per step below which the gripper counts as standing still
 BINS = 41  # of histograms; odd, so that standing still has a bin of its own
@@ -112,28 +112,31 @@ class Stats:
             "steps": self.steps,
             "split": self.split,
             "success": dict(self.success),
-            "configs": counted(self.configs),
-            "lengths": {task: described(lengths) for task, lengths in sorted(self.lengths.items())},
+            "configs": sort_counts(self.configs),
+            "lengths": {task: summarize_values(lengths) for task, lengths in sorted(self.lengths.items())},
             "objects": {
                 asset: {
                     "name": self.names.get(asset, asset),
                     "episodes": self.objects[asset],
                     "target": self.targets[asset],
                 }
-                for asset in counted(self.objects | self.targets)
+                for asset in sort_counts(self.objects | self.targets)
             },
             "layouts": {name: layout.as_json() for name, layout in sorted(self.layouts.items())},
-            "instructions": counted(self.instructions),
-            "templates": counted(self.templates),
-            "relations": counted(self.relations),
+            "instructions": sort_counts(self.instructions),
+            "templates": sort_counts(self.templates),
+            "relations": sort_counts(self.relations),
             "actions": {
-                name: {**described(column), **histogram(column)}
+                name: {**summarize_values(column), **histogram(column)}
                 for name, column in zip(ACTION_NAMES, self.actions.T, strict=True)
             },
-            "still": rounded(float(noop.mean())) if len(noop) else None,
-            "gripper_changes": described(self.gripper_changes),
+            "still": round_values(float(noop.mean())) if len(noop) else None,
+            "gripper_changes": summarize_values(self.gripper_changes),
             "subgoals": {
-                kind: {**described(np.array(steps) / self.rate_hz), "share": rounded(sum(steps) / self.steps)}
+                kind: {
+                    **summarize_values(np.array(steps) / self.rate_hz),
+                    "share": round_values(sum(steps) / self.steps),
+                }
                 for kind, steps in sorted(self.subgoals.items())
             },
         }
@@ -159,7 +162,7 @@ def collect(
         config, placement = stats.add(episode, source.lengths[number])
         for goal in episode.goals:
             stats.subgoals[goal.goal_type].append(goal.last - goal.first + 1)
-        actions.append(checked_actions(episode.read(ACTION_ARRAYS), f"{source.root}, episode {number}")[:-1])
+        actions.append(require_actions(episode.read(ACTION_ARRAYS), f"{source.root}, episode {number}")[:-1])
         stats.gripper_changes.append(int(np.count_nonzero(np.diff(actions[-1][:, 6]))))
         if len(placement.positions):
             places[config].append(placement)
@@ -179,18 +182,18 @@ def _config_name(scene: SceneRecord) -> str:
     return f"{name} (own configuration)" if config else name
 
 
-def counted(counter: Mapping[str, int]) -> dict[str, int]:
+def sort_counts(counter: Mapping[str, int]) -> dict[str, int]:
     """Return counts, the most frequent first, then by name."""
     return dict(sorted(counter.items(), key=lambda item: (-item[1], item[0])))
 
 
-def described(values: Iterable[float] | NDArray) -> dict[str, Any]:
+def summarize_values(values: Iterable[float] | NDArray) -> dict[str, Any]:
     array = np.asarray(list(values) if not isinstance(values, np.ndarray) else values, dtype=np.float64)
     if not len(array):
         return {"count": 0}
     low, p1, p10, median, p90, p99, high = np.percentile(array, [0, 1, 10, 50, 90, 99, 100])
     found = dict(mean=array.mean(), std=array.std(), min=low, p1=p1, p10=p10, median=median, p90=p90, p99=p99, max=high)
-    return {"count": len(array), **{key: rounded(float(value)) for key, value in found.items()}}
+    return {"count": len(array), **{key: round_values(float(value)) for key, value in found.items()}}
 
 
 def histogram(values: NDArray) -> dict[str, Any]:
@@ -199,4 +202,4 @@ def histogram(values: NDArray) -> dict[str, Any]:
         return {"edges": [], "counts": []}
     reach = float(np.abs(values).max()) or 1.0
     edges = np.array([-0.5, 0.5, 1.5]) if set(np.unique(values)) <= {0, 1} else np.linspace(-reach, reach, BINS + 1)
-    return {"edges": rounded(edges), "counts": np.histogram(values, edges)[0].tolist()}
+    return {"edges": round_values(edges), "counts": np.histogram(values, edges)[0].tolist()}

@@ -75,11 +75,11 @@ class LayoutMap:
             "episodes": self.episodes,
             "objects": int(self.counts.sum()) + self.outside,
             "outside": self.outside,
-            "coverage": rounded(self.coverage),
-            "x_edges": rounded(self.x_edges),
-            "y_edges": rounded(self.y_edges),
+            "coverage": round_values(self.coverage),
+            "x_edges": round_values(self.x_edges),
+            "y_edges": round_values(self.y_edges),
             "counts": self.counts.tolist(),
-            "targets": rounded(self.targets),
+            "targets": round_values(self.targets),
         }
 
 
@@ -121,5 +121,5 @@ def surface_of(config: dict[str, Any]) -> Surface | None:
     return Surface(f"{surface['furniture']}, {surface['name']}", x, y, yaw, region)
 
 
-def rounded(value: Any) -> Any:
+def round_values(value: Any) -> Any:
     return None if value is None else np.round(value, 6).tolist()

@@ -12,7 +12,7 @@ from robocas_ms3.core.errors import require_extra
 from robocas_ms3.core.files import atomic_file, make_folder, write_json
 from robocas_ms3.core.text import escape_controls, format_count, format_object_name
 from robocas_ms3.datasets.actions import ACTION_NAMES
-from robocas_ms3.datasets.statistics.collect import Stats, counted, histogram
+from robocas_ms3.datasets.statistics.collect import Stats, histogram, sort_counts
 from robocas_ms3.datasets.statistics.layouts import LayoutMap
 
 DPI = 110
@@ -27,7 +27,7 @@ def write_stats(stats: Stats, out: Path) -> list[Path]:
     make_folder(out)
     paths = [out / "stats.json"]
     write_json(paths[0], stats.as_json())
-    for name, draw in IMAGES.items():
+    for name, draw in PLOTS.items():
         figure = draw(stats)
         if figure is None:
             (out / f"{name}.png").unlink(missing_ok=True)  # of an earlier run
@@ -92,7 +92,7 @@ def draw_lengths(stats: Stats) -> Any:
 def draw_objects(stats: Stats) -> Any:
     if not stats.objects and not stats.targets:
         return None
-    everything = counted(stats.objects | stats.targets)
+    everything = sort_counts(stats.objects | stats.targets)
     ids = list(everything)[:MAX_ROWS]
     figure = _figure(7, 1.2 + 0.2 * len(ids))
     axes = _axes(figure, 1, 1, 1)[0]
@@ -160,7 +160,7 @@ def draw_instructions(stats: Stats) -> Any:
         f"Templates, {len(stats.templates)} different": stats.templates,
         "Relations": stats.relations,
     }
-    tables = {title: list(counted(table).items())[: MAX_ROWS // 2] for title, table in tables.items() if table}
+    tables = {title: list(sort_counts(table).items())[: MAX_ROWS // 2] for title, table in tables.items() if table}
     heights = [0.8 + 0.2 * len(rows) for rows in tables.values()]
     figure = _figure(10, sum(heights))
     panels = np.atleast_1d(figure.subplots(len(tables), 1, height_ratios=heights))
@@ -229,7 +229,7 @@ def draw_subgoals(stats: Stats) -> Any:
     return figure
 
 
-IMAGES: dict[str, Callable[[Stats], Any]] = {
+PLOTS: dict[str, Callable[[Stats], Any]] = {
     "lengths": draw_lengths,
     "objects": draw_objects,
     "layouts": draw_layouts,

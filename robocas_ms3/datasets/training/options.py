@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.sources.episode_source import Side
+from robocas_ms3.datasets.sources.episode_source import Split
 
 Steps = NDArray[np.int64]
 Padding = Literal["hold", "zero", "drop"]
-UPSTREAM_CAMERAS = ("base_camera", "gripper_camera")
-UPSTREAM_SIZE = (320, 256)
+V0_CAMERAS = ("base_camera", "gripper_camera")
+V0_SIZE = (320, 256)
 """Width and height in pixels."""
 STATE_KEYS = tuple(
     spec.name for spec in schema.EPISODE_INFO if spec.shape[:1] == ("T",) and spec.dtype != "str" and not spec.embedding
@@ -53,12 +53,12 @@ class SampleOptions:
         cached_episodes: number of episodes whose arrays are kept, in each worker.
     """
 
-    split: Side = "train"
+    split: Split = "train"
     observation_horizon: int = 6
     action_horizon: int = 1
     padding: Padding = "hold"
-    cameras: Sequence[str] = UPSTREAM_CAMERAS
-    size: tuple[int, int] | None = UPSTREAM_SIZE
+    cameras: Sequence[str] = V0_CAMERAS
+    size: tuple[int, int] | None = V0_SIZE
     depth: bool = False
     float_images: bool = False
     state: Sequence[str] = ()
@@ -71,7 +71,7 @@ class SampleOptions:
     cached_episodes: int = 64
 
     def __post_init__(self) -> None:
-        choices = [("split", self.split, get_args(Side)), ("padding", self.padding, get_args(Padding))]
+        choices = [("split", self.split, get_args(Split)), ("padding", self.padding, get_args(Padding))]
         for where, found, known in (*choices, *(("state", key, STATE_KEYS) for key in self.state)):
             if found not in known:
                 raise DatasetError("no such choice", where=where, expected=f"one of {', '.join(known)}", found=found)
@@ -82,17 +82,17 @@ class SampleOptions:
         if self.size is not None and (len(self.size) != 2 or min(self.size) < 1):
             raise DatasetError("no such size", where="size", expected="width and height >= 1", found=self.size)
 
-    def samples(self, length: int) -> range:
+    def sample_steps(self, length: int) -> range:
         """Return the steps of an episode of T steps that have a sample."""
         if self.padding == "drop":
             first = self.observation_horizon - 1
             return range(first, max(first, length - self.action_horizon))
         return range(max(0, length - 1))
 
-    def observed(self, step: int) -> Steps:
+    def observation_steps(self, step: int) -> Steps:
         """Return the steps (H,) that a sample observes; below 0 before the episode."""
         return np.arange(step - self.observation_horizon + 1, step + 1)
 
-    def acted(self, step: int) -> Steps:
+    def action_steps(self, step: int) -> Steps:
         """Return the steps (H + A - 1,) of its actions; below 0 or beyond T - 2 outside of the episode."""
         return np.arange(step - self.observation_horizon + 1, step + self.action_horizon)

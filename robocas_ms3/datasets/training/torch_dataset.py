@@ -19,9 +19,9 @@ from torch.utils.data import get_worker_info
 
 from robocas_ms3.core.errors import DatasetError, EmptySplitError
 from robocas_ms3.core.text import format_count
-from robocas_ms3.datasets.actions import ACTION_ARRAYS, ActionScale, check_finite, checked_actions
+from robocas_ms3.datasets.actions import ACTION_ARRAYS, ActionScale, check_finite, require_actions
 from robocas_ms3.datasets.formats import open_source
-from robocas_ms3.datasets.sources.episode_source import EpisodeSource, Kind, SourceEpisode
+from robocas_ms3.datasets.sources.episode_source import EpisodeSource, ImageKind, SourceEpisode
 from robocas_ms3.datasets.training.options import SampleOptions
 from robocas_ms3.scenes.language.templates import GOAL_TYPES
 
@@ -77,27 +77,27 @@ class RoboCASDataset(torch.utils.data.Dataset):
         self.transform = transform
         self.source = open_source(path, rate_hz=options.rate_hz, include_failed=options.include_failed)
         self.rate_hz = self.source.rate_hz
-        check_holds(self.source, options)
+        check_options(self.source, options)
         self.episodes: list[int] = self.source.split(options.split)
         if not self.episodes:
             expected, found = f"some in {options.split}", f"{len(self.source.lengths)} in all"
             what, fix = "this split holds no episodes", 'Add seeds, or pass split="all".'
             raise EmptySplitError(what, where=path, expected=expected, found=found, fix=fix)
-        self._steps = {number: options.samples(self.source.lengths[number]) for number in self.episodes}
+        self._steps = {number: options.sample_steps(self.source.lengths[number]) for number in self.episodes}
         self._offsets = np.cumsum([0, *map(len, self._steps.values())])
         if not len(self):
             longest = max(self.source.lengths[number] for number in self.episodes)
             needed = options.observation_horizon + options.action_horizon if options.padding == "drop" else 2
             what, expected = "no episode is long enough", format_count(needed, "step")
             raise DatasetError(what, where=path, expected=expected, found=longest, fix="Pad them.")
-        self.stages = np.concatenate([self._stages_of(number, within) for number, within in self._steps.items()])
+        self.subgoal_types = np.concatenate([self._types_of(number, within) for number, within in self._steps.items()])
         self.scale: ActionScale | None = None
         if options.normalize:
             space = self.source.action_space() if options.action_space is None else options.action_space
-            self.scale = ActionScale.of(space, path)
+            self.scale = ActionScale.from_action_space(space, path)
         self._cache: OrderedDict[int, dict[str, Any]] = OrderedDict()
 
-    def _stages_of(self, number: int, steps: range) -> NDArray[np.int8]:
+    def _types_of(self, number: int, steps: range) -> NDArray[np.int8]:
         stages = np.full(self.source.lengths[number], -1, dtype=np.int8)
         for goal in self.source.episode(number).goals:
             stages[goal.first : goal.last + 1] = _TYPE_INDEX.get(goal.goal_type, -1)
@@ -132,15 +132,15 @@ class RoboCASDataset(torch.utils.data.Dataset):
 
     def weights(self) -> torch.Tensor:
         """Return weights (N,) for ``WeightedRandomSampler``, with which each sub-goal type is drawn equally often."""
-        if (self.stages < 0).all():
+        if (self.subgoal_types < 0).all():
             raise DatasetError("no sub-goals are known here", where=self.source.root, expected="step_goals")
-        _, stages, counts = np.unique(self.stages, return_inverse=True, return_counts=True)
+        _, stages, counts = np.unique(self.subgoal_types, return_inverse=True, return_counts=True)
         return torch.from_numpy(1.0 / (len(counts) * counts[stages]))
 
     def __getitem__(self, index: int) -> Any:
         number, step = self.locate(int(index))
         arrays, options = self._arrays(number), self.options
-        observed, acted = options.observed(step), options.acted(step)
+        observed, acted = options.observation_steps(step), options.action_steps(step)
         last = len(arrays["action"]) - 2  # that an action leaves
         sample: dict[str, Any] = {"episode": number, "step": step}
         sample["observation_mask"] = torch.from_numpy(observed >= 0)
@@ -186,7 +186,7 @@ class RoboCASDataset(torch.utils.data.Dataset):
         return {**self.__dict__, "_cache": OrderedDict()}
 
 
-def check_holds(source: EpisodeSource, options: SampleOptions) -> None:
+def check_options(source: EpisodeSource, options: SampleOptions) -> None:
     there, cameras = source.cameras, tuple(options.cameras)
     if set(cameras) - set(there) or len(set(cameras)) < len(cameras):
         fix = "" if there else "Pass cameras=(), or make images with robocas convert."
@@ -218,7 +218,7 @@ def read_episode(source: EpisodeSource, number: int, options: SampleOptions) -> 
             raise DatasetError(what, where=f"{where}, {key}", expected=length, found=len(array))
     check_finite(arrays, where)
     made: dict[str, Any] = {
-        "action": checked_actions(arrays, where),
+        "action": require_actions(arrays, where),
         "first_command": float(arrays["gripper_status"][0]),
         "instruction": str(arrays["language_goal"]),
     }
@@ -236,18 +236,20 @@ def read_episode(source: EpisodeSource, number: int, options: SampleOptions) -> 
 
 
 def read_images(
-    episode: SourceEpisode, options: SampleOptions, observed: NDArray[np.int64], kind: Kind
+    episode: SourceEpisode, options: SampleOptions, observed: NDArray[np.int64], kind: ImageKind
 ) -> torch.Tensor:
     """Read the images of steps (H,), below 0 before the episode: (H, C, 3, h, w), or (H, C, h, w) in m."""
     if get_worker_info() is not None and cv2.getNumThreads() > 1:
         cv2.setNumThreads(0)  # a pool of OpenCV does not survive a fork
     steps = np.maximum(observed, 0)
     first, count = int(steps[0]), int(steps[-1] - steps[0]) + 1
-    shots = {camera: _read_camera(episode, camera, kind, (first, count), options.size) for camera in options.cameras}
-    shapes = {image.shape for images in shots.values() for image in images}
+    by_camera = {
+        camera: _read_camera(episode, camera, kind, (first, count), options.size) for camera in options.cameras
+    }
+    shapes = {image.shape for images in by_camera.values() for image in images}
     if len(shapes) > 1:
         raise DatasetError("images differ in size", where=episode.where, found=sorted(shapes), fix="Pass a size.")
-    stack = np.stack([np.stack(images) for images in shots.values()], axis=1)[steps - first]
+    stack = np.stack([np.stack(images) for images in by_camera.values()], axis=1)[steps - first]
     if kind == "depth":
         stack = stack.astype(np.float32) / 1000
     else:
@@ -259,7 +261,7 @@ def read_images(
 
 
 def _read_camera(
-    episode: SourceEpisode, camera: str, kind: Kind, run: tuple[int, int], size: tuple[int, int] | None
+    episode: SourceEpisode, camera: str, kind: ImageKind, run: tuple[int, int], size: tuple[int, int] | None
 ) -> list[NDArray]:
     images = []
     with closing(episode.frames(camera, kind, *run)) as frames:

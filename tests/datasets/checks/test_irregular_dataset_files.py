@@ -19,7 +19,7 @@ from robocas_ms3.datasets.manage.copy_episodes import FilePlacer
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.demos.recordings.trajectory_hdf5 import open_trajectory
 from robocas_ms3.robots.cameras import STANDARD_NAMES
-from robocas_ms3.viewer.source import open_source
+from robocas_ms3.viewer.source import open_content
 
 EPISODE = "episode_0000001"
 IMAGES = ("base_camera/rgb/0002.png", "base_camera/depth/0003.png")
@@ -42,7 +42,7 @@ def test_a_dataset_is_validated(dataset, kind):
 @pytest.mark.parametrize("kind", KINDS)
 def test_readers_of_images(dataset, kind):
     paths = [replace_file(dataset / EPISODE / name, kind) for name in IMAGES]
-    source, content = Dataset(dataset).episode(1), open_source(dataset)
+    source, content = Dataset(dataset).episode(1), open_content(dataset)
     for read in (source.rgb, lambda *place: content.rgb(1, *place)):
         with pytest.raises(DatasetError) as error:
             read("base_camera", 2)

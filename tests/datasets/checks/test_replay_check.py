@@ -166,18 +166,18 @@ def test_the_command_tells_it_and_may_ask_for_a_share(dataset, capsys):
     out = capsys.readouterr().out
     assert "episode 1: its own actions do not succeed again" in out
     assert "pick: 1 of 2 replayed episodes succeed again (50%)" in out
-    assert run(["validate", str(dataset), "--replay", "--min-share", "0.9"]) == 1
-    assert run(["validate", str(dataset), "--replay", "--min-share", "0.5"]) == 0
+    assert run(["validate", str(dataset), "--replay", "--min-success", "0.9"]) == 1
+    assert run(["validate", str(dataset), "--replay", "--min-success", "0.5"]) == 0
     capsys.readouterr()
     assert run(["validate", str(dataset), "--replay", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["replay"]["by_task"]["pick"]["share"] == 0.5
 
 
-@pytest.mark.parametrize("words", ["--min-share 0.5", "--replay --min-share 50", "--replay --min-share nan"])
+@pytest.mark.parametrize("words", ["--min-success 0.5", "--replay --min-success 50", "--replay --min-success nan"])
 def test_an_invalid_share_is_refused(dataset, player, capsys, words):
     assert run(["validate", str(dataset), *words.split()]) == 2
-    assert capsys.readouterr().err.startswith("error: --min-share: ")
+    assert capsys.readouterr().err.startswith("error: --min-success: ")
 
 
 @pytest.mark.parametrize("json_too", [(), ("--json",)])
@@ -189,6 +189,6 @@ def test_a_share_that_nobody_could_see_is_not_enough(dataset, capsys, json_too):
     assert run(command) == 0
     said = "pick: none of 2 episodes could be replayed: no share is known"
     assert json_too or said in capsys.readouterr().out
-    assert run([*command, "--min-share", "0.9"]) == 1
+    assert run([*command, "--min-success", "0.9"]) == 1
     edit_scene(dataset, 0, env_info={"env_id": "Y-v1", "env_kwargs": {}}, task="select")
-    assert run([*command, "--min-share", "0.9"]) == 1
+    assert run([*command, "--min-success", "0.9"]) == 1

@@ -70,16 +70,16 @@ def test_a_broken_recording(many, tmp_path, how):
     said = json.loads((out / "conversion.json").read_text())
     assert list(said["left_out"]) == ["3"]
     assert said["left_out"]["3"]["why"] in str(error.value)
-    for side, sides in zip(("train", "val"), Dataset(whole).sides, strict=True):
+    for side, sides in zip(("train", "val"), Dataset(whole).splits, strict=True):
         assert Dataset(out).split(side) == [number for number in sides if number != 3]
-    run(write_trajectory(trajectory, seeds=SEEDS, steps=16), out)  # mended
+    run(write_trajectory(trajectory, seeds=SEEDS, steps=16), out)  # repaired
     assert files_of(out) == files_of(whole)
 
 
 def test_the_only_one_of_its_side(many, tmp_path):
     """It comes back to its side, whatever was resumed between."""
     trajectory, whole = many
-    (val,) = Dataset(whole).sides[1]
+    (val,) = Dataset(whole).splits[1]
 
     class OfVal(Breaking):
         seed = SEEDS[val]
@@ -88,7 +88,7 @@ def test_the_only_one_of_its_side(many, tmp_path):
         with pytest.raises(IncompleteDatasetError, match=f"episode_{val:07d}"):
             run(trajectory, tmp_path / "out", open_renderer=OfVal)
         assert validate(tmp_path / "out").violations == []
-        assert Dataset(tmp_path / "out").sides[1] == []
+        assert Dataset(tmp_path / "out").splits[1] == []
     run(trajectory, tmp_path / "out")
     assert files_of(tmp_path / "out") == files_of(whole)
 
@@ -140,8 +140,8 @@ def test_the_command(many, tmp_path, monkeypatch, capsys, to):
     assert run_command(command) == 1
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
     assert "1 episode could not be written (found episode_0000003: cube: no such object). " in line
-    assert "--leave-out" in line
-    assert run_command([*command, "--leave-out"]) == 0
+    assert "--skip-errors" in line
+    assert run_command([*command, "--skip-errors"]) == 0
     assert run_command(["validate", str(out)]) == 0
     assert "5 episodes" in capsys.readouterr().out
     monkeypatch.setattr(owner, name, render_by(RayCaster, whole))

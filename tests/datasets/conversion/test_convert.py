@@ -114,7 +114,7 @@ def test_resume_keeps_what_is_there(trajectory, tmp_path):
     shutil.rmtree(out / "episode_0000001")
     kept = (out / "episode_0000000" / "episode_info.npz").stat().st_mtime_ns
     done = run(trajectory, out)
-    assert (done.kept, [e.number for e in done.episodes]) == (1, [1])
+    assert (done.existing, [e.number for e in done.episodes]) == (1, [1])
     assert files_of(out) == before
     assert (out / "episode_0000000" / "episode_info.npz").stat().st_mtime_ns == kept
     with pytest.raises(OutputExistsError) as error:
@@ -221,7 +221,7 @@ def test_append_keeps_numbers_and_split(trajectory, tmp_path):
     assert json.loads((out / "episode_0000004" / "scene.json").read_text())["source"]["trajectory"] == "more.h5"
     assert validate(out).violations == []
     again = run(more, out, append=True)
-    assert (again.kept, again.episodes) == (8, [])
+    assert (again.existing, again.episodes) == (8, [])
     assert files_of(out) == after
 
 
@@ -238,7 +238,7 @@ def test_with_other_versions_it_does_not_go_on(trajectory, tmp_path):
         assert files_of(out) == before
     about["made_with"] = {"robocas_ms3": "0.1.0"}  # older ones said no more
     (out / "conversion.json").write_text(json.dumps(about))
-    assert run(trajectory, out).kept == 2
+    assert run(trajectory, out).existing == 2
     assert len(run(more, out, append=True).episodes) == 1
 
 

@@ -55,7 +55,7 @@ def test_its_episode_is_written_again(whole, trajectory, tmp_path, caplog):
     path = out / "episode_0000001" / FILES[2]
     harm(path, 0.97)
     done = run(trajectory, out)
-    assert (done.kept, [episode.number for episode in done.episodes]) == (1, [1])
+    assert (done.existing, [episode.number for episode in done.episodes]) == (1, [1])
     assert f"{path}: cut off, or gone" in caplog.text
     assert files_of(out) == files_of(whole)
 
@@ -97,6 +97,6 @@ def test_parts_of_a_lerobot_dataset(trajectory, tmp_path, monkeypatch, name):
         lerobot.convert_lerobot(ConversionSettings(trajectory, tmp_path / "out", open_renderer=RayCaster))
     harm(tmp_path / "out" / ".parts" / "episode_0000001" / name, 0.5)
     done = lerobot.convert_lerobot(ConversionSettings(trajectory, tmp_path / "out", open_renderer=RayCaster))
-    assert (done.kept, [episode.number for episode in done.episodes]) == (1, [1])
+    assert (done.existing, [episode.number for episode in done.episodes]) == (1, [1])
     lerobot.convert_lerobot(ConversionSettings(trajectory, tmp_path / "whole", open_renderer=RayCaster))
     assert files_of(tmp_path / "out") == files_of(tmp_path / "whole")

@@ -8,7 +8,7 @@ from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.conversion.data_info import add_failures
 from robocas_ms3.datasets.manage.merge import merge
-from robocas_ms3.datasets.sources.provenance import environment_of
+from robocas_ms3.datasets.sources.provenance import environment_id
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.demos.failures import Failure
 
@@ -64,7 +64,7 @@ def test_another_task_has_seeds_of_its_own(tmp_path):
     assert made_in[0] == made_in[1]
     assert len(set(made_in)) == 3
     scenes = [Dataset(out).episode(n).scene for n in Dataset(out).numbers]
-    assert [environment_of(scene["env_info"]) for scene in scenes] == [made_in[i] for i in (0, 0, 2, 2, 3)]
+    assert [environment_id(scene["env_info"]) for scene in scenes] == [made_in[i] for i in (0, 0, 2, 2, 3)]
 
 
 def test_lines_of_an_earlier_version_are_not_added_again(tmp_path):

@@ -12,7 +12,7 @@ from synthetic import RayCaster, write_trajectory
 
 from robocas_ms3.core.errors import DatasetError, MissingExtraError
 from robocas_ms3.datasets.conversion.settings import ConversionSettings, WrittenEpisode
-from robocas_ms3.datasets.conversion.workers import WriteJob, write_episodes
+from robocas_ms3.datasets.conversion.workers import PendingEpisodes, write_episodes
 
 
 @dataclass
@@ -42,7 +42,7 @@ def file(tmp_path_factory):
 def job(file, tmp_path):
     def make(writer, numbers, continued=False, **settings):
         settings = ConversionSettings(file, tmp_path / "out", open_renderer=RayCaster, **settings)
-        return WriteJob(settings, writer, [(number, number + 10) for number in numbers], continued, "Repair it.")
+        return PendingEpisodes(settings, writer, [(number, number + 10) for number in numbers], continued, "Repair it.")
 
     return make
 

@@ -73,8 +73,8 @@ def test_of_what_is_new(made_up_images, tmp_path):
 
 def test_of_many_episodes_on_request(made_up_images, tmp_path, monkeypatch, capsys):
     hint = "no videos of so many episodes: --all-videos"
-    monkeypatch.setattr(conversion, "FEW", 2)  # of 20 they take seconds
-    monkeypatch.setattr(video, "SHEET", 2)
+    monkeypatch.setattr(conversion, "MAX_PREVIEWS", 2)  # of 20 they take seconds
+    monkeypatch.setattr(video, "SHEET_EPISODES", 2)
     path = write_trajectory(tmp_path / "three.h5", seeds=(1, 2, 3))
     assert converted(path, tmp_path / "three") == 0
     assert shown(tmp_path / "three") == []

@@ -8,11 +8,11 @@ pytest.importorskip("av", reason="needs the extra 'lerobot'")
 pa = pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
 pq = pytest.importorskip("pyarrow.parquet", reason="needs the extra 'lerobot'")
 
-from robocas_ms3.datasets.checks.dataset import Report
+from robocas_ms3.datasets.checks.dataset import ValidationReport
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check import check_lerobot
 from robocas_ms3.datasets.lerobot.tables import as_column, numbers, write_texts
-from robocas_ms3.datasets.lerobot.video import CODINGS, Encoder
+from robocas_ms3.datasets.lerobot.video import VIDEO_CODECS, VideoEncoder
 
 
 def found(root, **options):
@@ -35,7 +35,7 @@ def change(root, key, edit, file=DATA):
 
 def test_a_valid_dataset(valid):
     seen = []
-    assert check_lerobot(valid, on_episode=lambda done, all: seen.append((done, all))) == Report(2, 14, [])
+    assert check_lerobot(valid, on_episode=lambda done, all: seen.append((done, all))) == ValidationReport(2, 14, [])
     assert seen == [(1, 2), (2, 2)]
 
 
@@ -115,11 +115,11 @@ def test_videos_that_are_wrong(spoiled, name):
     assert name in {file for file, _ in found(spoiled, decode=True)}
     path.unlink()
     assert (name, "") in found(spoiled)
-    coding, image = CODINGS["h264" if name == VIDEO else "depth"], np.zeros((48, 64), np.uint16)
+    coding, image = VIDEO_CODECS["h264" if name == VIDEO else "depth"], np.zeros((48, 64), np.uint16)
     if name == VIDEO:
         image = np.zeros((48, 64, 3), np.uint8)
     for fps, frames, key in ((5, 13, "frames"), (4, 14, "time of frame 1")):
-        with Encoder(path, coding, fps, (64, 48)) as encoder:
+        with VideoEncoder(path, coding, fps, (64, 48)) as encoder:
             for _ in range(frames):
                 encoder.add(image)
         assert (name, key) in found(spoiled)

@@ -22,7 +22,7 @@ from robocas_ms3.datasets.lerobot.check import check_lerobot
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.manage.import_robocas import import_robocas
-from robocas_ms3.datasets.manage.split import Share, resplit
+from robocas_ms3.datasets.manage.split import SplitOptions, resplit
 from robocas_ms3.datasets.manage.survey import survey
 from robocas_ms3.datasets.sources.arrays import arrays_fingerprint
 from robocas_ms3.datasets.sources.reader import Dataset
@@ -132,7 +132,7 @@ def test_an_output_that_exists_is_left_alone(trajectory, tmp_path):
         convert(trajectory, out)
     (out / "meta/robocas/conversion.json").write_bytes(before["meta/robocas/conversion.json"])
     done = convert(trajectory, out)
-    assert (done.episodes, done.kept) == ([], 2)
+    assert (done.episodes, done.existing) == ([], 2)
     assert files_of(out) == before
     convert(trajectory, out, overwrite=True, include_failed=True)
     assert LeRobotDataset(out).info["total_episodes"] == 3
@@ -151,10 +151,10 @@ def test_an_imported_folder_can_be_resumed(dataset, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         convert(imported, out, on_episode=stop)
     done = convert(imported, out)
-    assert (done.kept, [e.number for e in done.episodes]) == (1, [1])
+    assert (done.existing, [e.number for e in done.episodes]) == (1, [1])
     marks = [f"arrays {arrays_fingerprint(Dataset(imported).episode(number).arrays)}" for number in (0, 1)]
     assert [entry["recording"] for entry in LeRobotDataset(out).settings["episodes"]] == marks
-    assert convert(imported, out).kept == 2
+    assert convert(imported, out).existing == 2
     shutil.rmtree(imported / "episode_0000001")
     with pytest.raises(OutputExistsError):
         convert(imported, out)
@@ -210,8 +210,8 @@ def test_the_split_is_the_folders_own(tmp_path):
     root = make(tmp_path, "ds", range(6))
     edit(root / "episode_0000002" / "scene.json", lambda c: c.update(success=False))
     convert_lerobot(ConversionSettings(root, tmp_path / "before", include_failed=True))
-    resplit(root, Share(0.5))
-    train, val = Dataset(root).sides
+    resplit(root, SplitOptions(0.5))
+    train, val = Dataset(root).splits
     assert sides_of(tmp_path / "before") != (train, val)  # that of the rule alone
     convert_lerobot(ConversionSettings(root, tmp_path / "all", include_failed=True))
     assert sides_of(tmp_path / "all") == (train, val)

@@ -163,7 +163,7 @@ def test_rows_are_counted_before_they_are_read(spoiled, file, monkeypatch):
         DATA: lambda: read_rows(spoiled / file, 0, 14),
         EPISODES: lambda: dataset.rows,
         schema.TASKS_FILE: lambda: dataset.tasks,
-        schema.SCENES_FILE: lambda: dataset.described,
+        schema.SCENES_FILE: lambda: dataset.scene_texts,
     }
     with pytest.raises(DatasetError):
         read[file]()

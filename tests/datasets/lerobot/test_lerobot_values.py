@@ -20,10 +20,10 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import from_xyzw
 from robocas_ms3.datasets.lerobot.arrays import frame_columns, robocas_arrays
 from robocas_ms3.datasets.lerobot.schema import FEATURES, features_json
-from robocas_ms3.datasets.lerobot.stats import Levels, joined_stats, vector_stats
+from robocas_ms3.datasets.lerobot.stats import LevelHistogram, joined_stats, vector_stats
 from robocas_ms3.datasets.lerobot.tables import read_rows
 from robocas_ms3.datasets.lerobot.variants import VARIANTS
-from robocas_ms3.datasets.lerobot.video import CODINGS, Encoder, to_depth
+from robocas_ms3.datasets.lerobot.video import VIDEO_CODECS, VideoEncoder, to_depth
 from robocas_ms3.datasets.sources.arrays import episode_arrays
 from robocas_ms3.demos.recordings.motion import Motion
 from robocas_ms3.demos.recordings.subgoals import SubGoal
@@ -127,7 +127,7 @@ def test_images_are_counted_exactly():
     rng = np.random.default_rng(0)
     images = rng.integers(0, 256, (4, 12, 16, 3), np.uint8)
     images[..., 1] //= 2
-    found, other = Levels.rgb(), Levels.rgb()
+    found, other = LevelHistogram.rgb(), LevelHistogram.rgb()
     for image in images[:3]:
         found.add(image)
     other.add(images[3])
@@ -139,7 +139,7 @@ def test_images_are_counted_exactly():
     median = np.quantile(channels, 0.5, axis=0, method="inverted_cdf")
     np.testing.assert_allclose(np.array(stats["q50"]).reshape(3), median)
     assert stats["count"] == [4]
-    large = Levels.rgb()  # thinned
+    large = LevelHistogram.rgb()  # thinned
     large.add(np.zeros((480, 640, 3), np.uint8))
     assert large.counts.sum() == 3 * 120 * 160
 
@@ -170,7 +170,7 @@ def test_a_file_that_does_not_say_whose_rows_are(tmp_path, other):
 
 
 def test_an_encoder_ends_its_stream_where_an_episode_fails(tmp_path, capfd):
-    with pytest.raises(KeyError), Encoder(tmp_path / "a.mp4", CODINGS["av1"], 5, (64, 48)) as encoder:
+    with pytest.raises(KeyError), VideoEncoder(tmp_path / "a.mp4", VIDEO_CODECS["av1"], 5, (64, 48)) as encoder:
         encoder.add(np.zeros((48, 64, 3), np.uint8))
         raise KeyError
     del encoder

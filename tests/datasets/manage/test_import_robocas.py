@@ -97,7 +97,7 @@ def test_pickles_are_never_loaded(upstream, tmp_path):
         _ = Dataset(upstream).episode(0).arrays
     assert (0, f"{NPZ}, robot_joints", pickled, "") in problems(upstream, "left out")
     # Texts are in data_info.json, too.
-    assert (1, f"{NPZ}, step_lang_goals", pickled, "made of data_info.json") in problems(upstream, "mended")
+    assert (1, f"{NPZ}, step_lang_goals", pickled, "made of data_info.json") in problems(upstream, "repaired")
     new = imported(upstream, tmp_path / "out")
     assert new.numbers == [1]
     assert validate(new.root).violations == []
@@ -111,7 +111,7 @@ def test_relative_motion_as_the_paper_writes_it(upstream, made, tmp_path):
     np.testing.assert_allclose(
         new.episode(1).arrays["rel_pos"], arrays_of(made / "episode_0000001")["rel_pos"], atol=1e-6
     )
-    assert any("one step later" in text for text in new.episode(1).scene["source"]["mended"])
+    assert any("one step later" in text for text in new.episode(1).scene["source"]["repaired"])
 
 
 def test_a_last_motion_becomes_the_identity_and_missing_velocities_are_made(upstream):
@@ -121,7 +121,7 @@ def test_a_last_motion_becomes_the_identity_and_missing_velocities_are_made(upst
     joints = np.arange(7, dtype=np.float32)[:, None] * np.full(7, 0.1, np.float32)
     change(upstream / "episode_0000000", base_rel_pos=motion)
     change(upstream / "episode_0000001", robot_joints=joints, arm_joint_vel=None)
-    repaired = {(episode, where): repair for episode, where, _, repair in problems(upstream, "mended")}
+    repaired = {(episode, where): repair for episode, where, _, repair in problems(upstream, "repaired")}
     assert "identity" in repaired[0, f"{NPZ}, base_rel_pos"]
     np.testing.assert_allclose(Dataset(upstream).episode(1).arrays["arm_joint_vel"], 0.5, atol=1e-5)  # 0.1 rad at 5 Hz
 
@@ -131,7 +131,7 @@ def test_quaternions_wxyz(upstream, tmp_path):
         arrays = arrays_of(episode)
         keys = ("ee_orn", "rel_orn", "base_orn", "base_rel_orn")
         change(episode, **{key: np.roll(arrays[key], 1, axis=1) for key in keys})
-    found = problems(upstream, "mended")
+    found = problems(upstream, "repaired")
     assert (None, f"{NPZ}, ee_orn, rel_orn", "quaternions wxyz", "converted from wxyz") in found
     imported(upstream, tmp_path / "out")
     assert validate(tmp_path / "out").violations == []
@@ -222,7 +222,7 @@ def test_embeddings_of_all_or_none_or_made(dataset, made, tmp_path):
     assert imported(dataset, tmp_path / "all").settings["embeddings"] is True
     change(dataset / "episode_0000000", language_embedding=np.ones(512, np.float32))
     assert (0, f"{NPZ}, language_embedding", "shape (512,)", "not taken") in problems(dataset, "noted")
-    assert (None, f"{NPZ}, embeddings", "1 episode without", "not taken") in problems(dataset, "mended")
+    assert (None, f"{NPZ}, embeddings", "1 episode without", "not taken") in problems(dataset, "repaired")
     assert imported(dataset, tmp_path / "none").settings["embeddings"] is False
     assert validate(tmp_path / "none").violations == []
     import_robocas(survey(dataset), tmp_path / "made", embed=embed)

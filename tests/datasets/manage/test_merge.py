@@ -11,7 +11,7 @@ from robocas_ms3.core.locks import locked_folder
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.manage.copy_episodes import CopyOptions, FilePlacer
 from robocas_ms3.datasets.manage.merge import merge
-from robocas_ms3.datasets.manage.split import Share, resplit
+from robocas_ms3.datasets.manage.split import SplitOptions, resplit
 from robocas_ms3.datasets.sources.reader import Dataset
 
 
@@ -126,29 +126,29 @@ def test_datasets_that_do_not_fit_together(parts, tmp_path, name):
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "out").exists()
     if "split" in name:
-        resplit(part, Share(0.5))  # as the message says
+        resplit(part, SplitOptions(0.5))  # as the message says
         merge([part], tmp_path / "out")
 
 
 def test_a_split_of_texts_is_read_as_numbers(parts, tmp_path):
     part = spoiled(parts[0], tmp_path)
-    sides = Dataset(part).sides
+    sides = Dataset(part).splits
     edit(part / "data_info.json", lambda c: c.update({k: list(map(str, c[k])) for k in ("train_eps", "val_eps")}))
     merge([part], tmp_path / "out")
     assert sides[1]
-    assert Dataset(tmp_path / "out").sides == sides
+    assert Dataset(tmp_path / "out").splits == sides
     assert resplit(part) == sides
 
 
 def test_what_is_appended_leaves_a_split_of_texts_as_it_is(parts, tmp_path):
     part = spoiled(parts[0], tmp_path)
-    sides = Dataset(part).sides[::-1]  # not the rule's
+    sides = Dataset(part).splits[::-1]  # not the rule's
     edit(part / "data_info.json", lambda c: c.update(train_eps=[str(*sides[0])], val_eps=[str(*sides[1])]))
     for number, seed in ((0, [10]), (1, [11])):  # as ManiSkill writes seeds
         edit(part / f"episode_000000{number}" / "scene.json", lambda c, seed=seed: c.update(seed=seed))
     trajectory = write_trajectory(tmp_path / "more.h5", seeds=(30,))
     convert(trajectory, part, append=True)
-    train, val = Dataset(part).sides
+    train, val = Dataset(part).splits
     assert ([n for n in train if n < 2], [n for n in val if n < 2]) == sides
 
 
@@ -190,7 +190,7 @@ def test_the_output(parts, tmp_path):
             merge([a, b], out, options=CopyOptions(overwrite=True))
     assert files_of(a) == before
     merge([a], tmp_path / "out")
-    assert merge([a], tmp_path / "out").kept == 2
+    assert merge([a], tmp_path / "out").existing == 2
     with pytest.raises(OutputExistsError) as error:
         merge([a, b], tmp_path / "out")
     assert error.value.where == tmp_path / "out" / "conversion.json"
@@ -222,7 +222,7 @@ def test_the_command_wants_datasets(tmp_path, capsys):
 def test_a_merged_dataset_can_be_appended_to(parts, tmp_path):
     merge(parts, tmp_path / "out")
     known = convert(parts[1].with_suffix(".h5"), tmp_path / "out", append=True)
-    assert (known.kept, known.episodes) == (2, [])
+    assert (known.existing, known.episodes) == (2, [])
     new = convert(write_trajectory(tmp_path / "c.h5", seeds=(30,)), tmp_path / "out", append=True)
     assert [episode.number for episode in new.episodes] == [4]
     assert validate(parts[0]).violations == []  # whose files are shared

@@ -11,7 +11,14 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.manage import split
 from robocas_ms3.datasets.manage.merge import merge
-from robocas_ms3.datasets.manage.split import Share, cut, folder_names, groups_of, resplit, split_by_fractions
+from robocas_ms3.datasets.manage.split import (
+    SplitOptions,
+    cut,
+    folder_names,
+    group_episodes,
+    resplit,
+    split_by_fractions,
+)
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.split import split_by_seed
 
@@ -30,7 +37,7 @@ def six(tmp_path_factory):
 def test_groups_are_whole_and_no_part_is_empty(values, shares):
     groups = {number: str(value) for number, value in enumerate(values)}
     if len(set(values)) < len(shares):
-        with pytest.raises(DatasetError, match="too few to split"):
+        with pytest.raises(DatasetError, match="too few groups to split"):
             cut(groups, shares)
         return
     parts = cut(groups, shares)
@@ -49,9 +56,9 @@ def test_a_tenth_by_seed_is_the_writers_split(count):
 def test_parts_have_some_of_both_sides():
     """Of 800 episodes, as of a dataset of `reproduce_small.sh`."""
     seeds = {number: 510000 + number for number in range(800)}
-    dataset = SimpleNamespace(sides=split_by_seed(seeds))
+    dataset = SimpleNamespace(splits=split_by_seed(seeds))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(split, "groups_of", lambda dataset, by: {n: str(seed) for n, seed in seeds.items()})
+        patch.setattr(split, "group_episodes", lambda dataset, by: {n: str(seed) for n, seed in seeds.items()})
         for share in (0.5, 0.25, 0.0625):
             for train, val in split_by_fractions(dataset, [share, 1 - share], "seed", None).values():
                 assert 0.04 < len(val) / (len(train) + len(val)) < 0.2
@@ -61,7 +68,7 @@ def test_shares():
     groups = {number: str(number) for number in range(100)}
     assert [len(part) for part in cut(groups, [0.7, 0.2, 0.1])] == [70, 20, 10]
     for wrong in ([1.0], [0.5, 0.6], [1.0, 0.0]):
-        with pytest.raises(DatasetError, match="not shares of a whole"):
+        with pytest.raises(DatasetError, match="invalid fractions"):
             cut(groups, wrong)
 
 
@@ -81,7 +88,7 @@ def test_training_and_validation_as_datasets(six, tmp_path):
 
 
 def test_parts_and_back(six, tmp_path, capsys):
-    words = ["split", str(six), "--parts", "0.5", "0.5", "--out", str(tmp_path / "parts")]
+    words = ["split", str(six), "--fractions", "0.5", "0.5", "--out", str(tmp_path / "parts")]
     assert run(words) == 0
     assert capsys.readouterr().out.count("3 episodes") == 2
     parts = [tmp_path / "parts" / f"part_{index}" for index in range(2)]
@@ -94,7 +101,7 @@ def test_parts_and_back(six, tmp_path, capsys):
         validates = read(root / "data_info.json")["val_eps"]
         seeds.append({ledger[str(number)]["seed"] for number in validates})
     assert seeds[0] == seeds[1]
-    assert run(["split", str(six), "--parts", "0.3", "0.7", "--out", str(tmp_path / "parts")]) == 1
+    assert run(["split", str(six), "--fractions", "0.3", "0.7", "--out", str(tmp_path / "parts")]) == 1
     assert "written with other settings" in capsys.readouterr().err
     shutil.rmtree(parts[1])
     assert run(words) == 0
@@ -106,20 +113,20 @@ def test_by_target_and_task(six, tmp_path):
         scene = root / f"episode_{number:07d}" / "scene.json"
         whole = {"slot": 0, "asset_id": target, "name": target}
         edit(scene, lambda s, task=task, whole=whole: s.update(task=task, target=whole))
-    assert run(["split", str(root), "--by", "task", "--out", str(tmp_path / "tasks")]) == 0
+    assert run(["split", str(root), "--group-by", "task", "--out", str(tmp_path / "tasks")]) == 0
     assert {path.name: len(Dataset(path).numbers) for path in (tmp_path / "tasks").iterdir()} == {
         "pick": 4,
         "search": 2,
     }
     anew = tmp_path / "anew"
-    assert run(["split", str(root), "--by", "task", "--out", str(anew), "--val-share", "0.3"]) == 0
+    assert run(["split", str(root), "--group-by", "task", "--out", str(anew), "--val-fraction", "0.3"]) == 0
     assert {path.name: len(read(path / "data_info.json")["val_eps"]) for path in anew.iterdir()} == {
         "pick": 1,
         "search": 1,
     }
     assert "seeds in the order of sha256(seed)" in read(anew / "pick" / "conversion.json")["split"]
-    assert run(["split", str(root), "--in-place", "--by", "target", "--val-share", "0.3"]) == 0
-    info, targets = read(root / "data_info.json"), groups_of(Dataset(root), "target")
+    assert run(["split", str(root), "--in-place", "--group-by", "target", "--val-fraction", "0.3"]) == 0
+    info, targets = read(root / "data_info.json"), group_episodes(Dataset(root), "target")
     sides = [{targets[n] for n in info[side]} for side in ("train_eps", "val_eps")]
     assert sorted(map(len, sides)) == [1, 1]
     assert not sides[0] & sides[1]
@@ -131,7 +138,7 @@ def test_names_of_folders_stay_inside(six, tmp_path):
     for number in range(6):
         target = {"asset_id": "../../pack/cup"}
         edit(root / f"episode_{number:07d}" / "scene.json", lambda s, target=target: s.update(target=target))
-    assert run(["split", str(root), "--by", "target", "--out", str(tmp_path / "targets")]) == 0
+    assert run(["split", str(root), "--group-by", "target", "--out", str(tmp_path / "targets")]) == 0
     assert [path.name for path in (tmp_path / "targets").iterdir()] == ["_.._pack_cup"]
 
 
@@ -146,7 +153,7 @@ def test_two_values_never_share_a_folder():
 def test_in_place_writes_two_files_only(six, tmp_path):
     root = shutil.copytree(six, tmp_path / "ds")
     before = files_of(root)
-    train, val = resplit(root, Share(0.5))
+    train, val = resplit(root, SplitOptions(0.5))
     assert (len(train), len(val)) == (3, 3)
     after = files_of(root)
     assert {name for name in after if after[name] != before.get(name)} == {"data_info.json", "conversion.json"}
@@ -170,22 +177,34 @@ def test_in_place_accepts_what_is_there(six, tmp_path):
     assert sorted(sum(resplit(root), [])) == sorted(train + val)
 
 
-def test_wrong_words(six, tmp_path, capsys):
+def test_invalid_options(six, tmp_path, capsys):
     out = str(tmp_path / "out")
-    for words, text in [
-        ([], "how to split?"),
-        (["--out-train", out], "how to split?"),
-        (["--in-place", "--out", out, "--by", "task"], "how to split?"),
-        (["--parts", "0.5", "0.5", "--in-place"], "parts need a folder"),
-        (["--out", out], "what is a part?"),
-        (["--out-train", out, "--out-val", f"{out}/val"], "two datasets in one folder"),
-        (["--in-place", "--by", "seed"], "how much validates?"),
-        (["--in-place", "--val-share", "1.5"], "val_share: not a share (expected > 0 and < 1, found 1.5)"),
-        (["--in-place", "--val-share", "0"], "val_share: not a share (expected > 0 and < 1, found 0.0)"),
-        (["--in-place", "--val-share", "nan"], "val_share: not a share (expected > 0 and < 1, found nan)"),
-        (["--parts", "0.9", "0.2", "--out", out], "not shares of a whole"),
+    for words, code, text in [
+        ([], 2, "--out: choose one way to split"),
+        (["--out-train", out], 2, "--out-train: missing second output folder"),
+        (["--in-place", "--out", out, "--group-by", "task"], 2, "found --in-place, --out)"),
+        (["--fractions", "0.5", "0.5", "--in-place"], 2, "--fractions: missing output folder"),
+        (["--out", out], 2, "--out: unclear how to split"),
+        (["--out-train", out, "--out-val", f"{out}/val"], 1, "overlaps the validation folder"),
+        (["--in-place", "--group-by", "seed"], 2, "--group-by: missing fraction"),
+        (
+            ["--in-place", "--val-fraction", "1.5"],
+            2,
+            "--val-fraction: invalid fraction (expected > 0 and < 1, found 1.5",
+        ),
+        (
+            ["--in-place", "--val-fraction", "0"],
+            2,
+            "--val-fraction: invalid fraction (expected > 0 and < 1, found 0.0",
+        ),
+        (
+            ["--in-place", "--val-fraction", "nan"],
+            2,
+            "--val-fraction: invalid fraction (expected > 0 and < 1, found nan",
+        ),
+        (["--fractions", "0.9", "0.2", "--out", out], 2, "--fractions: invalid fractions"),
     ]:
-        assert run(["split", str(six), *words]) == 1
+        assert run(["split", str(six), *words]) == code
         assert text in capsys.readouterr().err
         assert not (tmp_path / "out").exists()
 
@@ -195,7 +214,7 @@ def test_a_damaged_episode_stops_it_before_anything_is_written(six, tmp_path, ca
     root = shutil.copytree(six, tmp_path / "ds")
     spoil, file = DAMAGES[damage]
     spoil(root / "episode_0000004")
-    assert run(["split", str(root), "--parts", "0.5", "0.5", "--out", str(tmp_path / "out")]) == 1
+    assert run(["split", str(root), "--fractions", "0.5", "0.5", "--out", str(tmp_path / "out")]) == 1
     assert f"{root}/episode_0000004/{file}: " in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
@@ -207,14 +226,14 @@ def test_in_place_leaves_all_as_it_is_where_arrays_are_damaged(six, tmp_path, da
     spoil(root / "episode_0000004")
     before = files_of(root)
     with pytest.raises(DatasetError, match=f"episode_0000004/{file}: this episode is damaged"):
-        resplit(root, Share(0.5))
+        resplit(root, SplitOptions(0.5))
     assert files_of(root) == before
 
 
 def test_unknown_targets(six, tmp_path):
     root = shutil.copytree(six, tmp_path / "ds")
     edit(root / "episode_0000003" / "scene.json", lambda s: s.update(target=None))
-    with pytest.raises(DatasetError, match="episode_0000003.*does not say its target.*another --by"):
-        groups_of(Dataset(root), "target")
+    with pytest.raises(DatasetError, match="episode_0000003.*unknown target.*another --group-by"):
+        group_episodes(Dataset(root), "target")
     edit(root / "episode_0000003" / "scene.json", lambda s: s.update(seed=None))
-    assert groups_of(Dataset(root), "seed")[3] == "3"
+    assert group_episodes(Dataset(root), "seed")[3] == "3"

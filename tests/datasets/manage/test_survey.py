@@ -17,11 +17,11 @@ NAMES = ("base", "gripper", "static")
 
 def test_what_all_episodes_lack_is_one_finding(copy):
     assert [(f.episode, f.violation.file, f.outcome) for f in survey(copy).findings] == [
-        (None, "conversion.json", "mended"),
-        (None, NPZ, "mended"),
-        (None, NPZ, "mended"),
+        (None, "conversion.json", "repaired"),
+        (None, NPZ, "repaired"),
+        (None, NPZ, "repaired"),
         *(
-            (None, f"{camera}/cam_pose_wrt_{parent}.npy", "mended")
+            (None, f"{camera}/cam_pose_wrt_{parent}.npy", "repaired")
             for camera, parent in (("base_camera", "arm_base"), ("gripper_camera", "ee"), ("static_camera", "world"))
         ),
         (None, "scene.json", "noted"),
@@ -121,7 +121,7 @@ def test_the_overview(copy, tmp_path):
         info["language_goal"]["2"] = "dance"
 
     edit(copy / "data_info.json", spoil)
-    found = [(episode, text) for episode, _, text, _ in problems(copy, "mended") if episode is not None]
+    found = [(episode, text) for episode, _, text, _ in problems(copy, "repaired") if episode is not None]
     assert found == [
         (0, "an episode twice"),
         (0, "7"),
@@ -135,5 +135,5 @@ def test_the_overview(copy, tmp_path):
     assert 0 in new.info["train_eps"]
     assert validate(new.root).violations == []
     (copy / "data_info.json").write_text("{")
-    assert problems(copy, "mended")[0][:2] == (None, "data_info.json")
+    assert problems(copy, "repaired")[0][:2] == (None, "data_info.json")
     assert validate(imported(copy, tmp_path / "again").root).violations == []

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import from_xyzw
 from robocas_ms3.datasets.schema import EPISODE_INFO
-from robocas_ms3.datasets.sources.arrays import episode_arrays, with_embeddings
+from robocas_ms3.datasets.sources.arrays import add_embeddings, episode_arrays
 from robocas_ms3.demos.recordings.motion import (
     Motion,
     gripper_open,
@@ -65,7 +65,7 @@ def arrays_of(tcp, base, *, qpos=None, subgoals=None, embed=None):
     motion = Motion(qpos, np.zeros((count, 12)), root, tcp, base, np.ones(count, bool))
     subgoals = subgoals or [SubGoal.of("move and grasp", "grasp it", 0, count - 1)]
     arrays = episode_arrays(motion, "do it", subgoals)
-    return with_embeddings(arrays, embed) if embed else arrays
+    return add_embeddings(arrays, embed) if embed else arrays
 
 
 def test_relative_motion_is_in_the_frame_of_the_hand():

@@ -6,7 +6,7 @@ from managing import arrays_of, change
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.checks import arrays as laws
+from robocas_ms3.datasets.checks import arrays as array_checks
 from robocas_ms3.datasets.manage.repairs import ImportedEpisode, repair_arrays
 from robocas_ms3.datasets.sources.arrays import EpisodeArrays, load_arrays, read_arrays
 
@@ -35,7 +35,7 @@ def test_damage_is_noted_and_refused_by_who_needs_it(dataset):
 def test_what_is_not_there(tmp_path):
     stored = read_arrays(tmp_path / "episode_info.npz")
     assert (stored.steps, list(stored.unreadable)) == (0, [""])
-    assert said(laws.violations_of(stored, laws.FORM)) == [("", "this file", "no file")]
+    assert said(array_checks.violations_of(stored, array_checks.FORM)) == [("", "this file", "no file")]
     with pytest.raises(DatasetError, match="this episode can't be read .found No such file"):
         stored.needed([])
     with pytest.raises(DatasetError, match="no such file"):
@@ -45,9 +45,15 @@ def test_what_is_not_there(tmp_path):
 def test_what_is_absent_breaks_no_law_but_one(tmp_path):
     empty = EpisodeArrays(tmp_path, {})
     assert (
-        said(laws.violations_of(empty, (laws.check_shapes, laws.check_finite, laws.check_units, *laws.CONTENT))) == []
+        said(
+            array_checks.violations_of(
+                empty,
+                (array_checks.check_shapes, array_checks.check_finite, array_checks.check_units, *array_checks.CONTENT),
+            )
+        )
+        == []
     )
-    absent = [key for key, *_ in said(laws.check_keys(empty))]
+    absent = [key for key, *_ in said(array_checks.check_keys(empty))]
     assert absent == [spec.name for spec in schema.EPISODE_INFO if not spec.embedding]
 
 
@@ -62,9 +68,9 @@ def test_repairs_leave_what_they_are_given(made):
     repair_arrays(repaired)
     assert [(finding.violation.key, finding.outcome) for finding in repaired.findings] == [
         ("language_embedding", "noted"),
-        ("rel_pos", "mended"),
-        ("rel_orn", "mended"),
-        ("rel_agv_pose", "mended"),
+        ("rel_pos", "repaired"),
+        ("rel_orn", "repaired"),
+        ("rel_agv_pose", "repaired"),
     ]
     assert list(stored.arrays) == list(before)
     for key, array in before.items():

@@ -15,7 +15,7 @@ from robocas_ms3.datasets.conversion.settings import ConversionSettings
 from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.datasets.lerobot import reader, video
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
-from robocas_ms3.datasets.sources.episode_source import shots
+from robocas_ms3.datasets.sources.episode_source import iter_images
 
 CAMERAS = ("base_camera", "gripper_camera", "static_camera")
 STEPS = 7
@@ -66,7 +66,7 @@ def test_a_run_is_what_its_steps_are_one_by_one(folders, name, kind):
 
 def test_cameras_in_step_are_closed_with_the_run(lerobot, runs):
     episode = open_source(lerobot).episode(0)
-    run = shots(episode, CAMERAS, "depth")
+    run = iter_images(episode, CAMERAS, "depth")
     seen = [next(run), next(run)]
     assert len(runs) == 3
     assert not all_closed(runs)
@@ -94,4 +94,4 @@ def test_a_conversion_that_fails_leaves_no_video_open(lerobot, tmp_path, runs, m
 
 
 def test_an_episode_without_cameras_has_steps_without_images():
-    assert list(shots(SimpleNamespace(steps=2), ())) == [{}, {}]
+    assert list(iter_images(SimpleNamespace(steps=2), ())) == [{}, {}]

@@ -12,7 +12,7 @@ from robocas_ms3.datasets.statistics.collect import collect
 
 def test_a_dataset_without_a_split(tmp_path):
     (tmp_path / "episode_0000000").mkdir()
-    assert Dataset(tmp_path).sides == ([], [])
+    assert Dataset(tmp_path).splits == ([], [])
 
 
 @pytest.mark.parametrize("key", ["ep_length", "train_eps", "val_eps"])

@@ -13,9 +13,9 @@ from robocas_ms3.cli.stats import Stats as Command
 from robocas_ms3.cli.stats import main
 from robocas_ms3.core.errors import DatasetError, MissingExtraError
 from robocas_ms3.datasets.actions import ACTION_NAMES
-from robocas_ms3.datasets.statistics.collect import collect, described, histogram
+from robocas_ms3.datasets.statistics.collect import collect, histogram, summarize_values
 from robocas_ms3.datasets.statistics.layouts import Placement, Surface, layout_map
-from robocas_ms3.datasets.statistics.plots import IMAGES, write_stats
+from robocas_ms3.datasets.statistics.plots import PLOTS, write_stats
 
 TABLE = Surface("table, top", x=0.9, y=1.0, yaw=-np.pi / 2, region=[[0.0, -0.1], [0.1, 0.1]])
 CONFIG = {
@@ -96,8 +96,8 @@ def test_histogram_and_description():
     assert (found["edges"][0], found["edges"][-1], len(found["counts"])) == (-2, 2, 41)
     assert found["counts"][20] == 2
     assert histogram(np.array([0.0, 1, 1]))["counts"] == [1, 2]
-    assert described([]) == {"count": 0}
-    assert described([1, 2, 3, 4])["median"] == 2.5
+    assert summarize_values([]) == {"count": 0}
+    assert summarize_values([1, 2, 3, 4])["median"] == 2.5
 
 
 def test_datasets_that_do_not_say_how_they_were_made(dataset, tmp_path):
@@ -112,8 +112,8 @@ def test_datasets_that_do_not_say_how_they_were_made(dataset, tmp_path):
 def test_images_and_json(told, tmp_path, capsys):
     out = tmp_path / "out"
     assert main(Command(told, out=out)) == 0
-    assert sorted(path.name for path in out.iterdir()) == sorted(["stats.json", *(f"{name}.png" for name in IMAGES)])
-    for name in IMAGES:
+    assert sorted(path.name for path in out.iterdir()) == sorted(["stats.json", *(f"{name}.png" for name in PLOTS)])
+    for name in PLOTS:
         pixels = np.asarray(Image.open(out / f"{name}.png").convert("L"))
         assert (pixels < 200).mean() > 0.002, f"{name} is blank"
     line = capsys.readouterr().out.strip()
@@ -132,7 +132,7 @@ def test_texts_with_dollars_and_control_characters_are_labels(told, tmp_path):
     stats.lengths[text] = stats.lengths["pick"]
     stats.subgoals[text] = stats.subgoals["move and grasp"]
     names = [path.name for path in write_stats(stats, tmp_path / "out")]
-    assert names == ["stats.json", *(f"{name}.png" for name in IMAGES)]
+    assert names == ["stats.json", *(f"{name}.png" for name in PLOTS)]
 
 
 def test_the_default_folder_is_next_to_a_trajectory(trajectory, tmp_path):

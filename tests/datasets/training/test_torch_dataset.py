@@ -110,7 +110,7 @@ def test_actions_by_hand():
 
 
 def test_scale_maps_the_range_to_one_and_clips():
-    scale = ActionScale.of(
+    scale = ActionScale.from_action_space(
         {"relative_position": [[-0.1, 0, 0], [0.1, 0, 0.5]], "relative_rotation": [[-1, -1, -1], [1, 1, 3]]}
     )
     action = np.array([0.05, 7, 0.25, -9, 0, 1, 1])
@@ -118,13 +118,13 @@ def test_scale_maps_the_range_to_one_and_clips():
     assert np.allclose(encoded, [0.5, 0, 0, -1, 0, 0, 1])  # the second axis never moves
     assert np.allclose(scale.decode(encoded), [0.05, 0, 0.25, -1, 0, 1, 1])
     with pytest.raises(DatasetError, match="no range of actions"):
-        ActionScale.of({"relative_position": [[0, 0, 0]], "relative_rotation": [[0, 0, 0]]})
+        ActionScale.from_action_space({"relative_position": [[0, 0, 0]], "relative_rotation": [[0, 0, 0]]})
 
 
 def test_normalised_by_the_overviews_ranges(made):
     plain = RoboCASDataset(made, SampleOptions(split="all", cameras=(), observation_horizon=1))
     scaled = RoboCASDataset(made, SampleOptions(split="all", cameras=(), observation_horizon=1, normalize=True))
-    scale = ActionScale.of(json.loads((made / "data_info.json").read_text())["action_space"])
+    scale = ActionScale.from_action_space(json.loads((made / "data_info.json").read_text())["action_space"])
     for raw, seen in zip(plain, scaled, strict=True):
         np.testing.assert_allclose(seen["action"], scale.encode(raw["action"].numpy()), atol=1e-6)
 
@@ -175,7 +175,7 @@ def test_index_and_back(made):
 def test_weights_draw_all_stages_alike(made):
     data = RoboCASDataset(made, SampleOptions(split="all", cameras=(), observation_horizon=1, subgoals=True))
     weights = data.weights()
-    assert data.stages.tolist() == [2, 2, 2, 3, 3, 3] * 2
+    assert data.subgoal_types.tolist() == [2, 2, 2, 3, 3, 3] * 2
     assert weights.tolist() == pytest.approx([1 / 12] * 12)
 
 
@@ -241,7 +241,7 @@ def test_a_lerobot_folder_gives_the_same_samples(made, tmp_path):
             assert torch.equal(one[key], other[key])
         assert (one["instruction"], one["subgoal"]) == (other["instruction"], other["subgoal"])
         assert (one["rgb"].float() - other["rgb"].float()).abs().mean() < 12  # videos lose some
-    assert (ours.stages == theirs.stages).all()
+    assert (ours.subgoal_types == theirs.subgoal_types).all()
     (table,) = (tmp_path / "lerobot" / "data").rglob("*.parquet")
     table.write_bytes(table.read_bytes()[:100])
     with pytest.raises(DatasetError, match="file-000.parquet: this table can't be read"):

@@ -19,7 +19,7 @@ def test_trajectories_give_what_their_conversion_gives(made, trajectory):
         folder = RoboCASDataset(made, SampleOptions(split=side, **options))
         file = RoboCASDataset(trajectory, SampleOptions(split=side, **options))
         assert (len(folder), folder.episodes) == (len(file), file.episodes)
-        assert np.array_equal(folder.stages, file.stages)
+        assert np.array_equal(folder.subgoal_types, file.subgoal_types)
         for one, other in zip(folder, file, strict=True):
             for key, value in one.items():
                 if key == "action":  # the synthetic robot has made-up kinematics
