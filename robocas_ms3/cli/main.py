@@ -1,61 +1,81 @@
-"""The ``robocas`` command: parse the words, run the command, turn an error into one line and an exit code."""
+"""The ``robocas`` command: parse the arguments, run the command, print an error as one line, return an exit code."""
 
 from __future__ import annotations
 
 import errno
 import importlib
+import inspect
 import logging
-import operator
 import os
 import shutil
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import reduce
+import textwrap
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from types import ModuleType
-from typing import Annotated, Any, NoReturn, TextIO, get_type_hints
+from types import MappingProxyType, ModuleType
+from typing import Any, NoReturn, TextIO, get_type_hints
 
 import platformdirs
 import tyro
 
 from robocas_ms3 import __version__
-from robocas_ms3.cli.options import with_absolute_paths
+from robocas_ms3.cli.options import METAVARS, with_absolute_paths
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.core.files import DISK_FULL_ERRNOS
 from robocas_ms3.core.paths import ensure_home, is_writable, temporary_cache, variable_of
 from robocas_ms3.core.signals import INTERRUPTED, exit_command, forbid_exit, handle_interrupts
-from robocas_ms3.core.text import escape_controls, escape_log_lines, escape_tracebacks
+from robocas_ms3.core.text import did_you_mean, escape_controls, escape_log_lines, escape_tracebacks
 
-# Each is a module next to this one (import-robocas: import_robocas.py) with a function `main(cfg: Settings) -> int`. A
-# command with commands of its own has instead `COMMANDS`, such functions by name, `DESCRIPTION` and perhaps `DEFAULT`.
-COMMANDS = (
-    "doctor",
-    "list",
-    "show",
-    "generate",
-    "replay",
-    "convert",
-    "validate",
-    "video",
-    "view",
-    "stats",
-    "merge",
-    "split",
-    "import-robocas",
-    "assets",
-    "layouts",
-    "plan",
-    "train",
-    "eval",
-    "serve-policy",
+GROUPS: Mapping[str, Mapping[str, str]] = {
+    "demonstrations": {
+        "generate": "Record demonstrations of a task with a scripted policy",
+        "replay": "Replay recorded demonstrations",
+        "convert": "Render demonstrations into a dataset",
+    },
+    "datasets": {
+        "validate": "Check a dataset and list its violations",
+        "stats": "Write statistics of a dataset",
+        "view": "Show a dataset or a recording in a browser",
+        "video": "Write videos of a dataset",
+        "merge": "Merge datasets into one",
+        "split": "Split a dataset into several",
+        "import-robocas": "Import a dataset in the format of RoboCAS-v0",
+        "plan": "Generate a large dataset on this machine, Slurm or Ray",
+    },
+    "training and evaluation": {
+        "train": "Train a baseline",
+        "eval": "Evaluate a policy, and report and compare results",
+        "serve-policy": "Serve a policy over a socket",
+    },
+    "assets and scenes": {
+        "assets": "List, check and import asset packs",
+        "layouts": "Sample layouts in advance",
+        "show": "Render the scene of a task configuration",
+    },
+    "system": {
+        "list": "List tasks, configurations, robots, policies, baselines and packs",
+        "doctor": "Check the installation",
+    },
+}
+"""Title -> command -> its line in `robocas --help`.
+
+Each command is a module next to this one (import-robocas: import_robocas.py) with a function
+`main(cfg: Settings) -> int`. A command with subcommands has `COMMANDS` instead: such functions by name, `DESCRIPTION`,
+and possibly `DEFAULT`.
+"""
+COMMANDS = tuple(name for group in GROUPS.values() for name in group)
+DESCRIPTION = "Demonstrations, datasets and evaluation of robot manipulation in clutter, for ManiSkill3."
+OPTIONS = {
+    "-h, --help": "Show this help; after a command, the help of the command",
+    "--version": "Print the version",
+    "--debug": "Show the traceback of an error",
+}
+EXAMPLE = "robocas generate pick -n 10"
+CLI_STYLE = (
+    *(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.DisallowNone),
+    tyro.conf.PositionalMetavarFromFieldName,
 )
-DESCRIPTION = (
-    "RoboCAS for ManiSkill3: demonstrations and datasets of manipulation in complex object arrangements. "
-    "`robocas COMMAND --help` explains a command; --debug with any of them shows tracebacks."
-)
-CLI_STYLE = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.DisallowNone)
-# What the system says of disks, file servers, names and limits, which no traceback explains
+# Errors of disks, file servers, names and limits: a traceback would not explain them
 _ENVIRONMENT = {
     *DISK_FULL_ERRNOS,
     *(errno.EACCES, errno.EPERM, errno.EROFS, errno.EIO, errno.ENAMETOOLONG),
@@ -65,21 +85,21 @@ _ENVIRONMENT = {
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Run ``robocas`` and leave the process with its exit code; default arguments: the process's own."""
+    """Run ``robocas`` and end the process with its exit code; the default of ``argv`` is ``sys.argv[1:]``."""
     escape_tracebacks()
     handle_interrupts()
     exit_command(run(sys.argv[1:] if argv is None else argv))
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run ``robocas``; return its exit code: 0, 1 for a failure (one line on stderr), 2 for an invalid option.
+    """Run ``robocas`` and return its exit code: 0, 1 (failure, one line on stderr) or 2 (invalid argument).
 
-    ``--debug`` among the arguments gives tracebacks.
+    With ``--debug`` among the arguments an error shows its traceback.
     """
     arguments = [word for word in argv if word != "--debug"]
     debug = len(arguments) < len(argv) or os.environ.get("ROBOCAS_DEBUG", "0") not in {"", "0"}
     if arguments[:1] == ["--version"]:
-        return _say(f"robocas {__version__}", sys.stdout, 0)
+        return _write_line(f"robocas {__version__}", sys.stdout, 0)
     if not debug:
         # ManiSkill's logger (the blank is in its name) remarks on its own installation, and on CPUs without a GPU.
         logging.getLogger("mani_skill ").addFilter(lambda record: record.levelno >= logging.ERROR)
@@ -87,11 +107,11 @@ def run(argv: Sequence[str]) -> int:
     escape_log_lines()
     try:
         command, settings = parse(arguments)
-        _lend_folders()
+        _set_library_folders()
         with forbid_exit(f"robocas {arguments[0]}"):
             return command(with_absolute_paths(settings))
-    except KeyboardInterrupt as interrupt:  # a command may say how to go on
-        return _say("; ".join(["interrupted", *map(str, interrupt.args)]), sys.stderr, INTERRUPTED)
+    except KeyboardInterrupt as interrupt:  # its argument: how to continue
+        return _write_line("; ".join(["interrupted", *map(str, interrupt.args)]), sys.stderr, INTERRUPTED)
     except BrokenPipeError:
         # The reader went away (`robocas list | head`); whatever Python flushes on exit has nowhere to go.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -100,7 +120,7 @@ def run(argv: Sequence[str]) -> int:
         if debug:
             raise
         of_option = str(error.where).startswith("--")
-        return _say(f"error: {' '.join(str(error).split())}", sys.stderr, 2 if of_option else 1)
+        return _write_line(f"error: {' '.join(str(error).split())}", sys.stderr, 2 if of_option else 1)
     except ValueError as error:
         from robocas_ms3.core.documents import (
             DocumentError,  # with YAML, which no command waits for that fails otherwise
@@ -109,70 +129,106 @@ def run(argv: Sequence[str]) -> int:
         if debug or not isinstance(error, DocumentError):
             raise
         where = f"{error.filename}: " if error.filename else ""
-        return _say(f"error: {where}{' '.join(str(error).split())}", sys.stderr, 1)
+        return _write_line(f"error: {where}{' '.join(str(error).split())}", sys.stderr, 1)
     except OSError as error:
         if debug or error.errno not in _ENVIRONMENT:
             raise
         where = f"{error.filename}: " if error.filename else ""
-        return _say(f"error: {where}{os.strerror(error.errno)}{_remedy(error)}", sys.stderr, 1)
+        return _write_line(f"error: {where}{os.strerror(error.errno)}{_suggest_fix(error)}", sys.stderr, 1)
 
 
 def parse(words: Sequence[str]) -> tuple[Callable[[Any], int], Any]:
-    """Parse a command line without running it; only the module of its command is imported.
+    """Parse a command line without running it; import only the module of its command.
 
-    Return the function of the command and its settings. SystemExit: help was printed (0), or the words are wrong (2).
+    Returns:
+        The function of the command, and its settings.
+
+    Raises:
+        SystemExit: help was printed (0), or an argument is invalid (2).
     """
     if not words or words[0] not in COMMANDS:
-        commands = {name: module_of(name) for name in COMMANDS}
-        _print_help("robocas", DESCRIPTION, commands, words)
+        _check_command(words, "robocas", COMMANDS)
+        _exit_with_help("robocas", DESCRIPTION, GROUPS, EXAMPLE, OPTIONS)
     module, prog, rest = module_of(words[0]), f"robocas {words[0]}", list(words[1:])
     if not hasattr(module, "COMMANDS"):
-        return module.main, tyro.cli(settings_type(module.main), prog=prog, args=rest, config=CLI_STYLE)
+        return module.main, _parse_settings(module.main, prog, rest)
     commands, default = module.COMMANDS, getattr(module, "DEFAULT", None)
-    if default and not (rest and rest[0] in (*commands, "-h", "--help")) and _takes(commands[default], rest):
+    if default and not (rest and rest[0] in (*commands, "-h", "--help")) and _accepts(commands[default], rest):
         rest = [default, *rest]
     if not rest or rest[0] not in commands:
-        _print_help(prog, module.DESCRIPTION, commands, rest)
-    command, prog = commands[rest[0]], f"{prog} {rest[0]}"
-    return command, tyro.cli(settings_type(command), prog=prog, args=rest[1:], config=CLI_STYLE)
+        _check_command(rest, prog, commands)
+        summaries = {name: _summary(command) for name, command in commands.items()}
+        _exit_with_help(prog, module.DESCRIPTION, {"commands": summaries}, f"{prog} {next(iter(commands))} --help")
+    command = commands[rest[0]]
+    return command, _parse_settings(command, f"{prog} {rest[0]}", rest[1:])
 
 
 def module_of(name: str) -> ModuleType:
+    """Import the module of a command."""
     return importlib.import_module(f"robocas_ms3.cli.{name.replace('-', '_')}")
 
 
 def settings_type(command: Callable[[Any], int]) -> type:
-    """Return the dataclass that the function of a command takes: its options."""
+    """Return the dataclass of a command's options: the type of the parameter of its function."""
     (parameter, *_) = get_type_hints(command).values()
     return parameter
 
 
-def _takes(command: Callable[[Any], int], words: Sequence[str]) -> bool:
-    """Return whether words may belong to a command: they start with an option, or it has positional arguments."""
+def _parse_settings(command: Callable[[Any], int], prog: str, words: Sequence[str]) -> Any:
+    return tyro.cli(settings_type(command), prog=prog, args=words, config=CLI_STYLE, registry=METAVARS)
+
+
+def _accepts(command: Callable[[Any], int], words: Sequence[str]) -> bool:
+    """Return whether a command may accept these words: the first is an option, or it has positional arguments."""
     types = get_type_hints(settings_type(command), include_extras=True).values()
     positional = any(tyro.conf.Positional in getattr(found, "__metadata__", ()) for found in types)
     return positional or not words or words[0].startswith("-")
 
 
-@dataclass
-class _Group:
-    """Commands of a command, in the overview."""
+def _check_command(words: Sequence[str], prog: str, commands: Iterable[str]) -> None:
+    """Exit with 2 if the first word is neither a command nor an option for help."""
+    if words and words[0] not in ("-h", "--help"):
+        what = "unknown option" if words[0].startswith("-") else "unknown command"
+        error = RobocasError(
+            what,
+            where=prog,
+            expected=f"one of {', '.join(commands)}",
+            found=repr(words[0]),
+            fix=did_you_mean(words[0], commands),
+        )
+        raise SystemExit(_write_line(f"error: {error}", sys.stderr, 2))
 
 
-def _print_help(prog: str, description: str, commands: Mapping[str, Any], words: Sequence[str]) -> NoReturn:
-    """Print the overview of some commands, or that there is no such command among them."""
-    rows = []
-    for name, command in commands.items():
-        of_group = getattr(command, "DESCRIPTION", None)
-        settings = _Group if of_group else settings_type(getattr(command, "main", command))
-        rows.append(Annotated[settings, tyro.conf.subcommand(name, description=of_group)])
-    choice: Any = reduce(operator.or_, rows)
-    tyro.cli(choice, prog=prog, description=description, args=words or ["--help"], config=CLI_STYLE)
-    raise AssertionError("tyro leaves the process on --help and on an unknown command")
+def _summary(command: Callable[[Any], int]) -> str:
+    """Return the first line of the docstring of a command's settings."""
+    return (inspect.getdoc(settings_type(command)) or "").split("\n\n")[0].replace("\n", " ").rstrip(".")
 
 
-def _lend_folders() -> None:
-    """Give libraries that only want a place to write one, where theirs is missing or read-only."""
+def _exit_with_help(
+    prog: str,
+    description: str,
+    groups: Mapping[str, Mapping[str, str]],
+    example: str,
+    options: Mapping[str, str] = MappingProxyType({}),
+) -> NoReturn:
+    """Print the commands of a command, one per line, and exit with 0."""
+    width = min(shutil.get_terminal_size().columns, 120)
+    indent = 4 + max(len(name) for group in (*groups.values(), options) for name in group)
+    lines = [f"usage: {prog} COMMAND [OPTIONS]", ""]
+    for paragraph in inspect.cleandoc(description).split("\n\n"):
+        lines += [*textwrap.wrap(paragraph, width, break_on_hyphens=False), ""]
+    for title, group in {**groups, **({"options": options} if options else {})}.items():
+        lines.append(f"{title}:")
+        for name, text in group.items():
+            row = f"  {name:<{indent - 2}}{text}"
+            lines += textwrap.wrap(row, width, subsequent_indent=" " * indent, break_on_hyphens=False)
+        lines.append("")
+    print("\n".join([*lines, f"example: {example}"]))
+    raise SystemExit(0)
+
+
+def _set_library_folders() -> None:
+    """Point matplotlib and Mesa to a temporary folder if their own folder cannot be written to."""
     ensure_home()
     places = {
         "MPLCONFIGDIR": platformdirs.user_config_path("matplotlib"),
@@ -183,8 +239,8 @@ def _lend_folders() -> None:
             os.environ[variable] = str(folder / usual.name)
 
 
-def _remedy(error: OSError) -> str:
-    """Return how much space is free where it does not suffice, and what to do."""
+def _suggest_fix(error: OSError) -> str:
+    """Return how to fix an error of the system, with the free space if the disk is full."""
     variable = variable_of(error.filename) if error.filename else ""
     if error.errno not in DISK_FULL_ERRNOS:
         return f". Set {variable} to a folder that can be written to." if variable else ""
@@ -194,6 +250,6 @@ def _remedy(error: OSError) -> str:
     return f"{free}. Make room{elsewhere}, then run the command again."
 
 
-def _say(text: str, stream: TextIO, code: int) -> int:
+def _write_line(text: str, stream: TextIO, code: int) -> int:
     stream.write(escape_controls(text) + "\n")
     return code

@@ -1,6 +1,6 @@
-"""Options of the commands: types for the settings dataclasses, absolute paths, and what Ctrl-C says.
+"""Options of the commands: types and metavars for the settings dataclasses, absolute paths, the message of Ctrl-C.
 
-Help texts of options with these types say themselves what happens without the option, so tyro adds no default.
+The help text of an option with one of these types names its default; tyro adds none.
 """
 
 from __future__ import annotations
@@ -37,6 +37,34 @@ Folders = Annotated[
     tyro.conf.arg(metavar="DIR [DIR ...]", help_behavior_hint="(required)"),
 ]
 """Positional folders, at least one."""
+ConfigName = Annotated[str, tyro.conf.arg(metavar="CONFIG")]
+"""Name of a bundled task configuration, or a YAML file."""
+PackName = Annotated[str, tyro.conf.arg(metavar="PACK")]
+"""Name of an asset pack, or its folder."""
+Overrides = Annotated[tuple[str, ...], _NO_DEFAULT, tyro.conf.UseAppendAction, tyro.conf.arg(metavar="KEY=VALUE")]
+"""``KEY=VALUE`` of an option that may be given several times; default: none."""
+
+METAVARS = tyro.constructors.ConstructorRegistry()
+"""Rules for tyro: the metavar of a number is N or X, of a path PATH, of other text NAME."""
+
+
+@METAVARS.primitive_rule
+def _metavar_rule(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.PrimitiveConstructorSpec[Any] | None:
+    for kind, metavar, accepted in (
+        (int, "N", int),
+        (float, "X", int | float),
+        (str, "NAME", str),
+        (Path, "PATH", Path),
+    ):
+        if info.type is kind:
+            return tyro.constructors.PrimitiveConstructorSpec(
+                nargs=1,
+                metavar=metavar,
+                instance_from_str=lambda words, kind=kind: kind(words[0]),
+                is_instance=lambda value, accepted=accepted: isinstance(value, accepted),
+                str_from_instance=lambda value: [str(value)],
+            )
+    return None
 
 
 def with_absolute_paths(settings: _T) -> _T:

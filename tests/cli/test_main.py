@@ -46,7 +46,9 @@ def test_help_lists_every_command_and_imports_nothing_heavy():
         text=True,
         check=True,
     )
-    assert all(f"• {name}" in done.stdout for name in cli.COMMANDS)
+    lines = done.stdout.splitlines()
+    assert all(sum(line.startswith(f"  {name} ") for line in lines) == 1 for name in cli.COMMANDS)
+    assert all(len(line) <= 80 for line in lines)
     assert done.stderr == ""
 
 
@@ -69,15 +71,16 @@ def test_every_command_has_a_help_that_fits_a_narrow_terminal_and_a_valid_exampl
     shown = capsys.readouterr().out
     assert exit_info.value.code == 0
     assert f"usage: robocas {' '.join(words)} " in shown
-    assert all(f"• {word}" in shown for word in (subcommands(words[0]) if len(words) == 1 else ()))
-    assert all(len(line) <= 80 for line in shown.splitlines() if "│" in line)
+    commands = subcommands(words[0]) if len(words) == 1 else ()
+    assert all(f"\n  {word} " in shown for word in commands)
+    assert all(len(line) <= 80 for line in shown.splitlines() if commands or "│" in line)
     assert not re.search(r"\(default: (None)?\)|{None}", re.sub(r"[\s│]+", " ", shown))
     if len(words) == 2 or not subcommands(words[0]):
         (example,) = re.findall(r"Example: robocas (.+)", inspect.getdoc(cli.settings_type(command_of(*words))) or "")
         assert cli.parse(shlex.split(example))[0] == command_of(*words)
 
 
-MISTAKES = {  # said -> before anything heavy is imported
+MISTAKES = {  # arguments -> text of the error, printed before anything heavy is imported
     "generate pick --config pick_tabel_scattered": "Did you mean pick_table_scattered",
     "show pick_tabel_scattered": "Did you mean pick_table_scattered",
     "show --pack builtn": "builtn: no such asset pack",
@@ -124,8 +127,8 @@ INVALID_OPTIONS = [
 ]
 
 
-def test_mistakes_are_told_before_anything_heavy_is_imported(tmp_path):
-    """In one process, so that what one of them imported shows in all that follow."""
+def test_invalid_arguments_are_reported_before_anything_heavy_is_imported(tmp_path):
+    """All run in one process: a heavy module that one of them imports fails the test."""
     code = (
         "import sys; from robocas_ms3.cli.main import run\n"
         f"for words in {list(MISTAKES)!r}:\n"
@@ -143,7 +146,7 @@ def test_mistakes_are_told_before_anything_heavy_is_imported(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_lists_things_imports_nothing_heavy(tmp_path):
+def test_list_commands_import_nothing_heavy(tmp_path):
     code = (
         "import sys; from robocas_ms3.cli.main import run\n"
         "for words in ('list', 'eval protocols', 'assets list', 'assets info builtin'):\n"
@@ -165,7 +168,7 @@ def test_what_lists_things_imports_nothing_heavy(tmp_path):
         ("plan run tiny --out x --jbos 3", "--jobs"),
     ],
 )
-def test_wrong_words_are_exit_code_2_with_a_suggestion(words, suggestion, capsys):
+def test_invalid_arguments_exit_with_2_and_a_suggestion(words, suggestion, capsys):
     with pytest.raises(SystemExit) as exit_info:
         cli.run(words.split())
     shown = capsys.readouterr()
@@ -173,7 +176,7 @@ def test_wrong_words_are_exit_code_2_with_a_suggestion(words, suggestion, capsys
     assert suggestion in shown.err
 
 
-def test_eval_runs_a_protocol_where_no_other_command_is_named():
+def test_eval_without_a_command_runs_a_protocol():
     for words in ("eval", "eval pick", "eval --policy random", "eval pick search --out a"):
         short, long = cli.parse(words.split()), cli.parse(["eval", "run", *words.split()[1:]])
         assert short == long
@@ -191,7 +194,7 @@ def test_debug_gives_the_traceback(failing, monkeypatch):
     assert cli.run(["list"]) == 1
 
 
-def test_the_overview_and_the_version(capsys):
+def test_help_and_version(capsys):
     with pytest.raises(SystemExit) as exit_info:
         cli.run([])
     assert exit_info.value.code == 0
@@ -200,19 +203,19 @@ def test_the_overview_and_the_version(capsys):
     assert capsys.readouterr().out == f"robocas {__version__}\n"
 
 
-def test_interrupt(failing, capsys):
+def test_interrupt_exits_with_130(failing, capsys):
     failing(KeyboardInterrupt())
     assert cli.run(["list"]) == 130
     assert capsys.readouterr().err == "interrupted\n"
 
 
-def test_code_that_exits_inside_a_command_is_an_error(failing, capsys):
+def test_exit_inside_a_command_is_an_error(failing, capsys):
     failing(SystemExit(0))
     assert cli.run(["list"]) == 1
     assert capsys.readouterr().err.startswith("error: robocas list: ")
 
 
-def test_a_full_disk_is_one_line_but_a_bug_is_not(failing, capsys):
+def test_full_disk_is_one_line_and_a_bug_a_traceback(failing, capsys):
     failing(OSError(errno.ENOSPC, "No space left on device", "out/x.h5"))
     assert cli.run(["list"]) == 1
     said = r"error: out/x.h5: No space left on device \(\d+ MB free\)\. Make room, then run the command again\.\n"
@@ -226,7 +229,7 @@ def test_a_full_disk_is_one_line_but_a_bug_is_not(failing, capsys):
         cli.run(["list"])
 
 
-def test_a_damaged_document_is_a_line_that_names_it(failing, tmp_path, capsys):
+def test_damaged_document_is_one_line_with_its_path(failing, tmp_path, capsys):
     path = tmp_path / "report.json"
     path.write_text("")
     failing(lambda: load_json(path))
@@ -237,7 +240,7 @@ def test_a_damaged_document_is_a_line_that_names_it(failing, tmp_path, capsys):
         cli.run(["list"])
 
 
-def test_a_full_or_forbidden_cache_says_what_puts_it_elsewhere(failing, monkeypatch, tmp_path, capsys):
+def test_full_or_read_only_cache_names_its_variable(failing, monkeypatch, tmp_path, capsys):
     monkeypatch.setenv("ROBOCAS_CACHE", str(tmp_path))
     for number, said in (
         (
@@ -251,7 +254,7 @@ def test_a_full_or_forbidden_cache_says_what_puts_it_elsewhere(failing, monkeypa
         assert re.search(f"^error: {tmp_path}/robots/x: {said}", capsys.readouterr().err)
 
 
-def test_libraries_get_a_place_where_the_home_is_read_only(monkeypatch, tmp_path):
+def test_libraries_get_a_temporary_folder_when_home_is_read_only(monkeypatch, tmp_path):
     (tmp_path / "home").write_text("")
     for name in ("MPLCONFIGDIR", "MESA_SHADER_CACHE_DIR", "XDG_CONFIG_HOME", "XDG_CACHE_HOME"):
         monkeypatch.setenv(name, "")  # so that what the command sets is undone
@@ -259,14 +262,14 @@ def test_libraries_get_a_place_where_the_home_is_read_only(monkeypatch, tmp_path
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     cli.run(["--version"])
     cli.run(["validate", "nothing"])
-    assert "MPLCONFIGDIR" not in os.environ  # the home is as it should be
+    assert "MPLCONFIGDIR" not in os.environ  # the home is writable
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     cli.run(["validate", "nothing"])
     assert os.environ["MPLCONFIGDIR"] == f"{tmp_path}/robocas-{os.getuid()}/matplotlib"
     assert os.environ["MESA_SHADER_CACHE_DIR"].startswith(f"{tmp_path}/robocas-")
 
 
-def test_a_reader_that_goes_away():
+def test_closed_pipe_prints_no_traceback():
     script = f"{sys.executable} {ROOT / 'robocas_cli.py'} list --json | head -c 1; exit ${{PIPESTATUS[0]}}"
     done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, check=False)
     assert "Traceback" not in done.stderr
