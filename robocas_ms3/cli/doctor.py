@@ -1,4 +1,4 @@
-"""``robocas doctor``: check what works on this machine."""
+"""``robocas doctor``: check the installation."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ if TYPE_CHECKING:
 
 @dataclass
 class Doctor:
-    """Check versions, render device, physics, planner, assets and disk; exit code 1 if something required fails.
+    """Check versions, render device, physics, planner, asset packs and disk; exit code 1 if a required check fails.
 
     Example: robocas doctor
     """
 
     json: bool = False
-    """Print a machine-readable report."""
+    """Print the report as JSON."""
 
 
 def main(cfg: Doctor) -> int:
     from robocas_ms3.cli.progress import spinner
     from robocas_ms3.cli.terminal import print_json
-    from robocas_ms3.doctor.checks import examine
+    from robocas_ms3.doctor.checks import run_checks
 
-    with spinner("examining"):
-        findings = examine()
+    with spinner("checking the installation"):
+        findings = run_checks()
     failed = sum(finding.status == "fail" for finding in findings)
     if cfg.json:
         print_json({"ok": not failed, "findings": [asdict(finding) for finding in findings]})
@@ -43,9 +43,9 @@ def _print(findings: list[Finding], failed: int) -> None:
     from robocas_ms3.cli.terminal import print_table, table_console
 
     marks = {"ok": Text("ok", "green"), "limited": Text("limited", "yellow"), "fail": Text("FAIL", "bold red")}
-    columns = ("", "what", "found", *(["fix"] if any(finding.fix for finding in findings) else []))
+    columns = ("", "check", "found", *(["fix"] if any(finding.fix for finding in findings) else []))
     rows = [(marks[each.status], each.name, each.found, each.fix)[: len(columns)] for each in findings]
     print_table(columns, rows)
     limited = sum(finding.status == "limited" for finding in findings)
-    verdict = f"{failed} of what is needed fails" if failed else "everything needed works"
-    table_console().print(verdict + (f"; {format_count(limited, 'optional row')} limited" if limited else ""))
+    verdict = f"{format_count(failed, 'required check')} failed" if failed else "all required checks passed"
+    table_console().print(verdict + (f"; {format_count(limited, 'optional feature')} limited" if limited else ""))

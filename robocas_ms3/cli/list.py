@@ -1,29 +1,35 @@
-"""``robocas list``: tasks, shipped configurations, robots, policies, baselines, asset packs."""
+"""``robocas list``: print the tasks, configurations, robots, policies, baselines and asset packs."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from robocas_ms3.core.paths import builtin_packs_dir
 from robocas_ms3.core.text import format_count
+
+if TYPE_CHECKING:
+    from robocas_ms3.scenes.config import TaskConfig
 
 
 @dataclass
 class List:
     """List the tasks, bundled task configurations, robots, policies, baselines and asset packs.
 
+    The column "needs pack" of a configuration names packs that are not bundled: import them by `robocas assets`.
+
     Example: robocas list --json
     """
 
     json: bool = False
-    """Print a machine-readable list."""
+    """Print the lists as JSON."""
 
 
 def main(cfg: List) -> int:
     from robocas_ms3.cli.terminal import print_json
 
-    found = collect()
+    found = list_all()
     if cfg.json:
         print_json(found)
     else:
@@ -31,10 +37,11 @@ def main(cfg: List) -> int:
     return 0
 
 
-def collect() -> dict[str, list[dict[str, Any]]]:
-    """Gather what there is, verifying every pack; a damaged one has an ``error`` and no objects.
+def list_all() -> dict[str, list[dict[str, Any]]]:
+    """Return the rows of each list by its title: dicts with the same keys.
 
-    Policies and baselines of other packages are not imported, so a broken one shows only when it is chosen.
+    Each asset pack is loaded; a damaged pack has an ``error`` and no objects. Policies and baselines of other packages
+    are not imported: an error in such a package shows only when its policy or baseline is chosen.
     """
     from robocas_ms3.assets.pack import load_pack, pack_folders
     from robocas_ms3.baselines.registry import BASELINES
@@ -53,17 +60,18 @@ def collect() -> dict[str, list[dict[str, Any]]]:
     for name, path in bundled_configs().items():
         config = load_task_config(path)
         scene = f"{format_count(config.objects.count, 'object')}, {config.layout.kind}, on the {config.support}"
-        configs.append({"name": name, "task": config.task, "scene": scene, "description": config.description})
+        row = {"name": name, "task": config.task, "scene": scene, "needs_pack": _packs_to_import(config)}
+        configs.append({**row, "description": config.description})
     robots = [{"name": name, "agent": robot.agent} for name, robot in ROBOTS.items()]
-    policies = [{"name": name, "package": "robocas_ms3", "of": "builtin"} for name in POLICIES.builtin]
+    policies = [{"name": name, "package": "robocas_ms3", "entry_point": ""} for name in POLICIES.builtin]
     for points in POLICIES.entry_points.values():
-        policies += [{"name": point.name, "package": package_of(point), "of": point.value} for point in points]
+        policies += [{"name": point.name, "package": package_of(point), "entry_point": point.value} for point in points]
     baselines = [
-        {"name": name, "package": "robocas_ms3", "about": getattr(row, "about", "")}
+        {"name": name, "package": "robocas_ms3", "summary": getattr(row, "about", "")}
         for name, row in BASELINES.builtin.items()
     ]
     for points in BASELINES.entry_points.values():
-        baselines += [{"name": point.name, "package": package_of(point), "about": ""} for point in points]
+        baselines += [{"name": point.name, "package": package_of(point), "summary": ""} for point in points]
     packs = []
     for name, folder in pack_folders().items():
         row: dict[str, Any] = {"name": name, "folder": str(folder), "megabytes": round(_size(folder) / 1e6, 1)}
@@ -82,6 +90,13 @@ def collect() -> dict[str, list[dict[str, Any]]]:
     }
 
 
+def _packs_to_import(config: TaskConfig) -> list[str]:
+    """Return the packs of a configuration's furniture (``pack/id``) that are not bundled."""
+    assets = [item.asset for item in (*config.furniture.values(), config.room, config.basket) if item is not None]
+    packs = {asset.rpartition("/")[0] for asset in assets if "/" in asset}
+    return sorted(pack for pack in packs if not (builtin_packs_dir() / pack).is_dir())
+
+
 def _size(folder: Path) -> int:
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
@@ -91,10 +106,10 @@ def _print(found: dict[str, list[dict[str, Any]]]) -> None:
 
     tables = {
         "tasks": ("name", "env_id", "default_config", "summary"),
-        "configs": ("name", "task", "scene", "description"),
+        "configs": ("name", "task", "scene", "needs_pack", "description"),
         "robots": ("name", "agent"),
-        "policies": ("name", "package", "of"),
-        "baselines": ("name", "package", "about"),
+        "policies": ("name", "package", "entry_point"),
+        "baselines": ("name", "package", "summary"),
         "packs": ("name", "objects", "furniture", "megabytes", "folder"),
     }
     for kind, columns in tables.items():
@@ -105,4 +120,4 @@ def _print(found: dict[str, list[dict[str, Any]]]) -> None:
         print_table(heads, cells, whole=whole, title=kind, title_justify="left", title_style="bold")
     for pack in found["packs"]:
         if pack["error"]:
-            table_console().print(f"damaged: {pack['error']}", style="red", soft_wrap=True)
+            table_console().print(f"damaged pack {pack['name']}: {pack['error']}", style="red", soft_wrap=True)

@@ -1,1 +1,1 @@
-"""Find out what of this machine works, without being harmed by what does not."""
+"""Checks of an installation: each check that may crash runs in a child process."""

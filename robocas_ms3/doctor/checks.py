@@ -1,7 +1,7 @@
 """The checks of ``robocas doctor``.
 
-They import nothing that may be broken: versions are read from metadata, everything else runs in a child process
-(``probes.py``), so that a crash is a finding.
+They import no package that may be damaged: versions are read from metadata, and all else runs in a child process
+(``probes.py``), so a crash is a finding.
 """
 
 from __future__ import annotations
@@ -31,29 +31,28 @@ DISTRIBUTION = "robocas-ms3"
 PROBE_SECONDS = 120
 PROBES = Path(__file__).with_name("probes.py")
 GIGABYTE = 1e9
-LEAST_DISK, ENOUGH_DISK = 1.0, 10.0  # GB; a converted episode of pick takes about 0.1
+MIN_DISK_GB, RECOMMENDED_DISK_GB = 1.0, 10.0  # a converted episode of pick takes about 0.1 GB
 
-# Purpose of each extra. lerobot-env, slurm and ray are left out: setup.sh does not install them into the environment of
-# the package, where lerobot-env would replace torch and numpy.
+# Purpose of each extra, without lerobot-env, slurm and ray: setup.sh does not install these.
 EXTRAS = {
-    "language": "sentence embeddings in datasets, and language-conditioned policies",
-    "train": "training baselines and running the trained policies",
+    "language": "sentence embeddings in datasets and language-conditioned policies",
+    "train": "training baselines and evaluating them",
     "lerobot": "LeRobot datasets",
     "assets": "making asset packs",
     "remote": "policies over a socket",
     "plots": "plots of robocas stats",
 }
-# Packages with a row of their own; the others share one.
-NAMED = ("numpy", "torch", "mani-skill", "sapien", "python-fcl", "gymnasium")
+# Packages with their own row; all others share one row.
+PACKAGES_WITH_ROW = ("numpy", "torch", "mani-skill", "sapien", "python-fcl", "gymnasium")
 
 RENDERER_FIX = (
-    "Install a Vulkan driver: the GPU's own, or Mesa >= 24.3 (mesa-vulkan-drivers and libvulkan1; in a checkout, as "
-    "root: bash scripts/setup.sh). Without one everything runs state-only."
+    "Install a Vulkan driver: the driver of the GPU, or Mesa >= 24.3 (mesa-vulkan-drivers and libvulkan1; in a clone, "
+    "as root: bash scripts/setup.sh). Without a driver nothing can be rendered."
 )
 
 GPU_PHYSICS_FIX = (
-    "Check the GPU's driver. SAPIEN downloads PhysX's library for GPUs once; offline, copy ~/.sapien/physx/ from "
-    "another machine."
+    "Check the driver of the GPU. SAPIEN downloads the GPU library of PhysX once; on a machine without internet, copy "
+    "~/.sapien/physx/ from another machine."
 )
 
 
@@ -61,31 +60,34 @@ GPU_PHYSICS_FIX = (
 class Finding:
     """Result of a check."""
 
-    name: str  # of the thing that was checked
-    status: Literal["ok", "limited", "fail"]  # limited: something optional does not work
-    found: str  # version, device or reason
+    name: str  # of the package, device or folder
+    status: Literal["ok", "limited", "fail"]  # limited: an optional feature does not work
+    found: str  # version, device or error
     fix: str = ""
 
 
-def examine() -> list[Finding]:
-    """Run every check, in the order of the report."""
+def run_checks() -> list[Finding]:
+    """Run all checks; return the findings in the order of the report."""
     checks: list[Callable[[], list[Finding]]] = [
         check_python,
         check_packages,
         lambda: [check_extra(extra) for extra in EXTRAS],
-        lambda: [probe("render device", "render", required=False, fix=RENDERER_FIX)],
-        lambda: [probe("physics on CPU", "physx_cpu", fix=_reinstall("sapien"))],
-        lambda: [probe("physics on GPU", "physx_cuda", required=False, fix=GPU_PHYSICS_FIX)],
-        lambda: [probe("planner", "planner", fix="Fix the failing rows above first, then " + _reinstall("python-fcl"))],
-        lambda: [probe("asset packs", "packs", fix="Restore the named pack, or remove its folder.")],
+        lambda: [run_probe("render device", "render", required=False, fix=RENDERER_FIX)],
+        lambda: [run_probe("physics on CPU", "physx_cpu", fix=_reinstall("sapien"))],
+        lambda: [run_probe("physics on GPU", "physx_cuda", required=False, fix=GPU_PHYSICS_FIX)],
+        lambda: [
+            run_probe("planner", "planner", fix="Fix the failing rows above first, then " + _reinstall("python-fcl"))
+        ],
+        lambda: [run_probe("asset packs", "packs", fix="Restore the pack, or delete its folder.")],
         check_folders,
         lambda: [check_disk(Path.cwd())],
     ]
     with ThreadPoolExecutor(max_workers=2) as pool:
-        return [finding for found in pool.map(_guarded, checks) for finding in found]
+        return [finding for found in pool.map(_run_check, checks) for finding in found]
 
 
 def check_python() -> list[Finding]:
+    """Check that this Python is supported."""
     try:
         supported = SpecifierSet(metadata.metadata(DISTRIBUTION)["Requires-Python"])
     except metadata.PackageNotFoundError:
@@ -96,31 +98,32 @@ def check_python() -> list[Finding]:
 
 
 def check_packages() -> list[Finding]:
-    wanted = {_key(item.name): item for item in requirements(DISTRIBUTION)}
-    if not wanted:
+    """Check the versions of the required packages."""
+    required = {_key(item.name): item for item in requirements(DISTRIBUTION)}
+    if not required:
         return [Finding(DISTRIBUTION, "fail", "not installed", "Run bash scripts/setup.sh, or pip install -e .")]
-    named = [check_package(wanted.pop(name)) for name in NAMED if name in wanted]
-    rest = [check_package(item) for item in wanted.values()]
+    named = [check_package(required.pop(name)) for name in PACKAGES_WITH_ROW if name in required]
+    rest = [check_package(item) for item in required.values()]
     bad = [finding for finding in rest if finding.status != "ok"]
-    return named + (bad or [Finding("other packages", "ok", f"{len(rest)} as required")])
+    return named + (bad or [Finding("other packages", "ok", f"{len(rest)} in supported versions")])
 
 
-def check_package(wanted: Requirement) -> Finding:
+def check_package(requirement: Requirement) -> Finding:
     """Check that a package is installed in a supported version."""
-    name = _key(wanted.name)
-    fix = f"pip install '{wanted.name}{wanted.specifier}'"
+    name = _key(requirement.name)
+    fix = f"pip install '{requirement.name}{requirement.specifier}'"
     try:
-        found = metadata.version(wanted.name)
+        found = metadata.version(requirement.name)
     except metadata.PackageNotFoundError:
         return Finding(name, "fail", "not installed", fix)
-    # torch 2.13.0+cpu is torch 2.13.0
-    if not wanted.specifier.contains(Version(found).public, prereleases=True):
-        return Finding(name, "fail", f"{found}, needs {wanted.specifier}", fix)
+    # the public version of torch 2.13.0+cpu is 2.13.0
+    if not requirement.specifier.contains(Version(found).public, prereleases=True):
+        return Finding(name, "fail", f"{found}, expected {requirement.specifier}", fix)
     return Finding(name, "ok", found)
 
 
 def check_extra(extra: str) -> Finding:
-    """Check that the packages of an extra are installed; they are optional."""
+    """Check that the packages of an extra, which is optional, are installed."""
     findings = [check_package(item) for item in requirements(DISTRIBUTION, extra)]
     name, bad = f"extra {extra}", [finding for finding in findings if finding.status != "ok"]
     if not findings or bad:
@@ -130,10 +133,10 @@ def check_extra(extra: str) -> Finding:
 
 
 def check_folders() -> list[Finding]:
-    """Check that the folders of caches (required: files of the robot) and of imported packs (optional) are writable."""
+    """Check that the cache folder (required) and the folder of imported packs (optional) are writable."""
     cache = check_writable("cache folder", paths.cache_dir(), paths.CACHE, required=True)
     if cache.status == "ok" and not os.environ.get(paths.CACHE) and paths.cache_dir() == paths.temporary_cache():
-        found = f"{cache.found}: the cache folder of the user is not writable"
+        found = f"{cache.found} (temporary: the cache folder of the user is not writable)"
         cache = Finding(cache.name, "limited", found, f"Set ${paths.CACHE} to a permanent folder.")
     return [cache, check_writable("data folder", paths.data_dir(), paths.DATA, required=False)]
 
@@ -145,42 +148,43 @@ def check_writable(name: str, folder: Path, variable: str, *, required: bool) ->
         with tempfile.TemporaryDirectory(dir=existing):
             return Finding(name, "ok", str(folder))
     except OSError as error:
-        found = f"{folder}: can't be written ({error.strerror})"
-        fix = f"Set ${variable} to a folder that can be written to."
+        found = f"{folder} is not writable ({error.strerror})"
+        fix = f"Set ${variable} to a writable folder."
         return Finding(name, "fail" if required else "limited", found, fix)
 
 
 def check_disk(folder: Path) -> Finding:
+    """Check the free space of the disk of a folder."""
     free = shutil.disk_usage(folder).free / GIGABYTE
     found = f"{free:.1f} GB free in {folder}"
-    if free < LEAST_DISK:
-        return Finding("disk", "fail", found, "Free some space.")
-    if free < ENOUGH_DISK:
-        return Finding("disk", "limited", found, "Converted datasets take about 0.1 GB an episode.")
+    if free < MIN_DISK_GB:
+        return Finding("disk", "fail", found, "Free at least 1 GB.")
+    if free < RECOMMENDED_DISK_GB:
+        return Finding("disk", "limited", found, "A dataset takes about 0.1 GB per episode.")
     return Finding("disk", "ok", found)
 
 
-def probe(name: str, trial: str, *, fix: str, required: bool = True) -> Finding:
-    """Run a probe, one of `probes.PROBES`, in a child process; ``limited`` if it fails and is not required."""
+def run_probe(name: str, probe: str, *, fix: str, required: bool = True) -> Finding:
+    """Run one of `probes.PROBES` in a child process; a probe that fails is ``limited`` if it is not required."""
     bad: Literal["fail", "limited"] = "fail" if required else "limited"
     try:
         done = subprocess.run(
-            [sys.executable, str(PROBES), trial], capture_output=True, text=True, timeout=PROBE_SECONDS, check=False
+            [sys.executable, str(PROBES), probe], capture_output=True, text=True, timeout=PROBE_SECONDS, check=False
         )
     except subprocess.TimeoutExpired:
         return Finding(name, bad, f"no answer within {PROBE_SECONDS} s", fix)
     if done.returncode == 0:
         return Finding(name, "ok", done.stdout.strip())
-    said = done.stderr.strip().splitlines()
+    error_lines = done.stderr.strip().splitlines()
     if done.returncode == ABSENT:
-        return Finding(name, "ok", f"not used: {said[-1] if said else 'absent'}")
+        return Finding(name, "ok", f"not used: {error_lines[-1] if error_lines else 'absent'}")
     if done.returncode < 0:
         return Finding(name, bad, f"crashed ({signal.strsignal(-done.returncode) or -done.returncode})", fix)
-    return Finding(name, bad, said[-1] if said else f"exit code {done.returncode}", fix)
+    return Finding(name, bad, error_lines[-1] if error_lines else f"exit code {done.returncode}", fix)
 
 
 def requirements(distribution: str, extra: str = "") -> Iterator[Requirement]:
-    """Yield the requirements of an installed distribution on this Python, or only what an extra adds."""
+    """Yield the requirements of an installed distribution on this Python, or those that only an extra has."""
     try:
         lines = metadata.requires(distribution) or []
     except metadata.PackageNotFoundError:
@@ -191,12 +195,12 @@ def requirements(distribution: str, extra: str = "") -> Iterator[Requirement]:
             yield item
 
 
-def _guarded(check: Callable[[], list[Finding]]) -> list[Finding]:
+def _run_check(check: Callable[[], list[Finding]]) -> list[Finding]:
     try:
         return check()
-    except Exception as error:  # a check that breaks is a finding, not the end of the report
+    except Exception as error:  # a check with a bug is a finding
         name = getattr(check, "__name__", "check").removeprefix("check_")
-        return [Finding(name, "fail", f"{type(error).__name__}: {error}", "Report this.")]
+        return [Finding(name, "fail", f"{type(error).__name__}: {error}", "Report this bug.")]
 
 
 def _reinstall(package: str) -> str:

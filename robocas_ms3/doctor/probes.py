@@ -1,7 +1,7 @@
-"""Probes of libraries that may crash; this file runs as a program, in a process of its own.
+"""Probes of libraries that may crash; this file runs as a program in its own process.
 
-``python probes.py NAME`` prints one line on what works and exits with 0. Otherwise the last line on stderr is the
-reason, and the exit code is 1, or 3 if the machine lacks the device, which is no failure.
+``python probes.py NAME`` prints one line (a device or version) and exits with 0. If the probe fails, the last line on
+stderr is the error and the exit code is 1. If the machine has no such device, the exit code is 3.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ def physx_cpu() -> str:
     for _ in range(10):
         scene.step()
     fallen = 1.0 - float(box.pose.p[2])
-    if not 0.04 < fallen < 0.06:  # 0.5 g t^2 = 4.9 cm, 5.4 cm as the integrator has it
-        raise RuntimeError(f"a box fell {fallen:.3f} m in 0.1 s, not 0.05 m")
-    return "works"
+    if not 0.04 < fallen < 0.06:  # 0.5 g t^2 = 4.9 cm; the integrator gives 5.4 cm
+        raise RuntimeError(f"a box fell {fallen:.3f} m in 0.1 s, expected 0.05 m")
+    return "ok"
 
 
 def physx_cuda() -> str:
@@ -59,12 +59,12 @@ def physx_cuda() -> str:
     system.gpu_fetch_rigid_dynamic_data()
     fallen = 1.0 - float(system.cuda_rigid_body_data.torch()[0, 2])
     if not 0.04 < fallen < 0.06:
-        raise RuntimeError(f"a box fell {fallen:.3f} m in 0.1 s, not 0.05 m")
+        raise RuntimeError(f"a box fell {fallen:.3f} m in 0.1 s, expected 0.05 m")
     return torch.cuda.get_device_name()
 
 
 def planner() -> str:
-    """Generate the files of the robot, construct the planner, plan a short motion."""
+    """Write the URDF files of the robot, construct the planner and plan a short motion."""
     import numpy as np
 
     from robocas_ms3.planning.rrt_connect import RRTConnectPlanner
@@ -75,10 +75,11 @@ def planner() -> str:
     planner = RRTConnectPlanner(files.arm_urdf, files.arm_srdf, robot=robot.description, dt=0.05)
     start = np.asarray(robot.description.arm_rest, dtype=np.float64)
     path = planner.plan_to_qpos(start, [start + 0.2], stage="doctor")
-    return f"works, planned {len(path.qpos)} steps"
+    return f"planned a path of {len(path.qpos)} steps"
 
 
 def packs() -> str:
+    """Load all asset packs."""
     from robocas_ms3.assets.pack import load_pack, pack_folders
     from robocas_ms3.core.text import format_count
 
@@ -101,25 +102,25 @@ PROBES = {probe.__name__: probe for probe in (render, physx_cpu, physx_cuda, pla
 
 
 def _main() -> int:
-    # As a file, Python puts this folder first on the path; the package's own parent belongs there instead, last, so
-    # that it also answers in a checkout that is not installed.
+    # Python puts the folder of this file first on the path. Replace it by the parent of the package, last, so that a
+    # clone that is not installed can be imported.
     sys.path.pop(0)
     sys.path.append(str(Path(__file__).resolve().parents[2]))
-    # What libraries print goes to stderr; stdout is for the answer.
-    answer = os.fdopen(os.dup(1), "w")
+    # Output of libraries goes to stderr; stdout has only the line of the probe.
+    stdout = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     try:
         found = PROBES[sys.argv[1]]()
     except MissingDevice as error:
         sys.stderr.write(f"{error}\n")
         return ABSENT
-    except Exception as error:  # whatever the trial meets is its answer
+    except Exception as error:  # any error is the result of the probe
         from robocas_ms3.core.text import escape_controls
 
         sys.stderr.write(escape_controls(f"{type(error).__name__}: {' '.join(str(error).split())}") + "\n")
         return 1
-    answer.write(found + "\n")
-    answer.flush()
+    stdout.write(found + "\n")
+    stdout.flush()
     return 0
 
 
@@ -127,4 +128,4 @@ if __name__ == "__main__":
     exit_code = _main()
     from robocas_ms3.core.signals import exit_immediately
 
-    exit_immediately(exit_code)  # a library that crashes while it is torn down has worked nevertheless
+    exit_immediately(exit_code)  # skips destructors of libraries, which may crash

@@ -1,4 +1,4 @@
-"""`robocas doctor` in a process of its own, on a machine that works and on one where everything is broken."""
+"""`robocas doctor` on this machine, and on a machine with damaged packages."""
 
 import json
 import os
@@ -25,7 +25,7 @@ def doctor(*words: str, **environment: str) -> subprocess.CompletedProcess:
 
 
 @pytest.mark.slow
-def test_this_machine_is_fine():
+def test_all_required_checks_pass_on_this_machine():
     done = doctor("--json")
     report = json.loads(done.stdout)
     assert [finding for finding in report["findings"] if finding["status"] == "fail"] == []
@@ -36,7 +36,7 @@ def test_this_machine_is_fine():
 
 
 @pytest.fixture
-def broken_machine(tmp_path):
+def damaged_packages(tmp_path):
     """Return a folder for PYTHONPATH: numpy is too old, FCL crashes, mani_skill and sapien fail to import."""
     for name, version, source in (
         ("numpy", "1.20.0", "__version__ = '1.20.0'\n"),
@@ -53,9 +53,9 @@ def broken_machine(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_broken_machine_is_described(broken_machine):
-    unwritable = str(broken_machine / "numpy" / "__init__.py" / "x")
-    done = doctor("--json", PYTHONPATH=str(broken_machine), ROBOCAS_DATA=unwritable, ROBOCAS_CACHE=unwritable)
+def test_damaged_packages_are_findings(damaged_packages):
+    unwritable = str(damaged_packages / "numpy" / "__init__.py" / "x")
+    done = doctor("--json", PYTHONPATH=str(damaged_packages), ROBOCAS_DATA=unwritable, ROBOCAS_CACHE=unwritable)
     findings = {finding["name"]: finding for finding in json.loads(done.stdout)["findings"]}
     assert done.returncode == 1
     assert findings["numpy"]["status"] == "fail"
@@ -68,9 +68,9 @@ def test_a_broken_machine_is_described(broken_machine):
     assert all(finding["fix"] for finding in findings.values() if finding["status"] != "ok")
 
 
-def test_the_table_shows_the_fix(monkeypatch, capsys):
+def test_table_shows_the_fix(monkeypatch, capsys):
     findings = [Finding("python", "ok", "3.11"), Finding("numpy", "fail", "1.20.0", "pip install 'numpy>=1.26'")]
-    monkeypatch.setattr("robocas_ms3.doctor.checks.examine", lambda: findings)
+    monkeypatch.setattr("robocas_ms3.doctor.checks.run_checks", lambda: findings)
     assert main(Doctor()) == 1
     shown = capsys.readouterr().out
     assert "FAIL" in shown and "pip install 'numpy>=1.26'" in shown

@@ -2,24 +2,26 @@ import json
 
 import pytest
 
-from robocas_ms3.cli.list import List, collect, main
+from robocas_ms3.cli.list import List, list_all, main
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.paths import data_dir
 from robocas_ms3.scenes.config import bundled_configs, load_task_config
 
 
 def test_tasks_and_configs_are_listed():
-    found = collect()
+    found = list_all()
     assert {"name": "pick", "env_id": "RoboCASPick-v1"}.items() <= found["tasks"][0].items()
     configs = {row["name"]: row for row in found["configs"]}
     assert configs.keys() == bundled_configs().keys()
     for name, row in configs.items():
-        assert row["description"], f"{name} doesn't say what it is"
+        assert row["description"], f"{name} has no description"
         assert row["scene"].startswith(f"{load_task_config(name).objects.count} objects")
+        assert row["needs_pack"] == (["partnet"] if "partnet" in name else [])
+    assert sum(bool(row["needs_pack"]) for row in configs.values()) == 6
 
 
 def test_builtin_pack_is_listed():
-    packs = {row["name"]: row for row in collect()["packs"]}
+    packs = {row["name"]: row for row in list_all()["packs"]}
     assert len(packs["builtin"]["objects"]) >= 10
     assert {"table", "basket", "room"} <= set(packs["builtin"]["furniture"])
     assert packs["builtin"]["error"] == ""
@@ -36,7 +38,7 @@ def damaged_pack():
     folder.rmdir()
 
 
-def test_a_damaged_pack_does_not_hide_the_others(damaged_pack, capsys):
+def test_damaged_pack_is_listed_with_its_error(damaged_pack, capsys):
     assert main(List(json=True)) == 0
     packs = {row["name"]: row for row in json.loads(capsys.readouterr().out)["packs"]}
     assert "manifest" in packs["broken"]["error"]
@@ -48,7 +50,7 @@ def test_a_damaged_pack_does_not_hide_the_others(damaged_pack, capsys):
     assert "broken" in listed and "builtin" in listed
 
 
-def test_names_are_whole_in_a_pipe_and_in_a_narrow_terminal(capsys, monkeypatch):
+def test_names_are_not_wrapped(capsys, monkeypatch):
     names = [*bundled_configs(), "RoboCASOpenPick-v1"]
     assert main(List()) == 0
     piped = capsys.readouterr().out

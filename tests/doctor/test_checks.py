@@ -24,21 +24,21 @@ CRASH = f"crashed ({signal.strsignal(signal.SIGSEGV)})"
         (f"sys.stderr.write('no GPU'); sys.exit({checks.ABSENT})", True, "ok", "not used: no GPU"),
     ],
 )
-def test_a_probe_that_crashes_hangs_fails_or_lacks_a_device(tmp_path, monkeypatch, source, required, status, found):
+def test_probe_that_crashes_hangs_fails_or_lacks_a_device(tmp_path, monkeypatch, source, required, status, found):
     (tmp_path / "probes.py").write_text(f"import sys; {source}")
     monkeypatch.setattr(checks, "PROBES", tmp_path / "probes.py")
     monkeypatch.setattr(checks, "PROBE_SECONDS", 1.0)
-    made = checks.probe("planner", "planner", fix="mend", required=required)
-    assert made == checks.Finding("planner", status, found, "" if status == "ok" else "mend")
+    finding = checks.run_probe("planner", "planner", fix="reinstall it", required=required)
+    assert finding == checks.Finding("planner", status, found, "" if status == "ok" else "reinstall it")
 
 
-def test_probes_answer_on_stdout_only():
-    found = checks.probe("physics on CPU", "physx_cpu", fix="mend")
-    assert found == checks.Finding("physics on CPU", "ok", "works")
+def test_stdout_of_a_probe_is_its_line_only():
+    found = checks.run_probe("physics on CPU", "physx_cpu", fix="reinstall it")
+    assert found == checks.Finding("physics on CPU", "ok", "ok")
 
 
 @pytest.mark.parametrize(
-    ("wanted", "version", "status"),
+    ("requirement", "version", "status"),
     [
         ("numpy>=1.26", "1.26.4", "ok"),
         ("numpy>=1.26", "1.25.0", "fail"),
@@ -46,17 +46,17 @@ def test_probes_answer_on_stdout_only():
         ("mani_skill>=3.0.1,<3.1", None, "fail"),
     ],
 )
-def test_versions_of_packages(monkeypatch, wanted, version, status):
+def test_versions_of_packages(monkeypatch, requirement, version, status):
     def find(name):
         if version is None:
             raise metadata.PackageNotFoundError(name)
         return version
 
     monkeypatch.setattr(metadata, "version", find)
-    found = checks.check_package(Requirement(wanted))
+    found = checks.check_package(Requirement(requirement))
     assert found.status == status
     if status == "fail":
-        assert found.fix.startswith(f"pip install '{wanted[:5]}")
+        assert found.fix.startswith(f"pip install '{requirement[:5]}")
     if version is None:
         assert checks.check_extra("language").status == "limited"
 
@@ -69,7 +69,7 @@ def test_requirements_are_those_of_the_metadata():
     assert list(checks.requirements("no-such-distribution")) == []
 
 
-def test_a_package_that_is_not_installed_is_one_finding(monkeypatch):
+def test_missing_distribution_is_one_finding(monkeypatch):
     monkeypatch.setattr(checks, "DISTRIBUTION", "no-such-distribution")
     (found,) = checks.check_packages()
     assert found.status == "fail"
@@ -81,7 +81,7 @@ def test_python_versions(monkeypatch):
         assert checks.check_python()[0].status == status
 
 
-def test_folders_that_can_not_be_written(tmp_path, monkeypatch):
+def test_folders_that_are_not_writable(tmp_path, monkeypatch):
     file = tmp_path / "file"
     file.touch()
     monkeypatch.setenv("ROBOCAS_CACHE", str(file / "cache"))
@@ -94,7 +94,7 @@ def test_folders_that_can_not_be_written(tmp_path, monkeypatch):
     assert not (tmp_path / "a").exists()
 
 
-def test_a_cache_among_temporary_files_is_said(tmp_path, monkeypatch):
+def test_temporary_cache_folder_is_limited(tmp_path, monkeypatch):
     monkeypatch.delenv("ROBOCAS_CACHE", raising=False)
     monkeypatch.setattr(checks.paths, "cache_dir", lambda: tmp_path)
     monkeypatch.setattr(checks.paths, "temporary_cache", lambda: tmp_path)
@@ -110,11 +110,11 @@ def test_disk(tmp_path, monkeypatch, free, status):
     assert checks.check_disk(tmp_path).status == status
 
 
-def test_a_check_that_breaks_is_a_finding(monkeypatch):
+def test_check_that_raises_is_a_finding(monkeypatch):
     def check_sky(folder):
         raise RuntimeError("fell down")
 
-    monkeypatch.setattr(checks, "probe", lambda name, *_, **__: checks.Finding(name, "ok", ""))
+    monkeypatch.setattr(checks, "run_probe", lambda name, *_, **__: checks.Finding(name, "ok", ""))
     monkeypatch.setattr(checks, "check_disk", check_sky)
-    *_, found = checks.examine()
+    *_, found = checks.run_checks()
     assert (found.status, found.found) == ("fail", "RuntimeError: fell down")

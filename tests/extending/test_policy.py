@@ -8,7 +8,7 @@ import sys
 import pytest
 from strangers import PAGE, install, robocas
 
-from robocas_ms3.cli.list import collect
+from robocas_ms3.cli.list import list_all
 from robocas_ms3.core.errors import EvaluationError, ExtensionError
 from robocas_ms3.core.extensions import Registry
 from robocas_ms3.evaluation import policies, results
@@ -31,7 +31,7 @@ def site(tmp_path, monkeypatch):
 
 def test_it_is_found_and_listed_by_its_name(site):
     assert type(make_policy("descend")).__module__ == "my_policies"
-    listed = {row["name"]: row for row in collect()["policies"]}
+    listed = {row["name"]: row for row in list_all()["policies"]}
     assert listed["descend"] == {"name": "descend", "package": "my-policies", "of": "my_policies:Descend"}
     assert {"scripted", "scripted-ee-delta", "random", "noop"} <= listed.keys()
     with pytest.raises(EvaluationError, match="no such policy .*Did you mean descend"):
@@ -49,7 +49,7 @@ def test_a_broken_one_is_an_error_only_when_it_is_chosen(site, module, error):
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: spoilt-policies\nVersion: 1.0\n")
     (about / "entry_points.txt").write_text(f"[{POLICY_GROUP}]\nit = spoilt_policies:It\n")
     (site / "spoilt_policies.py").write_text(module)
-    assert "it" in {row["name"] for row in collect()["policies"]}
+    assert "it" in {row["name"] for row in list_all()["policies"]}
     assert type(make_policy("descend")).__name__ == "Descend"
     with pytest.raises(error):
         make_policy("it")
