@@ -176,15 +176,15 @@ def judge(found: Seed, generator: EpisodeGenerator, path: Path, args: Args) -> N
         states = np.array(group["env_states"]["articulations"][MOBILE_PANDA.uid])
     found.facts = json.loads(path.with_suffix(".json").read_text())["episodes"][0]["robocas"]["facts"]
     found.physx = round(bare_physx(generator, found.seed, actions), 3)
-    if not generator.worlds:
+    if not generator.open_loop_envs:
         return
-    world = generator.worlds[0]
+    world = generator.open_loop_envs[0]
     stride = sample_stride(generator.settings.control_freq, world.rate_hz)
     own = Motion.of(PANDA, states, actions[:, 7], sample_states(len(actions), stride)).actions[:-1].astype(np.float64)
     for draw in range(-1, args.draws):
         world.reset(found.seed)
         rng = np.random.default_rng([found.seed, FRESH + draw + 1])
-        success = world.play(own if draw < 0 else own + draw_noise(rng, len(own), *args.noise)).success
+        success = world.replay(own if draw < 0 else own + draw_noise(rng, len(own), *args.noise)).success
         if draw < 0:
             found.clean = success
         else:

@@ -68,7 +68,7 @@ PUBLIC = {
     "robocas_ms3.demos": [
         "EpisodeSettings",
         "GenerateSettings",
-        "Replay",
+        "ReplayResult",
         "ReplaySettings",
         "Summary",
         "TrajectoryFile",

@@ -20,12 +20,12 @@ def main(settings: GenerateSettings) -> int:
     from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.demos.generation import generate
 
-    players, weights = None, ""
+    make_roll_in, weights = None, ""
     if settings.episode.after_policy:
-        from robocas_ms3.evaluation.policy_rollin import Player, check_acting
+        from robocas_ms3.evaluation.policy_rollin import PolicyRollIn, check_roll_in
 
-        weights = check_acting(settings.episode)
-        players = partial(Player, settings.episode)
+        weights = check_roll_in(settings.episode)
+        make_roll_in = partial(PolicyRollIn, settings.episode)
     with ProgressBar("episodes recorded") as bar:
 
         def on_result(result: EpisodeResult) -> None:
@@ -40,7 +40,7 @@ def main(settings: GenerateSettings) -> int:
                 bar.note(f"{settings.out} has {format_count(there, 'episode')} already")
             bar.start(settings.episodes, there)
 
-        summary = generate(settings, on_start=on_start, on_result=on_result, players=players, weights=weights)
+        summary = generate(settings, on_start=on_start, on_result=on_result, make_roll_in=make_roll_in, weights=weights)
         bar.update(settings.episodes, settings.episodes)  # a recorded episode may follow a seed that was missing
     seconds = ", ".join(f"{part} {value:.2f}" for part, value in summary.mean_seconds.items())
     episodes, seeds = format_count(summary.episodes, "episode"), format_count(summary.seeds, "seed")

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from robocas_ms3.demos.settings import EpisodeSettings as EpisodeSettings
     from robocas_ms3.demos.settings import GenerateSettings as GenerateSettings
     from robocas_ms3.demos.settings import ReplaySettings as ReplaySettings
-    from robocas_ms3.demos.trajectory_replay import Replay as Replay
+    from robocas_ms3.demos.trajectory_replay import ReplayResult as ReplayResult
     from robocas_ms3.demos.trajectory_replay import replay as replay
 
 __getattr__, __dir__, __all__ = lazy_exports(
@@ -23,6 +23,6 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "robocas_ms3.demos.generation": ["Summary", "generate"],
         "robocas_ms3.demos.recordings.trajectory_file": ["TrajectoryFile"],
         "robocas_ms3.demos.settings": ["EpisodeSettings", "GenerateSettings", "ReplaySettings"],
-        "robocas_ms3.demos.trajectory_replay": ["Replay", "replay"],
+        "robocas_ms3.demos.trajectory_replay": ["ReplayResult", "replay"],
     },
 )

@@ -1,7 +1,8 @@
-"""The order in which the candidates of a decision are tried, and decisions where a process can't be forked.
+"""Order in which the candidates of a decision are tried, and backtracking without forked processes.
 
-`branches` comes back to the moment of a decision by forking there, `Resimulation` by running the attempt again from its
-reset. Both play the same candidates in the same order, so the episodes are the same; the second is only slower.
+`ForkedDecisions` (`demos.branches`) returns to a decision by forking the process there. `ResimulatedDecisions` returns
+to it by running the attempt again from its reset. Both try the same candidates in the same order and give the same
+episodes; the second is slower.
 """
 
 from __future__ import annotations
@@ -11,84 +12,88 @@ from typing import TypeVar
 
 from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.demos.failures import EpisodeResult
-from robocas_ms3.planning.decisions import ONE_BY_ONE, Effort
+from robocas_ms3.planning.decisions import FIRST_FEASIBLE, SearchLimits
 
 T = TypeVar("T")
 
 
-class DeadEnd(Exception):  # noqa: N818
-    """All candidates failed later, and their failures are noted: the decision before must be made otherwise."""
+class CandidatesExhausted(Exception):  # noqa: N818
+    """The episode failed after each candidate of a decision; backtrack to the previous decision.
+
+    The failures are in the result of the episode already.
+    """
 
 
-def turns(
-    candidates: Iterable[T], effort: Effort, result: EpisodeResult
+def order_candidates(
+    candidates: Iterable[T], limits: SearchLimits, result: EpisodeResult
 ) -> Generator[tuple[T, bool], float | PlanningError | None, None]:
-    """Yield which candidate is next, and whether to continue from it, or only to play it for its score.
+    """Yield candidates in the order of the search, each with a flag: continue the episode from it, or only score it.
 
-    A few are compared, and the episode continues from the best first; then from the next few. The caller sends the
-    score of a played candidate, or why it can't be played; nothing after continuing, which has failed then.
+    A few candidates are scored, and the episode continues from the best of them first. Then the next few follow. After
+    a candidate to score, the caller sends its score, or the error if its motions failed. After a candidate to continue
+    from, the caller sends None, since the episode failed there.
 
     Args:
-        candidates: of a decision, taken as they are needed.
-        effort: how many are compared and continued from.
-        result: of the episode so far.
+        candidates: of a decision, evaluated lazily.
+        limits: numbers of candidates to compare and to continue from.
+        result: result of the episode so far.
 
     Raises:
-        DeadEnd: the episode continued from some candidates, and from no other it shall.
-        PlanningError: none can be played; of the last one.
+        CandidatesExhausted: the episode has continued from as many candidates as the limits or its attempts allow.
+        PlanningError: no candidate could be played; the error of the last one.
     """
-    failure, continued, left = PlanningError("decision", "no_candidate"), 0, iter(candidates)
-    while continued < effort.tries and not result.exhausted:
-        compared: list[tuple[float, T]] = []
-        for candidate in left:
+    failure, continued, remaining = PlanningError("decision", "no_candidate"), 0, iter(candidates)
+    while continued < limits.max_continued and not result.out_of_attempts:
+        scored: list[tuple[float, T]] = []
+        for candidate in remaining:
             outcome = yield candidate, False
             if isinstance(outcome, PlanningError):
                 failure = outcome
                 continue
             assert outcome is not None
-            compared.append((outcome, candidate))
-            if len(compared) == effort.ahead or outcome >= effort.enough:
+            scored.append((outcome, candidate))
+            if len(scored) == limits.compared or outcome >= limits.sufficient_score:
                 break
-        if not compared:
+        if not scored:
             break
-        for _, candidate in sorted(compared, key=lambda scored: -scored[0]):
+        for _, candidate in sorted(scored, key=lambda pair: -pair[0]):
             yield candidate, True
             continued += 1
-            if continued == effort.tries or result.exhausted:
+            if continued == limits.max_continued or result.out_of_attempts:
                 break
-    raise DeadEnd if continued else failure
+    raise CandidatesExhausted if continued else failure
 
 
-class _Rerun(Exception):  # noqa: N818
-    """Run the attempt again: another candidate of a decision is next."""
+class _RestartAttempt(Exception):  # noqa: N818
+    """Signal to run the attempt again from its reset, with another candidate of a decision."""
 
 
 class _Decision:
-    """A decision that attempts come to again and again.
+    """State of a decision, which repeated runs of an attempt reach again.
 
     Args:
-        turns: of its candidates, by their indices.
+        order: `order_candidates` of the indices of the candidates.
 
     Attributes:
-        next: the turn to be taken, or why there is none.
-        chosen: index of the candidate that the episode continues from, if any.
+        next: index of the next candidate and whether to continue from it, or the error if none is left.
+        chosen: index of the candidate that the episode continues from; None: not chosen yet.
     """
 
-    def __init__(self, turns: Generator[tuple[int, bool], float | PlanningError | None, None]) -> None:
-        self._turns = turns
+    def __init__(self, order: Generator[tuple[int, bool], float | PlanningError | None, None]) -> None:
+        self._order = order
         self.advance()
 
     def advance(self, outcome: float | PlanningError | None = None) -> None:
-        """Take the outcome of a turn, and the next turn; see `backtracking.turns`."""
+        """Send the outcome of a candidate and fetch the next one, see `order_candidates`."""
         self.chosen: int | None = None
         try:
-            self.next: tuple[int, bool] | Exception = self._turns.send(outcome)
-        except (PlanningError, DeadEnd) as error:
+            self.next: tuple[int, bool] | Exception = self._order.send(outcome)
+        except (PlanningError, CandidatesExhausted) as error:
             self.next = error
 
 
-class Resimulation:
-    """Makes decisions by running attempts again from the reset; methods as `branches.ForkedBranches`."""
+class ResimulatedDecisions:
+    """Decisions that undo failures by running the attempt again from its reset; same methods as `ForkedDecisions`."""
 
     def __init__(self, result: EpisodeResult) -> None:
         self._result = result
@@ -102,23 +107,23 @@ class Resimulation:
             try:
                 attempt()
                 return True
-            except _Rerun:
+            except _RestartAttempt:
                 continue
             except PlanningError as error:
-                self._result.failed(error)
-            except DeadEnd:
+                self._result.add_failure(error)
+            except CandidatesExhausted:
                 self._decisions.pop()
-            # the last decision that the episode continued from is made otherwise
+            # backtrack to the last decision that the episode continued from
             while self._decisions and self._decisions[-1].chosen is None:
                 self._decisions.pop()
             if not self._decisions:
                 return False
             self._decisions[-1].advance()
 
-    def choose(self, candidates: Iterable[T], play: Callable[[T], float], effort: Effort = ONE_BY_ONE) -> T:
+    def choose(self, candidates: Iterable[T], play: Callable[[T], float], limits: SearchLimits = FIRST_FEASIBLE) -> T:
         items = list(candidates)
         if self._depth == len(self._decisions):
-            self._decisions.append(_Decision(turns(range(len(items)), effort, self._result)))
+            self._decisions.append(_Decision(order_candidates(range(len(items)), limits, self._result)))
         decision = self._decisions[self._depth]
         self._depth += 1
         if decision.chosen is None:
@@ -132,8 +137,8 @@ class Resimulation:
                     outcome = error
                 decision.advance(outcome)
                 if decision.next != (index, True):
-                    raise _Rerun
-                decision.chosen = index  # what was played stands
+                    raise _RestartAttempt
+                decision.chosen = index  # the candidate just played is the best one: keep its motions
                 return items[index]
             decision.chosen = index
         play(items[decision.chosen])

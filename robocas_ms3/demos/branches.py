@@ -1,13 +1,13 @@
-"""Branches of an episode, each in a forked process: what is tried there leaves no trace here.
+"""Backtracking with forked processes: each candidate of a decision runs in a process of its own.
 
-A decision (`planning.decisions`) forks a child per candidate. The child plays it, sends its score, and waits. The best
-child is told to continue: it *is* the episode from then on, while this process waits for its end. If it fails, this
-process, still at the decision, tells the next best. So processes stand in a row, one per decision, and the last one
-writes the episode. No candidate is simulated twice.
+A decision (`planning.decisions`) forks a child process per candidate. The child plays the candidate, sends its score
+and waits. The child with the best score then continues the episode, while the parent waits for the result. If the
+episode fails there, the parent, which is still at the decision, lets the next best child continue. The processes form a
+chain with one process per decision, and the last one writes the episode. No candidate is simulated twice.
 
-Children die with their parents, leave no zombies, and have a time limit. A child that is gone is played once more: if
-it was killed from outside, the episode stays the same; if it crashes again, it is passed over, or counts as a failed
-attempt where it had been told to continue.
+A child process is killed when its parent ends or a time limit is exceeded. After a crash, the candidate is played once
+more, so a kill from outside does not change the episode. After a second crash the candidate is skipped, or counts as a
+failed attempt if the episode had continued from it.
 """
 
 from __future__ import annotations
@@ -29,27 +29,27 @@ import torch
 from robocas_ms3.core.errors import PlanningError, RobocasError
 from robocas_ms3.core.remote_errors import RemoteError
 from robocas_ms3.core.signals import die_with_parent
-from robocas_ms3.demos.backtracking import DeadEnd, turns
+from robocas_ms3.demos.backtracking import CandidatesExhausted, order_candidates
 from robocas_ms3.demos.failures import EpisodeResult
-from robocas_ms3.planning.decisions import ONE_BY_ONE, Effort
+from robocas_ms3.planning.decisions import FIRST_FEASIBLE, SearchLimits
 
 T = TypeVar("T")
 
-PLAY_LIMIT, CONTINUE_LIMIT = 300.0, 3600.0  # s of wall-clock time for one candidate; for the rest of the episode
+CANDIDATE_TIMEOUT, EPISODE_TIMEOUT = 300.0, 3600.0  # s of wall-clock time: one candidate, the rest of the episode
 _log = logging.getLogger(__name__)
 
 
-class ChildCrash(Exception):  # noqa: N818
-    """A child took too long, or is gone."""
+class ProcessFailed(Exception):  # noqa: N818
+    """A forked process crashed or exceeded its time limit."""
 
 
-class ChildGone(ChildCrash):
-    """A child has ended without a word."""
+class ProcessCrashed(ProcessFailed):
+    """A forked process ended without sending a result."""
 
 
 @dataclass(frozen=True)
-class Child:
-    """A forked process."""
+class ForkedProcess:
+    """A forked child process and the pipe to it."""
 
     pid: int
     pipe: Connection
@@ -58,55 +58,58 @@ class Child:
         try:
             self.pipe.send(message)
         except OSError as error:
-            raise ChildGone("crashed") from error
+            raise ProcessCrashed("crashed") from error
 
     def receive(self, limit: float) -> Any:
-        """Return the child's next message; raises ``ChildCrash`` where there is none within ``limit`` seconds."""
+        """Return the next message of the process; raise ProcessFailed if none arrives within ``limit`` seconds."""
         try:
             if not self.pipe.poll(limit):
-                raise ChildCrash("timed_out")
+                raise ProcessFailed("timed_out")
             return self.pipe.recv()
-        except (EOFError, OSError) as error:  # it ended before it said anything, or in the middle of it
-            raise ChildGone("crashed") from error
+        except (EOFError, OSError) as error:  # it ended before or while it sent a message
+            raise ProcessCrashed("crashed") from error
 
-    def end(self) -> None:
+    def kill(self) -> None:
         self.pipe.close()
-        os.kill(self.pid, signal.SIGKILL)  # it is still ours, if only as a zombie
+        os.kill(self.pid, signal.SIGKILL)  # not waited for yet, so the id is not reused
         os.waitpid(self.pid, 0)
 
 
-def fork() -> Child | Connection:
-    """Fork this process; return the child, or in the child the pipe to this process."""
+def fork() -> ForkedProcess | Connection:
+    """Fork this process; return the child in the parent, and the pipe to the parent in the child."""
     for stream in (sys.stdout, sys.stderr):
-        if stream is not None:  # as in a service
+        if stream is not None:  # a service may have no streams
             stream.flush()
     try:
-        here, there = cast("tuple[Connection, Connection]", Pipe())
+        own_end, other_end = cast("tuple[Connection, Connection]", Pipe())
         pid = os.fork()
     except OSError as error:
         raise RobocasError(
-            "can't start another process",
+            "cannot fork another process",
             found=error.strerror,
-            fix="Use fewer --jobs, raise the limits (ulimit -u, -n), or --no-fork, which is slower.",
+            fix="Use fewer --jobs, raise the limits (ulimit -u, -n), or use --no-fork, which is slower.",
         ) from error
-    (there if pid else here).close()
-    return Child(pid, here) if pid else there
+    (other_end if pid else own_end).close()
+    return ForkedProcess(pid, own_end) if pid else other_end
 
 
-def set_up_child(parent: int) -> None:
-    """Set up a child before anything else; the system kills it when the process ``parent`` ends."""
+def set_up_forked_process(parent: int) -> None:
+    """Prepare a forked process before it does anything else; the system kills it when the process ``parent`` ends."""
     die_with_parent(parent)
-    gc.freeze()  # a collection that walks all objects would copy all of the parent's memory
-    torch.set_num_threads(1)  # the parent's threads are not here, and a parallel loop would wait for them forever
-    # Threads that are not here may hold the locks of the parent's streams. A line is written as soon as it ends, since
-    # a child ends without ado. Where there is no stream, as in a service, none is opened.
+    gc.freeze()  # a garbage collection of all objects would copy the parent's memory
+    torch.set_num_threads(1)  # fork keeps one thread only; a parallel loop would wait for the others forever
+    # New streams, since threads of the parent may hold the locks of the old ones. They are line buffered, since the
+    # process ends by os._exit, which does not flush.
     sys.stdout, sys.stderr = (
         stream and os.fdopen(os.dup(fd), "w", buffering=1) for fd, stream in ((1, sys.stdout), (2, sys.stderr))
     )
 
 
-def why_not_fork(*, renders: bool) -> str:
-    """Return why this process, with or without an open renderer, can't be forked safely; empty where it can."""
+def reason_not_to_fork(*, renders: bool) -> str:
+    """Return why this process cannot be forked safely; an empty string if it can.
+
+    ``renders`` says whether a renderer is open.
+    """
     if sys.platform != "linux":
         return "this is not Linux"
     if renders:
@@ -117,30 +120,33 @@ def why_not_fork(*, renders: bool) -> str:
 
 
 @cache
-def say_once(reason: str) -> None:
-    _log.warning("can't fork (%s): what fails is undone by simulating everything again", reason)
+def warn_no_fork(reason: str) -> None:
+    """Log once per reason that this process cannot be forked."""
+    _log.warning(
+        "cannot fork (%s): failed attempts are undone by simulating from the reset again, which is slower", reason
+    )
 
 
 class _Success(Exception):  # noqa: N818
-    pass
+    """Signal that a child process finished the episode."""
 
 
-class ForkedBranches:
-    """Makes decisions by forking; children send back the result of the episode (``result``)."""
+class ForkedDecisions:
+    """Decisions that undo failures by forking; child processes send back the result of the episode (``result``)."""
 
     def __init__(self, result: EpisodeResult) -> None:
         self._result = result
         self._pipe: Connection | None = None  # to the parent, in a child
-        self._children: list[Child] = []
+        self._children: list[ForkedProcess] = []
 
     def run(self, attempt: Callable[[], None]) -> bool:
-        """Run an attempt, which begins with a reset; return whether it, or one that decided otherwise, succeeded."""
+        """Run an attempt from its reset, with backtracking; return whether it succeeded with any candidates."""
         succeeded = True
         try:
             attempt()
         except _Success:
             pass
-        except DeadEnd:
+        except CandidatesExhausted:
             succeeded = False
         except PlanningError as error:
             self._result.failed(error)
@@ -153,97 +159,102 @@ class ForkedBranches:
             self._send_and_exit(succeeded)
         return succeeded
 
-    def choose(self, candidates: Iterable[T], play: Callable[[T], float], effort: Effort = ONE_BY_ONE) -> T:
-        """Choose; see `Decisions`. Returns in the child that continues the episode."""
-        order = turns(enumerate(candidates), effort, self._result)
-        played: dict[int, Child] = {}
+    def choose(self, candidates: Iterable[T], play: Callable[[T], float], limits: SearchLimits = FIRST_FEASIBLE) -> T:
+        """Choose a candidate, see `Decisions.choose`; return in the child process that continues the episode."""
+        order = order_candidates(enumerate(candidates), limits, self._result)
+        played: dict[int, ForkedProcess] = {}
         outcome: float | PlanningError | None = None
         try:
             while True:
                 (number, candidate), continues = order.send(outcome)
                 outcome = None
                 if not continues:
-                    child, outcome = self._try(play, candidate)
+                    child, outcome = self._play_in_child(play, candidate)
                     if child is None:
                         return candidate
                     played[number] = child
                 elif not self._continue_as(played[number]):
-                    again, failure = self._try(play, candidate)
+                    again, failure = self._play_in_child(play, candidate)
                     if again is None:
                         return candidate
                     if isinstance(failure, PlanningError) or not self._continue_as(again):
                         self._result.failed(PlanningError("branch", "crashed"))
         finally:
-            self._end_children()
+            self._kill_children()
 
-    def _try(self, play: Callable[[T], float], candidate: T) -> tuple[Child | None, float | PlanningError]:
-        """Return a child that has played a candidate, and its answer; in the child, no child once it shall continue."""
+    def _play_in_child(
+        self, play: Callable[[T], float], candidate: T
+    ) -> tuple[ForkedProcess | None, float | PlanningError]:
+        """Play a candidate in a child process; return the child and its score or error, and None in the child itself.
+
+        The child returns once it has to continue the episode.
+        """
         for last in (False, True):
             child = self._fork()
             if child is None:
                 self._play(play, candidate)
                 return None, 0.0
             try:
-                outcome = self._receive(child, PLAY_LIMIT)
-            except ChildCrash as error:
+                outcome = self._receive(child, CANDIDATE_TIMEOUT)
+            except ProcessFailed as error:
                 outcome = PlanningError("branch", str(error))
-                if isinstance(error, ChildGone) and not last:
-                    self._end(child)
+                if isinstance(error, ProcessCrashed) and not last:
+                    self._kill(child)
                     continue
             break
         if isinstance(outcome, PlanningError):
-            self._end(child)
+            self._kill(child)
         return child, outcome
 
-    def _fork(self) -> Child | None:
-        """Return a new child; None in the child."""
+    def _fork(self) -> ForkedProcess | None:
+        """Return a new child process; None in the child."""
         parent = os.getpid()
-        # an interrupt in between would find a child without a parent, or a child that takes itself for the root
+        # an interrupt between fork and set-up would leave a child unknown to the parent, or one that acts as the root
         before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
         try:
             forked = fork()
-            if isinstance(forked, Child):
+            if isinstance(forked, ForkedProcess):
                 self._children.append(forked)
                 return forked
-            not_ours = [*(other.pipe for other in self._children), *([self._pipe] if self._pipe else [])]
+            inherited = [*(child.pipe for child in self._children), *([self._pipe] if self._pipe else [])]
             self._pipe, self._children = forked, []
-            set_up_child(parent)
-            for pipe in not_ours:
+            set_up_forked_process(parent)
+            for pipe in inherited:
                 pipe.close()
             return None
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
-    def _continue_as(self, child: Child) -> bool:
-        """Let a child continue the episode; return whether it failed (True), or is gone (False)."""
+    def _continue_as(self, child: ForkedProcess) -> bool:
+        """Let a child continue the episode; return True if the episode failed there, False if the child crashed."""
         try:
             child.send(self._result)
-            succeeded = self._receive(child, CONTINUE_LIMIT)
-        except ChildGone:
+            succeeded = self._receive(child, EPISODE_TIMEOUT)
+        except ProcessCrashed:
             return False
-        except ChildCrash as error:
+        except ProcessFailed as error:
             self._result.failed(PlanningError("branch", str(error)))
             return True
         finally:
-            self._end(child)
+            self._kill(child)
         if succeeded:
             raise _Success
         return True
 
-    def _receive(self, child: Child, limit: float) -> Any:
+    def _receive(self, child: ForkedProcess, limit: float) -> Any:
         answer, result = child.receive(limit)
         if isinstance(answer, RemoteError):
             answer.reraise()
-        self._result.adopt(result)
+        self._result.copy_from(result)
         return answer
 
-    def _end(self, child: Child) -> None:
+    def _kill(self, child: ForkedProcess) -> None:
         self._children.remove(child)
-        child.end()
+        child.kill()
 
-    def _end_children(self) -> None:
+    def _kill_children(self) -> None:
         for child in list(self._children):
-            self._end(child)
+            self._kill(child)
 
     def _play(self, play: Callable[[T], float], candidate: T) -> None:
         try:
@@ -255,17 +266,17 @@ class ForkedBranches:
         assert self._pipe is not None
         try:
             self._pipe.send((score, self._result))
-            self._result.adopt(self._pipe.recv())
+            self._result.copy_from(self._pipe.recv())
         except (EOFError, ConnectionError):
             os._exit(0)
 
     def _send_and_exit(self, answer: bool | PlanningError | RemoteError) -> NoReturn:
         assert self._pipe is not None
         try:
-            self._end_children()
+            self._kill_children()
             self._pipe.send((answer, self._result))
-        except Exception:  # noqa: BLE001  (nobody listens)
+        except Exception:  # noqa: BLE001  (the parent has ended)
             if isinstance(answer, RemoteError):
                 _log.error("a branch failed\n%s", answer.traceback)
-        finally:  # not even an interrupt leads back into the code that the parent runs too
+        finally:  # even an interrupt must not return to the code that the parent runs too
             os._exit(0)

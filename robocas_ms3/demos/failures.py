@@ -1,6 +1,6 @@
-"""Results of seeds, the lines of ``failures.jsonl``, and starts that a policy left. Loads no simulator.
+"""Results of seeds, lines of ``failures.jsonl``, and initial states of expert interventions. Loads no simulator.
 
-``failures.jsonl`` has one line per failed attempt, and one per seed that was given up.
+``failures.jsonl`` has one line per failed attempt and one line per skipped seed.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.planning.decisions import Seconds
 
 FAILURES_FILE = "failures.jsonl"
-NOISY = "noisy_"  # begins the reasons of attempts that failed for noise alone
+WITH_NOISE = "_with_noise"  # suffix of the reasons of attempts that failed only with noise
 
 
 @dataclass(frozen=True)
-class Failure:
-    """A failed attempt.
+class FailedAttempt:
+    """A failed attempt at an episode, or a skipped seed: a line of ``failures.jsonl``.
 
     Attributes:
-        attempt: counted from 0; -1 marks the seed as given up.
-        stage: of the policy that failed.
-        reason: why, in words that can be counted.
-        seconds: wall-clock time of the attempt; 0 if a kill came before it was noted.
+        attempt: number of the attempt, from 0; -1 marks a skipped seed.
+        stage: stage of the policy that failed.
+        reason: a short fixed text, which reports count.
+        seconds: wall-clock time of the attempt; 0 if the process was killed before the line was written.
     """
 
     seed: Annotated[int, Field(ge=0, le=MAX_SEED)]
@@ -40,21 +40,22 @@ class Failure:
     seconds: Annotated[float, Field(ge=0, le=1e9)]
 
     @property
-    def gave_up(self) -> bool:
+    def skipped(self) -> bool:
+        """Whether this line marks a skipped seed."""
         return self.attempt < 0
 
 
 @dataclass
 class EpisodeResult:
-    """Result of a seed; forked processes send theirs back.
+    """Result of a seed; forked processes send theirs to the parent process.
 
     Attributes:
-        steps: length in control steps.
-        attempts: attempts used.
-        seconds: where the time went.
-        failures: every attempt that failed.
-        max_attempts: after so many the seed is given up.
-        begun: start of the attempt, s of the clock.
+        steps: length of the episode in control steps.
+        attempts: number of attempts, the successful one included.
+        seconds: CPU seconds by part.
+        failures: all failed attempts.
+        max_attempts: number of failed attempts after which the seed is skipped.
+        attempt_start: start of the current attempt, ``time.perf_counter()`` in s.
     """
 
     seed: int
@@ -62,39 +63,42 @@ class EpisodeResult:
     steps: int = 0
     attempts: int = 0
     seconds: Seconds = field(default_factory=Seconds)
-    failures: list[Failure] = field(default_factory=list)
+    failures: list[FailedAttempt] = field(default_factory=list)
     max_attempts: int = 1
-    begun: float = field(default_factory=time.perf_counter)
+    attempt_start: float = field(default_factory=time.perf_counter)
 
     @property
     def noise_failures(self) -> int:
-        return sum(failure.reason.startswith(NOISY) for failure in self.failures)
+        """Number of attempts that failed only with noise."""
+        return sum(failure.reason.endswith(WITH_NOISE) for failure in self.failures)
 
     @property
-    def exhausted(self) -> bool:
+    def out_of_attempts(self) -> bool:
         return len(self.failures) >= self.max_attempts
 
-    def failed(self, error: PlanningError) -> None:
+    def add_failure(self, error: PlanningError) -> None:
+        """Add a failed attempt that ended now, and start the clock of the next one."""
         now = time.perf_counter()
-        seconds = round(now - self.begun, 3)
-        self.failures.append(Failure(self.seed, len(self.failures), error.stage, error.reason, seconds))
-        self.begun = now
+        seconds = round(now - self.attempt_start, 3)
+        self.failures.append(FailedAttempt(self.seed, len(self.failures), error.stage, error.reason, seconds))
+        self.attempt_start = now
 
-    def adopt(self, other: EpisodeResult) -> None:
-        vars(self.seconds).update(vars(other.seconds))  # the executor keeps counting in this object
+    def copy_from(self, other: EpisodeResult) -> None:
+        """Take over all values of another result."""
+        vars(self.seconds).update(vars(other.seconds))  # in place, since the executor adds to this object
         vars(self).update({key: value for key, value in vars(other).items() if key != "seconds"})
 
 
 @dataclass(frozen=True)
-class Takeover:
-    """State in which a policy left a scene.
+class Intervention:
+    """Initial state of an expert intervention: the state in which a learned policy left a scene.
 
     Attributes:
-        policy: its name.
-        policy_steps: for which it acted.
-        state: as ``set_state_dict`` takes it, each array (1, D) float32 or bool; without targets of controllers.
-        gripper: last command of the gripper, -1 closed or 1 open.
-        refused: why nothing can be taken over, in a few words that can be counted; empty: it can.
+        policy: name of the policy that acted first.
+        policy_steps: number of policy steps before the intervention.
+        state: argument of ``set_state_dict``, each array (1, D) float32 or bool; without controller targets.
+        gripper: last gripper command, -1 closed or 1 open.
+        skip_reason: why the seed is skipped, a short fixed text; empty if the scripted policy can continue.
     """
 
     seed: int
@@ -102,20 +106,25 @@ class Takeover:
     policy_steps: int
     state: dict[str, dict[str, NDArray[Any]]]
     gripper: float
-    refused: str = ""
+    skip_reason: str = ""
 
 
-def failed_attempts(seed: int, recorded: Iterable[str], noted: Mapping[int, Failure]) -> list[Failure]:
-    """Return the failed attempts of a recorded seed (``stage: reason`` each), with seconds where lines have them."""
+def failed_attempts(seed: int, recorded: Iterable[str], logged: Mapping[int, FailedAttempt]) -> list[FailedAttempt]:
+    """Return the failed attempts of a recorded seed.
+
+    Args:
+        recorded: ``stage: reason`` of each attempt, from the recording.
+        logged: lines of ``failures.jsonl`` by attempt; they add the seconds.
+    """
     failures = []
     for attempt, text in enumerate(recorded):
         stage, _, reason = text.partition(": ")
-        known = noted.get(attempt)
-        same = known is not None and (known.stage, known.reason) == (stage, reason)
-        failures.append(known if known and same else Failure(seed, attempt, stage, reason, 0.0))
+        line = logged.get(attempt)
+        same = line is not None and (line.stage, line.reason) == (stage, reason)
+        failures.append(line if line and same else FailedAttempt(seed, attempt, stage, reason, 0.0))
     return failures
 
 
-def count_by_stage(failures: Iterable[Failure]) -> dict[str, int]:
+def count_by_stage(failures: Iterable[FailedAttempt]) -> dict[str, int]:
     """Return ``{"stage: reason": count}``, most frequent first."""
-    return dict(Counter(f"{f.stage}: {f.reason}" for f in failures if not f.gave_up).most_common())
+    return dict(Counter(f"{f.stage}: {f.reason}" for f in failures if not f.skipped).most_common())

@@ -21,7 +21,14 @@ from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.output_folder import FolderKind, OutputFolder
 from robocas_ms3.core.text import one_line
 from robocas_ms3.core.workers import Limits, Worker, WorkerPool, use_one_torch_thread
-from robocas_ms3.demos.failures import FAILURES_FILE, EpisodeResult, Failure, Takeover, count_by_stage, failed_attempts
+from robocas_ms3.demos.failures import (
+    FAILURES_FILE,
+    EpisodeResult,
+    FailedAttempt,
+    Intervention,
+    count_by_stage,
+    failed_attempts,
+)
 from robocas_ms3.demos.recordings.trajectory_hdf5 import merge, open_trajectory
 from robocas_ms3.demos.recordings.trajectory_json import read_json, versions
 from robocas_ms3.demos.settings import EpisodeSettings, GenerateSettings
@@ -29,11 +36,11 @@ from robocas_ms3.planning.decisions import Seconds
 
 RUN = "run.json"
 WEIGHTS = "after_policy_weights"
-"""Key of ``run.json``: hash of the weights of ``after_policy``."""
+"""Key of ``run.json`` with the hash of the weights of ``after_policy``."""
 
 
 def _upgrade_run(record: dict[str, Any]) -> dict[str, Any]:
-    """Return a ``run.json`` with defaults for what older versions of the package did not record."""
+    """Return a ``run.json`` with defaults for keys that older versions of the package did not write."""
     settings = record["settings"]
     if isinstance(settings, dict):
         settings = {**json.loads(json.dumps(asdict(EpisodeSettings("pick")))), **settings}
@@ -49,10 +56,10 @@ class Summary:
 
     Attributes:
         seeds: number of seeds tried.
-        mean_seconds: CPU seconds per seed tried: reset, planning, simulation, open-loop checks (`check`).
+        mean_seconds: CPU seconds per seed tried, by part: reset, planning, simulation, check (open loop).
         mean_steps: control steps per episode.
-        failures: ``{"stage: reason": count}`` of all attempts.
-        gave_up: seeds without an episode.
+        failures: ``{"stage: reason": count}`` of all failed attempts.
+        skipped: skipped seeds.
     """
 
     trajectory: Path
@@ -61,7 +68,7 @@ class Summary:
     mean_seconds: dict[str, float]
     mean_steps: float
     failures: dict[str, int]
-    gave_up: list[int]
+    skipped: list[int]
 
     @property
     def success_rate(self) -> float:
@@ -71,35 +78,35 @@ class Summary:
 def generate(
     settings: GenerateSettings,
     *,
-    on_start: Callable[[int], None] = lambda there: None,
+    on_start: Callable[[int], None] = lambda existing: None,
     on_result: Callable[[EpisodeResult], None] = lambda result: None,
-    players: Callable[[], Worker[int, Takeover]] | None = None,
+    make_roll_in: Callable[[], Worker[int, Intervention]] | None = None,
     weights: str = "",
 ) -> Summary:
-    """Generate episodes of consecutive seeds until there are enough.
+    """Generate episodes of consecutive seeds until the requested number is recorded.
 
-    The output folder gets ``trajectory.h5`` and ``.json``, ``failures.jsonl``, ``run.json`` (settings and versions) and
-    ``summary.json``. Each finished episode is a file of its own under ``episodes`` until the end: calling again
-    continues an interrupted run, or adds episodes to a finished one. Seeds are consecutive and results are taken in
-    their order, so neither ``jobs`` nor an interruption changes the outcome.
+    The function writes ``trajectory.h5`` and ``.json``, ``failures.jsonl``, ``run.json`` (settings and versions) and
+    ``summary.json`` to the output folder. Each finished episode is a separate file in ``episodes`` until the end of the
+    run. A second call resumes an interrupted run, or adds episodes to a finished run. Seeds are consecutive and results
+    are taken in their order, so neither ``jobs`` nor an interruption changes the episodes.
 
     Args:
         settings: options of the run.
         on_start: called with the number of existing episodes, after all checks.
         on_result: called for each new seed, in order.
-        players: makes the worker that runs ``after_policy`` in the scene of a seed, in processes of its own: a process
-            that renders or uses CUDA can't be forked.
-        weights: hash of that policy's weights, if it has some; a run continues with the same.
+        make_roll_in: makes the worker that runs ``after_policy`` in the scene of a seed. It runs in separate processes,
+            since a process that renders or uses CUDA cannot be forked.
+        weights: hash of the weights of that policy, if it has weights; a run is resumed with the same weights only.
 
     Raises:
         OutputExistsError: the folder was written with other settings or versions, or by another command.
-        RobocasError: an argument is invalid, which leaves no trace; another process writes there; far too many seeds
-            fail.
+        RobocasError: a setting is invalid (checked before anything is written), another process writes to the folder,
+            or too many seeds are skipped.
     """
     settings = settings.resolve()
     settings.check()
     assert settings.out is not None
-    assert bool(settings.episode.after_policy) == (players is not None)
+    assert bool(settings.episode.after_policy) == (make_roll_in is not None)
     record = {"settings": asdict(settings.episode), "first_seed": settings.seed, "versions": versions()}
     if weights:
         record[WEIGHTS] = weights
@@ -109,34 +116,34 @@ def generate(
         on_start(min(settings.episodes, sum(result.success for result in run.earlier.values())))
         results, good = [], 0
         try:
-            with closing(_results(settings, run, players)) as found:
+            with closing(_results(settings, run, make_roll_in)) as found:
                 while good < settings.episodes:
                     result = next(found)
                     if result.seed not in run.earlier:
                         output.check_exists()
-                        run.ledger.append(_lines(result))
+                        run.failures.append(_lines(result))
                         on_result(result)
                     results.append(result)
                     good += result.success
                     if len(results) - good > max(20, 3 * good):
                         raise RobocasError(
-                            "far too many seeds fail",
+                            "too many seeds are skipped",
                             where=output.path,
                             found=f"{len(results) - good} of {len(results)}",
-                            fix=f"See {FAILURES_FILE}; a smaller objects.count may help.",
+                            fix=f"See {FAILURES_FILE} for the reasons; fewer objects (--set objects.count=N) may help.",
                         )
         except BaseException:
             if not (results or run.earlier):
-                shutil.rmtree(run.shards, ignore_errors=True)  # unfinished episodes
+                shutil.rmtree(run.shards, ignore_errors=True)  # partial files only
             raise
         return run.finish(results)
 
 
 def _results(
-    settings: GenerateSettings, run: _Run, players: Callable[[], Worker[int, Takeover]] | None
+    settings: GenerateSettings, run: _Run, make_roll_in: Callable[[], Worker[int, Intervention]] | None
 ) -> Generator[EpisodeResult, None, None]:
     missing = (seed for seed in count(settings.seed) if seed not in run.earlier)
-    with closing(generate_seeds(settings, missing, run.shards, players)) as new:
+    with closing(generate_seeds(settings, missing, run.shards, make_roll_in)) as new:
         for seed in count(settings.seed):
             yield run.earlier[seed] if seed in run.earlier else next(new)
 
@@ -145,17 +152,17 @@ def generate_seeds(
     settings: GenerateSettings,
     seeds: Iterator[int],
     folder: Path,
-    players: Callable[[], Worker[int, Takeover]] | None = None,
+    make_roll_in: Callable[[], Worker[int, Intervention]] | None = None,
 ) -> Generator[EpisodeResult, None, None]:
-    """Yield the results of endless seeds in their order; each episode gets a file in ``folder``."""
+    """Yield the results of an endless iterator of seeds, in order; write each episode to a file in ``folder``."""
     limits = Limits(settings.episode_seconds, settings.memory_gb)
     with ExitStack() as stack:
-        tasks: Iterator[int | Takeover] = seeds
-        if players is not None:
-            make_player = partial(_make_player, players, settings.jobs)
-            on_crash = partial(_crashed_takeover, settings.episode.after_policy)
-            acting = WorkerPool(make_player, settings.jobs, limits=limits, on_crash=on_crash)
-            tasks = stack.enter_context(closing(stack.enter_context(acting).map(seeds)))
+        tasks: Iterator[int | Intervention] = seeds
+        if make_roll_in is not None:
+            make_roll_in_worker = partial(_make_roll_in_worker, make_roll_in, settings.jobs)
+            on_crash = partial(_crashed_roll_in, settings.episode.after_policy)
+            roll_ins = WorkerPool(make_roll_in_worker, settings.jobs, limits=limits, on_crash=on_crash)
+            tasks = stack.enter_context(closing(stack.enter_context(roll_ins).map(seeds)))
         make_worker = partial(_EpisodeWorker, settings, folder)
         pool = WorkerPool(make_worker, settings.jobs, limits=limits, on_crash=_crashed_episode)
         yield from stack.enter_context(pool).map(tasks)
@@ -163,65 +170,65 @@ def generate_seeds(
 
 class _EpisodeWorker:
     def __init__(self, settings: GenerateSettings, folder: Path) -> None:
-        from robocas_ms3.demos.generator import EpisodeGenerator  # takes seconds, and only workers need it
+        from robocas_ms3.demos.generator import EpisodeGenerator  # its import takes seconds
 
-        if settings.jobs:  # the user's own process keeps its threads
+        if settings.jobs:  # jobs=0: this process keeps its threads
             use_one_torch_thread()
         self._generator, self._folder = EpisodeGenerator(settings.episode, fork=settings.fork), folder
 
-    def run(self, task: int | Takeover) -> EpisodeResult:
-        seed, takeover = (task, None) if isinstance(task, int) else (task.seed, task)
-        return self._generator.generate(seed, self._folder, shard_name(seed), takeover)
+    def run(self, task: int | Intervention) -> EpisodeResult:
+        seed, intervention = (task, None) if isinstance(task, int) else (task.seed, task)
+        return self._generator.generate(seed, self._folder, shard_name(seed), intervention)
 
     def close(self) -> None:
         self._generator.close()
 
 
-def _make_player(players: Callable[[], Worker[int, Takeover]], jobs: int) -> Worker[int, Takeover]:
+def _make_roll_in_worker(make_roll_in: Callable[[], Worker[int, Intervention]], jobs: int) -> Worker[int, Intervention]:
     if jobs:
         use_one_torch_thread()
-    return players()
+    return make_roll_in()
 
 
-def _crashed_takeover(policy: str, seed: int, reason: str) -> Takeover:
-    return Takeover(seed, policy, 0, {}, 1.0, reason)
+def _crashed_roll_in(policy: str, seed: int, reason: str) -> Intervention:
+    return Intervention(seed, policy, 0, {}, 1.0, reason)
 
 
-def _crashed_episode(task: int | Takeover, reason: str) -> EpisodeResult:
+def _crashed_episode(task: int | Intervention, reason: str) -> EpisodeResult:
     seed = task if isinstance(task, int) else task.seed
-    return EpisodeResult(seed, success=False, attempts=1, failures=[Failure(seed, 0, "worker", reason, 0.0)])
+    return EpisodeResult(seed, success=False, attempts=1, failures=[FailedAttempt(seed, 0, "worker", reason, 0.0)])
 
 
 def shard_name(seed: int) -> str:
     return f"seed_{seed:09d}"
 
 
-def _lines(result: EpisodeResult) -> list[Failure]:
-    given_up = [] if result.success else [Failure(result.seed, -1, "episode", "gave_up", 0.0)]
-    return [*result.failures, *given_up]
+def _lines(result: EpisodeResult) -> list[FailedAttempt]:
+    skipped = [] if result.success else [FailedAttempt(result.seed, -1, "episode", "skipped", 0.0)]
+    return [*result.failures, *skipped]
 
 
 class _Run:
     """Files of a run in its output folder.
 
     Attributes:
-        shards: folder with a file per episode that is not merged yet.
-        ledger: ``failures.jsonl``.
-        earlier: results of earlier runs by seed: in the merged file, in files of their own, or given up.
+        shards: folder with one file per episode that is not merged yet.
+        failures: ``failures.jsonl``.
+        earlier: results of earlier calls by seed: merged episodes, episodes in ``shards``, and skipped seeds.
     """
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._trajectory = folder, folder / "trajectory.h5"
         self.shards = make_folder(folder / "episodes")
-        self.ledger: JsonLinesFile[Failure] = JsonLinesFile(folder / FAILURES_FILE, Failure)
-        noted: dict[int, dict[int, Failure]] = defaultdict(dict)  # by seed and attempt, the first of duplicates
-        for failure in self.ledger.read():
-            noted[failure.seed].setdefault(failure.attempt, failure)
-        self._noted = noted
+        self.failures: JsonLinesFile[FailedAttempt] = JsonLinesFile(folder / FAILURES_FILE, FailedAttempt)
+        logged: dict[int, dict[int, FailedAttempt]] = defaultdict(dict)  # by seed and attempt, the first of duplicates
+        for failure in self.failures.read():
+            logged[failure.seed].setdefault(failure.attempt, failure)
+        self._logged = logged
         self.earlier = {
             seed: EpisodeResult(seed, success=False, failures=list(lines.values())[:-1])
-            for seed, lines in noted.items()
-            if list(lines) == [*range(len(lines) - 1), -1]  # else lines are lost: run it again
+            for seed, lines in logged.items()
+            if list(lines) == [*range(len(lines) - 1), -1]  # else lines are missing: run the seed again
         }
         for path in sorted(self.shards.glob("seed_*.h5")):
             try:
@@ -230,29 +237,29 @@ class _Run:
             except RobocasError:
                 path.unlink()
         self.earlier |= self._merged()
-        self._rewrite_ledger([self.earlier[seed] for seed in sorted(self.earlier)])
+        self._rewrite_failures([self.earlier[seed] for seed in sorted(self.earlier)])
 
-    def _rewrite_ledger(self, results: list[EpisodeResult]) -> None:
-        """See that the ledger has the lines of these results, whatever a kill has lost, doubled or left behind."""
+    def _rewrite_failures(self, results: list[EpisodeResult]) -> None:
+        """Rewrite ``failures.jsonl`` if its lines differ from these results, e.g. after a kill."""
         lines = [line for result in results for line in _lines(result)]
-        if [line.record for line in self.ledger.lines()] != lines:
-            self.ledger.rewrite(lines)
+        if [line.record for line in self.failures.lines()] != lines:
+            self.failures.rewrite(lines)
 
     def _read(self, path: Path) -> dict[int, EpisodeResult]:
         results = {}
         for episode in read_json(path)["episodes"]:
             try:
-                # the block is written last: without it the episode was cut short
-                if about := episode.get("robocas"):
+                # the key is written last: an entry without it is incomplete
+                if recorded := episode.get("robocas"):
                     seed = int(episode["episode_seed"])
-                    result = EpisodeResult(seed, True, int(episode["elapsed_steps"]), int(about["attempts"]))
-                    result.failures = failed_attempts(seed, about["failed_attempts"], self._noted[seed])
-                    for part, value in about["seconds"].items():
+                    result = EpisodeResult(seed, True, int(episode["elapsed_steps"]), int(recorded["attempts"]))
+                    result.failures = failed_attempts(seed, recorded["failed_attempts"], self._logged[seed])
+                    for part, value in recorded["seconds"].items():
                         setattr(result.seconds, part, float(value))
                     results[seed] = result
             except (KeyError, TypeError, ValueError, AttributeError) as error:
-                where, fix = path.with_suffix(".json"), "Choose another --out, or --overwrite."
-                what = "`robocas generate` did not write this file"
+                where, fix = path.with_suffix(".json"), "Choose another --out, or use --overwrite."
+                what = "not written by `robocas generate`"
                 raise DatasetError(what, where=where, found=one_line(error), fix=fix) from error
         return results
 
@@ -262,22 +269,22 @@ class _Run:
             return {}
         data = read_json(path)
         with open_trajectory(path) as file:
-            there = [episode for episode in data["episodes"] if f"traj_{episode['episode_id']}" in file]
-        if len(there) < len(data["episodes"]):  # a merge was killed between its two files
-            write_json(path.with_suffix(".json"), {**data, "episodes": there})
+            stored = [episode for episode in data["episodes"] if f"traj_{episode['episode_id']}" in file]
+        if len(stored) < len(data["episodes"]):  # a merge was killed between its two files
+            write_json(path.with_suffix(".json"), {**data, "episodes": stored})
         return self._read(path)
 
     def finish(self, results: list[EpisodeResult]) -> Summary:
         merged = self._merged()
-        beyond = range(results[-1].seed + 1, max(merged, default=-1) + 1)  # more are there than were asked for
+        beyond = range(results[-1].seed + 1, max(merged, default=-1) + 1)  # more episodes exist than were requested
         results = [*results, *(self.earlier[seed] for seed in beyond if seed in self.earlier)]
         good = [result for result in results if result.success]
         new = [self.shards / f"{shard_name(result.seed)}.h5" for result in good if result.seed not in merged]
         if new:
             merge(([self._trajectory] if merged else []) + new, self._trajectory)
-            flush_to_disk(self._folder)  # before the files are deleted that it is made of
+            flush_to_disk(self._folder)  # before its source files are deleted
         shutil.rmtree(self.shards)
-        self._rewrite_ledger(results)
+        self._rewrite_failures(results)
         seconds = {part.name: [getattr(result.seconds, part.name) for result in results] for part in fields(Seconds)}
         summary = Summary(
             self._trajectory,
@@ -285,7 +292,7 @@ class _Run:
             len(results),
             {name: round(float(np.mean(values)), 3) for name, values in seconds.items()},
             round(float(np.mean([result.steps for result in good])), 1),
-            count_by_stage(self.ledger.read()),
+            count_by_stage(self.failures.read()),
             [result.seed for result in results if not result.success],
         )
         rate = {"trajectory": self._trajectory.name, "success_rate": summary.success_rate}

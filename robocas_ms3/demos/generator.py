@@ -1,4 +1,4 @@
-"""One seed to one recorded episode: attempts, undone or kept, until the task succeeds."""
+"""Generate the episode of a seed: attempts of the scripted policy until the task succeeds."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ import numpy as np
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.core.errors import LayoutError, PlanningError, UnrecoverableError
 from robocas_ms3.core.extensions import load_object
-from robocas_ms3.demos.backtracking import Resimulation
-from robocas_ms3.demos.branches import ForkedBranches, say_once, why_not_fork
-from robocas_ms3.demos.failures import EpisodeResult, Takeover
-from robocas_ms3.demos.interventions import complete
-from robocas_ms3.demos.open_loop import OpenLoop, Trials
+from robocas_ms3.demos.backtracking import ResimulatedDecisions
+from robocas_ms3.demos.branches import ForkedDecisions, reason_not_to_fork, warn_no_fork
+from robocas_ms3.demos.failures import EpisodeResult, Intervention
+from robocas_ms3.demos.interventions import intervene
+from robocas_ms3.demos.open_loop import OpenLoopChecks, OpenLoopEnv
 from robocas_ms3.demos.recordings.environment import RecordedEnv
 from robocas_ms3.demos.recordings.episode_recorder import EpisodeRecorder
 from robocas_ms3.demos.recordings.subgoals import SubGoal
 from robocas_ms3.demos.settings import EpisodeSettings
-from robocas_ms3.planning.decisions import Decisions, StraightDecisions
+from robocas_ms3.planning.decisions import Decisions, IrreversibleDecisions
 from robocas_ms3.planning.executor import Executor
 from robocas_ms3.planning.kinematics import ArmChain, Reachability
 from robocas_ms3.planning.protocol import Planner
@@ -35,13 +35,13 @@ from robocas_ms3.tasks.base import RoboCASEnv
 
 
 class EpisodeGenerator:
-    """Makes episodes of one task in one process: holds the environment, the planner and the policy.
+    """Generator of the episodes of one task in one process, with its environment, planner and policy.
 
-    Next to other processes it needs one thread of torch (``torch.set_num_threads``).
+    Limit torch to one thread (``torch.set_num_threads``) if several processes generate at once.
 
     Args:
-        settings: the same for all episodes.
-        fork: undo failed attempts by forking where that is safe; the episodes are the same without.
+        settings: settings of all episodes.
+        fork: whether to undo failed attempts by forking if that is safe; the episodes do not depend on it.
     """
 
     def __init__(self, settings: EpisodeSettings, *, fork: bool = True) -> None:
@@ -68,48 +68,48 @@ class EpisodeGenerator:
         self.reachability = Reachability(ArmChain(robot.files().arm_urdf, robot.description))
         # a scripted policy tries once, from wherever the episode stands, and raises PlanningError
         self.policy: Callable[[Arm], None] = load_object(TASKS[settings.task].solver)
-        self.worlds: list[OpenLoop] = []
-        self.trials: Trials | None = None
+        self.open_loop_envs: list[OpenLoopEnv] = []
+        self.open_loop_checks: OpenLoopChecks | None = None
         if settings.check_rate and not config.base_motion:
             scene = {"config": settings.config, "layouts": settings.layouts, **chosen}
             env = RecordedEnv(TASKS[settings.task].env_id, None, scene).with_pack(settings.pack)
-            self.worlds = [OpenLoop(env, settings.check_rate) for _ in range(1 + settings.check_trials)]
-            self.trials = Trials(self.worlds, settings)
+            self.open_loop_envs = [OpenLoopEnv(env, settings.check_rate) for _ in range(1 + settings.check_trials)]
+            self.open_loop_checks = OpenLoopChecks(self.open_loop_envs, settings)
         self._fork = fork and not settings.keep_recoveries
-        reason = why_not_fork(renders=base_env.scene.can_render())
+        reason = reason_not_to_fork(renders=base_env.scene.can_render())
         if self._fork and reason:
-            say_once(reason)
+            warn_no_fork(reason)
             self._fork = False
 
-    def generate(self, seed: int, folder: Path, name: str, takeover: Takeover | None = None) -> EpisodeResult:
-        """Make the episode of a seed, as ``folder/name.h5`` and ``.json``; no files where every attempt failed.
+    def generate(self, seed: int, folder: Path, name: str, intervention: Intervention | None = None) -> EpisodeResult:
+        """Generate the episode of a seed; write ``folder/name.h5`` and ``.json`` if an attempt succeeds.
 
-        The same seed and versions give the same episode, whatever was generated before. With a takeover, the episode
-        begins where another policy was in this scene.
+        The episode depends only on the seed, the settings and the package versions. With an intervention, it starts in
+        the state in which another policy left the scene.
         """
         recorder = EpisodeRecorder(self.env, folder, name)
         executor = Executor(recorder, seed)
         result = EpisodeResult(seed, success=False, seconds=executor.seconds, max_attempts=self.settings.max_attempts)
-        attempts = _Attempts(self, recorder, executor, result, takeover)
-        executor.rehearse = attempts.rehearse
+        attempts = _Attempts(self, recorder, executor, result, intervention)
+        executor.check_open_loop = attempts.check_open_loop
         try:
-            if takeover is not None and takeover.refused:
-                raise UnrecoverableError("takeover", takeover.refused)
+            if intervention is not None and intervention.skip_reason:
+                raise UnrecoverableError("intervention", intervention.skip_reason)
             if self.settings.keep_recoveries:
-                attempts.make_in_one_motion()
+                attempts.run_in_one_motion()
             else:
-                attempts.make_from_resets(ForkedBranches(result) if self._fork else Resimulation(result))
+                attempts.run_from_resets(ForkedDecisions(result) if self._fork else ResimulatedDecisions(result))
         except LayoutError as error:
-            result.failed(PlanningError("layout", error.what))
-        except UnrecoverableError as error:  # of a takeover; those of attempts are dealt with there
-            result.failed(error)
+            result.add_failure(PlanningError("layout", error.what))
+        except UnrecoverableError as error:  # of an intervention; those of attempts are handled there
+            result.add_failure(error)
         result.attempts = len(result.failures) + result.success
         return result
 
     def close(self) -> None:
         self.env.close()
-        for world in self.worlds:
-            world.close()
+        for env in self.open_loop_envs:
+            env.close()
 
 
 @dataclass
@@ -118,11 +118,11 @@ class _Attempts:
     recorder: EpisodeRecorder
     executor: Executor
     result: EpisodeResult
-    takeover: Takeover | None
+    intervention: Intervention | None
 
-    def make_from_resets(self, decisions: ForkedBranches | Resimulation) -> None:
-        """Make attempts, each from the reset; within them decisions are made otherwise."""
-        while not self.result.exhausted:
+    def run_from_resets(self, decisions: ForkedDecisions | ResimulatedDecisions) -> None:
+        """Run attempts, each from the reset, with backtracking over the decisions of the policy."""
+        while not self.result.out_of_attempts:
             number = len(self.result.failures)
 
             def attempt(number: int = number) -> None:
@@ -133,13 +133,13 @@ class _Attempts:
             if decisions.run(attempt):
                 return
 
-    def make_in_one_motion(self) -> None:
-        """Make attempts one after the other in one motion, as long as failures can be repaired."""
+    def run_in_one_motion(self) -> None:
+        """Run attempts one after the other as one motion; start from the reset again if recovery is impossible."""
         executor, result = self.executor, self.result
-        decisions = StraightDecisions(lambda: len(executor.actions))
+        decisions = IrreversibleDecisions(lambda: len(executor.actions))
         recoveries: list[dict[str, Any]] = []
         self._reset()
-        while not result.exhausted:
+        while not result.out_of_attempts:
             first = len(executor.actions)
             arm = self._arm(decisions, len(result.failures))
             try:
@@ -150,7 +150,7 @@ class _Attempts:
                 self._finish(recoveries)
                 return
             except PlanningError as error:
-                result.failed(error)
+                result.add_failure(error)
                 last = error
             try:
                 if not first < len(executor.actions) < self.generator.horizon or isinstance(last, UnrecoverableError):
@@ -166,66 +166,76 @@ class _Attempts:
         return Arm(self.generator.planner, self.generator.reachability, self.executor, decisions, (number,))
 
     def _play(self, arm: Arm) -> None:
-        if self.takeover is None:
+        if self.intervention is None:
             self.generator.policy(arm)
         else:
-            complete(arm, self.generator.policy)
+            intervene(arm, self.generator.policy)
 
     def _reset(self) -> None:
         self.executor.reset()
-        with self.executor.seconds.spent_on("reset"):
-            if self.takeover is not None:
-                self.recorder.begin_at(self.takeover.state)
+        with self.executor.seconds.measure("reset"):
+            if self.intervention is not None:
+                self.recorder.start_at(self.intervention.state)
                 self.executor.info = self.executor.base_env.get_info()
-                self.executor.gripper = self.takeover.gripper
-            if self.generator.trials is not None:
-                self.generator.trials.reset(self.executor.seed, self.takeover)
+                self.executor.gripper = self.intervention.gripper
+            if self.generator.open_loop_checks is not None:
+                self.generator.open_loop_checks.reset(self.executor.seed, self.intervention)
 
     @property
-    def _noisy(self) -> bool:
+    def _check_with_noise(self) -> bool:
         return self.result.noise_failures < self.generator.settings.check_failures
 
-    def rehearse(self, *, finished: bool = False) -> None:
-        if self.generator.trials is not None:
+    def check_open_loop(self, *, finished: bool = False) -> None:
+        if self.generator.open_loop_checks is not None:
             gripper = np.array([action[7] for action in self.executor.actions])
-            with self.executor.seconds.spent_on("check"):
-                self.generator.trials.follow(self.recorder.states, gripper, finished=finished, noisy=self._noisy)
+            with self.executor.seconds.measure("check"):
+                self.generator.open_loop_checks.check(
+                    self.recorder.states, gripper, finished=finished, noise=self._check_with_noise
+                )
 
     def _finish(self, recoveries: list[dict[str, Any]]) -> None:
         if len(self.executor.actions) > self.generator.horizon:
             raise UnrecoverableError("horizon", "too_long")
         if not self.executor.flag("success"):
             raise PlanningError("episode", "no_success")
-        self.rehearse(finished=True)
+        self.check_open_loop(finished=True)
         self.result.success, self.result.steps = True, len(self.executor.actions)
         self.recorder.finish(self._describe(recoveries))
 
     def _describe(self, recoveries: list[dict[str, Any]]) -> dict[str, Any]:
-        executor, settings, tried = self.executor, self.generator.settings, self.generator.trials is not None
-        env, taken = executor.base_env, self.takeover
+        executor, settings, checked = (
+            self.executor,
+            self.generator.settings,
+            self.generator.open_loop_checks is not None,
+        )
+        env, intervention = executor.base_env, self.intervention
         target = env.target_asset().asset
-        if taken is not None:
-            executor.segments[0].first = 0  # what freed the way to it is part of it
+        if intervention is not None:
+            executor.segments[0].first = 0  # the first sub-goal includes the retreat before it
         bounds = [part.first for part in executor.segments] + [len(executor.actions)]
-        said, layout = env.instruction(), env.layout()
-        assert layout is not None  # there was a reset
+        instruction, layout = env.instruction(), env.layout()
+        assert layout is not None  # set by the reset
         return {
-            "instruction": said.text,
-            "instruction_template": said.template_id,
+            "instruction": instruction.text,
+            "instruction_template": instruction.template_id,
             "relation": layout.relation,
             "support": env.task_config.support,
             "target": {"slot": int(env.target_slot[0]), "asset_id": target.id, "name": target.name},
             "objects": [asset.asset.id for asset in env.object_assets[0]],
             "subgoals": [
-                SubGoal.of(part.goal_type, part.goal_description, part.first, after - 1).model_dump()
-                for part, after in zip(executor.segments, bounds[1:], strict=True)
+                SubGoal.of(part.goal_type, part.goal_description, part.first, end - 1).model_dump()
+                for part, end in zip(executor.segments, bounds[1:], strict=True)
             ],
-            "check_rate": settings.check_rate if tried else None,
+            "check_rate": settings.check_rate if checked else None,
             "facts": {"disturbed": int(executor.info["disturbed"][0]), **executor.facts},
             "seconds": {part: round(value, 3) for part, value in asdict(executor.seconds).items()},
             "attempts": len(self.result.failures) + 1,
             "failed_attempts": [f"{failure.stage}: {failure.reason}" for failure in self.result.failures],
-            "check_trials": None if not tried else settings.check_trials if self._noisy else 0,
+            "check_trials": None if not checked else settings.check_trials if self._check_with_noise else 0,
             "recoveries": recoveries,
-            **({"takeover": {"policy": taken.policy, "policy_steps": taken.policy_steps}} if taken else {}),
+            **(
+                {"intervention": {"policy": intervention.policy, "policy_steps": intervention.policy_steps}}
+                if intervention
+                else {}
+            ),
         }

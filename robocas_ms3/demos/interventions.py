@@ -1,7 +1,7 @@
-"""Complete a task from the physical state in which a learned policy left it (`evaluation.policy_rollin`).
+"""Expert interventions (DAgger): complete a task from the state in which a learned policy left it.
 
-The scripted policy brakes, opens the gripper unless it holds the target, retreats from objects in its way, and does the
-task from there. Only this part is recorded.
+The scripted policy stops the arm, opens the gripper unless it holds the target, retreats from objects that it touches,
+and does the task from there. Only this part is recorded. `evaluation.policy_rollin` runs the learned policy.
 """
 
 from __future__ import annotations
@@ -15,41 +15,42 @@ from robocas_ms3.planning.executor import OPEN
 from robocas_ms3.planning.protocol import Array, Trajectory
 from robocas_ms3.planning.skills.arm import BACK_OUT, Arm, moved_back, plan_back_out, raised
 from robocas_ms3.planning.skills.base_placement import bring_to_basket
-from robocas_ms3.planning.skills.remove import hang_clear
+from robocas_ms3.planning.skills.remove import raise_held_object
 
-BRAKE_SECONDS = 0.2  # held where it was taken over, until it stands; a step of a dataset at 5 Hz
-LIFT = 0.10  # m that a held target is raised before it is carried, as after a grasp (`skills.grasping`)
+STOP_SECONDS = 0.2  # s to hold the initial position until the arm is at rest; a step of a dataset at 5 Hz
+LIFT = 0.10  # m that a held target is lifted before it is carried, as after a grasp (`skills.grasp`)
 
 
-def complete(arm: Arm, policy: Callable[[Arm], None]) -> None:
-    """Do the task (``policy``) from a state in which another policy was; returns when it has succeeded.
+def intervene(arm: Arm, policy: Callable[[Arm], None]) -> None:
+    """Complete the task with a scripted policy from the state in which another policy left the scene.
 
-    A held target is carried on; on every other attempt it is let go, since it may be held in a way that leads nowhere.
+    On even attempts a held target is carried to the basket. On odd attempts it is released first, since the grasp may
+    be unusable.
     """
     slot = arm.target
-    arm.executor.move_gripper(arm.executor.gripper, arm.at, seconds=BRAKE_SECONDS)
+    arm.executor.move_gripper(arm.executor.gripper, arm.at, seconds=STOP_SECONDS)
     if arm.executor.gripper != OPEN and arm.holds(slot) and arm.path[0] % 2 == 0:
-        _carry_on(arm, slot)
+        _carry_held_target(arm, slot)
         return
-    _get_free(arm)
+    _retreat(arm)
     policy(arm)
 
 
-def _carry_on(arm: Arm, slot: int) -> None:
+def _carry_held_target(arm: Arm, slot: int) -> None:
     if not arm.executor.flag("target_lifted"):
         arm.begin_subgoal("move and grasp")
         with arm.planning():
             lift = arm.plan_rise(arm.planner.tcp(arm.at), LIFT, stage="lift")
         arm.follow(lift)
     if arm.approach == "top":
-        hang_clear(arm, slot)  # it may have been lifted just above its neighbours
+        raise_held_object(arm, slot)  # it may be only just above its neighbours
     if not arm.holds(slot):
         raise PlanningError("lift", "slipped")
     bring_to_basket(arm, slot)
 
 
-def _get_free(arm: Arm) -> None:
-    """Open the gripper, and leave what the arm touches: upwards, or back where something may be above."""
+def _retreat(arm: Arm) -> None:
+    """Open the gripper and move away from everything that the arm touches: up, or back in a front approach."""
     if arm.executor.gripper != OPEN:
         arm.open_gripper()
     if arm.approach == "top":
@@ -63,21 +64,21 @@ def _get_free(arm: Arm) -> None:
         try:
             motion = plan_back_out(arm, [moved_back(tcp, distance) for distance in BACK_OUT])
         except PlanningError:
-            motion = _plan_off(arm, tcp)
+            motion = _plan_shortest_retreat(arm, tcp)
     arm.follow(motion)
 
 
-def _plan_off(arm: Arm, tcp_in_base: Array) -> Trajectory:
-    """Plan the shortest straight line off what is touched, through it: back, up, or towards the robot."""
+def _plan_shortest_retreat(arm: Arm, tcp_in_base: Array) -> Trajectory:
+    """Plan the shortest collision-ignoring straight line to a free pose: back, up, or towards the robot."""
     arm.planner.set_scene(arm.scene.obstacles())
     for distance in BACK_OUT[::-1]:
         inward = tcp_in_base.copy()
         inward[:2, 3] *= 1 - distance / np.linalg.norm(tcp_in_base[:2, 3])
         for goal in (moved_back(tcp_in_base, distance), raised(tcp_in_base, distance), inward):
             try:
-                line = arm.planner.plan_straight(arm.at, goal, stage="takeover", check_collisions=False)
+                line = arm.planner.plan_straight(arm.at, goal, stage="intervention", check_collisions=False)
             except PlanningError:
                 continue
             if arm.planner.free(line.qpos[-1:], arm.planner.finger_width).all():
                 return line
-    raise PlanningError("takeover", "stuck")
+    raise PlanningError("intervention", "stuck")

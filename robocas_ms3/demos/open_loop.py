@@ -1,7 +1,7 @@
-"""Plays 7-D dataset actions open loop at a dataset's rate, and checks a demonstration's own actions while it is made.
+"""Replay 7-D dataset actions open loop at the rate of a dataset, and check demonstrations while they are recorded.
 
-Each check (`Trials`) is an environment of its own that plays the actions of the recording so far, part by part, clean
-or with noise. So only the part after which the outcome differs has to be done again.
+`OpenLoopChecks` replays the actions recorded so far in environments of their own: without noise in the first one, with
+noise in the others. The check runs after each part of the episode, so only a part that fails is done again.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.core.errors import DatasetError, UnrecoverableError
-from robocas_ms3.demos.failures import NOISY, Takeover
+from robocas_ms3.demos.failures import WITH_NOISE, Intervention
 from robocas_ms3.demos.recordings.environment import RecordedEnv
 from robocas_ms3.demos.recordings.motion import Array, Motion, sample_states, sample_stride
 from robocas_ms3.demos.settings import EpisodeSettings
@@ -24,21 +24,21 @@ from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.tasks.base import RoboCASEnv
 
 CONTROL_MODE = "pd_ee_delta_pose"
-SETTLE_SECONDS = 1.0  # after the last action, held still: what was let go comes to rest
-# m by which the target may be off the recording at the end of a part; other objects that roll elsewhere show later
-PARTED = 0.02
+SETTLE_SECONDS = 1.0  # s to hold still after the last action, until released objects are at rest
+# m between the target and its recorded position at the end of a part; deviations of other objects are detected later
+MAX_TARGET_OFFSET = 0.02
 
 States = dict[str, dict[str, NDArray[np.float32]]]
 
 
 @dataclass(frozen=True)
-class Playback:
-    """Result of playing an episode's actions.
+class OpenLoopResult:
+    """Result of an open-loop replay of an episode.
 
     Attributes:
-        success: whether the task succeeded, at some step or within ``SETTLE_SECONDS`` after the last one.
-        tcp_in_base: (T, 3) m, of the TCP in the arm's base frame.
-        clipped: actions with a component of the translation, or the norm of the rotation, outside [-1, 1].
+        success: whether the task succeeded at any step or within ``SETTLE_SECONDS`` after the last one.
+        tcp_in_base: (T, 3) TCP positions in the arm's base frame, m.
+        clipped: number of actions with a translation component, or the norm of the rotation, outside [-1, 1].
     """
 
     success: bool
@@ -46,22 +46,26 @@ class Playback:
     clipped: int
 
 
-class OpenLoop:
-    """An environment that takes dataset actions at a rate, a whole number that divides the rate of physics.
+class OpenLoopEnv:
+    """An environment that is stepped with 7-D dataset actions.
+
+    Args:
+        env: the recorded environment.
+        rate_hz: rate of the actions, a divisor of 100, the rate of physics in Hz.
 
     Attributes:
-        success: whether the task has succeeded at some step since the reset.
-        clipped: actions since then that were beyond what one step may do.
+        success: whether the task has succeeded at any step since the reset.
+        clipped: number of actions since the reset that exceed the range of one step.
 
     Raises:
-        DatasetError: no such rate or environment.
+        DatasetError: invalid rate, or the environment is not installed.
     """
 
     def __init__(self, env: RecordedEnv, rate_hz: float) -> None:
         if rate_hz < 1 or rate_hz != int(rate_hz) or 100 % int(rate_hz):
             expected = "a whole number that divides 100"
             raise DatasetError(
-                "actions can't be played at this rate", where="rate_hz", expected=expected, found=rate_hz
+                "actions cannot be replayed at this rate", where="rate_hz", expected=expected, found=rate_hz
             )
         self._env = env.make(
             obs_mode="none",
@@ -90,21 +94,21 @@ class OpenLoop:
     def tcp_in_base(self) -> NDArray[np.float32]:
         return self.env.agent.tcp_in_arm_base.p[0].numpy().copy()
 
-    def begin_at(self, state: dict[str, Any], gripper: float) -> None:
-        """Continue from another state (as ``set_state_dict`` takes it), and the gripper's last command, -1 or 1."""
+    def start_at(self, state: dict[str, Any], gripper: float) -> None:
+        """Set the state (argument of ``set_state_dict``) and the last gripper command, -1 or 1."""
         self.env.set_state_dict(state)
         self._gripper = gripper
 
     def step(self, action: NDArray[np.floating]) -> None:
-        """Play one action (7,), see `motion.stored_actions`."""
-        wanted = np.asarray(action, dtype=np.float64)
-        motion = to_ee_delta_action(wanted[:3], wanted[3:6], euler="xyz")
+        """Apply one action (7,), see `motion.stored_actions`."""
+        action = np.asarray(action, dtype=np.float64)
+        motion = to_ee_delta_action(action[:3], action[3:6], euler="xyz")
         self.clipped += bool(np.abs(motion[:3]).max() > 1 or np.linalg.norm(motion[3:]) > 1)
-        self._gripper = 1.0 if wanted[6] > 0.5 else -1.0
+        self._gripper = 1.0 if action[6] > 0.5 else -1.0
         self._step(np.append(np.clip(motion, -1, 1), self._gripper))
 
     def settle(self) -> bool:
-        """Hold still until the task has succeeded, ``SETTLE_SECONDS`` at most; gives whether it has."""
+        """Hold still until the task succeeds, at most ``SETTLE_SECONDS``; return whether it succeeded."""
         for _ in range(round(SETTLE_SECONDS * self.rate_hz)):
             if self.success:
                 break
@@ -115,84 +119,85 @@ class OpenLoop:
         *_, info = self._env.step(action.astype(np.float32))
         self.success |= bool(info["success"][0])
 
-    def play(self, dataset_actions: NDArray[np.floating]) -> Playback:
-        """Play actions (S, 7) from the reset on; see `motion.stored_actions`, whose last row is left out."""
-        places = [self.tcp_in_base()]
+    def replay(self, dataset_actions: NDArray[np.floating]) -> OpenLoopResult:
+        """Replay actions (S, 7) from the reset: the rows of `motion.stored_actions` without the last one."""
+        positions = [self.tcp_in_base()]
         for action in np.asarray(dataset_actions, dtype=np.float64).reshape(-1, 7):
             self.step(action)
-            places.append(self.tcp_in_base())
+            positions.append(self.tcp_in_base())
         self.settle()
-        return Playback(self.success, np.stack(places).astype(np.float64), self.clipped)
+        return OpenLoopResult(self.success, np.stack(positions).astype(np.float64), self.clipped)
 
     def close(self) -> None:
         self._env.close()
 
 
 def draw_noise(rng: np.random.Generator, count: int, std_mm: float, std_deg: float) -> Array:
-    """Draw the noise (count, 7) of a robot to add to dataset actions: normal, each component by itself."""
+    """Draw actuation noise (count, 7) for dataset actions: independent normal components, m and rad, gripper 0."""
     drawn = np.zeros((count, 7))
     drawn[:, :6] = rng.normal(size=(count, 6)) * np.repeat([std_mm / 1000, np.deg2rad(std_deg)], 3)
     return drawn
 
 
-class Trials:
-    """Environments that follow a recording: the first one plays the actions as they are, the others with noise."""
+class OpenLoopChecks:
+    """Environments that replay a recording in parts: the first one without noise, the others with actuation noise."""
 
-    def __init__(self, worlds: Sequence[OpenLoop], settings: EpisodeSettings) -> None:
-        self._worlds, self._settings = worlds, settings
-        self._stride = sample_stride(settings.control_freq, worlds[0].rate_hz)
-        self._robot = worlds[0].env.robot_spec
-        self._seed, self._played = 0, 0
+    def __init__(self, envs: Sequence[OpenLoopEnv], settings: EpisodeSettings) -> None:
+        self._envs, self._settings = envs, settings
+        self._stride = sample_stride(settings.control_freq, envs[0].rate_hz)
+        self._robot = envs[0].env.robot_spec
+        self._seed, self._replayed = 0, 0
 
-    def reset(self, seed: int, takeover: Takeover | None = None) -> None:
-        for world in self._worlds:
-            world.reset(seed)
-            if takeover is not None:
-                world.begin_at(takeover.state, takeover.gripper)
-        self._seed, self._played = seed, 0
+    def reset(self, seed: int, intervention: Intervention | None = None) -> None:
+        for env in self._envs:
+            env.reset(seed)
+            if intervention is not None:
+                env.start_at(intervention.state, intervention.gripper)
+        self._seed, self._replayed = seed, 0
 
-    def follow(
-        self, states: States, gripper: NDArray[np.floating], *, finished: bool = False, noisy: bool = True
+    def check(
+        self, states: States, gripper: NDArray[np.floating], *, finished: bool = False, noise: bool = True
     ) -> None:
-        """Play what was recorded since the last call, and compare.
+        """Replay the actions recorded since the last call and compare the result with the recording.
 
         Args:
-            states: ManiSkill's, after the reset and after each control step; see ``EpisodeRecorder.states``.
-            gripper: (S,) its commands.
-            finished: the recording has ended: the last action may be a shorter one, and the task must succeed.
-            noisy: play it with noise too; without, those environments stay behind.
+            states: ManiSkill states after the reset and after each control step, see ``EpisodeRecorder.states``.
+            gripper: (S,) gripper commands.
+            finished: whether the recording has ended; then the last action may be shorter, and the task must succeed.
+            noise: whether to replay with noise too; the environments with noise are not stepped otherwise.
 
         Raises:
-            UnrecoverableError: ``clipped``, ``parted`` (the target is elsewhere than recorded) or ``no_success``; with
-                noise ``NOISY`` and the same.
+            UnrecoverableError: reason ``clipped``, ``target_displaced`` (more than ``MAX_TARGET_OFFSET`` from its
+                recorded position) or ``no_success``; with the suffix ``WITH_NOISE`` if only replays with noise fail.
         """
         samples = sample_states(len(gripper), self._stride)
         if not finished:
             samples = samples[samples % self._stride == 0]
-        new = samples[self._played :]
+        new = samples[self._replayed :]
         recorded = states["articulations"][self._robot.description.uid]
         actions = Motion.of(self._robot, recorded, gripper, new).actions[:-1].astype(np.float64)
-        for number, world in enumerate(self._worlds if noisy else self._worlds[:1]):
+        for number, env in enumerate(self._envs if noise else self._envs[:1]):
             for action in self._with_noise(actions, number) if number else actions:
-                world.step(action)
-            reason = _what_is_wrong(world, states, int(new[-1]), finished)
+                env.step(action)
+            reason = _find_deviation(env, states, int(new[-1]), finished)
             if reason:
-                raise UnrecoverableError("replay", f"{NOISY}{reason}" if number else reason)
-        self._played += len(actions)
+                raise UnrecoverableError("open_loop_check", f"{reason}{WITH_NOISE}" if number else reason)
+        self._replayed += len(actions)
 
     def _with_noise(self, actions: NDArray[np.float64], number: int) -> NDArray[np.float64]:
-        # drawn from the first action on, so that an action's noise is the same however often it is played
+        # drawn from the first action on, so that the noise of an action does not depend on the parts
         rng = np.random.default_rng([self._seed, number])
         std = self._settings.check_noise_mm, self._settings.check_noise_deg
-        return actions + draw_noise(rng, self._played + len(actions), *std)[self._played :]
+        return actions + draw_noise(rng, self._replayed + len(actions), *std)[self._replayed :]
 
 
-def _what_is_wrong(world: OpenLoop, states: States, sample: int, finished: bool) -> str:
-    if world.clipped:
+def _find_deviation(env: OpenLoopEnv, states: States, sample: int, finished: bool) -> str:
+    """Return the reason why a replay fails; an empty string if it does not."""
+    if env.clipped:
         return "clipped"
     if finished:
-        return "" if world.settle() else "no_success"
-    target = int(world.env.target_slot[0])
-    recorded = states["actors"][world.env.objects[target].name][sample, :3]
-    off = np.linalg.norm(world.env.object_poses[0, target, :3].numpy() - recorded)
-    return "parted" if off > PARTED else ""
+        return "" if env.settle() else "no_success"
+    target = int(env.env.target_slot[0])
+    recorded = states["actors"][env.env.objects[target].name][sample, :3]
+    offset = np.linalg.norm(env.env.object_poses[0, target, :3].numpy() - recorded)
+    return "target_displaced" if offset > MAX_TARGET_OFFSET else ""

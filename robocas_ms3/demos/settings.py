@@ -14,50 +14,51 @@ from robocas_ms3.robots.registry import DEFAULT as DEFAULT_ROBOT
 from robocas_ms3.robots.registry import find_robot
 from robocas_ms3.scenes.task_specs import SIM_FREQ, STANDARD_FREQ, TASKS
 
-_NO_HINT = tyro.conf.arg(help_behavior_hint="")  # the help text says what the default is
+_NO_HINT = tyro.conf.arg(help_behavior_hint="")  # the help text describes the default
 
 
 def _task_names() -> type:
-    """Return a type of the tasks' names, when the command line is parsed: it loads those of other packages."""
+    """Return a Literal type of all task names; called while parsing, since it loads tasks of other packages."""
     return tyro.extras.literal_type_from_choices(TASKS)
 
 
 @dataclass(frozen=True)
 class EpisodeSettings:
-    """How episodes are generated; the same for all seeds of a run."""
+    """Settings of the episodes; the same for all seeds of a run."""
 
     task: Annotated[str, tyro.conf.Positional, tyro.conf.arg(constructor_factory=_task_names)]
-    """Which task."""
+    """Task to record."""
     config: Annotated[str | dict[str, Any], tyro.conf.arg(constructor=str, help_behavior_hint="")] = ""
-    """Name of a shipped task configuration, or a YAML file. Default: the task's own (see `robocas list`)."""
+    """Bundled task configuration by name, or a YAML file. Default: the default of the task (see `robocas list`)."""
     pack: str = "builtin"
-    """Object pack: its name, or its folder."""
+    """Object pack: name or folder."""
     control_freq: int = STANDARD_FREQ
-    """Control rate in Hz (the paper's is 5); must divide 100, the rate of physics."""
+    """Control rate in Hz, a divisor of 100, the rate of physics. The RoboCAS paper uses 5 Hz."""
     max_attempts: int = 20
-    """Attempts of the policy before a seed is given up."""
+    """Maximum number of attempts of the scripted policy per seed; then the seed is skipped."""
     keep_recoveries: bool = False
-    """Leave failed attempts in the episode, as one continuous motion, instead of undoing them."""
+    """Keep failed attempts in the episode, as one continuous motion, instead of undoing them."""
     check_rate: Annotated[int | None, _NO_HINT] = None
-    """Rate in Hz at which an episode's own 7-D actions are tried open loop; an attempt whose actions don't succeed
-    again is undone. 0: no trial. Default: 5, or the control rate where 5 doesn't divide it."""
+    """Rate in Hz of the open-loop check, which replays the 7-D actions of each attempt; an attempt that fails the
+    check is undone. 0: no check. Default: 5 Hz, or the control rate if 5 is not a divisor of it."""
     check_trials: int = 1
-    """How often they are tried with a robot's noise as well. 0: not at all."""
+    """Number of additional open-loop checks with actuation noise, see --check-noise. 0: none."""
     check_failures: int = 1
-    """Attempts that may fail for noise alone; after so many an episode counts without, and its record says so."""
+    """Maximum number of attempts per seed that fail only with noise; later attempts are checked without noise, and the
+    recording says so (`check_trials: 0`)."""
     check_noise_mm: Annotated[float, tyro.conf.Suppress] = 0.5
     check_noise_deg: Annotated[float, tyro.conf.Suppress] = 0.2
     layouts: Annotated[str, tyro.conf.Suppress] = "auto"
-    """Where layouts come from, see `RoboCASEnv`."""
+    """Source of the layouts, see `RoboCASEnv`."""
     planner: str = "rrt_connect"
-    """Motion planner: rrt_connect, or another package's (see docs/extending.md)."""
+    """Motion planner: rrt_connect, or a planner of another package (see docs/extending.md)."""
     robot: str = DEFAULT_ROBOT
-    """Robot: ours, or another package's (see docs/extending.md)."""
+    """Robot: a robot of this package or of another one (see docs/extending.md)."""
     after_policy: Annotated[str, _NO_HINT] = ""
-    """Have a policy act first, as in the evaluation (its --policy): the scripted one takes over from where it is, and
-    only that is recorded. Scenes in which nothing is left to be done count as seeds given up."""
+    """Policy that acts first, as --policy of `robocas eval` (DAgger). The scripted policy then completes the task, and
+    only its part is recorded. Seeds in which the policy has succeeded or failed already are skipped."""
     after_steps: tuple[int, int] = (5, 60)
-    """Least and most of its steps, of which it has a random number in each scene."""
+    """Minimum and maximum number of policy steps before the scripted policy continues; drawn uniformly per seed."""
 
     def __post_init__(self) -> None:
         config = self.config or TASKS[self.task].default_config
@@ -71,8 +72,8 @@ class EpisodeSettings:
         """Check the settings before anything is written.
 
         Raises:
-            RobocasError: a number is out of its range, the task can't run the configuration, or there is no such
-                planner, robot or pack.
+            RobocasError: a number is out of range, the task cannot run the configuration, or a planner, robot or pack
+                is unknown.
         """
         from robocas_ms3.assets.pack import load_pack
         from robocas_ms3.planning.rrt_connect import BACKENDS
@@ -110,37 +111,38 @@ class EpisodeSettings:
 class GenerateSettings:
     """Record demonstrations of a task with its scripted policy, as a ManiSkill trajectory file.
 
-    Rendering is not needed: states and actions are recorded, images are rendered by `robocas convert`.
+    States and actions are recorded, which needs no renderer; `robocas convert` renders the images.
 
     Example: robocas generate pick -n 20 --config pick_shelf_scattered --set objects.count=12
     """
 
     episode: EpisodeSettings
     out: Annotated[Path | None, _NO_HINT] = None
-    """Output folder. Default: demos/<config>-<pack>."""
+    """Output folder. Default: demos/CONFIG-PACK."""
     episodes: Annotated[int, tyro.conf.arg(aliases=["-n"])] = 10
-    """How many successful episodes to record, at least 1."""
+    """Number of successful episodes to record, at least 1."""
     set: Annotated[tuple[str, ...], _NO_HINT, tyro.conf.UseAppendAction] = ()
     """Set a key of the configuration, such as `--set objects.count=12`; repeatable (docs/configuration.md)."""
     seed: int = 0
-    """First seed, 0 or more; the following episodes take the seeds after it."""
+    """Seed of the first episode, 0 or more; the next episodes use the following seeds."""
     jobs: int = 1
-    """Worker processes. The outcome does not depend on it. 0: this process generates, without limits."""
+    """Number of worker processes; the episodes do not depend on it. 0: record in this process, without limits."""
     episode_seconds: float = 1800.0
-    """Seconds an episode may take. One that takes longer, or more memory, or crashes, is retried once, by another
-    process; then its seed is given up."""
+    """Time limit per episode in seconds. An episode whose process exceeds a limit or crashes is retried once in a new
+    process; then its seed is skipped."""
     memory_gb: float = 8.0
-    """GB of memory a process may use."""
+    """Memory limit per process in GB."""
     check_noise: Annotated[tuple[float, float] | None, _NO_HINT] = None
-    """Noise of the noisy trials: standard deviations in mm and degrees, of each component of each action. Default: 0.5
-    0.2."""
+    """Noise of the open-loop checks with noise: standard deviations in mm and degrees of each component of each action.
+    Default: 0.5 0.2."""
     fork: bool = True
-    """Undo what fails by forking the process, where that is safe. The episodes are the same without, only slower."""
+    """Undo failed attempts by forking the process if that is safe. --no-fork gives the same episodes, but is slower."""
     overwrite: bool = False
-    """Start again. Default: continue a run with the same settings, or add episodes to a finished one."""
+    """Delete the output and start again. Default: resume a run with the same settings, or add episodes to a finished
+    run."""
 
     def resolve(self) -> GenerateSettings:
-        """Return the settings with an output folder, the noise, and a configuration that no file or ``set`` changes.
+        """Return settings with the defaults of folder and noise filled in, and YAML files and ``set`` resolved.
 
         Raises:
             ConfigError: the configuration is invalid.
@@ -170,27 +172,28 @@ class GenerateSettings:
 class ReplaySettings:
     """Replay a trajectory file: its actions, its states, or its actions in another control mode.
 
-    Exit code 1 if an episode does not succeed.
+    Exit status 1 if an episode does not succeed.
 
     Example: robocas replay demos/pick --count 2
     """
 
     trajectory: Annotated[Path, tyro.conf.Positional]
-    """F.h5, with F.json next to it, or the output folder of `robocas generate`."""
+    """Trajectory file F.h5 with F.json next to it, or the output folder of `robocas generate`."""
     control_mode: Annotated[str | None, tyro.conf.arg(aliases=["-c"], help_behavior_hint="")] = None
-    """Convert the actions: pd_joint_delta_pos, pd_ee_delta_pose or pd_ee_pose. Default: as recorded."""
+    """Control mode to convert the actions to: pd_joint_delta_pos, pd_ee_delta_pose or pd_ee_pose. Default: as
+    recorded."""
     obs_mode: Annotated[str, tyro.conf.arg(aliases=["-o"])] = "none"
-    """Observations to record with --save, e.g. rgb+depth or state."""
+    """Observation mode for --save, e.g. rgb+depth or state."""
     use_env_states: bool = False
-    """Set the recorded state after every step."""
+    """Set the recorded state after each step."""
     count: Annotated[int | None, _NO_HINT] = None
-    """Only the first so many episodes, at least 1."""
+    """Number of episodes to replay, from the first on; at least 1. Default: all."""
     save: Annotated[Path | None, _NO_HINT] = None
-    """Write the replayed episodes to this HDF5 file."""
+    """HDF5 file to write the replayed episodes to."""
     allow_failure: bool = False
-    """With --save: write failed episodes too."""
+    """With --save: also write failed episodes."""
     pack: Annotated[str | None, _NO_HINT] = None
-    """Object pack to use instead of the recorded one: its name, or its folder."""
+    """Object pack to use instead of the recorded pack: name or folder."""
     overwrite: bool = False
     """Replace the file given by --save if it exists."""
 

@@ -1,4 +1,4 @@
-"""Replay recorded trajectories: by actions, by actions of another control mode, or by states."""
+"""Replay recorded trajectories by their actions, by actions in another control mode, or by their states."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from robocas_ms3.demos.recordings.trajectory_hdf5 import (
     open_trajectory,
     read_steps,
 )
-from robocas_ms3.demos.recordings.trajectory_json import read_begin, read_json, was_taken_over
+from robocas_ms3.demos.recordings.trajectory_json import is_intervention, read_json, read_reset
 from robocas_ms3.demos.settings import ReplaySettings
 from robocas_ms3.robots.description_file import chain
 from robocas_ms3.robots.ee_controller import RoboCASEEPoseController
@@ -41,18 +41,18 @@ from robocas_ms3.tasks.base import RoboCASEnv
 
 _JOINT_DELTA_SCALE = 0.1  # rad at |action| = 1 of pd_joint_delta_pos
 CONVERTIBLE = ("pd_joint_pos", "pd_joint_delta_pos", "pd_ee_delta_pose", "pd_ee_pose")
-_JOINT_TARGETS = 8  # numbers of an action that can be converted
+_JOINT_TARGETS = 8  # length of an action that can be converted
 
 
 @dataclass(frozen=True)
-class Recorded:
+class RecordedEpisode:
     """A recorded episode of S steps.
 
     Attributes:
         where: name of the episode for messages.
         actions: (S, A).
-        states: S + 1, each as ``set_state_dict`` takes it.
-        taken_over: whether it begins at the first state instead of that of the reset.
+        states: S + 1 states, each an argument of ``set_state_dict``.
+        is_intervention: whether the episode starts at its first state instead of the reset.
     """
 
     where: str
@@ -61,45 +61,47 @@ class Recorded:
     control_mode: str
     actions: NDArray[np.float32]
     states: list[dict[str, Any]]
-    taken_over: bool
+    is_intervention: bool
 
     @classmethod
-    def read(cls, trajectory: Path, episode: dict[str, Any]) -> Recorded:
+    def read(cls, trajectory: Path, episode: dict[str, Any]) -> RecordedEpisode:
         where = f"{trajectory}, traj_{episode['episode_id']}"
-        begin = read_begin(episode, where)
+        reset = read_reset(episode, where)
         with open_trajectory(trajectory) as file:
             actions, states = read_steps(open_episode(file, episode["episode_id"]), extras=True)
-        return cls(where, *begin, actions, dict_to_list_of_dicts(states), was_taken_over(episode))
+        return cls(where, *reset, actions, dict_to_list_of_dicts(states), is_intervention(episode))
 
-    def check_fits(self, env: RoboCASEnv) -> None:
+    def check_compatible(self, env: RoboCASEnv) -> None:
         converted = env.control_mode != self.control_mode
         width = _JOINT_TARGETS if converted else cast(Any, env.single_action_space).shape[0]
         if self.actions.shape[1] != width:
             found = self.actions.shape[1]
-            raise DatasetError("actions of another robot", where=self.where, expected=f"{width} numbers", found=found)
+            raise DatasetError(
+                "actions do not fit the robot", where=self.where, expected=f"{width} numbers per action", found=found
+            )
         theirs = {name: np.size(row) for name, row in named_arrays(self.states[0])}
         ours = {name: np.size(row.cpu().numpy()) for name, row in named_arrays(env.get_state_dict())}
         for name in sorted({*theirs, *ours}):
             body = name.startswith(BODIES)
-            # targets of controllers and the like are kept for some modes, and weren't always
+            # states of controllers depend on the control mode and on the version
             if theirs.get(name) != ours.get(name) and (body or (name in theirs and not converted)):
                 raise DatasetError(
-                    "states of another scene",
+                    "states do not fit the scene",
                     where=f"{self.where}, {name}",
-                    expected=f"{ours[name]} numbers" if name in ours else "nothing of this name",
-                    found=f"{theirs[name]} numbers" if name in theirs else "nothing",
+                    expected=f"{ours[name]} numbers" if name in ours else "no such entry",
+                    found=f"{theirs[name]} numbers" if name in theirs else "no such entry",
                 )
 
 
 @dataclass(frozen=True)
-class Replay:
+class ReplayResult:
     """Result of the replay of one episode.
 
     Attributes:
-        episode_id: in the source file.
-        success: at the last step.
-        state_error: greatest distance of any object or the TCP's joints from the recorded final state, m or rad; None
-            when the actions were converted.
+        episode_id: number of the episode in the source file.
+        success: whether the task is successful at the last step.
+        state_error: greatest absolute difference of any number from the recorded final state, see `state_distance`;
+            None if the actions were converted.
     """
 
     episode_id: int
@@ -108,12 +110,12 @@ class Replay:
     state_error: float | None
 
 
-def replay(settings: ReplaySettings) -> Iterator[Replay]:
-    """Replay episodes one by one, as the iterator is asked for them. Settings are checked at once.
+def replay(settings: ReplaySettings) -> Iterator[ReplayResult]:
+    """Check the settings, then replay episodes lazily, one per result of the iterator.
 
     Raises:
-        DatasetError: the file can't be read, or the control mode can't be converted to.
-        OutputExistsError: ``save``, or its JSON, exists already.
+        DatasetError: the file cannot be read, or the actions cannot be converted to the control mode.
+        OutputExistsError: ``save`` or its JSON file exists already.
         RobocasError: ``count`` or ``obs_mode`` is invalid.
     """
     trajectory, save = settings.file, settings.save
@@ -126,20 +128,21 @@ def replay(settings: ReplaySettings) -> Iterator[Replay]:
     mode = settings.control_mode or recorded_mode
     if mode not in {*CONVERTIBLE, recorded_mode}:
         raise DatasetError(
-            "no control mode to convert to", where=trajectory, expected=f"one of {', '.join(CONVERTIBLE)}", found=mode
+            "unknown control mode", where="--control-mode", expected=f"one of {', '.join(CONVERTIBLE)}", found=mode
         )
     if mode != recorded_mode and (settings.use_env_states or recorded_mode != "pd_joint_pos"):
         raise DatasetError(
-            "only pd_joint_pos recordings can be converted, and not while setting states",
+            "cannot convert the actions",
             where=trajectory,
+            expected="a recording in pd_joint_pos, without --use-env-states",
             found=f"{recorded_mode} -> {mode}",
         )
     open_trajectory(trajectory).close()
     if save is not None:
         if save.suffix != ".h5":
-            raise DatasetError("a trajectory is an HDF5 file", where=save, expected="a name that ends in .h5")
+            raise DatasetError("not the name of an HDF5 file", where=save, expected="a name that ends in .h5")
         if save.resolve() == trajectory.resolve():
-            raise DatasetError("this is the recording itself", where=save, fix="Choose another name for the replay.")
+            raise DatasetError("--save is the recording itself", where=save, fix="Choose another file name.")
         for path in (save, save.with_suffix(".json")):
             check_replaceable(path, overwrite=settings.overwrite)
     kwargs: dict[str, Any] = {"control_mode": mode, "obs_mode": settings.obs_mode}
@@ -153,16 +156,16 @@ def _check_obs_mode(mode: str) -> None:
         parse_obs_mode_to_struct(mode)
     except AssertionError as error:
         raise RobocasError(
-            "no such observation mode",
-            where="obs_mode",
-            expected=f"none, state, state_dict, pointcloud, or some of {', '.join(ALL_VISUAL_TEXTURES)} joined by +",
+            "unknown observation mode",
+            where="--obs-mode",
+            expected=f"none, state, state_dict, pointcloud, or textures joined by +: {', '.join(ALL_VISUAL_TEXTURES)}",
             found=mode,
         ) from error
 
 
 def _replay_all(
     settings: ReplaySettings, recorded: RecordedEnv, kwargs: dict[str, Any], episodes: list[dict[str, Any]]
-) -> Iterator[Replay]:
+) -> Iterator[ReplayResult]:
     save = settings.save
     shards: list[Path] = []
     place = {} if save is None else {"dir": make_folder(save.parent), "prefix": f".{save.stem}.", "suffix": ".tmp"}
@@ -182,36 +185,37 @@ def _replay_all(
             merge(shards, save)
 
 
-def _replay_one(env: gym.Env, settings: ReplaySettings, episode: dict[str, Any]) -> Replay:
+def _replay_one(env: gym.Env, settings: ReplaySettings, episode: dict[str, Any]) -> ReplayResult:
     base_env = env.unwrapped
     assert isinstance(base_env, RoboCASEnv)
-    recorded = Recorded.read(settings.file, episode)
+    recorded = RecordedEpisode.read(settings.file, episode)
     _, info = env.reset(seed=recorded.seed, options=recorded.options)
-    recorded.check_fits(base_env)
+    recorded.check_compatible(base_env)
     converted = base_env.control_mode != recorded.control_mode
-    if isinstance(env, EpisodeRecorder) and recorded.taken_over:
-        env.begin_at(recorded.states[0])
-    elif settings.use_env_states or recorded.taken_over:
+    if isinstance(env, EpisodeRecorder) and recorded.is_intervention:
+        env.start_at(recorded.states[0])
+    elif settings.use_env_states or recorded.is_intervention:
         base_env.set_state_dict(recorded.states[0])
     for action, state in zip(recorded.actions, recorded.states[1:], strict=True):
         *_, info = env.step(_convert_action(action, base_env) if converted else action)
         if settings.use_env_states:
             base_env.set_state_dict(state)
     error = None if converted else state_distance(cast(Any, base_env.get_state_dict()), recorded.states[-1])
-    return Replay(episode["episode_id"], recorded.seed, bool(info["success"][0]), error)
+    return ReplayResult(episode["episode_id"], recorded.seed, bool(info["success"][0]), error)
 
 
 def _convert_action(action: np.ndarray, env: RoboCASEnv) -> np.ndarray:
-    """Convert ``pd_joint_pos`` targets (8,) to an action of the environment's mode, within its bounds, at its state.
+    """Convert ``pd_joint_pos`` targets (8,) to an action in the control mode of the environment at its current state.
 
-    ManiSkill's own converter wants end-effector deltas in the root's axes and measures them in the world's.
+    The action is clipped to its bounds. ManiSkill's converter is not used: it expects end-effector deltas in the root
+    frame and measures them in the world frame.
     """
     arm, gripper, robot = action[:7].astype(float), action[7:], env.robot_spec.description
     if env.control_mode == "pd_joint_pos":
         return action
     if env.control_mode == "pd_joint_delta_pos":
-        now = env.agent.robot.get_qpos()[0, robot.arm_slice].cpu().numpy()
-        return np.append(np.clip((arm - now) / _JOINT_DELTA_SCALE, -1, 1), gripper).astype(np.float32)
+        qpos = env.agent.robot.get_qpos()[0, robot.arm_slice].cpu().numpy()
+        return np.append(np.clip((arm - qpos) / _JOINT_DELTA_SCALE, -1, 1), gripper).astype(np.float32)
     tcp_in_base = chain(env.robot_spec.files().urdf, robot.arm_base_link, robot.tcp_link, arm[None])[0]
     if env.control_mode == "pd_ee_pose":
         euler = Rotation.from_matrix(tcp_in_base[:3, :3]).as_euler("XYZ")
@@ -225,11 +229,13 @@ def _convert_action(action: np.ndarray, env: RoboCASEnv) -> np.ndarray:
 
 
 def state_distance(state: dict[str, Any], recorded: dict[str, Any]) -> float:
-    """Return the greatest absolute difference of any number of two states; NaN where one has a NaN."""
-    worst = np.float64(0.0)
+    """Return the greatest absolute difference between two states over all numbers (m, rad, ...); NaN if one has NaN."""
+    largest = np.float64(0.0)
     for kind in ("actors", "articulations"):
         for name, value in recorded[kind].items():
-            now = state[kind][name]
-            now = now.cpu().numpy() if isinstance(now, torch.Tensor) else np.asarray(now)
-            worst = np.maximum(worst, np.abs(now.reshape(-1) - np.asarray(value).reshape(-1)).max())  # max() hides NaN
-    return float(worst)
+            current = state[kind][name]
+            current = current.cpu().numpy() if isinstance(current, torch.Tensor) else np.asarray(current)
+            largest = np.maximum(
+                largest, np.abs(current.reshape(-1) - np.asarray(value).reshape(-1)).max()
+            )  # max() ignores NaN
+    return float(largest)

@@ -1,6 +1,6 @@
-"""Let a policy act before the scripted one takes over: the start of DAgger demonstrations.
+"""Roll in a learned policy before the scripted policy continues: the first part of DAgger demonstrations.
 
-It acts as in the protocol `PROTOCOL` (RoboCAS-v0's steps at 5 Hz), in scenes of any configuration.
+The policy acts as in the protocol `PROTOCOL` (stepping of RoboCAS-v0 at 5 Hz), in scenes of any configuration.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from mani_skill.utils.common import to_numpy
 
 from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.datasets.conversion.env_renderer import require_renderer
-from robocas_ms3.demos.failures import Takeover
+from robocas_ms3.demos.failures import Intervention
 from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.evaluation.action_wrapper import UPSTREAM_HZ, PolicyActionWrapper, env_kwargs
 from robocas_ms3.evaluation.policies import open_policy
@@ -30,17 +30,17 @@ from robocas_ms3.scenes.task_specs import TASKS
 from robocas_ms3.tasks.vector import RoboCASVectorEnv
 
 PROTOCOL = "paper-v1"
-_STEPS = 410  # stream of an episode's seed
+_STEPS = 410  # random stream of the number of steps
 _log = logging.getLogger(__name__)
 
 
-def steps_of(seed: int, after_steps: tuple[int, int]) -> int:
-    """Return the number of steps that a policy acts in the scene of a seed: uniform, both ends included."""
+def roll_in_steps(seed: int, after_steps: tuple[int, int]) -> int:
+    """Draw the number of policy steps in the scene of a seed: uniform, both ends of ``after_steps`` included."""
     return int(np.random.default_rng([seed, _STEPS]).integers(after_steps[0], after_steps[1] + 1))
 
 
-def check_acting(settings: EpisodeSettings) -> str:
-    """Check that the policy can act, and return a hash of its weights, if it has some."""
+def check_roll_in(settings: EpisodeSettings) -> str:
+    """Check the policy of ``after_policy``; return the hash of its weights, or an empty string without weights."""
     with open_policy(settings.after_policy) as policy:
         load_protocol(PROTOCOL).rules.check_policy(policy.spec)
         if policy.spec.cameras:
@@ -48,8 +48,8 @@ def check_acting(settings: EpisodeSettings) -> str:
         return str(getattr(policy, "describe", dict)().get("weights", ""))
 
 
-class Player:
-    """A worker (`core.workers.Worker`) in which a policy acts in scenes, with one environment."""
+class PolicyRollIn:
+    """A worker (`core.workers.Worker`) that rolls in a policy in one environment, one scene per seed."""
 
     def __init__(self, settings: EpisodeSettings) -> None:
         self._settings, self._open = settings, ExitStack()
@@ -69,27 +69,31 @@ class Player:
         options = {"auto_reset": False, "ignore_terminations": True, "record_metrics": False}
         self._vector = RoboCASVectorEnv(self._env, "numpy", **options)
         folder = self._open.enter_context(tempfile.TemporaryDirectory(prefix="robocas-config-"))
-        self._config = Path(folder) / "config.yaml"  # policies get a file
+        self._config = Path(folder) / "config.yaml"  # policies expect a file
         config = load_task_config(settings.config).model_dump(mode="json")
         self._config.write_text(json.dumps(config), encoding="utf-8")
 
-    def run(self, seed: int) -> Takeover:
-        """Return the state in which the policy leaves the scene of a seed."""
-        settings, steps = self._settings, steps_of(seed, self._settings.after_steps)
+    def run(self, seed: int) -> Intervention:
+        """Run the policy in the scene of a seed and return the state in which it leaves the scene."""
+        settings, steps = self._settings, roll_in_steps(seed, self._settings.after_steps)
         batch = EpisodeBatch(self._vector, self._policy.spec, EndConditions(steps), 1 / UPSTREAM_HZ, refill=False)
         try:
             self._vector.reset(seed=[seed])
             (played,) = rollout(batch, self._policy, [self._episode(seed)])
         except LayoutError:
-            return Takeover(seed, settings.after_policy, 0, {}, 1.0, "no_layout")
+            return Intervention(seed, settings.after_policy, 0, {}, 1.0, "no_layout")
         if played.error:
             _log.warning("seed %d: %s", seed, played.error)
-        ends = {"policy_failed": played.error, "succeeded": played.at_end["success"], "failed": played.at_end["fail"]}
-        refused = next((reason for reason, true in ends.items() if true), "")
+        reasons = {
+            "policy_failed": played.error,
+            "succeeded": played.at_end["success"],
+            "failed": played.at_end["fail"],
+        }
+        skip_reason = next((reason for reason, applies in reasons.items() if applies), "")
         state: dict[str, Any] = self._base.get_state_dict()
-        state = {kind: to_numpy(of) for kind, of in state.items() if kind != "controller"}
+        state = {kind: to_numpy(values) for kind, values in state.items() if kind != "controller"}
         gripper = 1.0 if self._env.gripper_open else -1.0
-        return Takeover(seed, settings.after_policy, played.steps, state, gripper, refused)
+        return Intervention(seed, settings.after_policy, played.steps, state, gripper, skip_reason)
 
     def close(self) -> None:
         self._env.close()

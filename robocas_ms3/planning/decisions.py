@@ -1,7 +1,8 @@
-"""Decisions of a scripted policy, and where the time of its episode goes.
+"""Decisions of a scripted policy (backtracking search), and CPU seconds per part of an episode.
 
-A decision is a list of candidates, a function that plays one and returns its score, and a `Decisions` that tries them
-and continues from the best: `demos.branches` undoes what was tried, `StraightDecisions` can't.
+A decision has candidates, a function that plays a candidate and returns its score, and a `Decisions` object that plays
+candidates and continues from the best one. The classes in `demos.branches` and `demos.backtracking` undo the motions of
+the other candidates; `IrreversibleDecisions` cannot.
 """
 
 from __future__ import annotations
@@ -16,77 +17,79 @@ from typing import Protocol, TypeVar
 from robocas_ms3.core.errors import PlanningError
 
 T = TypeVar("T")
-TRIES = 3  # candidates of one decision that are gone on from before the decision before it is made otherwise
+MAX_CONTINUED = 3  # candidates of a decision to continue from, before the search backtracks to the previous decision
 
 
 @dataclass(frozen=True)
-class Effort:
-    """How many candidates are tried for a decision.
+class SearchLimits:
+    """Limits on the number of candidates that are tried for a decision.
 
     Attributes:
-        ahead: feasible candidates that are compared before the episode continues from the best.
-        tries: candidates that the episode continues from, before the decision is given up.
-        enough: a score at which no other candidate is played.
+        compared: feasible candidates that are scored before the episode continues from the best one.
+        max_continued: candidates to continue from, before the search backtracks to the previous decision.
+        sufficient_score: score from which on no further candidate is compared.
     """
 
-    ahead: int = 1
-    tries: int = TRIES
-    enough: float = math.inf
+    compared: int = 1
+    max_continued: int = MAX_CONTINUED
+    sufficient_score: float = math.inf
 
 
-ONE_BY_ONE = Effort()  # the first that can be done, then the next
+FIRST_FEASIBLE = SearchLimits()
+"""Continue from the first feasible candidate, and after a failure from the next one, without comparing scores."""
 
 
 class Decisions(Protocol):
-    """Plays candidates and goes on from one of them."""
+    """Interface of the search: plays candidates and continues from one of them."""
 
-    def choose(self, candidates: Iterable[T], play: Callable[[T], float], effort: Effort = ONE_BY_ONE) -> T:
-        """Play candidates from this moment on and continue from the one with the greatest score.
+    def choose(self, candidates: Iterable[T], play: Callable[[T], float], limits: SearchLimits = FIRST_FEASIBLE) -> T:
+        """Play candidates from the current state and continue from the one with the greatest score.
 
-        If a later step fails, the policy is back here and continues from the next best one, as if the first had never
-        been tried.
+        If a later step fails, the search returns to this state and continues from the next best candidate.
 
         Args:
-            candidates: the most promising first.
-            play: makes a candidate's motions and returns its score; raises ``PlanningError`` where it can't be done.
-            effort: how many are compared, and continued from.
+            candidates: candidates, the most promising first.
+            play: function that runs the motions of a candidate and returns its score; it raises PlanningError if the
+                candidate is not feasible.
+            limits: numbers of candidates to compare and to continue from.
 
         Returns:
-            The candidate that was played, its motions done.
+            The chosen candidate; its motions have been run.
 
         Raises:
-            PlanningError: of the last candidate, where none can be done; nothing has moved then.
+            PlanningError: no candidate is feasible; the error of the last one. Nothing has moved.
         """
         ...
 
 
 @dataclass(frozen=True)
-class StraightDecisions:
-    """Takes the first candidate that can be played and never undoes anything.
+class IrreversibleDecisions:
+    """Decisions that take the first feasible candidate and never undo motions.
 
     Attributes:
-        done: number of actions so far; a candidate that fails after some leaves no way to the next.
+        count_actions: function that returns the number of actions so far. After a candidate that fails with actions
+            done, no other candidate is played.
     """
 
-    done: Callable[[], int]
+    count_actions: Callable[[], int]
 
-    def choose(self, candidates: Iterable[T], play: Callable[[T], float], effort: Effort = ONE_BY_ONE) -> T:
+    def choose(self, candidates: Iterable[T], play: Callable[[T], float], limits: SearchLimits = FIRST_FEASIBLE) -> T:
         failure = PlanningError("decision", "no_candidate")
         for candidate in candidates:
-            before = self.done()
+            before = self.count_actions()
             try:
                 play(candidate)
                 return candidate
             except PlanningError as error:
                 failure = error
-                if self.done() > before:
+                if self.count_actions() > before:
                     raise
         raise failure
 
 
 @dataclass
 class Seconds:
-    """Where an episode's time went: CPU seconds of this process and of all its branches that could be played."""
+    """CPU seconds of an episode by part, in this process and in the child processes of all feasible candidates."""
 
     reset: float = 0.0
     planning: float = 0.0
@@ -94,7 +97,8 @@ class Seconds:
     check: float = 0.0
 
     @contextmanager
-    def spent_on(self, part: str) -> Iterator[None]:
+    def measure(self, part: str) -> Iterator[None]:
+        """Add the CPU seconds of a ``with`` block to a part."""
         start = time.process_time()
         try:
             yield

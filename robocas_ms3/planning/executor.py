@@ -37,7 +37,7 @@ class Executor:
         gripper: last command of the gripper.
         base: (3,) last command of the base joints: x m, y m, yaw rad.
         facts: counters of the policy for the record, e.g. ``pushes``.
-        rehearse: replays the actions so far open loop; raises ``UnrecoverableError`` where the outcome differs.
+        check_open_loop: replays the actions so far open loop; raises ``UnrecoverableError`` where the outcome differs.
     """
 
     env: gym.Env
@@ -49,7 +49,7 @@ class Executor:
     base: Array = field(default_factory=lambda: np.zeros(3))
     seconds: Seconds = field(default_factory=Seconds)
     facts: dict[str, Any] = field(default_factory=dict)
-    rehearse: Callable[[], None] = lambda: None
+    check_open_loop: Callable[[], None] = lambda: None
 
     @property
     def base_env(self) -> RoboCASEnv:
@@ -62,7 +62,7 @@ class Executor:
         return self.base_env.control_timestep
 
     def reset(self) -> None:
-        with self.seconds.spent_on("reset"):
+        with self.seconds.measure("reset"):
             _, self.info = self.env.reset(seed=self.seed)
         self.actions, self.segments, self.gripper, self.base = [], [], OPEN, np.zeros(3)
         self.facts = {}
@@ -112,6 +112,6 @@ class Executor:
         return bool(self.info[name][0])
 
     def _step(self, action: np.ndarray) -> None:
-        with self.seconds.spent_on("simulation"):
+        with self.seconds.measure("simulation"):
             *_, self.info = self.env.step(action)
         self.actions.append(action)

@@ -15,7 +15,7 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.text import format_object_name
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.sources.episode_source import EpisodeSource, ImageKind
-from robocas_ms3.demos.failures import Failure
+from robocas_ms3.demos.failures import FailedAttempt
 from robocas_ms3.demos.recordings.trajectory_json import one_seed
 from robocas_ms3.viewer.damage import as_dataset_error, join_reasons, read_or_default, read_scene
 from robocas_ms3.viewer.episode import facts_of, round_values, show_arrays
@@ -126,7 +126,7 @@ class PageContent:
         val, _ = read_or_default(lambda: self.source.split("val"), [])
         return {**dict.fromkeys(train, "train"), **dict.fromkeys(val, "val")}
 
-    def _failures(self, scene: Mapping[str, Any]) -> Sequence[Failure]:
+    def _failures(self, scene: Mapping[str, Any]) -> Sequence[FailedAttempt]:
         return self.failures.of_seed(one_seed(scene.get("seed")), scene.get("env_info"))
 
     def _show(self, number: int, scene: Mapping[str, Any]) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import Any
 
 from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.datasets.sources.provenance import environment_id
-from robocas_ms3.demos.failures import FAILURES_FILE, Failure
+from robocas_ms3.demos.failures import FAILURES_FILE, FailedAttempt
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class FailedAttempt(Failure):
+class TaskFailedAttempt(FailedAttempt):
     """A line of ``failures.jsonl``, with the task and environment of the run; None: unknown."""
 
     task: str | None = None
@@ -50,16 +50,16 @@ class FailedAttempt(Failure):
 class Failures:
     """The lines of ``failures.jsonl`` by seed, and a note on damaged ones."""
 
-    by_seed: Mapping[int, list[FailedAttempt]] = field(default_factory=dict)
+    by_seed: Mapping[int, list[TaskFailedAttempt]] = field(default_factory=dict)
     note: str = ""
 
     @classmethod
     def read(cls, folder: Path) -> Failures:
         try:
-            lines = JsonLinesFile[FailedAttempt](folder / FAILURES_FILE, FailedAttempt).lines()
+            lines = JsonLinesFile[TaskFailedAttempt](folder / FAILURES_FILE, TaskFailedAttempt).lines()
         except OSError as error:
             return cls(note=f"`{FAILURES_FILE}` can't be read: {error.strerror}.")
-        found: dict[int, list[FailedAttempt]] = defaultdict(list)
+        found: dict[int, list[TaskFailedAttempt]] = defaultdict(list)
         for line in lines:
             if line.record is not None:
                 found[line.record.seed].append(line.record)
@@ -67,7 +67,7 @@ class Failures:
         listed = ", ".join(damaged[:5]) + (", ..." if len(damaged) > 5 else "")
         return cls(dict(found), f"Damaged and left out: line {listed} of `{FAILURES_FILE}`." if damaged else "")
 
-    def of_seed(self, seed: int | None, env_info: Any = None) -> list[FailedAttempt]:
+    def of_seed(self, seed: int | None, env_info: Any = None) -> list[TaskFailedAttempt]:
         """Return the failures of a seed in an environment; none if the seed is unknown."""
         return [] if seed is None else [failure for failure in self.by_seed.get(seed, []) if failure.is_of(env_info)]
 
@@ -80,30 +80,30 @@ class Failures:
         task = tasks.pop() if len(tasks) == 1 else ""  # if the file does not name it
         lost = []
         for seed, of_seed in sorted(self.by_seed.items()):
-            runs: dict[str | None, list[FailedAttempt]] = defaultdict(list)
+            runs: dict[str | None, list[TaskFailedAttempt]] = defaultdict(list)
             for failure in of_seed:
                 runs[failure.environment].append(failure)
             for of_run in runs.values():
                 recorded = any(of_run[0].is_of(env_info) for env_info in environments[seed])
-                if recorded or not any(failure.gave_up for failure in of_run):
+                if recorded or not any(failure.skipped for failure in of_run):
                     continue
-                tried = [failure for failure in of_run if not failure.gave_up]
+                tried = [failure for failure in of_run if not failure.skipped]
                 named = stages(tried, {}) or ["given up"]
                 of_task = of_run[0].task or task
                 lost.append(Row(None, task=of_task, seed=seed, success=False, stages=named, attempts=len(tried)))
         return lost
 
 
-def stages(failures: Iterable[Failure], recorded: Mapping[str, Any]) -> list[str]:
-    named = {failure.stage for failure in failures if not failure.gave_up}
+def stages(failures: Iterable[FailedAttempt], recorded: Mapping[str, Any]) -> list[str]:
+    named = {failure.stage for failure in failures if not failure.skipped}
     return sorted(named | {recovery["stage"] for recovery in recorded.get("recoveries") or ()})
 
 
-def describe(failures: Iterable[Failure], recorded: Mapping[str, Any]) -> list[dict[str, str]]:
+def describe(failures: Iterable[FailedAttempt], recorded: Mapping[str, Any]) -> list[dict[str, str]]:
     lines = [
         {"stage": f.stage, "reason": f.reason, "text": f"attempt {f.attempt + 1}, {f.seconds:.1f} s, undone"}
         for f in failures
-        if not f.gave_up
+        if not f.skipped
     ]
     for recovery in recorded.get("recoveries") or ():
         first, last = recovery["range"]

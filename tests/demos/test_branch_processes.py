@@ -18,8 +18,8 @@ from branch_notes import Notes
 from robocas_ms3.core.errors import PlanningError, RobocasError
 from robocas_ms3.core.remote_errors import RemoteTraceback
 from robocas_ms3.demos import branches
-from robocas_ms3.demos.branches import ForkedBranches, why_not_fork
-from robocas_ms3.planning.decisions import Effort
+from robocas_ms3.demos.branches import ForkedDecisions, reason_not_to_fork
+from robocas_ms3.planning.decisions import SearchLimits
 
 
 def children() -> set[int]:
@@ -28,7 +28,7 @@ def children() -> set[int]:
 
 def forked(decide, notes=None):
     notes = notes or Notes()
-    runner = ForkedBranches(notes)
+    runner = ForkedDecisions(notes)
     before = children()
     ended = runner.run(lambda: decide(runner))
     assert children() == before, "no child is left, and no zombie"
@@ -85,7 +85,7 @@ def test_a_child_that_is_killed_once_changes_nothing(tmp_path, moment):
         return {"a": 1.0, "b": 3.0, "c": 2.0}[letter]
 
     def decide(runner):
-        first = runner.choose("abc", play, Effort(ahead=3))
+        first = runner.choose("abc", play, SearchLimits(compared=3))
         second = runner.choose("abc", lambda letter: 0.0)
         if second == "b":
             kill_once("it goes on")
@@ -101,7 +101,7 @@ def test_a_child_that_is_killed_once_changes_nothing(tmp_path, moment):
 
 
 def test_a_child_that_takes_too_long_is_ended(monkeypatch):
-    monkeypatch.setattr(branches, "PLAY_LIMIT", 0.2)
+    monkeypatch.setattr(branches, "CANDIDATE_TIMEOUT", 0.2)
 
     def play(letter):
         if letter == "a":
@@ -224,19 +224,19 @@ def test_an_error_says_where_in_a_child_it_came_from():
 
 
 def test_an_interrupt_in_a_new_child_ends_the_run_not_its_siblings(monkeypatch):
-    set_up_child, me = branches.set_up_child, os.getpid()
+    set_up_forked_process, me = branches.set_up_forked_process, os.getpid()
 
     def interrupted(parent):
-        set_up_child(parent)
+        set_up_forked_process(parent)
         raise KeyboardInterrupt
 
     def candidates():
         yield "a"
-        monkeypatch.setattr(branches, "set_up_child", interrupted)
+        monkeypatch.setattr(branches, "set_up_forked_process", interrupted)
         yield "b"
 
     def decide(runner):
-        runner.choose(candidates(), lambda letter: 0.0, Effort(ahead=2))
+        runner.choose(candidates(), lambda letter: 0.0, SearchLimits(compared=2))
 
     try:
         with pytest.raises(KeyboardInterrupt) as caught:
@@ -261,19 +261,19 @@ def test_what_children_print_comes_once_and_streams_may_be_missing(capfd, monkey
 
 SLEEPER = """
 import os, sys, time
-from robocas_ms3.demos.branches import ForkedBranches
-from robocas_ms3.planning.decisions import Effort
+from robocas_ms3.demos.branches import ForkedDecisions
+from robocas_ms3.planning.decisions import SearchLimits
 from robocas_ms3.core.remote_errors import RemoteTraceback
 class Notes:
-    exhausted = False
-    def failed(self, error): pass
-    def adopt(self, other): pass
+    out_of_attempts = False
+    def add_failure(self, error): pass
+    def copy_from(self, other): pass
 def attempt():
     for _ in range(2):
-        runner.choose("ab", lambda letter: 0.0, Effort(ahead=2))
+        runner.choose("ab", lambda letter: 0.0, SearchLimits(compared=2))
     print(os.getpid(), flush=True)
     time.sleep(120)
-runner = ForkedBranches(Notes())
+runner = ForkedDecisions(Notes())
 runner.run(attempt)
 """
 
@@ -298,7 +298,7 @@ def alive(pid: int) -> bool:
 
 
 def test_where_a_process_must_not_be_forked(monkeypatch):
-    assert why_not_fork(renders=True) == "a renderer is open"
-    assert why_not_fork(renders=False) == ("" if sys.platform == "linux" else "this is not Linux")
+    assert reason_not_to_fork(renders=True) == "a renderer is open"
+    assert reason_not_to_fork(renders=False) == ("" if sys.platform == "linux" else "this is not Linux")
     monkeypatch.setattr(sys, "platform", "darwin")
-    assert why_not_fork(renders=False) == "this is not Linux"
+    assert reason_not_to_fork(renders=False) == "this is not Linux"

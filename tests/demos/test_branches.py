@@ -6,11 +6,11 @@ import pytest
 from branch_notes import Notes
 
 from robocas_ms3.core.errors import PlanningError
-from robocas_ms3.demos.backtracking import DeadEnd, Resimulation, turns
-from robocas_ms3.demos.branches import ForkedBranches
-from robocas_ms3.planning.decisions import Effort, StraightDecisions
+from robocas_ms3.demos.backtracking import CandidatesExhausted, ResimulatedDecisions, order_candidates
+from robocas_ms3.demos.branches import ForkedDecisions
+from robocas_ms3.planning.decisions import IrreversibleDecisions, SearchLimits
 
-RUNNERS = [ForkedBranches, Resimulation]
+RUNNERS = [ForkedDecisions, ResimulatedDecisions]
 
 
 class World:
@@ -47,23 +47,29 @@ A_FEW, ALL = {"a": 1.0, "b": 3.0, "c": 2.0}, {"a": 1.0, "b": 2.0, "c": 3.0}  # s
 
 
 @pytest.mark.parametrize(
-    ("good", "effort", "scores", "outcome", "failures"),
+    ("good", "limits", "scores", "outcome", "failures"),
     [
-        ("bc", Effort(), None, "bc", "aa ab ac ba bb"),  # what failed leaves no trace
-        ("", Effort(), None, "", "aa ab ac ba bb bc ca cb cc"),
-        ("ba", Effort(tries=2), None, "ba", "aa ab"),  # a decision gives up after some tries
-        ("cb bc", Effort(ahead=3), A_FEW, "bc", "bb"),  # from the best of those compared first
-        ("cc", Effort(ahead=2, tries=9), ALL, "cc", "bb ba bc ab aa ac cb ca"),  # then others are compared
+        ("bc", SearchLimits(), None, "bc", "aa ab ac ba bb"),  # what failed leaves no trace
+        ("", SearchLimits(), None, "", "aa ab ac ba bb bc ca cb cc"),
+        ("ba", SearchLimits(max_continued=2), None, "ba", "aa ab"),  # backtrack after some candidates
+        ("cb bc", SearchLimits(compared=3), A_FEW, "bc", "bb"),  # from the best of those compared first
+        (
+            "cc",
+            SearchLimits(compared=2, max_continued=9),
+            ALL,
+            "cc",
+            "bb ba bc ab aa ac cb ca",
+        ),  # the next two
     ],
 )
-def test_ways_are_tried_in_order_until_one_ends_well(good, effort, scores, outcome, failures):
+def test_ways_are_tried_in_order_until_one_ends_well(good, limits, scores, outcome, failures):
     def decide(world, runner):
         def play(letter):
             world.act(letter)
             return scores[letter] if scores else 0.0
 
         for _ in range(2):
-            runner.choose("abc", play, effort)
+            runner.choose("abc", play, limits)
 
     found = search(decide, set(good.split()))
     assert found == (bool(outcome), outcome, [f"end: {end}" for end in failures.split()])
@@ -73,7 +79,9 @@ def test_enough_ends_the_comparison():
     scores = {"a": 1.0, "b": 5.0, "c": 9.0}
 
     def decide(world, runner):
-        runner.choose("abc", lambda letter: (world.act(letter), scores[letter])[1], Effort(ahead=3, enough=4))
+        runner.choose(
+            "abc", lambda letter: (world.act(letter), scores[letter])[1], SearchLimits(compared=3, sufficient_score=4)
+        )
 
     assert search(decide, {"b"}) == (True, "b", [])
 
@@ -86,7 +94,7 @@ def test_a_candidate_that_can_not_be_played_is_passed_over():
                 raise PlanningError("play", letter)
             return 0.0
 
-        runner.choose("abcd", play, Effort(ahead=2))
+        runner.choose("abcd", play, SearchLimits(compared=2))
         world.act("!")
 
     assert search(decide, {"c!"}) == (True, "c!", [])
@@ -117,7 +125,7 @@ def test_without_undoing_the_first_that_can_be_played_stays():
             raise PlanningError("late", letter)
         return 0.0
 
-    straight = StraightDecisions(lambda: len(world.done))
+    straight = IrreversibleDecisions(lambda: len(world.done))
     assert straight.choose("ab", play) == "b"
     with pytest.raises(PlanningError, match="late: c"):
         straight.choose("cb", play)
@@ -129,16 +137,16 @@ def test_candidates_are_taken_as_they_are_needed():
         yield "a"
         raise AssertionError("nobody asked for another")
 
-    order = turns(candidates(), Effort(tries=1), Notes())
+    order = order_candidates(candidates(), SearchLimits(max_continued=1), Notes())
     assert order.send(None) == ("a", False)
     assert order.send(0.0) == ("a", True)
-    with pytest.raises(DeadEnd):
+    with pytest.raises(CandidatesExhausted):
         order.send(None)
 
 
 def test_attempts_are_counted():
-    order = turns("abc", Effort(), notes := Notes(max_attempts=1))
+    order = order_candidates("abc", SearchLimits(), notes := Notes(max_attempts=1))
     assert (next(order), order.send(0.0)) == (("a", False), ("a", True))
-    notes.failed(PlanningError("end", "a"))
-    with pytest.raises(DeadEnd):
+    notes.add_failure(PlanningError("end", "a"))
+    with pytest.raises(CandidatesExhausted):
         order.send(None)

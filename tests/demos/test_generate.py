@@ -14,10 +14,10 @@ from mani_skill.utils.gym_utils import find_max_episode_steps_value
 from mani_skill.utils.structs import Pose
 
 from robocas_ms3.core.errors import PlanningError, UnrecoverableError
-from robocas_ms3.demos.branches import Child
+from robocas_ms3.demos.branches import ForkedProcess
 from robocas_ms3.demos.generation import generate
 from robocas_ms3.demos.generator import EpisodeGenerator
-from robocas_ms3.demos.open_loop import Trials
+from robocas_ms3.demos.open_loop import OpenLoopChecks
 from robocas_ms3.demos.recordings.trajectory_json import read_json
 from robocas_ms3.demos.settings import EpisodeSettings, GenerateSettings, ReplaySettings
 from robocas_ms3.demos.trajectory_replay import replay
@@ -136,7 +136,7 @@ def call_it_done(monkeypatch):
     """Let policies that only stir count as successful: what is tested is how attempts are kept or undone."""
     flag = Executor.flag
     monkeypatch.setattr(Executor, "flag", lambda self, name: name == "success" or flag(self, name))
-    monkeypatch.setattr(Trials, "follow", lambda *args, **how: None)
+    monkeypatch.setattr(OpenLoopChecks, "check", lambda *args, **how: None)
 
 
 def waiting(steps):
@@ -239,7 +239,7 @@ def test_the_way_back_to_a_decision_leaves_no_trace(tmp_path, monkeypatch, searc
 
 def test_forked_or_not_a_search_is_the_same_and_replays_bit_for_bit(tmp_path, monkeypatch, search_generator):
     """Even where a branch is killed from outside while it goes on."""
-    send = Child.send
+    send = ForkedProcess.send
 
     def send_and_kill_the_first(child, result):
         send(child, result)
@@ -247,7 +247,7 @@ def test_forked_or_not_a_search_is_the_same_and_replays_bit_for_bit(tmp_path, mo
             (tmp_path / "killed").touch()
             os.kill(child.pid, signal.SIGKILL)
 
-    monkeypatch.setattr(Child, "send", send_and_kill_the_first)
+    monkeypatch.setattr(ForkedProcess, "send", send_and_kill_the_first)
     episodes = []
     for fork in (True, False):
         monkeypatch.setattr(search_generator, "_fork", fork)
@@ -288,17 +288,17 @@ def test_recoveries_stay_unless_the_episode_is_lost(tmp_path, monkeypatch, searc
     assert read_json(tmp_path / "kept.h5")["episodes"][0]["robocas"]["recoveries"] == []
 
 
-@pytest.mark.parametrize("reason", ["no_success", "clipped", "parted"])
+@pytest.mark.parametrize("reason", ["no_success", "clipped", "target_displaced"])
 def test_an_attempt_whose_own_actions_do_not_come_out_the_same_is_undone(tmp_path, monkeypatch, pick_generator, reason):
     change(monkeypatch, pick_generator, check_failures=2)
-    world, spoilt = pick_generator.worlds[-1], []
+    world, spoilt = pick_generator.open_loop_envs[-1], []
     step, settle = world.step, world.settle
 
     def spoil(action):
         step(action)
         if not spoilt:
             world.clipped += reason == "clipped"
-            if reason == "parted":
+            if reason == "target_displaced":
                 target = world.env.objects[int(world.env.target_slot[0])]
                 target.set_pose(Pose.create_from_pq(target.pose.p + torch.tensor([[0.3, 0.0, 0.0]]), target.pose.q))
             if reason != "no_success":
@@ -312,16 +312,16 @@ def test_an_attempt_whose_own_actions_do_not_come_out_the_same_is_undone(tmp_pat
     monkeypatch.setattr(world, "settle", fail)
     result = pick_generator.generate(1, tmp_path, "again")
     assert result.success
-    assert result.failures[0].stage == "replay"
-    assert result.failures[0].reason == f"noisy_{reason}"
+    assert result.failures[0].stage == "open_loop_check"
+    assert result.failures[0].reason == f"{reason}_with_noise"
     data = read_json(tmp_path / "again.h5")["episodes"][0]["robocas"]
     assert (data["check_rate"], data["check_trials"]) == (5, 1)
 
 
 def test_where_noise_alone_spoils_attempts_an_episode_counts_without(tmp_path, monkeypatch, pick_generator):
     change(monkeypatch, pick_generator, check_failures=2)
-    monkeypatch.setattr(pick_generator.worlds[1], "settle", lambda: False)
+    monkeypatch.setattr(pick_generator.open_loop_envs[1], "settle", lambda: False)
     result = pick_generator.generate(1, tmp_path, "spoilt")
     assert result.success
-    assert [failure.reason for failure in result.failures].count("noisy_no_success") == 2
+    assert [failure.reason for failure in result.failures].count("no_success_with_noise") == 2
     assert read_json(tmp_path / "spoilt.h5")["episodes"][0]["robocas"]["check_trials"] == 0

@@ -10,7 +10,7 @@ import pytest
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.demos import generation as module
-from robocas_ms3.demos.failures import FAILURES_FILE, EpisodeResult, Failure
+from robocas_ms3.demos.failures import FAILURES_FILE, EpisodeResult, FailedAttempt
 from robocas_ms3.demos.generation import shard_name
 from robocas_ms3.demos.recordings.trajectory_json import read_json
 from robocas_ms3.demos.settings import EpisodeSettings, GenerateSettings
@@ -25,12 +25,12 @@ def generate(out, episodes, **how):
 
 
 def failures_of(seed):
-    return [Failure(seed, i, *text.split(": "), 0.0) for i, text in enumerate(FAILED.get(seed, []))]
+    return [FailedAttempt(seed, i, *text.split(": "), 0.0) for i, text in enumerate(FAILED.get(seed, []))]
 
 
 def lines_of(seed):
     """What the ledger says of a seed."""
-    return [*failures_of(seed), *([Failure(seed, -1, "episode", "gave_up", 0.0)] if seed == HOPELESS else [])]
+    return [*failures_of(seed), *([FailedAttempt(seed, -1, "episode", "skipped", 0.0)] if seed == HOPELESS else [])]
 
 
 def record(folder, seed):
@@ -52,7 +52,7 @@ def made(monkeypatch):
     """Seeds that were generated, in the order in which they were."""
     seeds_made = []
 
-    def make(settings, seeds, folder, players):
+    def make(settings, seeds, folder, make_roll_in):
         for seed in seeds:
             seeds_made.append(seed)
             if seed != HOPELESS:
@@ -80,7 +80,7 @@ def begun(out, shards, lines=()):
     run = {"settings": asdict(SETTINGS), "first_seed": 0}
     (out / "episodes").mkdir(parents=True)
     (out / "run.json").write_text(json.dumps(run))
-    JsonLinesFile(out / "failures.jsonl", Failure).append(lines)
+    JsonLinesFile(out / "failures.jsonl", FailedAttempt).append(lines)
     for seed in shards:
         record(out / "episodes", seed)
 
@@ -95,7 +95,7 @@ def test_seeds_that_workers_had_finished_ahead_are_in_nobodys_place(tmp_path, ma
     summary = generate(out, episodes=3)
     assert made == missing
     assert seeds_of(out) == [0, 1, 3]
-    assert (summary.episodes, summary.seeds, summary.gave_up) == (3, 4, [HOPELESS])
+    assert (summary.episodes, summary.seeds, summary.skipped) == (3, 4, [HOPELESS])
     assert not (out / "episodes").exists()
 
 
@@ -134,7 +134,7 @@ def test_what_was_cut_off_is_made_again(tmp_path, made, suffix, left):
     generate(out, episodes=3)
     assert made == [1, 2, 3]
     assert seeds_of(out) == [0, 1, 3]
-    assert JsonLinesFile(out / FAILURES_FILE, Failure).read() == [*lines_of(1), *lines_of(2)]
+    assert JsonLinesFile(out / FAILURES_FILE, FailedAttempt).read() == [*lines_of(1), *lines_of(2)]
 
 
 def test_killed_when_all_was_merged_already(tmp_path, made):
@@ -166,7 +166,7 @@ def test_fewer_than_there_are(tmp_path, made):
     before = generate(out, episodes=4)
     after = generate(out, episodes=2)
     assert seeds_of(out) == [0, 1, 3, 4]
-    assert (after.episodes, after.seeds, after.gave_up) == (before.episodes, before.seeds, before.gave_up)
+    assert (after.episodes, after.seeds, after.skipped) == (before.episodes, before.seeds, before.skipped)
     assert made == [0, 1, 2, 3, 4]
 
 

@@ -7,7 +7,7 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.actions import episode_actions
 from robocas_ms3.datasets.sources.arrays import episode_arrays
 from robocas_ms3.demos.generator import EpisodeGenerator
-from robocas_ms3.demos.open_loop import OpenLoop
+from robocas_ms3.demos.open_loop import OpenLoopEnv
 from robocas_ms3.demos.recordings.motion import sample_states
 from robocas_ms3.demos.recordings.subgoals import sample_subgoals
 from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
@@ -37,13 +37,13 @@ def recorded(tmp_path_factory):
         world.reset, world.step = reset_, step_
         return reset, step
 
-    plain = [listen(world, actions) for world, actions in zip(generator.worlds, played, strict=True)]
+    plain = [listen(world, actions) for world, actions in zip(generator.open_loop_envs, played, strict=True)]
     folder = tmp_path_factory.mktemp("recorded")
     assert generator.generate(SEED, folder, "one").success
-    for world, (reset, step) in zip(generator.worlds, plain, strict=True):
+    for world, (reset, step) in zip(generator.open_loop_envs, plain, strict=True):
         world.reset, world.step = reset, step
     with TrajectoryFile(folder / "one.h5") as file:
-        yield generator.worlds[0], file.recording(0), [np.array(actions) for actions in played]
+        yield generator.open_loop_envs[0], file.recording(0), [np.array(actions) for actions in played]
     generator.close()
 
 
@@ -56,7 +56,7 @@ def own_actions(recording):
 
 def play(world, actions):
     world.reset(SEED)
-    return world.play(actions)
+    return world.replay(actions)
 
 
 def test_a_demonstrations_own_actions_succeed_again(recorded):
@@ -100,4 +100,4 @@ def test_motion_beyond_a_step_is_counted(recorded):
 @pytest.mark.parametrize("rate", [0, 2.5, 7])
 def test_rates_that_physics_does_not_know(rate):
     with pytest.raises(DatasetError, match="can't be played at this rate"):
-        OpenLoop({"env_id": "robocas_ms3:RoboCASPick-v1", "env_kwargs": {}}, rate)
+        OpenLoopEnv({"env_id": "robocas_ms3:RoboCASPick-v1", "env_kwargs": {}}, rate)

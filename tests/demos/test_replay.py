@@ -11,7 +11,7 @@ import torch
 from synthetic import STEPS, write_trajectory
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.demos.trajectory_replay import Recorded, state_distance
+from robocas_ms3.demos.trajectory_replay import RecordedEpisode, state_distance
 
 
 @pytest.fixture
@@ -24,7 +24,7 @@ def entry(trajectory):
 
 
 def env_like(recorded, **changes):
-    """What `check_fits` asks of an environment: one step of the recording, as tensors of one env."""
+    """What `check_compatible` asks of an environment: one step of the recording, as tensors of one env."""
     bodies = {kind: {n: torch.tensor(row)[None] for n, row in of.items()} for kind, of in recorded.states[0].items()}
     return SimpleNamespace(
         control_mode=changes.get("control_mode", recorded.control_mode),
@@ -34,20 +34,20 @@ def env_like(recorded, **changes):
 
 
 def test_only_a_scene_like_the_recorded_one_fits(trajectory):
-    recorded = Recorded.read(trajectory, entry(trajectory))
-    recorded.check_fits(env_like(recorded))
-    recorded.check_fits(env_like(recorded, control_mode="pd_ee_pose", actions=7))
+    recorded = RecordedEpisode.read(trajectory, entry(trajectory))
+    recorded.check_compatible(env_like(recorded))
+    recorded.check_compatible(env_like(recorded, control_mode="pd_ee_pose", actions=7))
     with pytest.raises(DatasetError, match="actions of another robot .expected 7 numbers, found 8"):
-        recorded.check_fits(env_like(recorded, actions=7))
+        recorded.check_compatible(env_like(recorded, actions=7))
     with h5py.File(trajectory, "r+") as file:
         bodies = file["traj_0/env_states/actors"]
         bodies["guest"] = bodies["object_0"][:]
         file["traj_0/env_states/controller/arm"] = np.zeros((STEPS + 1, 7), np.float32)
-    other = Recorded.read(trajectory, entry(trajectory))
+    other = RecordedEpisode.read(trajectory, entry(trajectory))
     with pytest.raises(DatasetError, match="actors/guest: states of another scene .expected nothing of this name"):
-        other.check_fits(env_like(recorded))
+        other.check_compatible(env_like(recorded))
     with pytest.raises(DatasetError, match="actors/guest: .*expected 13 numbers, found nothing"):
-        recorded.check_fits(env_like(other))
+        recorded.check_compatible(env_like(other))
 
 
 def state(cube, cup=(0.0, 0.0), robot=(0.0, 0.0)):

@@ -11,7 +11,7 @@ from synthetic import write_trajectory
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import DatasetError, OutputExistsError, RobocasError
 from robocas_ms3.demos import generation as module
-from robocas_ms3.demos.failures import EpisodeResult, Failure
+from robocas_ms3.demos.failures import EpisodeResult, FailedAttempt
 from robocas_ms3.demos.generation import WEIGHTS
 from robocas_ms3.demos.settings import EpisodeSettings, GenerateSettings, ReplaySettings
 from robocas_ms3.demos.trajectory_replay import CONVERTIBLE, replay
@@ -77,7 +77,7 @@ def test_settings_are_resolved_once_and_for_all():
 
 def killed_run(out, **record):
     """Write what a run leaves that was killed after it gave a seed up."""
-    given_up = {"seed": 0, "attempt": -1, "stage": "episode", "reason": "gave_up", "seconds": 0.0}
+    given_up = {"seed": 0, "attempt": -1, "stage": "episode", "reason": "skipped", "seconds": 0.0}
     out.mkdir(exist_ok=True)
     (out / "run.json").write_text(json.dumps({"settings": asdict(SETTINGS), "first_seed": 0, **record}))
     (out / "failures.jsonl").write_text(json.dumps(given_up) + "\n")
@@ -88,15 +88,15 @@ def killed_run(out, **record):
 def hopeless(monkeypatch):
     """Every seed is given up."""
 
-    def give_up(settings, seeds, folder, players):
+    def give_up(settings, seeds, folder, make_roll_in):
         for seed in seeds:
-            yield EpisodeResult(seed, success=False, failures=[Failure(seed, 0, "reach", "far", 0.0)])
+            yield EpisodeResult(seed, success=False, failures=[FailedAttempt(seed, 0, "reach", "far", 0.0)])
 
     monkeypatch.setattr(module, "generate_seeds", give_up)
 
 
 def test_a_run_without_a_finished_seed_leaves_nothing(tmp_path, monkeypatch):
-    def interrupted(settings, seeds, folder, players):
+    def interrupted(settings, seeds, folder, make_roll_in):
         (folder / "seed_000000000.json").write_text("{")
         raise KeyboardInterrupt
         yield
@@ -143,7 +143,7 @@ def test_a_run_continues_with_its_settings_only(tmp_path, hopeless, settings, re
     known = asdict(settings) if change == WEIGHTS else asdict(SETTINGS)
     older = {key: value for key, value in known.items() if key not in DEFAULTS or change == WEIGHTS}
     out, there = killed_run(tmp_path / "out", settings=older, **record), []
-    acting = {"players": lambda: None, "weights": "def"} if settings.after_policy else {}
+    acting = {"make_roll_in": lambda: None, "weights": "def"} if settings.after_policy else {}
     with pytest.raises(RobocasError) as error:
         generate(settings, out, on_start=there.append, **acting)
     if change is None:

@@ -14,14 +14,14 @@ from robocas_ms3.datasets.checks.replay import replay_dataset
 from robocas_ms3.datasets.conversion.convert import convert
 from robocas_ms3.datasets.conversion.settings import ConversionSettings
 from robocas_ms3.datasets.sources.reader import Dataset
-from robocas_ms3.demos.failures import Takeover
+from robocas_ms3.demos.failures import Intervention
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
 from robocas_ms3.demos.recordings.trajectory_json import read_json
 from robocas_ms3.demos.settings import EpisodeSettings, ReplaySettings
 from robocas_ms3.demos.trajectory_replay import replay
 from robocas_ms3.evaluation.policies.replay import ReplayPolicy
-from robocas_ms3.evaluation.policy_rollin import Player, check_acting, steps_of
+from robocas_ms3.evaluation.policy_rollin import PolicyRollIn, check_roll_in, roll_in_steps
 
 CONFIG = "pick_upstream_eval"
 
@@ -32,7 +32,7 @@ def settings(policy: str, steps: tuple[int, int]) -> EpisodeSettings:
 
 @pytest.fixture
 def player(request):
-    made = Player(settings(*request.param))
+    made = PolicyRollIn(settings(*request.param))
     yield made
     made.close()
 
@@ -45,14 +45,14 @@ def generator():
 
 
 @pytest.fixture(scope="module")
-def taken_over(generator, tmp_path_factory):
+def is_intervention(generator, tmp_path_factory):
     """A recording that begins after 31 random steps, the state there, and the TCP's position in the arm's base."""
-    folder, player = tmp_path_factory.mktemp("taken_over"), Player(settings("random", (31, 31)))
-    takeover = player.run(2)
+    folder, player = tmp_path_factory.mktemp("is_intervention"), PolicyRollIn(settings("random", (31, 31)))
+    intervention = player.run(2)
     tcp = player._base.agent.tcp_in_arm_base.p[0].numpy().copy()
     player.close()
-    assert generator.generate(2, folder, "one", takeover).success
-    return folder / "one.h5", takeover, tcp
+    assert generator.generate(2, folder, "one", intervention).success
+    return folder / "one.h5", intervention, tcp
 
 
 def numbers(node, name=""):
@@ -62,17 +62,17 @@ def numbers(node, name=""):
 
 
 def test_steps_are_drawn_from_the_seed_both_ends_included():
-    assert steps_of(5, (7, 7)) == 7
-    drawn = [steps_of(seed, (5, 8)) for seed in range(60)]
+    assert roll_in_steps(5, (7, 7)) == 7
+    drawn = [roll_in_steps(seed, (5, 8)) for seed in range(60)]
     assert set(drawn) == {5, 6, 7, 8}
-    assert drawn == [steps_of(seed, (5, 8)) for seed in range(60)]
+    assert drawn == [roll_in_steps(seed, (5, 8)) for seed in range(60)]
 
 
 def test_weights_of_what_acts_have_a_hash_and_other_actions_than_the_protocols_are_refused():
     with pytest.raises(EvaluationError, match="joint_positions"):
-        check_acting(settings("scripted", (5, 60)))
-    assert check_acting(settings("random", (5, 60))) == ""
-    assert check_acting(settings("small", (5, 60))) == hash_weights(BUNDLED / "small")
+        check_roll_in(settings("scripted", (5, 60)))
+    assert check_roll_in(settings("random", (5, 60))) == ""
+    assert check_roll_in(settings("small", (5, 60))) == hash_weights(BUNDLED / "small")
 
 
 @pytest.mark.parametrize("player", [("random", (12, 12))], indirect=True)
@@ -81,7 +81,7 @@ def test_what_is_left_follows_from_the_seed_alone(player):
     other = player.run(4)
     again = player.run(3)
     assert first.policy_steps == again.policy_steps == 12
-    assert not first.refused
+    assert not first.skip_reason
     ours, theirs = numbers(first.state), numbers(again.state)
     assert ours.keys() == theirs.keys()
     assert all(np.array_equal(ours[name], theirs[name]) for name in ours)
@@ -90,28 +90,28 @@ def test_what_is_left_follows_from_the_seed_alone(player):
 
 @pytest.mark.parametrize("player", [("scripted-ee-delta", (90, 90))], indirect=True)
 def test_there_is_nothing_to_take_over_where_the_policy_succeeded(player, generator, tmp_path):
-    takeover = player.run(4)
-    assert takeover.refused == "succeeded"
-    assert takeover.policy_steps < 90
-    result = generator.generate(4, tmp_path, "one", takeover)
+    intervention = player.run(4)
+    assert intervention.skip_reason == "succeeded"
+    assert intervention.policy_steps < 90
+    result = generator.generate(4, tmp_path, "one", intervention)
     assert not result.success
-    assert [(failure.stage, failure.reason) for failure in result.failures] == [("takeover", "succeeded")]
-    died = Takeover(7, "random", 0, {}, 1.0, "SIGSEGV")
+    assert [(failure.stage, failure.reason) for failure in result.failures] == [("intervention", "succeeded")]
+    died = Intervention(7, "random", 0, {}, 1.0, "SIGSEGV")
     (failure,) = generator.generate(7, tmp_path, "one", died).failures
-    assert (failure.stage, failure.reason) == ("takeover", "SIGSEGV")
+    assert (failure.stage, failure.reason) == ("intervention", "SIGSEGV")
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow
-def test_the_record_begins_where_the_policy_was(taken_over, generator, tmp_path):
-    one, takeover, _ = taken_over
-    assert takeover.gripper == -1.0
-    assert generator.generate(2, tmp_path, "two", takeover).success
+def test_the_record_begins_where_the_policy_was(is_intervention, generator, tmp_path):
+    one, intervention, _ = is_intervention
+    assert intervention.gripper == -1.0
+    assert generator.generate(2, tmp_path, "two", intervention).success
     two = tmp_path / "two.h5"
     assert parse_actions(one) == parse_actions(two)
     with h5py.File(one) as file:
         group = file["traj_0"]
-        for name, left in numbers(takeover.state).items():
+        for name, left in numbers(intervention.state).items():
             assert np.array_equal(group[f"env_states{name}"][0], left[0]), name
         arm = group["env_states/articulations/robocas_mobile_panda"][:, 13 + 3 : 13 + 10]
         assert np.abs(np.diff(arm[:5], axis=0)).max() < 0.02  # rad a step: it brakes, it does not jump
@@ -119,14 +119,14 @@ def test_the_record_begins_where_the_policy_was(taken_over, generator, tmp_path)
         assert (told[:4] == -1).all()  # 0.2 s
         assert told[4] == 1  # nothing was held
     (episode,) = read_json(one)["episodes"]
-    assert episode["robocas"]["takeover"] == {"policy": "random", "policy_steps": 31}
+    assert episode["robocas"]["intervention"] == {"policy": "random", "policy_steps": 31}
     assert episode["robocas"]["subgoals"][0]["goal_range"][0] == 0
     assert [(played.success, played.state_error) for played in replay(ReplaySettings(one))] == [(True, 0.0)]
     saved = tmp_path / "saved.h5"
     assert [played.success for played in replay(ReplaySettings(one, use_env_states=True, save=saved))] == [True]
     assert parse_actions(saved) == parse_actions(one)
     with TrajectoryFile(saved) as file:
-        assert file.entry(0).taken_over
+        assert file.entry(0).is_intervention
     with pytest.raises(EvaluationError, match="begin where another policy was"):
         ReplayPolicy(one)
 
@@ -146,9 +146,9 @@ def test_the_record_begins_where_the_policy_was(taken_over, generator, tmp_path)
     indirect=["player"],
 )
 def test_it_goes_on_with_what_the_gripper_holds(player, generator, tmp_path, subgoals, commands):
-    takeover = player.run(2)
-    assert takeover.gripper == -1.0
-    assert generator.generate(2, tmp_path, "one", takeover).success
+    intervention = player.run(2)
+    assert intervention.gripper == -1.0
+    assert generator.generate(2, tmp_path, "one", intervention).success
     (episode,) = read_json(tmp_path / "one.h5")["episodes"]
     assert [part["goal_type"] for part in episode["robocas"]["subgoals"]] == subgoals
     with h5py.File(tmp_path / "one.h5") as file:
@@ -158,8 +158,8 @@ def test_it_goes_on_with_what_the_gripper_holds(player, generator, tmp_path, sub
 
 
 @pytest.mark.slow
-def test_it_is_converted_from_where_the_policy_was(taken_over, tmp_path, needs_renderer):
-    recording, _, tcp = taken_over
+def test_it_is_converted_from_where_the_policy_was(is_intervention, tmp_path, needs_renderer):
+    recording, _, tcp = is_intervention
     settings = {"cameras": ("base_camera",), "size": (64, 48), "depth": False, "embeddings": False, "video": False}
     convert(ConversionSettings(recording, tmp_path / "dataset", **settings))
     report = replay_dataset(tmp_path / "dataset")

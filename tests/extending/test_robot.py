@@ -121,7 +121,7 @@ from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.conversion.convert import convert
 from robocas_ms3.datasets.conversion.settings import ConversionSettings
-from robocas_ms3.demos.open_loop import OpenLoop
+from robocas_ms3.demos.open_loop import OpenLoopEnv
 from robocas_ms3.core.poses import from_wxyz, inverse
 from robocas_ms3.demos.recordings.motion import sample_states, stored_actions
 from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
@@ -134,7 +134,7 @@ with TrajectoryFile(file) as opened:
     recording = opened.recording(0)
     env = opened.env.make(obs_mode="none", render_backend="none")
     env.reset(seed=opened.entry(0).seed)
-    world = OpenLoop(opened.env, 5)
+    world = OpenLoopEnv(opened.env, 5)
     world.reset(opened.entry(0).seed)
 samples = sample_states(recording.control_steps, 4)
 qpos = recording.states["articulations"]["twin"][samples, 13:25]
@@ -148,7 +148,7 @@ for step in (0, 20, len(qpos) - 1):
     off.append(np.abs(arrays["ee_pos"][step] - tcp[:3, 3]).max())
 print(max(off) < 1e-5, len(arrays["ee_pos"]) == len(qpos))
 actions = stored_actions(*(arrays[name] for name in ("rel_pos", "rel_orn", "gripper_status")))
-print(world.play(actions[:-1]).success)
+print(world.replay(actions[:-1]).success)
 """,
     )
     robot, same, near, again = said.splitlines()

@@ -20,7 +20,7 @@ from robocas_ms3.core.documents import DocumentError, open_arrays
 from robocas_ms3.core.errors import AssetError, DatasetError, TrainingError
 from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.poses import from_xyz_yaw
-from robocas_ms3.demos.failures import Failure
+from robocas_ms3.demos.failures import FailedAttempt
 from robocas_ms3.scenes.cache import ABOUT, LayoutCache
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.layout import Layout
@@ -98,7 +98,7 @@ FAILURE = {"seed": 1, "attempt": 0, "stage": "a", "reason": "b", "seconds": 1.0}
 @pytest.mark.parametrize("changes", [{"attempt": -2}, {"seed": 2**62}, {"seconds": 1e308}, {"seconds": True}])
 def test_a_failure_out_of_range_is_no_failure(tmp_path, changes):
     (tmp_path / "failures.jsonl").write_text(json.dumps({**FAILURE, **changes}) + "\n")
-    assert JsonLinesFile(tmp_path / "failures.jsonl", Failure).read() == []
+    assert JsonLinesFile(tmp_path / "failures.jsonl", FailedAttempt).read() == []
 
 
 def test_arrays_that_unpack_to_more_than_there_may_be(tmp_path, monkeypatch):

@@ -33,11 +33,11 @@ from robocas_ms3.datasets.sources.provenance import recorded_scene, recording_en
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.trajectory import TrajectorySource
 from robocas_ms3.datasets.statistics.collect import collect
-from robocas_ms3.demos.failures import Failure, count_by_stage
+from robocas_ms3.demos.failures import FailedAttempt, count_by_stage
 from robocas_ms3.demos.generation import OUTPUT
 from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
 from robocas_ms3.demos.settings import EpisodeSettings
-from robocas_ms3.demos.trajectory_replay import Recorded
+from robocas_ms3.demos.trajectory_replay import RecordedEpisode
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
 from robocas_ms3.evaluation.report.comparison import compare_results
@@ -173,7 +173,7 @@ def read_recording(root):
             recording = file.recording(index)
             motion = recording.motion(np.arange(0, recording.control_steps + 1, 4))
             assert np.isfinite(motion.actions).all()
-            assert np.isfinite(Recorded.read(path, file.episodes[index]).actions).all()
+            assert np.isfinite(RecordedEpisode.read(path, file.episodes[index]).actions).all()
             assert recording_entry(file, index)
             assert recorded_scene(file, index)
     source = TrajectorySource(path)
@@ -223,7 +223,7 @@ def read_plan_folder(root):
 
 def read_generation(root):
     OutputFolder(root, OUTPUT, RUN).read()
-    count_by_stage(JsonLinesFile(root / "failures.jsonl", Failure).read())
+    count_by_stage(JsonLinesFile(root / "failures.jsonl", FailedAttempt).read())
 
 
 def read_conversion(root):

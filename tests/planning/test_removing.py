@@ -12,7 +12,7 @@ from mani_skill.utils.structs import Pose
 from robocas_ms3.core.errors import PlanningError, UnrecoverableError
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.settings import EpisodeSettings
-from robocas_ms3.planning.decisions import StraightDecisions
+from robocas_ms3.planning.decisions import IrreversibleDecisions
 from robocas_ms3.planning.executor import Executor
 from robocas_ms3.planning.protocol import Obstacle, Shape
 from robocas_ms3.planning.pushes import push_direction
@@ -38,7 +38,7 @@ def begin(generator, seed):
     executor = Executor(generator.env, seed)
     executor.reset()
     executor.facts = {"pushes": 0, "removals": 0}
-    arm = Arm(generator.planner, generator.reachability, executor, StraightDecisions(lambda: len(executor.actions)))
+    arm = Arm(generator.planner, generator.reachability, executor, IrreversibleDecisions(lambda: len(executor.actions)))
     target = int(arm.env.target_slot[0])
     slots = [s for s in np.flatnonzero(arm.env.present[0].numpy()).tolist() if s != target]
     return arm, target, sorted(slots, key=lambda slot: -surface(arm, slot)[:, 2].max())
@@ -143,10 +143,10 @@ def test_where_nothing_can_be_moved_the_target_is_grasped_as_it_lies(generator, 
 
     monkeypatch.setattr(Heap, "make", refuse)
     monkeypatch.setattr(Heap, "visible", True)
-    for name in ("grasp", "hang_clear", "carry_to_basket", "release_into_basket"):
+    for name in ("grasp", "raise_held_object", "carry_to_basket", "release_into_basket"):
         monkeypatch.setattr(search, name, lambda *_, name=name, **how: skills.append(name))
     search.attempt(arm)
-    assert skills == ["grasp", "hang_clear", "carry_to_basket", "release_into_basket"]
+    assert skills == ["grasp", "raise_held_object", "carry_to_basket", "release_into_basket"]
 
 
 def test_after_a_push_the_arm_rises_clear_of_furniture_and_basket(generator, monkeypatch):

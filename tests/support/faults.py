@@ -22,7 +22,7 @@ from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.datasets.conversion.episode_folder import find_damaged
 from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.datasets.sources.reader import Dataset
-from robocas_ms3.demos.failures import FAILURES_FILE, Failure
+from robocas_ms3.demos.failures import FAILURES_FILE, FailedAttempt
 from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
 from robocas_ms3.demos.recordings.trajectory_hdf5 import open_trajectory
 from robocas_ms3.evaluation import results
@@ -83,7 +83,7 @@ def content(command, out):
     """(episode, what came of it), without what a clock said; none may be there twice."""
     if command.name == "generate":
         episodes = json.loads((out / "trajectory.json").read_text())["episodes"]
-        lines: list[Failure] = JsonLinesFile(out / FAILURES_FILE, Failure).read()
+        lines: list[FailedAttempt] = JsonLinesFile(out / FAILURES_FILE, FailedAttempt).read()
         failed = {seed: list(of) for seed, of in groupby(lines, lambda line: line.seed)}
         assert list(failed) == sorted({line.seed for line in lines})
         with open_trajectory(out / "trajectory.h5") as file:

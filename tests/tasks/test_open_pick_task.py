@@ -12,7 +12,7 @@ import robocas_ms3  # noqa: F401
 from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.datasets.sources.arrays import episode_arrays
 from robocas_ms3.demos.generator import EpisodeGenerator
-from robocas_ms3.demos.open_loop import Trials
+from robocas_ms3.demos.open_loop import OpenLoopChecks
 from robocas_ms3.demos.recordings.motion import sample_states
 from robocas_ms3.demos.recordings.subgoals import sample_subgoals
 from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
@@ -57,7 +57,7 @@ def done_early():
     flag = Executor.flag
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Executor, "flag", lambda self, name: name == "success" or flag(self, name))
-        patch.setattr(Trials, "follow", lambda *_, **how: None)
+        patch.setattr(OpenLoopChecks, "check", lambda *_, **how: None)
         yield
 
 

@@ -19,7 +19,7 @@ def run_folder(tmp_path_factory):
     failures = [
         {"seed": 4, "attempt": 0, "stage": "grasp", "reason": "slipped", "seconds": 2.5},
         {"seed": 9, "attempt": 0, "stage": "reach", "reason": "unreachable", "seconds": 1.0},
-        {"seed": 9, "attempt": -1, "stage": "episode", "reason": "gave_up", "seconds": 0.0},
+        {"seed": 9, "attempt": -1, "stage": "episode", "reason": "skipped", "seconds": 0.0},
     ]
     (folder / "failures.jsonl").write_text("".join(json.dumps(line) + "\n" for line in failures))
     return folder

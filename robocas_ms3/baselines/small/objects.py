@@ -59,7 +59,7 @@ def locate_objects(
     try:
         layout, target = episode.layout, episode.scene.get("target") or {}
         meant, known = str(target.get("asset_id") or ""), layout.get("poses")
-        if not known or "takeover" in (episode.scene.get("recorded") or {}):  # the other policy may have moved them
+        if not known or "intervention" in (episode.scene.get("recorded") or {}):  # the other policy may have moved them
             nothing = np.full((steps, 0, 2), np.nan, np.float32)
             return SceneObjects(steps, meant, places=dict.fromkeys(projections, nothing))
         there = np.array(layout.get("present") or [True] * len(known), bool)

@@ -16,7 +16,7 @@ from robocas_ms3.core.text import one_line
 from robocas_ms3.datasets.actions import episode_actions
 from robocas_ms3.datasets.sources.file_models import EnvInfo, Layout, SceneRecord, read_scene
 from robocas_ms3.datasets.sources.reader import Dataset
-from robocas_ms3.demos.open_loop import OpenLoop
+from robocas_ms3.demos.open_loop import OpenLoopEnv
 from robocas_ms3.demos.recordings.environment import read_env
 from robocas_ms3.demos.recordings.trajectory_json import one_seed, read_reset_options
 
@@ -99,7 +99,7 @@ class _Player:
     def __init__(self, rate_hz: float, pack: str | Path | None) -> None:
         self._rate_hz, self._pack = rate_hz, pack
         self._env_info: EnvInfo | None = None
-        self._open_loop: OpenLoop | None = None
+        self._open_loop: OpenLoopEnv | None = None
 
     def play(self, number: int, task: str, scene: SceneRecord, arrays: Mapping[str, NDArray]) -> EpisodeReplay:
         seed, reason = one_seed(scene.seed), _not_playable(scene, arrays)
@@ -108,12 +108,12 @@ class _Player:
         if self._open_loop is None or scene.env_info != self._env_info:
             self.close()
             env = read_env(scene.env_info and scene.env_info.model_dump(), "scene.json, env_info", pack=self._pack)
-            self._env_info, self._open_loop = scene.env_info, OpenLoop(env, self._rate_hz)
+            self._env_info, self._open_loop = scene.env_info, OpenLoopEnv(env, self._rate_hz)
         self._open_loop.reset(seed, read_reset_options(scene.reset_options, "reset_options"))
         other = _other_scene(scene.layout or Layout(), self._open_loop)
         if other:
             return EpisodeReplay(number, task, None, skipped=f"its seed builds another scene now: {other}")
-        played = self._open_loop.play(episode_actions(arrays)[:-1])
+        played = self._open_loop.replay(episode_actions(arrays)[:-1])
         error = np.linalg.norm(played.tcp_in_base - arrays["ee_pos"], axis=1)
         return EpisodeReplay(number, task, played.success, float(error.mean()), float(error.max()), played.clipped)
 
@@ -123,7 +123,7 @@ class _Player:
             self._open_loop = None
 
 
-def _other_scene(recorded: Layout, open_loop: OpenLoop) -> str:
+def _other_scene(recorded: Layout, open_loop: OpenLoopEnv) -> str:
     built = open_loop.layout
     if recorded.object_ids and recorded.object_ids != list(built.object_ids):
         return "other objects"
@@ -145,7 +145,7 @@ def _not_playable(scene: SceneRecord, arrays: Mapping[str, NDArray]) -> str:
         return "its scene.json does not say how to build the scene"
     if scene.success is False:
         return "it was recorded without success"
-    if scene.recorded and scene.recorded.takeover is not None:
+    if scene.recorded and scene.recorded.intervention is not None:
         return "it begins where another policy was, to which its seed does not lead"
     if len(arrays["ee_pos"]) < 2:
         return "it has no actions"

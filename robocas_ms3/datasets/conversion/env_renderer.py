@@ -64,7 +64,7 @@ class EnvRenderer:
             mine, theirs = set(built.get(kind, {})), set(recording.states.get(kind, {}))
             if mine != theirs:
                 refuse("", sorted(theirs), sorted(mine))
-        for name, states in () if recording.taken_over else recording.states.get("actors", {}).items():
+        for name, states in () if recording.is_intervention else recording.states.get("actors", {}).items():
             distance = float(np.linalg.norm(built["actors"][name][0, :3].cpu().numpy() - states[0, :3]))
             if distance > _SAME_PLACE:
                 refuse(name, "the recorded place", f"{distance * 1000:.1f} mm away")

@@ -103,7 +103,7 @@ class Recorded(_Part):
     facts: dict[str, Any] | None = None
     attempts: NonNegativeInt | None = None
     recoveries: list[_Recovery] | None = None
-    takeover: Any = None
+    intervention: Any = None
     seconds: dict[str, Any] | None = None
 
 

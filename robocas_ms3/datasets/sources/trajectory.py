@@ -19,7 +19,7 @@ from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.demos.recordings.motion import sample_states, sample_stride
 from robocas_ms3.demos.recordings.subgoals import SubGoal, sample_subgoals
 from robocas_ms3.demos.recordings.trajectory_file import Recording, TrajectoryFile
-from robocas_ms3.demos.recordings.trajectory_json import Entry
+from robocas_ms3.demos.recordings.trajectory_json import EpisodeEntry
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.layout import PARKING_HEIGHT
 
@@ -51,7 +51,7 @@ class TrajectorySource(EpisodeSource):
             self._entries = [_read_entry(file, index) for index in self.index]
         self.numbers, self.file = list(range(len(self.index))), file
 
-    def info(self, number: int) -> Entry:
+    def info(self, number: int) -> EpisodeEntry:
         """Return what the JSON says of an episode, which is checked."""
         found = self._entries[number]
         if isinstance(found, DatasetError):
@@ -97,7 +97,7 @@ class RecordedEpisode(SourceEpisode):
         self._source, self._number = source, number
 
     @property
-    def _entry(self) -> Entry:
+    def _entry(self) -> EpisodeEntry:
         return self._source.info(self._number)
 
     @property
@@ -151,7 +151,7 @@ class RecordedEpisode(SourceEpisode):
         return self._source.recording(self._number, bodies=bodies)
 
 
-def _read_entry(file: TrajectoryFile, index: int) -> Entry | DatasetError:
+def _read_entry(file: TrajectoryFile, index: int) -> EpisodeEntry | DatasetError:
     """Return the JSON's entry, or the error, which is of that episode alone."""
     try:
         entry = file.entry(index)

@@ -49,7 +49,7 @@ class EpisodeRecorder(gym.Wrapper):
         self._keep(observation)
         return observation, info
 
-    def begin_at(self, state: dict[str, Any]) -> None:
+    def start_at(self, state: dict[str, Any]) -> None:
         """Begin anew from a state of the scene that was reset, as ``set_state_dict`` takes it."""
         self._base_env.set_state_dict(state)
         self._steps = _Steps()

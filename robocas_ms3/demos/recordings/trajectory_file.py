@@ -19,7 +19,7 @@ from robocas_ms3.demos.recordings.trajectory_hdf5 import (
     read_steps,
     readable,
 )
-from robocas_ms3.demos.recordings.trajectory_json import Entry, RunRecord, read_entry, read_json
+from robocas_ms3.demos.recordings.trajectory_json import EpisodeEntry, RunRecord, read_entry, read_json
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.robots.registry import RobotSpec
 
@@ -27,7 +27,7 @@ _STATE_DIM = 13 + 2 * RobotDescription.finger_slice.stop
 
 
 @dataclass(frozen=True)
-class Recording(Entry):
+class Recording(EpisodeEntry):
     """One recorded episode.
 
     Attributes:
@@ -114,7 +114,7 @@ class TrajectoryFile:
         """Leave the open file behind, which no other process and no copy can have."""
         return {**self.__dict__, "_file": None}
 
-    def entry(self, index: int) -> Entry:
+    def entry(self, index: int) -> EpisodeEntry:
         return read_entry(self.episodes[index], self._where(index))
 
     def recording(self, index: int, *, bodies: bool = True) -> Recording:

@@ -2,7 +2,7 @@
 
 HDF5 ends the process where it can't write what it holds, so files are made in memory or on reserved space. HDF5 lets a
 file name others: by links, as the place of an array's bytes, as pieces of an array. A recording is somebody's data and
-chooses no paths: what does is refused, and nothing of it is read.
+chooses no paths: such files are refused, and nothing of it is read.
 """
 
 from __future__ import annotations

@@ -54,7 +54,7 @@ class ResetRecord(_Record):
     options: dict[Literal["reconfigure"], bool] | None = None
 
 
-class BeginRecord(_Record):
+class EpisodeHeader(_Record):
     """How an episode begins, in every ManiSkill trajectory."""
 
     episode_id: int
@@ -69,7 +69,7 @@ class TaskRecord(SubGoals):
     instruction: str
 
 
-class EpisodeRecord(BeginRecord):
+class EpisodeRecord(EpisodeHeader):
     """An episode that ``robocas generate`` recorded."""
 
     elapsed_steps: NonNegativeInt | None = None
@@ -101,7 +101,7 @@ class TrajectoryRecord(_Record):
 
 
 @dataclass(frozen=True)
-class Entry:
+class EpisodeEntry:
     """A recorded episode of S control steps in the JSON.
 
     Attributes:
@@ -109,7 +109,7 @@ class Entry:
         reset_options: further options of ``env.reset``.
         control_steps: S.
         subgoals: ranges over the actions 0..S-1.
-        taken_over: whether it begins where another policy was, instead of at the reset.
+        is_intervention: whether it begins where another policy was, instead of at the reset.
     """
 
     episode_id: int
@@ -119,16 +119,16 @@ class Entry:
     control_steps: int
     instruction: str
     subgoals: list[SubGoal]
-    taken_over: bool
+    is_intervention: bool
 
 
-def read_entry(episode: Mapping[str, Any], where: object) -> Entry:
+def read_entry(episode: Mapping[str, Any], where: object) -> EpisodeEntry:
     found = parse(EpisodeRecord, episode, DatasetError, where=where, about=_ENTRY)
     goals = found.robocas.subgoals
     steps = found.elapsed_steps
     if steps is None and not goals:
         raise DatasetError("the JSON's entry does not say how long the episode is", where=where)
-    return Entry(
+    return EpisodeEntry(
         episode_id=found.episode_id,
         seed=found.episode_seed,
         reset_options=_options(found.reset_kwargs),
@@ -136,19 +136,19 @@ def read_entry(episode: Mapping[str, Any], where: object) -> Entry:
         control_steps=goals[-1].last + 1 if steps is None else steps,
         instruction=found.robocas.instruction,
         subgoals=goals,
-        taken_over=was_taken_over(episode),
+        is_intervention=is_intervention(episode),
     )
 
 
-def was_taken_over(episode: Mapping[str, Any]) -> bool:
+def is_intervention(episode: Mapping[str, Any]) -> bool:
     """Whether an episode begins where another policy was."""
     recorded = episode.get("robocas")
-    return isinstance(recorded, Mapping) and recorded.get("takeover") is not None
+    return isinstance(recorded, Mapping) and recorded.get("intervention") is not None
 
 
-def read_begin(episode: Mapping[str, Any], where: object) -> tuple[int, dict[str, Any], str]:
+def read_reset(episode: Mapping[str, Any], where: object) -> tuple[int, dict[str, Any], str]:
     """Return seed and options of ``env.reset`` that an episode begins with, and the control mode of its actions."""
-    found = parse(BeginRecord, episode, DatasetError, where=where, about=_ENTRY)
+    found = parse(EpisodeHeader, episode, DatasetError, where=where, about=_ENTRY)
     return found.episode_seed, _options(found.reset_kwargs), found.control_mode
 
 

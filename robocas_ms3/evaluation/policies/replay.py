@@ -15,7 +15,7 @@ from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.demos.recordings.environment import read_env
 from robocas_ms3.demos.recordings.motion import Motion, sample_states
 from robocas_ms3.demos.recordings.trajectory_hdf5 import open_episode, open_trajectory, read_actions
-from robocas_ms3.demos.recordings.trajectory_json import read_begin, read_json, was_taken_over
+from robocas_ms3.demos.recordings.trajectory_json import is_intervention, read_json, read_reset
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.robots.registry import RobotSpec
@@ -110,11 +110,11 @@ class ReplayPolicy(TrackPolicy):
         if env.control_mode != "pd_joint_pos":
             what, found = "can't be played here", env.control_mode
             raise EvaluationError(what, where=trajectory, expected="pd_joint_pos", found=found)
-        if any(map(was_taken_over, data["episodes"])):
+        if any(map(is_intervention, data["episodes"])):
             what, fix = "episodes that begin where another policy was", "Use robocas replay, which begins there too."
             raise EvaluationError(what, where=trajectory, expected="episodes that begin with a reset", fix=fix)
         self._episodes = {
-            read_begin(one, f"{trajectory}, traj_{one['episode_id']}")[0]: one["episode_id"] for one in data["episodes"]
+            read_reset(one, f"{trajectory}, traj_{one['episode_id']}")[0]: one["episode_id"] for one in data["episodes"]
         }
         rate = env.kwargs.get("sim_config", {}).get("control_freq", 20)
         self.spec = PolicySpec(convention="joint_positions", rate_hz=rate, language="none")

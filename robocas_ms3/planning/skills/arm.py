@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 
 from robocas_ms3.core.errors import PlanningError
-from robocas_ms3.planning.decisions import ONE_BY_ONE, TRIES, Decisions, Effort
+from robocas_ms3.planning.decisions import FIRST_FEASIBLE, MAX_CONTINUED, Decisions, SearchLimits
 from robocas_ms3.planning.executor import CLOSED, OPEN, Executor
 from robocas_ms3.planning.kinematics import Reachability
 from robocas_ms3.planning.protocol import Array, Planner, Trajectory
@@ -65,7 +65,7 @@ class Arm:
         self.planner.seed(int(entropy.generate_state(1)[0]))
         self.rng = np.random.default_rng(entropy)
 
-    def choose(self, candidates: Iterable[T], play: Callable[[T], float], effort: Effort = ONE_BY_ONE) -> T:
+    def choose(self, candidates: Iterable[T], play: Callable[[T], float], limits: SearchLimits = FIRST_FEASIBLE) -> T:
         path = self.path
 
         def play_one(numbered: tuple[int, T]) -> float:
@@ -74,11 +74,11 @@ class Arm:
             self._seed()
             return play(candidate)
 
-        return self.decisions.choose(enumerate(candidates), play_one, effort)[1]
+        return self.decisions.choose(enumerate(candidates), play_one, limits)[1]
 
     def come_back_here(self) -> None:
         """Let what comes next begin again from here when it fails, with other random numbers."""
-        self.choose(range(TRIES), lambda _: 0.0)
+        self.choose(range(MAX_CONTINUED), lambda _: 0.0)
 
     @property
     def env(self) -> RoboCASEnv:
@@ -102,7 +102,7 @@ class Arm:
         self.executor.label(**subgoal(goal_type, *words))
 
     def planning(self):
-        return self.executor.seconds.spent_on("planning")
+        return self.executor.seconds.measure("planning")
 
     def follow(self, *motions: Trajectory, until: str | None = None) -> bool:
         reached = True

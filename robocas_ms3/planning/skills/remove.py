@@ -36,7 +36,7 @@ PLACES_SOLVED, PLACES_PLANNED = 96, 12
 def remove(arm: Arm, slot: int) -> None:
     """Grasp an object, put it down on a free place of the surface, step back."""
     grasp(arm, slot, lift_height=lift_height(arm, slot))
-    hang_clear(arm, slot)
+    raise_held_object(arm, slot)
     with arm.planning():
         way = plan_place(arm, slot)
     arm.follow(way)
@@ -49,7 +49,7 @@ def remove(arm: Arm, slot: int) -> None:
     arm.follow(retreat)
 
 
-def hang_clear(arm: Arm, slot: int) -> None:
+def raise_held_object(arm: Arm, slot: int) -> None:
     attach_held(arm, slot)
     arm.rise_clear(without=slot)
 

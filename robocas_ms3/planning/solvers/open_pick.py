@@ -12,6 +12,6 @@ def attempt(arm: Arm) -> None:
     if not is_opened(arm):
         arm.begin_subgoal("operate the target")
         open_from_reach(arm)
-        arm.executor.rehearse()
+        arm.executor.check_open_loop()
         arm.come_back_here()
     pick.attempt(arm)

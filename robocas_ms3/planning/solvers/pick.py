@@ -9,5 +9,5 @@ from robocas_ms3.planning.skills.base_placement import bring_to_basket, grasp_fr
 def attempt(arm: Arm) -> None:
     arm.begin_subgoal("move and grasp")
     grasp_from_reach(arm, arm.target)
-    arm.executor.rehearse()
+    arm.executor.check_open_loop()
     bring_to_basket(arm, arm.target)

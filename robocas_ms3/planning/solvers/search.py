@@ -6,14 +6,14 @@ What to move, and how, is decided by trying a few ways and taking the one after 
 from __future__ import annotations
 
 from robocas_ms3.core.errors import PlanningError
-from robocas_ms3.planning.decisions import Effort
+from robocas_ms3.planning.decisions import SearchLimits
 from robocas_ms3.planning.executor import OPEN
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.planning.skills.grasp import grasp
 from robocas_ms3.planning.skills.heap import FACTS, Heap
 from robocas_ms3.planning.skills.look import FAR, NEAR, look_at, prepare_looks
 from robocas_ms3.planning.skills.place import carry_to_basket, release_into_basket
-from robocas_ms3.planning.skills.remove import hang_clear
+from robocas_ms3.planning.skills.remove import raise_held_object
 
 LIFT_HEIGHT = 0.15  # m, upstream's
 AHEAD = 3  # moves that are compared
@@ -37,7 +37,7 @@ def attempt(arm: Arm) -> None:
             arm.begin_subgoal("find the object")
         done = len(arm.executor.actions)
         try:
-            arm.choose(heap.moves(), heap.make, Effort(AHEAD, tries(heap.moves_made), ENOUGH))
+            arm.choose(heap.moves(), heap.make, SearchLimits(AHEAD, tries(heap.moves_made), ENOUGH))
         except PlanningError:
             if len(arm.executor.actions) > done:
                 raise
@@ -46,10 +46,10 @@ def attempt(arm: Arm) -> None:
             if not heap.visible or not _grasp(arm, slot):
                 raise
             break
-        arm.executor.rehearse()
+        arm.executor.check_open_loop()
         if heap.uncovered and not heap.visible:
             look_at(arm, heap.middle(slot), NEAR)
-    arm.executor.rehearse()
+    arm.executor.check_open_loop()
     arm.begin_subgoal("transfer object")
     carry_to_basket(arm, slot)
     heap.check_surface()
@@ -68,7 +68,7 @@ def _grasp(arm: Arm, slot: int) -> bool:
     def play(kind: int) -> float:
         arm.executor.gripper = OPEN  # it opens on the way
         grasp(arm, slot, lift_height=LIFT_HEIGHT, other_than=kind)
-        hang_clear(arm, slot)
+        raise_held_object(arm, slot)
         return 0.0
 
     try:

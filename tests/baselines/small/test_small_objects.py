@@ -60,7 +60,7 @@ def test_a_camera_in_the_world():
 
 def test_without_a_layout_or_after_another_policy_nothing_is_known():
     after = episode()
-    after.scene["recorded"] = {"takeover": {"policy": "small", "policy_steps": 5}}
+    after.scene["recorded"] = {"intervention": {"policy": "small", "policy_steps": 5}}
     for unknown in (episode({}), episode({"object_ids": ["apple"], "present": [True]}), after):
         found = locate_objects(unknown, ARRAYS, tcp([1] * STEPS), PROJECTIONS)
         assert (found.kinds, found.places["base_camera"].shape) == ([], (STEPS, 0, 2))

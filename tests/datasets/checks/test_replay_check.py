@@ -12,7 +12,7 @@ from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import AssetError
 from robocas_ms3.datasets.checks import replay as replay_check
 from robocas_ms3.datasets.checks.replay import replay_dataset
-from robocas_ms3.demos.open_loop import Playback
+from robocas_ms3.demos.open_loop import OpenLoopResult
 
 
 class Player:
@@ -36,14 +36,14 @@ class Player:
     def reset(self, seed, options):
         self.seed, self.options = seed, options
 
-    def play(self, actions):
+    def replay(self, actions):
         self.plays.append((self.seed, actions))
         pose, places = np.eye(4), [np.zeros(3)]
         for action in actions.astype(float):
             pose[:3, 3] += pose[:3, :3] @ action[:3]
             pose[:3, :3] = pose[:3, :3] @ Rotation.from_euler("xyz", action[3:6]).as_matrix()
             places.append(pose[:3, 3].copy())
-        return Playback(self.seed != 5, np.array(places), 0)
+        return OpenLoopResult(self.seed != 5, np.array(places), 0)
 
     def close(self):
         self.closed = True
@@ -52,7 +52,7 @@ class Player:
 @pytest.fixture(autouse=True)
 def player(monkeypatch):
     Player.made = []
-    monkeypatch.setattr(replay_check, "OpenLoop", Player)
+    monkeypatch.setattr(replay_check, "OpenLoopEnv", Player)
     return Player
 
 

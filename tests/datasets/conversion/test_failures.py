@@ -10,17 +10,17 @@ from robocas_ms3.datasets.conversion.data_info import add_failures
 from robocas_ms3.datasets.manage.merge import merge
 from robocas_ms3.datasets.sources.provenance import environment_id
 from robocas_ms3.datasets.sources.reader import Dataset
-from robocas_ms3.demos.failures import Failure
+from robocas_ms3.demos.failures import FailedAttempt
 
-SLIPPED = Failure(3, 0, "grasp", "slipped", 2.5)
-LOST = Failure(4, -1, "episode", "gave_up", 0.0)
-OTHER = Failure(9, 1, "reach", "unreachable", 1.0)
+SLIPPED = FailedAttempt(3, 0, "grasp", "slipped", 2.5)
+LOST = FailedAttempt(4, -1, "episode", "skipped", 0.0)
+OTHER = FailedAttempt(9, 1, "reach", "unreachable", 1.0)
 
 
 def run_of(folder, failures, seeds=(3, 5), **kwargs):
     """A trajectory and what went wrong with it."""
     folder.mkdir()
-    JsonLinesFile(folder / "failures.jsonl", Failure).append(failures)
+    JsonLinesFile(folder / "failures.jsonl", FailedAttempt).append(failures)
     return write_trajectory(folder / "trajectory.h5", seeds=seeds, **kwargs)
 
 
@@ -28,7 +28,7 @@ def told(out, task=None):
     """Failures of a dataset, of one task or all."""
     lines = [json.loads(line) for line in (out / "failures.jsonl").read_text().splitlines()]
     assert all(set(line) == {*vars(SLIPPED), "task", "environment"} for line in lines)
-    return [Failure(*(line[key] for key in vars(SLIPPED))) for line in lines if task in (None, line["task"])]
+    return [FailedAttempt(*(line[key] for key in vars(SLIPPED))) for line in lines if task in (None, line["task"])]
 
 
 def test_lost_seeds_go_along(tmp_path):

@@ -17,7 +17,7 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import atomic_file
 from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
 from robocas_ms3.demos.recordings.trajectory_hdf5 import damage_of, merge, reserved, write_whole
-from robocas_ms3.demos.trajectory_replay import Recorded
+from robocas_ms3.demos.trajectory_replay import RecordedEpisode
 from robocas_ms3.evaluation.policies.replay import ReplayPolicy
 from robocas_ms3.evaluation.policy import EpisodeSpec
 
@@ -146,14 +146,14 @@ def by_merge(path):
 
 
 def by_replay(path):
-    return Recorded.read(path, json.loads(path.with_suffix(".json").read_text())["episodes"][0])
+    return RecordedEpisode.read(path, json.loads(path.with_suffix(".json").read_text())["episodes"][0])
 
 
 def by_policy(path):
     return ReplayPolicy(path).track(EpisodeSpec(0, 0, "", "", "", "", 3, "")).actions
 
 
-def refused(read, path, *words):
+def check_refused(read, path, *words):
     with pytest.raises(DatasetError) as caught:
         read(path)
     assert "\n" not in str(caught.value)
@@ -169,7 +169,7 @@ def test_states_of_other_files(whole, fill, read):
         with h5py.File(whole, "r+") as file:
             del file["elsewhere"]
             file[CUBE.rpartition("/")[0]].create_dataset("more", data=SECRET)
-    refused(read, whole, "can't choose files", "object_1", "arrays of its own")
+    check_refused(read, whole, "can't choose files", "object_1", "arrays of its own")
     assert not whole.with_name("merged.h5").exists()
 
 
@@ -177,7 +177,7 @@ def test_states_of_other_files(whole, fill, read):
 @pytest.mark.parametrize("name", ["traj_0/actions", "traj_0"])
 def test_a_link_in_place_of_actions_or_of_the_episode(whole, read, name):
     replaced(whole, name, external_link)
-    refused(read, whole, "can't choose files", name.rpartition("/")[2])
+    check_refused(read, whole, "can't choose files", name.rpartition("/")[2])
 
 
 @pytest.mark.parametrize("read", [by_file, by_replay])
@@ -185,13 +185,13 @@ def test_states_said_to_be_huge(whole, read):
     """A kilobyte of a file can stand for terabytes: they are not asked for."""
     huge = {"shape": (2**33, 2**33), "dtype": np.float32, "chunks": (1024, 1024), "compression": "gzip"}
     replaced(whole, CUBE, lambda file, name: file.create_dataset(name, **huge))
-    refused(read, whole, "MB of numbers")
+    check_refused(read, whole, "MB of numbers")
 
 
 def test_a_ring_of_groups_ends(whole):
     with h5py.File(whole, "r+") as file:
         file["traj_0/env_states/ring"] = file["traj_0/env_states"]
-    refused(by_replay, whole, "damaged")
+    check_refused(by_replay, whole, "damaged")
     assert by_file(whole).control_steps == STEPS  # which reads bodies alone
 
 
@@ -212,4 +212,4 @@ def test_nan_is_not_replayed(whole, name):
     with h5py.File(whole, "r+") as file:
         file[f"traj_0/{name}"][4, 2] = np.nan
     for read in (by_file, by_replay, *([by_policy] if name == "actions" else [])):
-        refused(read, whole, "NaN or infinity", name.rpartition("/")[2], "row 4")
+        check_refused(read, whole, "NaN or infinity", name.rpartition("/")[2], "row 4")

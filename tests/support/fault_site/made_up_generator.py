@@ -11,7 +11,7 @@ class EpisodeGenerator:
     def __init__(self, settings, *, fork=True):
         pass
 
-    def generate(self, seed, folder, name, takeover=None):
+    def generate(self, seed, folder, name, intervention=None):
         path = folder / f"{name}.h5"
         with h5py.File(path, "w") as file:
             file.create_group("traj_0").attrs["seed"] = seed
