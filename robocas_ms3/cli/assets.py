@@ -260,11 +260,11 @@ def _write(jobs: list[Job], command: _Making, out: Path, description: str, *, re
         def on_made(made: JobResult) -> None:
             bar.advance()
             if made.asset is None:
-                bar.note(f"left out: {made.error}")
+                bar.add_note(f"left out: {made.error}")
                 return
             for repair in made.asset.repairs:
                 if repair.startswith("warning:"):
-                    bar.note(f"{made.id}: {repair}")
+                    bar.add_note(f"{made.id}: {repair}")
 
         results = write_pack(
             jobs,

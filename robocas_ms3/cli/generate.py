@@ -33,11 +33,11 @@ def main(settings: GenerateSettings) -> int:
                 bar.advance()
             else:
                 last = result.failures[-1]
-                bar.note(f"seed {result.seed}: given up ({last.stage}: {last.reason})")
+                bar.add_note(f"seed {result.seed}: given up ({last.stage}: {last.reason})")
 
         def on_start(there: int) -> None:
             if there >= settings.episodes:
-                bar.note(f"{settings.out} has {format_count(there, 'episode')} already")
+                bar.add_note(f"{settings.out} has {format_count(there, 'episode')} already")
             bar.start(settings.episodes, there)
 
         summary = generate(settings, on_start=on_start, on_result=on_result, make_roll_in=make_roll_in, weights=weights)

@@ -1,4 +1,4 @@
-"""``robocas layouts build | info``: layout caches, filled ahead."""
+"""``robocas layouts build | info``: sample layouts in advance and store them in layout caches."""
 
 from __future__ import annotations
 
@@ -13,43 +13,42 @@ if TYPE_CHECKING:
     from robocas_ms3.scenes.cache import LayoutCache
     from robocas_ms3.scenes.layout_table import Engine, SeedPair
 
-from robocas_ms3.cli.options import CORES, Jobs, Maybe, Repeated
+from robocas_ms3.cli.options import CORES, Jobs, Maybe, Overrides, PackName
 from robocas_ms3.core.text import format_count
 
 
 @dataclass
 class Build:
-    """Make the layouts of a range of seeds ahead, so that a reset only sets poses.
+    """Sample the layouts of a range of seeds in advance, so that a reset only sets poses.
 
-    Existing layouts are kept: the same command continues after an interruption.
+    Existing layouts are kept: after an interruption, the same command continues.
 
-    One env has objects and arrangement of one seed. Several envs are built with the objects of seeds 0, 1, ... and keep
-    them, while arrangements change: for num_envs=4, --objects 0:4 --seeds 0:100 is what resets without a seed use.
-    These are also written as one file, which such envs read at once. Where that is for a GPU, its engine tries each of
-    them: a layout of which an object moves more than 3 mm in the first second is marked, and no reset takes it.
+    A single environment takes the objects and their poses from one seed. A vector environment is built with the objects
+    of seeds 0, 1, ... and keeps them; only the poses change. For num_envs=4, `--objects 0:4 --seeds 0:100` covers all
+    resets without a seed. These layouts are also written to one file, the layout table. For a GPU, each layout of the
+    table is simulated for 1 s: if an object moves more than 3 mm, the layout is marked and resets skip it.
 
     Example: robocas layouts build pick_table_scattered --seeds 0:100 --set objects.count=12
     """
 
     config: Annotated[str, tyro.conf.Positional]
-    """Name of a shipped task configuration, or a YAML file."""
-    set: Repeated[str] = ()
-    """Set a key of the configuration, such as `--set objects.count=12`; repeatable (docs/configuration.md). The layouts
-    are those of the resolved configuration."""
-    pack: str = "builtin"
-    """Object pack: its name, or its folder."""
-    furniture_pack: str = "builtin"
-    """Pack of the furniture: its name, or its folder."""
-    seeds: str = "0:100"
-    """First seed, and the one after the last: 0:100. Each set of --objects also has its own seed's layout."""
-    objects: Maybe[str] = None
-    """Seeds of objects of several envs, 0:4 or 3,7. Default: those of one env."""
+    """Name of a bundled task configuration, or a YAML file."""
+    set: Overrides = ()
+    """Set a key of the configuration, such as `--set objects.count=12`; repeatable (docs/configuration.md)."""
+    pack: PackName = "builtin"
+    """Name or folder of the object pack."""
+    furniture_pack: PackName = "builtin"
+    """Name or folder of the furniture pack."""
+    seeds: Annotated[str, tyro.conf.arg(metavar="FIRST:END")] = "0:100"
+    """Range of seeds, without END. With --objects, the layout of each object seed itself is added."""
+    objects: Annotated[Maybe[str], tyro.conf.arg(metavar="SEEDS")] = None
+    """Object seeds of a vector environment, 0:4 or 3,7. Default: layouts of a single environment."""
     engine: Literal["auto", "cpu", "gpu"] = "auto"
-    """With --objects: PhysX on the CPU or on a GPU, which is to run them. Auto: a GPU if there is one."""
+    """With --objects: physics engine of the vector environment; auto takes a GPU if there is one."""
     jobs: Jobs = CORES
-    """Processes. Default: one for each CPU core."""
+    """Number of processes. Default: one per CPU core."""
     out: Maybe[Path] = None
-    """Folder of all layout caches. Default: where environments look for them."""
+    """Folder of the layout caches. Default: the folder that environments read."""
 
 
 @dataclass
@@ -60,7 +59,7 @@ class Info:
     """
 
     folder: Maybe[Path] = None
-    """Folder of all layout caches. Default: where environments look for them."""
+    """Folder of the layout caches. Default: the folder that environments read."""
 
 
 def build(command: Build) -> int:
@@ -74,56 +73,55 @@ def build(command: Build) -> int:
     objects = None if command.objects is None else parse_seeds(command.objects, "--objects", listed=True)
     seeds = parse_seeds(command.seeds, "--seeds")
     config = load_task_config(command.config, overrides=command.set)
-    packs = load_pack(command.pack), load_pack(command.furniture_pack)  # before what takes seconds to import
+    packs = load_pack(command.pack), load_pack(command.furniture_pack)  # before the slow imports
     from robocas_ms3.scenes.cache import LayoutCache, seed_pairs
     from robocas_ms3.scenes.model import SceneModel
 
     pairs = seed_pairs(seeds, objects)
     cache = LayoutCache(SceneModel.load(config, *packs), command.out or "auto")
     engine = choose_engine(command.engine) if objects is not None else None
-    there = len(pairs) - len(cache.missing(pairs))
+    present = len(pairs) - len(cache.missing(pairs))
     failures = 0
-    with ProgressBar("layouts made") as bar:
-        bar.start(len(pairs), there)
+    with ProgressBar("layouts sampled") as bar:
+        bar.start(len(pairs), present)
         for (chosen, seed), problem in cache.fill(pairs, command.jobs):
             if problem:
                 failures += 1
-                which = f"seed {seed}" if objects is None else f"objects {chosen}, seed {seed}"
-                bar.note(f"{which}: {problem}")
+                which = f"seed {seed}" if objects is None else f"object seed {chosen}, seed {seed}"
+                bar.add_note(f"{which}: {problem}")
             else:
                 bar.advance()
-    if engine is not None:  # for several envs, whose resets then read one file
+    if engine is not None:  # resets of a vector environment read the layout table
         cache.write_table(engine, pairs)
     moving = 0
     if engine == "gpu":
-        moving = try_all(cache, engine, pack=command.pack, furniture_pack=command.furniture_pack)
-    made = len(pairs) - there - failures
-    print_line(
-        f"{format_count(made, 'layout')} made, {there} there already, {format_count(failures, 'seed')} without one"
-    )
+        moving = check_stability(cache, engine, pack=command.pack, furniture_pack=command.furniture_pack)
+    sampled = len(pairs) - present - failures
+    counts = f"{format_count(sampled, 'layout')} sampled, {present} already present"
+    print_line(f"{counts}, {format_count(failures, 'seed')} without a layout")
     if engine is not None and (table := cache.table(engine)) is not None:
         sets, arrangements = table.rows.shape
-        size = f"{format_count(sets, 'set')} of objects by {format_count(arrangements, 'seed')}"
-        print_line(f"table: {cache.table_path(engine)}, {size}")
+        size = f"{format_count(sets, 'object seed')} x {format_count(arrangements, 'seed')}"
+        print_line(f"layout table: {cache.table_path(engine)}, {size}")
     if engine == "gpu":
-        print_line(f"objects of {moving} move when the GPU simulates them: no reset takes these")
-    print_line(f"cache: {cache.folder}")
+        print_line(f"{format_count(moving, 'layout')} with moving objects in GPU simulation, skipped by resets")
+    print_line(f"layout cache: {cache.folder}")
     return 1 if failures else 0
 
 
-def choose_engine(wanted: Literal["auto", "cpu", "gpu"]) -> Engine:
-    """Return the engine that is to run the layouts; raise ConfigError if a GPU is wanted and there is none."""
+def choose_engine(engine: Literal["auto", "cpu", "gpu"]) -> Engine:
+    """Return the engine of the vector environment; raise ConfigError if it is a GPU and there is none."""
     from torch.cuda import is_available
 
     from robocas_ms3.core.errors import ConfigError
 
-    if wanted == "gpu" and not is_available():
-        raise ConfigError("needs a GPU", where="--engine", found="no CUDA device", fix="Take --engine cpu.")
-    return "gpu" if wanted != "cpu" and is_available() else "cpu"
+    if engine == "gpu" and not is_available():
+        raise ConfigError("needs a GPU", where="--engine", found="no CUDA device", fix="Pass --engine cpu.")
+    return "gpu" if engine != "cpu" and is_available() else "cpu"
 
 
-def try_all(cache: LayoutCache, engine: Engine, **packs: str) -> int:
-    """Let the engine try layouts in state `UNCHECKED`; return how many layouts of the table it moves."""
+def check_stability(cache: LayoutCache, engine: Engine, **packs: str) -> int:
+    """Simulate the unchecked layouts of the table; return the number of layouts whose objects move."""
     from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.scenes.layout_table import LayoutStatus
     from robocas_ms3.tasks.layout_stability import check_layouts, status_of, unchecked_layouts
@@ -131,14 +129,14 @@ def try_all(cache: LayoutCache, engine: Engine, **packs: str) -> int:
     seeds = unchecked_layouts(cache, engine)
     if seeds:
         found: dict[SeedPair, LayoutStatus] = {}
-        trial = check_layouts(cache, engine, seeds, **packs)
+        checks = check_layouts(cache, engine, seeds, **packs)
         try:
-            with ProgressBar("layouts tried") as bar:
+            with ProgressBar("layouts simulated") as bar:
                 bar.start(sum(map(len, seeds.values())))
-                for pair, moved in trial:
+                for pair, moved in checks:
                     found[pair] = status_of(moved)
                     bar.advance()
-        finally:  # interrupted, it keeps what was found
+        finally:  # keeps the results if interrupted
             cache.write_statuses(engine, found)
     table = cache.table(engine)
     return len(table.pairs(LayoutStatus.UNSTABLE)) if table else 0
@@ -156,7 +154,7 @@ def info(command: Info) -> int:
             about = load_json(path)
             config, furniture = about["config"], ", ".join(sorted(about["furniture"]))
             of = (config["task"], config["layout"]["kind"], config["objects"]["count"], about["object_pack"]["name"])
-        except (OSError, ValueError, KeyError, TypeError):  # the layouts are still of use
+        except (OSError, ValueError, KeyError, TypeError):  # the layouts can still be read
             of, furniture = (f"{ABOUT} is damaged", "", "", ""), ""
         rows.append((path.parent.name, count_layouts(path.parent), *of, furniture))
     print_table(("cache", "layouts", "task", "layout", "objects", "object pack", "furniture"), rows)
@@ -166,7 +164,7 @@ def info(command: Info) -> int:
 
 
 def parse_seeds(text: str, option: str, *, listed: bool = False) -> list[int]:
-    """Return the seeds of ``FIRST:END``, or, where that is allowed, of a list ``SEED,SEED``."""
+    """Return the seeds of ``FIRST:END`` or, if ``listed``, of ``SEED,SEED,...``."""
     from robocas_ms3.core.errors import ConfigError
 
     if listed and re.fullmatch(r"\d+(,\d+)*", text):
@@ -174,9 +172,9 @@ def parse_seeds(text: str, option: str, *, listed: bool = False) -> list[int]:
     match = re.fullmatch(r"(\d+):(\d+)", text)
     if match is None or int(match[1]) >= int(match[2]):
         expected = "FIRST:END such as 0:100" + (", or 3,7" if listed else "")
-        raise ConfigError("no range of seeds", where=option, expected=expected, found=text)
+        raise ConfigError("invalid range of seeds", where=option, expected=expected, found=text)
     return list(range(int(match[1]), int(match[2])))
 
 
-DESCRIPTION = "Build layouts ahead, and list those that are there."
+DESCRIPTION = "Sample layouts in advance, and list the layout caches."
 COMMANDS = {"build": build, "info": info}

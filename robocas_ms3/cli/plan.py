@@ -1,4 +1,4 @@
-"""``robocas plan run | join | status | list``: datasets of any size, from a plan."""
+"""``robocas plan run | join | status | list``: generate the dataset of a plan."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from robocas_ms3.cli.options import CORES, Jobs, Maybe, Repeated, resumable
+from robocas_ms3.cli.options import CORES, Jobs, Maybe, Overrides, resumable
 from robocas_ms3.core.text import format_count
 
 
 @dataclass
 class Run:
-    """Make the dataset of a plan, or continue: record, render, join. docs/scale.md.
+    """Generate the dataset of a plan: record episodes, render them and join them.
 
-    Ctrl-C or a crash loses no finished episode: the same command continues.
+    After Ctrl-C or a crash, the same command continues; finished episodes are kept. docs/scale.md.
 
     Example: robocas plan run tiny --out runs/tiny --jobs 2
     """
@@ -26,22 +26,22 @@ class Run:
     plan: Annotated[str, tyro.conf.Positional]
     """Name of a bundled plan (`robocas plan list`), or a YAML file."""
     out: Path
-    """Output folder."""
+    """Output folder of the plan."""
     executor: Literal["local", "slurm", "ray"] = "local"
-    """What does the work: this machine, jobs of Slurm, or tasks of Ray."""
+    """Where work units run: processes of this machine, jobs of Slurm, or tasks of Ray."""
     jobs: Jobs = CORES
-    """How many episodes are made at once. Default: one per CPU core of this machine."""
-    executor_option: Repeated[str] = ()
-    """Set an option of Slurm or Ray, such as `--executor-option partition=cpu`; repeatable (docs/scale.md)."""
-    shard: Maybe[str] = None
-    """K/N, such as 0/4: do the work units whose number is K modulo N, and do not join; shards may run at once."""
+    """Number of work units that run at the same time. Default: one per CPU core of this machine."""
+    executor_option: Overrides = ()
+    """Option of the executor, such as `--executor-option partition=cpu`; repeatable (docs/scale.md)."""
+    shard: Annotated[Maybe[str], tyro.conf.arg(metavar="K/N")] = None
+    """Run only the work units whose number is K modulo N, such as 0/4, and do not join. Default: run all and join."""
     overwrite: bool = False
     """Replace the output folder if it exists."""
 
 
 @dataclass
 class Join:
-    """Join the episodes of a plan whose work units are done, as by `robocas plan run --shard`.
+    """Join the episodes of a plan after all shards of `robocas plan run --shard` have ended.
 
     Example: robocas plan join runs/tiny
     """
@@ -49,12 +49,12 @@ class Join:
     out: Annotated[Path, tyro.conf.Positional]
     """Output folder of the plan."""
     jobs: Jobs = CORES
-    """Processes that make the LeRobot dataset. Default: one per CPU core."""
+    """Number of processes that write the LeRobot dataset. Default: one per CPU core."""
 
 
 @dataclass
 class Status:
-    """Print the status of a plan, from any machine that sees its folder.
+    """Print the progress of a plan, on any machine that has access to its folder.
 
     Example: robocas plan status runs/tiny
     """
@@ -62,7 +62,7 @@ class Status:
     out: Annotated[Path, tyro.conf.Positional]
     """Output folder of the plan."""
     json: bool = False
-    """As JSON."""
+    """Print the status as JSON."""
 
 
 @dataclass
@@ -88,8 +88,9 @@ def run(command: Run) -> int:
     shard = parse_shard(command.shard, PlanError) if command.shard is not None else None
     if shard and (command.overwrite or command.executor != "local"):
         found = "--overwrite" if command.overwrite else f"--executor {command.executor}"
-        raise PlanError("a shard continues in its folder, on this machine", where="--shard", found=found)
-    options = dict(_option(word) for word in command.executor_option)
+        expected = "--executor local, without --overwrite"
+        raise PlanError("invalid combination of options", where="--shard", expected=expected, found=found)
+    options = dict(_parse_option(word) for word in command.executor_option)
     plan = load_plan(command.plan)
     executor = open_executor(command.executor, PlanFolder(plan, command.out), command.jobs, options)
     if command.executor == "local" and "datasets" in plan.stages:
@@ -99,8 +100,8 @@ def run(command: Run) -> int:
     with closing(ProgressDisplay()) as display:
 
         def show_stage(text: str) -> None:
-            display.flush()  # the progress when the stage began
-            display.note(text)
+            display.flush()  # writes the progress before the name of the stage
+            display.add_note(text)
 
         show = partial(show_plan, display)
         if shard:
@@ -108,10 +109,10 @@ def run(command: Run) -> int:
         else:
             report = run_plan(executor, overwrite=command.overwrite, on_status=show, on_stage=show_stage)
     if shard:
-        then = f"robocas plan join {command.out} joins all" if complete else "other work units are missing"
-        print_line(f"{command.out}: the work units of shard {command.shard} are done; {then}")
+        then = f"next: robocas plan join {command.out}" if complete else "work units of other shards are missing"
+        print_line(f"{command.out}: shard {command.shard} is complete; {then}")
     else:
-        _say_products(command.out, report)
+        _print_products(command.out, report)
     return 0
 
 
@@ -119,7 +120,7 @@ def join(command: Join) -> int:
     from robocas_ms3.cli.terminal import print_stderr
     from robocas_ms3.plans.run import join_plan
 
-    _say_products(command.out, join_plan(command.out, jobs=command.jobs, on_stage=print_stderr))
+    _print_products(command.out, join_plan(command.out, jobs=command.jobs, on_stage=print_stderr))
     return 0
 
 
@@ -148,33 +149,33 @@ def show_status(command: Status) -> int:
         rows.append(
             (part.name, f"{part.done} of {part.requested}", part.tried, failed, *seconds, f"{part.bytes / 1e6:.0f}")
         )
-    columns = ("part", "episodes", "seeds", "failed", "record, CPU s each", "render, CPU s each", "MB")
+    columns = ("part", "episodes", "seeds", "failed seeds", "record (CPU s/episode)", "render (CPU s/episode)", "MB")
     print_table(columns, rows, whole=columns[:3])
     if found.finished:
-        print_line("finished")
+        print_line(f"{command.out}: complete")
     elif found.seconds_left is not None:
         left, idle = found.seconds_left / 60, found.idle_seconds or 0.0
         rate = format_count(round(found.episodes_per_hour), "episode")
-        print_line(f"{rate} per hour, {left:.0f} min left; the last one {idle:.0f} s ago")
+        print_line(f"{rate} per hour, {left:.0f} min left, last episode {idle:.0f} s ago")
     return 0
 
 
-def _say_products(out: Path, report: dict[str, Any]) -> None:
+def _print_products(out: Path, report: dict[str, Any]) -> None:
     from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.plans.folder import REPORT
 
-    made = [str(path.relative_to(out)) for path in sorted(out.glob("d[ae]*s/*"))]
-    print_line(f"{out}: {format_count(report['episodes'], 'episode')}; {', '.join([*made, REPORT])}")
+    written = [str(path.relative_to(out)) for path in sorted(out.glob("d[ae]*s/*"))]
+    print_line(f"{out}: wrote {format_count(report['episodes'], 'episode')}: {', '.join([*written, REPORT])}")
 
 
-def _option(word: str) -> tuple[str, str]:
+def _parse_option(word: str) -> tuple[str, str]:
     from robocas_ms3.core.errors import PlanError
 
     name, sign, value = word.partition("=")
     if not (name and sign):
-        raise PlanError("invalid option", where="--executor-option", expected="NAME=VALUE", found=word)
+        raise PlanError("invalid option of the executor", where="--executor-option", expected="NAME=VALUE", found=word)
     return name, value
 
 
-DESCRIPTION = "Make datasets of any size from a plan; docs/scale.md."
+DESCRIPTION = "Generate large datasets from a plan, a YAML file; docs/scale.md."
 COMMANDS = {"run": run, "join": join, "status": show_status, "list": list_plans}

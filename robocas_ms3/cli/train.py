@@ -130,7 +130,7 @@ def train(baseline: str, cfg: Training) -> int:
             stepping.update(done, of)
 
         first = os.environ.get("RANK", "0") == "0"  # one of several processes writes to the terminal
-        progress = Progress(stepping.note, reading.update, step) if first else Progress()
+        progress = Progress(stepping.add_note, reading.update, step) if first else Progress()
         changes, place = changes_of(cfg), out.absolute()
         options = RunOptions(baseline, data, place, changes, start=start, device=cfg.device, overwrite=cfg.overwrite)
         train_run(options, progress)

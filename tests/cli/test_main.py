@@ -86,7 +86,7 @@ MISTAKES = {  # arguments -> text of the error, printed before anything heavy is
     "show --pack builtn": "builtn: no such asset pack",
     "show --seed -1": "--seed: number out of range (expected 0 to 4294967295, found -1)",
     "layouts build pick_tabel_scattered": "Did you mean pick_table_scattered",
-    "layouts build pick_table_scattered --seeds 3": "--seeds: no range of seeds",
+    "layouts build pick_table_scattered --seeds 3": "--seeds: invalid range of seeds",
     "layouts build pick_table_scattered --jobs 0": "--jobs: number out of range",
     "replay missing.h5": "missing.json: the JSON that belongs to this trajectory is missing",
     "convert missing.h5 --out o --to lerobt": "Did you mean lerobot?",

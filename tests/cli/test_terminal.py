@@ -59,7 +59,7 @@ def test_bars_and_their_notes(monkeypatch):
     monkeypatch.setattr(progress, "terminal_of_stderr", lambda: made)
     with progress.ProgressBar(HOSTILE) as bar:
         bar.start(2)
-        bar.note(HOSTILE)
+        bar.add_note(HOSTILE)
         bar.advance()
     assert "\x1b[2J" not in file.getvalue()
     assert not controls(file.getvalue()) - {"\x1b", "\r"}  # those that draw the bar

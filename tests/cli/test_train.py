@@ -62,4 +62,4 @@ def test_a_training_from_the_command_line(made_up, tmp_path, monkeypatch, capsys
     assert [record["config"]["train"][key] for key in ("steps", "batch_size", "seed")] == [8, 2, 5]
     said = capsys.readouterr()
     assert f"robocas eval TASK --policy {made} --protocol paper-v1" in said.out
-    assert "steps trained: 8 of 8" in said.err
+    assert "steps trained: 8/8" in said.err

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from robocas_ms3.assets.pack import load_pack
-from robocas_ms3.cli.layouts import try_all
+from robocas_ms3.cli.layouts import check_stability
 from robocas_ms3.scenes.cache import LayoutCache, count_layouts, seed_pairs
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.layout import write_layout
@@ -58,7 +58,7 @@ def test_what_was_found_before_an_interruption_is_kept(cache, monkeypatch):
     monkeypatch.setattr(layout_stability, "check_layouts", tried)
     for _ in range(2):
         with pytest.raises(KeyboardInterrupt):
-            try_all(cache, "cpu")
+            check_stability(cache, "cpu")
     table = cache.table("cpu")
     assert table is not None
     assert (table.pairs(LayoutStatus.STABLE), table.pairs(LayoutStatus.UNSTABLE)) == ([(0, 0)], [(0, 1)])

@@ -22,7 +22,7 @@ def test_a_conversion_and_its_repetition(trajectory, made_up_images, tmp_path, c
     assert run(command) == 0
     printed = capsys.readouterr()
     assert printed.out.startswith(f"{tmp_path / 'out'}: 2 episodes, 14 steps, ")
-    assert "episodes written: 2 of 2" in printed.err
+    assert "episodes written: 2/2" in printed.err
     assert run(command) == 0
     assert capsys.readouterr().out.endswith(": 0 episodes, 2 kept\n")
 
