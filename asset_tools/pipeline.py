@@ -287,7 +287,7 @@ def check_target(folder: Path) -> None:
     if not re.fullmatch(PACK_NAME, folder.name):
         expected = "small letters, digits, _ and -"
         raise AssetError("this is no name for a pack", where=folder, expected=expected, found=folder.name)
-    check_replaceable(folder, overwrite=True, marks=(MANIFEST,))
+    check_replaceable(folder, overwrite=True, markers=(MANIFEST,))
 
 
 def made_of(jobs: Sequence[Job], folder: Path, *, skip_errors: bool = False) -> bool:

@@ -70,7 +70,7 @@ def _write(cfg: View, out: Path, source) -> int:
     from robocas_ms3.core.output_folder import check_replaceable
     from robocas_ms3.viewer.export import export
 
-    check_replaceable(out, overwrite=cfg.overwrite, marks=("data/index.js",))
+    check_replaceable(out, overwrite=cfg.overwrite, markers=("data/index.js",))
     with ProgressBar("episodes written", transient=True) as bar:
         count, damaged = export(
             source,

@@ -1,6 +1,6 @@
-"""Read JSON, YAML and NumPy files of unknown origin within bounds: a small file must not take all memory.
+"""Read untrusted JSON, YAML and NumPy files with limits on size and depth, so that no file exhausts the memory.
 
-A file with wrong content raises `DocumentError`, which is a ``ValueError``. A file that cannot be read raises
+A file with invalid content raises `DocumentError`, which is a ``ValueError``. A file that cannot be read raises
 ``OSError``.
 """
 
@@ -23,34 +23,34 @@ import yaml
 from robocas_ms3.core.text import one_line
 
 JSON_LIMIT = 256 * 2**20
-"""Bytes: a hundred thousand recordings have 230 MB of it."""
+"""Bytes; the JSON file of 100,000 recorded episodes has 230 MB."""
 YAML_LIMIT = 4 * 2**20
 ARRAYS_LIMIT = 2**31
-"""Bytes that the arrays of an ``.npz`` may have: compressed, they can be a thousandth of that."""
+"""Bytes of all arrays of an ``.npz`` file after decompression, which can multiply their size by a thousand."""
 INTEGER_LIMIT = 2**63
-"""Integers are smaller in magnitude: NumPy, torch and Parquet hold 64 bits."""
+"""Upper bound (exclusive) of the magnitude of integers: NumPy, torch and Parquet store 64 bits."""
 JSON_DEPTH = YAML_DEPTH = 64
 YAML_NODES = 500_000
-"""Values, those that aliases stand for counted each time: nine aliases of nine aliases of ... are a billion."""
+"""Values, with aliases expanded: nested aliases can expand a short file to a billion values."""
 _TOO_DEEP = f"nested more than {JSON_DEPTH} deep"
-_INTEGER_LENGTH = 64  # characters; the time to read base 60 ("1:1:1") grows with their square
-_SHOWN_KEYS = 8  # of the way to a wrong value
+_INTEGER_LENGTH = 64  # characters; the parse time of base 60 ("1:1:1") is quadratic in the length
+_SHOWN_KEYS = 8  # of the path to an invalid value
 _CONTAINERS = (dict, list, tuple)
-_SURROGATE = re.compile(r"[\ud800-\udfff]")  # no encoding has one
+_SURROGATE = re.compile(r"[\ud800-\udfff]")  # lone surrogates cannot be encoded
 
 DAMAGED_FILE_ERRORS = (
     *(OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error),
-    NotImplementedError,  # damaged flags or method of an archive's member
-    *(SyntaxError, tokenize.TokenError),  # an array's header
-    MemoryError,  # and one that says it is larger than anything
+    NotImplementedError,  # damaged flags or compression method of an archive's member
+    *(SyntaxError, tokenize.TokenError),  # damaged header of an array
+    MemoryError,  # a header that declares a huge array
 )
-"""What NumPy raises for damaged arrays and archives."""
+"""The errors that NumPy raises for damaged arrays and archives."""
 
 
 class DocumentError(ValueError):
-    """A file that is too large, nested too deeply, or not of its language; in one line."""
+    """A file that is too large, nested too deeply, or not valid JSON, YAML or NumPy data; the message is one line."""
 
-    filename: str = ""  # as errors of the system have it; empty where a text was read
+    filename: str = ""  # as in OSError; empty if a string was parsed
 
 
 @contextmanager
@@ -63,7 +63,7 @@ def _reading(path: Path) -> Iterator[None]:
 
 
 def load_json(path: Path) -> Any:
-    """Read a JSON file of bounded size and depth, whose numbers are finite and of 64 bits."""
+    """Read a JSON file of bounded size and depth; numbers must be finite, and integers fit in 64 bits."""
     with _reading(path):
         return decode_json(read_text(path, JSON_LIMIT))
 
@@ -76,34 +76,34 @@ def decode_json(text: str | bytes) -> Any:
         raise DocumentError(str(error)) from error
     except RecursionError as error:
         raise DocumentError(_TOO_DEEP) from error
-    if fault := find_invalid_value(values):
-        keys, found = fault
+    if invalid := find_invalid_value(values):
+        keys, found = invalid
         raise DocumentError(f"{'.'.join(map(repr, keys[:_SHOWN_KEYS]))}: {found}" if keys else found)
     return values
 
 
 def find_invalid_value(values: Any, depth: int = 0) -> tuple[tuple[Any, ...], str] | None:
-    """Return keys and description of the first value that the package does not keep in JSON, or None.
+    """Return the keys and a description of the first value that JSON files of this package must not have, or None.
 
-    These are NaN, infinity, integers beyond 64 bits, lone surrogates, and what is nested too deeply.
+    Invalid are NaN, infinity, integers over 64 bits, lone surrogates, and values nested too deeply.
     """
     if not isinstance(values, _CONTAINERS):
-        return ((), found) if (found := _scalar_fault(values)) else None
+        return ((), found) if (found := _describe_invalid_scalar(values)) else None
     if depth == JSON_DEPTH:
         return (), _TOO_DEEP
     is_dict = isinstance(values, dict)
     for key, value in values.items() if is_dict else enumerate(values):
-        if is_dict and (found := _scalar_fault(key)):
+        if is_dict and (found := _describe_invalid_scalar(key)):
             return (), f"key {found}"
         if isinstance(value, _CONTAINERS):
-            if fault := find_invalid_value(value, depth + 1):
-                return (key, *fault[0]), fault[1]
-        elif found := _scalar_fault(value):
+            if invalid := find_invalid_value(value, depth + 1):
+                return (key, *invalid[0]), invalid[1]
+        elif found := _describe_invalid_scalar(value):
             return (key,), found
     return None
 
 
-def _scalar_fault(value: Any) -> str:
+def _describe_invalid_scalar(value: Any) -> str:
     if isinstance(value, str):
         return "" if value.isascii() or not _SURROGATE.search(value) else f"{value!r:.80} is not Unicode text"
     if isinstance(value, float):
@@ -114,7 +114,7 @@ def _scalar_fault(value: Any) -> str:
 
 
 def load_yaml(path: Path) -> Any:
-    """Read a YAML file of bounded size, depth and aliases; a key given twice in a mapping is an error."""
+    """Read a YAML file of bounded size, depth and number of aliases; duplicate keys of a mapping are an error."""
     with _reading(path):
         text = read_text(path, YAML_LIMIT)
         try:
@@ -128,13 +128,13 @@ def open_arrays(path: Path) -> Any:
 
     Raises one of `DAMAGED_FILE_ERRORS`.
     """
-    import numpy as np  # not for every command
+    import numpy as np  # slow to import, and not needed by every command
     from numpy.lib.npyio import NpzFile
 
     check_regular(path)
     file = np.load(path, allow_pickle=False)
     if not isinstance(file, NpzFile):
-        raise DocumentError("one array, not an archive of several")
+        raise DocumentError("expected an .npz archive, found a single array")
     if file.zip is not None and sum(info.file_size for info in file.zip.infolist()) > ARRAYS_LIMIT:
         file.close()
         raise DocumentError(_too_large(ARRAYS_LIMIT))
@@ -142,19 +142,19 @@ def open_arrays(path: Path) -> Any:
 
 
 def load_array(path: Path, limit: int = ARRAYS_LIMIT) -> Any:
-    """Read an ``.npy`` file of at most ``limit`` bytes without pickled objects. Raises `DAMAGED_FILE_ERRORS`."""
-    import numpy as np  # not for every command
+    """Read an ``.npy`` file of at most ``limit`` bytes without pickled objects; raise one of `DAMAGED_FILE_ERRORS`."""
+    import numpy as np  # slow to import, and not needed by every command
 
     check_regular(path, limit)
     array = np.load(path, allow_pickle=False)
     if not isinstance(array, np.ndarray):
         array.close()
-        raise DocumentError("an archive, not one array")
+        raise DocumentError("expected a single array, found an .npz archive")
     return array
 
 
 def check_regular(path: Path, limit: int | None = None) -> None:
-    """Refuse a file of more than ``limit`` bytes, and a pipe, a device or a socket, on which a read may never end."""
+    """Raise DocumentError for a file over ``limit`` bytes, and for pipes, devices and sockets, which may block."""
     status = path.stat()
     if not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)):
         raise DocumentError("not a regular file")
@@ -167,13 +167,13 @@ def read_bytes(path: Path, limit: int) -> bytes:
         check_regular(path, limit)
         with path.open("rb") as file:
             content = file.read(limit + 1)
-        if len(content) > limit:  # it grows
+        if len(content) > limit:  # another process appends to it
             raise DocumentError(_too_large(limit))
         return content
 
 
 def read_text(path: Path, limit: int) -> str:
-    """Read a text in UTF-8 of at most ``limit`` bytes."""
+    """Read a UTF-8 text file of at most ``limit`` bytes."""
     with _reading(path):
         try:
             return read_bytes(path, limit).decode("utf-8")
@@ -186,7 +186,7 @@ def _too_large(limit: int) -> str:
 
 
 class _Loader(yaml.SafeLoader):
-    """Counts what it composes, and takes no key twice."""
+    """YAML loader that limits the number and depth of values, and refuses duplicate keys."""
 
     def __init__(self, stream: Any) -> None:
         super().__init__(stream)
@@ -197,7 +197,7 @@ class _Loader(yaml.SafeLoader):
         event: Any = self.peek_event()
         self._nodes += self._sizes.get(event.anchor, 0) if isinstance(event, yaml.AliasEvent) else 1
         if self._nodes > YAML_NODES:
-            raise DocumentError(f"more than {YAML_NODES} values, with those that aliases stand for")
+            raise DocumentError(f"more than {YAML_NODES} values after expanding aliases")
         if self._depth >= YAML_DEPTH:
             raise DocumentError(_TOO_DEEP)
         before = self._nodes
@@ -209,12 +209,12 @@ class _Loader(yaml.SafeLoader):
         return node
 
     def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
-        """Compose a mapping, refusing repeated keys."""
+        """Compose a mapping; raise for a duplicate key."""
         node = super().compose_mapping_node(anchor)
         seen = set()
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode) and (key.tag, key.value) in seen:
-                raise yaml.MarkedYAMLError(None, None, f"the key {key.value!r} is given twice", key.start_mark)
+                raise yaml.MarkedYAMLError(None, None, f"duplicate key {key.value!r}", key.start_mark)
             seen.add((key.tag, str(key.value)))
         return node
 

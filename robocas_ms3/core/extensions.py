@@ -1,4 +1,4 @@
-"""Registries of objects by name: the builtin ones, and those of installed packages (entry points)."""
+"""Registries of named objects: builtin objects, and entry points of installed packages."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ T = TypeVar("T")
 
 
 class Registry(Mapping[str, T]):
-    """Objects by name. Entry points of other packages are loaded one by one, when they are asked for.
+    """A read-only mapping of names to objects; an entry point of another package is loaded at its first use.
 
-    Loading an entry point that fails raises an error; iterating leaves it out and logs one warning.
+    Access to an entry point that cannot be loaded raises an error. Iteration skips it and logs one warning.
 
     Args:
-        kind: what the objects are, for messages.
-        group: of the entry points, such as ``robocas_ms3.tasks``. The name of an entry point is that of its object.
-        type_: type of the objects.
-        builtin: the objects of this package, which no other package can replace.
+        kind: noun for the objects in messages, such as ``planner``.
+        group: group of the entry points, such as ``robocas_ms3.tasks``. An entry point has the name of its object.
+        type_: required type of the objects.
+        builtin: objects of this package; other packages cannot replace them.
     """
 
     def __init__(self, kind: str, group: str, type_: Any, builtin: Mapping[str, T]) -> None:
@@ -57,7 +57,7 @@ class Registry(Mapping[str, T]):
         return sum(1 for _ in self)
 
     def find(self, name: str, *, where: object = "") -> T:
-        """Return the object of a name; raise ExtensionError if it is unknown, or its entry point can't be loaded."""
+        """Return an object by name; raise ExtensionError if the name is unknown or its entry point cannot be loaded."""
         if name in self:
             return self[name]
         known = list(self)
@@ -66,11 +66,11 @@ class Registry(Mapping[str, T]):
 
     @cached_property
     def entry_points(self) -> dict[str, list[EntryPoint]]:
-        """The entry points of other packages by name, not loaded; more than one where packages conflict."""
+        """Entry points of other packages by name, not loaded; several per name if packages conflict."""
         found: dict[str, list[EntryPoint]] = {}
         for point in sorted(entry_points(group=self.group), key=lambda point: (point.name, package_of(point))):
             if point.name in self.builtin:
-                _log.warning("a second %s %r, of %s, is left out", self.kind, point.name, point.value)
+                _log.warning("%s %r of %s is ignored: the name is builtin", self.kind, point.name, point.value)
             elif point.value not in {other.value for other in found.setdefault(point.name, [])}:
                 found[point.name].append(point)
         return found
@@ -78,7 +78,7 @@ class Registry(Mapping[str, T]):
     def _load(self, points: list[EntryPoint]) -> T:
         point, where = points[0], f"{points[0].name} = {points[0].value}"
         if len(points) > 1:
-            what, packages = f"several packages have a {self.kind} of this name", ", ".join(map(package_of, points))
+            what, packages = f"several packages define a {self.kind} with this name", ", ".join(map(package_of, points))
             raise ExtensionError(what, where=point.name, found=packages, fix="Uninstall all but one.")
         fix = f"Repair or uninstall {package_of(point)}."
         try:
@@ -86,11 +86,11 @@ class Registry(Mapping[str, T]):
                 found = point.load()
         except ExtensionError:
             raise
-        except Exception as error:  # code of another package may raise anything
-            what = f"this {self.kind} can't be loaded"
+        except Exception as error:  # code of another package may raise any error
+            what = f"cannot load this {self.kind}"
             raise ExtensionError(what, where=where, found=format_error(error), fix=fix) from error
         if not isinstance(found, self.type):
-            expected, what = f"a {self.type.__name__}", f"not a {self.kind}"
+            expected, what = f"a {self.type.__name__}", f"invalid {self.kind}"
             raise ExtensionError(what, where=where, expected=expected, found=type(found).__name__, fix=fix)
         return found
 
@@ -101,10 +101,12 @@ def package_of(point: EntryPoint) -> str:
 
 
 def load_object(path: str) -> Any:
-    """Return the object of an import path, ``package.module:name``; raise ExtensionError if there is none."""
+    """Import the object at ``package.module:name``; raise ExtensionError if that fails."""
     module, _, name = path.partition(":")
     try:
         with forbid_exit(path):
             return getattr(import_module(module), name)
     except (ImportError, AttributeError, ValueError) as error:
-        raise ExtensionError("no such object", where=path, expected="package.module:name", found=error) from error
+        raise ExtensionError(
+            "cannot import this object", where=path, expected="package.module:name", found=error
+        ) from error

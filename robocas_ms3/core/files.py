@@ -1,4 +1,4 @@
-"""Files appear whole or not at all: they are written next to the target, then renamed."""
+"""Atomic writes: a file or folder is written under a temporary name next to its target, and then renamed."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from robocas_ms3.core.paths import variable_of
 
 _Error = TypeVar("_Error", bound=RobocasError)
 DISK_FULL_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT})
-"""Error numbers of a disk without room."""
+"""Error numbers of a full disk or an exceeded quota."""
 LEFTOVER_AGE = 86400.0
-"""Age in s, since the last change, of files that a killed run left."""
-_SHOWN_KEYS = 8  # of the way to a wrong value, in a message
-_NAME_BYTES = 96  # of stem and of suffix that a temporary name repeats: file systems allow 255 in all
-_TRIES = 5  # to rename a folder onto one that other processes replace
+"""Seconds since the last change after which temporary folders of other runs are deleted: their run was killed."""
+_SHOWN_KEYS = 8  # of the path to an invalid value, in a message
+_NAME_BYTES = 96  # of stem and suffix in a temporary name; file systems allow 255 in total
+_TRIES = 5  # renames of a folder that other processes replace at the same time
 
 
 @contextmanager
 def add_path_to_errors(path: Path | str) -> Iterator[None]:
-    """Give errors of the system a path where they have none: writing into an open file says no name.
+    """Add a path to each OSError without one, such as an error of writing to an open file.
 
-    An error of copying names the file that was read, that of a full disk too: then it is this one.
+    An error of a full disk while copying names the source file; it is replaced by this path.
     """
     try:
         yield
@@ -48,14 +48,14 @@ def add_path_to_errors(path: Path | str) -> Iterator[None]:
 
 @contextmanager
 def atomic_file(path: Path | str, *, sync: bool = False) -> Iterator[Path]:
-    """Yield a temporary path next to ``path``; on success it replaces ``path``, on failure it is removed.
+    """Yield a temporary path next to ``path``; rename it to ``path`` on success, delete it on failure.
 
-    The temporary name keeps the suffix, since many writers choose their format by it. Nobody can predict the name, so
-    nobody can put a symbolic link there first.
+    The temporary name keeps the suffix, since many writers choose the format by it. It is random, so that no other user
+    can place a symbolic link there.
 
     Args:
         path: of the file.
-        sync: whether a power cut leaves no half of the file under its name.
+        sync: whether to flush the file to the disk before the rename, so that a power failure leaves no partial file.
     """
     path = Path(path)
     make_folder(path.parent)
@@ -75,7 +75,7 @@ def atomic_file(path: Path | str, *, sync: bool = False) -> Iterator[Path]:
 
 
 def open_for_append(path: Path) -> BufferedRandom:
-    """Open a file for reading and appending, or create it; raise RobocasError for a symbolic link or a pipe."""
+    """Open or create a file for reading and appending; raise RobocasError for a symbolic link, pipe or device."""
     flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     found = "a pipe or device"
     try:
@@ -101,13 +101,13 @@ def _sync(path: Path) -> None:
 
 @contextmanager
 def atomic_folder(path: Path | str, *, sync: bool = False) -> Iterator[Path]:
-    """Yield a new folder next to ``path``; on success it replaces ``path``, on failure it is removed.
+    """Yield a new folder next to ``path``; rename it to ``path`` on success, delete it on failure.
 
-    A folder that can't be renamed, see `is_fixed`, gets the content of the new one, one entry after the other.
+    If ``path`` cannot be renamed (see `is_fixed`), the entries of the new folder are moved into it one by one.
 
     Args:
         path: of the folder.
-        sync: whether its files are on the disk before it gets its name: a power cut leaves none that is half there.
+        sync: whether to flush the files to the disk before the rename: a power failure leaves no partial folder.
     """
     path = Path(path)
     fixed = is_fixed(path)
@@ -121,7 +121,7 @@ def atomic_folder(path: Path | str, *, sync: bool = False) -> Iterator[Path]:
             if sync:
                 flush_to_disk(tmp)
             if fixed:
-                empty_folder(path, but=tmp)
+                empty_folder(path, keep=tmp)
                 for entry in list(tmp.iterdir()):
                     os.replace(entry, path / entry.name)
             else:
@@ -131,19 +131,19 @@ def atomic_folder(path: Path | str, *, sync: bool = False) -> Iterator[Path]:
 
 
 def is_fixed(folder: Path) -> bool:
-    """Return whether a folder can't be renamed: a mount point, or one in a folder that is read-only."""
+    """Return whether a folder cannot be renamed: a mount point, or a folder whose parent is read-only."""
     return folder.is_dir() and (os.path.ismount(folder) or not os.access(folder.resolve().parent, os.W_OK | os.X_OK))
 
 
-def empty_folder(folder: Path, but: Path | None = None) -> None:
-    """Delete the content of a folder, ``but`` one entry."""
+def empty_folder(folder: Path, keep: Path | None = None) -> None:
+    """Delete the content of a folder, except the entry ``keep``."""
     for entry in folder.iterdir():
-        if entry != but:
+        if entry != keep:
             remove(entry)
 
 
 def remove(path: Path) -> None:
-    """Delete a file or a folder; of a symbolic link the link alone."""
+    """Delete a file, a folder or a symbolic link; the target of a link stays."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:
@@ -151,7 +151,7 @@ def remove(path: Path) -> None:
 
 
 def _move_in(tmp: Path, path: Path) -> None:
-    """Rename a folder onto another, which other processes may replace at the same time."""
+    """Replace a folder by renaming; other processes may replace it at the same time."""
     for tries_left in reversed(range(_TRIES)):
         old = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".old", dir=path.parent))
         try:
@@ -168,9 +168,9 @@ def _move_in(tmp: Path, path: Path) -> None:
 
 
 def _restore_and_sweep(path: Path) -> None:
-    """Put back a folder of a run that was killed between the two renames of `_move_in`; delete older leftovers."""
+    """Restore the folder if a run was killed between the two renames of `_move_in`; delete old temporary folders."""
     name = glob.escape(path.name)
-    with suppress(OSError):  # another run may do the same
+    with suppress(OSError):  # another run may do the same at the same time
         for old in path.parent.glob(f".{name}.*.old/old"):
             if not path.exists():
                 os.replace(old, path)
@@ -180,22 +180,22 @@ def _restore_and_sweep(path: Path) -> None:
 
 
 def make_folder(path: Path | str) -> Path:
-    """Make a folder and its parents; raise RobocasError if it can't be made or written to."""
+    """Create a folder and its parents; raise RobocasError if it cannot be created or is not writable."""
     path = Path(path)
     try:
         path.mkdir(parents=True, exist_ok=True)
         if os.access(path, os.W_OK | os.X_OK):
             return path
-        what, found = "this folder is not writable", ""
+        what, found = "folder is not writable", ""
     except OSError as error:
-        what, found = "can't make this folder", error.strerror or ""
+        what, found = "cannot create this folder", error.strerror or ""
     variable = variable_of(path)
-    fix = f"Set {variable} to a folder that can be written to." if variable else "Choose another."
+    fix = f"Set {variable} to a writable folder." if variable else "Choose another folder."
     raise RobocasError(what, where=path, found=found, fix=fix)
 
 
 def flush_to_disk(folder: Path | str) -> None:
-    """Write all files of a folder's file system to the disk, in one call: they survive a power cut."""
+    """Flush the file system of a folder to the disk in one call, so that its files survive a power failure."""
     syncfs = getattr(ctypes.CDLL(None, use_errno=True), "syncfs", None)
     if syncfs is None:
         os.sync()
@@ -209,7 +209,7 @@ def flush_to_disk(folder: Path | str) -> None:
 
 
 def write_json(path: Path | str, data: Any, *, sync: bool = False) -> None:
-    """Write JSON whole or not at all; ``sync`` is that of `atomic_file`. Raises as `json_text` does."""
+    """Write a JSON file atomically; ``sync`` as in `atomic_file`, errors as in `json_text`."""
     text = json_text(data, path, indent=2) + "\n"
     with atomic_file(path, sync=sync) as tmp:
         tmp.write_text(text, encoding="utf-8")
@@ -218,15 +218,15 @@ def write_json(path: Path | str, data: Any, *, sync: bool = False) -> None:
 def json_text(
     data: Any, where: object, *, indent: int | None = None, ascii_only: bool = False, error: type[_Error] = RobocasError
 ) -> str:
-    """Return values as a JSON text that `documents.load_json` and pydantic read; indent None: one line.
+    """Return values as JSON text that `documents.load_json` and pydantic accept, on one line if ``indent`` is None.
 
-    Raises ``error``, whose ``where`` names the key, for a value that they would refuse, such as NaN.
+    Raises ``error``, whose ``where`` names the key, for a value that a reader would refuse, such as NaN.
     """
-    from robocas_ms3.core.documents import find_invalid_value  # with YAML, for which `robocas --help` need not wait
+    from robocas_ms3.core.documents import find_invalid_value  # imports YAML, which `robocas --help` does not need
 
-    if fault := find_invalid_value(data):
-        keys, found = fault
+    if invalid := find_invalid_value(data):
+        keys, found = invalid
         place = f"{where}, {'.'.join(map(str, keys[:_SHOWN_KEYS]))}" if keys else where
         expected = "finite numbers of 64 bits, Unicode text, JSON types"
-        raise error("this value can't be written as JSON", where=place, expected=expected, found=found)
+        raise error("cannot write this value as JSON", where=place, expected=expected, found=found)
     return json.dumps(data, indent=indent, ensure_ascii=ascii_only, allow_nan=False)

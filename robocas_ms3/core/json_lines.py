@@ -1,7 +1,7 @@
-"""Files of JSON lines that grow by a record at a time, such as the outcomes of episodes.
+"""Append-only JSON Lines files, such as the outcomes of episodes.
 
-A run may be killed while it writes: a last line that was cut off is no line, and is written over. One with a number
-that is NaN or infinite is damaged.
+A run may be killed while it writes: an incomplete last line is ignored, and the next append replaces it. A line with a
+NaN or infinite number is damaged.
 """
 
 from __future__ import annotations
@@ -22,28 +22,28 @@ from robocas_ms3.core.strict_model import error_from_validation, validate_json
 
 Record = TypeVar("Record")
 _Error = TypeVar("_Error", bound=RobocasError)
-_LIMIT = 2**30  # bytes of a file: a million lines have 300 MB
+_LIMIT = 2**30  # bytes; a million lines have about 300 MB
 
 
 @dataclass(frozen=True)
 class Line(Generic[Record]):
-    """A line of the file."""
+    """A line of a JSON Lines file."""
 
     number: int  # from 1 on
-    record: Record | None  # None: it is damaged
+    record: Record | None  # None: the line is damaged
     problem: ValidationError | None = None
-    cut_off: bool = False  # perhaps by a kill: it is the last one, and has no end
+    cut_off: bool = False  # a damaged last line without a line end: the run was killed
 
 
 _form_of = lru_cache(TypeAdapter)
 
 
 class JsonLinesFile(Generic[Record]):
-    """The file.
+    """A JSON Lines file with records of one type.
 
     Args:
-        path: of the file, which may not exist yet.
-        record: what a line is: a dataclass, or a type of JSON. Types are checked; unknown keys are ignored.
+        path: of the file, which need not exist.
+        record: type of a line: a dataclass or a JSON type. Types are checked; unknown keys are ignored.
     """
 
     def __init__(self, path: Path, record: Any) -> None:
@@ -51,7 +51,7 @@ class JsonLinesFile(Generic[Record]):
         self._form: TypeAdapter[Record] = _form_of(record)
 
     def lines(self) -> list[Line[Record]]:
-        """Return all lines but empty ones, the damaged ones too; none if there is no file. Raises as `read_bytes`."""
+        """Return all lines except empty ones, including damaged lines; [] without a file. Raises as `read_bytes`."""
         try:
             pieces = read_bytes(self.path, _LIMIT).split(b"\n")
         except FileNotFoundError:
@@ -59,11 +59,11 @@ class JsonLinesFile(Generic[Record]):
         return [self._read(number, piece, len(pieces)) for number, piece in enumerate(pieces, 1) if piece.strip()]
 
     def read(self) -> list[Record]:
-        """Return the records of all lines that are not damaged."""
+        """Return the records of all undamaged lines."""
         return [line.record for line in self.lines() if line.record is not None]
 
     def append(self, records: Iterable[Record], *, sync: bool = False) -> None:
-        """Add lines, which are on the disk when this returns if ``sync``; no records leave the file as it is."""
+        """Append lines; ``sync`` flushes them to the disk. Without records the file is not touched."""
         text = _text(records, self.path)
         if not text:
             return
@@ -79,7 +79,7 @@ class JsonLinesFile(Generic[Record]):
             tmp.write_bytes(_text(records, self.path))
 
     def line_error(self, line: Line[Record], error: type[_Error], about: str) -> _Error:
-        """Return an error of ours for a damaged line of this file; ``about`` is what it isn't, such as "no outcome"."""
+        """Return an ``error`` for a damaged line of this file; ``about`` is the start of its message."""
         assert line.problem is not None
         return error_from_validation(line.problem, self._form, error, where=f"{self.path}:{line.number}", about=about)
 
@@ -90,7 +90,7 @@ class JsonLinesFile(Generic[Record]):
             return Line(number, None, problem, cut_off=number == last)
 
     def _end_last_line(self, file: Any) -> None:
-        """Remove a last line that was cut off; end one that only lacks its end."""
+        """Remove an incomplete last line, or end a complete last line that has no line end."""
         if file.seek(0, os.SEEK_END):
             file.seek(-1, os.SEEK_END)
         if file.read() in (b"", b"\n"):

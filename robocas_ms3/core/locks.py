@@ -1,4 +1,4 @@
-"""Locks on folders and files, which end with the process that holds them."""
+"""Locks on folders and files; a lock is released when its process ends."""
 
 from __future__ import annotations
 
@@ -16,22 +16,24 @@ from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.core.files import is_fixed, make_folder, open_for_append
 
 LOCK = ".lock"
-"""Name of the lock file inside a folder that can't have it next to it, such as a mount point."""
-# Raised by network file systems that have no locks, or whose lock server is down
+"""Name of the lock file inside a folder, for folders such as mount points; otherwise it is next to the folder."""
+# raised by network file systems without locks or without a running lock server
 _NO_LOCKS = frozenset({errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS})
-_DYING = 0.5  # s that a killed process, or a child that it was starting, may still hold a lock
+_DYING = 0.5  # s for which a killed process, or a child that it was starting, may still hold a lock
 _log = logging.getLogger(__name__)
 
 
 @contextmanager
 def locked_folder(path: Path | str) -> Iterator[None]:
-    """Hold a lock on a folder, which may not exist yet; see `lock_file`.
+    """Lock a folder, which need not exist; errors as in `lock_file`.
 
-    Parent folders that were made for the lock are removed if the folder does not exist in the end.
+    Parent folders created for the lock file are removed if the folder does not exist at the end.
     """
     path = Path(path)
     new = [folder for folder in path.parents if not folder.exists()]
-    real = path.resolve()  # one lock file whatever link leads to the folder, and outside if the folder may be replaced
+    real = (
+        path.resolve()
+    )  # one lock file for all links to the folder; next to the folder, since the folder may be replaced
     lock = path / LOCK if is_fixed(path) else real.parent / f".{real.name}.lock"
     try:
         with _open_locked(lock, path):
@@ -47,7 +49,7 @@ def locked_folder(path: Path | str) -> Iterator[None]:
 
 
 def lock_file(file: IO[Any], path: Path, *, wait: bool) -> None:
-    """Lock an open file until it is closed; a file system without locks gives a warning.
+    """Lock an open file until it is closed; log a warning if the file system has no locks.
 
     Raises RobocasError, which names ``path``, if another process holds the lock and ``wait`` is not set.
     """
@@ -58,25 +60,29 @@ def lock_file(file: IO[Any], path: Path, *, wait: bool) -> None:
             return
         except BlockingIOError as error:
             if time.monotonic() > until:
-                what, fix = "another process is writing here", "Wait until it is done."
+                what, fix = "another process writes to this folder", "Wait until that process ends."
                 raise RobocasError(what, where=path, fix=fix) from error
             time.sleep(0.02)
         except OSError as error:
             if error.errno not in _NO_LOCKS:
-                raise RobocasError("can't lock this folder", where=path, found=error.strerror) from error
-            _log.warning("%s: its file system has no locks (%s): run one command at a time", path, error.strerror)
+                raise RobocasError("cannot lock this folder", where=path, found=error.strerror) from error
+            _log.warning(
+                "%s: the file system has no locks (%s). Run only one command at a time in this folder.",
+                path,
+                error.strerror,
+            )
             return
 
 
 def _open_locked(lock: Path, path: Path) -> IO[bytes]:
-    """Open and lock a file; again if the process that held the lock has removed the file in between."""
+    """Open and lock a lock file; retry if the process that held the lock removed the file meanwhile."""
     while True:
         make_folder(lock.parent)
         try:
             file = open_for_append(lock)
-        except OSError as error:  # folders of /proc look writable
-            what = "can't write into this folder"
-            raise RobocasError(what, where=lock.parent, found=error.strerror, fix="Choose another.") from error
+        except OSError as error:  # folders in /proc report that they are writable
+            what = "cannot write to this folder"
+            raise RobocasError(what, where=lock.parent, found=error.strerror, fix="Choose another folder.") from error
         try:
             lock_file(file, path, wait=False)
         except BaseException:

@@ -1,6 +1,6 @@
-"""Output folders: what may be written into, continued or replaced, and what a killed run leaves.
+"""Create, continue and replace output folders, and clean up after killed runs.
 
-The commands that write a folder step by step use `OutputFolder`. Commands that write a file or folder in one go use
+Commands that write a folder step by step use `OutputFolder`. Commands that write a file or folder at once use
 `check_replaceable` and `files.atomic_file` or `files.atomic_folder`.
 """
 
@@ -22,48 +22,48 @@ from robocas_ms3.core.errors import OutputExistsError, RobocasError
 from robocas_ms3.core.files import empty_folder, json_text, make_folder, remove, write_json
 from robocas_ms3.core.locks import LOCK, locked_folder
 
-_LEFTOVERS = (".*.tmp*", ".*.old")  # of `files.atomic_file` and `files.atomic_folder` in a process that was killed
-_OVERWRITTEN = "overwritten"  # key of a record whose content is being moved away; a run that finds it starts again
+_LEFTOVERS = (".*.tmp*", ".*.old")  # of `files.atomic_file` and `files.atomic_folder` in a killed process
+_OVERWRITTEN = "overwritten"  # key of the record while the old content is moved away; a run that finds it starts again
 _SHOWN_CHANGES = 8
 _SHOWN_VALUE = 60  # characters
 
 
 @dataclass(frozen=True)
 class FolderKind:
-    """What tells the output folders of a command from other folders."""
+    """How to recognize the output folders of a command."""
 
-    command: str  # such as "robocas generate"
-    records: tuple[str, ...]  # paths of the JSON file with the settings; a run starts with the first
-    key: str  # that the record of this command has, and of no other
-    marks: tuple[str, ...] = ()  # other paths; a folder that is known by them alone can only be overwritten
-    upgrade: Callable[[dict[str, Any]], dict[str, Any]] = dict  # a record as its settings are compared
+    command: str  # name of the command, such as "robocas generate"
+    records: tuple[str, ...]  # possible paths of the JSON file with the settings; a new run writes the first
+    key: str  # key that only the records of this command have
+    markers: tuple[str, ...] = ()  # other paths; a folder with a marker but no record can only be overwritten
+    upgrade: Callable[[dict[str, Any]], dict[str, Any]] = dict  # converts a record before its settings are compared
 
 
 class OutputFolder:
-    """A folder that a run writes into, is locked by, and continues if its recorded settings match.
+    """A locked output folder, which a later run with the same settings continues.
 
-    Entering locks and checks the folder, and changes nothing in it. `start` comes before the first file. Leaving by an
-    error removes a started folder that holds no result yet::
+    Entering locks and checks the folder without changing it. Call `start` before writing the first file. If an error
+    leaves the block, a started folder without results is removed::
 
         with OutputFolder(out, KIND, settings, overwrite=overwrite) as output:
             output.start(record)
             ...
 
     Args:
-        path: of the folder; missing and empty folders are fine.
-        kind: of the command.
-        settings: what has to match to continue: JSON values, by keys of the record. None: see `check_settings`.
-        overwrite: whether to start again.
-        shared: whether other processes of the same run write there too: then the folder is not locked, a record that
-            is there stays, and so do leftovers.
+        path: of the folder, which may be missing or empty.
+        kind: how to recognize the folders of the command.
+        settings: JSON values that must match the record to continue, by key. None: `check_settings` is called later.
+        overwrite: whether to delete the content and start again.
+        shared: whether other processes of the same run write to the folder; then it is not locked, and an existing
+            record and leftovers stay.
 
     Attributes:
         path: of the folder.
-        recorded: content of the record; None: the run starts from nothing.
+        recorded: content of the record; None: the run starts in an empty folder.
 
     Raises:
-        OutputExistsError: on entering: the folder was not written by the command, or with other settings.
-        RobocasError: on entering: another process writes there. On leaving: somebody removed the folder.
+        OutputExistsError: on entry: another command wrote the folder, or the settings differ.
+        RobocasError: on entry: another process writes to the folder. On exit: the folder was removed during the run.
     """
 
     def __init__(
@@ -106,13 +106,13 @@ class OutputFolder:
                     self.path.rmdir()
 
     def read(self) -> None:
-        """Check the folder without locking it, as is enough for further processes of one run."""
+        """Read and check the record without locking the folder, for further processes of the same run."""
         self.recorded = self._load_matching()
         if self._settings is not None:
             self.check_settings(self._settings)
 
     def check_settings(self, settings: Mapping[str, Any]) -> None:
-        """Raise OutputExistsError if recorded settings differ; not those of a folder that is to be overwritten."""
+        """Raise OutputExistsError if the recorded settings differ, unless the folder is overwritten."""
         if self.recorded is not None:
             self._compare(self.recorded, settings)
 
@@ -124,10 +124,12 @@ class OutputFolder:
             more = len(changes) - _SHOWN_CHANGES
             found = "; ".join(changes[:_SHOWN_CHANGES]) + (f"; {more} more" if more > 0 else "")
             fix = "Continue with the recorded settings and versions, choose another folder, or pass --overwrite."
-            raise OutputExistsError("written with other settings", where=self._record_path(), found=found, fix=fix)
+            raise OutputExistsError(
+                "the output folder was written with other settings", where=self._record_path(), found=found, fix=fix
+            )
 
     def start(self, record: Mapping[str, Any]) -> None:
-        """Make the folder, delete content that is overwritten and leftovers of a killed run, and write the record."""
+        """Create the folder, delete overwritten content and leftovers of killed runs, and write the record."""
         if self._overwrite and not self._started and self.path.is_dir():
             self._hide_content()
         self._started = True
@@ -149,23 +151,23 @@ class OutputFolder:
                 os.replace(entry, old / entry.name)
 
     def check_exists(self) -> None:
-        """Raise RobocasError if somebody removed the folder: writers make missing folders, and would go on there."""
+        """Raise RobocasError if the folder was removed, since writers would create it again and continue."""
         if not self._record_path().is_file():
-            raise self._removed()
+            raise self._removed_error()
 
-    def _removed(self) -> RobocasError:
+    def _removed_error(self) -> RobocasError:
         what, fix = "the output folder was removed or emptied during the run", "Start again."
         return RobocasError(what, where=self.path, expected=self._record_path().name, fix=fix)
 
     def check_record(self) -> None:
-        """Raise RobocasError if the record was removed, or has other settings: another run started here."""
+        """Raise RobocasError if the record was removed, or if another run started here with other settings."""
         record = self._load_record()
         if record is None:
-            raise self._removed()
+            raise self._removed_error()
         self._compare(record, self._settings or {})
 
     def _record_path(self) -> Path:
-        """Return the path of the record, or of the one that will be written."""
+        """Return the path of the existing record, or the path for a new record."""
         paths = [self.path / record for record in self._kind.records]
         return next((path for path in paths if path.is_file()), paths[0])
 
@@ -173,15 +175,15 @@ class OutputFolder:
         if is_empty(self.path):
             return None
         record = self._load_record()
-        if record is not None and record.get(_OVERWRITTEN) is True:  # killed while it moved the content
+        if record is not None and record.get(_OVERWRITTEN) is True:  # killed while moving the content
             self._overwrite = True
         if record is None:
-            if not any((self.path / mark).exists() for mark in self._kind.marks):
-                known_by = [f"{self._kind.records[0]} with {self._kind.key!r}", *self._kind.marks]
-                what, expected = f"this is not an output of `{self._kind.command}`", " or ".join(known_by)
-                raise OutputExistsError(what, where=self.path, expected=expected, fix="Choose another.")
+            if not any((self.path / mark).exists() for mark in self._kind.markers):
+                known_by = [f"{self._kind.records[0]} with {self._kind.key!r}", *self._kind.markers]
+                what, expected = f"not an output folder of `{self._kind.command}`", " or ".join(known_by)
+                raise OutputExistsError(what, where=self.path, expected=expected, fix="Choose another folder.")
             if not self._overwrite and self._has_results():
-                what, fix = "there are no recorded settings to continue with", "Pass --overwrite to start again."
+                what, fix = "cannot continue: the recorded settings are missing", "Pass --overwrite to start again."
                 raise OutputExistsError(what, where=self._record_path(), fix=fix)
         return None if self._overwrite or not (self._shared or self._has_results()) else record
 
@@ -193,15 +195,15 @@ class OutputFolder:
 
     def _has_results(self) -> bool:
         records = {self.path / record for record in self._kind.records}
-        return any(path not in records and path.lstat().st_size for path in _content(self.path))
+        return any(path not in records and path.lstat().st_size for path in _iter_files(self.path))
 
 
-def _content(folder: Path) -> Iterator[Path]:
+def _iter_files(folder: Path) -> Iterator[Path]:
     for entry in folder.iterdir() if folder.is_dir() else ():
         if _is_hidden(entry):
             continue
         if entry.is_dir() and not entry.is_symlink():
-            yield from _content(entry)
+            yield from _iter_files(entry)
         else:
             yield entry
 
@@ -211,43 +213,43 @@ def _is_hidden(path: Path) -> bool:
 
 
 def is_empty(path: Path) -> bool:
-    """Return whether nothing exists there but an empty folder, or one with a lock and leftovers of a killed run."""
+    """Return whether a path is missing, or a folder with at most a lock file and leftovers of killed runs."""
     if not path.is_dir():
         return not path.exists()
     return all(map(_is_hidden, path.iterdir()))
 
 
-def check_replaceable(path: Path | str, *, overwrite: bool | None = None, marks: Sequence[str] = ()) -> None:
-    """Check that an output that is written in one go does not exist, or may be replaced.
+def check_replaceable(path: Path | str, *, overwrite: bool | None = None, markers: Sequence[str] = ()) -> None:
+    """Check that an output does not exist, or may be replaced.
 
     Args:
         path: a file or folder.
-        overwrite: the command's flag; None: it has none.
-        marks: paths inside, one of which a folder must have to be replaced.
+        overwrite: value of the option --overwrite; None: the command has no such option.
+        markers: paths inside the folder; the folder must have one of them to be replaced.
 
     Raises:
-        OutputExistsError: the output exists, and the flag is not set, or it was written by something else.
+        OutputExistsError: the output exists and must not be overwritten, or another program wrote it.
     """
     path = Path(path)
     if is_empty(path):
         return
     if not overwrite:
-        fix = "Choose another." if overwrite is None else "Pass --overwrite to replace it, or choose another."
-        raise OutputExistsError("the output exists already", where=path, fix=fix)
-    if marks and not any((path / mark).exists() for mark in marks):
-        what = "refusing to replace what this command has not written"
-        raise OutputExistsError(what, where=path, expected=" or ".join(marks), fix="Choose another.")
+        fix = "Choose another path." if overwrite is None else "Pass --overwrite to replace it, or choose another path."
+        raise OutputExistsError("the output exists", where=path, fix=fix)
+    if markers and not any((path / marker).exists() for marker in markers):
+        what = "refusing to replace a path that this command did not write"
+        raise OutputExistsError(what, where=path, expected=" or ".join(markers), fix="Choose another path.")
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove temporary files and folders that a killed run left; the folder has to be locked."""
+    """Remove temporary files and folders of killed runs; the folder must be locked."""
     for pattern in _LEFTOVERS:
         for leftover in folder.glob(pattern):
             remove(leftover)
 
 
 def list_setting_changes(before: Any, now: Any, path: str, tolerance: float = 0.0) -> list[str]:
-    """Return ``path: before -> now`` for each JSON value that differs, of floats by more than a tolerance."""
+    """Return ``path: before -> now`` for each JSON value that differs; floats may differ by ``tolerance``."""
     if isinstance(before, dict) and isinstance(now, dict):
         pairs = [(key, before.get(key), now.get(key)) for key in dict.fromkeys([*before, *now])]
     elif isinstance(before, list) and isinstance(now, list) and len(before) == len(now):

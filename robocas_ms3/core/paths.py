@@ -1,6 +1,6 @@
-"""Folders of bundled data, of the user's data and of the cache.
+"""Paths of bundled data, of the user's data folder and of the cache.
 
-Without a home folder, and without the variable that chooses a folder, asking for it raises RobocasError.
+The functions raise RobocasError if the user has no home folder and the environment variable of the folder is not set.
 """
 
 from __future__ import annotations
@@ -19,36 +19,36 @@ import platformdirs
 from robocas_ms3.core.errors import RobocasError
 
 PACKAGE_DIR = Path(__file__).resolve().parents[1]
-CACHE, DATA = "ROBOCAS_CACHE", "ROBOCAS_DATA"  # environment variables that choose folders
+CACHE, DATA = "ROBOCAS_CACHE", "ROBOCAS_DATA"  # environment variables with the paths of the folders
 _log = logging.getLogger(__name__)
 
 
 def data_dir() -> Path:
     """Return the folder of the user's asset packs: ``$ROBOCAS_DATA``, by default the user's data folder."""
-    return Path(os.environ.get(DATA) or _of_user(platformdirs.user_data_path))
+    return Path(os.environ.get(DATA) or _user_folder(platformdirs.user_data_path))
 
 
 def cache_dir() -> Path:
     """Return the cache folder: ``$ROBOCAS_CACHE``, by default the user's cache folder.
 
-    If the variable is not set and the user's folder is not writable, it is a private one among the temporary files.
+    If the variable is not set and the user's folder is not writable, it is a private folder in the temporary directory.
     """
     chosen = os.environ.get(CACHE)
-    return Path(chosen) if chosen else _cache_of_user(_of_user(platformdirs.user_cache_path))
+    return Path(chosen) if chosen else _user_cache(_user_folder(platformdirs.user_cache_path))
 
 
-def _of_user(find: Callable[[str], Path]) -> Path:
+def _user_folder(find: Callable[[str], Path]) -> Path:
     folder = Path()
     with suppress(RuntimeError):  # without a home folder some versions raise, others return "~/.cache/robocas"
         folder = find("robocas")
     if not folder.is_absolute():
-        found, fix = os.environ.get("HOME") or "nothing", f"Set {CACHE} and {DATA} to folders that can be written to."
+        found, fix = os.environ.get("HOME") or "nothing", f"Set {CACHE} and {DATA} to writable folders."
         raise RobocasError("the user has no home folder", where="HOME", expected="a path", found=found, fix=fix)
     return folder
 
 
 def ensure_home() -> None:
-    """Set ``HOME`` to an absolute path, which libraries need: the user's home folder, or one in the cache."""
+    """Set ``HOME``, which libraries need, to the user's home folder, or to a folder in the cache if there is none."""
     home = os.environ.get("HOME", "")
     if not os.path.isabs(home):
         with suppress(KeyError):  # a user id without an entry, as in many containers
@@ -60,15 +60,15 @@ def ensure_home() -> None:
 
 
 @lru_cache(maxsize=8)
-def _cache_of_user(usual: Path) -> Path:
+def _user_cache(usual: Path) -> Path:
     if is_writable(usual) or (instead := temporary_cache()) is None:
         return usual
-    _log.warning("%s can't be written to: %s is the cache instead; set %s to choose one", usual, instead, CACHE)
+    _log.warning("%s is not writable: the cache is %s. Set %s to choose another folder.", usual, instead, CACHE)
     return instead
 
 
 def temporary_cache() -> Path | None:
-    """Return a cache folder among the temporary files that is this user's alone; None if somebody else made it."""
+    """Create and return a private cache folder in the temporary directory; None if another user owns the path."""
     folder = Path(tempfile.gettempdir()) / f"robocas-{os.getuid()}"
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
@@ -80,13 +80,13 @@ def temporary_cache() -> Path | None:
 
 
 def is_writable(folder: Path) -> bool:
-    """Return whether a folder can be written to, or be made."""
+    """Return whether a folder is writable, or can be created."""
     existing = next(parent for parent in (folder, *folder.parents) if os.path.lexists(parent))
     return existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)
 
 
 def variable_of(path: Path | str) -> str:
-    """Return the environment variable that chooses where a path is, of cache or user's data; empty if none does."""
+    """Return the environment variable that moves a path (cache or data folder); empty if there is none."""
     path = Path(path).absolute()
     for name, folder_of in ((CACHE, cache_dir), (DATA, data_dir)):
         with suppress(RobocasError):  # no home folder
@@ -96,7 +96,7 @@ def variable_of(path: Path | str) -> str:
 
 
 def task_configs_dir() -> Path:
-    """Return the folder of bundled task configurations: inside the package in the wheel, at the top in a checkout."""
+    """Return the folder of bundled task configurations: in the package if installed, in the root of a checkout."""
     bundled = PACKAGE_DIR / "data" / "task_configs"
     return bundled if bundled.is_dir() else PACKAGE_DIR.parent / "task_configs"
 

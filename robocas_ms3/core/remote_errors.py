@@ -1,4 +1,4 @@
-"""Errors that one process sends to another, with their tracebacks."""
+"""Send errors with their tracebacks from one process to another."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from robocas_ms3.core.signals import exit_error
 
 @dataclass(frozen=True)
 class RemoteError:
-    """An error in a form that can be pickled."""
+    """A picklable copy of an error and its traceback."""
 
-    error: BaseException  # another with its message where it can't be pickled
-    where: str  # the process that raised it, such as "a branch"
-    traceback: str  # there
+    error: BaseException  # a RuntimeError with the same message if the error cannot be pickled
+    where: str  # the process that raised the error, such as "a worker"
+    traceback: str
 
     @classmethod
     def of(cls, error: BaseException, where: str) -> RemoteError:
-        """Return an error in this form; one that can't be pickled becomes a RuntimeError.
+        """Convert an error; an error that cannot be pickled becomes a RuntimeError.
 
-        ``where`` names this process; an error from another process keeps the name of that one.
+        ``where`` names this process; an error that came from another process keeps the name of that process.
         """
-        if isinstance(error, SystemExit):  # would end the receiving process without a message
+        if isinstance(error, SystemExit):  # a SystemExit would end the receiving process without a message
             error = exit_error(error, where).with_traceback(error.__traceback__)
         cause = error.__cause__
         place = cause.args if isinstance(cause, RemoteTraceback) else (where, "".join(format_exception(error)))
-        with suppress(Exception):  # any error of pickling it
+        with suppress(Exception):  # pickling may raise any error
             if type(pickle.loads(pickle.dumps(error))) is type(error):
                 return cls(error, *place)
         return cls(RuntimeError(f"{type(error).__name__}: {error}"), *place)
@@ -44,7 +44,7 @@ class RemoteError:
 
 
 class RemoteTraceback(Exception):  # noqa: N818  (the cause of an error, as in `concurrent.futures`)
-    """The text of a traceback in another process; tracebacks can't be pickled."""
+    """The traceback of another process as text, since tracebacks cannot be pickled."""
 
     def __str__(self) -> str:
         where, text = self.args

@@ -1,4 +1,4 @@
-"""What may end the process: Ctrl-C, which may be deferred, and foreign code, which may not (`forbid_exit`)."""
+"""Control how a process ends: Ctrl-C and SIGTERM, deferred interrupts, and exits in code of extensions."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ from typing import Any, NoReturn
 from robocas_ms3.core.errors import ExtensionError
 
 INTERRUPTED = 130
-"""Exit code of a program that Ctrl-C ended, as a shell reports it."""
-_TERMINATED = 143  # and of one that `timeout`, `kill` or a batch system ended
-_GRACE = 2.2  # s to end in: processes, files, policies
-_SECOND = 0.5  # s from one SIGINT to the next that is a second one; sooner, it is the same key pressed, sent twice
+"""Exit code of a program ended by Ctrl-C (128 + SIGINT)."""
+_TERMINATED = 143  # exit code after SIGTERM, which `timeout`, `kill` and batch systems send
+_GRACE = 2.2  # s for clean-up: worker processes, files, policies
+_SECOND = 0.5  # s; a SIGINT sooner after the first belongs to the same key press
 _PR_SET_PDEATHSIG = 1
 
 
 class _CommandInterrupt:
-    """Ctrl-C and SIGTERM of a command: the first ends it within seconds, later ones change nothing.
+    """Handler of Ctrl-C and SIGTERM in a command: the first signal ends the command within seconds.
 
-    Python only notes a signal, and calls the handler when native code returns or a deferral ends. Until then a second
-    SIGINT ends the process at once: a thread that learns of the first one ignores those of the next half second, and
-    then restores the system's default.
+    Python calls a signal handler only when native code returns or a deferral ends. Until then a second SIGINT ends the
+    process at once: a thread, woken by the first SIGINT, ignores SIGINT for half a second, and then restores the
+    system's default action. Signals after the call of the handler are ignored.
     """
 
     def __init__(self) -> None:
         self.installed = False
-        self.protected = False  # from the second SIGINT too
+        self.protected = False  # from a second SIGINT
         self.code = INTERRUPTED
         self._handled = threading.Event()
 
     def install(self) -> None:
-        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not where a shell has it ignored
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # a shell may have set it to ignored
             read, write = os.pipe()
             os.set_blocking(write, False)
             signal.set_wakeup_fd(write, warn_on_full_buffer=False)
@@ -52,30 +52,30 @@ class _CommandInterrupt:
 
     def handle(self, number: int, frame: FrameType | None) -> None:
         self._handled.set()
-        for one in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(one, signal.SIG_IGN)  # who is impatient would interrupt what ends the processes
+        for ignored in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(ignored, signal.SIG_IGN)  # further signals must not interrupt the clean-up
         self.code = _TERMINATED if number == signal.SIGTERM else INTERRUPTED
         last = threading.Timer(_GRACE, os._exit, (self.code,))
         last.daemon = True
         last.start()
         raise KeyboardInterrupt
 
-    def waits(self) -> bool:
+    def is_armed(self) -> bool:
         return self.installed and signal.getsignal(signal.SIGINT) == self.handle
 
     def arm(self) -> None:
-        """Let the system restore its default when the first SIGINT comes, if the C library has ``sysv_signal``.
+        """Let the system restore its default action at the first SIGINT, if the C library has ``sysv_signal``.
 
-        So the second one ends the process even while native code keeps the thread of `_watch` from running.
+        A second SIGINT then ends the process even while native code keeps the thread of `_watch` from running.
         """
         libc = ctypes.CDLL(None)
-        action = ctypes.create_string_buffer(1024)  # a `struct sigaction`, which begins with the handler
+        action = ctypes.create_string_buffer(1024)  # a `struct sigaction`; the handler is its first member
         if hasattr(libc, "sysv_signal") and libc.sigaction(int(signal.SIGINT), None, action) == 0:
             libc.sysv_signal(int(signal.SIGINT), ctypes.c_void_p.from_buffer(action))
 
     def _watch(self, signals: int) -> None:
-        libc = ctypes.CDLL(None)  # `signal.signal` is for the main thread alone
-        while signal.SIGINT not in os.read(signals, 1):  # SIGTERM comes here too
+        libc = ctypes.CDLL(None)  # only the main thread may call `signal.signal`
+        while signal.SIGINT not in os.read(signals, 1):  # the pipe also receives SIGTERM
             pass
         default = signal.SIG_IGN
         while not self._handled.is_set():
@@ -89,12 +89,12 @@ _command = _CommandInterrupt()
 
 
 def handle_interrupts() -> None:
-    """Let the first Ctrl-C or SIGTERM end this process, a command, within seconds; later ones change nothing."""
+    """Install handlers so that the first Ctrl-C or SIGTERM ends this command within seconds."""
     _command.install()
 
 
 def exit_command(code: int) -> NoReturn:
-    """Leave the process with an exit code, at once if it was interrupted."""
+    """Exit the process with an exit code; skip the teardown of libraries if it was interrupted."""
     if code == INTERRUPTED:
         exit_immediately(_command.code)
     sys.exit(code)
@@ -102,43 +102,44 @@ def exit_command(code: int) -> NoReturn:
 
 @contextmanager
 def deferred_interrupts(*, second_ends: bool = True) -> Iterator[list[Any]]:
-    """Handle a SIGINT or SIGTERM that comes inside afterwards, once; gives the list that those that came are in.
+    """Defer SIGINT and SIGTERM until the end of the block; yield the list of signals received so far.
 
-    A signal mask is not enough: the system gives the signal to another thread, and Python tells the main thread.
+    Only the first signal is handled. A signal mask does not suffice: the system delivers the signal to another thread,
+    and Python runs the handler in the main thread.
 
     Args:
-        second_ends: whether a second SIGINT, half a second after the first or later, ends a command at once.
+        second_ends: whether a second SIGINT, at least half a second after the first, ends the command at once.
     """
-    came: list[tuple[int, FrameType | None]] = []
+    received: list[tuple[int, FrameType | None]] = []
     held: dict[int, Any] = {}
     if threading.current_thread() is threading.main_thread():
         for number in (signal.SIGINT, signal.SIGTERM):
             if callable(handler := signal.getsignal(number)):
                 held[number] = handler
-                signal.signal(number, lambda number, frame: came.append((number, frame)))
+                signal.signal(number, lambda number, frame: received.append((number, frame)))
     protected, _command.protected = _command.protected, _command.protected or not second_ends
     try:
-        yield came
+        yield received
     finally:
         _command.protected = protected
-        with ExitStack() as restored:  # one that comes now interrupts this, but not what is restored after it
+        with ExitStack() as restored:  # a signal during this loop must not prevent the other restorations
             for number, handler in held.items():
                 restored.callback(_restore, number, handler)
-        if came:
-            held[came[0][0]](*came[0])
+        if received:
+            held[received[0][0]](*received[0])
 
 
 def exit_immediately(code: int) -> NoReturn:
-    """Run exit functions, and end the process without what torch and SAPIEN do then: it takes a second, or crashes."""
+    """Run exit functions and end the process, without the teardown of torch and SAPIEN, which is slow or crashes."""
     atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):
-        with suppress(OSError, ValueError, AttributeError):  # a closed one, or none, as in a service
+        with suppress(OSError, ValueError, AttributeError):  # a closed stream, or None as in a service
             stream.flush()
     os._exit(code)
 
 
 def die_with_parent(parent: int) -> None:
-    """Have Linux kill this process as soon as the thread that started it ends, of the process with id ``parent``."""
+    """Ask Linux to kill this process when the thread of process ``parent`` (an id) that started it ends."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != parent:
@@ -147,17 +148,17 @@ def die_with_parent(parent: int) -> None:
 
 @contextmanager
 def forbid_exit(source: str) -> Iterator[None]:
-    """Turn a SystemExit, or a KeyboardInterrupt without a signal, of the code of ``source`` into ExtensionError."""
+    """Convert SystemExit, and KeyboardInterrupt without a signal, from the code of ``source`` to ExtensionError."""
     try:
         yield
     except (SystemExit, KeyboardInterrupt) as error:
-        if isinstance(error, KeyboardInterrupt) and not _command.waits():  # it may come from a signal
+        if isinstance(error, KeyboardInterrupt) and not _command.is_armed():  # a signal may have raised it
             raise
         raise exit_error(error, source) from error
 
 
 def exit_error(error: BaseException, source: str) -> ExtensionError:
-    """Make the error that says where foreign code tried to end the process."""
+    """Return an error with the line of an extension's code that tried to end the process."""
     frames = extract_tb(error.__traceback__)
     line = f" at {frames[-1].filename}:{frames[-1].lineno}" if frames else ""
     fix = "Raise an Exception there instead."

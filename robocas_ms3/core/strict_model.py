@@ -1,6 +1,6 @@
-"""Data of others read strictly: the base of all declared forms, and pydantic's errors in our words.
+"""Validate untrusted data strictly with pydantic, and convert its errors to one-line messages.
 
-A message names the key, what was expected and what was found; of a mistyped key or word also the nearest known ones.
+A message has the key, the expected and the found value, and suggestions for a misspelled key or word.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, TypeAdapter, Validat
 
 from robocas_ms3.core.documents import DocumentError, decode_json
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.core.text import did_you_mean, one_line
+from robocas_ms3.core.text import did_you_mean, format_count, one_line
 
 _Model = TypeVar("_Model", bound=BaseModel)
 _Error = TypeVar("_Error", bound=RobocasError)
 MAX_NUMBER = 1e12
-"""No number of a declared form is larger: products of numbers like 1e308 are infinite."""
+"""Largest magnitude of numbers in a `StrictModel`: products of numbers such as 1e308 are infinite."""
 MAX_NAME_BYTES = 200
-"""Bytes; file systems allow 255, of which temporary files add some."""
+"""Bytes of a file name; file systems allow 255, and temporary names are longer."""
 _NAME = f"1 to {MAX_NAME_BYTES} printable characters without / and \\, no leading dot"
-# where pydantic's message alone does not say what was expected
+# expected values by error type, if pydantic's message does not name them
 _EXPECTED = {
     "extra_forbidden": "no such key",
     "missing": "this key",
@@ -37,17 +37,17 @@ _EXPECTED = {
     "model_type": "a mapping",
     "dict_type": "a mapping",
 }
-_FOUND_LENGTH = 80  # of a wrong value, or of a key, in a message
-_OUT_OF_RANGE = re.compile(rb"NaN|Infinity|\d[eE]\+?\d{3}|\d{19}")  # may be a number that `decode_json` refuses
+_FOUND_LENGTH = 80  # characters of an invalid value or a key in a message
+_OUT_OF_RANGE = re.compile(rb"NaN|Infinity|\d[eE]\+?\d{3}|\d{19}")  # possibly a number that `decode_json` refuses
 
 
 class StrictModel(BaseModel):
-    """Refuse unknown keys and numbers beyond `MAX_NUMBER`; nothing changes after loading."""
+    """Base class of immutable pydantic models that refuse unknown keys and numbers over `MAX_NUMBER`."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     @model_validator(mode="after")
-    def _numbers_are_bounded(self) -> StrictModel:
+    def _check_numbers(self) -> StrictModel:
         for name, value in self:
             if (wrong := _too_large(value)) is not None:
                 raise ValueError(f"{name}: expected numbers of at most {MAX_NUMBER:g}, found {wrong:g}")
@@ -55,54 +55,56 @@ class StrictModel(BaseModel):
 
 
 def _too_large(value: Any) -> float | None:
-    """Return a number beyond the greatest that is in a value, or None; models inside check their own."""
+    """Return a number in a value whose magnitude exceeds `MAX_NUMBER`, or None; nested models check themselves."""
     if isinstance(value, int | float):
         return value if abs(value) > MAX_NUMBER else None
     inside = value.values() if isinstance(value, Mapping) else value if isinstance(value, list | tuple) else ()
-    return next((wrong for each in inside if (wrong := _too_large(each)) is not None), None)
+    return next((wrong for item in inside if (wrong := _too_large(item)) is not None), None)
 
 
 @dataclass(frozen=True)
 class InvalidValue:
-    """An invalid value, in one line each."""
+    """An error of pydantic with one-line texts."""
 
-    key: str  # as the file has it; empty: at the top
-    kind: str  # pydantic's type of the error
+    key: str  # dotted path in the file; empty: top level
+    kind: str  # error type of pydantic
     what: str
-    expected: str  # empty, as `found`, where `what` says it all
+    expected: str  # empty if `what` contains it, as is `found`
     found: str
-    fix: str  # the nearest known words, where there are some
+    fix: str  # suggestions, or empty
     value: Any
-    context: Mapping[str, Any]  # pydantic's limits and the like
+    context: Mapping[str, Any]  # `ctx` of pydantic, such as limits
 
 
 def parse(model: type[_Model], data: Any, error: type[RobocasError], *, where: object, about: str = "") -> _Model:
-    """Return values, as YAML has them, in a declared form.
+    """Validate values read from YAML and return them as a model.
 
     Args:
-        model: the form.
+        model: class of the model.
         data: a mapping.
-        error: to be raised.
-        where: file or option of the values, for messages; or a function that returns it for the key of a mistake.
-        about: what the values aren't then, such as "not a valid plan".
+        error: type of the error to raise.
+        where: file or option of the values, for messages; or a function that returns it for the key of an error.
+        about: start of the message, such as "not a valid plan".
 
     Raises:
-        RobocasError: ``error``, for the first mistake; the count of further ones is in the message.
+        RobocasError: an ``error`` for the first invalid value, with the number of further ones.
     """
     try:
-        text = json.dumps(data, default=lambda value: {type(value).__name__: str(value)})  # as a date, which none takes
-    except (TypeError, ValueError) as problem:  # such a key, or an alias of what holds it
-        what = "a value here has no place in this file"
+        text = json.dumps(
+            data, default=lambda value: {type(value).__name__: str(value)}
+        )  # such as a date, which no model accepts
+    except (TypeError, ValueError) as problem:  # a key of another type, or a YAML alias of its own parent
+        what = "unsupported keys or recursive aliases"
         where = where("") if callable(where) else where
         raise error(f"{about}: {what}" if about else what, where=where, found=problem) from problem
-    # JSON mode: strict about types, yet lists serve as tuples and whole numbers as floats, as in YAML
+    # strict JSON mode accepts lists as tuples and integers as floats, as needed for YAML
     return parse_json(model, text, error, where=where, about=about)
 
 
 def parse_json(
     model: type[_Model], text: str | bytes, error: type[RobocasError], *, where: object, about: str = ""
 ) -> _Model:
-    """Return the values of a JSON text in a declared form; see `parse`."""
+    """Validate a JSON text and return it as a model; see `parse`."""
     try:
         return validate_json(model, text)
     except ValidationError as problem:
@@ -110,10 +112,10 @@ def parse_json(
 
 
 def validate_json(form: type[BaseModel] | TypeAdapter[Any], text: str | bytes) -> Any:
-    """Read JSON strictly in a declared form, or raise ValidationError; numbers are finite, integers have 64 bits."""
+    """Validate JSON strictly; raise ValidationError, also for NaN, infinity and integers over 64 bits."""
     validate = form.validate_json if isinstance(form, TypeAdapter) else form.model_validate_json
     found = validate(text, strict=True)
-    if _OUT_OF_RANGE.search(text.encode() if isinstance(text, str) else text):  # hardly ever: then it is read once more
+    if _OUT_OF_RANGE.search(text.encode() if isinstance(text, str) else text):  # rarely true
         try:
             decode_json(text)
         except DocumentError as problem:
@@ -131,11 +133,11 @@ def error_from_validation(
     about: str = "",
     fix: str = "",
 ) -> _Error:
-    """Return pydantic's error as one of ours: its first mistake, and how many more there are; see `parse`."""
+    """Convert a pydantic error to an ``error`` with its first invalid value and the number of others; see `parse`."""
     first, *others = list_invalid_values(problem, form)
-    # a union has a mistake for each of its types, at its own place or further out
+    # a union reports one error per type, at its own key or at an outer key
     more = sum(not f"{first.key}.".startswith(f"{other.key}." if other.key else "") for other in others)
-    fixes = (first.fix, f"{more} more after this one." if more else "", fix)
+    fixes = (first.fix, f"{format_count(more, 'more error')}." if more else "", fix)
     what = f"{about}: {first.what}" if about else first.what
     where = where(first.key) if callable(where) else where
     return error(what, where=where, expected=first.expected, found=first.found, fix=" ".join(filter(None, fixes)))
@@ -146,12 +148,12 @@ def list_invalid_values(
     form: type[BaseModel] | TypeAdapter[Any] | None = None,
     words: Mapping[str, str] | None = None,
 ) -> list[InvalidValue]:
-    """Return pydantic's errors, one mistake per key, unknown keys first.
+    """Return the invalid values of a pydantic error, one per key, unknown keys first.
 
     Args:
-        problem: pydantic's.
-        form: that was asked for; None: one without unions, whose alternatives pydantic takes for keys.
-        words: for what was expected, by pydantic's types of errors, in addition to ours.
+        problem: error of pydantic.
+        form: model or type that was validated; may be None if it has no unions, whose types pydantic reports as keys.
+        words: further texts of expected values by error type of pydantic.
     """
     schema: dict[str, Any] = {}
     if form is not None:
@@ -160,33 +162,35 @@ def list_invalid_values(
     for details in problem.errors(include_url=False):
         found.setdefault(".".join(_place(details["loc"], schema)[0]), []).append(details)
     made = [_invalid_value(key, same, schema, {**_EXPECTED, **(words or {})}) for key, same in found.items()]
-    return sorted(made, key=lambda mistake: mistake.kind != "extra_forbidden")  # it may be why another is missing
+    return sorted(
+        made, key=lambda value: value.kind != "extra_forbidden"
+    )  # a misspelled key is also reported as missing
 
 
 def check_name(name: str, error: type[RobocasError], *, where: object, fix: str = "") -> str:
-    """Return a name that can be that of one file or folder; raise ``error`` if it can't be used in a path."""
+    """Return a name if it is valid for a file or folder; raise ``error`` otherwise."""
     try:
         return _check_name(name)
     except ValueError as problem:
-        what, found = "this name can't be used for a file", f"{name!r:.80}"
+        what, found = "invalid file name", f"{name!r:.80}"
         raise error(what, where=where, expected=_NAME, found=found, fix=fix) from problem
 
 
 def _check_name(name: str) -> str:
     fits = 0 < len(name.encode()) <= MAX_NAME_BYTES
     if not (fits and name.isprintable()) or name.startswith(".") or {*name} & {"/", "\\"}:
-        raise ValueError(f"not a name for a file: expected {_NAME}")
+        raise ValueError(f"invalid file name: expected {_NAME}")
     return name
 
 
 FileName = Annotated[str, AfterValidator(_check_name)]
-"""A field of a declared form that becomes a part of a path."""
+"""Type of a model's field that is used as a file name."""
 
 
 def _invalid_value(key: str, same: list[Any], schema: dict[str, Any], words: Mapping[str, str]) -> InvalidValue:
     details = same[0]
     kind, value, context = details["type"], details["input"], details.get("ctx", {})
-    what, expected, found, fix = f"wrong value for {key or '(top level)'!r}", "", "", ""
+    what, expected, found, fix = f"invalid value for {key or '(top level)'!r}", "", "", ""
     if kind == "extra_forbidden":
         *outer, name = details["loc"]
         name, known = one_line(name, _FOUND_LENGTH), sorted(_place(tuple(outer), schema)[1].get("properties", {}))
@@ -196,14 +200,14 @@ def _invalid_value(key: str, same: list[Any], schema: dict[str, Any], words: Map
         discriminator = _place(details["loc"], schema)[1]["discriminator"]
         tag, kinds = discriminator["propertyName"], sorted(discriminator["mapping"])
         name = one_line(context.get("tag", ""), _FOUND_LENGTH)
-        what, expected = f"wrong value for '{f'{key}.{tag}' if key else tag}'", f"one of {kinds}"
+        what, expected = f"invalid value for '{f'{key}.{tag}' if key else tag}'", f"one of {kinds}"
         found, fix = repr(name) if name else "nothing", did_you_mean(name, kinds)
     elif kind == "value_error":
         message = one_line(details["msg"].removeprefix("Value error, "))
         what = f"{key}: {message}" if key else message
         found = repr(value)[:_FOUND_LENGTH] if isinstance(value, str | int | float) and str(value) not in what else ""
     elif kind == "json_invalid":
-        what, found = "this is not valid JSON", one_line(context["error"])
+        what, found = "invalid JSON", one_line(context["error"])
     else:
         expected = " or ".join(dict.fromkeys(_expected(details, words) for details in same))
         found = "nothing" if kind == "missing" else repr(value)
@@ -222,9 +226,9 @@ def _expected(details: Any, words: Mapping[str, str]) -> str:
 
 
 def _place(location: tuple[int | str, ...], schema: dict[str, Any]) -> tuple[list[str], dict[str, Any]]:
-    """Return the keys that lead to a mistake, as the file has them, and the JSON schema of what belongs there, or {}.
+    """Return the keys of an invalid value as in the file, and the JSON schema of this value, or {}.
 
-    pydantic adds the kind of a block that comes in several, the type of a value, and "[key]" where a key is wrong.
+    The location of pydantic also has tags of tagged unions, types of values, and "[key]" for an invalid key.
     """
     node = _resolved(schema, schema)
     keys: list[str] = []

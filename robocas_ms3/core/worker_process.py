@@ -1,4 +1,4 @@
-"""One worker process: started, given tasks, and killed when a task exceeds its limits."""
+"""A worker process: start it, send tasks to it, and kill it when a task exceeds its limits."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ Result = TypeVar("Result")
 Task_contra = TypeVar("Task_contra", contravariant=True)
 Result_co = TypeVar("Result_co", covariant=True)
 
-START_SECONDS = 900.0  # until a worker is made
-_EXIT_SECONDS = 1.0  # until an idle process has left
-POLL_SECONDS = 1.0  # between two checks of limits
-_JOB_KILL_SECONDS = 2.0  # until this process is ended too, where a batch system ends all processes of a job
-# Not `multiprocessing`, whose spawn runs the user's main module again: it needs `if __name__ == "__main__"` there, and
-# fails in a program from standard input.
+START_SECONDS = 900.0  # limit for creating a worker
+_EXIT_SECONDS = 1.0  # limit for the exit of an idle process
+POLL_SECONDS = 1.0  # interval of the limit checks
+_JOB_KILL_SECONDS = 2.0  # wait for the end of this process too: a batch system kills all processes of a job
+# `multiprocessing` would import the user's main module again: that requires `if __name__ == "__main__"` and fails for a
+# program read from standard input.
 _PROGRAM = "import sys; sys.path[:] = {path!r}; from robocas_ms3.core.worker_process import main; main({fd}, {parent})"
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What one task may take."""
+    """Limits of one task."""
 
     seconds: float = math.inf  # wall-clock time
-    memory_gb: float = math.inf  # GiB, resident, of the worker process and of each process that it forked
+    memory_gb: float = math.inf  # GiB of resident memory, for the worker process and for each of its forks
 
 
 NO_LIMITS = Limits()
@@ -59,24 +59,24 @@ class ProcessCrashError(WorkerCrashError):
 
 
 class Worker(Protocol[Task_contra, Result_co]):
-    """Keeps what tasks need, and runs one task after the other."""
+    """An object that runs tasks one after the other and keeps their shared resources."""
 
     def run(self, task: Task_contra, /) -> Result_co: ...
 
     def close(self) -> None:
-        """Free what it holds: after a task that raised an error, and when a pool without processes is closed."""
+        """Free the resources; called after a task that raised an error, and when a pool without processes closes."""
         ...
 
 
 class WorkerProcess(Generic[Task, Result]):
-    """A process that runs one task after the other.
+    """A process that runs tasks one after the other.
 
-    The thread that starts it has to live as long: Linux kills a process when the thread that started it ends.
+    Keep the starting thread alive: Linux kills the process when that thread ends.
 
     Args:
-        make_worker: is called in the process.
+        make_worker: creates the worker; called in the process.
         limits: of each task.
-        stop: a `Connection` that becomes readable when the running task has to be killed.
+        stop: a `Connection` that becomes readable when the running task must be killed.
 
     Attributes:
         connection: to the process, a `Connection`.
@@ -97,11 +97,14 @@ class WorkerProcess(Generic[Task, Result]):
         if self._process is None or self._process.poll() is not None:
             try:
                 self.launch()
-                self._receive(START_SECONDS)  # that it reads: nothing below waits for a full pipe
+                self._receive(START_SECONDS)  # the process reads: later writes cannot block on a full pipe
                 self.send(self.pickled_worker)
                 self._receive(START_SECONDS)
             except ProcessCrashError as crash:
-                what, fix = "a worker process died before its first task", "See its output above, and robocas doctor."
+                what, fix = (
+                    "a worker process crashed before its first task",
+                    "See its output above, and run robocas doctor.",
+                )
                 raise WorkerStartError(what, found=crash.found, fix=fix) from crash
             except BaseException:
                 self.end()
@@ -109,8 +112,8 @@ class WorkerProcess(Generic[Task, Result]):
         self.send(task)
         return self._receive(self._limits.seconds)
 
-    def leave(self) -> None:
-        """Let the process leave; kill it where that takes too long, or where it is busy."""
+    def quit(self) -> None:
+        """Let an idle process exit; kill it if it is busy or the exit takes too long."""
         if self._process is not None:
             self.connection.close()
             with suppress(subprocess.TimeoutExpired):
@@ -119,11 +122,11 @@ class WorkerProcess(Generic[Task, Result]):
 
     @property
     def pickled_worker(self) -> bytes:
-        """The first message to the process; the answer to it is None, or the error of making the worker."""
+        """First message to the process; the process answers None, or the error of creating the worker."""
         return cloudpickle.dumps(self._make_worker)
 
     def launch(self) -> None:
-        """Start the process, which answers None when it reads, before any message."""
+        """Start the process, which sends None when it is ready to read."""
         self.end()
         try:
             self.connection, theirs = Pipe()
@@ -132,11 +135,11 @@ class WorkerProcess(Generic[Task, Result]):
                 command = [sys.executable, "-c", program]
                 self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, pass_fds=(theirs.fileno(),))
         except OSError as error:
-            what, fix = "can't start another process", "Use fewer --jobs, or raise the limits (ulimit -u, -n)."
+            what, fix = "cannot start another process", "Use fewer --jobs, or raise the limits (ulimit -u, -n)."
             raise RobocasError(what, found=error.strerror or error, fix=fix) from error
 
     def send(self, message: object) -> None:
-        """Send a message; raises ProcessCrashError."""
+        """Send a message; raise ProcessCrashError if the process has died."""
         try:
             self.connection.send(message)
         except OSError as error:
@@ -157,14 +160,14 @@ class WorkerProcess(Generic[Task, Result]):
         """Kill the process and raise ProcessCrashError if it exceeds the deadline (`time.monotonic`) or the memory."""
         now = time.monotonic()
         if now > deadline:
-            raise self._crash("too slow")
-        if now - self._checked > POLL_SECONDS:  # also where tasks are shorter than that
+            raise self._crash("time limit exceeded")
+        if now - self._checked > POLL_SECONDS:  # also if tasks are shorter than the interval
             self._checked = now
             if _exceeds_memory(self.pid, self._limits.memory_gb):
-                raise self._crash("too much memory")
+                raise self._crash("memory limit exceeded")
 
     def read(self) -> Any:
-        """Read the answer that is there; raises ProcessCrashError, or the error of the task."""
+        """Read a waiting answer; raise ProcessCrashError, or the error of the task."""
         try:
             answer = self.connection.recv()
         except (EOFError, OSError) as error:
@@ -174,7 +177,7 @@ class WorkerProcess(Generic[Task, Result]):
         return answer
 
     def _crash(self, reason: str = "") -> ProcessCrashError:
-        """End the process, and return the error that says why."""
+        """Kill the process and return the error with the reason."""
         assert self._process is not None
         if not reason:
             with suppress(subprocess.TimeoutExpired):
@@ -182,14 +185,14 @@ class WorkerProcess(Generic[Task, Result]):
             code = self._process.returncode
             reason = signal.Signals(-code).name if code is not None and code < 0 else f"exit code {code}"
             if code in (-signal.SIGTERM, -signal.SIGKILL):
-                wait([self._stop], _JOB_KILL_SECONDS)  # else the task would be blamed for the end of all
-        died = ProcessCrashError("its worker process died", found=reason)
-        died.pid = self.pid
+                wait([self._stop], _JOB_KILL_SECONDS)  # otherwise the task would be blamed for the end of the job
+        error = ProcessCrashError("the worker process crashed", found=reason)
+        error.pid = self.pid
         self.end()
-        return died
+        return error
 
     def end(self) -> None:
-        """Kill the process and what it forked, if it runs."""
+        """Kill the process and its forks, if it runs."""
         if self._process is not None:
             _kill_tree(self._process)
             self._process = None
@@ -199,25 +202,27 @@ class WorkerProcess(Generic[Task, Result]):
 
 
 def worker_error(error: BaseException, where: str) -> RemoteError:
-    """Return an error of code in a worker, which may not end it: the process ignores Ctrl-C."""
+    """Convert an error of code in a worker, where KeyboardInterrupt cannot come from Ctrl-C."""
     return RemoteError.of(exit_error(error, where) if isinstance(error, KeyboardInterrupt) else error, where)
 
 
 def _exceeds_memory(pid: int, memory_gb: float) -> bool:
-    """Return whether a process, or one that it forked, uses more than ``memory_gb`` GiB."""
+    """Return whether a process or one of its forks uses more than ``memory_gb`` GiB."""
     if memory_gb == math.inf:
         return False
     try:
         process = psutil.Process(pid)
-        return any(one.memory_info().rss > memory_gb * 2**30 for one in [process, *process.children(recursive=True)])
+        return any(
+            member.memory_info().rss > memory_gb * 2**30 for member in [process, *process.children(recursive=True)]
+        )
     except psutil.Error:
         return False  # it has just ended
 
 
 def _kill_tree(process: subprocess.Popen[bytes]) -> None:
-    """Kill a process and what it forked, which must not go on writing files, and wait for its end."""
+    """Kill a process and its forks, which must not continue to write files, and wait for its end."""
     if process.poll() is not None:
-        return  # another process may have its id by now
+        return  # another process may have this id by now
     with suppress(psutil.Error):
         for forked in psutil.Process(process.pid).children(recursive=True):
             forked.kill()
@@ -226,22 +231,22 @@ def _kill_tree(process: subprocess.Popen[bytes]) -> None:
 
 
 def main(descriptor: int, parent: int) -> None:
-    """Run tasks of the pool in process ``parent`` until it closes the connection, a file descriptor."""
-    for number in (signal.SIGINT, signal.SIGTERM):  # a terminal or a batch system sends them to all processes
+    """Run tasks sent by process ``parent`` through the file descriptor, until the connection is closed."""
+    for number in (signal.SIGINT, signal.SIGTERM):  # terminals and batch systems send these signals to all processes
         signal.signal(number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     die_with_parent(parent)
     os.set_inheritable(descriptor, False)
     escape_log_lines()
     escape_tracebacks()
-    tqdm.set_lock(threading.RLock())  # its own is a semaphore of the system, which a killed process leaves behind
+    tqdm.set_lock(threading.RLock())  # the default lock is a system semaphore, which a killed process leaks
     with suppress(EOFError, OSError):
         _serve(Connection(descriptor))
     exit_immediately(0)
 
 
 def _serve(connection: Connection) -> None:
-    """Make the worker, then run tasks; answer each message with a result or a `RemoteError`."""
+    """Create the worker and run tasks; answer each message with a result or a `RemoteError`."""
     make_worker: Any = None
     worker: Any = None
 
@@ -277,5 +282,5 @@ def _answer(connection: Connection, function: Callable[[Any], Any]) -> None:
         connection.send(answer)
     except OSError:
         raise
-    except Exception as error:  # the result can't be pickled
+    except Exception as error:  # the result cannot be pickled
         connection.send(RemoteError.of(error, "a worker"))

@@ -1,15 +1,15 @@
-"""Run tasks in worker processes, within limits of time and memory, whichever of the processes dies.
+"""Run tasks in worker processes, with limits on time and memory; crashes of single processes are handled.
 
-What `WorkerPool` guarantees:
+`WorkerPool` guarantees:
 
-- Worker processes are started anew, not forked: a renderer, CUDA and locks held by threads do not survive a fork. The
-  user's main module is not run again.
-- Each process makes its worker once, before its first task, and again after a task that raised an error. An error of
-  making it is the task's error.
-- A process that crashes, or exceeds a limit, costs only its own task, which another process tries again once.
-- Tasks may be endless: they are taken as workers become free. Results come in the order of the tasks, or when they are
-  there.
-- Ctrl-C in the program stops the running tasks and starts no others; the processes print nothing.
+- Worker processes are spawned, not forked, since renderers, CUDA and locks of threads do not survive a fork. The user's
+  main module is not imported again.
+- Each process creates its worker before its first task, and again after a task that raised an error. An error of the
+  creation is raised as the error of the task.
+- A process that crashes or exceeds a limit affects only its own task, which another process retries once.
+- The iterable of tasks may be infinite: tasks are taken as workers become free. Results are in task order, or in order
+  of completion.
+- Ctrl-C stops the running tasks and starts no others; the worker processes print nothing.
 - The processes end when the program ends, even by ``kill -9``, and so do their forks that call `die_with_parent`.
 """
 
@@ -34,14 +34,14 @@ from robocas_ms3.core.worker_process import NO_LIMITS, Limits, ProcessCrashError
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-_POLL_SECONDS = 0.2  # between two checks of signals
-_TASKS_PER_WORKER = 2  # running and queued, so that no worker waits for its next task
-_RESULTS_PER_WORKER = 8  # that wait for that of an earlier task
+_POLL_SECONDS = 0.2  # interval of the checks for signals
+_TASKS_PER_WORKER = 2  # running or queued, so that no worker has to wait
+_RESULTS_PER_WORKER = 8  # finished, but waiting for the result of an earlier task
 _log = logging.getLogger(__name__)
 
 
 class FunctionWorker(Generic[Task, Result]):
-    """A worker that calls a function."""
+    """A worker that calls a function for each task."""
 
     def __init__(self, function: Callable[[Task], Result]) -> None:
         self.run = function
@@ -51,17 +51,16 @@ class FunctionWorker(Generic[Task, Result]):
 
 
 class WorkerPool(Generic[Task, Result]):
-    """Worker processes that run tasks; a context manager, which ends them.
+    """A pool of worker processes; a context manager that ends them.
 
     Args:
-        make_worker: is called in each process; sent by cloudpickle, so it may be of the main module. Tasks and results
-            are pickled.
-        num_workers: number of processes, of which each starts when it is needed; 0: tasks run in this process, without
-            limits.
-        limits: of each task.
-        retries: how often a task is tried again whose process crashed.
-        on_crash: gives the result of a task whose last process crashed, and the reason, or raises an error; default:
-            raises `WorkerCrashError`.
+        make_worker: creates the worker in each process. It is sent with cloudpickle, so it may be defined in the main
+            module. Tasks and results are pickled.
+        num_workers: number of processes, started on demand; 0: tasks run in this process, without limits.
+        limits: limits of each task.
+        retries: number of retries of a task whose process crashed.
+        on_crash: called with a task whose last process crashed and the reason; returns its result or raises an error.
+            Default: raise `WorkerCrashError`.
     """
 
     def __init__(
@@ -75,32 +74,32 @@ class WorkerPool(Generic[Task, Result]):
     ) -> None:
         self._make_worker, self._num_workers, self._limits = make_worker, num_workers, limits
         self._retries, self._on_crash = retries, on_crash or _raise_crash
-        self._worker: Worker[Task, Result] | None = None  # in this process
+        self._worker: Worker[Task, Result] | None = None  # the worker of this process
         self._jobs: SimpleQueue[_Job[Task, Result] | None] = SimpleQueue()
         self._threads: list[threading.Thread] = []  # each supervises one process
-        self._owner = 0  # process id of the threads' process: a fork has no threads
+        self._owner = 0  # process id: a fork of this process has no threads
         self._stop_reader: Any = None  # a Connection; readable once the pool is stopped
         self._stop_writer: Any = None
         self._stopped = False
 
     def map(self, tasks: Iterable[Task], *, ordered: bool = True) -> Generator[Result, None, None]:
-        """Run tasks, which are taken from the iterable as workers become free.
+        """Run tasks and yield their results; take tasks from the iterable as workers become free.
 
         Args:
-            tasks: may be endless.
-            ordered: whether results come in the order of the tasks, or each when it is there.
+            tasks: may be infinite.
+            ordered: whether to yield results in task order instead of in order of completion.
 
         Raises:
             WorkerStartError: no process can start.
             CancelledError: another thread stopped the pool.
-            Exception: whatever a task, making a worker or ``on_crash`` raises.
+            Exception: any error of a task, of ``make_worker`` or of ``on_crash``.
         """
         if self._num_workers == 0:
             return self._map_here(tasks)
         return self._map_in_processes(tasks, ordered)
 
     def run(self, task: Task) -> Result:
-        """Run one task and wait for it; raises as `map` does."""
+        """Run one task and return its result; errors as in `map`."""
         (result,) = self.map([task])
         return result
 
@@ -136,7 +135,7 @@ class WorkerPool(Generic[Task, Result]):
                 pending.remove(job)
                 if job.error is not None:
                     raise job.error
-                yield job.result  # pyright: ignore[reportReturnType]  (of a job that is done)
+                yield job.result  # pyright: ignore[reportReturnType]  (the job is done)
         finally:
             for job in pending:
                 job.cancelled = True
@@ -145,7 +144,7 @@ class WorkerPool(Generic[Task, Result]):
         if self._owner != os.getpid():
             self._owner, self._jobs = os.getpid(), SimpleQueue()
             self._stop_reader, self._stop_writer = Pipe(duplex=False)
-            # daemons: a pool that nobody closed does not keep the program from ending
+            # daemons: a pool that was not closed must not block the end of the program
             self._threads = [threading.Thread(target=self._supervise, daemon=True) for _ in range(self._num_workers)]
             for thread in self._threads:
                 thread.start()
@@ -154,8 +153,8 @@ class WorkerPool(Generic[Task, Result]):
     def _wait(self, finished: SimpleQueue[None]) -> None:
         """Wait until a job is done.
 
-        Not by `concurrent.futures`, whose locks stay held after a Ctrl-C at the wrong moment. In steps, since a signal
-        that another thread got wakes nobody here.
+        `concurrent.futures` is not used, since its locks can stay held after Ctrl-C. The wait has a timeout, since a
+        signal delivered to another thread does not wake this one.
         """
         while True:
             if self._stopped:
@@ -165,18 +164,18 @@ class WorkerPool(Generic[Task, Result]):
                 return
 
     def _supervise(self) -> None:
-        """Run jobs in one process; in a thread of its own."""
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # for the process, until it ignores Ctrl-C
+        """Run jobs in one worker process; each process has its own supervising thread."""
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited by the process, until it ignores Ctrl-C
         process: WorkerProcess[Task, Result] = WorkerProcess(self._make_worker, self._limits, self._stop_reader)
         while (job := self._jobs.get()) is not None and not self._stopped:
             if not job.cancelled:
                 try:
                     job.result = self._run_job(process, job.task)
-                except BaseException as error:  # noqa: BLE001  (it is raised where the result is waited for)
+                except BaseException as error:  # noqa: BLE001  (`map` raises it)
                     job.error = error
                 job.done = True
                 job.finished.put(None)
-        process.leave()
+        process.quit()
 
     def _run_job(self, process: WorkerProcess[Task, Result], task: Task) -> Result:
         reason = ""
@@ -189,11 +188,11 @@ class WorkerPool(Generic[Task, Result]):
             except ProcessCrashError as crash:
                 reason = str(crash.found)
                 if retries_left:
-                    _log.warning("%.80s: its worker process died (%s); it is tried again", task, reason)
+                    _log.warning("%.80s: the worker process crashed (%s); the task is retried", task, reason)
         return self._on_crash(task, reason)
 
     def stop(self) -> None:
-        """Kill the running tasks, and let the idle processes leave; does not wait for that."""
+        """Kill the running tasks and let idle processes exit; return without waiting for them."""
         self._stopped = True
         if self._owner == os.getpid():
             self._stop_writer.close()
@@ -222,7 +221,7 @@ class WorkerPool(Generic[Task, Result]):
 
 
 class _Job(Generic[Task, Result]):
-    """A task, its result, and a queue that says when it is done; the queue holds no results, which may be large."""
+    """A task, its result, and a queue that is notified when the task is done."""
 
     def __init__(self, task: Task, finished: SimpleQueue[None]) -> None:
         self.task, self.finished = task, finished
@@ -232,12 +231,12 @@ class _Job(Generic[Task, Result]):
 
 
 def use_one_torch_thread() -> None:
-    """Let torch use one thread: several threads of small operations wait for each other."""
+    """Limit torch to one thread, since threads slow down small operations."""
     import torch
 
     torch.set_num_threads(1)
 
 
 def _raise_crash(task: Any, reason: str) -> Any:
-    what, fix = "its worker process died", "Is memory short? Use fewer --jobs."
+    what, fix = "the worker process crashed", "If the memory is short, use fewer --jobs."
     raise WorkerCrashError(what, where=f"{task}"[:80], found=reason, fix=fix)

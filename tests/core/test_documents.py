@@ -121,7 +121,7 @@ def test_what_is_not_of_its_language_is_one_line(file, load, text):
 
 @pytest.mark.parametrize(
     ("text", "match"),
-    [("a: 1\na: 2", "'a' is given twice"), ("? [1]\n: 2", "unhashable key"), ("d: 2020-02-30", "day is out of range")],
+    [("a: 1\na: 2", "duplicate key 'a'"), ("? [1]\n: 2", "unhashable key"), ("d: 2020-02-30", "day is out of range")],
 )
 def test_yaml_that_can_be_built_in_no_way(file, text, match):
     with pytest.raises(DocumentError, match=match):

@@ -67,7 +67,7 @@ def test_a_name_of_several_packages_is_an_error(tmp_path, monkeypatch, caplog):
     numbers = registry()
     assert dict(numbers) == {"one": 1, "six": 6}  # both packages name the same object
     assert len(caplog.messages) == 1 and "ours, yours" in caplog.messages[0]
-    with pytest.raises(ExtensionError, match="several packages have a number of this name"):
+    with pytest.raises(ExtensionError, match="several packages define a number with this name"):
         numbers.find("seven")
 
 
@@ -80,5 +80,5 @@ def test_the_error_of_an_unknown_name_suggests_the_nearest_one():
 def test_objects_by_import_path():
     assert load_object("robocas_ms3.core.extensions:load") is load_object
     for path in ("robocas_ms3.core.extensions:nothing", "robocas_ms3.nothing:load", "robocas_ms3.core.extensions"):
-        with pytest.raises(ExtensionError, match=f"{path}: no such object .expected package.module:name"):
+        with pytest.raises(ExtensionError, match=f"{path}: cannot import this object .expected package.module:name"):
             load_object(path)

@@ -55,7 +55,7 @@ def test_damaged_lines_are_told_from_one_that_was_cut_off(ledger):
         (7, None, True),
     ]
     error = ledger.line_error(lines[1], DatasetError, "no try")
-    assert str(error) == (f"{ledger.path}:3: no try: wrong value for 'seed' (expected a whole number, found '1')")
+    assert str(error) == (f"{ledger.path}:3: no try: invalid value for 'seed' (expected a whole number, found '1')")
     ledger.append([Try(3)])
     assert [line.number for line in ledger.lines() if line.record is None] == [3, 4, 5]
     assert ledger.read() == [Try(1), Try(2), Try(3)]
@@ -67,7 +67,7 @@ def test_a_number_that_is_not_finite_damages_its_line(tmp_path, number):
     ledger.path.write_text(f'{{"seed": 1, "seconds": {number}}}\n{{"seed": 2}}\n{{"seed": 3, "more": [{number}]}}\n')
     assert [line.record for line in ledger.lines()] == [None, Try(2), None]
     error = str(ledger.line_error(ledger.lines()[2], DatasetError, "no try"))
-    assert error.startswith(f"{ledger.path}:3: no try: this is not valid JSON (found ")
+    assert error.startswith(f"{ledger.path}:3: no try: invalid JSON (found ")
     with pytest.raises(RobocasError):
         ledger.append([Try(4, float("nan"))])
     assert len(ledger.lines()) == 3

@@ -12,7 +12,7 @@ from robocas_ms3.core.files import atomic_folder
 from robocas_ms3.core.locks import locked_folder
 from robocas_ms3.core.output_folder import FolderKind, OutputFolder, check_replaceable, remove_leftovers
 
-KIND = FolderKind("robocas test", ("run.json",), "rate", marks=("old_format",))
+KIND = FolderKind("robocas test", ("run.json",), "rate", markers=("old_format",))
 SETTINGS = {"rate": 5, "camera": {"size": [640, 480], "depth": True}}
 
 
@@ -183,9 +183,9 @@ def test_output_written_in_one_go(tmp_path):
     for overwrite in (None, False):
         with pytest.raises(OutputExistsError):
             check_replaceable(out, overwrite=overwrite)
-    check_replaceable(out, overwrite=True, marks=("index.html", "index.js"))
+    check_replaceable(out, overwrite=True, markers=("index.html", "index.js"))
     with pytest.raises(OutputExistsError):
-        check_replaceable(out, overwrite=True, marks=("pack.json",))
+        check_replaceable(out, overwrite=True, markers=("pack.json",))
 
 
 def test_leftovers_are_removed_and_links_are_not_followed(tmp_path):

@@ -68,30 +68,30 @@ def test_what_fits_is_read_as_yaml_has_it():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"name": "A"}, "wrong value for 'name' (expected a string like ^[a-z]+$, found 'A')"),
-        ({"name": 1, "boards": "2"}, "wrong value for 'name' (expected a string, found 1). 1 more after this one."),
+        ({"name": "A"}, "invalid value for 'name' (expected a string like ^[a-z]+$, found 'A')"),
+        ({"name": 1, "boards": "2"}, "invalid value for 'name' (expected a string, found 1). 1 more error."),
         ({"boards": 3}, "boards: an even number (found 3)"),
         (
             {"boards": 3, "bords": 2},
             "unknown key 'bords' (expected one of ['boards', 'name', 'names', 'things'], found 'bords'). "
-            "Did you mean boards? 1 more after this one.",
+            "Did you mean boards? 1 more error.",
         ),
-        ({"names": {"x y": 1}}, "wrong value for 'names.x y' (expected a string like ^[a-z]+$, found 'x y')"),
+        ({"names": {"x y": 1}}, "invalid value for 'names.x y' (expected a string like ^[a-z]+$, found 'x y')"),
         (
             {"names": {"two\nlines": 1}},
-            "wrong value for 'names.two lines' (expected a string like ^[a-z]+$, found 'two\\nlines')",
+            "invalid value for 'names.two lines' (expected a string like ^[a-z]+$, found 'two\\nlines')",
         ),
         (
             {"things": [{"kind": "ball", "radius": 0}]},
-            "wrong value for 'things.0.radius' (expected greater than 0, found 0)",
+            "invalid value for 'things.0.radius' (expected greater than 0, found 0)",
         ),
         (
             {"things": [{"kind": "ball", "radius": float("inf")}]},
-            "wrong value for 'things.0.radius' (expected a finite number, found inf)",
+            "invalid value for 'things.0.radius' (expected a finite number, found inf)",
         ),
         (
             {"things": [{"kind": "bal"}]},
-            "wrong value for 'things.0.kind' (expected one of ['ball', 'crate'], found 'bal'). Did you mean ball?",
+            "invalid value for 'things.0.kind' (expected one of ['ball', 'crate'], found 'bal'). Did you mean ball?",
         ),
     ],
 )
@@ -100,12 +100,12 @@ def test_mistakes(changes, message):
 
 
 def test_what_json_has_no_word_for_is_a_mistake_at_its_key():
-    assert said(boards={1, 2}) == "wrong value for 'boards' (expected a whole number, found {'set': '{1, 2}'})"
+    assert said(boards={1, 2}) == "invalid value for 'boards' (expected a whole number, found {'set': '{1, 2}'})"
     assert "has no place in this file" in said(names={(1, 2): 3})
 
 
 def test_json_itself():
-    with pytest.raises(AssetError, match=r"^f: this is not valid JSON .found EOF while parsing"):
+    with pytest.raises(AssetError, match=r"^f: invalid JSON .found EOF while parsing"):
         parse_json(Shelf, '{"name": ', AssetError, where="f")
     assert parse_json(Shelf, b'{"name": "a"}', AssetError, where="f").boards == 2
 
@@ -118,9 +118,7 @@ def test_other_words_and_other_forms():
     assert (first.key, first.expected, first.found, first.value) == ("a.radius", "metres", "'x'", "x")
     assert (second.key, second.kind) == ("b", "model_type")
     made = error_from_validation(caught.value, form, AssetError, where="f", fix="Make it again.")
-    assert str(made) == (
-        "f: wrong value for 'a.radius' (expected a number, found 'x'). 1 more after this one. Make it again."
-    )
+    assert str(made) == ("f: invalid value for 'a.radius' (expected a number, found 'x'). 1 more error. Make it again.")
 
 
 def test_the_nearest_words():

@@ -123,7 +123,7 @@ def test_a_process_is_ended_while_another_thread_launches_it(monkeypatch):  # as
         def __exit__(self, *_):
             self.close()
             pids.append(process.pid)
-            process.leave()
+            process.quit()
 
     def pipe():
         ours, theirs = connections()

@@ -190,7 +190,7 @@ def test_a_crash_in_a_pool_of_the_task_is_an_error_of_the_task(tmp_path):
 
 @pytest.mark.parametrize(
     ("task", "limits", "reason"),
-    [("hang", Limits(seconds=1.2), "too slow"), ("grow", Limits(memory_gb=0.3), "too much memory")],
+    [("hang", Limits(seconds=1.2), "time limit exceeded"), ("grow", Limits(memory_gb=0.3), "memory limit exceeded")],
 )
 def test_a_task_that_exceeds_a_limit_is_tried_again_once(tmp_path, caplog, task, limits, reason):
     def crashed(task, reason):
@@ -274,7 +274,7 @@ def test_a_process_that_is_too_large_before_its_first_task_blames_no_task():
     with WorkerPool(TooLarge, 1, limits=Limits(memory_gb=0.2), on_crash=lambda task, reason: (task, 0, 0)) as pool:
         with pytest.raises(WorkerStartError) as caught:
             pool.run("a")
-        assert caught.value.found == "too much memory"
+        assert caught.value.found == "memory limit exceeded"
 
 
 PROGRAM = """

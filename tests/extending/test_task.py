@@ -117,7 +117,7 @@ except ConfigError as error:
     print(error)
 """,
     )
-    assert "wrong value for 'task'" in said
+    assert "invalid value for 'task'" in said
     assert said.strip().endswith("Did you mean push_zone?")
 
 

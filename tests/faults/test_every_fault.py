@@ -310,7 +310,7 @@ def test_two_runs_into_one_folder(command, undisturbed, tmp_path, row):
         wait_until(lambda: begun(log), process)
         code, said = run(command.line(out, 2))
         assert code == 1
-        assert is_one_line(said) and "another process is writing here" in said, said[-2000:]
+        assert is_one_line(said) and "another process writes to this folder" in said, said[-2000:]
         assert process.wait(PATIENCE) == 0
     row.judge(undisturbed(command)[0], content(command, out))
 

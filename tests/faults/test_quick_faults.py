@@ -53,7 +53,7 @@ def test_a_generation_gives_a_seed_up_that_hangs_twice(befalls, tmp_path):
     given_up = []
     settings = GenerateSettings(EpisodeSettings("pick"), tmp_path / "out", episodes=3, episode_seconds=2)
     summary = generate(settings, on_result=lambda result: given_up.extend(result.failures))
-    assert [(one.seed, one.stage, one.reason) for one in given_up] == [(1, "worker", "too slow")]
+    assert [(one.seed, one.stage, one.reason) for one in given_up] == [(1, "worker", "time limit exceeded")]
     assert (summary.episodes, summary.skipped) == (3, [1])
     episodes = json.loads((tmp_path / "out" / "trajectory.json").read_text())["episodes"]
     assert [one["episode_seed"] for one in episodes] == [0, 2, 3]  # another in its place, the others as they were

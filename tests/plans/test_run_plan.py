@@ -123,9 +123,9 @@ def test_a_process_that_dies_once_costs_nothing(undisturbed, tmp_path):
     assert_same(undisturbed, out)
     assert deaths_of(out) == [
         (10, "record: SIGSEGV"),
-        (12, "record: too much memory"),
+        (12, "record: memory limit exceeded"),
         (13, "record: ValueError: a bug of two lines"),
-        (3, "record: too slow"),
+        (3, "record: time limit exceeded"),
     ]
 
 

@@ -37,7 +37,7 @@ def add_versions(record: dict[str, Any]) -> dict[str, Any]:
     return record if is_whole else {**record, "made_with": now}
 
 
-DATASET = FolderKind("robocas convert", (schema.CONVERSION_FILE,), "rate_hz", marks=MARKS, upgrade=add_versions)
+DATASET = FolderKind("robocas convert", (schema.CONVERSION_FILE,), "rate_hz", markers=MARKS, upgrade=add_versions)
 
 
 def dataset_settings(rate_hz: float, image_options: ImageOptions, embeddings: bool) -> dict[str, Any]:

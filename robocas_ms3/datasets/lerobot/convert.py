@@ -43,7 +43,7 @@ _OUTPUT = FolderKind(
     "robocas convert --to lerobot",
     (f"{_PARTS}/plan.json", CONVERSION_FILE),
     "settings",
-    marks=(INFO_FILE, _PARTS),
+    markers=(INFO_FILE, _PARTS),
     upgrade=add_versions,
 )
 _FOLDERS = (*CONTENT, STAGING, "meta")  # meta comes last: where it is, the dataset is whole

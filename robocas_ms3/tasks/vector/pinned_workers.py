@@ -139,5 +139,5 @@ def _end(processes: list[WorkerProcess[Any, Any]], busy: set[int], ended: thread
         elif process.connection is not None:
             process.connection.close()
     for process in processes:
-        process.leave()
+        process.quit()
     ended.set()

@@ -251,7 +251,7 @@ def test_what_would_be_numbered_alike_is_refused(trajectory, tmp_path, monkeypat
     run(trajectory, out, embeddings=True)
 
     def meanwhile(file, chosen):
-        with pytest.raises(RobocasError, match="another process is writing here"):
+        with pytest.raises(RobocasError, match="another process writes to this folder"):
             run(other, out, append=True, embeddings=True)
         return made_up_vectors(file, chosen)
 

@@ -202,7 +202,7 @@ def test_the_output(parts, tmp_path):
         with pytest.raises(OutputExistsError):
             merge([a, b], tmp_path / "mine", options=CopyOptions(overwrite=overwrite))
     assert (tmp_path / "mine" / "thesis.tex").exists()
-    with locked_folder(tmp_path / "locked"), pytest.raises(RobocasError, match="another process is writing here"):
+    with locked_folder(tmp_path / "locked"), pytest.raises(RobocasError, match="another process writes to this folder"):
         merge([a], tmp_path / "locked")
 
 

@@ -132,7 +132,7 @@ def test_outcomes_are_written_once_per_episode(make, tmp_path):
 def test_the_folder_of_a_result_is_locked_until_the_environment_is_closed(make, tmp_path):
     first = make(1, out=tmp_path / "result")
     for refused in (lambda: make(1, out=tmp_path / "result"), locked_folder(tmp_path / "result").__enter__):
-        with pytest.raises(RobocasError, match="another process is writing here"):
+        with pytest.raises(RobocasError, match="another process writes to this folder"):
             refused()
     first.close()
     make(1, out=tmp_path / "result").reset(seed=0)

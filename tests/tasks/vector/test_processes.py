@@ -141,7 +141,7 @@ def test_a_process_that_is_killed_between_two_steps_is_not_replaced():
 
 @slow
 @pytest.mark.parametrize(
-    ("limits", "found"), [(Limits(seconds=5), "too slow"), (Limits(memory_gb=0.3), "too much memory")]
+    ("limits", "found"), [(Limits(seconds=5), "time limit exceeded"), (Limits(memory_gb=0.3), "memory limit exceeded")]
 )
 def test_a_process_that_exceeds_a_limit_is_ended(limits, found):
     raises = pytest.raises(VectorEnvCrashError, match="env 0")
