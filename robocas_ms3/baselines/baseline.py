@@ -37,7 +37,7 @@ class Progress:
     step: Callable[[int, int], None] = lambda done, total: None
 
 
-def no_episodes(path: Path, split: Split) -> EmptySplitError:
+def empty_split_error(path: Path, split: Split) -> EmptySplitError:
     """Return the error of a split without episodes."""
     fix = "Add episodes: a tenth of them validates."
     return EmptySplitError("this split holds no episodes", where=path, expected=f"some in {split}", fix=fix)
@@ -61,8 +61,8 @@ class TrainSettings(StrictModel):
         seed: of all random numbers.
         precision: of the forward pass. auto: bf16 on processors and GPUs that multiply it fast, else fp32.
         workers: processes that read samples; 0: none besides this one.
-        log_every, check_every, save_every: steps between lines of the log, validations and checkpoints.
-        check_samples: most samples of the validation split, the same ones each time.
+        log_every, validate_every, save_every: steps between lines of the log, validations and checkpoints.
+        validation_samples: most samples of the validation split, the same ones each time.
     """
 
     steps: int = Field(default=20_000, ge=1, le=10**9)
@@ -81,9 +81,9 @@ class TrainSettings(StrictModel):
     precision: Precision = "auto"
     workers: int = Field(default=0, ge=0, le=1024)
     log_every: int = Field(default=50, ge=1)
-    check_every: int = Field(default=1000, ge=1)
+    validate_every: int = Field(default=1000, ge=1)
     save_every: int = Field(default=500, ge=1)
-    check_samples: int = Field(default=2048, ge=1, le=10**9)
+    validation_samples: int = Field(default=2048, ge=1, le=10**9)
 
 
 class BaselineConfig(StrictModel):

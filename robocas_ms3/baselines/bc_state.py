@@ -1,4 +1,4 @@
-"""`bc-state`: chunks of poses from the privileged state of the simulator, an upper bound without vision."""
+"""`bc-state`: behaviour cloning of action chunks from the privileged state of the simulator, without images."""
 
 from __future__ import annotations
 
@@ -14,9 +14,26 @@ from numpy.typing import NDArray
 from pydantic import Field
 from torch import nn
 
-from robocas_ms3.baselines.baseline import Baseline, BaselineConfig, Batch, OnRead, Split, TrainSettings, no_episodes
-from robocas_ms3.baselines.chunks import ROW, ChunkPolicy, Scale, chunk_losses, encode, next_keys, spread, state_of
-from robocas_ms3.baselines.dataset_checks import check_base_stands
+from robocas_ms3.baselines.baseline import (
+    Baseline,
+    BaselineConfig,
+    Batch,
+    OnRead,
+    Split,
+    TrainSettings,
+    empty_split_error,
+)
+from robocas_ms3.baselines.chunks import (
+    ROW,
+    ChunkPolicy,
+    Scale,
+    chunk_losses,
+    encode_chunks,
+    encode_proprioception,
+    next_key_poses,
+    scale_statistics,
+)
+from robocas_ms3.baselines.dataset_checks import check_base_is_fixed
 from robocas_ms3.baselines.training.record import hash_dataset
 from robocas_ms3.core.documents import DAMAGED_FILE_ERRORS
 from robocas_ms3.core.errors import DatasetError, EvaluationError
@@ -32,22 +49,22 @@ from robocas_ms3.robots.quantities import GRIPPER_WIDTH
 
 _CACHE_VERSION = 3
 _PACKAGES = ("robocas-ms3", "mani_skill", "sapien")
-_MIN_DEVIATION = 1e-2  # of an input: a quantity that hardly changes must not be blown up
+_MIN_DEVIATION = 1e-2  # smallest deviation of an input: nearly constant inputs must not be scaled up
 
 
 class BcStateConfig(BaselineConfig):
     """Configuration of `bc-state`.
 
     Attributes:
-        rate_hz: steps per second.
-        chunk: number of predicted steps.
-        width: of the layers.
-        blocks: residual blocks of two layers each.
-        dropout: within the blocks.
-        noise: deviation of the noise on the inputs in training, in deviations of the inputs.
-        keys_weight, gripper_weight, near: see `SmallConfig`.
-        play: steps of a chunk before the next one is predicted.
-        fade: decay of the weight of older predictions, see `ChunkPolicy`.
+        rate_hz: policy steps per second.
+        chunk: number of predicted policy steps.
+        width: size of the hidden layers.
+        blocks: number of residual blocks, of two layers each.
+        dropout: dropout rate in the blocks.
+        noise: standard deviation of the input noise in training, in standard deviations of the inputs.
+        keys_weight, gripper_weight, near_distance: see `SmallConfig`.
+        n_action_steps: steps of a chunk before the next one is predicted.
+        temporal_ensemble_coeff: decay of the weight of older predictions, see `ChunkPolicy`.
         train: see `TrainSettings`.
     """
 
@@ -59,39 +76,39 @@ class BcStateConfig(BaselineConfig):
     noise: float = Field(default=0.02, ge=0)
     keys_weight: float = Field(default=0.5, ge=0)
     gripper_weight: float = Field(default=0.5, ge=0)
-    near: float = Field(default=0.0, ge=0)
-    play: int = Field(default=1, ge=1, le=1000)
-    fade: float = Field(default=0.5, ge=0)
+    near_distance: float = Field(default=0.0, ge=0)
+    n_action_steps: int = Field(default=1, ge=1, le=1000)
+    temporal_ensemble_coeff: float = Field(default=0.5, ge=0)
     train: TrainSettings = TrainSettings(
         steps=20_000, batch_size=256, learning_rate=1e-3, weight_decay=0.01, precision="fp32"
     )
 
 
 class StateSamples:
-    """Samples of `bc-state`: a batch has ``inputs`` (B, D), ``chunk`` (B, K, 10) and ``key`` (B, 9)."""
+    """Training samples of `bc-state`: batches of ``inputs`` (B, D), ``chunk`` (B, K, 10) and ``key`` (B, 9)."""
 
     def __init__(self, config: BcStateConfig, path: Path, split: Split, on_read: OnRead) -> None:
         arrays = load_states(path, config.rate_hz, on_read)
-        sides = split_by_seed(dict(enumerate(arrays["seeds"].tolist())))
-        numbers = sides[0 if split == "train" else 1]
+        train, val = split_by_seed(dict(enumerate(arrays["seeds"].tolist())))
+        numbers = train if split == "train" else val
         self.episodes = len(numbers)
         if not numbers:
-            raise no_episodes(path, split)
+            raise empty_split_error(path, split)
         ends = np.cumsum(arrays["lengths"])
         rows = [slice(int(ends[number] - arrays["lengths"][number]), int(ends[number])) for number in numbers]
         poses, opened = arrays["poses"], arrays["opened"]
-        self._chunks = _concatenate([encode(poses[row], opened[row], config.chunk) for row in rows])
-        self._keys = _concatenate([next_keys(poses[row], opened[row]) for row in rows])
+        self._chunks = _concatenate([encode_chunks(poses[row], opened[row], config.chunk) for row in rows])
+        self._keys = _concatenate([next_key_poses(poses[row], opened[row]) for row in rows])
         self._inputs = _concatenate(
-            [inputs_of(arrays["state"][row], poses[row], arrays["widths"][row]) for row in rows]
+            [make_inputs(arrays["state"][row], poses[row], arrays["widths"][row]) for row in rows]
         )
         values = self._inputs.numpy()
         deviation = np.maximum(values.std(0), _MIN_DEVIATION)
         self.facts: dict[str, Any] = {
             "rate_hz": config.rate_hz,
             "inputs": {"mean": values.mean(0).tolist(), "deviation": deviation.tolist()},
-            "chunk": spread(self._chunks[..., :9].numpy()),
-            "keys": spread(self._keys.numpy()),
+            "chunk": scale_statistics(self._chunks[..., :9].numpy()),
+            "keys": scale_statistics(self._keys.numpy()),
         }
 
     def __len__(self) -> int:
@@ -102,11 +119,11 @@ class StateSamples:
         return {"inputs": self._inputs[rows], "chunk": self._chunks[rows], "key": self._keys[rows]}
 
 
-def inputs_of(
+def make_inputs(
     state: NDArray[np.floating], poses: NDArray[np.floating], widths: NDArray[np.floating]
 ) -> NDArray[np.float32]:
-    """Return the inputs (N, D + 10) of the network: privileged state (N, D) and proprioception, see `state_of`."""
-    return np.concatenate([state, state_of(poses, widths)], axis=1).astype(np.float32)
+    """Return inputs (N, D + 10): privileged state (N, D) and proprioception of TCP poses and gripper widths."""
+    return np.concatenate([state, encode_proprioception(poses, widths)], axis=1).astype(np.float32)
 
 
 def _concatenate(parts: list[NDArray[np.float32]]) -> torch.Tensor:
@@ -114,10 +131,10 @@ def _concatenate(parts: list[NDArray[np.float32]]) -> torch.Tensor:
 
 
 def load_states(path: Path, rate_hz: float, on_read: OnRead) -> dict[str, NDArray[Any]]:
-    """Return the arrays of `read_states`, which take minutes for a thousand episodes and are therefore cached."""
+    """Return the arrays of `read_states`, from a cache if possible: reading 1000 episodes takes minutes."""
     if path.is_dir() or path.suffix != ".h5":
-        fix = "Name the trajectory.h5 of robocas generate."
-        raise DatasetError("bc-state learns from recorded states", where=path, expected="a trajectory.h5", fix=fix)
+        fix = "Pass the trajectory.h5 of `robocas generate`."
+        raise DatasetError("bc-state trains on recorded states", where=path, expected="a trajectory.h5", fix=fix)
     cached = _cache_path(path, rate_hz)
     if cached.is_file():
         with suppress(*DAMAGED_FILE_ERRORS), np.load(cached) as arrays:
@@ -129,20 +146,20 @@ def load_states(path: Path, rate_hz: float, on_read: OnRead) -> dict[str, NDArra
 
 
 def _cache_path(path: Path, rate_hz: float) -> Path:
-    digest = hashlib.sha256(f"{_CACHE_VERSION} {rate_hz!r}\n".encode())
+    digest = hashlib.sha256(f"{_CACHE_VERSION} {rate_hz!r}\n".encode_chunks())
     for file in (path, path.with_suffix(".json")):
-        digest.update(f"{hash_dataset(file) if file.is_file() else None}\n".encode())
+        digest.update(f"{hash_dataset(file) if file.is_file() else None}\n".encode_chunks())
     for package in _PACKAGES:
-        digest.update(f"{package} {version(package)}\n".encode())
+        digest.update(f"{package} {version(package)}\n".encode_chunks())
     return cache_dir() / "bc-state" / f"{digest.hexdigest()[:32]}.npz"
 
 
 def read_states(path: Path, rate_hz: float, on_read: OnRead) -> dict[str, NDArray[Any]]:
-    """Return the privileged state at each step of the successful episodes, from their environment.
+    """Restore each step of the successful episodes in their environment and read its privileged state.
 
     Returns:
-        ``state`` (N, D), ``poses`` (N, 4, 4), ``opened`` (N,), ``widths`` (N,) of all steps; ``lengths``, ``seeds``
-        by episode.
+        Per step: ``state`` (N, D), ``poses`` (N, 4, 4) of the TCP in the arm's base frame, ``opened`` (N,) gripper
+        commands, ``widths`` (N,) m. Per episode: ``lengths``, ``seeds``.
     """
     parts: dict[str, list[NDArray[Any]]] = {name: [] for name in ("state", "poses", "opened", "widths")}
     lengths, seeds, env = [], [], None
@@ -157,14 +174,14 @@ def read_states(path: Path, rate_hz: float, on_read: OnRead) -> dict[str, NDArra
                 where = f"{path}, episode {recording.episode_id}"
                 samples = sample_states(recording.control_steps, stride)
                 motion = recording.motion(samples)
-                check_base_stands(np.diff(motion.qpos[:, RobotDescription.base_slice], axis=0), where)
+                check_base_is_fixed(np.diff(motion.qpos[:, RobotDescription.base_slice], axis=0), where)
                 if env is None:
                     env = file.env.make(obs_mode="state_dict", render_backend="none", reward_mode="none")
                 env.reset(seed=recording.seed, options=dict(recording.reset_options))
                 rows = [_privileged_state(env.unwrapped, recording.state(int(sample))) for sample in samples]
                 if parts["state"] and parts["state"][0].shape[1] != len(rows[0]):
                     expected = parts["state"][0].shape[1]
-                    what = "another number of objects in this scene"
+                    what = "the number of objects differs between scenes"
                     raise DatasetError(what, where=where, expected=expected, found=len(rows[0]))
                 parts["state"].append(np.stack(rows))
                 parts["poses"].append(motion.tcp_in_base)
@@ -180,7 +197,9 @@ def read_states(path: Path, rate_hz: float, on_read: OnRead) -> dict[str, NDArra
     arrays = {name: np.concatenate(part) for name, part in parts.items()}
     for name, array in arrays.items():
         if array.dtype.kind == "f" and not np.isfinite(array).all():
-            raise DatasetError("NaN or infinite value", where=f"{path}, {name}", fix="robocas validate says more.")
+            raise DatasetError(
+                "NaN or infinite value", where=f"{path}, {name}", fix="Run `robocas validate` for details."
+            )
     return {**arrays, "lengths": np.array(lengths), "seeds": np.array(seeds)}
 
 
@@ -190,7 +209,7 @@ def _privileged_state(env: Any, state: dict[str, dict[str, NDArray[np.float32]]]
 
 
 class BcStateModel(nn.Module):
-    """Residual layers from the privileged state to a chunk and the next key pose."""
+    """Residual MLP that predicts a chunk and the next key pose from the privileged state."""
 
     def __init__(self, config: BcStateConfig, facts: dict[str, Any]) -> None:
         super().__init__()
@@ -211,7 +230,7 @@ class BcStateModel(nn.Module):
         self.out = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, config.chunk * ROW + 9))
 
     def predict(self, inputs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return normalised chunks (B, K, 10) with logits of the commands, and normalised key poses (B, 9)."""
+        """Return normalised chunks (B, K, 10) with logits of the gripper commands, and normalised key poses (B, 9)."""
         scaled = self.input_scale(inputs).clamp(-5, 5)
         if self.training and self.config.noise:
             scaled = scaled + self.config.noise * torch.randn_like(scaled)
@@ -225,9 +244,9 @@ class BcStateModel(nn.Module):
         return chunk_losses(self, batch, *self.predict(batch["inputs"]))
 
     def act(self, inputs: torch.Tensor) -> torch.Tensor:
-        """Return chunks (B, K, 10): poses, and probabilities that the gripper opens."""
+        """Return chunks (B, K, 10): poses and probabilities of the command to open the gripper."""
         chunk, _ = self.predict(inputs)
-        return torch.cat([self.chunk_scale.back(chunk[..., :9]), chunk[..., 9:].sigmoid()], dim=-1)
+        return torch.cat([self.chunk_scale.inverse(chunk[..., :9]), chunk[..., 9:].sigmoid()], dim=-1)
 
 
 def make_policy(config: BcStateConfig, facts: dict[str, Any], model: BcStateModel) -> ChunkPolicy:
@@ -236,17 +255,17 @@ def make_policy(config: BcStateConfig, facts: dict[str, Any], model: BcStateMode
     def predict(seen: Observations, row: int) -> NDArray[np.floating]:
         assert seen.state is not None
         one = slice(row, row + 1)
-        inputs = inputs_of(
+        inputs = make_inputs(
             seen.state[one], from_wxyz(seen.tcp_in_base[one]), seen.robot[GRIPPER_WIDTH].reshape(-1)[one]
         )
         if inputs.shape[1] != size:
-            what, fix = "the policy was trained in other scenes", "Evaluate it in the task and scenes of its data."
+            what, fix = "wrong size of privileged state", "Evaluate in the task and configuration of the training data."
             raise EvaluationError(what, where="bc-state", expected=f"{size} numbers", found=inputs.shape[1], fix=fix)
         with torch.inference_mode():
             return model.act(torch.from_numpy(inputs).to(device))[0].cpu().numpy()
 
     spec = PolicySpec("robocas", reference="tcp", rate_hz=facts["rate_hz"], state=True, language="none")
-    return ChunkPolicy(spec, predict, min(config.play, config.chunk), config.fade)
+    return ChunkPolicy(spec, predict, min(config.n_action_steps, config.chunk), config.temporal_ensemble_coeff)
 
 
 BASELINE = Baseline("bc-state", 1, BcStateConfig, BcStateModel, make_policy, StateSamples)

@@ -7,7 +7,7 @@ from collections.abc import Collection
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.baselines.baseline import Split, no_episodes
+from robocas_ms3.baselines.baseline import Split, empty_split_error
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.manage.repairs import eef_turn
 from robocas_ms3.datasets.sources.episode_source import EpisodeSource
@@ -41,15 +41,15 @@ def check_dataset(
         raise DatasetError("the dataset has another rate", where=source.root, expected=expected, found=found, fix=fix)
     numbers = source.split(split)
     if not numbers:
-        raise no_episodes(source.root, split)
+        raise empty_split_error(source.root, split)
     check_tcp_frame(source, numbers[0])
     for number in numbers:
         motion = source.episode(number).read(["rel_agv_pose"])["rel_agv_pose"]
-        check_base_stands(motion, f"{source.root}, episode {number}")
+        check_base_is_fixed(motion, f"{source.root}, episode {number}")
     return numbers
 
 
-def check_base_stands(motion: NDArray[np.floating], where: object) -> None:
+def check_base_is_fixed(motion: NDArray[np.floating], where: object) -> None:
     """Check that a base stands, of motions (T, 3) in m, m and rad per step: actions of 7 numbers leave it out."""
     path = np.cumsum(motion, axis=0, dtype=np.float64)
     furthest = float(np.abs(np.concatenate([motion, path])).max(initial=0))

@@ -10,7 +10,15 @@ from hypothesis import strategies as st
 from made_up_observations import observe, start
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.baselines.chunks import ChunkPolicy, Scale, chunk_losses, decode, encode, next_keys, spread
+from robocas_ms3.baselines.chunks import (
+    ChunkPolicy,
+    Scale,
+    chunk_losses,
+    decode_chunk,
+    encode_chunks,
+    next_key_poses,
+    scale_statistics,
+)
 from robocas_ms3.evaluation.policy import PolicySpec
 
 
@@ -19,7 +27,7 @@ def test_a_chunk_by_hand():
     quarter = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]  # about z
     poses[0, :3, :3] = quarter
     poses[1, :3, 3] = poses[2, :3, 3] = 0, 0.5, 0.25
-    rows = encode(poses, [True, True, False], 3)
+    rows = encode_chunks(poses, [True, True, False], 3)
     # along y of the base is along x of a TCP that is turned by a quarter; its x axis then points along the base's y
     assert np.allclose(rows[0, 0], [0.5, 0, 0.25, 0, -1, 0, 1, 0, 0, 1])
     assert np.allclose(rows[0, 1, 9], 0)
@@ -34,7 +42,7 @@ def test_decoding_inverts_encoding(seed, length, steps):
     poses[:, :3, :3] = Rotation.random(length, random_state=seed).as_matrix()
     poses[:, :3, 3] = rng.normal(size=(length, 3))
     opened = rng.random(length) > 0.5
-    found, commands = decode(encode(poses, opened, steps), poses[:, None])
+    found, commands = decode_chunk(encode_chunks(poses, opened, steps), poses[:, None])
     for t in range(length):
         for k in range(steps):
             at = min(t + k + 1, length - 1)
@@ -44,7 +52,7 @@ def test_decoding_inverts_encoding(seed, length, steps):
 
 @given(st.integers(0, 10_000))
 def test_any_prediction_becomes_a_rotation(seed):
-    poses, _ = decode(np.random.default_rng(seed).normal(size=(4, 10)), np.eye(4))
+    poses, _ = decode_chunk(np.random.default_rng(seed).normal(size=(4, 10)), np.eye(4))
     assert np.allclose(poses[:, :3, :3] @ poses[:, :3, :3].swapaxes(1, 2), np.eye(3), atol=1e-6)
     assert np.allclose(np.linalg.det(poses[:, :3, :3]), 1)
 
@@ -53,21 +61,24 @@ def test_key_poses_are_where_the_gripper_moves_next():
     poses = np.tile(np.eye(4), (7, 1, 1))
     poses[:, 0, 3] = [0, 1, 2, 3, 4, 5, 6]
     # commanded to close between steps 2 and 3, to open between 4 and 5: it does so at 2 and 4; then the end
-    keys = next_keys(poses, [1, 1, 1, 0, 0, 1, 1])
+    keys = next_key_poses(poses, [1, 1, 1, 0, 0, 1, 1])
     assert keys[:, 0].tolist() == [2, 1, 0, 1, 0, 1, 0]
 
 
 def test_scale_and_back():
     motions = np.array([[[0.0] * 9], [[1.0] * 9]])  # two samples of one step: mean 0.5, deviation 0.5
-    scale = Scale(**spread(motions))
+    scale = Scale(**scale_statistics(motions))
     assert torch.allclose(scale(torch.ones(1, 9)), torch.ones(1, 9))
-    assert torch.allclose(scale.back(scale(torch.full((1, 9), 0.3))), torch.full((1, 9), 0.3))
-    assert min(spread(np.zeros((2, 1, 9)))["deviation"][0]) > 0
+    assert torch.allclose(scale.inverse(scale(torch.full((1, 9), 0.3))), torch.full((1, 9), 0.3))
+    assert min(scale_statistics(np.zeros((2, 1, 9)))["deviation"][0]) > 0
 
 
-def losses(near):
-    """Of two samples with one step: the first reaches 0.1 m, and is off by 0.3 m; the second 0.3 m, and is right."""
-    weights, one = SimpleNamespace(near=near, gripper_weight=0.5, keys_weight=2.0), Scale([0.0] * 9, [1.0] * 9)
+def losses(near_distance):
+    """Return the losses of two samples of one step: label at 0.1 m with an error of 0.3 m; label at 0.3 m, no error."""
+    weights, one = (
+        SimpleNamespace(near_distance=near_distance, gripper_weight=0.5, keys_weight=2.0),
+        Scale([0.0] * 9, [1.0] * 9),
+    )
     model = SimpleNamespace(config=weights, chunk_scale=one, key_scale=one)
     chunk, key = torch.zeros(2, 1, 10), torch.zeros(2, 9)
     chunk[0, 0, 0], chunk[1, 0, 0], key[:, 1] = 0.1, 0.3, 0.04
@@ -77,7 +88,7 @@ def losses(near):
 
 
 def test_losses_by_hand():
-    found = losses(near=0.0)
+    found = losses(near_distance=0.0)
     assert found["motion"].item() == pytest.approx(0.3 / 9 / 2)
     assert found["gripper"].item() == pytest.approx(0.693147)  # even odds
     assert found["keys"].item() == pytest.approx(0.003)
@@ -85,7 +96,8 @@ def test_losses_by_hand():
     assert found["first_mm"].item() == found["last_mm"].item() == pytest.approx(150)
     assert found["near_mm"].tolist() == [2 * found["key_mm"].item(), 2.0]  # of both
     assert found["key_mm"].item() == pytest.approx(3 * 3**0.5)
-    assert losses(near=0.1)["motion"].item() == pytest.approx(0.3 / 9 * 2 / 3)  # with 0.1 m, weights are 1/2 and 1/4
+    weighted = losses(near_distance=0.1)["motion"].item()
+    assert weighted == pytest.approx(0.3 / 9 * 2 / 3)  # weights 1/2 and 1/4 with 0.1 m
 
 
 def row(x=0.0, opened=1.0):
@@ -95,10 +107,16 @@ def row(x=0.0, opened=1.0):
 HERE = [0.5, 0, 0.3, 1, 0, 0, 0]
 
 
-def policy(*chunks, play=1, fade=0.0, reopen=0.0):
+def policy(*chunks, n_action_steps=1, temporal_ensemble_coeff=0.0, reopen=0.0):
     """A policy of envs 0 and 1 that predicts given chunks, one after the other."""
     rest = iter(chunks)
-    made = ChunkPolicy(PolicySpec(), lambda observations, _: np.array(next(rest), float), play, fade, reopen)
+    made = ChunkPolicy(
+        PolicySpec(),
+        lambda observations, _: np.array(next(rest), float),
+        n_action_steps,
+        temporal_ensemble_coeff,
+        reopen,
+    )
     made.reset([start(0), start(1)])
     return made
 
@@ -126,7 +144,7 @@ def test_older_predictions_are_of_the_same_step_and_frame():
 
 
 def test_newer_predictions_weigh_more():
-    acting = policy([row(), row(0.0, 0.0)], [row(0.4, 1.0), row()], fade=np.log(3))  # 3 to 1
+    acting = policy([row(), row(0.0, 0.0)], [row(0.4, 1.0), row()], temporal_ensemble_coeff=np.log(3))  # 3 to 1
     act(acting)
     action = act(acting)[0]
     assert action[0] == pytest.approx(0.3)
@@ -135,7 +153,7 @@ def test_newer_predictions_weigh_more():
 
 def test_a_chunk_is_followed_before_the_next():
     """For two of three steps; then the mean of its third row and the first of the next."""
-    acting = policy([row(0.1), row(0.2), row(0.3)], [row(0.5), row(), row()], play=2)
+    acting = policy([row(0.1), row(0.2), row(0.3)], [row(0.5), row(), row()], n_action_steps=2)
     assert acting.spec.observe_every == 2
     assert [act(acting)[0, 0] for _ in range(3)] == pytest.approx([0.1, 0.2, 0.4])
 
@@ -146,7 +164,7 @@ def test_each_env_has_its_own_chunks():
     act(acting, envs=(0, 1))
     acting.reset([start(1)])
     assert act(acting, envs=(0, 1))[:, 0].tolist() == pytest.approx([0.3, 0.4])
-    acting = policy([row(0.1), row(0.2)], [row(0.3), row(0.4)], [row(0.5), row(0.6)], play=2)
+    acting = policy([row(0.1), row(0.2)], [row(0.3), row(0.4)], [row(0.5), row(0.6)], n_action_steps=2)
     assert act(acting, envs=(0, 1))[:, 0].tolist() == pytest.approx([0.1, 0.3])
     acting.reset([start(1)])
     assert act(acting, envs=(0, 1))[:, 0].tolist() == pytest.approx([0.2, 0.5])
@@ -165,7 +183,7 @@ CLOSED = [row(0.0, 0.0), row(0.0, 0.0)]
     ],
 )
 def test_the_reopen_heuristic(reopen, width, moved, opened):
-    acting = policy(CLOSED, CLOSED, fade=2.0, reopen=reopen)
+    acting = policy(CLOSED, CLOSED, temporal_ensemble_coeff=2.0, reopen=reopen)
     assert act(acting, width=width)[0, 6] == 0.0
     assert act(acting, [HERE[0] + moved, *HERE[1:]], width=width)[0, 6] == opened
 
@@ -178,7 +196,7 @@ def test_older_chunks_do_not_keep_an_empty_gripper_closed():
 
 
 def test_the_reopen_heuristic_forgets_where_another_episode_ended():
-    acting = policy(CLOSED, CLOSED, fade=2.0, reopen=0.02)
+    acting = policy(CLOSED, CLOSED, temporal_ensemble_coeff=2.0, reopen=0.02)
     for _ in range(2):
         acting.reset([start(0)])
         assert act(acting)[0, 6] == 0.0

@@ -12,7 +12,7 @@ from synthetic import write_trajectory
 
 from robocas_ms3.baselines.bc_state import BASELINE as BC_STATE
 from robocas_ms3.baselines.bc_state import BcStateConfig
-from robocas_ms3.baselines.dataset_checks import check_base_stands, check_tcp_frame
+from robocas_ms3.baselines.dataset_checks import check_base_is_fixed, check_tcp_frame
 from robocas_ms3.baselines.rt1 import BASELINE as RT1
 from robocas_ms3.baselines.rt1.config import RT1Config
 from robocas_ms3.baselines.small import BASELINE as SMALL
@@ -78,8 +78,8 @@ def test_nan_is_found_before_the_first_step(name, key, folder, tmp_path):
 def test_a_base_that_trembles_stands():
     motion = np.zeros((200, 3), np.float32)
     motion[::2], motion[1::2] = 1e-4, -1e-4
-    check_base_stands(motion, "here")
-    check_base_stands(motion[:0], "here")
+    check_base_is_fixed(motion, "here")
+    check_base_is_fixed(motion[:0], "here")
 
 
 @pytest.mark.parametrize("column", [0, 1, 2])
@@ -88,7 +88,7 @@ def test_a_base_that_drives_in_one_step_or_slowly(column, rows):
     motion = np.zeros((len(rows), 3))
     motion[:, column] = rows
     with pytest.raises(DatasetError) as caught:
-        check_base_stands(motion, "here")
+        check_base_is_fixed(motion, "here")
     assert caught.value.where == "here"
 
 

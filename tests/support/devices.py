@@ -15,7 +15,7 @@ CHANGES = {
     "small": {"views": {"base_camera": VIEW, "gripper_camera": VIEW}, "channels": 8, "width": 32, "heads": 2},
     "rt1": SIZES,
 }
-TRAIN = {"steps": 6, "batch_size": 2, "log_every": 2, "check_every": 3, "save_every": 2, "workers": 0}
+TRAIN = {"steps": 6, "batch_size": 2, "log_every": 2, "validate_every": 3, "save_every": 2, "workers": 0}
 
 
 def check(dataset, tmp_path, name, precision, device):

@@ -23,7 +23,7 @@ class MadeUpConfig(BaselineConfig):
     damaged_at: int = -1  # sample that can't be read
     steep_at: int = -1  # sample whose loss is a number, and whose gradient is none
     train: TrainSettings = TrainSettings(
-        steps=40, batch_size=4, log_every=4, check_every=20, save_every=10, warmup_steps=3, ema=0.9, precision="fp32"
+        steps=40, batch_size=4, log_every=4, validate_every=20, save_every=10, warmup_steps=3, ema=0.9, precision="fp32"
     )
 
 

@@ -2,7 +2,7 @@
 
 from robocas_ms3.baselines.small.config import View
 
-VIEW = View(rendered=(64, 48), size=(64, 48))
+VIEW = View(image_size=(64, 48), size=(64, 48))
 TINY = dict(
     views={"base_camera": VIEW, "gripper_camera": VIEW},
     chunk=3,

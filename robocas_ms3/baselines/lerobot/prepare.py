@@ -24,7 +24,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from robocas_ms3.baselines.dataset_checks import check_base_stands
+from robocas_ms3.baselines.dataset_checks import check_base_is_fixed
 from robocas_ms3.baselines.lerobot.policy import (
     ACTION,
     DIMENSIONS,
@@ -100,7 +100,7 @@ def _open(source: Path) -> LeRobotDataset:
 
 def _columns(episode: LeRobotEpisode, vectors: dict[str, NDArray[np.float32]]) -> dict[str, NDArray]:
     arrays, steps = episode.arrays, episode.steps
-    check_base_stands(arrays["rel_agv_pose"], episode.where)
+    check_base_is_fixed(arrays["rel_agv_pose"], episode.where)
     parts = (arrays[key].reshape(steps, -1) for key in ("ee_pos", "ee_orn", "robot_joints", GRIPPER_WIDTH))
     columns: dict[str, NDArray] = {STATE: state_of(*parts), ACTION: episode.columns[ACTION].astype(np.float32)}
     if vectors:

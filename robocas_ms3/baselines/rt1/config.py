@@ -37,7 +37,7 @@ class RT1Train(TrainSettings):
     clip_norm: float = Field(default=4.0, ge=0)
     ema: float = Field(default=0.0, ge=0, lt=1)
     workers: int = Field(default=4, ge=0)
-    check_every: int = Field(default=5000, ge=1)
+    validate_every: int = Field(default=5000, ge=1)
     save_every: int = Field(default=2000, ge=1)
 
 

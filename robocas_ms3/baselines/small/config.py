@@ -11,37 +11,37 @@ from robocas_ms3.core.strict_model import StrictModel
 
 
 class View(StrictModel):
-    """The part of a camera's images that the network sees.
+    """Crop and size of a camera's images as input of the network.
 
     Attributes:
-        rendered: width and height of the whole images, in pixels.
-        part: left, top, right, bottom of the part, as fractions of the image.
-        size: width and height that the part is scaled to, in pixels; multiples of 16.
+        image_size: width and height of the uncropped images, pixels.
+        crop: left, top, right, bottom of the crop, as fractions of the image.
+        size: width and height that the crop is scaled to, pixels; multiples of 16.
     """
 
-    rendered: tuple[int, int] = (512, 384)
-    part: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
+    image_size: tuple[int, int] = (512, 384)
+    crop: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
     size: tuple[int, int] = (128, 96)
 
     @model_validator(mode="after")
     def _check(self) -> View:
-        left, top, right, bottom = self.part
+        left, top, right, bottom = self.crop
         if not (0 <= left < right <= 1 and 0 <= top < bottom <= 1):
-            raise ValueError(f"invalid part {list(self.part)}: expected left < right and top < bottom, in 0..1")
-        if min(self.rendered) < 16 or min(self.size) < 16 or any(number % 16 for number in self.size):
-            raise ValueError("size has to be multiples of 16, and rendered at least 16 pixels")
+            raise ValueError(f"invalid crop {list(self.crop)}: expected left < right and top < bottom, in 0..1")
+        if min(self.image_size) < 16 or min(self.size) < 16 or any(number % 16 for number in self.size):
+            raise ValueError("size: expected multiples of 16 pixels, and image_size of at least 16 pixels")
         return self
 
     def box(self) -> tuple[int, int, int, int]:
-        """Return left, top, right, bottom of the part in pixels."""
-        width, height = self.rendered
-        left, top, right, bottom = self.part
+        """Return left, top, right, bottom of the crop in pixels of the uncropped image."""
+        width, height = self.image_size
+        left, top, right, bottom = self.crop
         return round(left * width), round(top * height), round(right * width), round(bottom * height)
 
 
 if TYPE_CHECKING:
     Views = dict[str, View]
-else:  # null leaves a camera of the defaults out
+else:  # null removes a camera of the defaults
     Views = Annotated[dict[str, View | None], AfterValidator(lambda views: {k: v for k, v in views.items() if v})]
 
 
@@ -49,31 +49,31 @@ class SmallConfig(BaselineConfig):
     """Configuration of `small`.
 
     Attributes:
-        views: by camera; null leaves one out. The base camera is behind the arm: what can be reached is in the lower
-            middle of its images, objects of RoboCAS-v0's scenes in a thirtieth of them.
-        language: whether the instruction is an input.
-        rate_hz: steps per second of the data and of the policy.
-        chunk: number of predicted steps.
-        channels: of the first feature maps.
-        width, heads, layers, dropout: of the transformer.
-        keys_weight: weight of the loss of the next key pose.
-        gripper_weight: weight of the loss of the gripper commands.
-        near: distance in m at which a pose has half the weight of one that is reached, see `chunk_losses`; 0: no
-            weights.
-        point_weight: weight, per camera, of the loss of where the next key pose is in the image (`localization`).
-        name_weight: weight, per camera, of the loss of where objects of other instructions are.
-        lift: whether points are located in space by the calibration of the cameras (`localization.Lift`).
-        lift_weight: weight of the loss of that, per camera.
-        shift: largest random shift of the images in training, in pixels.
+        views: view by camera; null removes a camera. The base camera is behind the arm. Reachable objects are in the
+            lower middle of its images; the objects of RoboCAS-v0's scenes cover a thirtieth of the image area.
+        language: whether the instruction embedding is an input.
+        rate_hz: policy steps per second, of the data and of the policy.
+        chunk: number of predicted policy steps.
+        channels: channels of the first feature maps.
+        width, heads, layers, dropout: sizes of the transformer.
+        keys_weight: loss weight of the next key pose.
+        gripper_weight: loss weight of the gripper commands.
+        near_distance: distance in m at which the loss weight of a pose is half of its weight at 0 m, see
+            `chunk_losses`; 0: equal weights.
+        key_cell_weight: loss weight, per camera, of the image cell of the next key pose (`localization`).
+        object_cell_weight: loss weight, per camera, of the image cells of objects that other instructions name.
+        unproject: whether attended cells are unprojected to points by the camera calibration (`Unproject`).
+        unproject_weight: loss weight of the unprojection, per camera.
+        shift: largest random image shift in training, pixels.
         brightness: largest random change of brightness and contrast in training, as a fraction.
-        play: steps of a chunk before the next one is predicted.
-        fade: decay of the weight of older predictions, see `ChunkPolicy`.
-        reopen: distance in m of the reopen heuristic, see `ChunkPolicy`; 0: switched off.
+        n_action_steps: policy steps of a chunk that are executed before the next prediction.
+        temporal_ensemble_coeff: decay of the weight of older predictions, see `ChunkPolicy`.
+        reopen: distance in m of the reopen heuristic, see `ChunkPolicy`; 0 switches it off.
         train: see `TrainSettings`.
     """
 
     views: Views = {
-        "base_camera": View(part=(0.30, 0.60, 0.62, 0.90), size=(160, 112)),
+        "base_camera": View(crop=(0.30, 0.60, 0.62, 0.90), size=(160, 112)),
         "gripper_camera": View(),
     }
     language: bool = True
@@ -86,22 +86,22 @@ class SmallConfig(BaselineConfig):
     dropout: float = Field(default=0.1, ge=0, lt=1)
     keys_weight: float = Field(default=0.5, ge=0)
     gripper_weight: float = Field(default=0.5, ge=0)
-    near: float = Field(default=0.2, ge=0)
-    point_weight: float = Field(default=0.1, ge=0)
-    name_weight: float = Field(default=0.1, ge=0)
-    lift: bool = True
-    lift_weight: float = Field(default=0.1, ge=0)
+    near_distance: float = Field(default=0.2, ge=0)
+    key_cell_weight: float = Field(default=0.1, ge=0)
+    object_cell_weight: float = Field(default=0.1, ge=0)
+    unproject: bool = True
+    unproject_weight: float = Field(default=0.1, ge=0)
     shift: int = Field(default=3, ge=0, le=1000)
     brightness: float = Field(default=0.2, ge=0, lt=1)
-    play: int = Field(default=7, ge=1, le=1000)
-    fade: float = Field(default=0.15, ge=0)
+    n_action_steps: int = Field(default=7, ge=1, le=1000)
+    temporal_ensemble_coeff: float = Field(default=0.15, ge=0)
     reopen: float = Field(default=0.02, ge=0)
     train: TrainSettings = TrainSettings(steps=3_500, batch_size=96, learning_rate=6e-4, weight_decay=0.01)
 
     @model_validator(mode="after")
     def _check(self) -> SmallConfig:
         if not self.views:
-            raise ValueError("views have to be of at least one camera")
+            raise ValueError("views: expected at least one camera, found none")
         if self.width % self.heads:
-            raise ValueError(f"width {self.width} has to be a multiple of heads {self.heads}")
+            raise ValueError(f"width {self.width}: expected a multiple of heads ({self.heads})")
         return self

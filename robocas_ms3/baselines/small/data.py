@@ -1,4 +1,4 @@
-"""Samples of `small`: images of a dataset, decoded once and held in memory, and the poses to predict."""
+"""Training samples of `small`: images of a dataset, decoded once and kept in memory, and the poses to predict."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 
 from robocas_ms3.baselines.baseline import Batch, OnRead, Split
-from robocas_ms3.baselines.chunks import encode, next_keys, spread, state_of
+from robocas_ms3.baselines.chunks import encode_chunks, encode_proprioception, next_key_poses, scale_statistics
 from robocas_ms3.baselines.dataset_checks import check_dataset
 from robocas_ms3.baselines.small.config import SmallConfig, View
 from robocas_ms3.baselines.small.localization import project_points
@@ -37,12 +37,12 @@ from robocas_ms3.robots.quantities import GRIPPER_WIDTH
 
 _log = logging.getLogger(__name__)
 _MIN_HEIGHT_DEVIATION = 0.01  # m
-_MIN_WORD_DEVIATION = 0.01  # of a number of an embedding; all are about 0.05
+_MIN_TEXT_DEVIATION = 0.01  # of a component of an embedding; components are about 0.05
 _KEYS = ("ee_pos", "ee_orn", GRIPPER_WIDTH, "gripper_status", "base_pos", "base_orn")
 
 
 class SmallSamples:
-    """Samples of `small`, one of every step."""
+    """Samples of `small`, one per step of a dataset's split."""
 
     def __init__(self, config: SmallConfig, path: Path, split: Split, on_read: OnRead) -> None:
         self._config, self._source = config, open_source(path)
@@ -66,8 +66,8 @@ class SmallSamples:
         self._state = torch.empty((count, 10))
         self._chunks = torch.empty((count, config.chunk, 10))
         self._keys = torch.empty((count, 9))
-        self._places = {camera: torch.empty((count, 2)) for camera in views}
-        self._words = torch.zeros((len(numbers), 384))
+        self._key_pixels = {camera: torch.empty((count, 2)) for camera in views}
+        self._texts = torch.zeros((len(numbers), 384))
         self._episode = torch.from_numpy(np.repeat(np.arange(len(numbers)), lengths))
         starts = (np.cumsum(lengths) - lengths).tolist()
         scenes: list[SceneObjects] = []
@@ -75,18 +75,18 @@ class SmallSamples:
             for objects in pool.map(self._read, range(len(numbers)), numbers, starts):
                 scenes.append(objects)
                 on_read(len(scenes), len(numbers))
-        self._find_questions(scenes if config.language else [replace(objects, target="") for objects in scenes])
-        if config.language and split == "train" and not (self._kinds >= 0).any():
-            what = "no scene.json with the places of the objects: only the next key pose is pointed at"
+        self._choose_object_texts(scenes if config.language else [replace(objects, target="") for objects in scenes])
+        if config.language and split == "train" and not (self._classes >= 0).any():
+            what = "no object poses in scene.json: image cells are learned for the next key pose only"
             _log.warning("%s: %s", path, what)
         self.facts: dict[str, Any] = {
             "rate_hz": source.rate_hz,
-            "pictures": {camera: list(size) for camera, size in sizes.items()},
-            "chunk": spread(self._chunks[..., :9].numpy()),
-            "keys": spread(self._keys.numpy()),
-            **({"calibration": self._calibration} if config.lift else {}),
-            "heights": _spread_of_heights(self._state.numpy(), self._keys.numpy()),
-            "words": _spread_of_words(self._words.numpy()),
+            "image_sizes": {camera: list(size) for camera, size in sizes.items()},
+            "chunk": scale_statistics(self._chunks[..., :9].numpy()),
+            "keys": scale_statistics(self._keys.numpy()),
+            **({"calibration": self._calibration} if config.unproject else {}),
+            "heights": _height_statistics(self._state.numpy(), self._keys.numpy()),
+            "text": _text_statistics(self._texts.numpy()),
         }
 
     def __len__(self) -> int:
@@ -95,44 +95,53 @@ class SmallSamples:
     def __getitems__(self, indices: list[int]) -> Batch:
         """Return a batch of B samples.
 
-        Inputs are images by camera (B, h, w, 3) uint8, ``state`` (B, 10) and ``words`` (B, 384). To predict are
-        ``chunk`` (B, K, 10), ``key`` (B, 9), where that is in the image, ``CAMERA_place`` (B, 2), and where each of N
-        objects is, ``CAMERA_places`` (B, N, 2) and ``heights`` (B, N) in the arm's base, for the instructions
-        ``asked`` (B, N, 384) that name one of its ``kinds`` (B, N), -1 = no instruction does.
+        Inputs:
+            CAMERA: (B, h, w, 3) uint8 images of each camera.
+            state: (B, 10) proprioception.
+            text: (B, 384) embedding of the instruction.
+
+        Labels, for up to N objects per scene:
+            chunk: (B, K, 10), see `chunks`.
+            key: (B, 9) next key pose in the TCP frame.
+            CAMERA_key_pixel: (B, 2) its pixel in each camera.
+            CAMERA_object_pixels: (B, N, 2) pixels of the objects; NaN: not known.
+            object_heights: (B, N) heights of the objects in the arm's base frame, m.
+            object_texts: (B, N, 384) embeddings of instructions that name the objects.
+            object_classes: (B, N) class of each object; -1: no instruction of the dataset names it.
         """
         rows = torch.tensor(indices)
         episodes = self._episode[rows]
         return {
             **{camera: images[rows] for camera, images in self._images.items()},
-            **{f"{camera}_place": places[rows] for camera, places in self._places.items()},
-            **{f"{camera}_places": places[rows] for camera, places in self._object_places.items()},
-            "kinds": self._kinds[episodes],
-            "heights": self._heights[episodes],
-            "asked": self._words[self._asked[episodes]],
+            **{f"{camera}_key_pixel": pixels[rows] for camera, pixels in self._key_pixels.items()},
+            **{f"{camera}_object_pixels": pixels[rows] for camera, pixels in self._object_pixels.items()},
+            "object_classes": self._classes[episodes],
+            "object_heights": self._object_heights[episodes],
+            "object_texts": self._texts[self._object_texts[episodes]],
             "state": self._state[rows],
-            "words": self._words[episodes],
+            "text": self._texts[episodes],
             "chunk": self._chunks[rows],
             "key": self._keys[rows],
         }
 
-    def _read(self, place: int, number: int, start: int) -> SceneObjects:
-        """Read the episode of a number into the rows from ``start`` on."""
+    def _read(self, index: int, number: int, start: int) -> SceneObjects:
+        """Read an episode into the rows from ``start`` on; return its objects."""
         config, episode = self._config, self._source.episode(number)
         arrays = episode.read([*_KEYS, *(["language_embedding"] if config.language else [])])
         length = self._source.lengths[number]
         for key, array in arrays.items():
             if array.dtype.kind == "f" and not np.isfinite(array).all():
                 where = f"{self._source.root}, episode {number}, {key}"
-                raise DatasetError("NaN or infinite value", where=where, fix="robocas validate says more.")
+                raise DatasetError("NaN or infinite value", where=where, fix="Run `robocas validate` for details.")
         poses = from_xyzw(arrays["ee_pos"].astype(np.float64), arrays["ee_orn"].astype(np.float64))
         opened, rows = arrays["gripper_status"].reshape(-1), slice(start, start + length)
-        self._state[rows] = torch.from_numpy(state_of(poses, arrays[GRIPPER_WIDTH].reshape(-1)))
-        self._chunks[rows] = torch.from_numpy(encode(poses, opened, config.chunk))
-        keys = next_keys(poses, opened)
-        at_keys = (poses[:, :3, :3] @ keys[:, :3, None])[..., 0] + poses[:, :3, 3]  # in the arm's base
+        self._state[rows] = torch.from_numpy(encode_proprioception(poses, arrays[GRIPPER_WIDTH].reshape(-1)))
+        self._chunks[rows] = torch.from_numpy(encode_chunks(poses, opened, config.chunk))
+        keys = next_key_poses(poses, opened)
+        key_points = (poses[:, :3, :3] @ keys[:, :3, None])[..., 0] + poses[:, :3, 3]  # in the arm's base frame
         self._keys[rows] = torch.from_numpy(keys)
         if config.language:
-            self._words[place] = torch.from_numpy(arrays["language_embedding"])
+            self._texts[index] = torch.from_numpy(arrays["language_embedding"])
         projections: dict[str, Callable[[Array], NDArray[np.float32]]] = {}
         for camera, view in config.views.items():
             stored = (0, 0)
@@ -148,53 +157,53 @@ class SmallSamples:
                 stored=stored,
                 view=view,
             )
-            points = in_camera_parent(episode.camera_parent(camera), at_keys[:, None], poses, arrays)[:, 0]
-            self._places[camera][rows] = torch.from_numpy(projections[camera](points))
+            points = in_camera_parent(episode.camera_parent(camera), key_points[:, None], poses, arrays)[:, 0]
+            self._key_pixels[camera][rows] = torch.from_numpy(projections[camera](points))
         return locate_objects(episode, arrays, poses, projections)
 
     def _check_calibration(self, camera: str, found: dict[str, Any], where: object) -> None:
         first = self._calibration[camera]
-        if self._config.lift and not same_calibration(first, found):
+        if self._config.unproject and not same_calibration(first, found):
             key = "mount" if not same_calibration(first, found, ["mount"]) else "intrinsic"
             raise DatasetError(
-                "a camera is mounted in another way than in other episodes, or is fixed in the world unlike the arm",
+                "camera calibration differs between episodes",
                 where=f"{where}, {camera}, {key}",
                 expected=np.round(first[key], 4).tolist(),
                 found=np.round(found[key], 4).tolist(),
-                fix="Train with --set lift=false, or on episodes of one calibration.",
+                fix="Train with --set unproject=false, or on episodes of one calibration relative to the arm.",
             )
 
-    def _find_questions(self, scenes: list[SceneObjects]) -> None:
-        """Choose an instruction for each object of each episode, of an episode whose target is of that kind."""
-        most = max(len(objects.kinds) for objects in scenes)
+    def _choose_object_texts(self, scenes: list[SceneObjects]) -> None:
+        """Choose for each object the instruction of an episode whose target is an object of that class."""
+        most = max(len(objects.classes) for objects in scenes)
         names = sorted({objects.target for objects in scenes} - {""})
-        named = {name: [place for place, objects in enumerate(scenes) if objects.target == name] for name in names}
-        self._kinds = torch.full((len(scenes), most), -1)
-        self._asked = torch.zeros((len(scenes), most), dtype=torch.int64)
-        self._heights = torch.full((len(scenes), most), torch.nan)
-        self._object_places = {
-            camera: torch.full((len(self._state), most, 2), torch.nan) for camera in scenes[0].places
+        named = {name: [index for index, objects in enumerate(scenes) if objects.target == name] for name in names}
+        self._classes = torch.full((len(scenes), most), -1)
+        self._object_texts = torch.zeros((len(scenes), most), dtype=torch.int64)
+        self._object_heights = torch.full((len(scenes), most), torch.nan)
+        self._object_pixels = {
+            camera: torch.full((len(self._state), most, 2), torch.nan) for camera in scenes[0].pixels
         }
         start = 0
-        for place, objects in enumerate(scenes):
-            self._heights[place, : len(objects.kinds)] = torch.from_numpy(objects.points[:, 2]).float()
-            for column, kind in enumerate(objects.kinds):
-                if kind in named:
-                    self._kinds[place, column] = names.index(kind)
-                    self._asked[place, column] = named[kind][(place + column) % len(named[kind])]
-            for camera, places in objects.places.items():
-                rows = self._object_places[camera][start : start + len(places)]
-                rows[:, : len(objects.kinds)] = torch.from_numpy(places)
+        for index, objects in enumerate(scenes):
+            self._object_heights[index, : len(objects.classes)] = torch.from_numpy(objects.points[:, 2]).float()
+            for column, name in enumerate(objects.classes):
+                if name in named:
+                    self._classes[index, column] = names.index(name)
+                    self._object_texts[index, column] = named[name][(index + column) % len(named[name])]
+            for camera, pixels in objects.pixels.items():
+                rows = self._object_pixels[camera][start : start + len(pixels)]
+                rows[:, : len(objects.classes)] = torch.from_numpy(pixels)
             start += objects.steps
 
 
 def _check_memory(config: SmallConfig, count: int, path: Path) -> None:
-    processes = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))  # of accelerate launch; each holds all images
+    processes = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))  # of accelerate launch; each process keeps all images
     needed = processes * count * sum(3 * view.size[0] * view.size[1] for view in config.views.values())
     free = psutil.virtual_memory().available
     if needed > 0.9 * free:
         raise DatasetError(
-            "the images do not fit into memory",
+            "the images of the dataset do not fit into memory",
             where=path,
             expected=f"{needed / 1e9:.1f} GB",
             found=f"{free / 1e9:.1f} GB free",
@@ -202,39 +211,42 @@ def _check_memory(config: SmallConfig, count: int, path: Path) -> None:
         )
 
 
-def _spread_of_heights(state: NDArray[np.floating], keys: NDArray[np.floating]) -> dict[str, float]:
-    """Return mean and deviation of the heights of key poses (N, 9) in the arm's base, m, for states (N, 10)."""
+def _height_statistics(state: NDArray[np.floating], keys: NDArray[np.floating]) -> dict[str, float]:
+    """Return mean and deviation of the heights of key poses (N, 9) in the arm's base frame, m; states (N, 10)."""
     x, y = state[:, 3:6], state[:, 6:9]
     axes = np.stack([x[:, 2], y[:, 2], np.cross(x, y)[:, 2]], axis=1)  # the last row of the TCP's rotation
     heights = (axes * keys[:, :3]).sum(axis=1) + state[:, 2]
     return {"mean": float(heights.mean()), "deviation": max(float(heights.std()), _MIN_HEIGHT_DEVIATION)}
 
 
-def _spread_of_words(words: NDArray[np.floating]) -> dict[str, Any]:
-    """Return the arguments of a `Scale` of embeddings (N, 384).
+def _text_statistics(embeddings: NDArray[np.floating]) -> dict[str, Any]:
+    """Return the arguments of a `Scale` of instruction embeddings (N, 384).
 
-    Instructions of a task differ in a name: a hundredth of what they have in common, and all that matters.
+    The instructions of a task differ only in the object's name, which changes the embedding by about a hundredth.
     """
-    return {"mean": words.mean(0).tolist(), "deviation": np.maximum(words.std(0), _MIN_WORD_DEVIATION).tolist()}
+    return {
+        "mean": embeddings.mean(0).tolist(),
+        "deviation": np.maximum(embeddings.std(0), _MIN_TEXT_DEVIATION).tolist(),
+    }
 
 
 def crop_image(image: NDArray[Any], view: View, where: object = "") -> NDArray[Any]:
-    """Return the part (h, w, 3) of an image (H, W, 3) that a view shows, scaled by areas."""
-    width, height = view.rendered
+    """Crop and scale an image (H, W, 3) to a view (h, w, 3), by area averaging."""
+    width, height = view.image_size
     if image.shape[1::-1] != (width, height):
         if image.shape[1] * height != image.shape[0] * width or image.shape[1] < width:
             found, fix = f"{image.shape[1]} x {image.shape[0]}", f"robocas convert --size {width} {height}"
             raise DatasetError(
-                "images of another size",
+                "wrong image size",
                 where=where,
                 expected=f"{width} x {height}",
                 found=found,
-                fix=f"{fix}, or change views.",
+                fix=f"{fix}, or --set views.CAMERA.image_size.",
             )
         image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
     left, top, right, bottom = view.box()
-    part = image[top:bottom, left:right]
-    smaller = part.shape[1] >= view.size[0]
+    crop = image[top:bottom, left:right]
+    smaller = crop.shape[1] >= view.size[0]
     return np.ascontiguousarray(
-        cv2.resize(part, view.size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
+        cv2.resize(crop, view.size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
     )

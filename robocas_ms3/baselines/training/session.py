@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from robocas_ms3.baselines.training.checkpoints import Checkpoint
 
 OUTPUT = FolderKind("robocas train", (RUN,), "baseline")
-_INPUTS = ("rate_hz", "pictures", "cameras", "calibration", "observed", "acted")
+_INPUTS = ("rate_hz", "image_sizes", "cameras", "calibration", "observed", "acted")
 """Facts that have to be the same in both runs. Others, such as scales, need the same shape."""
 _TOLERANCE = 1e-3  # of these: camera poses differ in the last bits
 

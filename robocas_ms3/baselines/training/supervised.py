@@ -34,7 +34,7 @@ def train_supervised(
     def validate() -> None:
         if validation is None or not learner.step:
             return
-        if learner.step == settings.steps or learner.step % settings.check_every == 0:
+        if learner.step == settings.steps or learner.step % settings.validate_every == 0:
             metrics = learner.evaluate(_validation_batches(run, validation, settings))
             log("val", metrics)
             text = ", ".join(f"{name} {value:.4g}" for name, value in metrics.items() if math.isfinite(value))
@@ -119,7 +119,7 @@ def learning_rate(step: int, count: int, settings: TrainSettings) -> float:
 def _validation_batches(run: RunFolder, samples: Samples, settings: TrainSettings) -> Iterator[tuple[int, Batch]]:
     """Yield this process's batches with their sizes; the same samples at each validation."""
     accelerator = run.accelerator
-    count = min(len(samples), settings.check_samples)
+    count = min(len(samples), settings.validation_samples)
     indices = torch.linspace(0, len(samples) - 1, count).long().tolist()
     if count >= accelerator.num_processes:  # else each process takes all
         indices = indices[accelerator.process_index :: accelerator.num_processes]

@@ -1,4 +1,4 @@
-"""`small`: its samples of a dataset, that it learns them, how it continues and acts, and datasets that it refuses."""
+"""`small`: samples of a dataset, training, policy, and refused datasets."""
 
 import shutil
 from types import SimpleNamespace
@@ -11,11 +11,11 @@ from made_up_runs import fit
 from pydantic import ValidationError
 from small_sizes import TINY, VIEW
 
-from robocas_ms3.baselines.chunks import decode
+from robocas_ms3.baselines.chunks import decode_chunk
 from robocas_ms3.baselines.small import BASELINE, data
 from robocas_ms3.baselines.small.config import SmallConfig, View
 from robocas_ms3.baselines.small.data import crop_image
-from robocas_ms3.baselines.small.localization import CELL, NOWHERE, pointing_losses
+from robocas_ms3.baselines.small.localization import CELL, NOWHERE, cell_losses
 from robocas_ms3.baselines.small.model import shift_images
 from robocas_ms3.baselines.small.objects import SceneObjects
 from robocas_ms3.baselines.training.session import merge_configs
@@ -35,7 +35,7 @@ def samples(folder):
 
 
 def test_samples_are_learned_and_a_policy_sees_the_same(samples, folder):
-    """The loss falls, and the policy does what the network predicts for the sample of a step."""
+    """The loss falls, and the policy executes the network's prediction for the sample of a step."""
     model, losses = fit(BASELINE, SmallConfig(**TINY), samples, 30)
     assert losses[-1] < 0.4 * losses[0]
     source = open_source(folder)
@@ -57,20 +57,21 @@ def test_samples_are_learned_and_a_policy_sees_the_same(samples, folder):
 
 
 def test_every_weight_is_learned(samples):
-    """In bf16 as well; weights without a gradient would stall training on several GPUs."""
+    """In bf16 too; parameters without a gradient would stall training on several GPUs."""
     torch.manual_seed(0)
     model = BASELINE.model(SmallConfig(**TINY), samples.facts)
     batch = samples.__getitems__(list(range(len(samples))))
-    batch |= {"kinds": torch.zeros(len(samples), 1), "asked": batch["words"][:, None]}  # an object at the next key
-    batch |= {"heights": torch.full((len(samples), 1), 0.1)}
-    batch |= {f"{camera}_places": batch[f"{camera}_place"][:, None] for camera in model.config.views}
+    # One object at the position of the next key pose
+    batch |= {"object_classes": torch.zeros(len(samples), 1), "object_texts": batch["text"][:, None]}
+    batch |= {"object_heights": torch.full((len(samples), 1), 0.1)}
+    batch |= {f"{camera}_object_pixels": batch[f"{camera}_key_pixel"][:, None] for camera in model.config.views}
     with torch.autocast("cpu", torch.bfloat16):
         loss = model(batch)["loss"]
     loss.backward()
     assert [name for name, weight in model.named_parameters() if weight.grad is None] == []
     assert all(torch.isfinite(weight.grad).all() for weight in model.parameters())
-    for lift in (*model.lifts.values(), *model.stands.values()):
-        assert lift.offsets.weight.grad.any() and lift.height[2].weight.grad.any()
+    for unproject in (*model.key_unprojectors.values(), *model.object_unprojectors.values()):
+        assert unproject.offsets.weight.grad.any() and unproject.height[2].weight.grad.any()
 
 
 def test_samples_are_those_of_the_dataset(samples, folder):
@@ -83,43 +84,43 @@ def test_samples_are_those_of_the_dataset(samples, folder):
     assert np.array_equal(batch["gripper_camera"][0].numpy(), expected)
     assert batch["state"][0, :3].tolist() == pytest.approx(arrays["ee_pos"][4].tolist())
     assert batch["state"][0, 9].item() == pytest.approx(float(arrays["gripper_width"][4]) / 0.08)
-    assert batch["words"][0].tolist() == arrays["language_embedding"].tolist()
+    assert batch["text"][0].tolist() == arrays["language_embedding"].tolist()
     here = np.eye(4)
     here[:3, 3] = arrays["ee_pos"][4]
     turn = batch["state"][0, 3:9].numpy().astype(np.float64)
     here[:3, :3] = np.stack([turn[:3], turn[3:], np.cross(turn[:3], turn[3:])], axis=1)
-    ahead, _ = decode(batch["chunk"][0].numpy(), here)
+    ahead, _ = decode_chunk(batch["chunk"][0].numpy(), here)
     assert np.allclose(ahead[0, :3, 3], arrays["ee_pos"][5], atol=1e-5)
     wxyz = to_wxyz(ahead[:1])[0, 3:]
     assert abs(wxyz @ np.roll(arrays["ee_orn"][5], 1)) == pytest.approx(1, abs=1e-5)
 
 
-def test_objects_are_asked_for_by_instructions_that_name_them(folder, monkeypatch, caplog):
-    """Without language all instructions would be equal, and have different answers."""
+def test_objects_get_instructions_that_name_them(folder, monkeypatch, caplog):
+    """Without language, all instructions would be equal and have different labels."""
 
     def made(episode, arrays, poses, projections):
         nowhere = {name: np.zeros((len(poses), 2, 2), np.float32) for name in projections}
         return SceneObjects(len(poses), "apple", ["apple", "pear"], nowhere, np.zeros((2, 3)))
 
     read(folder)
-    (line,) = caplog.messages  # the made-up dataset knows no scenes
-    assert line.startswith(f"{folder}: no scene.json")
+    (line,) = caplog.messages  # the made-up dataset has no layouts
+    assert line.startswith(f"{folder}: no object poses in scene.json")
     caplog.clear()
     monkeypatch.setattr(data, "locate_objects", made)
     batches = [read(folder, "val", language=language).__getitems__([0]) for language in (True, False)]
-    assert [batch["kinds"].tolist() for batch in batches] == [[[0, -1]], [[-1, -1]]]
-    assert [bool(batch["words"].any()) for batch in batches] == [True, False]
+    assert [batch["object_classes"].tolist() for batch in batches] == [[[0, -1]], [[-1, -1]]]
+    assert [bool(batch["text"].any()) for batch in batches] == [True, False]
     assert not caplog.records
 
 
-def test_a_part_is_cut_and_scaled():
+def test_images_are_cropped_and_scaled():
     image = np.zeros((48, 64, 3), np.uint8)
     image[24:, 32:] = 200
-    view = View(rendered=(64, 48), part=(0.5, 0.5, 1.0, 1.0), size=(16, 16))
+    view = View(image_size=(64, 48), crop=(0.5, 0.5, 1.0, 1.0), size=(16, 16))
     assert (crop_image(image, view) == 200).all()
     assert crop_image(image, view).shape == (16, 16, 3)
     larger = np.repeat(np.repeat(image, 2, 0), 2, 1)
-    assert (crop_image(larger, view) == 200).all()  # scaled to ``rendered`` first
+    assert (crop_image(larger, view) == 200).all()  # scaled to ``image_size`` first
 
 
 def test_shifts_move_images_as_a_whole():
@@ -133,21 +134,21 @@ def test_labels_move_with_the_shifted_image(samples, monkeypatch):
     torch.manual_seed(0)
     model = BASELINE.model(SmallConfig(**{**TINY, "shift": 16}), samples.facts).train()
     batch = samples.__getitems__([0] * 64)
-    x, y = batch["base_camera_place"][0].long().tolist()
+    x, y = batch["base_camera_key_pixel"][0].long().tolist()
     batch["base_camera"] = torch.zeros_like(batch["base_camera"])
     batch["base_camera"][:, y, x] = 255
     seen, cells = [], []
 
-    def look(images, look=model._look):
+    def encode(images, encode=model._encode_images):
         seen.append(images["base_camera"])
-        return look(images)
+        return encode(images)
 
     def losses(logits, answers, columns):
         cells.append(answers)
-        return pointing_losses(logits, answers, columns)
+        return cell_losses(logits, answers, columns)
 
-    monkeypatch.setattr(model, "_look", look)
-    monkeypatch.setattr("robocas_ms3.baselines.small.model.pointing_losses", losses)
+    monkeypatch.setattr(model, "_encode_images", encode)
+    monkeypatch.setattr("robocas_ms3.baselines.small.model.cell_losses", losses)
     model(batch)
     bright = seen[0][:, 0] > 0  # (64, 48, 64)
     for image, cell in zip(bright, cells[0][:, 0].tolist(), strict=True):
@@ -158,8 +159,8 @@ def test_labels_move_with_the_shifted_image(samples, monkeypatch):
 
 
 def test_images_are_requested_in_the_size_of_the_dataset(folder):
-    """Images of half the size are not the same, rendered or scaled."""
-    half = View(rendered=(32, 24), size=(32, 32))
+    """Rendering at half the size gives other images than scaling to half the size."""
+    half = View(image_size=(32, 24), size=(32, 32))
     views = {"base_camera": half, "gripper_camera": half}
     config, samples = SmallConfig(**{**TINY, "views": views}), read(folder, "val", views=views)
     policy = BASELINE.policy(config, samples.facts, BASELINE.model(config, samples.facts))
@@ -169,8 +170,8 @@ def test_images_are_requested_in_the_size_of_the_dataset(folder):
         read(folder, views={"base_camera": View()})
 
 
-def test_a_camera_and_language_may_be_left_out(folder):
-    """A camera by `--set views.gripper_camera=null`, above the defaults."""
+def test_training_without_a_camera_and_language(folder):
+    """`--set views.gripper_camera=null` removes a camera of the defaults."""
     changes = {"views": {"gripper_camera": None}, "language": False}
     merged = merge_configs(SmallConfig(**TINY).model_dump(mode="json"), changes)
     config = parse(SmallConfig, merged, TrainingError, where="small")
@@ -188,9 +189,9 @@ def test_a_camera_and_language_may_be_left_out(folder):
         (SmallConfig, {**TINY, "heads": 3, "width": 32}),
         (SmallConfig, {**TINY, "views": {}}),
         (View, {"size": (100, 96)}),
-        (View, {"part": (0.5, 0, 0.4, 1)}),
-        (View, {"part": (0, 0, 1.2, 1)}),
-        (View, {"rendered": (0, 0)}),
+        (View, {"crop": (0.5, 0, 0.4, 1)}),
+        (View, {"crop": (0, 0, 1.2, 1)}),
+        (View, {"image_size": (0, 0)}),
     ],
 )
 def test_invalid_configurations(model, values):
@@ -218,15 +219,15 @@ def _widen_camera(folder):
         (_widen_camera, r"gripper_camera, intrinsic: .*expected \["),
     ],
 )
-def test_datasets_that_do_not_suit(folder, tmp_path, spoil, message):
+def test_unsuitable_datasets_are_refused(folder, tmp_path, spoil, message):
     copy = shutil.copytree(folder, tmp_path / "copy")
     spoil(copy)
     with pytest.raises(DatasetError, match=message):
         read(copy)
 
 
-def test_images_have_to_fit_into_memory(folder, monkeypatch):
-    """Each process of `accelerate launch` holds all of them."""
+def test_images_must_fit_into_memory(folder, monkeypatch):
+    """Each process of `accelerate launch` keeps all images."""
     fits = 1.5 * 35 * 2 * 3 * VIEW.size[0] * VIEW.size[1] / 0.9  # once, and not twice
     monkeypatch.setattr(data.psutil, "virtual_memory", lambda: SimpleNamespace(available=fits))
     read(folder)
@@ -236,11 +237,11 @@ def test_images_have_to_fit_into_memory(folder, monkeypatch):
     assert caught.value.where == folder
 
 
-def test_without_lift_a_camera_may_move(folder, tmp_path):
+def test_without_unprojection_a_camera_may_move(folder, tmp_path):
     copy = shutil.copytree(folder, tmp_path / "copy")
     _move_camera(copy)
-    samples = read(copy, lift=False)
-    model = BASELINE.model(SmallConfig(**TINY, lift=False), samples.facts)
+    samples = read(copy, unproject=False)
+    model = BASELINE.model(SmallConfig(**TINY, unproject=False), samples.facts)
     batch = samples.__getitems__([0, 1, 2])
     assert torch.isfinite(model(batch)["loss"])
     assert model.act(batch).shape == (3, 3, 10)

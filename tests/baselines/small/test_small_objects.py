@@ -1,4 +1,4 @@
-"""Where objects are in the images, until the gripper command changes."""
+"""Pixels of objects in the images, until the gripper command changes."""
 
 from types import SimpleNamespace
 
@@ -33,40 +33,40 @@ def episode(layout=LAYOUT, target="lemon"):
 
 
 def tcp(heights):
-    """Over the apple, fingers down: x of the TCP is x of the base, y and z are turned round."""
+    """Return TCP poses above the apple, fingers down: x axis as in the base, y and z reversed."""
     return from_rotation([[1, 0, height] for height in heights], np.diag([1.0, -1, -1]))
 
 
-def test_places_by_hand():
+def test_pixels_and_positions_of_objects():
     found = locate_objects(episode(), ARRAYS, tcp([1, 0.9, 0.8, 0.7, 0.6]), PROJECTIONS)
-    assert (found.steps, found.target, found.kinds) == (STEPS, "lemon", ["apple", "lemon"])
+    assert (found.steps, found.target, found.classes) == (STEPS, "lemon", ["apple", "lemon"])
     in_base = [[1, 0], [0, 1]]  # a metre ahead of the arm; a metre to its left, and half a metre up
-    assert found.places["base_camera"] == pytest.approx(np.tile(np.float32(in_base), (STEPS, 1, 1)), abs=1e-6)
+    assert found.pixels["base_camera"] == pytest.approx(np.tile(np.float32(in_base), (STEPS, 1, 1)), abs=1e-6)
     assert found.points == pytest.approx(np.array([[1, 0, 0], [0, 1, 0.5]]), abs=1e-6)
     in_tcp = [[0, 0], [-1, -1]]
-    assert found.places["gripper_camera"] == pytest.approx(np.tile(np.float32(in_tcp), (STEPS, 1, 1)), abs=1e-6)
+    assert found.pixels["gripper_camera"] == pytest.approx(np.tile(np.float32(in_tcp), (STEPS, 1, 1)), abs=1e-6)
 
 
-def test_once_the_command_changes_objects_may_have_moved():
+def test_pixels_are_unknown_after_a_gripper_command():
     closed = {**ARRAYS, "gripper_status": np.array([True, True, True, False, True])}
-    held = locate_objects(episode(), closed, tcp([1] * STEPS), PROJECTIONS).places["gripper_camera"]
+    held = locate_objects(episode(), closed, tcp([1] * STEPS), PROJECTIONS).pixels["gripper_camera"]
     assert np.isnan(held).all((1, 2)).tolist() == [False, False, False, True, True]
 
 
-def test_a_camera_in_the_world():
+def test_world_camera_sees_points_in_the_world_frame():
     points = np.zeros((STEPS, 1, 3))
     assert in_camera_parent("world", points, tcp([1] * STEPS), ARRAYS)[0, 0].tolist() == pytest.approx(BASE)
 
 
-def test_without_a_layout_or_after_another_policy_nothing_is_known():
+def test_no_objects_without_layout_or_after_another_policy():
     after = episode()
     after.scene["recorded"] = {"intervention": {"policy": "small", "policy_steps": 5}}
     for unknown in (episode({}), episode({"object_ids": ["apple"], "present": [True]}), after):
         found = locate_objects(unknown, ARRAYS, tcp([1] * STEPS), PROJECTIONS)
-        assert (found.kinds, found.places["base_camera"].shape) == ([], (STEPS, 0, 2))
+        assert (found.classes, found.pixels["base_camera"].shape) == ([], (STEPS, 0, 2))
 
 
 @pytest.mark.parametrize("layout", [{"poses": [[1, 2]]}, {**LAYOUT, "present": [True]}, {"poses": LAYOUT["poses"]}])
-def test_a_damaged_scene_is_an_error(layout):
-    with pytest.raises(DatasetError, match="scene.json: this description of a scene is damaged"):
+def test_damaged_scene_is_an_error(layout):
+    with pytest.raises(DatasetError, match="scene.json: damaged description of a scene"):
         locate_objects(episode(layout), ARRAYS, tcp([1] * STEPS), PROJECTIONS)

@@ -167,7 +167,7 @@ def test_a_nan_ends_the_run_and_the_last_checkpoint_stays(made_up, data, tmp_pat
 def test_an_unchecked_nan_is_not_saved(made_up, data, tmp_path, monkeypatch):
     """As on a GPU, where steps are not waited for, and without lines of the log, which end the run."""
     monkeypatch.setattr(Learner, "check_finite", lambda self, step, **values: None)
-    changes = {"steep_at": 7, "train": {"save_every": 1, "log_every": 100, "check_every": 100}}
+    changes = {"steep_at": 7, "train": {"save_every": 1, "log_every": 100, "validate_every": 100}}
     train("made-up", data, tmp_path / "run", changes)
     assert_finite(tmp_path / "run")
 
