@@ -1,1 +1,1 @@
-"""Scenes: layouts as pure maths, and building them in a simulator."""
+"""Scenes: task configurations, layouts of objects, instructions, and building a scene in a simulator."""

@@ -18,12 +18,12 @@ from robocas_ms3.scenes.layout import PARKING_HEIGHT
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.randomise import draw_camera_shift, draw_finishes, draw_lights
 
-_SHADOW_NEAR = -2.0  # m along the light from the origin; farther back, ceiling and walls would shade the whole room
+_SHADOW_NEAR = -2.0  # m along the light from the origin; with less, ceiling and walls shade the whole room
 
 
 @dataclass(frozen=True)
 class Fixtures:
-    """Actors that stay the same in all scenes of a configuration."""
+    """Actors that all scenes of a configuration have in common."""
 
     room: Actor
     furniture: dict[str, Actor | Articulation]
@@ -33,7 +33,7 @@ class Fixtures:
 def build_fixtures(
     scene: ManiSkillScene, model: SceneModel, level: VisualLevel = "fast", seeds: Sequence[int] = (0,)
 ) -> Fixtures:
-    """Build room, furniture and basket into every sub-scene, whose seeds decide the finishes of its room."""
+    """Build room, furniture and basket in every sub-scene; the seed of a sub-scene decides the finishes of its room."""
     furniture: dict[str, Actor | Articulation] = {}
     for name, asset in model.furniture.items():
         build_one = spawn_articulation if asset.links else spawn
@@ -56,7 +56,14 @@ def _build_room(scene: ManiSkillScene, model: SceneModel, level: VisualLevel, se
 
 
 def build_lights(scene: ManiSkillScene, config: TaskConfig, seeds: Sequence[int], *, shadow: bool) -> None:
-    """Light every sub-scene by its seed; with ``shadow``, or as configured, the slanted light casts shadows."""
+    """Add lights to every sub-scene; its seed decides their intensity and direction.
+
+    Args:
+        scene: the ManiSkill scene.
+        config: the task configuration.
+        seeds: seed of each sub-scene.
+        shadow: whether the slanted light casts shadows, even if the configuration has them off.
+    """
     for i, seed in enumerate(seeds):
         lights = draw_lights(config, seed)
         scene.sub_scenes[i].ambient_light = [lights.ambient] * 3
@@ -74,19 +81,19 @@ def build_lights(scene: ManiSkillScene, config: TaskConfig, seeds: Sequence[int]
 
 
 def shift_cameras(cameras: Sequence[RenderCamera], config: TaskConfig, seeds: Sequence[int]) -> None:
-    """Move the cameras of every sub-scene by its seed; the order of the cameras counts."""
-    by = config.randomisation.cameras
-    if by is None:
+    """Shift the cameras of every sub-scene; the shift depends on its seed and on the camera's position in the list."""
+    limits = config.randomisation.cameras
+    if limits is None:
         return
     for number, camera in enumerate(cameras):
         for part, seed in zip(camera._render_cameras, seeds, strict=True):
-            part.local_pose = part.local_pose * sapien.Pose(draw_camera_shift(by, number, seed))
+            part.local_pose = part.local_pose * sapien.Pose(draw_camera_shift(limits, number, seed))
 
 
 def build_objects(
     scene: ManiSkillScene, config: TaskConfig, assets: Sequence[Sequence[LoadedObject]], level: VisualLevel
 ) -> list[Actor]:
-    """Build the objects of all envs, a row of assets per env: an actor per slot, and the plane for unused slots."""
+    """Build one actor per object slot from assets (one row per env), and the plane for unused slots."""
     columns = zip(*assets, strict=True)
     actors = [build_object_slot(scene, slot, column, level) for slot, column in enumerate(columns)]
     if config.has_unused_slots:
@@ -97,7 +104,7 @@ def build_objects(
 def build_object_slot(
     scene: ManiSkillScene, slot: int, assets: Sequence[LoadedObject], level: VisualLevel = "fast"
 ) -> Actor:
-    """Build one slot of objects, env i's being ``assets[i]``, as one actor whose bodies are in the order of envs."""
+    """Build an object slot as one actor; the body of env i is ``assets[i]``, and bodies are in the order of envs."""
     name, waiting = f"object_{slot}", sapien.Pose([slot * 0.5, 0, 20.0])
     envs_of: dict[str, list[int]] = {}
     for env, asset in enumerate(assets):
@@ -120,7 +127,7 @@ def build_object_slot(
 
 
 def build_parking(scene: ManiSkillScene, slots: int) -> Actor:
-    """Build the plane, far below the floor, for slots that an episode does not use."""
+    """Build the plane far below the floor on which the objects of unused slots are placed."""
     builder: Any = scene.create_actor_builder()
     half_size = [(slots + 1) / 2, 1.0, 0.1]
     center = sapien.Pose([(slots - 1) / 4, 0, PARKING_HEIGHT - half_size[2]])

@@ -1,4 +1,4 @@
-"""The layout cache: layouts made ahead or on demand, and kept, so that a reset only sets poses."""
+"""The layout cache: stored layouts, sampled in advance or at the first use, so that a reset only sets poses."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ from robocas_ms3.scenes.layout_table import (
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.sample import sample_layout
 
-LAYOUT_FORMAT = 14  # raised when the same seed gives another layout, or the files change
-ABOUT = "about.json"  # in the folder of a cache: all that its layouts depend on
+LAYOUT_FORMAT = 14  # increased when a seed gives another layout or when the files change
+ABOUT = "about.json"  # file of a cache folder that lists everything the layouts depend on
 _FOLDER_SIZE = 1000  # layouts
-# parts of a configuration that layouts do not depend on
-_NOT_OF_LAYOUTS = {
+# keys of a configuration that have no effect on layouts
+_KEYS_WITHOUT_EFFECT = {
     "description",
     "support",
     "lights",
@@ -50,7 +50,7 @@ _NOT_OF_LAYOUTS = {
     "cameras",
     "room",
 }
-_LOOKS = {"room", "finishes", "lights", "cameras"}
+_APPEARANCE_KEYS = {"room", "finishes", "lights", "cameras"}
 _log = logging.getLogger(__name__)
 
 
@@ -59,8 +59,8 @@ def layout_source(model: SceneModel, layouts: str | Path | LayoutSource | None =
 
     Args:
         model: the scene's assets.
-        layouts: folder of all layout caches; ``auto``: in the user's cache folder; None: every layout is sampled again;
-            a ``.npy`` file: of frozen layouts; or a source itself.
+        layouts: folder of all layout caches; ``auto``: the user's cache folder; None: no cache, each layout is
+            sampled when needed; path of a ``.npy`` file: frozen layouts; or a source itself.
     """
     if callable(layouts):
         return layouts
@@ -70,15 +70,15 @@ def layout_source(model: SceneModel, layouts: str | Path | LayoutSource | None =
 
 
 def caches_folder(root: str | Path = "auto") -> Path:
-    """Return the folder of all layout caches; ``auto``: in the user's cache folder."""
+    """Return the folder of all layout caches; ``auto``: the user's cache folder."""
     return cache_dir() / "layouts" if root == "auto" else Path(root)
 
 
 class LayoutSampler:
-    """Samples layouts, the same ones in every process.
+    """A `LayoutSource` that samples layouts without storing them; each process gets the same layouts.
 
-    Where PhysX has a GPU it cooks hulls otherwise, on a CPU too, and heaps come to rest elsewhere. There a worker
-    process samples the layouts; it ends with this object.
+    A process that has enabled PhysX on a GPU cooks other hulls, so heaps settle in other poses. Such a process lets a
+    worker process sample the layouts. The worker ends when this object is deleted.
     """
 
     def __init__(self, model: SceneModel) -> None:
@@ -94,11 +94,16 @@ class LayoutSampler:
         return self.make(objects_seed, seed, self._object_ids[objects_seed])
 
     def make(self, objects_seed: int, seed: int, object_ids: ObjectIds | None = None) -> Layout:
-        """Return the layout of two seeds, with the objects of the objects seed if the seeds differ.
+        """Return the layout of an objects seed and a seed.
+
+        Args:
+            objects_seed: decides the objects.
+            seed: decides everything else.
+            object_ids: objects of the objects seed, if they are known.
 
         Raises:
-            LayoutError: there is no layout.
-            SimulationError: the worker process died, and another one too.
+            LayoutError: the seeds have no layout.
+            SimulationError: the worker process crashed, and so did its replacement.
         """
         if not physx.is_gpu_enabled():
             return sample_layout(self._model, objects_seed, seed, object_ids)
@@ -118,20 +123,20 @@ def _sample(model: SceneModel, task: tuple[int, int, ObjectIds | None]) -> Layou
 
 def _raise_crash(task: tuple[int, int, ObjectIds | None], reason: str) -> NoReturn:
     # not a `LayoutError`: another seed would not help
-    raise SimulationError("the process that samples layouts died", where=f"seed {task[1]}", found=reason)
+    raise SimulationError("the process that samples layouts crashed", where=f"seed {task[1]}", found=reason)
 
 
 class LayoutCache:
-    """Layouts of one configuration and its packs, a small file each; a `LayoutSource`.
+    """A `LayoutSource` that stores the layouts of one configuration and its packs, one small file per layout.
 
-    Several processes may use a cache at once: files appear whole, and two that make the same layout make the same file.
+    Several processes may use a cache at once: files are written atomically, and equal seeds give equal files.
 
     Args:
         model: the scene's assets.
-        root: of all caches; see `caches_folder`.
+        root: folder of all caches; see `caches_folder`.
 
     Attributes:
-        folder: of this cache.
+        folder: folder of this cache.
     """
 
     def __init__(self, model: SceneModel, root: str | Path = "auto") -> None:
@@ -143,7 +148,7 @@ class LayoutCache:
         self.folder = caches_folder(root) / f"{model.config.task}-{key}"
 
     def table(self, engine: Engine) -> LayoutTable | None:
-        """Return its layouts as one mapped file, if that was written for an engine and is not damaged."""
+        """Return the layout table of an engine, mapped into memory; None if it is missing or damaged."""
         path = self.table_path(engine)
         if not path.is_file():
             return None
@@ -157,7 +162,10 @@ class LayoutCache:
         return self.folder / f"table-{engine}.npy"
 
     def write_table(self, engine: Engine, pairs: Iterable[SeedPair]) -> LayoutTable | None:
-        """Write the layouts that exist of some pairs as a table, if any does; an earlier table's layouts stay in it."""
+        """Write the stored layouts of some seed pairs to the table of an engine, and return the table.
+
+        Layouts of an earlier table are kept. No table is written, and None returned, if no pair has a layout.
+        """
         with self._locked():
             before = self.table(engine)
             states = {pair: before.state(pair) for pair in before.pairs()} if before else {}
@@ -186,10 +194,10 @@ class LayoutCache:
         return self.folder / f"{seed // _FOLDER_SIZE:07d}" / f"{name}.npz"
 
     def get(self, objects_seed: int, seed: int) -> Layout:
-        """Return the layout of two seeds (see `sample_layout`), from its file if there is one, else made and kept.
+        """Return the layout of two seeds (see `sample_layout`): read its file, or sample and store the layout.
 
         Raises:
-            LayoutError: there is no layout. Nothing is kept of that.
+            LayoutError: the seeds have no layout. The failure is not stored.
         """
         path = self.path(objects_seed, seed)
         if path.is_file():
@@ -198,7 +206,7 @@ class LayoutCache:
                 layout.check(self._names)
                 return layout
             except (*DAMAGED_FILE_ERRORS, KeyError, TypeError) as error:
-                _log.warning("%s: damaged, made again (%s)", path, error)
+                _log.warning("%s: damaged layout file, the layout is sampled again (%s)", path, error)
         known = None if objects_seed == seed else self.get(objects_seed, objects_seed).object_ids
         layout = self._sample.make(objects_seed, seed, known)
         if not (self.folder / ABOUT).is_file():
@@ -214,14 +222,14 @@ class LayoutCache:
         return [pair for pair in pairs if not self.path(*pair).is_file()]
 
     def fill(self, pairs: Iterable[SeedPair], jobs: int = 1) -> Generator[tuple[SeedPair, str], None, None]:
-        """Make the layouts that are missing. Objects' own layouts come first, with which the others begin.
+        """Sample and store the missing layouts, first those whose two seeds are equal, which decide the objects.
 
         Args:
-            pairs: of seeds.
-            jobs: processes; the outcome does not depend on it.
+            pairs: seed pairs.
+            jobs: number of processes; it has no effect on the layouts.
 
         Yields:
-            Each pair when it is done, in any order, and why there is no layout; empty where there is one.
+            Each seed pair when it is done, in any order, and the reason why it has no layout (empty if it has one).
         """
         missing = self.missing(pairs)
         without: dict[int, str] = {}  # objects seeds without objects, and why
@@ -245,16 +253,16 @@ def _make(cache: LayoutCache, pair: SeedPair) -> tuple[SeedPair, str]:
 
 
 def _crashed(pair: SeedPair, why: str) -> tuple[SeedPair, str]:
-    return pair, f"the process that made it died ({why}); is memory short?"
+    return pair, f"the process that sampled the layout crashed ({why}); check the available memory"
 
 
 def seed_pairs(seeds: Iterable[int], objects: Iterable[int] | None = None) -> list[SeedPair]:
-    """Return the pairs of seeds whose layouts environments ask for.
+    """Return the (objects seed, seed) pairs of the layouts that environments need.
 
     Args:
-        seeds: of layouts.
-        objects: seeds of objects, as several envs have them: each goes with all ``seeds``, and first with itself, which
-            is the layout its env is built with. None: as one env has it, objects and layout of one seed.
+        seeds: layout seeds.
+        objects: objects seeds of several envs. Each is paired with itself, which is the layout that its env is built
+            with, and with all ``seeds``. None: one env, whose objects seed is its layout seed.
     """
     if objects is None:
         return [(seed, seed) for seed in seeds]
@@ -267,8 +275,8 @@ def count_layouts(folder: Path) -> int:
 
 
 def _about(model: SceneModel) -> dict[str, Any]:
-    config = model.config.model_dump(mode="json", exclude=_NOT_OF_LAYOUTS)
-    config["randomisation"] = {k: v for k, v in config["randomisation"].items() if k not in _LOOKS}
+    config = model.config.model_dump(mode="json", exclude=_KEYS_WITHOUT_EFFECT)
+    config["randomisation"] = {k: v for k, v in config["randomisation"].items() if k not in _APPEARANCE_KEYS}
     parts: dict[str, LoadedFurniture] = {**model.furniture, **({"basket": model.basket} if model.basket else {})}
     return {
         "layout_format": LAYOUT_FORMAT,

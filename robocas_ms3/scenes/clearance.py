@@ -1,4 +1,4 @@
-"""Checks that nothing in a configuration overlaps, and that all is within the robot's reach. No simulator."""
+"""Check that nothing in a configuration overlaps and that basket and objects are within reach. No simulator."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from robocas_ms3.robots.description import Envelope, RobotDescription
 from robocas_ms3.scenes.config.task import TaskConfig
 from robocas_ms3.scenes.placement import Array, Region
 
-_TOUCHING = 0.005  # m by which hulls may overlap: they are coarser than what is shown
-_STEP, _ALONG = 0.05, 0.01  # m between places of the base that are tried, and along the arm
+_TOUCHING = 0.005  # m by which hulls may overlap: collision hulls are coarser than the visual meshes
+_STEP, _ALONG = 0.05, 0.01  # m between sampled positions of the base, and between sampled points of the arm
 
 
 @dataclass(frozen=True)
 class CollisionBody:
-    """Something in the scene: its key in the configuration, and its hulls in the world, m."""
+    """Furniture, basket, room or robot: its key in the configuration, and its hulls in the world, m."""
 
     key: str
     hulls: list[Hull]
 
     @cached_property
     def bounds(self) -> tuple[Array, Array]:
-        """Least and greatest corners of the boxes around its N hulls, (N, 3) each."""
+        """Least and greatest corners of the bounding boxes of the N hulls, (N, 3) each."""
         corners = [(hull.vertices.min(axis=0), hull.vertices.max(axis=0)) for hull in self.hulls]
         return np.array([low for low, _ in corners]), np.array([high for _, high in corners])
 
@@ -45,17 +45,17 @@ def check_clearance(
 ) -> None:
     """Check that furniture, basket and robot don't overlap, and that basket and objects are within the arm's reach.
 
-    What a seed moves is checked where it is drawn (`robot_placement`), and reach includes what that may give.
+    `robot_placement` checks randomised poses when they are drawn. The reach includes the range of randomisation.
 
     Args:
         config: the configuration.
-        placed: assets and their poses 4x4 in the world, by key: ``furniture.NAME``, ``room``, and ``basket`` if any.
-        region: for objects, and 4x4 of its frame in the world, with what has to be opened open.
+        placed: assets and their 4x4 poses in the world by key: ``furniture.NAME``, ``room``, and optionally ``basket``.
+        region: region of the objects, and its 4x4 frame in the world while the furniture is open.
         robot_pose: 4x4 in the world.
-        robot: not checked where it has no envelope.
+        robot: its body and reach are checked if it has an envelope.
 
     Raises:
-        ConfigError: naming the two, and by how much.
+        ConfigError: two things overlap, or something is out of reach; the message has the distance.
     """
     joints = {f"furniture.{name}": item.joints for name, item in config.furniture.items()}
     around = {key: CollisionBody(key, _world_hulls(*at, joints.get(key, {}))) for key, at in placed.items()}
@@ -72,7 +72,8 @@ def check_clearance(
         deep = max((overlap(a, b) for a, b in _near(one, other)), default=0.0)
         if deep > _TOUCHING:
             fix = f"Move one of them by more than {deep:.2f} m" + ("." if other is room else ", or leave one out.")
-            raise ConfigError(f"{one.key} and {other.key} overlap", expected="apart", found=f"{deep:.3f} m", fix=fix)
+            what, found = f"{one.key} and {other.key} overlap", f"an overlap of {deep:.3f} m"
+            raise ConfigError(what, expected="no overlap", found=found, fix=fix)
     if envelope is not None:
         if config.randomisation.robot is None:
             arm = np.array(envelope.arm_at_start[config.robot_start])
@@ -81,7 +82,10 @@ def check_clearance(
 
 
 def overlap(one: Hull, other: Hull) -> float:
-    """Return how far one hull has to be moved to be clear of another, m; 0 where it is (by separating axes: exact)."""
+    """Return the distance in m by which one hull has to move to be clear of another; 0 if they don't overlap.
+
+    The result is exact (separating axis theorem).
+    """
     least = _least_overlap(one, other, np.concatenate([_normals(one), _normals(other)]))
     if least > 0:
         crossed = np.cross(_edges(one)[:, None], _edges(other)[None]).reshape(-1, 3)
@@ -105,7 +109,7 @@ def _normals(hull: Hull) -> Array:
 
 
 def _edges(hull: Hull) -> Array:
-    """Return directions (E, 3) of a hull's edges, parallel ones once."""
+    """Return the directions (E, 3) of a hull's edges, without duplicates."""
     pairs = np.sort(np.concatenate([hull.faces[:, [0, 1]], hull.faces[:, [1, 2]], hull.faces[:, [2, 0]]]), axis=1)
     ways = np.diff(hull.vertices[np.unique(pairs, axis=0)], axis=1)[:, 0]
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
@@ -130,7 +134,7 @@ def _world_hulls(part: LoadedFurniture, pose: Array, joints: Mapping[str, float]
 
 def _body(envelope: Envelope, robot_pose: Array) -> CollisionBody:
     corners = np.array(list(product((-1.0, 1.0), (-1.0, 1.0), (0.0, 1.0))))
-    sides = np.array([(0, 1, 2), (0, 1, 4), (0, 2, 4)])  # one along x, y and z each: those opposite add no axes
+    sides = np.array([(0, 1, 2), (0, 1, 4), (0, 2, 4)])  # one face per axis: opposite faces add no separating axes
     hulls = [Hull(transform_points(robot_pose, corners * box), sides) for box in envelope.body_boxes]
     return CollisionBody("robot", hulls)
 
@@ -141,7 +145,7 @@ def _densely(corners: Array) -> Array:
 
 
 def _check_arm(points: Array, others: list[CollisionBody]) -> None:
-    """Check that the arm, sampled at points (P, 3), does not start inside of something."""
+    """Check that no point (P, 3) of the arm's start pose is inside of another body."""
     for other in others:
         for hull, low, high in zip(other.hulls, *other.bounds, strict=True):
             close = points[np.all((points > low) & (points < high), axis=1)]
@@ -151,11 +155,12 @@ def _check_arm(points: Array, others: list[CollisionBody]) -> None:
             along, spans = close @ normals.T, hull.vertices @ normals.T
             if ((along > spans.min(axis=0)) & (along < spans.max(axis=0))).all(axis=1).any():
                 fix = f"Move or turn the robot or {other.key}, or choose another robot_start."
-                raise ConfigError("the robot's arm begins inside of something", where="robot", found=other.key, fix=fix)
+                what = "the robot's arm starts inside of another body"
+                raise ConfigError(what, where="robot", found=other.key, fix=fix)
 
 
 def _shoulders(config: TaskConfig, robot_pose: Array, robot: RobotDescription, envelope: Envelope) -> Array:
-    """Return where the arm's shoulder may be (P, 3), world, m: one place, or a grid where the base moves."""
+    """Return possible positions (P, 3) of the arm's shoulder, world, m: one, or a grid if the base can drive."""
     ranges = robot.base_limits[:2] if config.base_motion else ((0.0, 0.0),) * 2
     spans = [np.arange(low, high + _STEP, _STEP) for low, high in ranges]
     x, y = (grid.ravel() for grid in np.meshgrid(*spans))
@@ -170,7 +175,7 @@ def _check_reach(
     shoulders: Array,
     envelope: Envelope,
 ) -> None:
-    """Check that the nearest points of region and basket are where a stretched arm gets, or the base brings it."""
+    """Check that the nearest points of region and basket are within reach of the arm, including base motion."""
     moved = config.randomisation.robot
     reach = envelope.reach + _STEP + (np.sqrt(2) * moved.position if moved else 0.0)
     area, frame = region
@@ -190,11 +195,11 @@ def _within(distance: float, limit: float, what: str, fix: str) -> None:
             f"{what} is out of the arm's reach",
             expected=f"at most {limit:.2f} m from its shoulder",
             found=f"{distance:.2f} m",
-            fix=f"{fix}: {distance - limit:.2f} m are to be made up.",
+            fix=f"{fix}: it is {distance - limit:.2f} m too far away.",
         )
 
 
 def _distance(points: Array, frame: Array, low: Array, high: Array) -> float:
-    """Return the least distance of points (P, 3) in the world from a box in a frame, m."""
+    """Return the least distance in m between points (P, 3) in the world and a box given in a frame."""
     local = transform_points(np.asarray(np.linalg.inv(frame), dtype=np.float64), points)
     return float(np.linalg.norm(local - np.clip(local, low, high), axis=1).min())

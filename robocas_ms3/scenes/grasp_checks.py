@@ -1,4 +1,4 @@
-"""Which annotated grasps, poses of the TCP, come from the robot's side and are clear: geometry only, no simulator."""
+"""Check annotated grasps (TCP poses) for direction and collisions of the open gripper. Geometry only, no simulator."""
 
 from __future__ import annotations
 
@@ -14,32 +14,32 @@ from robocas_ms3.assets.pack import LoadedObject
 
 Array = NDArray[np.float64]
 
-Approach = Literal["top", "front"]  # from above; level, as into a shelf
+Approach = Literal["top", "front"]  # from above; horizontal, as into a shelf
 
-MAX_WIDTH = float(2 * GRIPPER_BOXES[0, 0, 1])  # m, of the open gripper that grasps are annotated for
+MAX_WIDTH = float(2 * GRIPPER_BOXES[0, 0, 1])  # m, opening of the gripper for which grasps are annotated
 MAX_CLOSING_TILT_DEG = 60.0  # of the closing axis from the horizontal
 MAX_SIDEWAYS_DEG = 45.0  # of the approach's horizontal direction from that of base -> object
 FRONT_ELEVATION_DEG = (-60.0, 10.0)  # of a front approach above the horizontal
-FREE_LEAN_DEG = 15.0  # an approach this close to straight down has no horizontal direction to speak of
+FREE_LEAN_DEG = 15.0  # an approach this close to vertical has no meaningful horizontal direction
 PREGRASP_DISTANCE = 0.1  # m
 
-SIDE_CLEARANCE = 0.005  # m to either side that a free grasp leaves: planners inflate obstacles
+SIDE_CLEARANCE = 0.005  # m of free space on either side of the gripper, since planners inflate obstacles
 NEIGHBOURHOOD = 0.5  # m from an object's centre, beyond which the gripper at one of its grasps does not reach
-SPARSE = 16  # each 16th point is tested against the gripper before all of them
+SPARSE = 16  # every 16th point is tested first, then all points
 TESTED_AT_ONCE = 1 << 16  # pairs of grasp and point
-HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # of the wrist, about the approach: the same grasp
+HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # half a turn about the approach axis gives an equivalent grasp
 
 
 def check_directions(
     tcp_in_world: Array, base_to_object: Array, approach: Approach = "top"
 ) -> dict[str, NDArray[np.bool_]]:
-    """Test the directions of grasps against gravity and the robot.
+    """Test the approach and closing directions of grasps relative to gravity and the robot.
 
     Args:
-        tcp_in_world: (G, 4, 4).
-        base_to_object: (3,) or (2,) in the world; only the horizontal part counts. Approaches deviate from it by at
-            most `MAX_SIDEWAYS_DEG`, but those that are nearly vertical (`FREE_LEAN_DEG`).
-        approach: from where the gripper may come.
+        tcp_in_world: (G, 4, 4) grasps.
+        base_to_object: (3,) or (2,) vector in the world, of which the horizontal part is used. Approaches may deviate
+            from it by at most `MAX_SIDEWAYS_DEG`; nearly vertical ones (`FREE_LEAN_DEG`) have no such limit.
+        approach: allowed direction of the gripper's approach.
 
     Returns:
         Three tests, each (G,): ``from_above`` or ``from_the_front``, ``from_the_robots_side``, ``closing_is_level``.
@@ -60,12 +60,12 @@ def check_directions(
 
 
 def is_gripper_clear(tcp_in_world: Array, points_in_world: Array, side_clearance: float = 0.0) -> NDArray[np.bool_]:
-    """Return for each grasp (G, 4, 4) whether no point (P, 3) is in the open gripper, from pre-grasp to grasp.
+    """Return (G,) whether the open gripper is free of points on its way from pre-grasp to grasp.
 
     Args:
-        tcp_in_world: (G, 4, 4).
+        tcp_in_world: (G, 4, 4) grasps.
         points_in_world: (P, 3) m.
-        side_clearance: how far from its sides (along x and y of the TCP) points have to stay, m.
+        side_clearance: least distance of points from the gripper's sides (along x and y of the TCP), m.
     """
     clear = np.ones(len(tcp_in_world), dtype=bool)
     if len(points_in_world) == 0 or len(tcp_in_world) == 0:
@@ -79,7 +79,7 @@ def is_gripper_clear(tcp_in_world: Array, points_in_world: Array, side_clearance
     if len(points) == 0:
         return clear
     left = np.flatnonzero(np.all((first <= points.max(0)) & (last >= points.min(0)), axis=1))
-    for some in (points[::SPARSE], points):  # few points rule out most of the grasps that are not clear
+    for some in (points[::SPARSE], points):  # a few points exclude most of the blocked grasps
         batch = max(1, TESTED_AT_ONCE // len(some))
         for start in range(0, len(left), batch):
             part = left[start : start + batch]
@@ -89,7 +89,7 @@ def is_gripper_clear(tcp_in_world: Array, points_in_world: Array, side_clearance
 
 
 def _bounds_around(tcp_in_world: Array, low: Array, high: Array) -> tuple[Array, Array]:
-    """Return low and high corners (G, 3) of the box ``low`` to ``high`` and its mirror image (y = 0) at each TCP."""
+    """Return bounds (G, 3) of the box ``low`` to ``high`` and its mirror image about y = 0, for each TCP."""
     low = np.array([low[0], -high[1], low[2]])
     rotations = tcp_in_world[:, :3, :3]
     centers = rotations @ ((low + high) / 2) + tcp_in_world[:, :3, 3]
@@ -98,7 +98,7 @@ def _bounds_around(tcp_in_world: Array, low: Array, high: Array) -> tuple[Array,
 
 
 def _any_inside(tcp: Array, points: Array, low: Array, high: Array) -> NDArray[np.bool_]:
-    """Return for each TCP (G, 4, 4) whether a point (P, 3) is in one of the boxes (B, 3), or in their mirror image."""
+    """Return (G,) whether a point (P, 3) is inside one of the boxes (B, 3) or its mirror image, for each TCP."""
     x, y, z = to_tcp_frames(tcp, points)
     y = np.abs(y)
     inside = np.zeros(len(tcp), dtype=bool)
@@ -108,8 +108,8 @@ def _any_inside(tcp: Array, points: Array, low: Array, high: Array) -> NDArray[n
 
 
 def to_tcp_frames(tcp: Array, points: Array) -> Iterator[Array]:
-    """Yield coordinates x, y, z, (G, P) each, of points (P, 3) in the frames of TCPs (G, 4, 4)."""
-    # no BLAS, whose threads may change the last bits
+    """Yield the coordinates x, y and z (G, P) of points (P, 3) in the frames of TCPs (G, 4, 4)."""
+    # without BLAS, whose threads may change the last bits
     a, b, c = (points[:, i] - tcp[:, i, 3, None] for i in range(3))
     for axis in range(3):
         yield tcp[:, 0, axis, None] * a + tcp[:, 1, axis, None] * b + tcp[:, 2, axis, None] * c
@@ -122,17 +122,17 @@ def has_free_grasps(
     robot_xy: Array,
     approach: Approach = "top",
     *,
-    at_least: int,
+    min_count: int,
 ) -> bool:
-    """Return whether enough of an object's grasps come from the robot's side and pass clear of everything else.
+    """Return whether enough of an object's grasps have an allowed direction and are free of collisions.
 
     Args:
         asset: the object.
         object_in_world: 4x4.
-        scene_points_in_world: (P, 3) surfaces of everything else.
-        robot_xy: (2,) where the arm's base stands, m.
-        approach: from where the gripper may come.
-        at_least: how many are enough.
+        scene_points_in_world: (P, 3) samples of all other surfaces, m.
+        robot_xy: (2,) position of the arm's base, m.
+        approach: allowed direction of the gripper's approach.
+        min_count: number of grasps that are enough.
     """
     notes, center = asset.annotations, object_in_world[:3, 3]
     grasps = object_in_world @ notes.grasps_tcp_in_object
@@ -140,20 +140,20 @@ def has_free_grasps(
     for passed in check_directions(grasps, center[:2] - robot_xy, approach).values():
         good &= passed
     grasps = grasps[good]
-    if at_least == 0 or len(grasps) < at_least:
-        return at_least == 0
+    if min_count == 0 or len(grasps) < min_count:
+        return min_count == 0
     low, high = _swept_bounds(grasps)
     near = scene_points_in_world[np.all((scene_points_in_world >= low) & (scene_points_in_world <= high), axis=1)]
-    free, batch = 0, 2 * at_least  # mostly the first batch decides
+    free, batch = 0, 2 * min_count  # the first batch usually decides
     for start in range(0, len(grasps), batch):
-        if free >= at_least or free + len(grasps) - start < at_least:
+        if free >= min_count or free + len(grasps) - start < min_count:
             break
         free += int(is_gripper_clear(grasps[start : start + batch], near, side_clearance=SIDE_CLEARANCE).sum())
-    return free >= at_least
+    return free >= min_count
 
 
 def _swept_bounds(tcp_in_world: Array) -> tuple[Array, Array]:
-    """Return low and high corner (3,) of the volume that the open gripper sweeps on its way to grasps (G, 4, 4)."""
+    """Return bounds (3,) of the volume that the open gripper sweeps on its way to grasps (G, 4, 4)."""
     high = GRIPPER_BOXES[:, 1].max(axis=0) + (SIDE_CLEARANCE, SIDE_CLEARANCE, 0)
     low = np.array([-high[0], -high[1], GRIPPER_BOXES[:, 0, 2].min() - PREGRASP_DISTANCE])
     corners = np.array(list(itertools.product(*zip(low, high, strict=True))))

@@ -1,4 +1,4 @@
-"""Heaps: objects dropped one by one between four walls, which are then taken away. Bare PhysX."""
+"""Make heaps: objects drop one by one between four walls, which are then removed. Uses PhysX without ManiSkill."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from robocas_ms3.core.text import format_count
 from robocas_ms3.scenes.config.task import StackedLayout
 from robocas_ms3.scenes.placement import Array, Region
 
-BUCKET_SECONDS = 1.0  # at most, after the last one
-SPREAD_SECONDS, OPEN_SECONDS = 2.0, 0.5  # at most: within a fence along the sides of the region, and without it
-SPREAD = 0.05  # m that centres of mass may lie outside the region in the end
-WALL = 0.05  # m, half its thickness
-_LOOK_EVERY = 10  # steps between two checks whether everything is at rest
+BUCKET_SECONDS = 1.0  # greatest simulated time after the last object has fallen
+SPREAD_SECONDS, OPEN_SECONDS = 2.0, 0.5  # greatest times within a fence around the region, and without it
+SPREAD = 0.05  # m by which centres of mass may be outside the region at the end
+WALL = 0.05  # m, half the thickness of a wall
+_CHECK_STEPS = 10  # steps between two checks whether everything is at rest
 _TRIES = 40
 
-# Evenly spread unit vectors (64, 3), a Fibonacci lattice: an object's extreme points along them make its outline
+# Evenly spread unit vectors (64, 3), a Fibonacci lattice: the extreme points along them approximate an object's hull
 _HEIGHTS = 1 - (2 * np.arange(64) + 1) / 64
 _TURNS = np.arange(64) * np.pi * (3 - np.sqrt(5))
 _RADII = np.sqrt(1 - _HEIGHTS**2)
@@ -50,23 +50,23 @@ def drop_heap(
     *,
     headroom: float = np.inf,
 ) -> Array:
-    """Drop objects into a frictionless bucket on a plane, then take the bucket away (docs/layouts.md).
+    """Drop objects into a frictionless bucket on a plane, then remove the bucket (docs/layouts.md).
 
-    They fall as one convex hull each, one soon after the other; the heap then spreads with all hulls of its objects, at
-    first within a fence, which stops what would roll away.
+    Each object falls as one convex hull. Then the heap spreads with all hulls of its objects, first within a fence that
+    stops rolling objects, then without it.
 
     Args:
         rng: source of all randomness.
         assets: K objects.
-        region: of a horizontal plane.
-        layout: how they fall.
-        headroom: that the heap has to stay below, m.
+        region: region of a horizontal plane.
+        layout: parameters of the drop.
+        headroom: greatest height of the heap, m.
 
     Returns:
         (K, 4, 4) objects at rest in the region's frame, in the order of ``assets``.
 
     Raises:
-        LayoutError: heap after heap fell apart over the region's edges, or was too high.
+        LayoutError: each of several heaps spread over the region's edges or was too high.
     """
     for _ in range(_TRIES):
         with engine_settings():
@@ -81,9 +81,10 @@ def drop_heap(
         if inside.all() and top - region.z < headroom:
             return poses
     raise LayoutError(
-        f"no heap here of {format_count(len(assets), 'object')}",
+        f"no heap of {format_count(len(assets), 'object')}",
         where="layout",
-        found=f"{_TRIES} heaps fell apart" + (f" or rose above {headroom:.3f} m" if np.isfinite(headroom) else ""),
+        found=f"{_TRIES} heaps spread over the edges"
+        + (f" or were higher than {headroom:.3f} m" if np.isfinite(headroom) else ""),
         fix="Lower objects.count or enlarge the surface.",
     )
 
@@ -91,8 +92,8 @@ def drop_heap(
 def _fill_bucket(
     rng: np.random.Generator, assets: Sequence[LoadedObject], region: Region, layout: StackedLayout
 ) -> Array:
-    """Return poses (K, 4, 4) of objects that have fallen into the bucket, with their outlines for bodies."""
-    # narrower buckets make higher heaps, which spread when the walls are gone
+    """Return poses (K, 4, 4) of objects after they have fallen into the bucket, each as one convex hull."""
+    # a narrower bucket makes a higher heap, which spreads when the walls are removed
     middle, half = _middle(region), layout.bucket * np.subtract(region.max_xy, region.min_xy) / 2
     scene = new_scene()
     add_ground(scene, np.array([*middle, region.z]))
@@ -116,7 +117,7 @@ def _fill_bucket(
 
 
 def _spread(assets: Sequence[LoadedObject], poses: Array, region: Region) -> Array:
-    """Return poses (K, 4, 4) of objects after the bucket is gone, and then the fence."""
+    """Return poses (K, 4, 4) of objects after bucket and fence have been removed."""
     middle = _middle(region)
     scene = new_scene()
     add_ground(scene, np.array([*middle, region.z]))
@@ -132,7 +133,7 @@ def _spread(assets: Sequence[LoadedObject], poses: Array, region: Region) -> Arr
 
 
 def outline(asset: LoadedObject) -> Array:
-    """Return points (V, 3), at most 64, whose convex hull is about that of the object, m, in the asset's frame."""
+    """Return at most 64 points (V, 3) whose convex hull approximates the object's, m, in the asset's frame."""
     points = np.concatenate(asset.hulls)
     return points[np.unique(np.argmax(points @ _DIRECTIONS.T, axis=0))]
 
@@ -142,7 +143,14 @@ def _middle(region: Region) -> Array:
 
 
 def draw_drop_order(rng: np.random.Generator, assets: Sequence[LoadedObject], noise: float | None) -> NDArray[np.intp]:
-    """Draw the order of falling: by size times a random factor, whose logarithm deviates by ``noise``; None: any."""
+    """Draw the order in which objects fall.
+
+    Args:
+        rng: source of randomness.
+        assets: K objects.
+        noise: standard deviation of the logarithm of the random factor on the sizes by which objects are sorted,
+            smallest first; None: any order.
+    """
     if noise is None:
         return rng.permutation(len(assets))
     sizes = np.array([np.prod(asset.asset.extents) for asset in assets])
@@ -178,7 +186,7 @@ def _add_walls(scene: sapien.Scene, middle: Array, half: Array, z: float) -> lis
 def _run(scene: sapien.Scene, seconds: float, bodies: Sequence[physx.PhysxRigidDynamicComponent]) -> None:
     for step in range(round(seconds / TIME_STEP)):
         scene.step()
-        if step >= 2 * _LOOK_EVERY and step % _LOOK_EVERY == 0:
+        if step >= 2 * _CHECK_STEPS and step % _CHECK_STEPS == 0:
             linear, angular = (np.stack([getattr(b, f"{n}_velocity") for b in bodies]) for n in ("linear", "angular"))
             speeds = np.linalg.norm(linear, axis=1) + 0.05 * np.linalg.norm(angular, axis=1)
             if speeds.max() < 0.01:

@@ -1,4 +1,4 @@
-"""A layout: where everything is at the start of an episode; and its ``.npz`` file. No simulator."""
+"""The layout of a scene: poses and target at the start of an episode, and its ``.npz`` file. No simulator."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ from robocas_ms3.core.files import atomic_file
 Array = NDArray[np.float64]
 
 ObjectIds = tuple[str, ...]
-"""Objects of a scene: an id of the object pack per slot."""
+"""Objects of a scene: one id of the object pack per slot."""
 
 _FILE_KEYS = {"visible_fractions": "visible_fractions"}  # keys of files where they differ from the fields' names
-_ROTATION_ERROR = 1e-3  # by which a matrix may differ from a rotation, as single precision does
-PARKING_HEIGHT = -5.0  # z of the plane, m, on which slots wait that an episode does not use
+_ROTATION_ERROR = 1e-3  # tolerance of rotation matrices, for single precision
+PARKING_HEIGHT = -5.0  # z in m of the plane on which the objects of unused slots are placed
 
 
 @dataclass(frozen=True)
 class Layout:
-    """A settled arrangement of objects and its target. K objects; world frame, metres.
+    """Settled objects, robot, basket and target of a scene. K object slots; world frame, metres.
 
     Attributes:
         object_ids: K ids of the object pack.
-        object_poses: (K, 4, 4) objects at rest; of those that aren't present, where they wait.
-        robot_pose: (4, 4) the robot's root on the floor.
-        basket_pose: (4, 4) the basket's frame; None where there is no basket.
+        object_poses: (K, 4, 4) objects at rest; objects that are not present are parked below the floor.
+        robot_pose: (4, 4) pose of the robot's root on the floor.
+        basket_pose: (4, 4) pose of the basket's frame; None if the scene has no basket.
         target: slot of the target.
-        relation: how the instruction tells the target from identical objects, e.g. ``nearest``; empty: by its name.
-        present: (K,) which slots take part; default: all. The number of slots is the same for every seed.
-        visible_fractions: (K,) p_vis of each object from the selection camera; NaN where it was not asked for.
+        relation: relation that distinguishes the target from identical objects, e.g. ``nearest``; empty: no relation.
+        present: (K,) which slots are used; default: all. The number of slots is the same for every seed.
+        visible_fractions: (K,) visible fraction (p_vis) of each object from the selection camera; NaN: not computed.
     """
 
     object_ids: ObjectIds
@@ -55,18 +55,18 @@ class Layout:
             object.__setattr__(self, "visible_fractions", np.full(len(self.object_ids), np.nan))
 
     def check(self, names: Collection[str]) -> None:
-        """Raise ValueError where a layout read from a file can't be built with the objects of these names."""
+        """Raise ValueError if the layout is invalid, or has objects that are not among these names."""
         count = len(self.object_ids)
         shapes = self.object_poses.shape, self.present.shape, self.visible_fractions.shape
         if shapes != ((count, 4, 4), (count,), (count,)) or not set(self.object_ids) <= set(names):
-            raise ValueError("other objects than those of the pack, or not as many poses as objects")
+            raise ValueError("objects that the pack does not have, or numbers of poses and objects that differ")
         fixtures = [self.robot_pose] if self.basket_pose is None else [self.robot_pose, self.basket_pose]
         if any(pose.shape != (4, 4) for pose in fixtures) or not 0 <= self.target < count:
-            raise ValueError("a pose is not 4x4, or the target is not one of the objects")
+            raise ValueError("a pose that is not 4x4, or a target that is not one of the objects")
         poses = np.concatenate([self.object_poses, fixtures])
         turns = poses[:, :3, :3]
         if not np.isfinite(poses).all() or np.abs(turns @ turns.swapaxes(1, 2) - np.eye(3)).max() > _ROTATION_ERROR:
-            raise ValueError("a pose is not finite, or not a rotation")
+            raise ValueError("a pose with NaN or infinite values, or with an invalid rotation")
 
 
 LayoutSource = Callable[[int, int], Layout]
@@ -78,7 +78,7 @@ def write_layout(layout: Layout, path: Path) -> None:
     arrays: dict[str, Any] = {
         name: np.zeros(0) if value is None else np.asarray(value) for name, value in values.items()
     }
-    archive = BytesIO()  # a zip file on a full disk raises once more when it is closed
+    archive = BytesIO()  # on a full disk, closing a zip file would raise a second error
     np.savez(archive, **arrays)
     with atomic_file(path) as tmp:
         tmp.write_bytes(archive.getbuffer())
@@ -88,7 +88,7 @@ def read_layout(path: Path) -> Layout:
     """Read a layout.
 
     Raises:
-        ValueError: or another of `documents.DAMAGED_FILE_ERRORS`, or KeyError or TypeError: the file is damaged.
+        ValueError: the file is damaged; so do KeyError, TypeError and `documents.DAMAGED_FILE_ERRORS`.
     """
     with open_arrays(path) as file:
         values = {f.name: file[_FILE_KEYS.get(f.name, f.name)] for f in fields(Layout)}

@@ -1,8 +1,8 @@
-"""Many layouts in one ``.npy`` file, an array of records in single precision.
+"""Many layouts in one ``.npy`` file: an array of records in single precision.
 
-- A table, of a layout cache: S sets of objects (by the seed that drew them) with L layouts each (by their own seeds),
-  for PhysX on a CPU or on a GPU. It is mapped into memory, so that a reset of any number of envs is a gather.
-- Frozen layouts, of a protocol: those of a list of seeds, the same scenes on every machine.
+- A layout table belongs to a layout cache and to PhysX on a CPU or a GPU. It has S rows (objects seeds) and L columns
+  (layout seeds). It is mapped into memory, so that a reset of any number of envs is one gather.
+- Frozen layouts belong to a protocol: the layouts of a list of seeds, which give the same scenes on every machine.
 """
 
 from __future__ import annotations
@@ -28,28 +28,32 @@ Engine = Literal["cpu", "gpu"]
 SeedPair = tuple[int, int]
 """Objects seed, seed."""
 
-_FIX = "Make it again: robocas layouts build."
+_FIX = "Build the table again: robocas layouts build."
 
 
 class LayoutStatus(IntEnum):
-    """LayoutStatus of a layout in a table."""
+    """Status of a layout in a table."""
 
     MISSING = 0
-    UNCHECKED = 1  # stable in the engine that made it
+    UNCHECKED = 1  # stable in the engine that sampled it, not yet checked in the engine of the table
     STABLE = 2
-    UNSTABLE = 3  # the engine of the table moves its objects
+    UNSTABLE = 3  # objects move in the engine of the table
 
 
 def is_usable(states: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Return whether an episode may begin with layouts in these states."""
+    """Return whether layouts with these statuses may start an episode."""
     return (states == LayoutStatus.UNCHECKED) | (states == LayoutStatus.STABLE)
 
 
 class LayoutTable:
-    """Layouts of a table file; ``names`` are the ids of the object pack's objects, sorted.
+    """Layouts of a table file.
+
+    Args:
+        path: the file.
+        names: sorted ids of the object pack's objects.
 
     Attributes:
-        rows: (S, L) records, mapped.
+        rows: (S, L) records, mapped into memory.
 
     Raises:
         LayoutError: the file is damaged.
@@ -57,7 +61,7 @@ class LayoutTable:
 
     def __init__(self, path: Path, names: Sequence[str]) -> None:
         self._names = list(names)
-        self.rows = _open(path, partial(np.lib.format.open_memmap, mode="r"), "no table of layouts", dimensions=2)
+        self.rows = _open(path, partial(np.lib.format.open_memmap, mode="r"), "not a layout table", dimensions=2)
         self._sets, self._seeds = self.rows["objects_seed"][:, 0].copy(), self.rows["seed"][0].copy()  # rising
         self._states = self.rows["state"].copy()
 
@@ -74,7 +78,7 @@ class LayoutTable:
         return LayoutStatus(int(self.find_records(np.array([pair[0]]), np.array([pair[1]]))[0][0]))
 
     def pairs(self, *states: LayoutStatus) -> list[SeedPair]:
-        """Return the pairs of the layouts in these states; default: of all that the table holds."""
+        """Return the seed pairs of the layouts with these statuses; default: of all layouts in the table."""
         rows, columns = np.nonzero(np.isin(self._states, states) if states else self._states)
         return [*zip(self._sets[rows].tolist(), self._seeds[columns].tolist(), strict=True)]
 
@@ -82,7 +86,7 @@ class LayoutTable:
         return bool(is_usable(self._states[self._sets == objects_seed]).any())
 
     def object_ids(self, objects_seed: int) -> ObjectIds | None:
-        """Return the objects of a seed; None where the table has no layout of them."""
+        """Return the objects of an objects seed; None if the table has no layout of them."""
         row = int(np.searchsorted(self._sets, objects_seed))
         if row == len(self._sets) or self._sets[row] != objects_seed:
             return None
@@ -90,7 +94,7 @@ class LayoutTable:
         return tuple(str(self._names[i]) for i in self.rows["objects"][row, column].tolist())
 
     def layout(self, pair: SeedPair) -> Layout | None:
-        """Return a layout, in single precision; None where the table lacks it."""
+        """Return a layout in single precision; None if the table does not have it."""
         state, rows, columns = self.find_records(np.array([pair[0]]), np.array([pair[1]]))
         return _layout(self.rows[rows[0], columns[0]], self._names) if state[0] != LayoutStatus.MISSING else None
 
@@ -101,7 +105,14 @@ def write_table(
     layouts: Mapping[SeedPair, Layout],
     states: Mapping[SeedPair, LayoutStatus] = MappingProxyType({}),
 ) -> None:
-    """Write layouts as a table; a pair of its seeds without a layout is `LayoutStatus.MISSING`."""
+    """Write layouts as a table.
+
+    Args:
+        path: the file.
+        names: sorted ids of the object pack's objects.
+        layouts: layouts by seed pair; other pairs of the same seeds become `LayoutStatus.MISSING`.
+        states: statuses by seed pair; default: `LayoutStatus.UNCHECKED`.
+    """
     records = _records(names, layouts, states)
     sets, row = np.unique(records["objects_seed"], return_inverse=True)
     seeds, column = np.unique(records["seed"], return_inverse=True)
@@ -112,7 +123,7 @@ def write_table(
 
 
 def write_statuses(path: Path, names: Sequence[str], states: Mapping[SeedPair, LayoutStatus]) -> None:
-    """Write the states of some layouts into a table; layouts that it lacks stay `LayoutStatus.MISSING`."""
+    """Write the statuses of some layouts into a table; pairs without a layout stay `LayoutStatus.MISSING`."""
     table = LayoutTable(path, names)
     rows = np.array(table.rows)
     for pair, state in states.items():
@@ -123,7 +134,11 @@ def write_statuses(path: Path, names: Sequence[str], states: Mapping[SeedPair, L
 
 
 class FrozenLayouts:
-    """A `LayoutSource` of frozen layouts; ``names`` are the ids of the object pack's objects.
+    """A `LayoutSource` of frozen layouts.
+
+    Args:
+        path: the file.
+        names: ids of the object pack's objects.
 
     Raises:
         LayoutError: the file is damaged.
@@ -131,26 +146,27 @@ class FrozenLayouts:
 
     def __init__(self, path: Path, names: Collection[str]) -> None:
         self._path, self._names = path, sorted(names)
-        self._records = _open(path, load_array, "no frozen layouts", dimensions=1)
+        self._records = _open(path, load_array, "not a file of frozen layouts", dimensions=1)
         self._places = {int(seed): i for i, seed in enumerate(self._records["seed"])}
 
     @property
     def seeds(self) -> tuple[int, int]:
-        """First and last of the consecutive seeds from the least on."""
+        """First and last of the consecutive seeds that start with the least seed."""
         first = last = min(self._places)
         while last + 1 in self._places:
             last += 1
         return first, last
 
     def __call__(self, objects_seed: int, seed: int) -> Layout:
-        """Return the layout of a seed, which has its own objects.
+        """Return the layout of a seed, which is also its objects seed.
 
         Raises:
-            LayoutError: there is none, or the seeds differ.
+            LayoutError: the file has no layout of the seed, or the seeds differ.
         """
         if objects_seed != seed or seed not in self._places:
             found = seed if objects_seed == seed else f"objects of {objects_seed}, layout of {seed}"
-            raise LayoutError("has no layout of this seed", where=self._path, found=found)
+            expected = f"one of {len(self._places)} seeds from {min(self._places)} to {max(self._places)}"
+            raise LayoutError("no frozen layout of this seed", where=self._path, expected=expected, found=found)
         return _layout(self._records[self._places[seed]], self._names)
 
 
@@ -159,15 +175,16 @@ def write_frozen_layouts(path: Path, names: Collection[str], layouts: Mapping[in
 
 
 def join_frozen_layouts(path: Path, parts: Sequence[Path]) -> None:
-    """Join files of one configuration's layouts, in the order given; see `FrozenLayouts`.
+    """Join several files of frozen layouts of one configuration, in the given order.
 
     Raises:
-        LayoutError: one of them is damaged, or of another configuration.
+        LayoutError: a file is damaged, or belongs to another configuration.
     """
-    pieces = [_open(part, load_array, "no frozen layouts", dimensions=1) for part in parts]
+    pieces = [_open(part, load_array, "not a file of frozen layouts", dimensions=1) for part in parts]
     for part, piece in zip(parts, pieces, strict=True):
         if piece.dtype["objects"] != pieces[0].dtype["objects"]:
-            raise LayoutError("no frozen layouts of this configuration", where=part)
+            what, expected = "frozen layouts of another configuration", f"as many objects as in {parts[0]}"
+            raise LayoutError(what, where=part, expected=expected)
     _save(path, np.concatenate(pieces))
 
 
@@ -210,7 +227,7 @@ def _layout(record: Any, names: Sequence[str]) -> Layout:
         )
         layout.check(names)
     except (ValueError, IndexError) as error:
-        raise LayoutError("this layout is damaged", found=error, fix=_FIX) from error
+        raise LayoutError("damaged layout", found=error, fix=_FIX) from error
     return layout
 
 
@@ -220,7 +237,7 @@ def _open(path: Path, load: Callable[[Path], Any], what: str, *, dimensions: int
         rows = load(path)
         slots, words = rows.dtype["present"].itemsize, rows.dtype["relation"].itemsize // 4
         if rows.dtype != _record_type(slots, words) or rows.ndim != dimensions or not rows.size:
-            raise ValueError("other fields than those of layouts")
+            raise ValueError("an array without the fields of layouts")
     except (*DAMAGED_FILE_ERRORS, KeyError, TypeError) as error:
         raise LayoutError(what, where=path, found=error, fix=_FIX if dimensions == 2 else "") from error
     return rows
@@ -237,7 +254,7 @@ def _record_type(slots: int, words: int) -> np.dtype:
             ("objects_seed", "i8"),
             ("seed", "i8"),
             ("state", "u1"),
-            ("objects", "i4", (slots,)),  # numbers among the names
+            ("objects", "i4", (slots,)),  # indices into the sorted names
             ("object_poses", "f4", (slots, 7)),
             ("robot_pose", "f4", 7),
             ("basket_pose", "f4", 7),

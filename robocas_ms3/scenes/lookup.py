@@ -1,4 +1,4 @@
-"""Look up what a configuration names in the packs; every mistake is a `ConfigError`. No simulator."""
+"""Look up the assets of a configuration in the packs; an invalid name is a `ConfigError`. No simulator."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from robocas_ms3.scenes.placement import Array, Region
 from robocas_ms3.scenes.relations import RELATIONS, THREE_OBJECT_RELATIONS
 from robocas_ms3.scenes.task_specs import TASKS
 
-MAX_OPENED_FRACTION = {"prismatic": 0.95, "revolute": 0.8}  # share of a joint's range that scripted pulls aim at
+MAX_OPENED_FRACTION = {"prismatic": 0.95, "revolute": 0.8}  # fraction of a joint's range that scripted pulls aim at
 
 
 def fixture_pose(config: PoseConfig) -> Array:
@@ -25,7 +25,7 @@ def fixture_pose(config: PoseConfig) -> Array:
 
 
 def furniture_pose(config: PlacedConfig, furniture: LoadedFurniture) -> Array:
-    """Return 4x4 of a piece of furniture's frame; the configuration has the place of its lowest point."""
+    """Return the 4x4 pose of a furniture frame from the configured position of its lowest point."""
     pose = fixture_pose(config.pose)
     pose[2, 3] += furniture.asset.origin_height
     return pose
@@ -37,11 +37,11 @@ def _check_known(what: str, found: str, known: Collection[str]) -> None:
 
 
 def find_furniture(pack: Pack, asset_id: str, *, key: str) -> LoadedFurniture:
-    """Return a piece of furniture: an id of the pack, or ``pack/id`` of another one.
+    """Return a piece of furniture by its id in the pack, or by ``pack/id`` in another pack.
 
     Raises:
         ConfigError: the pack has no such furniture.
-        AssetError: there is no such pack.
+        AssetError: the other pack does not exist.
     """
     other, _, name = asset_id.rpartition("/")
     if other:
@@ -58,7 +58,7 @@ def find_room(pack: Pack, config: TaskConfig) -> LoadedFurniture:
         _check_known(f"room.finishes.{part}: no such finish", finish, known[part])
     for part in random.room or ():
         _check_known("randomisation.room: no such part of the room", part, known)
-    for part, finishes in random.finishes.items():  # its parts are among `randomisation.room`
+    for part, finishes in random.finishes.items():  # the configuration ensures that its parts are in `random.room`
         for finish in finishes:
             _check_known(f"randomisation.finishes.{part}: no such finish", finish, known[part])
     return room
@@ -67,7 +67,8 @@ def find_room(pack: Pack, config: TaskConfig) -> LoadedFurniture:
 def find_container(pack: Pack, config: PlacedConfig) -> LoadedFurniture:
     basket = find_furniture(pack, config.asset, key="basket.asset")
     if basket.asset.inner is None or basket.asset.mass is None:
-        raise ConfigError("basket.asset: this furniture is no movable container", found=config.asset)
+        expected = "furniture with a mass and an inner volume"
+        raise ConfigError("basket.asset: not a movable container", expected=expected, found=config.asset)
     return basket
 
 
@@ -75,7 +76,7 @@ def find_objects(pack: Pack, config: TaskConfig) -> list[str]:
     wanted = sorted(pack.objects) if config.objects.ids == "all" else config.objects.ids
     ids = resolve_ids(pack, wanted, key="objects.ids")
     if not ids:
-        raise ConfigError(f"objects.ids: pack {pack.name!r} has no objects to choose from")
+        raise ConfigError(f"objects.ids: pack {pack.name!r} has no objects", expected="at least one object")
     for number, names in enumerate(config.randomisation.object_sets or ()):
         resolve_ids(pack, names, key=f"randomisation.object_sets.{number}")
     if config.randomisation.distractors:
@@ -85,7 +86,10 @@ def find_objects(pack: Pack, config: TaskConfig) -> list[str]:
 
 
 def _check_relations(pack: Pack, config: TaskConfig, ids: list[str]) -> None:
-    """Check that a layout can have enough objects of a name for each relation; all relations stand for those it can."""
+    """Check that layouts can have enough objects of one name for each relation.
+
+    The complete list of relations is always valid: it stands for those that the layout allows.
+    """
     asked, layout, random = config.target.relations, config.layout, config.randomisation
     named = "relation" in TASKS[config.task].slots
     if not named or not isinstance(layout, OrderlyLayout) or set(asked) == set(RELATIONS):
@@ -97,10 +101,10 @@ def _check_relations(pack: Pack, config: TaskConfig, ids: list[str]) -> None:
         most += random.distractors.count[1]
     if wrong and most < 3:
         raise ConfigError(
-            f"target.relations: {', '.join(wrong)} needs three objects of a name or more",
+            f"target.relations: {', '.join(wrong)} needs at least three objects of one name",
             expected="layout.copies and objects.count of 3 or more",
             found=f"layout.copies {layout.copies}, objects.count {config.objects.count}",
-            fix="Raise layout.copies, or leave these relations out.",
+            fix="Raise layout.copies, or remove these relations.",
         )
 
 
@@ -115,7 +119,11 @@ def _most_alike(pack: Pack, ids: list[str], config: TaskConfig, copies: int) -> 
 
 
 def resolve_ids(pack: Pack, wanted: list[str | int] | list[str], *, key: str) -> list[str]:
-    """Return the ids of a pack's objects, from ids or GraspNet-1Billion's numbers."""
+    """Return ids of a pack's objects from ids or numbers in GraspNet-1Billion.
+
+    Raises:
+        ConfigError: the pack has no such object; the message names ``key``.
+    """
     numbers = {
         loaded.asset.graspnet_id: i for i, loaded in pack.objects.items() if loaded.asset.graspnet_id is not None
     }
@@ -141,7 +149,7 @@ def find_region(config: SurfaceConfig, furniture: LoadedFurniture) -> Region:
         return Region(whole.min_xy, whole.max_xy, whole.z)
     if not (np.greater_equal(config.min_xy, whole.min_xy) & np.less_equal(config.max_xy, whole.max_xy)).all():
         raise ConfigError(
-            f"surface: the rectangle lies outside surface {config.name!r} of {furniture.asset.id!r}",
+            f"surface: the rectangle is outside surface {config.name!r} of {furniture.asset.id!r}",
             expected=f"within {whole.min_xy}..{whole.max_xy}",
             found=f"{config.min_xy}..{config.max_xy}",
         )
@@ -149,14 +157,14 @@ def find_region(config: SurfaceConfig, furniture: LoadedFurniture) -> Region:
 
 
 def check_joints(config: TaskConfig, furniture: dict[str, LoadedFurniture]) -> None:
-    """Check positions of doors and drawers, and that the one to open is closed at first and can be pulled open."""
+    """Check joint positions, and that the part to open starts closed and can be pulled open."""
     for name, item in config.furniture.items():
         known = {link.joint.name: link.joint.limits for link in furniture[name].asset.links}
         for joint, position in item.joints.items():
             _check_known(f"furniture.{name}.joints: no such joint", joint, known)
             low, high = known[joint]
             if not low <= position <= high:
-                where = f"furniture.{name}.joints.{joint}: out of its limits"
+                where = f"furniture.{name}.joints.{joint}: outside of the joint's limits"
                 raise ConfigError(where, expected=f"{low}..{high}", found=position)
     opening = config.opening
     if opening is None:
@@ -166,7 +174,7 @@ def check_joints(config: TaskConfig, furniture: dict[str, LoadedFurniture]) -> N
     limit = MAX_OPENED_FRACTION[joint.kind]
     if opening.opened_at >= limit:
         raise ConfigError(
-            f"opening.opened_at: scripted pulls open the {joint.kind} joint {joint.name!r} no further than {limit}",
+            f"opening.opened_at: scripted pulls open the {joint.kind} joint {joint.name!r} up to {limit} of its range",
             expected=f"below {limit}",
             found=opening.opened_at,
             fix="Lower opening.opened_at.",
@@ -175,10 +183,10 @@ def check_joints(config: TaskConfig, furniture: dict[str, LoadedFurniture]) -> N
     position = config.furniture[opening.furniture].joints.get(joint.name, 0.0)
     if position / end >= opening.opened_at:
         raise ConfigError(
-            f"furniture.{opening.furniture}.joints.{joint.name}: open at first, so that there is nothing to open",
+            f"furniture.{opening.furniture}.joints.{joint.name}: the part to open starts open",
             expected=f"less than opening.opened_at of its range, {opening.opened_at * end:g}",
             found=position,
-            fix="Leave the joint out, which closes it, or make the task pick.",
+            fix="Remove the joint from `joints`, which closes it, or use the task pick.",
         )
 
 

@@ -1,4 +1,4 @@
-"""A configuration with its assets, looked up and checked. No simulator."""
+"""The assets of a configuration, looked up and checked. No simulator."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ from robocas_ms3.scenes.placement import Array, Region
 
 @dataclass(frozen=True)
 class SceneModel:
-    """A configuration with its assets. Poses are 4x4 in the world where no seed has moved anything.
+    """A configuration with its assets. Poses are 4x4 in the world, before randomisation.
 
     Attributes:
         config: the configuration.
         object_pack: pack of the objects.
-        object_ids: ids that objects are drawn from.
+        object_ids: ids from which objects are drawn.
         room: the room.
-        furniture: by the configuration's names.
-        furniture_poses: of the furniture's frames.
-        basket: the container; None: there is none.
-        basket_pose: of its frame.
-        robot_pose: of the robot's root, on the floor.
-        region: rectangle for objects, in the frame of the furniture it belongs to.
+        furniture: furniture by its name in the configuration.
+        furniture_poses: poses of the furniture's frames.
+        basket: the container; None if the scene has none.
+        basket_pose: pose of the basket's frame.
+        robot_pose: pose of the robot's root on the floor.
+        region: rectangle for objects, in the frame of its furniture.
     """
 
     config: TaskConfig
@@ -68,7 +68,7 @@ class SceneModel:
         """Look up all assets of a configuration.
 
         Raises:
-            ConfigError: an asset is unknown or unfit for its use, or things overlap or are out of the robot's reach.
+            ConfigError: an asset is unknown or unsuitable, or things overlap or are out of the robot's reach.
         """
         furniture = {
             name: find_furniture(furniture_pack, item.asset, key=f"furniture.{name}.asset")
@@ -98,18 +98,18 @@ class SceneModel:
 
     @property
     def support_pose(self) -> Array:
-        """4x4 of the frame of the furniture that objects stand on."""
+        """4x4 pose of the furniture on which objects stand."""
         return self.furniture_poses[self.config.surface.furniture]
 
     @property
     def headroom(self) -> float:
-        """Free height above the surface, m; infinite where nothing is above."""
+        """Free height above the surface, m; infinite if nothing is above it."""
         surface = self.config.surface
         return self.furniture[surface.furniture].asset.surfaces[surface.name].headroom or np.inf
 
     @property
     def support_link(self) -> str:
-        """Moving part that objects stand on; empty: the body of the furniture."""
+        """Moving part on which objects stand; empty: the body of the furniture."""
         surface = self.config.surface
         return self.furniture[surface.furniture].asset.surfaces[surface.name].link
 
@@ -119,14 +119,14 @@ class SceneModel:
 
     @property
     def opened_position(self) -> float:
-        """Joint position, m or rad, from which that joint counts as opened; its sign is the direction of opening."""
+        """Joint position, m or rad, from which the joint to open counts as open; the sign is the opening direction."""
         joint, opening = self.opened_joint, self.config.opening
         assert joint is not None
         assert opening is not None
         return opening.opened_at * max(joint.limits, key=abs)
 
     def joint_positions(self, name: str, *, opened: bool) -> dict[str, float]:
-        """Return the joint positions of a piece of furniture by name, as at first or once opened; others are 0."""
+        """Return the joint positions of a piece of furniture by name, at the start or when opened; others are 0."""
         positions = dict(self.config.furniture[name].joints)
         joint, opening = self.opened_joint, self.config.opening
         if opened and joint is not None and opening is not None and opening.furniture == name:
@@ -134,7 +134,7 @@ class SceneModel:
         return positions
 
     def support_motion(self, *, opened: bool) -> Array:
-        """Return 4x4 by which joints have moved the surface from its closed pose, in the support's frame."""
+        """Return the 4x4 motion of the surface from its closed pose, in the support's frame."""
         name = self.config.surface.furniture
         if not self.support_link:
             return np.eye(4)
@@ -145,8 +145,8 @@ class SceneModel:
         """Return samples (P, 3) of the collision surfaces of furniture and basket, world, m.
 
         Args:
-            basket_pose: 4x4; None where there is no basket.
-            opened: with the door or drawer of the task opened.
+            basket_pose: 4x4; None if the scene has no basket.
+            opened: whether the door or drawer of the task is open.
         """
         furniture = self._opened_points if opened else self.furniture_points
         if self.basket is None or basket_pose is None:
@@ -155,7 +155,7 @@ class SceneModel:
 
     @cached_property
     def furniture_points(self) -> Array:
-        """Samples (P, 3) of the collision surfaces of furniture, doors and drawers as at first, world, m."""
+        """Samples (P, 3) of the collision surfaces of furniture, doors and drawers at their start, world, m."""
         return self._furniture_points(opened=False)
 
     @cached_property
@@ -174,7 +174,7 @@ class SceneModel:
 
     @property
     def front(self) -> Array:
-        """(2,) unit vector along an axis of the support's frame: from the region to the robot."""
+        """Unit vector (2,) from the region to the robot, along the nearest axis of the support's frame."""
         middle = np.add(self.region.min_xy, self.region.max_xy) / 2
         to_robot = (np.linalg.inv(self.support_pose) @ self.robot_pose)[:2, 3] - middle
         axis = int(np.argmax(np.abs(to_robot)))

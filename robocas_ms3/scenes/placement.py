@@ -1,4 +1,4 @@
-"""Places of objects on a surface: scattered, or in columns. No simulator."""
+"""Place objects on a surface, scattered or in columns. No simulator."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from robocas_ms3.scenes.config.task import OrderlyLayout, ScatteredLayout
 
 Array = NDArray[np.float64]
 
-_TIGHT = 0.3  # share of the tries after which objects are packed rather than strewn
-_TRIES_AT_ONCE = 40  # positions of one object before the layout starts over
-# Builtin products show their label to their own -y, and resting poses have no yaw of their own, so that in every one
-# the label looks to -y of the plane or up, text upright for someone who stands at -y.
+_TIGHT = 0.3  # fraction of the tries after which objects are packed close together
+_TRIES_AT_ONCE = 40  # positions tried per object before the layout starts again
+# The label of a bundled product is on its -y side, and resting poses have no yaw. So the label always points to -y of
+# the plane or up, and its text is upright for a viewer at -y.
 _LABEL_YAW = -np.pi / 2
 
 
 @dataclass(frozen=True)
 class PlaceableObject:
-    """An object to be placed; the arrays are those of `assets.annotations.Annotations`."""
+    """An object to place; its arrays are those of `assets.annotations.Annotations`."""
 
     name: str
     resting_poses: Array
@@ -36,7 +36,7 @@ class PlaceableObject:
 
 @dataclass(frozen=True)
 class Region:
-    """An upright rectangle on a horizontal surface, in the frame of the furniture it belongs to, m."""
+    """An axis-aligned rectangle on a horizontal surface, in the frame of its furniture, m."""
 
     min_xy: tuple[float, float]
     max_xy: tuple[float, float]
@@ -48,7 +48,7 @@ def sample_scattered(
 ) -> Array:
     """Place objects apart from each other, each in one of its resting poses at a random yaw.
 
-    Big objects are placed first, since they are the hard ones; when one finds no room, the layout starts over.
+    Large objects are placed first. If an object finds no free position, the layout starts again.
 
     Returns:
         (K, 4, 4) objects in the region's frame, in the order of ``placeables``.
@@ -60,7 +60,7 @@ def sample_scattered(
     all_areas = [np.array([shapely.Polygon(footprint).area for footprint in p.footprints]) for p in placeables]
     while tries < max_tries:
         poses = np.zeros((len(placeables), 4, 4))
-        # Where it gets tight, objects rather stand than lie: of several poses drawn, the one covering least is taken.
+        # When space is short, objects stand rather than lie: the pose with the smallest footprint of several is used.
         tightness = tries / max_tries
         draws = 1 + int(8 * tightness)
         choices = [_choose_pose(rng, p, areas, draws) for p, areas in zip(placeables, all_areas, strict=True)]
@@ -73,8 +73,8 @@ def sample_scattered(
                 free = ~shapely.dwithin(np.array(placed), outlines[:, None], min_gap).any(axis=1)
                 yaws, positions, outlines = (values[free] for values in (yaws, positions, outlines))
             if not len(yaws):
-                break  # no room for this one: start over
-            # and they rather stand in a corner or close to each other than anywhere, so that room is left for the rest
+                break  # no free position: start again
+            # and they are placed in corners or close to each other, which leaves room for the rest
             best = 0 if tightness < _TIGHT else _snuggest(outlines, placed, region)
             shapely.prepare(outlines[best])
             placed.append(outlines[best])
@@ -86,13 +86,13 @@ def sample_scattered(
     raise LayoutError(
         f"no room for {things} {min_gap * 100:.1f} cm apart on {size[0]:.2f} x {size[1]:.2f} m",
         where="layout",
-        found=f"{max_tries} tries used up",
+        found=f"no layout after {max_tries} tries",
         fix="Lower objects.count or layout.min_gap, enlarge the surface, or raise layout.max_tries.",
     )
 
 
 def _snuggest(outlines: NDArray, placed: list[shapely.Polygon], region: Region) -> int:
-    """Return the index of the outline nearest to its two nearest neighbours; the region's edges are neighbours too."""
+    """Return the index of the outline nearest to its two nearest neighbours, including the region's edges."""
     low, high = shapely.bounds(outlines)[:, :2], shapely.bounds(outlines)[:, 2:]
     gaps = [low - region.min_xy, np.subtract(region.max_xy, high)]
     if placed:
@@ -101,7 +101,7 @@ def _snuggest(outlines: NDArray, placed: list[shapely.Polygon], region: Region) 
 
 
 def _candidates(rng: np.random.Generator, footprint: Array, region: Region) -> tuple[Array, Array, NDArray]:
-    """Draw yaws (n,), positions (n, 2) and outlines (n,) of a footprint in a region; fewer where it is narrow."""
+    """Draw yaws (n,), positions (n, 2) and outlines (n,) of a footprint inside a region; n depends on its size."""
     yaws = rng.uniform(-np.pi, np.pi, _TRIES_AT_ONCE)
     shares = rng.uniform(0, 1, (_TRIES_AT_ONCE, 2))
     cos, sin = np.cos(yaws), np.sin(yaws)
@@ -122,28 +122,28 @@ def _choose_pose(rng: np.random.Generator, placeable: PlaceableObject, areas: Ar
 def sample_orderly(
     rng: np.random.Generator, placeables: list[PlaceableObject], region: Region, layout: OrderlyLayout, front: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Stand objects in columns that begin at the front edge, labels to the front.
+    """Place objects in columns that start at the front edge, with their labels to the front.
 
-    All objects stand in their display pose, or, where there is none, in the most probable one. Neighbouring columns
-    are as far apart as the mean of their widths times ``column_spacing``. What is drawn: the order of the columns,
-    those of one kind of object staying together, and where in the free room along the edge the block stands.
+    Objects stand in their display pose or, without one, in their most probable resting pose. The distance of
+    neighbouring columns is the mean of their widths times ``column_spacing``. Two things are random: the order of the
+    kinds of objects, whose columns stay together, and the position of the block along the edge.
 
     Args:
         rng: source of all randomness.
         placeables: K objects.
-        region: rectangle that holds every footprint.
-        layout: sizes of columns and gaps; ``keep_what_fits`` leaves out the first column that doesn't fit, all after
-            it, and objects behind the region.
-        front: (2,) unit vector along an axis of the region's frame, out of the front edge.
+        region: rectangle that contains every footprint.
+        layout: sizes of columns and gaps. ``keep_what_fits`` omits the first column that doesn't fit, all columns
+            after it, and objects behind the region.
+        front: (2,) unit vector along an axis of the region's frame that points out of the front edge.
 
     Returns:
-        (K, 4, 4) objects in the region's frame, in the order of ``placeables``; (K,) which of them there is room for.
+        (K, 4, 4) objects in the region's frame, in the order of ``placeables``; (K,) whether there is room for each.
 
     Raises:
-        LayoutError: the columns don't fit side by side, or one is too long; or nothing fits at all.
+        LayoutError: the columns don't fit side by side, a column is too long, or nothing fits.
     """
     columns = _columns(placeables, layout.rows)
-    along = np.array([-front[1], front[0]])  # the front edge's own direction
+    along = np.array([-front[1], front[0]])  # direction of the front edge
     jitter = np.deg2rad(layout.yaw_jitter_deg)
     yaws = np.arctan2(front[1], front[0]) - _LABEL_YAW + rng.uniform(-jitter, jitter, len(placeables))
     if layout.column_yaw == "random":
@@ -168,7 +168,7 @@ def sample_orderly(
 
     poses, there = np.tile(np.eye(4), (len(placeables), 1, 1)), np.zeros(len(placeables), dtype=bool)
     for column, center in zip(members[:count], start + centers[:count], strict=True):
-        free = edge  # what is left of the column begins here
+        free = edge  # start of the free part of the column
         for i in column:
             x, y = (center - (low[i, 0] + high[i, 0]) / 2) * along + (free - high[i, 1]) * front
             poses[i] = from_xyz_yaw(x, y, region.z, yaws[i]) @ placeables[i].resting_poses[choices[i]]
@@ -178,12 +178,12 @@ def sample_orderly(
         if not there[column].all() and not layout.keep_what_fits:
             raise _does_not_fit(f"{len(column)} x {placeables[column[0]].name} in a column", depth, edge - back)
     if not there.any():
-        raise _does_not_fit("even the first objects of the columns", min(high[:, 1] - low[:, 1]), edge - back)
+        raise _does_not_fit("the first objects of all columns", min(high[:, 1] - low[:, 1]), edge - back)
     return poses, there
 
 
 def _columns(placeables: list[PlaceableObject], rows: int) -> list[tuple[str, int]]:
-    """Return the column of each object, kind and number: objects of a kind, at most ``rows`` of them."""
+    """Return the column (kind, number) of each object; a column has at most ``rows`` objects of one kind."""
     seen: Counter[str] = Counter()
     columns = []
     for placeable in placeables:
@@ -193,7 +193,7 @@ def _columns(placeables: list[PlaceableObject], rows: int) -> list[tuple[str, in
 
 
 def _ordered(rng: np.random.Generator, columns: list[tuple[str, int]]) -> list[list[int]]:
-    """Return the objects of each column, in the order of the columns along the edge: kinds are shuffled."""
+    """Return the objects of each column in their order along the edge, with shuffled kinds."""
     kinds: dict[str, dict[int, list[int]]] = {}
     for i, (kind, number) in enumerate(columns):
         kinds.setdefault(kind, {}).setdefault(number, []).append(i)
@@ -212,9 +212,9 @@ def _does_not_fit(what: str, needed: float, room: float) -> LayoutError:
 
 
 def choose_objects(rng: np.random.Generator, ids: list[str], count: int, *, repeats: bool = False) -> list[str]:
-    """Draw ``count`` ids: each at most once, unless there are fewer ids than that; then as evenly as can be.
+    """Draw ``count`` ids without repetition or, if there are fewer ids, as evenly as possible.
 
-    With ``repeats`` each is drawn from all of them.
+    With ``repeats``, each id is drawn independently from all of them.
     """
     if repeats:
         return [ids[i] for i in rng.integers(len(ids), size=count)]

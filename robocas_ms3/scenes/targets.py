@@ -101,14 +101,14 @@ class SettledScene:
         """Return whether enough of an object's grasps would be clear with all other objects out of the way."""
         return self._has_grasps(slot, [], self.model.config.target.min_uncovered_grasps)
 
-    def _has_grasps(self, slot: int, others: list[Array], at_least: int) -> bool:
+    def _has_grasps(self, slot: int, others: list[Array], min_count: int) -> bool:
         return has_free_grasps(
             self.assets[slot],
             self.opened_poses[slot],
             np.concatenate([self.fixture_points, *others]),
             self.robot_pose[:2, 3],
             self.model.config.target.approach,
-            at_least=at_least,
+            min_count=min_count,
         )
 
     def _within_reach(self, slot: int, other: int) -> bool:

@@ -84,4 +84,4 @@ def test_batch_gives_the_counts_of_single_grasps():
     free = int(clear.sum()) // 2
     assert 0 < free < len(kept) // 2
     for least, found in ((0, True), (free, True), (free + 1, False)):
-        assert has_free_grasps(asset, pose, points, base[:2, 3], at_least=least) == found
+        assert has_free_grasps(asset, pose, points, base[:2, 3], min_count=least) == found

@@ -53,7 +53,7 @@ def test_what_can_not_be_is_refused(changes, said):
 
 def test_an_arm_that_begins_inside_of_something_is_refused():
     above = {"asset": "side_table", "pose": at(0.7, 0.15, 0.62)}
-    with pytest.raises(ConfigError, match=r"arm begins inside of something \(found furniture.above\). Move or turn"):
+    with pytest.raises(ConfigError, match=r"arm starts inside of another body \(found furniture.above\). Move or turn"):
         load_scene(furniture={"table": TABLE, "above": above})
 
 

@@ -115,12 +115,12 @@ def test_a_damaged_one_is_named(tmp_path):
     path = tmp_path / "table.npy"
     for content in (b"", b"no table", b"\x93NUMPY"):
         path.write_bytes(content)
-        with pytest.raises(LayoutError, match=r"table\.npy: no table of layouts.*robocas layouts build"):
+        with pytest.raises(LayoutError, match=r"table\.npy: not a layout table.*robocas layouts build"):
             LayoutTable(path, NAMES)
     numbers = np.zeros((2, 3), [("objects_seed", "i8"), ("seed", "i8"), ("state", "u1"), ("present", "?", (3,))])
     for content in (np.zeros((2, 3)), numbers):
         np.save(path, content)
-        with pytest.raises(LayoutError, match="no table of layouts"):
+        with pytest.raises(LayoutError, match="not a layout table"):
             LayoutTable(path, NAMES)
 
 

@@ -150,7 +150,7 @@ def test_everything_in_columns_is_inside_and_apart(seed, jitter, count):
         (kinds("abc", (0.3, 0.04)), False, r"3 columns side by side.*at most 0.80 m, found 1.08 m"),
         (kinds("aaa", (0.05, 0.12)), False, r"3 x a in a column.*at most 0.30 m, found 0.38 m"),
         (kinds("ab", (0.9, 0.04)), True, "side by side"),
-        (kinds("ab", (0.05, 0.31)), True, "even the first objects"),
+        (kinds("ab", (0.05, 0.31)), True, "the first objects of all"),
     ],
 )
 def test_columns_that_do_not_fit_are_an_error(things, keep, words):

@@ -244,10 +244,10 @@ def test_blocks_that_cannot_be(changes, key, words):
     ("name", "opening", "joints", "words"),
     [
         ("open_pick_container", {}, {"flap": 0.1}, r"no such joint.*found flap"),
-        ("open_pick_container", {}, {"door_slide": 9.0}, r"door_slide: out of its limits.*found 9.0"),
-        ("open_pick_container", {"opened_at": 0.95}, {}, r"opening.opened_at: .* 'door_slide' no further than 0.95"),
+        ("open_pick_container", {}, {"door_slide": 9.0}, r"door_slide: outside of the joint.*found 9.0"),
+        ("open_pick_container", {"opened_at": 0.95}, {}, r"opening.opened_at: .* 'door_slide' up to 0.95"),
         ("open_pick_refrigerator", {"opened_at": 0.85}, {}, r"opened_at: .*revolute.*below 0.8, found 0.85.*Lower"),
-        ("open_pick_container", {}, {"door_slide": 0.45}, "door_slide: open at first"),  # beyond 0.8 of 0.55 m
+        ("open_pick_container", {}, {"door_slide": 0.45}, "door_slide: the part to open starts open"),
         ("open_pick_container", {"opened_at": 0.8}, {"door_slide": 0.43}, ""),
     ],
 )
