@@ -1,4 +1,4 @@
-"""Draw the looks of a scene: finishes of the room, lights, cameras; each from a stream of its own."""
+"""Draw the appearance of a scene: finishes of the room, lights and cameras, each from its own random stream."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from robocas_ms3.scenes.config.randomisation import CameraRandomisation
 from robocas_ms3.scenes.config.task import TaskConfig
 from robocas_ms3.scenes.placement import Array
 
-_ROOM, _LIGHTS, _CAMERAS = range(200, 203)  # streams; those of layouts are in sample.py
+_ROOM, _LIGHTS, _CAMERAS = range(200, 203)  # random streams; sample.py has the streams of layouts
 
 
 @dataclass(frozen=True)
 class Lights:
-    """Grey lights; ``direction`` is the unit vector in which the slanted one shines, world."""
+    """Intensities of the lights; ``direction`` is the unit vector of the slanted light, world frame."""
 
     ambient: float
     directional: float
@@ -46,7 +46,7 @@ def draw_lights(config: TaskConfig, seed: int) -> Lights:
 
 
 def draw_camera_shift(by: CameraRandomisation, camera: int, seed: int) -> Array:
-    """Draw 4x4 of a camera's new pose in its old one; ``camera`` is its number."""
+    """Draw the 4x4 pose of a shifted camera in its original frame; ``camera`` is the camera's index."""
     rng = np.random.default_rng([seed, _CAMERAS, camera])
     shift = np.eye(4)
     shift[:3, 3] = _either_way(rng.uniform(-by.position, by.position, 3), by.min_position, by.position)
@@ -56,5 +56,5 @@ def draw_camera_shift(by: CameraRandomisation, camera: int, seed: int) -> Array:
 
 
 def _either_way(drawn: Array, least: float, most: float) -> Array:
-    """Scale numbers of at most a magnitude to magnitudes between ``least`` and that."""
+    """Scale values in [-most, most] to magnitudes between ``least`` and ``most``; signs stay."""
     return drawn if least == 0 else np.copysign(least + np.abs(drawn) * (1 - least / most), drawn)

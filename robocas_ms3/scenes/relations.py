@@ -1,4 +1,4 @@
-"""The relations by which an instruction names one of several identical objects, seen from the robot."""
+"""Relations that distinguish one of several identical objects in an instruction, seen from the robot."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ Relation = Literal[
     "second_from_right",
     "rightmost",
 ]
-"""The first three order objects by horizontal distance, the others from left to right."""
+"""The first three compare horizontal distances, the others positions from left to right."""
 
 RELATIONS: tuple[Relation, ...] = get_args(Relation)
 THREE_OBJECT_RELATIONS: tuple[Relation, ...] = ("second_nearest", "second_from_left", "middle", "second_from_right")
 """Relations that need at least three objects."""
-MARGIN = 0.03  # m by which the named object differs from every other in what the relation compares
+MARGIN = 0.03  # m, least difference between the named object and every other in the compared quantity
 
 
 def select_by_relation(relation: Relation, xy_in_robot: NDArray[np.float64]) -> int | None:
-    """Return the index of the object that a relation names; None where the answer is not clear by `MARGIN`.
+    """Return the index of the object that a relation names; None if the answer is not clear by `MARGIN`.
 
     Args:
-        relation: how the instruction names it.
-        xy_in_robot: (n, 2) m, centres of the identical objects in the robot's frame: x ahead, y to its left.
+        relation: the relation of the instruction.
+        xy_in_robot: (n, 2) m, centres of the identical objects in the robot's frame: x forward, y left.
     """
     by_distance = relation in {"nearest", "second_nearest", "farthest"}
     key = np.linalg.norm(xy_in_robot, axis=1) if by_distance else -xy_in_robot[:, 1]

@@ -1,4 +1,4 @@
-"""Where robot and basket stand: as configured, or moved by the seed to where they can stand."""
+"""Draw the poses of robot and basket around their configured poses, and check that they are valid."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from robocas_ms3.scenes.placement import Array
 from robocas_ms3.scenes.settle import add_furniture
 
 STAND_SECONDS = 1.0
-MAX_SHIFT, MAX_TURN_DEG = 0.005, 2.0  # in STAND_SECONDS, of a basket that stands
+MAX_SHIFT, MAX_TURN_DEG = 0.005, 2.0  # m and deg, greatest motion of a stable basket in STAND_SECONDS
 LOAD = 0.5  # kg
 _TRIES = 50
-_BODY_BOXES = PANDA_ENVELOPE.body_boxes  # whatever robot: a layout follows from its configuration and seeds alone
+_BODY_BOXES = PANDA_ENVELOPE.body_boxes  # for every robot, so that a layout depends on configuration and seeds only
 
 
 def place_robot(model: SceneModel, rng: np.random.Generator) -> Array:
-    """Draw 4x4 of the robot's root until its body is clear of furniture; as configured where nothing moves it."""
+    """Return the robot's 4x4 root pose: as configured, or drawn until its body is clear of furniture."""
     by = model.config.randomisation.robot
     points = np.zeros((0, 3)) if by is None else model.furniture_points
     return _place("robot", model.robot_pose, by, rng, lambda pose: is_body_clear(pose, points))
 
 
 def place_basket(model: SceneModel, robot_pose: Array, rng: np.random.Generator) -> Array | None:
-    """Draw 4x4 of the basket's frame until it stands clear of the robot; as configured where nothing moves it.
+    """Return the basket's 4x4 pose: as configured, or drawn until it is stable and clear of the robot.
 
     Returns:
-        None where there is no basket.
+        The pose; None if the scene has no basket.
     """
     if model.basket is None or model.basket_pose is None:
         return None
@@ -56,15 +56,15 @@ def _place(
         if good(moved):
             return moved
     raise LayoutError(
-        f"the {name} can't stand anywhere near where it is configured",
+        f"no valid pose of the {name} near its configured pose",
         where=f"randomisation.{name}",
-        found=f"{_TRIES} places tried",
-        fix=f"Lower randomisation.{name}.position, or configure the {name} farther from furniture and edges.",
+        found=f"{_TRIES} poses tried",
+        fix=f"Lower randomisation.{name}.position, or move the {name} farther from furniture and edges.",
     )
 
 
 def _moved(pose: Array, by: PoseRandomisation, rng: np.random.Generator) -> Array:
-    """Shift a pose in x and y and turn it about its own vertical."""
+    """Shift a pose in x and y and turn it about its vertical axis."""
     shift, yaw = rng.uniform(-by.position, by.position, 2), np.deg2rad(rng.uniform(-by.yaw_deg, by.yaw_deg))
     moved = pose @ from_xyz_yaw(0, 0, 0, yaw)
     moved[:2, 3] += shift
@@ -72,11 +72,11 @@ def _moved(pose: Array, by: PoseRandomisation, rng: np.random.Generator) -> Arra
 
 
 def is_body_clear(base_in_world: Array, cloud: Array) -> bool:
-    """Return whether no point (P, 3) in the world is in the robot's body; points below the floor are not.
+    """Return whether no point is inside the robot's body; points below the floor are ignored.
 
     Args:
-        base_in_world: 4x4 of a frame on the floor, turned as the mobile base is: the robot's root, base joints at 0.
-        cloud: the points, m.
+        base_in_world: 4x4 frame on the floor with the heading of the mobile base (the robot's root for base joints 0).
+        cloud: (P, 3) points in the world, m.
     """
     local = transform_points(np.asarray(np.linalg.inv(base_in_world), dtype=np.float64), cloud)
     x, y, z = np.abs(local[:, 0]), np.abs(local[:, 1]), local[:, 2]
@@ -85,10 +85,7 @@ def is_body_clear(base_in_world: Array, cloud: Array) -> bool:
 
 
 def is_basket_stable(model: SceneModel, basket_pose: Array) -> bool:
-    """Simulate whether the basket stays at a pose 4x4 in the world, also with a load in any of its corners; 30 ms.
-
-    Over an edge it tips, in the air it falls, out of a wall it is pushed.
-    """
+    """Simulate whether the basket stays at a 4x4 pose in the world with a load in each of its corners; takes 30 ms."""
     assert model.basket is not None
     facts = model.basket.asset
     assert facts.inner is not None

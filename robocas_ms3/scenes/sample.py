@@ -1,4 +1,4 @@
-"""From a seed to a layout: which objects, where they stand, which one is the target."""
+"""Sample a layout from seeds: the objects, their poses, the target."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from robocas_ms3.scenes.settle import settle
 from robocas_ms3.scenes.targets import SettledScene, choose_target, target_rule
 from robocas_ms3.scenes.task_specs import TASKS
 
-# Every random decision of a scene has a stream of its own, so that a new one never shifts the others.
+# Each random decision of a scene has its own stream, so that a new decision does not change the others.
 _OBJECTS, _LAYOUT, _TARGET, _ROBOT, _BASKET, _COUNT = range(6)
-_SETS, _TRIES = 5, 10  # sets of objects that a seed tries, and layouts of each
+_SETS, _TRIES = 5, 10  # sets of objects per seed, and layouts per set
 _KINDS = 50  # tries to find kinds whose columns fit
-_SEVERAL = 5  # layouts without a target, from which on the error blames the target
+_SEVERAL = 5  # number of layouts without a target from which the error reports the target as the reason
 _log = logging.getLogger(__name__)
 
 
 def draw_object_set(model: SceneModel, objects_seed: int, number: int = 0) -> ObjectIds:
-    """Draw the ``number``-th set of objects of a seed, an id per slot: those of the task, then distractors.
+    """Draw the ``number``-th set of objects of a seed: one id per slot, first the task's objects, then distractors.
 
     Raises:
-        LayoutError: no object fits on the surface, or no columns of them do.
+        LayoutError: no object or no column of objects fits on the surface.
     """
     config = model.config
     rng = np.random.default_rng([objects_seed, _OBJECTS, number])
@@ -54,20 +54,20 @@ def draw_object_set(model: SceneModel, objects_seed: int, number: int = 0) -> Ob
 
 
 def sample_layout(model: SceneModel, objects_seed: int, seed: int, object_ids: ObjectIds | None = None) -> Layout:
-    """Draw a layout, let it settle, and choose its target. The same seeds give the same layout.
+    """Draw a layout, let it settle, and choose its target; the same seeds give the same layout.
 
     The objects of a seed are the first drawn set (`draw_object_set`) for which this seed gives a layout. Some sets have
     none: side by side on a shelf, no object of them can be grasped in any order.
 
     Args:
         model: the scene's assets.
-        objects_seed: decides the objects; with a single env the same as ``seed``.
+        objects_seed: decides the objects; for a single env equal to ``seed``.
         seed: decides everything else.
-        object_ids: the objects of ``objects_seed``, where they are known: it takes its own layout to know them.
+        object_ids: the objects of ``objects_seed``; None: they are taken from its own layout, which is sampled first.
 
     Raises:
         LayoutError: the objects don't fit, don't come to rest, or none qualifies as the target; or robot or basket
-            find no place where they can stand.
+            have no valid pose.
     """
 
     def rng(stream: int) -> np.random.Generator:
@@ -98,7 +98,7 @@ def sample_layout(model: SceneModel, objects_seed: int, seed: int, object_ids: O
                     unarranged.append(error)  # in another order the columns may fit
                     continue
                 if object_ids is not None:
-                    raise  # it has tried often enough
+                    raise  # the function has already tried many times
                 unarranged += [error] * _TRIES
                 break
             present = wanted.copy()
@@ -126,7 +126,7 @@ def sample_layout(model: SceneModel, objects_seed: int, seed: int, object_ids: O
 def overlaps_basket(
     assets: list[LoadedObject], poses: Array, basket: LoadedFurniture | None, basket_pose: Array | None
 ) -> bool:
-    """Return whether an object at its pose (K, 4, 4) is in the basket, or meets its walls, judged by bounding boxes."""
+    """Return whether the bounding box of an object at its pose (K, 4, 4) overlaps the basket's bounding box."""
     if basket is None or basket_pose is None:
         return False
     walls = np.concatenate(basket.hulls)
@@ -139,21 +139,23 @@ def overlaps_basket(
 
 
 def _failure(model: SceneModel, unarranged: list[LayoutError], unsettled: int, untargeted: int) -> LayoutError:
-    """Return the error of a layout that could not be made: no target, where several came to rest."""
+    """Return the error of seeds without a layout; the target is the reason if several layouts came to rest."""
     if untargeted < _SEVERAL and len(unarranged) > _SETS * _TRIES // 2:
         return unarranged[-1]
     found = (
-        f"{_SETS * _TRIES} layouts tried: {len(unarranged)} did not fit, {unsettled} did not come to rest or met the "
-        f"basket, {untargeted} had no target"
+        f"{_SETS * _TRIES} layouts tried: {len(unarranged)} did not fit, {unsettled} did not come to rest or touched "
+        f"the basket, {untargeted} had no target"
     )
     if untargeted < _SEVERAL:
-        fix = "Lower objects.count, enlarge the surface, use objects that stand firmly, or move the basket less."
+        fix = (
+            "Lower objects.count, enlarge the surface, use more stable objects, or lower randomisation.basket.position."
+        )
         return LayoutError("the objects don't come to rest", where="layout", found=found, fix=fix)
     lower = ", ".join(target_rule(model.config.task).keys)
     fix = f"Raise target.max_distance, lower target.{lower} or min_free_grasps, or use other objects."
     relations = ", ".join(model.config.target.relations)
     if relations and "relation" in TASKS[model.config.task].slots:
-        fix = f"Give other target.relations than {relations}, or more layout.copies. {fix}"
+        fix = f"Use target.relations other than {relations}, or raise layout.copies. {fix}"
     return LayoutError("no object qualifies as the target", where="target", found=found, fix=fix)
 
 
@@ -172,7 +174,7 @@ def _kinds_that_fit(rng: np.random.Generator, model: SceneModel, ids: list[str],
 
 
 def _usable(model: SceneModel, ids: list[str], *, columns: bool = False) -> list[str]:
-    """Return the ids of objects that fit under what is above; for columns those with a display pose, if any has one."""
+    """Return the ids of objects that fit below the headroom; for columns those with a display pose, if any has one."""
     if not columns and model.headroom == np.inf:
         return ids
     things = {i: make_placeable(model.object_pack.objects[i], model.headroom) for i in ids}
@@ -190,14 +192,14 @@ def _usable(model: SceneModel, ids: list[str], *, columns: bool = False) -> list
 @lru_cache  # once each
 def _warn_left_out(ids: tuple[str, ...]) -> None:
     _log.warning(
-        "objects left out, since no resting pose fits under what is above the surface, or, in an orderly layout, "
-        "since they have no display pose that does: %s",
+        "objects excluded: %s. None of their resting poses (in an orderly layout: their display pose) fits below the "
+        "surface's headroom.",
         ", ".join(ids),
     )
 
 
 def make_placeable(asset: LoadedObject, headroom: float = np.inf) -> PlaceableObject:
-    """Return an object with its resting poses that are lower than ``headroom``, m."""
+    """Return an object with those of its resting poses that are lower than ``headroom``, m."""
     notes = asset.annotations
     low = np.arange(len(notes.resting_poses))
     if np.isfinite(headroom):
@@ -215,7 +217,7 @@ def make_placeable(asset: LoadedObject, headroom: float = np.inf) -> PlaceableOb
 def _arrange(
     rng: np.random.Generator, model: SceneModel, assets: list[LoadedObject]
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Return (K, 4, 4) objects in the support's frame, (K,) which of them there is room for."""
+    """Return (K, 4, 4) objects in the support's frame, and (K,) whether there is room for each."""
     layout, region, everything = model.config.layout, model.region, np.ones(len(assets), dtype=bool)
     if isinstance(layout, StackedLayout):
         return drop_heap(rng, assets, region, layout, headroom=model.headroom), everything
@@ -226,7 +228,7 @@ def _arrange(
 
 
 def _presence(model: SceneModel, slots: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Draw (K,) which slots take part, (K,) which of them may be the target."""
+    """Draw (K,) which slots are used, and (K,) which of them may be the target."""
     config = model.config
     count, random = config.objects.count, config.randomisation
     used = int(rng.integers(random.count[0], random.count[1] + 1)) if random.count else count

@@ -1,4 +1,4 @@
-"""Let objects come to rest where they were put, in a bare PhysX scene, and check whether they stay."""
+"""Let objects come to rest in a PhysX scene, and check that the settled layout is stable."""
 
 from __future__ import annotations
 
@@ -14,33 +14,33 @@ from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.placement import Array
 
 SETTLE_SECONDS, CHECK_SECONDS = 1.0, 1.0
-CHECKS = 3  # at most; what moved in one is checked again from where it came to
-MAX_MOVE, MAX_TILT_DEG = 0.05, 5.0  # while settling: what goes farther has fallen, tipped over or rolled off
-MAX_SHIFT, MAX_TURN_DEG = 0.003, 2.0  # in CHECK_SECONDS, of an object that stays
-MAX_LINEAR, MAX_ANGULAR = 0.01, 0.1  # m/s, rad/s, of an object at rest
+CHECKS = 3  # greatest number of checks; after motion the next check starts from the new poses
+MAX_MOVE, MAX_TILT_DEG = 0.05, 5.0  # m and deg while settling; more: the object fell, tipped over or rolled away
+MAX_SHIFT, MAX_TURN_DEG = 0.003, 2.0  # m and deg in CHECK_SECONDS, of a stable object
+MAX_LINEAR, MAX_ANGULAR = 0.01, 0.1  # m/s and rad/s, of an object at rest
 
 
 def settle(
     assets: Sequence[LoadedObject], poses: Array, model: SceneModel, basket_pose: Array | None, *, heap: bool = False
 ) -> tuple[Array, bool]:
-    """Simulate objects among furniture and basket: first so that they settle, then to see whether they stay.
+    """Let objects settle among furniture and basket, then check that the settled poses are stable.
 
-    The second part begins in a new scene, as a reset does: an engine that knows no contacts yet may give a narrow
-    object a kick that it would not get where it has long been standing. Where objects move then, they have settled a
-    little more, and are put into another new scene; a heap creeps for a while.
+    Each check starts in a new scene, as a reset does: an engine without known contacts may kick a narrow object that
+    would otherwise keep standing. If objects move in a check, the next check starts from their new poses, since heaps
+    creep for a while.
 
-    The engine solves contacts in an order that depends on the order in which bodies were made. So a heap has to stay
-    with its objects made in either order.
+    PhysX solves contacts in an order that depends on the order in which bodies are created. So a heap must be stable
+    for both orders of its objects.
 
     Args:
         assets: K objects.
         poses: (K, 4, 4) in the world.
-        model: where the furniture stands; doors and drawers stay as at first.
-        basket_pose: 4x4 in the world; None where there is no basket.
-        heap: whether objects lie on each other; then they may tip over meanwhile.
+        model: poses of the furniture; doors and drawers keep their start positions.
+        basket_pose: 4x4 in the world; None if the scene has no basket.
+        heap: whether objects may rest on each other and tip over while settling.
 
     Returns:
-        (K, 4, 4) settled poses in the world; whether all objects stay there, which is about where they were put.
+        (K, 4, 4) settled poses in the world; whether all objects are stable and near their original poses.
     """
     max_tilt = np.inf if heap else np.deg2rad(MAX_TILT_DEG)
     with engine_settings():
@@ -77,10 +77,10 @@ def _simulate(
     *,
     backwards: bool = False,
 ) -> tuple[Array, bool]:
-    """Simulate objects in a new scene, where the last one is made first if ``backwards``.
+    """Simulate objects in a new scene; with ``backwards`` the objects are created in reverse order.
 
     Returns:
-        Poses (K, 4, 4) at the end; whether all are at rest, half-way and then.
+        Poses (K, 4, 4) at the end; whether all objects are at rest half-way and at the end.
     """
     scene = new_scene()
     add_furniture(scene, model)
@@ -100,7 +100,7 @@ def _simulate(
 
 
 def add_furniture(scene: sapien.Scene, model: SceneModel) -> None:
-    """Add the furniture where it stands, doors and drawers as at first; none of it moves."""
+    """Add the furniture as fixed bodies, with doors and drawers at their start positions."""
     for name, asset in model.furniture.items():
         frame = model.furniture_poses[name]
         add_fixed(scene, asset.hulls, frame, asset.asset.friction)

@@ -1,4 +1,4 @@
-"""Which object of an arrangement is the target: rules, of which each task names one. No simulator."""
+"""Choose the target among settled objects, by the rule of the task. No simulator."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from robocas_ms3.scenes.visibility import MeshScene, PinholeCamera, object_mesh,
 
 @dataclass(frozen=True)
 class TargetChoice:
-    """The target.
+    """The chosen target.
 
     Attributes:
-        slot: its index.
-        relation: how the instruction tells it from objects of the same name; empty: not needed.
-        visible_fractions: (K,) p_vis where the rule asked for it; empty: it did not.
+        slot: slot of the target.
+        relation: relation that distinguishes it from objects of the same name; empty: no relation.
+        visible_fractions: (K,) p_vis of the objects; empty if the rule does not use it.
     """
 
     slot: int
@@ -38,16 +38,16 @@ class TargetChoice:
 
 @dataclass(frozen=True)
 class SettledScene:
-    """Settled objects, before a target is chosen. K slots; poses 4x4 in the world, m.
+    """Settled objects before a target is chosen. K slots; poses 4x4 in the world, m.
 
     Attributes:
         model: configuration and assets.
-        assets: of the K slots.
-        poses: (K, 4, 4).
-        present: (K,) which slots take part.
-        candidate: (K,) which may be the target: present, and no distractor.
-        robot_pose: of the robot's root.
-        basket_pose: of the basket's frame, if there is one.
+        assets: assets of the K slots.
+        poses: (K, 4, 4) object poses.
+        present: (K,) which slots are used.
+        candidate: (K,) which objects may be the target: present, and no distractor.
+        robot_pose: pose of the robot's root.
+        basket_pose: pose of the basket; None if the scene has none.
     """
 
     model: SceneModel
@@ -64,7 +64,7 @@ class SettledScene:
 
     @cached_property
     def opened_poses(self) -> Array:
-        """(K, 4, 4) where the objects will be once the furniture is open."""
+        """(K, 4, 4) poses of the objects after the furniture has been opened."""
         frame = self.model.support_pose
         before, after = (self.model.support_motion(opened=opened) for opened in (False, True))
         moved = frame @ after @ np.linalg.inv(frame @ before)
@@ -72,12 +72,12 @@ class SettledScene:
 
     @property
     def xy_in_robot(self) -> Array:
-        """(K, 2) m, objects in the robot's frame: x ahead, y to its left."""
+        """(K, 2) m, positions of the objects in the robot's frame: x forward, y left."""
         return (np.linalg.inv(self.robot_pose) @ self.opened_poses)[:, :2, 3]
 
     @property
     def eligible(self) -> NDArray[np.bool_]:
-        """(K,) candidates with enough grasps that are near enough to the robot."""
+        """(K,) candidates that have enough grasps and are near enough to the robot."""
         rules = self.model.config.target
         near = np.linalg.norm(self.xy_in_robot, axis=1) <= rules.max_distance
         graspable = np.array([asset.asset.grasp_count >= rules.min_grasps for asset in self.assets])
@@ -85,11 +85,11 @@ class SettledScene:
 
     @cached_property
     def fixture_points(self) -> Array:
-        """(P, 3) samples of opened furniture and basket, world, m."""
+        """(P, 3) samples of the surfaces of opened furniture and basket, world, m."""
         return self.model.fixture_points(self.basket_pose, opened=True)
 
     def has_free_grasps(self, slot: int) -> bool:
-        """Return whether enough of an object's grasps are clear of everything else."""
+        """Return whether enough grasps of an object are free of collisions."""
         others = [
             transform_points(self.opened_poses[other], self.assets[other].surface_points())
             for other in np.flatnonzero(self.present)
@@ -98,7 +98,7 @@ class SettledScene:
         return self._has_grasps(slot, others, self.model.config.target.min_free_grasps)
 
     def has_uncovered_grasps(self, slot: int) -> bool:
-        """Return whether enough of an object's grasps would be clear with all other objects out of the way."""
+        """Return whether enough grasps of an object would be free of collisions without the other objects."""
         return self._has_grasps(slot, [], self.model.config.target.min_uncovered_grasps)
 
     def _has_grasps(self, slot: int, others: list[Array], min_count: int) -> bool:
@@ -112,7 +112,7 @@ class SettledScene:
         )
 
     def _within_reach(self, slot: int, other: int) -> bool:
-        """Return False where an object is certainly too far away from another to be in its grasps' way."""
+        """Return False if an object is too far from another to block its grasps."""
         centers = self.opened_poses[[slot, other], :3, 3]
         radius = np.linalg.norm(np.concatenate(self.assets[other].hulls), axis=1).max()
         grasps = self.assets[slot].annotations.grasps_tcp_in_object[:, :3, 3]
@@ -122,11 +122,11 @@ class SettledScene:
 
 @dataclass(frozen=True)
 class TargetRule:
-    """A way to choose the target.
+    """A rule that chooses the target.
 
     Attributes:
-        choose: from a generator and an arrangement; None where no object qualifies.
-        keys: of ``target`` in a configuration, numbers that let fewer objects qualify the higher they are.
+        choose: function of a random generator and a `SettledScene`; returns None if no object qualifies.
+        keys: keys of ``target`` in a configuration whose higher values let fewer objects qualify.
     """
 
     choose: Callable[[np.random.Generator, SettledScene], TargetChoice | None]
@@ -142,7 +142,7 @@ def choose_target(rng: np.random.Generator, scene: SettledScene) -> TargetChoice
 
 
 def _by_name(rng: np.random.Generator, scene: SettledScene) -> TargetChoice | None:
-    """Choose any object; its name is all the instruction says, so among same-named ones the nearest is meant."""
+    """Choose any object; of objects with the same name only the nearest one can be the target."""
     nearest: dict[str, int] = {}
     for slot in np.argsort(np.linalg.norm(scene.xy_in_robot, axis=1), kind="stable"):
         if scene.present[slot]:
@@ -153,7 +153,7 @@ def _by_name(rng: np.random.Generator, scene: SettledScene) -> TargetChoice | No
 
 
 def _by_relation(rng: np.random.Generator, scene: SettledScene) -> TargetChoice | None:
-    """Choose one of several identical objects, named by where it is among them; or by its name alone, the nearest."""
+    """Choose one of several identical objects by a relation; without configured relations, as `_by_name`."""
     if not scene.model.config.target.relations:
         return _by_name(rng, scene)
     pairs = [(name, relation) for name in sorted(set(scene.names)) for relation in scene.model.config.target.relations]
@@ -167,7 +167,7 @@ def _by_relation(rng: np.random.Generator, scene: SettledScene) -> TargetChoice 
 
 
 def selection_camera(model: SceneModel) -> PinholeCamera:
-    """Return the camera that p_vis is measured with: over the middle of the objects' region."""
+    """Return the camera that measures p_vis, above the middle of the objects' region."""
     region = model.region
     middle = np.append(np.add(region.min_xy, region.max_xy) / 2, region.z)
     center = transform_points(model.support_pose, middle[None])[0]
@@ -175,10 +175,9 @@ def selection_camera(model: SceneModel) -> PinholeCamera:
 
 
 def _by_visibility(rng: np.random.Generator, scene: SettledScene) -> TargetChoice | None:
-    """Choose a hidden object, near ones more often: weight 1 / distance to the robot (upstream's when it makes data).
+    """Choose a hidden object with a weight of 1 / distance to the robot, as RoboCAS-v0 does when it generates data.
 
-    An object whose grasps furniture or basket block does not qualify, whatever lies on it: a can on its broad side, a
-    screwdriver in a gap.
+    An object whose grasps are blocked by furniture or basket does not qualify, e.g. a flat can on its broad side.
     """
     rules = scene.model.config.target
     slots = np.flatnonzero(scene.present)

@@ -1,4 +1,4 @@
-"""The tasks: a frozen row each. Other packages add rows by entry points ``robocas_ms3.tasks``."""
+"""Specifications of the tasks. Other packages add tasks by entry points of the group ``robocas_ms3.tasks``."""
 
 from __future__ import annotations
 
@@ -7,29 +7,29 @@ from dataclasses import dataclass, field
 
 from robocas_ms3.core.extensions import Registry
 
-SIM_FREQ = 100  # Hz, of physics
-STANDARD_FREQ = 20  # Hz, of control; gymnasium's horizon is for it
+SIM_FREQ = 100  # Hz, physics
+STANDARD_FREQ = 20  # Hz, control; the horizon registered with gymnasium assumes this rate
 STAGES = ("furniture_opened", "reached_any", "obstacles_cleared", "reached_target", "target_grasped", "target_lifted")
 
 
 @dataclass(frozen=True)
 class TaskSpec:
-    """A task. Its parts are import paths, ``package.module:name``, so that reading a row imports no simulator.
+    """Specification of a task. Code is named by import paths ``package.module:name``, so no simulator is imported.
 
     Attributes:
         name: short name, as in ``robocas generate pick``.
         env_id: gymnasium id.
-        env: path of its class, a `tasks.base.RoboCASEnv` whose ``SPEC`` is this.
-        default_config: name of a shipped task configuration, or path of a YAML file.
-        target: path of a `scenes.targets.TargetRule`.
-        solver: path of its scripted policy, a function of an `Arm` that tries once.
-        seconds: horizon; upstream allows 200 steps of 5 Hz.
-        training_seconds: horizon to train with where the base stands still (`rl_kwargs`).
+        env: import path of the environment class, a `tasks.base.RoboCASEnv` with this specification as ``SPEC``.
+        default_config: name of a bundled task configuration, or path of a YAML file.
+        target: import path of a `scenes.targets.TargetRule`.
+        solver: import path of the scripted policy, a function of an `Arm` that makes one attempt.
+        seconds: horizon in s; RoboCAS-v0 allows 200 steps at 5 Hz.
+        training_seconds: horizon in s for training with a fixed base (`rl_kwargs`).
         summary: one line for `robocas list`.
-        slots: of its instructions besides object and support: ``relation``, which may be left out, ``part``.
-        checks: paths of functions of a `TaskConfig` that raise ValueError where it does not suit the task.
-        instructions: its templates by split; default: those of ``language/instructions.yaml``.
-        stages: that an episode comes through, in order; an evaluation names the first not reached.
+        slots: slots of its instructions in addition to object and support: ``relation`` (optional) and ``part``.
+        checks: import paths of functions that raise ValueError if a `TaskConfig` does not suit the task.
+        instructions: instruction templates by split; default: those of ``language/instructions.yaml``.
+        stages: stages of an episode in their order; an evaluation reports the first stage not reached.
     """
 
     name: str
@@ -47,12 +47,12 @@ class TaskSpec:
     stages: tuple[str, ...] = STAGES
 
     def steps(self, control_freq: int) -> int:
-        """Return the horizon in control steps at a rate, Hz."""
+        """Return the horizon in control steps at a control rate in Hz."""
         return self.seconds * control_freq
 
     @property
     def max_episode_steps(self) -> int:
-        """Horizon at the standard rate, which gymnasium registers."""
+        """Horizon in control steps at the standard rate, as registered with gymnasium."""
         return self.steps(STANDARD_FREQ)
 
 
@@ -79,7 +79,7 @@ SELECT = TaskSpec(
     solver="robocas_ms3.planning.solvers.pick:attempt",
     seconds=40,
     training_seconds=20,
-    summary="grasp the one of several identical objects that the instruction names by where it stands",
+    summary="grasp one of several identical objects, named by its position, and drop it into the basket",
     slots=("relation",),
     checks=(REQUIRE_BASKET, "robocas_ms3.scenes.config.task:require_copies"),
 )
@@ -92,7 +92,7 @@ SEARCH = TaskSpec(
     solver="robocas_ms3.planning.solvers.search:attempt",
     seconds=120,
     training_seconds=90,
-    summary="find the named object in a heap, clear what covers it, and drop it into the basket",
+    summary="find the named object in a heap, remove the objects that cover it, and drop it into the basket",
     checks=(REQUIRE_BASKET,),
 )
 OPEN_PICK = TaskSpec(

@@ -1,4 +1,4 @@
-"""How much of an object a camera sees (p_vis), by casting rays at its mesh. No renderer, no simulator."""
+"""Measure the visible fraction of objects (p_vis) by ray casting. No renderer, no simulator."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from robocas_ms3.scenes.placement import Array
 PixelBox = tuple[slice, slice]  # rows, columns
 
 SELECTION_CAMERA_HEIGHT = 0.5  # m, of the selection camera above the support, upstream's
-_FAR = 1e30  # embree's distance of a miss is greater
+_FAR = 1e30  # embree returns a greater distance for a ray without a hit
 _scenes: WeakKeyDictionary[trimesh.Trimesh, EmbreeScene] = WeakKeyDictionary()
 
 
@@ -44,16 +44,16 @@ class PinholeCamera:
         return self.height / 2 / np.tan(self.fov_y / 2)
 
     def rays(self, box: PixelBox) -> Array:
-        """Return directions (rows, columns, 3) through the centres of pixels, in the camera's frame; their x is 1."""
+        """Return ray directions (rows, columns, 3) through pixel centres in the camera's frame, with x = 1."""
         rows, columns = np.mgrid[box]
         left = (self.width / 2 - columns - 0.5) / self.focal_length
         up = (self.height / 2 - rows - 0.5) / self.focal_length
         return np.stack([np.ones(rows.shape), left, up], axis=-1)
 
     def pixel_box(self, points: Array) -> PixelBox:
-        """Return rows and columns within which points (P, 3) in the world appear; empty where they don't."""
+        """Return the rows and columns in which points (P, 3) in the world appear; empty if none does."""
         local = (points - self.pose[:3, 3]) @ self.pose[:3, :3]
-        if local[:, 0].min() <= 1e-3:  # partly behind the camera: anywhere
+        if local[:, 0].min() <= 1e-3:  # partly behind the camera: the whole image
             return slice(0, self.height), slice(0, self.width)
         row = self.height / 2 - local[:, 2] / local[:, 0] * self.focal_length
         column = self.width / 2 - local[:, 1] / local[:, 0] * self.focal_length
@@ -79,13 +79,13 @@ def _mesh_of(path: Path, _changed_ns: int) -> trimesh.Trimesh:
 
 
 def object_mesh(asset: Part, level: VisualLevel = "fast") -> trimesh.Trimesh:
-    """Return the mesh that is rendered, in the asset's frame; shared, so not to be changed."""
+    """Return the visual mesh in the asset's frame; it is shared between callers, so don't change it."""
     path = asset.visual(level)
     return _mesh_of(path, path.stat().st_mtime_ns)
 
 
 class MeshScene:
-    """Meshes at their poses, seen by any number of cameras.
+    """Meshes at their poses, for ray casting from any number of cameras.
 
     Args:
         meshes: K meshes.
@@ -96,16 +96,16 @@ class MeshScene:
         self._placed = list(zip(meshes, poses, strict=True))
 
     def visible_fractions(self, camera: PinholeCamera) -> Array:
-        """Return p_vis = visible / full projected area of each mesh (K,), in 0..1; NaN where it is out of view."""
+        """Return p_vis = visible / full projected area of each mesh (K,), in [0, 1]; NaN if it is out of view."""
         ids, full = self.segmentation(camera)
         visible = np.bincount(ids[ids >= 0], minlength=len(full))
         return visible / np.where(full > 0, full, np.nan)
 
     def segmentation(self, camera: PinholeCamera) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
-        """Return what each pixel shows, and the pixels that each mesh would fill alone.
+        """Return the segmentation image, and the number of pixels of each mesh without occlusion.
 
         Returns:
-            (height, width) index of a mesh, -1: none; number of pixels per mesh.
+            (height, width) mesh index, or -1 for the background; (K,) number of pixels of each mesh on its own.
         """
         nearest = np.full((camera.height, camera.width), np.inf)
         ids, full = np.full(nearest.shape, -1), np.zeros(len(self._placed), dtype=int)
@@ -119,9 +119,9 @@ class MeshScene:
 
 
 def _depths(camera: PinholeCamera, mesh: trimesh.Trimesh, pose: Array) -> tuple[PixelBox, Array]:
-    """Return the box of pixels that a mesh appears in, and its depth there, m; infinite: none."""
+    """Return the pixel box of a mesh, and its depth in m in this box; infinite where a ray misses the mesh."""
     box = camera.pixel_box(transform_points(pose, mesh.vertices))
-    # rays go into the mesh's frame: its search tree is built once, and single precision is plenty there
+    # rays are cast in the mesh's frame: its search tree is built once, and single precision is sufficient
     to_mesh = pose[:3, :3].T
     position = to_mesh @ (camera.pose[:3, 3] - pose[:3, 3])
     directions = camera.rays(box) @ (to_mesh @ camera.pose[:3, :3]).T
@@ -135,9 +135,9 @@ def _depths(camera: PinholeCamera, mesh: trimesh.Trimesh, pose: Array) -> tuple[
 
 
 def ray_scene(mesh: trimesh.Trimesh) -> EmbreeScene:
-    """Return the search tree of a mesh, which is built once per process."""
+    """Return the ray casting scene of a mesh; it is built once per process."""
     if mesh not in _scenes:
-        scene = EmbreeScene(robust=True)  # no ray slips through between two triangles
+        scene = EmbreeScene(robust=True)  # no ray passes between two adjacent triangles
         TriangleMesh(scene, mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32))
         _scenes[mesh] = scene
     return _scenes[mesh]
