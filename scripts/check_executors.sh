@@ -1,16 +1,16 @@
 #!/usr/bin/env bash
-# One plan of pick episodes with images by each executor: this machine, Slurm, a Ray cluster of two nodes on this machine, the
-# same with files gathered by the driver. Compares all that the runs made byte for byte, prints a table, ends with 1 on any
-# difference. With --kill each also runs while the processes of a job, or a node, are killed.
+# Run one plan of pick episodes with images with each executor: this machine, Slurm, a Ray cluster of two nodes on this
+# machine, and this cluster with files gathered by the driver. Compare the files of all runs byte for byte, and print a table;
+# exit status 1 means that files differ. --kill repeats each run and kills the processes of a job, or a node, during it.
 #
 #     bash scripts/check_executors.sh [--episodes 40] [--seed 0] [--jobs 2] [--kill] [--out FOLDER]
 #
-# Where no Slurm answers, scripts/slurm_here.sh starts one for as long as this takes (root; Debian, Ubuntu); where that can't
-# be, jobs are processes that submitit starts, and the table says so. FOLDER keeps what was made; a Slurm of several
-# machines needs one that all of them see. Needs a render device.
+# If no Slurm runs, scripts/slurm_here.sh starts one and stops it at the end (root on Debian or Ubuntu). If that fails, submitit
+# starts the jobs as processes, and the table says so. --out FOLDER keeps the files of the runs; a Slurm of several machines
+# needs a folder that all machines share. Needs a render device.
 #
-# ROBOCAS_EXECUTORS_VENV  environment to use as it is, with the extras slurm and ray (default: one is made by scripts/setup.sh in
-#                       a temporary folder, which takes minutes and gigabytes, and deleted in the end)
+# ROBOCAS_EXECUTORS_VENV  existing environment with the extras slurm and ray (default: scripts/setup.sh creates one in a
+#                       temporary folder, which takes minutes and gigabytes; it is deleted at the end)
 set -euo pipefail
 for word in "$@"; do
     case $word in
@@ -47,7 +47,7 @@ if ! timeout 10 sinfo --noheader >/dev/null 2>&1; then
     if [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null && bash scripts/slurm_here.sh; then
         slurm_is_ours=1
     else
-        say "no Slurm can be started here: its jobs are processes of this machine"
+        say "Slurm cannot be started on this machine: its jobs are local processes"
     fi
 fi
 

@@ -1,14 +1,14 @@
 #!/usr/bin/env bash
-# What other packages make of ours: vla-eval plays our episodes, and says what `robocas eval` says of the same policy;
-# robostats computes our intervals and tests.
+# Compare with other packages: vla-eval runs the episodes of a protocol and must report the outcomes of `robocas eval` for the
+# same policy; robostats must compute the same intervals and tests.
 #
 #   bash scripts/check_others.sh
 #
-# These are no dependencies, not even of the tests, so they get an environment of their own with this checkout in it.
+# They are not dependencies of the package or its tests; this script installs them with the checkout in a separate environment.
 # Needs a render device (scripts/setup.sh installs one) and a few minutes.
 #
 # ROBOCAS_OTHERS_VENV    folder of that environment (default: .venv-others in the checkout)
-# ROBOCAS_OTHERS_PYTHON  interpreter to make it with (default: python3.11; robostats takes none before)
+# ROBOCAS_OTHERS_PYTHON  interpreter to create it with (default: python3.11, the oldest that robostats supports)
 set -euo pipefail
 [ $# = 0 ] || { echo "usage: bash scripts/check_others.sh" >&2; exit 2; }
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
@@ -21,7 +21,7 @@ if [ "$(cat "$venv/.packages" 2>/dev/null)" != "$stamp" ]; then
     echo "environment $venv: ${PACKAGES[*]} (minutes the first time)"
     "${ROBOCAS_OTHERS_PYTHON:-python3.11}" -m venv --clear "$venv"
     pip=("$venv/bin/python" -m pip --disable-pip-version-check install -qq -c requirements.lock)
-    "${pip[@]}" torch==2.13.0 # first and by itself: a CPU build where one is at hand
+    "${pip[@]}" torch==2.13.0 # first and alone: pip takes a CPU build if it finds one
     "${pip[@]}" -e '.[remote]' pytest hypothesis "${PACKAGES[@]}"
     echo "$stamp" >"$venv/.packages"
 fi
@@ -29,4 +29,4 @@ export OMP_NUM_THREADS=1
 "$venv/bin/python" -W ignore scripts/check_vla_eval.py
 "$venv/bin/python" -m pytest -q tests/evaluation/test_statistics.py -k another_package -W error::pytest.PytestWarning \
     -o addopts= -rs | tee "$venv/robostats.txt"
-! grep -q skipped "$venv/robostats.txt" || { echo "robostats was not asked" >&2; exit 1; }
+! grep -q skipped "$venv/robostats.txt" || { echo "the comparison with robostats was skipped" >&2; exit 1; }

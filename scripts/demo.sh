@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# Sets up, records three pick episodes, writes a dataset of them with videos, checks it, says where everything lies.
+# Set up, record three pick episodes, convert them to a dataset with videos, validate it, and print where the files are.
 #
-#   bash scripts/demo.sh [OUT]      OUT: output folder, by default demo_output; what an earlier demo left there goes
+#   bash scripts/demo.sh [OUT]      # OUT: output folder (default: demo_output); an earlier demo in it is overwritten
 set -euo pipefail
 out=$(realpath -m "${1:-"$(dirname "${BASH_SOURCE[0]}")/../demo_output"}")
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
@@ -10,7 +10,7 @@ bash scripts/setup.sh
 robocas=${ROBOCAS_VENV:-.venv}/bin/robocas
 "$robocas" generate pick -n 3 --seed 0 --out "$out/demonstrations" --overwrite
 if ! "${robocas%robocas}python" robocas_ms3/doctor/probes.py render >/dev/null 2>&1; then
-    echo "No render device: the demonstrations are recorded, but no images can be made of them; see robocas doctor."
+    echo "No render device: the demonstrations are recorded but cannot be converted to images. See robocas doctor."
     echo "demonstrations  $out/demonstrations/trajectory.h5"
     exit 0
 fi

@@ -1,11 +1,14 @@
 #!/usr/bin/env bash
-# Every fault in generation, conversion, plan and evaluation, with real episodes: crashes, endless loops, memory, kill -9 at
-# random moments, full disks, ... Prints the fault table in Markdown, also as JSON.
+# Inject faults into generation, conversion, plans and evaluation with real episodes: crashes, endless loops, exhausted
+# memory, kill -9 at random times, full disks. Print a table of the faults and their outcomes in Markdown.
 #
-#   bash scripts/faults.sh [FOLDER] [PYTEST_ARGUMENTS...]   # faults.md and faults.json go there; default: faults
+#   bash scripts/faults.sh [FOLDER] [PYTEST_ARGUMENTS...]   # writes faults.md and faults.json to FOLDER (default: faults)
 #
-# ROBOCAS_FAULT_KILLS: how often each command is killed (20). ROBOCAS_FAULT_SEED: of the random moments; the table says
-# which there was. PYTHON names the interpreter; default: the one scripts/setup.sh made. An hour or more on two cores.
+# ROBOCAS_FAULT_KILLS  number of times that each command is killed (default: 20)
+# ROBOCAS_FAULT_SEED   seed of the random times; the table states the seed that was used
+# PYTHON               interpreter (default: that of scripts/setup.sh)
+#
+# Takes an hour or more on two cores.
 set -uo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 

@@ -1,18 +1,18 @@
 #!/usr/bin/env bash
-# All that only a GPU can show, in one command on a CUDA machine: tests marked gpu (contracts with 16 and 256
-# envs, scenes as on a CPU, partial resets, restored states, host synchronisation per step, contact buffers, heaps tried
-# by its engine; baselines that train and act), then steps a second of 1 to 4096 envs.
+# Run all checks that need a GPU, on a machine with CUDA: the tests marked gpu, then steps per second with 1 to 4096 envs.
+# The tests cover contracts with 16 and 256 envs, scenes equal to those on a CPU, partial resets, restored states, host
+# synchronisation per step, contact buffers, heaps checked by the GPU's physics, and training and inference of baselines.
 #
-#   bash scripts/gpu_checks.sh [FOLDER]     # reports go there; default: gpu_checks
+#   bash scripts/gpu_checks.sh [FOLDER]     # writes reports to FOLDER (default: gpu_checks)
 #
-# Offline too, once SAPIEN's library for GPUs is there: it is downloaded when it is first asked for, into
-# ~/.sapien/physx/<version>/libPhysXGpu_64.so; carry that file along.
+# SAPIEN downloads its GPU library at the first use to ~/.sapien/physx/<version>/libPhysXGpu_64.so. On a machine without
+# internet, copy that file from another machine.
 #
-# Where PhysX does not start on the GPU, the batched code runs with CUDA tensors on CPU physics instead
-# (tests/support/gpu_emulation). Exit status: 0 all passed, 1 a check failed, 2 all passed but PhysX did not start.
+# If PhysX does not start on the GPU, the batched code runs with CUDA tensors on CPU physics (tests/support/gpu_emulation).
+# Exit status: 0 all passed, 1 a check failed, 2 all passed but PhysX did not start.
 #
-# PYTHON names the interpreter; default: the one scripts/setup.sh made, else python3. It needs what the environments need
-# (sapien, mani_skill, torch with CUDA, ...), the train extra and pytest; the motion planner is not used.
+# PYTHON names the interpreter (default: that of scripts/setup.sh, else python3). It needs the packages of the environments
+# (sapien, mani_skill, torch with CUDA, ...), the extra `train` and pytest, but not the motion planner.
 set -uo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -23,9 +23,9 @@ mkdir -p "$out"
 export PYTHONPATH="$PWD${PYTHONPATH:+:$PYTHONPATH}" OMP_NUM_THREADS=1 PYTHONWARNINGS=ignore
 
 if ! device=$("$python" -c 'import torch; print(torch.cuda.get_device_name())' 2>/dev/null); then
-    echo "No CUDA device here. Skipped, and so unproven: contracts with 16 and 256 envs, scenes as on a CPU, partial"
-    echo "resets, restored states, host synchronisation per step, contact buffers, heaps tried by its engine, training, steps"
-    echo "a second of more than one env."
+    echo "No CUDA device. Not tested: contracts with 16 and 256 envs, scenes equal to those on a CPU, partial resets,"
+    echo "restored states, host synchronisation per step, contact buffers, heaps checked by the GPU's physics, training,"
+    echo "steps per second of more than one env."
     "$python" benchmarks/fps.py --envs 1 --modes state --steps 50 | tee "$out/fps.json"
     exit $?
 fi
@@ -51,8 +51,8 @@ if "$python" -c 'from sapien import physx; physx.enable_gpu()' >"$out/physx.txt"
     exit $failed
 fi
 tail -n 3 "$out/physx.txt"
-echo "PhysX does not start on the GPU. Offline, copy ~/.sapien/physx/ from a machine where it has started once."
-echo "Instead, the batched code runs with CUDA tensors on CPU physics; one env is timed. Unproven: physics on the GPU,"
+echo "PhysX does not start on the GPU. Without internet, copy ~/.sapien/physx/ from a machine on which it has started."
+echo "The batched code is tested with CUDA tensors on CPU physics, and one env is timed. Not tested: physics on the GPU,"
 echo "its contact buffers, 256 envs, steps per second of more than one env."
 export PYTHONPATH="$PYTHONPATH:$PWD/tests/support"
 check tests.txt -m gpu tests/gpu/test_baselines.py

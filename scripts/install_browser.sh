@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Installs Debian's Chromium, which the tests of `robocas view` look at its page with. Not an error where it can't be:
-# nothing but those tests needs it, and they say that they were skipped. It is tried once; on CI (`CI` is set) each time.
+# Install Debian's Chromium, in which the tests of `robocas view` open its page. A failure is no error: only those tests need
+# it, and they are skipped without it. After a failure it is not tried again, except on CI (the variable `CI` is set).
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -15,10 +15,10 @@ say() { printf 'setup: %s\n' "$*"; }
 for name in "${ROBOCAS_CHROMIUM:-chromium}" chromium chromium-browser google-chrome google-chrome-stable; do
     if command -v "$name" >/dev/null; then exit 0; fi
 done
-# Ubuntu's package of this name is a stub that wants snapd.
+# On Ubuntu the package chromium is a stub that needs snapd.
 if ! grep -qsx 'ID=debian' /etc/os-release || [ "$(id -u)" != 0 ] || [ -e "$tried" ]; then exit 0; fi
 
 say "installing chromium for the tests of robocas view"
 if { apt-get update -qq && apt-get install -y -qq --no-install-recommends chromium; } >/dev/null 2>&1; then exit 0; fi
 touch "$tried"
-say "no chromium: the tests of the page will be skipped. Remove $tried to try again."
+say "Chromium could not be installed: the tests of the page are skipped. Remove $tried to try again."

@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
-# Makes rendering work on a machine without a GPU: installs Mesa's software Vulkan driver where SAPIEN finds no device.
+# Install Mesa's software Vulkan driver if SAPIEN finds no render device, so that rendering works without a GPU.
 #
-# SAPIEN 3 needs VK_KHR_external_semaphore_fd, which that driver (lavapipe) has from Mesa 24.3 on. Nothing here is an
-# error: without a renderer the package still simulates and generates state-only data, so the script ends with 0.
+# SAPIEN 3 needs VK_KHR_external_semaphore_fd, which this driver (lavapipe) has since Mesa 24.3. A failure is no error:
+# without a renderer the package simulates and records state-only data, so the exit status is 0.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -13,12 +13,12 @@ export DEBIAN_FRONTEND=noninteractive
 say() { printf 'setup: %s\n' "$*"; }
 renders() { "$python" robocas_ms3/doctor/probes.py render >/dev/null 2>&1; }
 advise() {
-    say "no render device: $1. Until then everything works without images (state-only)."
+    say "no render device: $1. Without one, everything but images works."
     exit 0
 }
 
-# Prints "URI<tab>signing key or -" of the distribution's own archive, read from sources in either of apt's two styles.
-# The security archive and others are told apart by their suites.
+# Print "URI<tab>signing key or -" of the distribution's archive, from the apt sources in either of their two formats.
+# The suite distinguishes it from the security archive and others.
 archive_of() {
     local suite=$1 files=()
     shopt -s nullglob
@@ -97,7 +97,7 @@ else
     command="apt-get install mesa-vulkan-drivers libvulkan1"
 fi
 [ "$(id -u)" = 0 ] || advise "run as root: $command"
-[ ! -e "$tried" ] || advise "installing one failed before; remove $tried to try again, or install a $NEEDED"
+[ ! -e "$tried" ] || advise "an earlier installation failed; remove $tried to try again, or install a $NEEDED"
 
 say "no render device: installing Mesa's software Vulkan driver"
 log=$(mktemp)

@@ -38,4 +38,4 @@ elif [ "$(cat "$venv/.packages" 2>/dev/null)" != "${packages[*]}" ]; then
     echo "${packages[*]}" >"$venv/.packages"
 fi
 venv=$(cd "$venv" && pwd)
-export HF_HUB_OFFLINE=${HF_HUB_OFFLINE:-1} HF_HOME=${HF_HOME:-$venv/hub} # tables are cached there; nothing is downloaded
+export HF_HUB_OFFLINE=${HF_HUB_OFFLINE:-1} HF_HOME=${HF_HOME:-$venv/hub} # tables are cached there; models are not downloaded

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Sets up everything the project needs; safe to run again (a second or so when there is nothing to do).
+# Install everything that the project needs. It is safe to run again, and then takes about a second.
 #
 #   bash scripts/setup.sh               # .venv: everything at the versions of requirements.lock, Python 3.10 to 3.13
 #   bash scripts/setup.sh --lerobot     # .venv-lerobot: RoboCAS and LeRobot 0.6 in one environment, Python 3.12
@@ -7,8 +7,8 @@
 # ROBOCAS_VENV            folder of the virtual environment instead of .venv or .venv-lerobot
 # ROBOCAS_PYTHON          interpreter to create it with (default: the first of python3.11, 3.12, 3.13, 3.10, python3 that
 #                         is supported)
-# ROBOCAS_NUMPY           another version of numpy than that of requirements.lock, such as 1.26.4. Later calls for the same
-#                         environment keep it; ROBOCAS_NUMPY=lock goes back.
+# ROBOCAS_NUMPY           version of numpy, such as 1.26.4, instead of that in requirements.lock. Later calls for the same
+#                         environment keep it; ROBOCAS_NUMPY=lock installs the locked version again.
 # ROBOCAS_SKIP_RENDERER=1 do not install a software renderer
 # ROBOCAS_SKIP_BROWSER=1  do not install Chromium for the tests of robocas view
 set -euo pipefail
@@ -71,7 +71,7 @@ install_packages() {
         "${pip[@]}" -e '.[lerobot-env,language]' ./lerobot_env_robocas
     else
         say "packages, at the versions of requirements.lock (minutes the first time)"
-        # torch first, with its dependencies: a CPU build satisfies it where pip finds one, and nothing later replaces it.
+        # torch first, with its dependencies: a CPU build is accepted if pip finds one, and later packages do not replace it.
         "${pip[@]}" -c requirements.lock "$TORCH"
         # The lock is complete. --no-deps: mani_skill pins mplib, which is not used and has no wheel for Python 3.13.
         "${pip[@]}" --no-deps -r requirements.lock
@@ -86,10 +86,10 @@ install_packages() {
     fi
 }
 
-# The version of numpy that was chosen is kept, as test.sh and demo.sh call this script too; ROBOCAS_NUMPY=lock goes back.
+# Keep the chosen version of numpy, because test.sh and demo.sh call this script too.
 if [ -z "${ROBOCAS_NUMPY:-}" ]; then ROBOCAS_NUMPY=$(cat "$venv/.robocas-numpy" 2>/dev/null || true); fi
 if [ "${ROBOCAS_NUMPY:-}" = lock ]; then ROBOCAS_NUMPY=; fi
-is_editable() { # pip install ".[...]" replaces the editable install by a copy
+is_editable() { # `pip install ".[...]"` replaces the editable installation by a copy
     local checkout=$PWD absolute
     absolute=$(realpath -s "$python")
     local code="import sys; from importlib.util import find_spec as find; sys.exit(find('robocas_ms3').origin != sys.argv[1])"
