@@ -21,27 +21,27 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from PIL import Image
 
 TRAIN_STEPS = 10
-PRECISION_MM = 0  # of depth up to MAX_DEPTH_MM
-MAX_DEPTH_MM = 4095  # farther pixels are stored as this
+PRECISION_MM = 0  # of depth values up to MAX_DEPTH_MM
+MAX_DEPTH_MM = 4095  # greater depths are stored as this value
 SPEECH = "On my way."
 ANSWERS = {"speech": SPEECH, "text": SPEECH}
-"""What the stub server says to every prompt."""
+"""Answer of the stub server to every prompt."""
 
 
 def main(root: Path, source: Path | None) -> None:
-    """Run all checks; whatever LeRobot refuses raises."""
+    """Run all checks; a failed check raises an error."""
     versions = {name: version(name) for name in ("lerobot", "torch", "torchvision", "datasets", "av", "pyarrow")}
     say(f"versions: {versions}")
-    begun = time.perf_counter()
+    start = time.perf_counter()
     dataset = load(root)
-    say(f"loaded in {time.perf_counter() - begun:.1f} s: {dataset.num_episodes} episodes, {len(dataset)} frames")
+    say(f"loaded in {time.perf_counter() - start:.1f} s: {dataset.num_episodes} episodes, {len(dataset)} frames")
     say(f"format {dataset.meta.info['codebase_version']}, {dataset.fps} fps, cameras {dataset.meta.camera_keys}")
     check_items(dataset)
     check_iteration(dataset)
     if "language_persistent" in dataset.meta.features:
         check_subgoals(dataset, root, source)
         check_depth(dataset, root, source)
-        check_annotate(dataset, root)
+        check_annotations(dataset, root)
         check_train(dataset, root)
     say(f"LeRobot {versions['lerobot']} accepts {root}")
 
@@ -99,14 +99,14 @@ def check_iteration(dataset: LeRobotDataset) -> None:
         from lerobot.utils.collate import lerobot_collate_fn
 
         options["collate_fn"] = lerobot_collate_fn
-    begun, seen = time.perf_counter(), []
+    start, indices = time.perf_counter(), []
     for batch in torch.utils.data.DataLoader(dataset, batch_size=16, shuffle=True, num_workers=1, **options):
-        seen += batch["index"].tolist()
+        indices += batch["index"].tolist()
         for key in rgb_keys(dataset):
             assert 0 <= batch[key].min() <= batch[key].max() <= 1
-    assert sorted(seen) == list(range(len(dataset)))
-    seconds = time.perf_counter() - begun
-    say(f"iterated {len(seen)} frames in {seconds:.1f} s, {len(seen) / seconds:.0f} per second")
+    assert sorted(indices) == list(range(len(dataset)))
+    seconds = time.perf_counter() - start
+    say(f"iterated {len(indices)} frames in {seconds:.1f} s, {len(indices) / seconds:.0f} per second")
 
 
 def rgb_keys(dataset: LeRobotDataset) -> list[str]:
@@ -161,8 +161,8 @@ def robocas_folders(root: Path, source: Path | None) -> dict[int, Path]:
     return {episode: places[entry["recording"]] for episode, entry in enumerate(ours)}
 
 
-class Stub(BaseHTTPRequestHandler):
-    """An OpenAI-compatible server that gives one answer to everything."""
+class StubHandler(BaseHTTPRequestHandler):
+    """OpenAI-compatible server that gives one answer to every prompt."""
 
     def do_GET(self) -> None:  # noqa: N802
         """List the one model."""
@@ -188,9 +188,9 @@ class Stub(BaseHTTPRequestHandler):
         """Log nothing."""
 
 
-def check_annotate(dataset: LeRobotDataset, root: Path) -> None:
-    """Run lerobot-annotate on a copy against a stub server: its speech is added, and our rows stay."""
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Stub)
+def check_annotations(dataset: LeRobotDataset, root: Path) -> None:
+    """Run lerobot-annotate on a copy against a stub server: it must add speech and keep the other rows."""
+    server = ThreadingHTTPServer(("127.0.0.1", 0), StubHandler)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(copytree(root, Path(folder) / root.name))
@@ -201,13 +201,13 @@ def check_annotate(dataset: LeRobotDataset, root: Path) -> None:
             "--vlm.model_id=stub",
             "--vlm.auto_serve=false",
             "--video_backend=pyav",
-            "--plan.enabled=false",  # our sub-goals and paraphrases
-            "--vqa.enabled=false",  # our boxes
+            "--plan.enabled=false",  # the dataset has sub-goals and paraphrases
+            "--vqa.enabled=false",  # the dataset has boxes
             "--interjections.max_interjections_per_episode=0",  # they need the module plan
         )
         server.shutdown()
         annotated = load(copy)
-        before, after = (one.hf_dataset.with_format(None) for one in (dataset, annotated))
+        before, after = (data.hf_dataset.with_format(None) for data in (dataset, annotated))
         spoken = 0
         for ours, theirs in zip(before, after, strict=True):
             assert theirs["language_persistent"] == ours["language_persistent"]
@@ -217,7 +217,7 @@ def check_annotate(dataset: LeRobotDataset, root: Path) -> None:
             assert all(SPEECH in json.dumps(row["tool_calls"]) for row in added)
         assert spoken == dataset.num_episodes
         annotated[0]
-    say(f"lerobot-annotate added {spoken} rows of speech and kept all of ours")
+    say(f"lerobot-annotate added {spoken} rows of speech and kept all other rows")
 
 
 def check_train(dataset: LeRobotDataset, root: Path) -> None:
@@ -226,7 +226,7 @@ def check_train(dataset: LeRobotDataset, root: Path) -> None:
     inputs = {key: feature_of(dataset.meta.features[key]) for key in keys}
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "act"
-        begun = time.perf_counter()
+        start = time.perf_counter()
         run(
             "lerobot-train",
             "--dataset.repo_id=robocas/check",
@@ -246,7 +246,7 @@ def check_train(dataset: LeRobotDataset, root: Path) -> None:
             f"--output_dir={out}",
         )
         assert (out / "checkpoints/last/pretrained_model/model.safetensors").is_file()
-    say(f"lerobot-train: {TRAIN_STEPS} steps of ACT in {time.perf_counter() - begun:.0f} s")
+    say(f"lerobot-train: {TRAIN_STEPS} steps of ACT in {time.perf_counter() - start:.0f} s")
 
 
 def feature_of(feature: dict) -> dict:
@@ -258,14 +258,14 @@ def feature_of(feature: dict) -> dict:
 
 
 def run(name: str, *words: str) -> None:
-    """Run a command of LeRobot; its output is shown if it fails."""
+    """Run a command of LeRobot; print its output if it fails."""
     done = subprocess.run([Path(sys.executable).with_name(name), *words], capture_output=True, text=True, check=False)
     if done.returncode:
         sys.exit(f"{name} failed\n{done.stdout[-4000:]}\n{done.stderr[-4000:]}")
 
 
 def say(text: str) -> None:
-    """Print a line at once."""
+    """Print a line without buffering."""
     print(text, flush=True)
 
 

@@ -1,4 +1,4 @@
-"""Evaluates policies in RoboCAS with LeRobot, in one process; run by check_lerobot_env.sh."""
+"""Evaluate policies in RoboCAS with LeRobot, in one process; called by check_lerobot_env.sh."""
 
 import contextlib
 import io
@@ -31,7 +31,7 @@ HUB_FILE = Path(__file__).resolve().parents[1] / "examples" / "lerobot_hub" / "e
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 COMMANDS = Path(sys.executable).parent
 CAMERAS = {"cameras": "base_camera,gripper_camera", "observation_width": 64, "observation_height": 48}
-# A policy of `robocas eval`: the demonstrator, whose actions are saved by episode.
+# Module with a policy for `robocas eval`: the scripted policy, whose actions are saved by episode.
 RECORDER = """
 import numpy as np
 from robocas_ms3.evaluation.policies.scripted import ScriptedPolicy
@@ -59,7 +59,7 @@ class Recorder(ScriptedPolicy):
 
 
 def main() -> None:
-    """Run all checks; a check that fails raises."""
+    """Run all checks; a failed check raises an error."""
     names = ("robocas_ms3", "lerobot", "lerobot_env_robocas", "torch", "numpy", "gymnasium", "mani_skill", "sapien")
     say({name: version(name) for name in names})
     register_third_party_plugins()
@@ -72,7 +72,7 @@ def main() -> None:
 
 
 def check_untrained_policy(folder: Path) -> None:
-    """Evaluate ACT with random weights by the command: two tasks, two envs, two episodes of each task."""
+    """Run lerobot-eval with random weights of ACT: two tasks, two envs, two episodes per task."""
     features = env_to_policy_features(settings())
     outputs = {key: feature for key, feature in features.items() if feature.type is FeatureType.ACTION}
     inputs = {key: feature for key, feature in features.items() if key not in outputs}
@@ -106,9 +106,9 @@ def check_untrained_policy(folder: Path) -> None:
         f"--output_dir={folder / 'out'}",
     ]
     say(" ".join(command))
-    started = time.perf_counter()
+    start = time.perf_counter()
     run(command)
-    seconds = time.perf_counter() - started
+    seconds = time.perf_counter() - start
     info = json.loads((folder / "out" / "eval_info.json").read_text())
     assert set(info["per_group"]) == {"select", "search"}
     assert info["overall"]["n_episodes"] == 4
@@ -123,7 +123,7 @@ def check_untrained_policy(folder: Path) -> None:
 
 
 def check_recorded_actions(folder: Path) -> None:
-    """Replay the demonstrator's actions in LeRobot's loop: the outcomes equal those of `robocas eval`."""
+    """Replay the actions of the scripted policy with LeRobot; compare the outcomes with `robocas eval`."""
     (folder / "recorder.py").write_text(RECORDER.replace("FILE", str(folder / "actions.npz")))
     command = [COMMANDS / "robocas", "eval", "pick", "search", "--protocol", "smoke", "--policy", "recorder:Recorder"]
     run([*command, "--out", folder / "ours"], path=folder)
@@ -132,9 +132,9 @@ def check_recorded_actions(folder: Path) -> None:
     instructions = [episode.instruction for episode in load_protocol("smoke").episodes]
     for task, seeds in (("pick", [1, 0]), ("search", [0, 1])):
         env = envs[task][0]
-        policy, same = Replay(env, actions), PolicyProcessorPipeline(steps=[])
+        policy, identity = ReplayModule(env, actions), PolicyProcessorPipeline(steps=[])
         with contextlib.redirect_stderr(io.StringIO()):  # a progress bar
-            found = rollout(env, policy, same, same, same, lambda action: action, seeds=seeds)
+            found = rollout(env, policy, identity, identity, identity, lambda action: action, seeds=seeds)
         theirs = outcomes(folder / "theirs" / task)
         assert policy.instructions == [instructions[episode] for episode in env.episodes], policy.instructions
         for row, episode in enumerate(env.episodes.tolist()):
@@ -147,8 +147,8 @@ def check_recorded_actions(folder: Path) -> None:
     assert any(outcome["success"] for outcome in ours.values())
 
 
-class Replay(torch.nn.Module):
-    """Repeats recorded actions of the episodes of an environment."""
+class ReplayModule(torch.nn.Module):
+    """Replays the recorded actions of each episode of an environment."""
 
     def __init__(self, env, actions) -> None:
         super().__init__()
@@ -169,7 +169,7 @@ class Replay(torch.nn.Module):
 
 
 def check_hub_file() -> None:
-    """Load examples/lerobot_hub/env.py from a cache of the Hub, without a network, and step it."""
+    """Load examples/lerobot_hub/env.py from a cache of the Hub, without internet, and step the environment."""
     assert HF_HUB_OFFLINE, "set HF_HUB_OFFLINE=1"
     repository = Path(HF_HUB_CACHE) / "models--someone--robocas"
     shutil.rmtree(repository, ignore_errors=True)
@@ -189,18 +189,18 @@ def check_hub_file() -> None:
 
 
 def settings(**others) -> EnvConfig:
-    """Return a configuration of small images and the protocol smoke."""
+    """Return a configuration with small images and the protocol `smoke`."""
     return EnvConfig.get_choice_class("robocas")(protocol="smoke", **CAMERAS, **others)
 
 
 def outcomes(folder: Path) -> dict[int, dict]:
     """Return the outcomes of a result by episode, without measured times."""
     lines = [json.loads(line) for line in (folder / "episodes.jsonl").read_text().splitlines()]
-    return {one["episode"]: {key: value for key, value in one.items() if key != "inference_ms"} for one in lines}
+    return {line["episode"]: {key: line[key] for key in line if key != "inference_ms"} for line in lines}
 
 
 def run(command: list, path: Path | None = None) -> None:
-    """Run a command, with a folder of modules, and print what it prints last."""
+    """Run a command, with `path` as PYTHONPATH, and print the last lines of its output."""
     env = {**os.environ, **({} if path is None else {"PYTHONPATH": str(path)})}
     done = subprocess.run([str(word) for word in command], env=env, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -208,7 +208,7 @@ def run(command: list, path: Path | None = None) -> None:
 
 
 def say(text: object) -> None:
-    """Print a line at once."""
+    """Print a line without buffering."""
     print(text, flush=True)
 
 

@@ -12,16 +12,16 @@ PAGE = Path(__file__).resolve().parents[1] / "docs" / "configuration.md"
 _HEAD = "| key | type and range | default | meaning |\n|---|---|---|---|\n"
 _ONE = {"string": "string", "integer": "whole number", "number": "number", "boolean": "true or false"}
 _MANY = {"string": "strings", "integer": "whole numbers", "number": "numbers"}
-_EXTENDS = f"| `{EXTENDS}` | string | none | base configuration: a shipped name, or a YAML file relative to this one |"
+_EXTENDS = f"| `{EXTENDS}` | string | none | base configuration: a bundled name, or a YAML file relative to this file |"
 _NAME = "NAME"  # stands for a key that the file chooses
 
 Schema = dict[str, Any]
 
 
 def markdown() -> str:
-    """A section with a table for each block of keys, the file's own first, separated by empty lines."""
+    """Return a section with a table for each block of keys, that of the file first, separated by empty lines."""
     schema = TaskConfig.model_json_schema()
-    places: dict[str, list[str]] = {"": [""]}  # definition -> where it is used; in the order they are met
+    places: dict[str, list[str]] = {"": [""]}  # definition -> keys that use it, in the order of the file
     _collect(schema, schema, "", places)
     sections = []
     for name, where in places.items():
@@ -36,7 +36,7 @@ def markdown() -> str:
 
 
 def _collect(schema: Schema, block: Schema, path: str, places: dict[str, list[str]]) -> None:
-    """Note where each block is used, depth first."""
+    """Collect the keys that use each block, depth first."""
     for key, field in block["properties"].items():
         for name, suffix, kind in _references(field):
             place = f"{path}{key}{suffix}"
@@ -46,7 +46,7 @@ def _collect(schema: Schema, block: Schema, path: str, places: dict[str, list[st
 
 
 def _references(field: Schema) -> list[tuple[str, str, str]]:
-    """(definition, suffix of the key, kind) of the blocks a field holds."""
+    """Return (definition, suffix of the key, kind) of the blocks that a field contains."""
     kinds = {ref: kind for kind, ref in field.get("discriminator", {}).get("mapping", {}).items()}
     nodes = [(field, ""), *((choice, "") for choice in (*field.get("anyOf", ()), *field.get("oneOf", ())))]
     if isinstance(field.get("additionalProperties"), dict):
@@ -77,7 +77,7 @@ def _default(value: Any) -> str:
     if value is None:
         return "none"
     if isinstance(value, dict):
-        return "the block's own" if value else "empty"
+        return "see the block" if value else "empty"
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, list):
@@ -114,13 +114,13 @@ def _list_type(field: Schema) -> str:
 
 
 def _limits(field: Schema, each: str = "") -> str:
-    """Range of a number, as `, 0 to 1`; open ends are said in words."""
+    """Return the range of a number, such as `, 0 to 1`; ranges with one limit are in words."""
     words = {"minimum": "at least", "exclusiveMinimum": "above", "maximum": "at most", "exclusiveMaximum": "below"}
     found = {key: field[key] for key in words if key in field}
     if found.keys() == {"minimum", "maximum"}:
         return f", {each}{found['minimum']:g} to {found['maximum']:g}"
-    said = " and ".join(f"{words[key]} {value:g}" for key, value in found.items())
-    return f", {each}{said}" if said else ""
+    limits = " and ".join(f"{words[key]} {value:g}" for key, value in found.items())
+    return f", {each}{limits}" if limits else ""
 
 
 if __name__ == "__main__":

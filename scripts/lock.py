@@ -2,9 +2,9 @@
 
     python scripts/lock.py python3.10 python3.11 python3.12 python3.13
 
-Runs with Python 3.11 or newer. CUDA packages that come with one build of torch are left out, so that the lock fits all
-builds. Some packages pin a requirement that we do not use and that has no build for a supported Python (``IGNORED``):
-the lock has the package without that requirement, and is installed with ``pip install --no-deps``.
+Needs Python 3.11 or newer. The lock omits CUDA packages that belong to one build of torch, so that it fits all builds.
+It also omits requirements in ``IGNORED``, which are not used and have no build for a supported Python. Therefore the
+lock is installed with ``pip install --no-deps``.
 """
 
 import json
@@ -19,12 +19,12 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parent.parent
 TORCH = "torch==2.13.0"
-NUMPY = "numpy==2.2.6"  # the newest for Python 3.10 and for LeRobot 0.6, so that all environments compute the same bits
-OPENPI = "openpi-client==0.1.2"  # tests send messages with it; not in the dev extra because it asks for numpy < 2
+NUMPY = "numpy==2.2.6"  # the newest for Python 3.10 and LeRobot 0.6: all environments compute the same bits
+OPENPI = "openpi-client==0.1.2"  # for tests of messages; not in the extra `dev` because it requires numpy < 2
 NOT_INSTALLED = {"slurm", "ray", "lerobot-env"}  # extras that setup.sh does not install into .venv
 OF_ONE_TORCH_BUILD = ("nvidia-c", "nvidia-n", "cuda-", "triton")
 IGNORED = {
-    "mani-skill": {"mplib"},  # ==0.1.1: no wheel for Python 3.13, and nothing here imports it
+    "mani-skill": {"mplib"},  # ==0.1.1 has no wheel for Python 3.13 and is not used
     "openpi-client": {"numpy"},  # < 2: its code works with numpy 2
 }
 HEADER = """\
@@ -34,7 +34,7 @@ HEADER = """\
 
 
 def project_requirements() -> list[str]:
-    """Return what pyproject.toml asks for with the extras that setup.sh installs, torch at its pinned version."""
+    """Return the requirements of pyproject.toml with the extras that setup.sh installs, torch at its pinned version."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     found = [*project["build-system"]["requires"], *project["project"]["dependencies"], TORCH, NUMPY, OPENPI]
     for name, extra in project["project"]["optional-dependencies"].items():

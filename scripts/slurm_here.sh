@@ -1,15 +1,15 @@
 #!/usr/bin/env bash
-# Slurm on this machine alone: a cluster of one node with all its cores, to try `robocas plan run --executor slurm`.
+# Start a Slurm cluster of one node, this machine with all its cores, to test `robocas plan run --executor slurm`.
 #
-#     scripts/slurm_here.sh           installs (Debian, Ubuntu) and starts munge, slurmctld and slurmd; needs root
-#     scripts/slurm_here.sh status    says what runs; ends with 0 if Slurm answers
-#     scripts/slurm_here.sh stop      cancels all jobs and ends what was started
+#     scripts/slurm_here.sh           install (Debian, Ubuntu) and start munge, slurmctld and slurmd; needs root
+#     scripts/slurm_here.sh status    print nodes and jobs; exit status 0 if Slurm answers
+#     scripts/slurm_here.sh stop      cancel all jobs and stop the daemons
 #
-# Jobs go to the partition `here`; those of a second one, `first`, preempt them: they are sent back to the queue.
+# Jobs go to the partition `here`. Jobs of a second partition, `first`, preempt them: they return to the queue.
 #
-# Needs no systemd, so it works in a container. Started twice, it is started once. A slurm.conf that is none of its own
-# stays as it is, and then nothing is started. What the daemons say is in /var/log/robocas-slurm, what they remember in
-# /var/lib/robocas-slurm. Memory is not shared out: jobs may ask for what they like.
+# It needs no systemd and works in a container. A second start changes nothing. A slurm.conf that this script did not write
+# is kept, and then nothing is started. Logs are in /var/log/robocas-slurm, the state is in /var/lib/robocas-slurm. Slurm
+# does not manage memory here: a job may request any amount.
 set -euo pipefail
 
 conf=/etc/slurm/slurm.conf
@@ -27,7 +27,7 @@ answers() { timeout 5 sinfo --noheader >/dev/null 2>&1; }
 node_is_up() { sinfo --noheader --format=%T | grep -qE "^(idle|mixed|allocated|completing)"; }
 ours() { [ -f "$conf" ] && head -n 1 "$conf" | grep -qxF "$mark"; }
 
-# Process id in a file of a daemon, if that still runs and is no other's by now.
+# Print the process id in the pid file of a daemon, if a process of its name has this id.
 running() {
     local pid
     pid=$(cat "$1" 2>/dev/null) && [ -n "$pid" ] && [ "$(cat "/proc/$pid/comm" 2>/dev/null)" = "$2" ] && echo "$pid"
@@ -44,14 +44,14 @@ wait_until() {
 install_packages() {
     command -v slurmctld >/dev/null && command -v slurmd >/dev/null && command -v sbatch >/dev/null \
         && command -v munged >/dev/null && return
-    command -v apt-get >/dev/null || refuse "install slurmctld, slurmd, sbatch and munge; there is no apt-get here"
+    command -v apt-get >/dev/null || refuse "there is no apt-get: install slurmctld, slurmd, sbatch and munge"
     say "installing slurmctld, slurmd, slurm-client and munge"
     local log
     log=$(mktemp)
     if ! { apt-get update -qq && apt-get install -y -qq --no-install-recommends \
         slurmctld slurmd slurm-client munge; } >"$log" 2>&1; then
         tail -n 5 "$log" >&2
-        refuse "could not install them; all of apt's words are in $log"
+        refuse "could not install them; the output of apt is in $log"
     fi
     rm -f "$log"
 }
@@ -67,7 +67,7 @@ ClusterName=here
 SlurmctldHost=$host(127.0.0.1)
 SlurmUser=root
 AuthType=auth/munge
-# a requeued job waits until its credentials are over, two minutes by default
+# a requeued job waits until its credentials expire, two minutes by default
 AuthInfo=cred_expire=15
 CredType=cred/munge
 StateSaveLocation=$state/ctld
@@ -88,7 +88,7 @@ ReturnToService=2
 SlurmctldTimeout=30
 SlurmdTimeout=30
 JobRequeue=1
-# jobs of \`first\` send those of \`here\` back to the queue
+# jobs of \`first\` return jobs of \`here\` to the queue
 PreemptType=preempt/partition_prio
 PreemptMode=REQUEUE
 $node NodeAddr=127.0.0.1 State=UNKNOWN
@@ -112,11 +112,11 @@ start_munge() {
 
 start() {
     if answers && { ! ours || { node_is_up && running /run/robocas-slurmd.pid slurmd >/dev/null; }; }; then
-        say "runs already"
+        say "already running"
         return
     fi
     [ "$(id -u)" = 0 ] || refuse "run this as root"
-    if [ -e "$conf" ] && ! ours; then refuse "$conf is somebody's: start that Slurm, or move the file away"; fi
+    if [ -e "$conf" ] && ! ours; then refuse "$conf was not written by this script: start that Slurm, or move the file"; fi
     install_packages
     mkdir -p "$logs" "$state/ctld" "$state/d"
     write_conf
@@ -125,19 +125,19 @@ start() {
     wait_until answers || refuse "slurmctld does not answer; see $logs/slurmctld.log"
     running /run/robocas-slurmd.pid slurmd >/dev/null || slurmd
     wait_until node_is_up || refuse "the node is $(sinfo --noheader --partition=here --format=%T); see $logs/slurmd.log"
-    say "a cluster of $(sinfo --noheader --partition=here --format=%c) cores is up; scripts/slurm_here.sh stop ends it"
+    say "a cluster of $(sinfo --noheader --partition=here --format=%c) cores is running; stop it with scripts/slurm_here.sh stop"
 }
 
 stop() {
     if ! ours; then
-        say "no Slurm of this script is here"
+        say "no Slurm of this script is running"
         return
     fi
     [ "$(id -u)" = 0 ] || refuse "run this as root"
     if answers; then
         squeue --noheader --format=%A | sort -u | xargs -r scancel || true
         # shellcheck disable=SC2016
-        wait_until eval '[ -z "$(squeue --noheader)" ]' || say "some jobs don't end; they are left to themselves"
+        wait_until eval '[ -z "$(squeue --noheader)" ]' || say "some jobs do not end; they continue to run"
     fi
     end /run/robocas-slurmd.pid slurmd
     end /run/robocas-slurmctld.pid slurmctld
@@ -157,7 +157,7 @@ end() {
 }
 
 status() {
-    answers || refuse "does not answer"
+    answers || refuse "Slurm does not answer"
     sinfo
     squeue
 }
@@ -166,5 +166,5 @@ case ${1:-start} in
     start) start ;;
     stop) stop ;;
     status) status ;;
-    *) refuse "start, status or stop; the head of this script says more" ;;
+    *) refuse "unknown command '$1': expected start, status or stop" ;;
 esac
