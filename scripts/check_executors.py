@@ -195,9 +195,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0, help="seed of the first episode")
     parser.add_argument("--jobs", type=int, default=2, help="number of jobs of each executor")
     parser.add_argument("--kill", action="store_true", help="repeat each run and kill a job or a node during it")
-    parser.add_argument(
-        "--out", type=Path, help="folder for the files of the runs (default: a temporary folder)"
-    )
+    parser.add_argument("--out", type=Path, help="folder for the files of the runs (default: a temporary folder)")
     parser.add_argument("--from", dest="start", type=Path, default=Path.cwd(), help=argparse.SUPPRESS)
     words = parser.parse_args()
     out = (words.start / words.out).resolve() if words.out else Path(tempfile.mkdtemp(prefix="robocas-executors-"))

@@ -90,6 +90,7 @@ PUBLIC = {
         "load_protocol",
         "make_policy",
         "open_policy",
+        "read_result",
         "write_report",
     ],
 }

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from robocas_ms3.evaluation.remote.server import PolicyServer as PolicyServer
     from robocas_ms3.evaluation.report import write_report as write_report
     from robocas_ms3.evaluation.results import Result as Result
+    from robocas_ms3.evaluation.results import read_result as read_result
     from robocas_ms3.evaluation.session import EvaluationSession as EvaluationSession
     from robocas_ms3.evaluation.settings import EvaluationSettings as EvaluationSettings
 
@@ -36,7 +37,7 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "robocas_ms3.evaluation.remote.client": ["RemotePolicy"],
         "robocas_ms3.evaluation.remote.server": ["PolicyServer"],
         "robocas_ms3.evaluation.report": ["write_report"],
-        "robocas_ms3.evaluation.results": ["Result"],
+        "robocas_ms3.evaluation.results": ["Result", "read_result"],
         "robocas_ms3.evaluation.session": ["EvaluationSession"],
         "robocas_ms3.evaluation.settings": ["EvaluationSettings"],
     },
