@@ -1,4 +1,4 @@
-"""``robocas assets``: make packs; `assets_show` has the commands that look at them."""
+"""``robocas assets``: build and import packs; `assets_show` has the commands that print and check packs."""
 
 from __future__ import annotations
 
@@ -17,31 +17,31 @@ from robocas_ms3.core.checks import check_number
 from robocas_ms3.core.text import format_count
 
 CONTACT_SHEET = "contact_sheet.png"
-SHEET = 60  # assets on the contact sheet of an import
-# `asset_tools.pipeline.Job`, which only loads when a command runs
+MAX_SHEET_ASSETS = 60  # assets on the contact sheet of an import
+# `asset_tools.pipeline.Job`, imported only when a command runs
 Job = Any
 
 
 @dataclass(kw_only=True)
-class _Making:
+class _ImportOptions:
     jobs: Jobs = CORES
-    """Processes. Default: one for each CPU core."""
+    """Number of processes. Default: one per CPU core."""
     skip_errors: bool = False
-    """Leave out models with errors, instead of stopping at the first one."""
+    """Skip models with errors. Default: stop at the first error."""
     overwrite: bool = False
-    """Replace a pack of this name that was made from other files or settings; unchanged assets are reused."""
+    """Replace a pack of this name that was imported from other files or settings; unchanged assets are reused."""
 
     def __post_init__(self) -> None:
         check_number("--jobs", self.jobs, 1)
 
 
 @dataclass(kw_only=True)
-class ImportScans(_Making):
-    """Make a pack from a folder of raw scans: one object for each mesh file or subfolder.
+class ImportScans(_ImportOptions):
+    """Import a folder of raw scans as a pack: one object per mesh file or subfolder.
 
     Each scan is repaired, closed, decomposed into convex hulls, decimated for rendering, and annotated with resting
-    poses and grasps. Then it is dropped, grasped and shaken in simulation, and the outcome is stored. Finished objects
-    are cached, so an interrupted import continues where it stopped.
+    poses and grasps. Then it is dropped, grasped and shaken in simulation, and the measurements are stored. Finished
+    objects are cached: after an interruption, the same command continues.
 
     Example: robocas assets import-scans scans/ --pack mine --units cm
     """
@@ -51,52 +51,52 @@ class ImportScans(_Making):
     pack: str
     """Name of the new pack."""
     units: Maybe[Literal["m", "cm", "mm", "inch"]] = None
-    """Unit of the files. Default: guessed from the sizes of all of them."""
+    """Unit of length of the files. Default: estimated from the sizes of all scans."""
     up: Maybe[Literal["x", "y", "z", "-x", "-y", "-z"]] = None
-    """Axis that points up in the files. Default: guessed for each."""
+    """Axis that points up in the files. Default: estimated for each scan."""
     masses: Maybe[Path] = None
-    """YAML file with masses in kg by object id. Default: estimated from the volume."""
+    """YAML file with masses in kg by object id. Default: estimated from the volumes."""
     licence: str = "unknown"
     """Licence of the scans, for the manifest."""
     attribution: str = "unknown"
-    """Whom to name, for the manifest."""
+    """Authors of the scans, for the manifest."""
 
 
 @dataclass(kw_only=True)
-class ImportGraspNet(_Making):
-    """Make a pack from GraspNet-1Billion as downloaded: models/ and, if there, grasp_label/.
+class ImportGraspNet(_ImportOptions):
+    """Import the models of GraspNet-1Billion as a pack, with grasps from grasp_label/ if this folder exists.
 
-    Objects get the ids that the builtin pack uses for their stand-ins, so that a task configuration runs on either.
+    The objects have the same ids as their stand-ins in the builtin pack, so a task configuration runs on both packs.
 
     Example: robocas assets import-graspnet downloads/graspnet
     """
 
     root: Annotated[Path, tyro.conf.Positional]
-    """GraspNet's folder, with models/NNN/textured.obj and grasp_label/NNN_labels.npz."""
+    """Folder of GraspNet-1Billion, with models/NNN/textured.obj and grasp_label/NNN_labels.npz."""
     pack: str = "graspnet"
     """Name of the new pack."""
     ids: Several[int] = ()
-    """GraspNet's numbers. Default: RoboCAS's 46."""
+    """Numbers of objects in GraspNet-1Billion. Default: the 46 objects of RoboCAS."""
 
 
 @dataclass(kw_only=True)
-class ImportYCB(_Making):
-    """Make a pack from the YCB objects that ManiSkill downloads (python -m mani_skill.utils.download_asset ycb).
+class ImportYCB(_ImportOptions):
+    """Import the YCB objects of ManiSkill as a pack (download: python -m mani_skill.utils.download_asset ycb).
 
     Example: robocas assets import-ycb
     """
 
     root: Annotated[Maybe[Path], tyro.conf.Positional] = None
-    """ManiSkill's YCB folder. Default: where ManiSkill puts it."""
+    """Folder of the YCB objects. Default: the download folder of ManiSkill."""
     pack: str = "ycb"
     """Name of the new pack."""
     ids: Several[str] = ()
-    """Names such as 005_tomato_soup_can. Default: all."""
+    """Ids of YCB objects, such as 005_tomato_soup_can. Default: all."""
 
 
 @dataclass(kw_only=True)
-class ImportPartNet(_Making):
-    """Make a pack of furniture from PartNet-Mobility models.
+class ImportPartNet(_ImportOptions):
+    """Import PartNet-Mobility models as a pack of furniture.
 
     Example: robocas assets import-partnet downloads/7179 --annotations annotations
     """
@@ -104,26 +104,26 @@ class ImportPartNet(_Making):
     models: Annotated[Several[Path], tyro.conf.Positional]
     """Folders of models, each with a mobility.urdf."""
     template: bool = False
-    """Import nothing; print an annotation to start from, with the joints of the first model."""
+    """Print a template of the annotation of the first model, with its joints, and import nothing."""
     pack: str = "partnet"
     """Name of the new pack."""
     annotations: Maybe[Path] = None
-    """Folder with <id>.yaml for models that none is shipped for."""
+    """Folder with ID.yaml for each model without a bundled annotation."""
 
 
 @dataclass(kw_only=True)
 class Build:
-    """Make the builtin pack again from its formulas; only in a clone of the repository.
+    """Build the builtin pack from its formulas; only in a clone of the repository.
 
     Example: robocas assets build --ids plate --out packs/plate
     """
 
     out: Maybe[Path] = None
-    """Its folder. Default: where the package has it."""
+    """Folder of the pack. Default: the folder of the builtin pack."""
     ids: Several[str] = ()
-    """Only these assets; needs --out. Default: all."""
+    """Ids of the assets to build; needs --out. Default: all."""
     jobs: Jobs = CORES
-    """Processes. Default: one for each CPU core."""
+    """Number of processes. Default: one per CPU core."""
 
 
 def import_scans(command: ImportScans) -> int:
@@ -137,7 +137,7 @@ def import_scans(command: ImportScans) -> int:
     jobs = scan_jobs(
         command.source, settings, partial(_inspect, command), lambda reason: print_line(f"skipped {reason}")
     )
-    return _make(jobs, command, out, "scan")
+    return _import_pack(jobs, command, out, "scan")
 
 
 def import_graspnet(command: ImportGraspNet) -> int:
@@ -146,7 +146,7 @@ def import_graspnet(command: ImportGraspNet) -> int:
 
     out = _target(command.pack)
     jobs = graspnet_jobs(command.root, command.ids, partial(_inspect, command))
-    return _make(jobs, command, out, "GraspNet object")
+    return _import_pack(jobs, command, out, "GraspNet object")
 
 
 def import_ycb(command: ImportYCB) -> int:
@@ -155,7 +155,7 @@ def import_ycb(command: ImportYCB) -> int:
 
     out = _target(command.pack)
     jobs = ycb_jobs(command.root, command.ids, partial(_inspect, command))
-    return _make(jobs, command, out, "YCB object")
+    return _import_pack(jobs, command, out, "YCB object")
 
 
 def import_partnet(command: ImportPartNet) -> int:
@@ -166,13 +166,14 @@ def import_partnet(command: ImportPartNet) -> int:
     from asset_tools.partnet.template import template
 
     if not command.models:
-        raise AssetError("no model given", expected="folders with a mobility.urdf", fix="Give at least one.")
+        expected, fix = "folders with a mobility.urdf", "Pass at least one folder."
+        raise AssetError("missing model folder", where="--models", expected=expected, fix=fix)
     if command.template:
         from robocas_ms3.cli.terminal import print_text
 
         print_text(template(command.models[0]))
         return 0
-    return _make(partnet_jobs(command.models, command.annotations), command, _target(command.pack), "PartNet model")
+    return _import_pack(partnet_jobs(command.models, command.annotations), command, _target(command.pack), "PartNet model")
 
 
 def build(command: Build) -> int:
@@ -189,19 +190,20 @@ def build(command: Build) -> int:
             "the formulas of the builtin pack are not installed",
             expected="asset_tools/builtin of the repository",
             found="an installed wheel",
-            fix="Clone the repository to change them; the pack itself is installed and complete.",
+            fix="The builtin pack is complete; to change its formulas, clone the repository.",
         ) from error
     if command.ids and command.out is None:
-        raise AssetError("the shipped pack is made as a whole", found="--ids without --out", fix="Pass --out FOLDER.")
+        fix = "Pass --out FOLDER to build a part of the pack."
+        raise AssetError("the builtin pack can only be built as a whole", where="--ids", found="no --out", fix=fix)
     out = command.out or builtin_packs_dir() / NAME
-    making = _Making(jobs=command.jobs, overwrite=True)
-    status = _write(builtin_jobs(command.ids), making, out, DESCRIPTION, record=False)
+    options = _ImportOptions(jobs=command.jobs, overwrite=True)
+    status = _write(builtin_jobs(command.ids), options, out, DESCRIPTION, record=False)
     if status == 0 and command.out is None:
         (out / FORMULAS_HASH).write_text(f"{formulas_hash()}\n")
     return status
 
 
-def _inspect(command: _Making, models: Mapping[str, Any]) -> Mapping[str, Any]:
+def _inspect(command: _ImportOptions, models: Mapping[str, Any]) -> Mapping[str, Any]:
     from asset_tools.inspection import inspect_models
     from robocas_ms3.cli.progress import ProgressBar
 
@@ -211,19 +213,20 @@ def _inspect(command: _Making, models: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _target(name: str) -> Path:
-    """Return the folder of an imported pack; raise AssetError if no imported pack may have this name."""
+    """Return the folder of an imported pack; raise AssetError if the name is invalid or taken by a bundled pack."""
     from asset_tools.pipeline import check_target
     from robocas_ms3.core.errors import AssetError
     from robocas_ms3.core.paths import builtin_packs_dir, data_dir
 
     if (builtin_packs_dir() / name).exists() or Path(name).name != name:
-        raise AssetError("this can't be the name of an imported pack", found=name, fix="Choose another with --pack.")
+        what, fix = "invalid name for an imported pack", "Choose another name."
+        raise AssetError(what, where="--pack", expected="a name that no bundled pack has", found=repr(name), fix=fix)
     out = data_dir() / "packs" / name
     check_target(out)
     return out
 
 
-def _make(jobs: list[Job], command: _Making, out: Path, what: str) -> int:
+def _import_pack(jobs: list[Job], command: _ImportOptions, out: Path, what: str) -> int:
     from asset_tools.pipeline import check_jobs, made_of
     from robocas_ms3.assets.pack import load_pack
     from robocas_ms3.cli.terminal import print_line
@@ -235,20 +238,20 @@ def _make(jobs: list[Job], command: _Making, out: Path, what: str) -> int:
         try:
             load_pack(out)
         except AssetError as error:
-            print_line(f"making it again: {error}")
+            print_line(f"the pack is damaged and is imported again: {error}")
         else:
             print_line(f"{out} is up to date")
             if not (out / CONTACT_SHEET).exists():
                 _draw_sheet(out)
             return 0
     elif out.exists() and not command.overwrite:
-        what = "a pack of this name exists; its files, settings or versions were others"
-        fix = "Pass --overwrite to update it, or choose another name with --pack."
+        what = "this pack was imported from other files, settings or versions"
+        fix = "Pass --overwrite to replace it, or choose another name with --pack."
         raise OutputExistsError(what, where=out, fix=fix)
     return _write(jobs, command, out, format_count(len(jobs), what))
 
 
-def _write(jobs: list[Job], command: _Making, out: Path, description: str, *, record: bool = True) -> int:
+def _write(jobs: list[Job], command: _ImportOptions, out: Path, description: str, *, record: bool = True) -> int:
     from asset_tools.pipeline import JobResult, write_pack
     from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.cli.terminal import print_line
@@ -260,7 +263,7 @@ def _write(jobs: list[Job], command: _Making, out: Path, description: str, *, re
         def on_made(made: JobResult) -> None:
             bar.advance()
             if made.asset is None:
-                bar.add_note(f"left out: {made.error}")
+                bar.add_note(f"skipped: {made.error}")
                 return
             for repair in made.asset.repairs:
                 if repair.startswith("warning:"):
@@ -278,8 +281,8 @@ def _write(jobs: list[Job], command: _Making, out: Path, description: str, *, re
         )
     assets_show.info(assets_show.Info(pack=str(out)))
     bad = [made.id for made in results if made.asset is None]
-    left_out = f"; {len(bad)} left out: {', '.join(bad)}" if bad else ""
-    print_line(f"wrote {out}: {format_count(len(results) - len(bad), 'asset')}{left_out}")
+    skipped = f"; {len(bad)} skipped: {', '.join(bad)}" if bad else ""
+    print_line(f"wrote {out}: {format_count(len(results) - len(bad), 'asset')}{skipped}")
     if record:
         _draw_sheet(out)
     return 0
@@ -295,12 +298,12 @@ def _draw_sheet(folder: Path) -> None:
     pack = load_pack(folder)
     ids = [asset.id for asset in pack.manifest.assets]
     try:
-        with spinner(f"drawing {format_count(len(ids[:SHEET]), 'asset')}"):
-            contact_sheet(pack, folder / CONTACT_SHEET, ids[:SHEET])
+        with spinner(f"rendering {format_count(len(ids[:MAX_SHEET_ASSETS]), 'asset')}"):
+            contact_sheet(pack, folder / CONTACT_SHEET, ids[:MAX_SHEET_ASSETS])
     except AssetError as error:
         print_line(f"no contact sheet: {error}")
         return
-    rest = f"; `robocas assets sheet {folder.name}` draws all {len(ids)}" if len(ids) > SHEET else ""
+    rest = f"; all {len(ids)} assets: robocas assets sheet {folder.name}" if len(ids) > MAX_SHEET_ASSETS else ""
     print_line(f"contact sheet: {folder / CONTACT_SHEET}{rest}")
 
 
@@ -314,15 +317,15 @@ def _masses(path: Path | None) -> dict[str, float]:
         data = load_yaml(path)
         masses = {str(key): float(value) for key, value in data.items()}
         if not all(0 < mass < 1000 for mass in masses.values()):
-            raise ValueError("masses must be positive")
+            raise ValueError("a mass that is not positive, or not below 1000 kg")
         return masses
     except (OSError, AttributeError, TypeError, ValueError) as error:
         raise AssetError(
-            "can't read the masses", where=path, expected="a YAML mapping: object id: kg", found=error
+            "invalid file of masses", where=path, expected="a YAML mapping of object ids to kg", found=error
         ) from error
 
 
-DESCRIPTION = "Look at asset packs, and make new ones from scans and datasets. Without a command: list."
+DESCRIPTION = "List, check and import asset packs. Without a command: list."
 COMMANDS = {
     "list": assets_show.list_packs,
     "info": assets_show.info,

@@ -1,4 +1,4 @@
-"""``robocas assets list | info | verify | sheet``: look at packs."""
+"""``robocas assets list | info | verify | sheet``: print and check asset packs."""
 
 from __future__ import annotations
 
@@ -26,47 +26,47 @@ class ListPacks:
 
 @dataclass
 class Info:
-    """Print a table of the assets of a pack: size, mass, hulls, grasps, repairs.
+    """Print the assets of a pack: size, mass, hulls, grasps and repairs.
 
     Example: robocas assets info builtin
     """
 
     pack: Annotated[str, tyro.conf.Positional]
-    """Its name, or its folder."""
+    """Name or folder of the pack."""
 
 
 @dataclass
 class Verify:
-    """Check the files of a pack and its collision hulls; with --physics, every asset in simulation.
+    """Check the files and collision hulls of a pack; with --physics, check each asset in simulation.
 
-    Files are compared with the hashes of the manifest; hulls are cooked for CPU and GPU.
+    Files are compared with the hashes of the manifest. Hulls are cooked for PhysX on CPU and GPU.
 
     Example: robocas assets verify builtin
     """
 
     pack: Annotated[str, tyro.conf.Positional]
-    """Its name, or its folder."""
+    """Name or folder of the pack."""
     physics: bool = False
-    """Drop, grasp and shake every object, move every joint, and print a table of the quality."""
+    """Drop, grasp and shake each object, move each joint, and print the measurements."""
     jobs: Jobs = CORES
-    """With --physics: processes. Default: one for each CPU core."""
+    """With --physics: number of processes. Default: one per CPU core."""
     json: Maybe[Path] = None
-    """With --physics: write the table here too."""
+    """With --physics: JSON file for the measurements."""
 
 
 @dataclass
 class Sheet:
-    """Draw a contact sheet of a pack: appearance, hulls, stable poses, best grasps.
+    """Render a contact sheet of a pack: appearance, hulls, resting poses and best grasps.
 
     Example: robocas assets sheet builtin --ids plate mug
     """
 
     pack: Annotated[str, tyro.conf.Positional]
-    """Its name, or its folder."""
+    """Name or folder of the pack."""
     out: Maybe[Path] = None
-    """PNG to write. Default: <pack>.png here."""
+    """PNG or JPEG file. Default: PACK.png in the working directory."""
     ids: Several[str] = ()
-    """Only these assets. Default: all."""
+    """Ids of the assets to render. Default: all."""
 
 
 def list_packs(command: ListPacks) -> int:
@@ -129,7 +129,7 @@ def info(command: Info) -> int:
 
 
 def verify(command: Verify) -> int:
-    """Run ``verify``; 1 where an asset falls short of what is asked of packs."""
+    """Run ``verify``; return 1 if an asset violates the requirements of packs."""
     from robocas_ms3.assets.cooked_hulls import cooking_faults
     from robocas_ms3.assets.pack import load_pack
     from robocas_ms3.cli.terminal import console, print_line
@@ -138,7 +138,7 @@ def verify(command: Verify) -> int:
     for loaded in pack.objects.values():
         _ = loaded.annotations
     faults = cooking_faults(pack.root)
-    print_line(f"{pack.name}: {format_count(len(pack.manifest.assets), 'asset')}, every file is as it should be")
+    print_line(f"{pack.name}: {format_count(len(pack.manifest.assets), 'asset')}, all files match the manifest")
     for fault in faults:
         console().print(escape_controls(str(fault)), style="red", soft_wrap=True)
     if command.physics:
@@ -158,8 +158,9 @@ def sheet(command: Sheet) -> int:
     pack = load_pack(command.pack)
     out = command.out or Path(f"{pack.name}.png")
     if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
-        raise AssetError("a sheet is a PNG or JPEG", where=out, expected=".png, .jpg", found=out.suffix or "no suffix")
-    with spinner(f"drawing {format_count(len(command.ids) or len(pack.manifest.assets), 'asset')}"):
+        found = out.suffix or "no suffix"
+        raise AssetError("unknown image format of a contact sheet", where=out, expected=".png or .jpg", found=found)
+    with spinner(f"rendering {format_count(len(command.ids) or len(pack.manifest.assets), 'asset')}"):
         contact_sheet(pack, out, ids=command.ids or None)
     print_line(f"wrote {out}")
     return 0
@@ -185,8 +186,10 @@ def _verify_physics(pack: Pack, jobs: int, out: Path | None) -> int:
     console = table_console()
     for header, cells in ((HEADER, rows(objects)), (FURNITURE_HEADER, furniture_rows(furniture))):
         print_table(header, cells)
-    anew = {name: pack.objects[name].asset.model_copy(update={"quality": found}) for name, found in objects.items()}
-    violations = [*judge(anew), *judge_furniture(furniture)]
+    remeasured = {
+        name: pack.objects[name].asset.model_copy(update={"quality": found}) for name, found in objects.items()
+    }
+    violations = [*judge(remeasured), *judge_furniture(furniture)]
     violations += [other for name, found in objects.items() for other in differences(pack.objects[name], found)]
     for violation in violations:
         where = violation.asset or "the pack"
@@ -195,7 +198,7 @@ def _verify_physics(pack: Pack, jobs: int, out: Path | None) -> int:
         assets = {name: quality.model_dump() for name, quality in {**objects, **furniture}.items()}
         write_json(out, {"pack": pack.name, "assets": assets, "violations": [asdict(v) for v in violations]})
     if not violations:
-        console.print(f"{pack.name}: {format_count(total, 'asset')}, as good as packs should be")
+        console.print(f"{pack.name}: {format_count(total, 'asset')}, no violations")
     return 1 if violations else 0
 
 

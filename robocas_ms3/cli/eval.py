@@ -1,4 +1,4 @@
-"""``robocas eval``: measure a policy by a protocol; report, compare and check results; make protocols."""
+"""``robocas eval``: evaluate a policy on a protocol; report, compare and verify results; freeze protocols."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Annotated
 import tyro
 
 from robocas_ms3.cli import eval_results
-from robocas_ms3.cli.options import Repeated, resumable
+from robocas_ms3.cli.options import Overrides, resumable
 from robocas_ms3.core.text import format_count
 from robocas_ms3.evaluation.settings import EvaluationSettings
 
-DESCRIPTION = """Measure a policy by a protocol, and work with results.
+DESCRIPTION = """Evaluate a policy on a protocol, and report, compare and verify results.
 
 `robocas eval pick --policy small` is short for `robocas eval run pick --policy small`.
 """
@@ -21,7 +21,7 @@ DESCRIPTION = """Measure a policy by a protocol, and work with results.
 
 @dataclass
 class Protocols:
-    """List the bundled protocols, and the configurations to train on that belong to them.
+    """List the bundled protocols and their training configurations.
 
     Example: robocas eval protocols
     """
@@ -29,32 +29,34 @@ class Protocols:
 
 @dataclass
 class Freeze:
-    """Make a protocol of your own from a plan: choose its scenes and write them to files.
+    """Create a protocol from a plan: sample its scenes and write them to files.
 
     Example: robocas eval freeze scripts/protocols/smoke.yaml --out protocols/mine --set objects.count=12
     """
 
     plan: Annotated[Path, tyro.conf.Positional]
-    """YAML file of the plan; scripts/protocols has those of the bundled protocols."""
+    """YAML file of the plan; scripts/protocols contains the plans of the bundled protocols."""
     out: Path
     """Folder of the protocol."""
-    set: Repeated[str] = ()
+    set: Overrides = ()
     """Set a key in all configurations of the plan, such as `--set objects.count=12`; repeatable
     (docs/configuration.md)."""
 
 
 @resumable
 def run(settings: EvaluationSettings) -> int:
-    """Run the episodes that the result lacks; return 1 if any episode of the result ended with an error."""
+    """Run the episodes that the result does not have yet; return 1 if an episode of the result ended with an error."""
     from robocas_ms3.core.errors import EvaluationError
     from robocas_ms3.core.text import did_you_mean
     from robocas_ms3.scenes.task_specs import TASKS
 
-    for word in settings.tasks:  # before the imports below, which take seconds
+    for word in settings.tasks:  # before the slow imports
         if word not in TASKS:
             expected = f"one of {', '.join(TASKS)}; or {', '.join(COMMANDS)}"
             fix = did_you_mean(word, [*TASKS, *COMMANDS])
-            raise EvaluationError("no such task", where="--tasks", expected=expected, found=word, fix=fix)
+            raise EvaluationError(
+                "unknown task or command", where="--tasks", expected=expected, found=repr(word), fix=fix
+            )
     from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.cli.terminal import print_line, print_text
     from robocas_ms3.core.workers import use_one_torch_thread
@@ -76,14 +78,12 @@ def run(settings: EvaluationSettings) -> int:
             bar.advance()
     result = read_result(session.folder)
     print_text(render_markdown(result))
-    broken, succeeded = result.error_count(), sum(outcome.success for outcome in outcomes)
-    errors = f", {broken} broken off by an error (--retry-errors runs them again)" if broken else ""
-    total = format_count(len(result.outcomes), "episode")
-    print_line(
-        f"{format_count(len(outcomes), 'episode')} run, {succeeded} succeeded; {session.folder}: {total}{errors}"
-    )
+    errors, successes = result.error_count(), sum(outcome.success for outcome in outcomes)
+    print_line(f"{format_count(len(outcomes), 'episode')} run, {successes} succeeded")
+    note = f", {errors} ended with an error (run them again with --retry-errors)" if errors else ""
+    print_line(f"{session.folder}: {format_count(len(result.outcomes), 'episode')}{note}")
     eval_results.write_pages(result, session.folder, settings.protocol)
-    return 1 if broken else 0
+    return 1 if errors else 0
 
 
 def list_protocols(cfg: Protocols) -> int:
@@ -95,7 +95,7 @@ def list_protocols(cfg: Protocols) -> int:
         count = format_count(len(protocol.episodes), "episode")
         print_line(f"{name}: {count}, {protocol.hash[:12]}: {protocol.rules.description}")
         if files := protocol.training_configs():
-            print_line(f"    to train on: {', '.join(map(str, files))}")
+            print_line(f"    training configurations: {', '.join(map(str, files))}")
     return 0
 
 
@@ -109,11 +109,11 @@ def freeze(cfg: Freeze) -> int:
 
     plan = read_plan(cfg.plan)
     check_replaceable(cfg.out)
-    with ProgressBar("episodes chosen") as bar:
+    with ProgressBar("scenes frozen") as bar:
         for done, total in make(plan, cfg.out, overrides=cfg.set):
             bar.update(done, total)
     protocol = load_protocol(cfg.out)
-    print_line(f"{cfg.out}: {format_count(len(protocol.episodes), 'episode')}, {protocol.hash}")
+    print_line(f"{cfg.out}: {format_count(len(protocol.episodes), 'episode')}, hash {protocol.hash}")
     return 0
 
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @resumable
 def main(settings: GenerateSettings) -> int:
-    settings = settings.resolve()  # an invalid configuration is an error before the imports below, which take seconds
+    settings = settings.resolve()  # reports an invalid configuration before the slow imports
     from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.demos.generation import generate
@@ -33,19 +33,19 @@ def main(settings: GenerateSettings) -> int:
                 bar.advance()
             else:
                 last = result.failures[-1]
-                bar.add_note(f"seed {result.seed}: given up ({last.stage}: {last.reason})")
+                bar.add_note(f"seed {result.seed} skipped ({last.stage}: {last.reason})")
 
-        def on_start(there: int) -> None:
-            if there >= settings.episodes:
-                bar.add_note(f"{settings.out} has {format_count(there, 'episode')} already")
-            bar.start(settings.episodes, there)
+        def on_start(present: int) -> None:
+            if present >= settings.episodes:
+                bar.add_note(f"{settings.out} already has {format_count(present, 'episode')}")
+            bar.start(settings.episodes, present)
 
         summary = generate(settings, on_start=on_start, on_result=on_result, make_roll_in=make_roll_in, weights=weights)
-        bar.update(settings.episodes, settings.episodes)  # a recorded episode may follow a seed that was missing
+        bar.update(settings.episodes, settings.episodes)  # episodes of a continued run may count only now
     seconds = ", ".join(f"{part} {value:.2f}" for part, value in summary.mean_seconds.items())
     episodes, seeds = format_count(summary.episodes, "episode"), format_count(summary.seeds, "seed")
-    print_line(f"{episodes} from {seeds} ({summary.success_rate:.0%})")
-    print_line(f"mean seconds a seed: {seconds}; mean length {summary.mean_steps:.0f} steps")
+    print_line(f"{episodes} from {seeds} (success rate {summary.success_rate:.0%})")
+    print_line(f"mean seconds per seed: {seconds}; mean length: {summary.mean_steps:.0f} steps")
     if summary.failures:
         print_line("failed attempts: " + ", ".join(f"{reason} x{n}" for reason, n in summary.failures.items()))
     print_line(f"wrote {summary.trajectory}")

@@ -116,8 +116,8 @@ def _print(found: dict[str, list[dict[str, Any]]]) -> None:
         rows = [[row[column] for column in columns] for row in found[kind]]
         cells = [[", ".join(cell) if isinstance(cell, list) else cell for cell in row] for row in rows]
         heads = [column.replace("_", " ") for column in columns]
-        whole = ("env id", "default config", "task")
-        print_table(heads, cells, whole=whole, title=kind, title_justify="left", title_style="bold")
+        no_wrap = ("env id", "default config", "task")
+        print_table(heads, cells, no_wrap=no_wrap, title=kind, title_justify="left", title_style="bold")
     for pack in found["packs"]:
         if pack["error"]:
             table_console().print(f"damaged pack {pack['name']}: {pack['error']}", style="red", soft_wrap=True)

@@ -22,18 +22,18 @@ _P = ParamSpec("_P")
 _NO_DEFAULT = tyro.conf.arg(help_behavior_hint="")
 
 Maybe = Annotated[_T | None, _NO_DEFAULT]
-"""A value; default: None."""
+"""Optional value; default: None."""
 CORES = os.cpu_count() or 1
 Jobs = Annotated[int, _NO_DEFAULT]
-"""A number of processes; default: `CORES`."""
+"""Number of processes; default: `CORES`."""
 Several = Annotated[tuple[_T, ...], _NO_DEFAULT]
-"""Values; default: none."""
+"""Several values; default: none."""
 Repeated = Annotated[tuple[_T, ...], _NO_DEFAULT, tyro.conf.UseAppendAction]
 """Values of an option that may be given several times; default: none."""
 Folders = Annotated[
     tuple[Path, ...],
     tyro.conf.Positional,
-    # tyro also accepts no folder at all, so commands check the number themselves
+    # tyro accepts no folder at all, so commands check the number
     tyro.conf.arg(metavar="DIR [DIR ...]", help_behavior_hint="(required)"),
 ]
 """Positional folders, at least one."""
@@ -68,14 +68,16 @@ def _metavar_rule(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructor
 
 
 def with_absolute_paths(settings: _T) -> _T:
-    """Return settings with absolute paths, because libraries may change the working directory.
+    """Return settings with absolute paths: libraries may change the working directory.
 
-    The folders named by environment variables become absolute too.
+    The paths in the environment variables of cache and data folder become absolute, too.
     """
     try:
         os.getcwd()
     except FileNotFoundError as error:
-        raise RobocasError("the working directory was removed", fix="Change to a folder that exists.") from error
+        raise RobocasError(
+            "the working directory does not exist any more", fix="Change to an existing folder."
+        ) from error
     for variable in (CACHE, DATA):
         if path := os.environ.get(variable):
             os.environ[variable] = str(Path(path).absolute())
@@ -93,9 +95,9 @@ def _absolute(value: Any) -> Any:
 
 
 def resumable(command: Callable[_P, int]) -> Callable[_P, int]:
-    """Decorate a command that continues its work when it is run again: Ctrl-C says so.
+    """Decorate a command that continues its work when it is run again: Ctrl-C prints that.
 
-    With ``overwrite`` in its settings, it continues without that.
+    A command that was run with ``overwrite`` continues without this option.
     """
 
     @wraps(command)

@@ -150,7 +150,7 @@ def show_status(command: Status) -> int:
             (part.name, f"{part.done} of {part.requested}", part.tried, failed, *seconds, f"{part.bytes / 1e6:.0f}")
         )
     columns = ("part", "episodes", "seeds", "failed seeds", "record (CPU s/episode)", "render (CPU s/episode)", "MB")
-    print_table(columns, rows, whole=columns[:3])
+    print_table(columns, rows, no_wrap=columns[:3])
     if found.finished:
         print_line(f"{command.out}: complete")
     elif found.seconds_left is not None:

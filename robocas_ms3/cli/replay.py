@@ -13,23 +13,25 @@ def main(settings: ReplaySettings) -> int:
     from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.demos.recordings.trajectory_json import read_json
 
-    total = len(read_json(settings.file)["episodes"][: settings.count])  # an error before the imports below
+    total = len(
+        read_json(settings.file)["episodes"][: settings.count]
+    )  # reports a damaged file before the slow imports
     from robocas_ms3.core.workers import use_one_torch_thread
     from robocas_ms3.demos.trajectory_replay import replay
 
     use_one_torch_thread()
-    replayed = replay(settings)
+    results = replay(settings)
     done = []
     with ProgressBar("episodes replayed") as bar:
-        for result in replayed:
+        for result in results:
             done.append(result)
             bar.update(len(done), total)
     for result in done:
         if not result.success:
-            print_line(f"episode {result.episode_id} (seed {result.seed}): not successful")
-    good = sum(result.success for result in done)
-    print_line(f"{good} of {format_count(len(done), 'episode')} succeeded")
+            print_line(f"episode {result.episode_id} (seed {result.seed}) failed")
+    successes = sum(result.success for result in done)
+    print_line(f"{successes} of {format_count(len(done), 'episode')} succeeded")
     errors = [result.state_error for result in done if result.state_error is not None]
     if errors:
-        print_line(f"greatest difference from a recorded final state: {np.max(errors):.3g}")  # NaN where one is
-    return 0 if good == len(done) else 1
+        print_line(f"largest error of a final state: {np.max(errors):.3g}")  # NaN if an error is NaN
+    return 0 if successes == len(done) else 1

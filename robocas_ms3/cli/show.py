@@ -1,4 +1,4 @@
-"""``robocas show``: look at a scene."""
+"""``robocas show``: render the scene of a task configuration."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from robocas_ms3.cli.options import Repeated
+from robocas_ms3.cli.options import Overrides, PackName
 
 if TYPE_CHECKING:
     from robocas_ms3.scenes.config import TaskConfig
@@ -16,25 +16,25 @@ if TYPE_CHECKING:
 
 @dataclass
 class Show:
-    """Render the scene of a configuration to PNG files, from all cameras, after reset.
+    """Render the scene of a task configuration after a reset: one PNG file per camera.
 
     Example: robocas show pick_table_scattered --set objects.count=12 --set target.approach=front
     """
 
     config: Annotated[str, tyro.conf.Positional] = "pick_table_scattered"
-    """Name of a shipped task configuration, or a YAML file."""
-    set: Repeated[str] = ()
+    """Name of a bundled task configuration, or a YAML file."""
+    set: Overrides = ()
     """Set a key of the configuration, such as `--set objects.count=12`; repeatable (docs/configuration.md)."""
     print_config: bool = False
-    """Print the resolved configuration as YAML instead of rendering: `extends` and --set applied, defaults added."""
-    pack: str = "builtin"
-    """Object pack: its name, or its folder."""
+    """Print the configuration as YAML, with `extends`, --set and defaults resolved, instead of rendering."""
+    pack: PackName = "builtin"
+    """Name or folder of the object pack."""
     seed: int = 0
-    """Seed of the episode, 0 or more."""
+    """Seed of the episode, at least 0."""
     out: Path = Path("scene")
     """Folder for the images."""
     shader: Literal["minimal", "default", "rt-fast", "rt-med", "rt"] = "default"
-    """ManiSkill shader: minimal (fast), default, or ray tracing (rt..., needs a GPU)."""
+    """Shader of ManiSkill: minimal (fast), default, or ray tracing (rt..., needs a GPU)."""
 
 
 def main(cfg: Show) -> int:
@@ -44,7 +44,7 @@ def main(cfg: Show) -> int:
     from robocas_ms3.scenes.config import load_task_config
 
     check_number("--seed", cfg.seed, 0, MAX_SEED)
-    config = load_task_config(cfg.config, overrides=cfg.set)  # before seconds go by for what is imported next
+    config = load_task_config(cfg.config, overrides=cfg.set)  # before the slow imports
     if cfg.print_config:
         return print_config(config)
     load_pack(cfg.pack)
@@ -71,16 +71,14 @@ def main(cfg: Show) -> int:
     base_env = env.unwrapped
     assert isinstance(base_env, RoboCASEnv)
     if not base_env.scene.can_render():
-        raise RobocasError(
-            "no render device", fix="Run scripts/setup.sh, or install a Vulkan driver; see robocas doctor."
-        )
+        raise RobocasError("no render device found", fix="Install a Vulkan driver; see robocas doctor.")
     from PIL import Image
 
     obs, _ = env.reset(seed=cfg.seed)
     make_folder(cfg.out)
     images = {name: data["rgb"][0] for name, data in obs["sensor_data"].items()}
     overview = base_env.render_rgb_array()
-    assert overview is not None  # there is a render device, and the environment has a camera for it
+    assert overview is not None  # the environment has a render device and a render camera
     images["overview"] = overview[0]
     for name, pixels in images.items():
         path = cfg.out / f"{Path(cfg.config).stem}_seed{cfg.seed}_{name}.png"
@@ -93,7 +91,7 @@ def main(cfg: Show) -> int:
 
 
 def print_config(config: TaskConfig) -> int:
-    """Print a configuration as YAML that `load_task_config` loads."""
+    """Print a configuration as YAML, in the form that `load_task_config` reads."""
     import yaml
 
     from robocas_ms3.cli.terminal import print_text
@@ -104,7 +102,7 @@ def print_config(config: TaskConfig) -> int:
 
 
 def _require_gpu(shader: str) -> None:
-    """A software renderer says that it traces rays, and takes hours for an image."""
+    """Raise RobocasError if there is no GPU: a software renderer would take hours per image."""
     import sapien
 
     from robocas_ms3.core.errors import RobocasError
@@ -113,4 +111,6 @@ def _require_gpu(shader: str) -> None:
         sapien.Device("cuda")
     except RuntimeError as error:
         fix = "Pass --shader default."
-        raise RobocasError("ray tracing needs a GPU", where=f"--shader {shader}", found="none", fix=fix) from error
+        raise RobocasError(
+            "ray tracing needs a GPU", where=f"--shader {shader}", found="no CUDA device", fix=fix
+        ) from error

@@ -1,4 +1,4 @@
-"""Text on the terminal. Control characters in data are shown as escapes: they never move the cursor or set colours."""
+"""Print text on a terminal. Control characters in data are printed as escapes, so they cannot control the terminal."""
 
 from __future__ import annotations
 
@@ -13,28 +13,29 @@ from robocas_ms3.core.text import escape_controls
 if TYPE_CHECKING:
     from rich.console import Console
 
-_PIPED_WIDTH = 200  # with 80 columns long names would be broken, and no search would find them
+_PIPED_WIDTH = 200  # columns; 80 would wrap long names, and grep would not find them
 
 
 def console(**options: Any) -> Console:
-    """Return a console that shows control characters as escapes and does not interpret markup."""
+    """Return a rich console that prints control characters as escapes and ignores markup."""
     return _printable_console()(**{"markup": False, "emoji": False, "highlight": False, **options})
 
 
 def table_console() -> Console:
-    """Return a console for tables: as wide as the terminal, or 200 columns in a pipe or a file."""
-    made = console()
-    return made if made.is_terminal else console(width=_PIPED_WIDTH)
+    """Return a console for tables: the width of the terminal, or 200 columns in a pipe or a file."""
+    found = console()
+    return found if found.is_terminal else console(width=_PIPED_WIDTH)
 
 
 def print_table(
-    columns: Sequence[str], rows: Iterable[Sequence[object]], *, whole: Collection[str] = (), **options: Any
+    columns: Sequence[str], rows: Iterable[Sequence[object]], *, no_wrap: Collection[str] = (), **options: Any
 ) -> None:
-    """Print a table, unless it is empty.
+    """Print a table; print nothing if it has no rows.
 
     Args:
-        columns: their heads; those in ``whole``, and the first one, are never broken.
-        rows: a cell is text, or a renderable of rich.
+        columns: titles of the columns.
+        rows: cells of each row, text or a `rich.text.Text`.
+        no_wrap: titles of the columns that are never wrapped, in addition to the first one.
         options: options of `rich.table.Table`.
     """
     from rich.table import Table
@@ -42,7 +43,7 @@ def print_table(
 
     table = Table(**options)
     for number, column in enumerate(columns):
-        table.add_column(column, overflow="fold", no_wrap=number == 0 or column in whole)
+        table.add_column(column, overflow="fold", no_wrap=number == 0 or column in no_wrap)
     for row in rows:
         table.add_row(*(cell if isinstance(cell, Text) else str(cell) for cell in row))
     if table.row_count:
@@ -50,11 +51,11 @@ def print_table(
 
 
 def terminal_of_stderr() -> Console | None:
-    """Return a console of stderr if it is a terminal that can move its cursor; FORCE_COLOR does not count."""
+    """Return a console of stderr, or None if stderr is no interactive terminal, whatever FORCE_COLOR says."""
     if not sys.stderr.isatty():
         return None
-    made = console(stderr=True)
-    return made if made.is_interactive else None
+    found = console(stderr=True)
+    return found if found.is_interactive else None
 
 
 def print_line(text: str) -> None:
@@ -63,11 +64,12 @@ def print_line(text: str) -> None:
 
 
 def print_text(text: str) -> None:
-    """Print lines on stdout. Data in them must have no line breaks of its own."""
+    """Print a text of several lines on stdout; line breaks inside data must be escaped by the caller."""
     console().print(text, soft_wrap=True)
 
 
 def print_json(values: object) -> None:
+    """Print values as indented JSON on stdout."""
     print_text(json.dumps(values, indent=2, ensure_ascii=False))
 
 
@@ -78,7 +80,7 @@ def print_stderr(text: str) -> None:
 
 @lru_cache(maxsize=1)
 def _printable_console() -> type[Console]:
-    from rich.console import Console  # 0.1 s, for which `robocas --version` need not wait
+    from rich.console import Console  # takes 0.1 s, which `robocas --version` does not need
     from rich.segment import Segment
     from rich.text import Text
 
@@ -87,10 +89,10 @@ def _printable_console() -> type[Console]:
             return super().render_str(escape_controls(text, lines=True), **options)
 
         def render(self, *args: Any, **options: Any) -> Iterable[Segment]:
-            for one in super().render(*args, **options):  # of a `Text` that was made elsewhere
-                yield one if one.control else Segment(escape_controls(one.text, lines=True), one.style)
+            for segment in super().render(*args, **options):  # also of a `Text` that the caller created
+                yield segment if segment.control else Segment(escape_controls(segment.text, lines=True), segment.style)
 
-        def on_broken_pipe(self) -> NoReturn:  # rich ends the process here
+        def on_broken_pipe(self) -> NoReturn:  # rich would end the process
             raise BrokenPipeError
 
     return PrintableConsole
