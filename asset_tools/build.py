@@ -20,7 +20,7 @@ from asset_tools.quality.measure import measure_object
 from asset_tools.resting_poses import resting_poses
 from asset_tools.sources import FurnitureSource, ObjectSource
 from asset_tools.visual import to_display
-from robocas_ms3.assets.annotations import Annotations, footprints
+from robocas_ms3.assets.annotations import Annotations, compute_footprints
 from robocas_ms3.assets.hulls import read_hulls, write_hulls
 from robocas_ms3.assets.manifest import FurnitureAsset, FurnitureQuality, ObjectAsset
 from robocas_ms3.assets.pack import (
@@ -29,12 +29,12 @@ from robocas_ms3.assets.pack import (
     HULLS,
     LINKS,
     VISUALS,
+    BodyFiles,
     LoadedFurniture,
-    Part,
     VisualLevel,
     sha256,
 )
-from robocas_ms3.assets.physics import Solid
+from robocas_ms3.assets.physics import RigidBody
 from robocas_ms3.core.errors import AssetError
 
 SURFACE_POINTS = 1024
@@ -81,7 +81,7 @@ def _build_object(source: ObjectSource, folder: Path) -> ObjectAsset:
     center = np.array(triple(closed.center_mass))
     moments, axes = principal_inertia(closed, source.mass)
     inertia = np.array(moments_of(moments))
-    solid = Solid(hulls, source.mass, center, inertia, np.array(axes), source.friction)
+    solid = RigidBody(hulls, source.mass, center, inertia, np.array(axes), source.friction)
     rest = resting_poses(solid)
     grasps, reason = source.grasps, ""
     if grasps is None:
@@ -95,7 +95,7 @@ def _build_object(source: ObjectSource, folder: Path) -> ObjectAsset:
     points, faces = trimesh.sample.sample_surface(closed, SURFACE_POINTS, seed=0)[:2]
     notes = Annotations(
         resting_poses=rest.poses,
-        footprints=_light(footprints(hulls, rest.poses)),
+        footprints=_light(compute_footprints(hulls, rest.poses)),
         resting_probabilities=rest.probabilities,
         display_pose=rest.display_pose,
         grasps_tcp_in_object=_light(grasps.tcp_in_object),
@@ -167,7 +167,7 @@ def build_furniture(source: FurnitureSource, folder: Path) -> FurnitureAsset:
         **body,
     )
     # of what the simulator will load, not of what it was written from
-    parts = {link.name: Part(folder / LINKS / link.name) for link in asset.links}
+    parts = {link.name: BodyFiles(folder / LINKS / link.name) for link in asset.links}
     return asset.model_copy(update={"quality": measure_furniture(LoadedFurniture(folder, asset=asset, links=parts))})
 
 

@@ -14,7 +14,7 @@ from scipy.spatial import ConvexHull, QhullError
 from asset_tools.quality.hulls import hull_quality, volume_iou
 from asset_tools.solids import to_mesh, to_solid
 from robocas_ms3.assets.cooked_hulls import OBLONG, SHRINKAGE, cook_hulls
-from robocas_ms3.assets.hulls import box_of, center_of, slenderness
+from robocas_ms3.assets.hulls import center_of_mass, find_box, slenderness
 from robocas_ms3.assets.physics import cook
 from robocas_ms3.core.errors import AssetError
 
@@ -126,7 +126,7 @@ def few_vertices(points: Array, *, bevel: float = BEVEL) -> Array:
     if len(chosen) > MAX_VERTICES and flat_faces(vertices[chosen]) > GPU_LIMIT:
         chosen = chosen[:MAX_VERTICES]
     kept = vertices[chosen]
-    center = center_of(kept)
+    center = center_of_mass(kept)
     return center + (kept - center) * np.cbrt(hull.volume / ConvexHull(kept).volume)
 
 
@@ -136,9 +136,9 @@ def for_engine(points: Array) -> Array:
     A hull that is too slender is stretched along its thin axes. One that loses too much is what the engine makes of it.
     One that the engine refuses becomes a box around it. Boxes stay as they are.
     """
-    if box_of(points) is not None:
+    if find_box(points) is not None:
         return points
-    center = center_of(points)
+    center = center_of_mass(points)
     axes = np.linalg.svd(points - points.mean(axis=0))[2]
     local = (points - center) @ axes.T
     depths = np.abs(local).max(axis=0)

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
-from robocas_ms3.assets.cooked_hulls import cooking_faults
+from robocas_ms3.assets.cooked_hulls import find_hull_violations
 from robocas_ms3.assets.manifest import (
     SCHEMA_VERSION,
     Asset,
@@ -268,7 +268,7 @@ def write_pack(
 def _without_miscooked(results: list[JobResult], folder: Path, skip_errors: bool) -> list[JobResult]:
     """Give up, or leave them out, where the physics engine makes less of hulls than their files say."""
     faults: dict[str, str] = {}
-    for fault in cooking_faults(folder):
+    for fault in find_hull_violations(folder):
         faults.setdefault(fault.asset.partition("/")[0], str(fault))
     if faults and not skip_errors:
         raise AssetError("; ".join(faults.values()), fix=SKIP)

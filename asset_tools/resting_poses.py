@@ -18,15 +18,15 @@ from asset_tools.stability import (
     stable_directions,
     toppling_angle,
 )
-from robocas_ms3.assets.hulls import box_of
+from robocas_ms3.assets.hulls import find_box
 from robocas_ms3.assets.physics import (
-    Solid,
+    RigidBody,
     add_body,
     add_ground,
     cook,
     engine_settings,
-    new_scene,
-    places,
+    grid_origins,
+    make_scene,
     pose_matrix,
 )
 from robocas_ms3.core.errors import AssetError
@@ -66,7 +66,7 @@ class RestingPoses:
 
 @dataclass(frozen=True)
 class _Body:
-    solid: Solid
+    solid: RigidBody
     points: Array  # (K, 3) corners of the hull of everything
     cooked: Array  # (L, 3) the same of the shapes that the engine makes of it
 
@@ -80,7 +80,7 @@ class _Body:
         return pose
 
 
-def resting_poses(solid: Solid) -> RestingPoses:
+def resting_poses(solid: RigidBody) -> RestingPoses:
     """Find the poses in which an object stays where it is put. The same input gives the same poses.
 
     Poses of less than 2 % are left out, unless all are rare. Those of one height count together: a cylinder has many
@@ -115,7 +115,7 @@ def resting_poses(solid: Solid) -> RestingPoses:
 
 def _cooked(piece: Array) -> Array:
     """Return the corners (V, 3) of the engine's shape of a convex hull; boxes are exact."""
-    return piece if box_of(piece) is not None else cook(piece, physx.PhysxMaterial(1, 1, 0)).vertices
+    return piece if find_box(piece) is not None else cook(piece, physx.PhysxMaterial(1, 1, 0)).vertices
 
 
 def _turn_up(up: Array) -> Array:
@@ -170,9 +170,9 @@ def _firm(body: _Body, directions: Array, which: list[int]) -> tuple[Array, list
 
 def _simulate(body: _Body, starts: Array) -> Array:
     """Poses (N, 4, 4) one second after the object was put down in each of the poses (N, 4, 4), one object each."""
-    offsets = places(len(starts))
+    offsets = grid_origins(len(starts))
     with engine_settings():
-        scene = new_scene()
+        scene = make_scene()
         objects = []
         for start, offset in zip(starts, offsets, strict=True):
             add_ground(scene, offset)

@@ -26,7 +26,7 @@ from asset_tools.quality.drops import drop_test
 from asset_tools.quality.grasp_hold import hold_test
 from asset_tools.quality.hulls import hull_quality
 from asset_tools.resting_poses import resting_poses
-from robocas_ms3.assets.physics import Solid
+from robocas_ms3.assets.physics import RigidBody
 
 
 @dataclass
@@ -59,7 +59,7 @@ def main(cfg: Benchmark) -> None:
             hulls = list(shape.pieces) or decompose(closed).hulls
         center = np.asarray(closed.center_mass)
         inertia, axes = principal_inertia(closed, spec.mass)
-        solid = Solid(hulls, spec.mass, center, np.array(inertia), np.array(axes))
+        solid = RigidBody(hulls, spec.mass, center, np.array(inertia), np.array(axes))
         with timed("resting poses"):
             rest = resting_poses(solid)
         with timed("grasps"):

@@ -21,7 +21,7 @@ from robocas_ms3.planning.kinematics import ArmChain, Reachability
 from robocas_ms3.planning.protocol import Array
 from robocas_ms3.planning.rrt_connect import RRTConnectPlanner
 from robocas_ms3.robots.description import MOBILE_PANDA
-from robocas_ms3.robots.urdf import robot_files
+from robocas_ms3.robots.urdf import make_robot_files
 
 SPACING = 0.005
 
@@ -99,7 +99,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
 
-    files, watch, points, seconds = robot_files(), Stopwatch(), [], []
+    files, watch, points, seconds = make_robot_files(), Stopwatch(), [], []
     planner = RRTConnectPlanner(files.arm_urdf, files.arm_srdf, robot=MOBILE_PANDA, dt=0.05)
     reachability = Reachability(ArmChain(files.arm_urdf, MOBILE_PANDA))
     for scene in range(options.seed, options.seed + options.scenes):

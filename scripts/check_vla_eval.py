@@ -48,7 +48,7 @@ from robocas_ms3.evaluation import (
 )
 from robocas_ms3.evaluation.policies.scripted import ScriptedPolicy
 from robocas_ms3.robots.description import RobotDescription
-from robocas_ms3.robots.quantities import GRIPPER_WIDTH, STATE, columns_of
+from robocas_ms3.robots.quantities import GRIPPER_WIDTH, STATE, feature_columns
 
 BENCHMARK = "robocas_ms3.evaluation.harness.vla_eval:RoboCAS"
 TASKS, EPISODES_PER_TASK, CHUNK = ["pick", "select"], 2, 4
@@ -102,7 +102,7 @@ class ReplayServer(PredictModelServer):
                 file.write(json.dumps([name, number, obs["task_description"]]) + "\n")
         recorded = {key: self.recording[f"{name} {number} {key}"] for key in ("actions", "state", *CAMERAS)}
         # without the quaternion, whose sign is arbitrary, and the base, which policies do not observe
-        columns = [columns_of(STATE)[key] for key in ("ee_pos", "robot_joints", GRIPPER_WIDTH)]
+        columns = [feature_columns(STATE)[key] for key in ("ee_pos", "robot_joints", GRIPPER_WIDTH)]
         state = np.concatenate([obs["state"][part] for part in columns])
         assert np.allclose(state, recorded["state"][ctx.step], atol=1e-4)
         assert list(obs["images"]) == list(CAMERAS)

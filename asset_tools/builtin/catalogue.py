@@ -16,7 +16,7 @@ from pydantic import Field, create_model, model_validator
 from asset_tools.builtin import animals, bottles, fruits, labels, planes, shapes, skins, tools, toys
 from asset_tools.builtin.mesh import Shape
 from asset_tools.builtin.models import Model
-from robocas_ms3.assets.manifest import Name, Positive, Share
+from robocas_ms3.assets.manifest import Fraction, Name, Positive
 from robocas_ms3.core.documents import DocumentError, load_yaml
 from robocas_ms3.core.errors import AssetError
 from robocas_ms3.core.strict_model import StrictModel, parse
@@ -99,7 +99,7 @@ class Product(StrictModel):
     category: Name
     size: tuple[Positive, Positive, Positive]
     mass: Positive
-    roughness: Share = 0.45
+    roughness: Fraction = 0.45
     graspnet_id: int
     spoken: str = ""
     hollow: bool = False

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from robocas_ms3.assets.manifest import Name, NotNegative, Positive, Quaternion, Surface, Vec3
+from robocas_ms3.assets.manifest import Name, NonNegative, Positive, Quaternion, Surface, Vec3
 from robocas_ms3.core.documents import DocumentError, load_yaml
 from robocas_ms3.core.errors import AssetError
 from robocas_ms3.core.strict_model import StrictModel, parse
@@ -33,8 +33,8 @@ class JointNote(StrictModel):
     """What to change about a joint."""
 
     mass: Positive | None = Field(default=None, description="of what it moves, kg; none: by volume")
-    friction: NotNegative | None = None
-    damping: NotNegative | None = None
+    friction: NonNegative | None = None
+    damping: NonNegative | None = None
     closed: Annotated[float, Field(ge=-1e6, le=1e6)] | None = Field(
         default=None, description="position at which it is closed, as the URDF counts"
     )

@@ -14,7 +14,7 @@ from shapely.geometry import MultiPolygon, Polygon
 from asset_tools.decompose import few_vertices
 from asset_tools.repair import close
 from robocas_ms3.assets.cooked_hulls import OBLONG
-from robocas_ms3.assets.hulls import box_of, slenderness
+from robocas_ms3.assets.hulls import find_box, slenderness
 from robocas_ms3.core.errors import AssetError
 
 Array = np.ndarray
@@ -94,7 +94,7 @@ def for_gpu(hull: Array) -> list[Array]:
 
 
 def _sturdy(hull: Array) -> bool:
-    return box_of(hull) is not None or slenderness(hull) < SLENDER
+    return find_box(hull) is not None or slenderness(hull) < SLENDER
 
 
 def _size(points: Array, rank: int) -> float:

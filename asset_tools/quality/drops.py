@@ -13,12 +13,12 @@ from scipy.spatial.transform import Rotation
 from robocas_ms3.assets.hulls import Hull, convex_faces, sample_surface
 from robocas_ms3.assets.physics import (
     TIME_STEP,
-    Solid,
+    RigidBody,
     add_body,
     add_ground,
     engine_settings,
-    new_scene,
-    places,
+    grid_origins,
+    make_scene,
     pose_matrix,
 )
 
@@ -61,7 +61,7 @@ class DropReport:
     good: NDArray[np.bool_]
 
 
-def drop_test(solid: Solid, resting_poses: Array, *, seed: int = 0) -> DropReport:
+def drop_test(solid: RigidBody, resting_poses: Array, *, seed: int = 0) -> DropReport:
     """Let an object fall 20 times from 5 cm above a table, turned at random, for 3 s; repeatable.
 
     It is at rest once its kinetic energy stays below 4.5e-4 J/kg for good; so what trembles is never at rest.
@@ -106,15 +106,15 @@ def _advances(velocities: Array) -> bool:
     return bool(path >= LEAST_PATH and ahead >= ONE_WAY * path)
 
 
-def _fall(solid: Solid, seed: int) -> tuple[Array, Array, Array, Array]:
+def _fall(solid: RigidBody, seed: int) -> tuple[Array, Array, Array, Array]:
     """Poses (T, N, 4, 4), horizontal velocities (T, N, 2), kinetic energies (T, N), final penetrations (N,)."""
     vertices = np.concatenate([np.asarray(hull, float) for hull in solid.hulls])
     turns = Rotation.from_quat(np.random.default_rng(seed).normal(size=(DROPS, 4))).as_matrix()  # evenly over all
-    origins = places(DROPS)
+    origins = grid_origins(DROPS)
     steps = round((TIME_LIMIT + WATCHED) / TIME_STEP)
     poses, velocities, energies = np.zeros((steps, DROPS, 4, 4)), np.zeros((steps, DROPS, 2)), np.zeros((steps, DROPS))
     with engine_settings():
-        scene = new_scene()
+        scene = make_scene()
         bodies: list[physx.PhysxRigidDynamicComponent] = []
         for turn, origin in zip(turns, origins, strict=True):
             add_ground(scene, origin)
@@ -139,7 +139,7 @@ def _fall(solid: Solid, seed: int) -> tuple[Array, Array, Array, Array]:
     return poses, velocities, energies, sunk
 
 
-def _energy(body: physx.PhysxRigidDynamicComponent, solid: Solid) -> float:
+def _energy(body: physx.PhysxRigidDynamicComponent, solid: RigidBody) -> float:
     """Kinetic energy, J."""
     speed, spin = np.asarray(body.linear_velocity), np.asarray(body.angular_velocity)
     axes = (body.entity_pose * body.cmass_local_pose).to_transformation_matrix()[:3, :3]
@@ -149,7 +149,7 @@ def _energy(body: physx.PhysxRigidDynamicComponent, solid: Solid) -> float:
 class _Comparison:
     """Which of the listed poses (S, 4, 4) a pose is the same as; see `drop_test`."""
 
-    def __init__(self, solid: Solid, listed: Array) -> None:
+    def __init__(self, solid: RigidBody, listed: Array) -> None:
         points = sample_surface([Hull(*convex_faces(np.asarray(hull, float))) for hull in solid.hulls], SPACING)
         self._points = points[:: len(points) // MAX_POINTS + 1]
         self._center = solid.center_of_mass

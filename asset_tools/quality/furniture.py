@@ -17,7 +17,7 @@ from robocas_ms3.assets.hulls import convex_faces
 from robocas_ms3.assets.kinematics import link_poses
 from robocas_ms3.assets.manifest import FurnitureQuality, Handle, Link, Surface
 from robocas_ms3.assets.pack import LoadedFurniture
-from robocas_ms3.assets.physics import TIME_STEP, add_component, engine_settings, pose_matrix, shape_of
+from robocas_ms3.assets.physics import TIME_STEP, add_component, engine_settings, make_shape, pose_matrix
 
 Array = np.ndarray
 
@@ -257,7 +257,7 @@ def _put_down(
     bodies = []
     for thing in things:
         body = physx.PhysxRigidDynamicComponent()
-        shape = shape_of(thing.corners, stage.material)
+        shape = make_shape(thing.corners, stage.material)
         shape.density = PROBE_DENSITY
         body.attach(shape)
         pose = start.copy()

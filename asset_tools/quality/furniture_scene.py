@@ -13,7 +13,7 @@ from asset_tools.sources import FurnitureSource
 from robocas_ms3.assets.kinematics import joint_frame
 from robocas_ms3.assets.manifest import Handle, Link, Surface
 from robocas_ms3.assets.pack import LoadedFurniture
-from robocas_ms3.assets.physics import add_component, new_scene, pose_matrix, shape_of
+from robocas_ms3.assets.physics import add_component, make_scene, make_shape, pose_matrix
 from robocas_ms3.core.errors import AssetError
 
 Array = np.ndarray
@@ -58,7 +58,7 @@ class Stage:
     """A scene with the furniture in it, its body fixed, its frame the world's."""
 
     def __init__(self, model: Model, positions: Mapping[str, float] | None = None) -> None:
-        self.scene = new_scene()
+        self.scene = make_scene()
         self.material = physx.PhysxMaterial(model.friction, model.friction, 0.0)
         self.links: dict[str, physx.PhysxArticulationLinkComponent] = {}
         if not model.links:
@@ -100,7 +100,7 @@ class Stage:
     def _attach(self, component: physx.PhysxRigidBaseComponent, pieces: Sequence[Array]) -> None:
         for piece in pieces:
             try:
-                component.attach(shape_of(piece, self.material))
+                component.attach(make_shape(piece, self.material))
             except RuntimeError as error:
                 raise AssetError("the physics engine refused a convex hull", found=error) from error
 

@@ -14,11 +14,11 @@ from robocas_ms3.assets.annotations import GRIPPER_BOXES
 from robocas_ms3.assets.physics import (
     TIME_STEP,
     Array,
-    Solid,
+    RigidBody,
     add_body,
     engine_settings,
-    new_scene,
-    places,
+    grid_origins,
+    make_scene,
     pose_matrix,
 )
 from robocas_ms3.core.errors import AssetError
@@ -53,7 +53,7 @@ class _Hand:
     palm: physx.PhysxArticulationLinkComponent  # its frame is the TCP's
 
 
-def hold_test(solid: Solid, grasps_tcp_in_object: Array) -> NDArray[np.bool_]:
+def hold_test(solid: RigidBody, grasps_tcp_in_object: Array) -> NDArray[np.bool_]:
     """Say for each grasp whether the object stays in the hand. The same input gives the same answer.
 
     The hand points down around an object that floats in the pose of the grasp. It closes, and from then on gravity
@@ -75,9 +75,9 @@ def hold_test(solid: Solid, grasps_tcp_in_object: Array) -> NDArray[np.bool_]:
     if not np.allclose(turned, 1, atol=1e-3):
         raise AssetError("a grasp is no rigid pose", expected="determinant 1", found=float(turned.min()))
     with engine_settings():
-        scene = new_scene(TIME_STEP)
+        scene = make_scene(TIME_STEP)
         hands, objects = [], []
-        for grasp, place in zip(grasps_tcp_in_object, places(len(grasps_tcp_in_object)), strict=True):
+        for grasp, place in zip(grasps_tcp_in_object, grid_origins(len(grasps_tcp_in_object)), strict=True):
             tcp = _DOWN.copy()
             tcp[:3, 3] = place + [0, 0, _HEIGHT]
             hands.append(_add_hand(scene, tcp))

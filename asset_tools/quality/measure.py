@@ -16,7 +16,7 @@ from asset_tools.quality.hulls import hull_quality
 from robocas_ms3.assets.annotations import Annotations
 from robocas_ms3.assets.manifest import ObjectAsset, ObjectQuality
 from robocas_ms3.assets.pack import LoadedObject
-from robocas_ms3.assets.physics import Solid
+from robocas_ms3.assets.physics import RigidBody
 
 TOP_GRASPS = 20
 
@@ -53,7 +53,7 @@ class Violation:
 
 
 def measure_object(
-    closed: trimesh.Trimesh, solid: Solid, annotations: Annotations, *, hollow: bool = False
+    closed: trimesh.Trimesh, solid: RigidBody, annotations: Annotations, *, hollow: bool = False
 ) -> ObjectQuality:
     """Measure an object when it is made. The same input gives the same numbers.
 
@@ -80,7 +80,7 @@ def remeasure(loaded: LoadedObject) -> ObjectQuality:
     How close the hulls are to the closed mesh is taken over from the manifest, since packs don't keep that mesh.
     """
     facts = loaded.asset
-    solid = Solid(
+    solid = RigidBody(
         loaded.hulls,
         facts.mass,
         np.array(facts.center_of_mass),
@@ -199,7 +199,7 @@ def rows(qualities: Mapping[str, ObjectQuality]) -> list[tuple[str, ...]]:
     return table
 
 
-def _physics(solid: Solid, annotations: Annotations) -> dict[str, Any]:
+def _physics(solid: RigidBody, annotations: Annotations) -> dict[str, Any]:
     """The fields of `ObjectQuality` that come out of the engine."""
     dropped = drop_test(solid, annotations.resting_poses)
     grasps = np.asarray(annotations.grasps_tcp_in_object, float)[top_grasps(annotations)]

@@ -46,7 +46,7 @@ class Annotations:
     """
 
     resting_poses: Array
-    footprints: Array
+    compute_footprints: Array
     resting_probabilities: Array
     display_pose: int
     grasps_tcp_in_object: Array
@@ -99,7 +99,7 @@ class Annotations:
         return corners[~np.all(corners == np.roll(corners, 1, axis=0), axis=1)]
 
 
-def footprints(hulls: list[Array], poses: Array) -> Array:
+def compute_footprints(hulls: list[Array], poses: Array) -> Array:
     """Return what convex hulls, vertices (V, 3), cover of the plane in resting poses (S, 4, 4); see `Annotations`."""
     points = np.concatenate(hulls)
     polygons = []

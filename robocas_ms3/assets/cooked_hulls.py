@@ -15,7 +15,7 @@ import numpy as np
 from sapien import physx
 from scipy.spatial import ConvexHull
 
-from robocas_ms3.assets.hulls import Array, box_of, read_hulls, slenderness
+from robocas_ms3.assets.hulls import Array, find_box, read_hulls, slenderness
 from robocas_ms3.assets.pack import HULLS
 from robocas_ms3.assets.physics import cook
 from robocas_ms3.core.errors import AssetError
@@ -39,7 +39,7 @@ class CookedHull:
 
 
 @dataclass(frozen=True)
-class CookingFault:
+class HullViolation:
     """A hull that is smaller once cooked.
 
     Attributes:
@@ -64,13 +64,13 @@ class CookingFault:
         return f"{self.asset}: hull {self.hull} {what} on a {self.way}"
 
 
-def cooking_faults(folder: Path) -> list[CookingFault]:
+def find_hull_violations(folder: Path) -> list[HullViolation]:
     """Cook all hulls in a pack's folder, but boxes, for CPU and GPU; return those that shrink or can't be built."""
     named: list[tuple[str, int, Array]] = []
     for path in sorted(folder.rglob(HULLS)):
         name = path.parent.relative_to(folder).as_posix()
         hulls = enumerate(read_hulls(path))
-        named += [(name, number, hull.vertices) for number, hull in hulls if box_of(hull.vertices) is None]
+        named += [(name, number, hull.vertices) for number, hull in hulls if find_box(hull.vertices) is None]
     if not named:
         return []
     pieces = [vertices for _, _, vertices in named]
@@ -82,7 +82,7 @@ def cooking_faults(folder: Path) -> list[CookingFault]:
         on_gpu = pool.run(pieces)
     ways = {"GPU": on_gpu, "CPU": cook_hulls(pieces)}
     return [
-        CookingFault(name, number, way, result)
+        HullViolation(name, number, way, result)
         for way, results in ways.items()
         for (name, number, _), result in zip(named, results, strict=True)
         if result.lost > SHRINKAGE or (result.oblong and way == "GPU")

@@ -97,7 +97,7 @@ def convex_faces(points: Array) -> tuple[Array, NDArray[np.int64]]:
     return vertices, faces
 
 
-def box_of(vertices: Array) -> Box | None:
+def find_box(vertices: Array) -> Box | None:
     """Return the box of which points (8, 3) are the corners, however it is turned; None if they are not a box's.
 
     Order and signs of its axes turn it least: a box along x, y and z has no rotation.
@@ -143,12 +143,12 @@ def _edges(ways: Array) -> Array | None:
 
 def slenderness(points: Array) -> float:
     """Return reach over least depth of the convex hull of points (V, 3), from its centre of mass; a cube has 1."""
-    center = center_of(points)
+    center = center_of_mass(points)
     depth = -(ConvexHull(points).equations @ np.append(center, 1.0)).max()
     return float(np.abs(points - center).max() / depth)
 
 
-def center_of(points: Array) -> Array:
+def center_of_mass(points: Array) -> Array:
     """Return the centre of mass (3,) of the convex hull of points (V, 3)."""
     inside = points.mean(axis=0)
     corners = points[ConvexHull(points).simplices] - inside
@@ -171,7 +171,7 @@ def sample_surface(hulls: Sequence[Hull], spacing: float) -> Array:
                 depth = np.max(points[close] @ planes[:, :3].T + planes[:, 3], axis=1)
                 points = np.delete(points, close[depth <= -_HIDDEN_DEPTH], axis=0)
         kept.append(points)
-    return thin(np.concatenate(kept), spacing)
+    return thin_points(np.concatenate(kept), spacing)
 
 
 def sample_triangles(corners: Array, spacing: float) -> Array:
@@ -192,7 +192,7 @@ def sample_triangles(corners: Array, spacing: float) -> Array:
     return np.concatenate(points)
 
 
-def thin(points: Array, spacing: float) -> Array:
+def thin_points(points: Array, spacing: float) -> Array:
     """Keep one point (P, 3) per cube of edge ``spacing / 2``: the first one given."""
     cells = np.floor(points / (spacing / 2) + 0.25).astype(np.int64)
     low, high = cells.min(axis=0), cells.max(axis=0)

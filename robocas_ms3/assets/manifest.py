@@ -57,9 +57,9 @@ Quaternion = Annotated[
     tuple[float, float, float, float], Field(description="wxyz, of length 1 within 1e-3"), AfterValidator(_unit)
 ]
 Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
-Share = Annotated[float, Field(ge=0, le=1)]
-Moments = Annotated[
+NonNegative = Annotated[float, Field(ge=0)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
+PrincipalMoments = Annotated[
     tuple[Positive, Positive, Positive], Field(description="principal moments, kg m2"), AfterValidator(_of_a_body)
 ]
 Name = Annotated[str, Field(pattern=r"^[a-z0-9_]+$", max_length=MAX_NAME_BYTES)]
@@ -105,8 +105,8 @@ class Joint(StrictModel):
     axis: Vec3 = Field(description="unit vector: the way it slides, or turns by the right-hand rule")
     origin: Vec3 = Field(default=(0, 0, 0), description="a point on the axis, m")
     limits: tuple[float, float] = Field(description="m or rad; 0, which is closed, lies within")
-    friction: NotNegative = Field(description="Coulomb friction, as PhysX has it")
-    damping: NotNegative = Field(description="N s/m or N m s/rad")
+    friction: NonNegative = Field(description="Coulomb friction, as PhysX has it")
+    damping: NonNegative = Field(description="N s/m or N m s/rad")
 
     @model_validator(mode="after")
     def _sound(self) -> Joint:
@@ -125,7 +125,7 @@ class Link(StrictModel):
     joint: Joint
     mass: Positive
     center_of_mass: Vec3
-    inertia: Moments
+    inertia: PrincipalMoments
     inertia_wxyz: Quaternion = (1, 0, 0, 0)
 
 
@@ -144,15 +144,19 @@ class ObjectQuality(StrictModel):
     compact: bool = Field(description="False: thin or hollow, judged by surface distance instead of volume")
     hull_count: int = Field(ge=1)
     hull_vertices: int = Field(ge=4, description="of the largest hull")
-    volume_iou: Share = Field(description="overlap of the hulls with the closed mesh they were made from")
-    surface_p95: NotNegative = Field(description="95th percentile of the distances between both surfaces, m")
-    rest_share: Share = Field(description="of drops that end in a listed resting pose, at rest in time, not jittering")
-    rolling_share: Share = Field(default=0, description="of drops that count as at rest only because they roll evenly")
-    rest_time: NotNegative = Field(description="median time until at rest after the drop, s")
-    penetration: NotNegative = Field(description="deepest into the plane at rest, m")
-    jitter: NotNegative = Field(description="largest kinetic energy from 2 s to 3 s of drops that don't roll, J per kg")
+    volume_iou: Fraction = Field(description="overlap of the hulls with the closed mesh they were made from")
+    surface_p95: NonNegative = Field(description="95th percentile of the distances between both surfaces, m")
+    rest_share: Fraction = Field(
+        description="of drops that end in a listed resting pose, at rest in time, not jittering"
+    )
+    rolling_share: Fraction = Field(
+        default=0, description="of drops that count as at rest only because they roll evenly"
+    )
+    rest_time: NonNegative = Field(description="median time until at rest after the drop, s")
+    penetration: NonNegative = Field(description="deepest into the plane at rest, m")
+    jitter: NonNegative = Field(description="largest kinetic energy from 2 s to 3 s of drops that don't roll, J per kg")
     grasps_tried: int = Field(ge=0)
-    grasps_held: Share = Field(description="of those tried: still in the hand after lifting and shaking")
+    grasps_held: Fraction = Field(description="of those tried: still in the hand after lifting and shaking")
 
 
 class FurnitureQuality(StrictModel):
@@ -160,8 +164,10 @@ class FurnitureQuality(StrictModel):
 
     hull_count: int = Field(ge=1)
     hull_vertices: int = Field(ge=4)
-    joints_open: Share | None = Field(default=None, description="share of joints that a force opens and closes again")
-    surfaces_hold: Share | None = Field(default=None, description="share of surfaces on which objects stay")
+    joints_open: Fraction | None = Field(
+        default=None, description="share of joints that a force opens and closes again"
+    )
+    surfaces_hold: Fraction | None = Field(default=None, description="share of surfaces on which objects stay")
 
 
 class AssetBase(StrictModel):
@@ -174,7 +180,7 @@ class AssetBase(StrictModel):
     licence: str
     attribution: str
     units: Literal["m"] = "m"
-    extents: tuple[NotNegative, NotNegative, NotNegative] = Field(
+    extents: tuple[NonNegative, NonNegative, NonNegative] = Field(
         description="size of the visual mesh's bounding box, m"
     )
     friction: Positive = 0.99
@@ -191,7 +197,7 @@ class ObjectAsset(AssetBase):
     )
     mass: Positive = Field(description="kg")
     center_of_mass: Vec3 = Field(description="m, in the asset's frame")
-    inertia: Moments
+    inertia: PrincipalMoments
     inertia_wxyz: Quaternion = (1, 0, 0, 0)
     grasp_count: int = Field(ge=0)
     no_grasps_because: str = Field(default="", description="why there are fewer grasps than usual, if so")
@@ -204,7 +210,7 @@ class FurnitureAsset(AssetBase):
     kind: Literal["furniture"] = "furniture"
     mass: Positive | None = Field(default=None, description="kg; none: its body can't move")
     center_of_mass: Vec3 = (0, 0, 0)
-    inertia: Moments | None = Field(default=None, description="given if the mass is")
+    inertia: PrincipalMoments | None = Field(default=None, description="given if the mass is")
     inertia_wxyz: Quaternion = (1, 0, 0, 0)
     origin_height: float = Field(default=0.0, description="height of the frame's origin above the lowest point, m")
     surfaces: dict[Name, Surface] = {}

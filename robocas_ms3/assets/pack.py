@@ -35,7 +35,7 @@ _packs: dict[tuple[str, int, int], Pack] = {}  # (path, size, mtime) -> pack: ge
 
 
 @dataclass(frozen=True)
-class Part:
+class BodyFiles:
     """The geometry of one body: a folder with files to render and hulls for physics."""
 
     folder: Path
@@ -70,7 +70,7 @@ class Part:
 
 
 @dataclass(frozen=True)
-class LoadedObject(Part):
+class LoadedObject(BodyFiles):
     """A thing to pick up, with its entry in the manifest."""
 
     asset: ObjectAsset = field(kw_only=True)
@@ -81,7 +81,7 @@ class LoadedObject(Part):
 
 
 @dataclass(frozen=True)
-class LoadedFurniture(Part):
+class LoadedFurniture(BodyFiles):
     """Furniture, a basket or a room, with its entry in the manifest. As a part, it is the fixed body.
 
     Attributes:
@@ -89,7 +89,7 @@ class LoadedFurniture(Part):
     """
 
     asset: FurnitureAsset = field(kw_only=True)
-    links: dict[str, Part] = field(default_factory=dict, kw_only=True)
+    links: dict[str, BodyFiles] = field(default_factory=dict, kw_only=True)
 
     def all_surface_points(self, positions: Mapping[str, float]) -> Array:
         """Return points (P, 3), m, on body and links in the furniture's frame; joints not in ``positions`` are at 0."""
@@ -117,7 +117,7 @@ class Pack:
     furniture: dict[str, LoadedFurniture]
 
 
-def pack_folders() -> dict[str, Path]:
+def find_packs() -> dict[str, Path]:
     """Return name -> folder of every pack, the shipped ones first; a user's pack can't hide a shipped one."""
     found: dict[str, Path] = {}
     for parent in (builtin_packs_dir(), data_dir() / "packs"):
@@ -137,7 +137,7 @@ def load_pack(name_or_path: str | Path) -> Pack:
     Raises:
         AssetError: there is no such pack, or a file of it is missing, changed, damaged or not listed.
     """
-    known = pack_folders()
+    known = find_packs()
     folder = known.get(str(name_or_path), Path(name_or_path)).resolve()
     if not (folder / MANIFEST).is_file():
         raise AssetError(
@@ -152,11 +152,11 @@ def load_pack(name_or_path: str | Path) -> Pack:
     key = (str(path), status.st_size, status.st_mtime_ns)
     if key not in _packs:
         _packs[key] = _read(folder, path)
-    verify(_packs[key])
+    verify_pack(_packs[key])
     return _packs[key]
 
 
-def verify(pack: Pack) -> None:
+def verify_pack(pack: Pack) -> None:
     """Check that the files of all assets are those the manifest lists. A file is read once per process and change."""
     for asset in pack.manifest.assets:
         folder = pack.root / asset.id
@@ -238,7 +238,7 @@ def _read(folder: Path, path: Path) -> Pack:
         if isinstance(asset, ObjectAsset):
             objects[asset.id] = LoadedObject(home, asset=asset)
         else:
-            links = {link.name: Part(home / LINKS / link.name) for link in asset.links}
+            links = {link.name: BodyFiles(home / LINKS / link.name) for link in asset.links}
             furniture[asset.id] = LoadedFurniture(home, asset=asset, links=links)
     return Pack(manifest.name, folder, manifest, objects, furniture)
 

@@ -12,8 +12,8 @@ import numpy as np
 import sapien
 from sapien import physx
 
-from robocas_ms3.assets.hulls import Box, box_of
-from robocas_ms3.assets.pack import LoadedObject, Part
+from robocas_ms3.assets.hulls import Box, find_box
+from robocas_ms3.assets.pack import BodyFiles, LoadedObject
 from robocas_ms3.core.errors import AssetError
 
 Array = np.ndarray
@@ -28,7 +28,7 @@ SPACING = 10.0  # m between objects that are simulated at once
 
 
 @dataclass(frozen=True)
-class Solid:
+class RigidBody:
     """A free body, in its own frame: hulls of vertices (V, 3), m; mass, kg; principal moments (3,), kg m2, and axes."""
 
     hulls: Sequence[Array]
@@ -55,20 +55,20 @@ def engine_settings() -> Iterator[None]:
         physx.set_shape_config(shape)
 
 
-def new_scene(time_step: float = TIME_STEP) -> sapien.Scene:
+def make_scene(time_step: float = TIME_STEP) -> sapien.Scene:
     """Return an empty scene without a renderer; use it within `engine_settings`."""
     scene = sapien.Scene([physx.PhysxCpuSystem()])
     scene.set_timestep(time_step)
     return scene
 
 
-def add_body(scene: sapien.Scene, solid: Solid, pose: Array) -> physx.PhysxRigidDynamicComponent:
+def add_body(scene: sapien.Scene, solid: RigidBody, pose: Array) -> physx.PhysxRigidDynamicComponent:
     """Add a free body at a pose (4, 4) of its frame in the world."""
     material = physx.PhysxMaterial(solid.friction, solid.friction, 0.0)
     free = physx.PhysxRigidDynamicComponent()
     try:
         for piece in solid.hulls:
-            free.attach(shape_of(piece, material))
+            free.attach(make_shape(piece, material))
     except RuntimeError as error:
         raise AssetError("the physics engine refused a convex hull", found=error) from error
     free.mass = solid.mass
@@ -79,18 +79,18 @@ def add_body(scene: sapien.Scene, solid: Solid, pose: Array) -> physx.PhysxRigid
     return free
 
 
-def solid_of(asset: LoadedObject) -> Solid:
+def make_solid(asset: LoadedObject) -> RigidBody:
     facts = asset.asset
     moments, center, axes = (np.array(v) for v in (facts.inertia, facts.center_of_mass, facts.inertia_wxyz))
-    return Solid(asset.hulls, facts.mass, center, moments, axes, facts.friction)
+    return RigidBody(asset.hulls, facts.mass, center, moments, axes, facts.friction)
 
 
-def add_fixed(scene: sapien.Scene, hulls: Sequence[Array], pose: Array, friction: float) -> None:
+def add_static_body(scene: sapien.Scene, hulls: Sequence[Array], pose: Array, friction: float) -> None:
     """Add convex pieces (V, 3) that never move, their frame at a pose (4, 4) in the world."""
     material = physx.PhysxMaterial(friction, friction, 0.0)
     body = physx.PhysxRigidStaticComponent()
     for piece in hulls:
-        body.attach(shape_of(piece, material))
+        body.attach(make_shape(piece, material))
     add_component(scene, body, sapien.Pose(pose))
 
 
@@ -102,16 +102,16 @@ def add_ground(scene: sapien.Scene, origin: Array) -> None:
     add_component(scene, ground, sapien.Pose(origin - np.array([0, 0, 0.05])))
 
 
-def places(count: int) -> Array:
+def grid_origins(count: int) -> Array:
     """Return origins (N, 3) of objects that are simulated at once: a grid, four per row."""
     origins = np.zeros((count, 3))
     origins[:, 0], origins[:, 1] = np.arange(count) % 4 * SPACING, np.arange(count) // 4 * SPACING
     return origins
 
 
-def shape_of(vertices: Array, material: physx.PhysxMaterial) -> physx.PhysxCollisionShape:
+def make_shape(vertices: Array, material: physx.PhysxMaterial) -> physx.PhysxCollisionShape:
     """Return the shape of a convex hull of points (V, 3); a box, which is exact and fast, if they are its corners."""
-    box = box_of(vertices)
+    box = find_box(vertices)
     return cook(vertices, material) if box is None else _box_shape(box, material)
 
 
@@ -122,9 +122,9 @@ def cook(vertices: Array, material: physx.PhysxMaterial) -> physx.PhysxCollision
     )
 
 
-def shapes_of(part: Part, material: physx.PhysxMaterial) -> list[physx.PhysxCollisionShape]:
+def load_shapes(part: BodyFiles, material: physx.PhysxMaterial) -> list[physx.PhysxCollisionShape]:
     """Return the shapes of all hulls of an asset; bodies made of one file share the engine's meshes."""
-    boxes = [box_of(hull) for hull in part.hulls]
+    boxes = [find_box(hull) for hull in part.hulls]
     # a file of boxes is not cooked: the engine rejects slender ones on a GPU
     loaded = [] if all(boxes) else _load(part.hulls_path, material)
     if loaded and len(loaded) != len(boxes):

@@ -12,8 +12,8 @@ from mani_skill.utils.structs import Actor, Articulation
 
 from robocas_ms3.assets.kinematics import joint_frame
 from robocas_ms3.assets.manifest import BODY, FurnitureAsset, Link, ObjectAsset
-from robocas_ms3.assets.pack import LoadedFurniture, LoadedObject, Part, VisualLevel
-from robocas_ms3.assets.physics import DAMPING, shapes_of
+from robocas_ms3.assets.pack import BodyFiles, LoadedFurniture, LoadedObject, VisualLevel
+from robocas_ms3.assets.physics import DAMPING, load_shapes
 from robocas_ms3.core.errors import AssetError
 
 
@@ -94,13 +94,13 @@ def spawn_articulation(
     return articulation
 
 
-def _add_shapes(builder: Any, part: Part, friction: float, level: VisualLevel, *, render: bool) -> None:
+def _add_shapes(builder: Any, part: BodyFiles, friction: float, level: VisualLevel, *, render: bool) -> None:
     make = builder.build_physx_component
 
     def build(link_parent: Any = None) -> Any:
         # not by the builder's own means: it makes no boxes of a file's hulls, and drops those that can't be cooked
         component = make(link_parent)
-        for shape in shapes_of(part, sapien.physx.PhysxMaterial(friction, friction, 0.0)):
+        for shape in load_shapes(part, sapien.physx.PhysxMaterial(friction, friction, 0.0)):
             component.attach(shape)
         return component
 

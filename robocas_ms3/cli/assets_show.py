@@ -72,12 +72,12 @@ class Sheet:
 def list_packs(command: ListPacks) -> int:
     from rich.text import Text
 
-    from robocas_ms3.assets.pack import load_pack, pack_folders
+    from robocas_ms3.assets.pack import find_packs, load_pack
     from robocas_ms3.cli.terminal import print_table
     from robocas_ms3.core.errors import AssetError
 
     rows: list[tuple[object, ...]] = []
-    for name, folder in pack_folders().items():
+    for name, folder in find_packs().items():
         try:
             pack = load_pack(name)
             rows.append((name, len(pack.objects), len(pack.furniture), folder))
@@ -130,14 +130,14 @@ def info(command: Info) -> int:
 
 def verify(command: Verify) -> int:
     """Run ``verify``; return 1 if an asset violates the requirements of packs."""
-    from robocas_ms3.assets.cooked_hulls import cooking_faults
+    from robocas_ms3.assets.cooked_hulls import find_hull_violations
     from robocas_ms3.assets.pack import load_pack
     from robocas_ms3.cli.terminal import console, print_line
 
     pack = load_pack(command.pack)
     for loaded in pack.objects.values():
         _ = loaded.annotations
-    faults = cooking_faults(pack.root)
+    faults = find_hull_violations(pack.root)
     print_line(f"{pack.name}: {format_count(len(pack.manifest.assets), 'asset')}, all files match the manifest")
     for fault in faults:
         console().print(escape_controls(str(fault)), style="red", soft_wrap=True)

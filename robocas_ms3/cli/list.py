@@ -43,7 +43,7 @@ def list_all() -> dict[str, list[dict[str, Any]]]:
     Each asset pack is loaded; a damaged pack has an ``error`` and no objects. Policies and baselines of other packages
     are not imported: an error in such a package shows only when its policy or baseline is chosen.
     """
-    from robocas_ms3.assets.pack import load_pack, pack_folders
+    from robocas_ms3.assets.pack import find_packs, load_pack
     from robocas_ms3.baselines.registry import BASELINES
     from robocas_ms3.core.errors import AssetError
     from robocas_ms3.core.extensions import package_of
@@ -73,7 +73,7 @@ def list_all() -> dict[str, list[dict[str, Any]]]:
     for points in BASELINES.entry_points.values():
         baselines += [{"name": point.name, "package": package_of(point), "summary": ""} for point in points]
     packs = []
-    for name, folder in pack_folders().items():
+    for name, folder in find_packs().items():
         row: dict[str, Any] = {"name": name, "folder": str(folder), "megabytes": round(_size(folder) / 1e6, 1)}
         try:
             pack = load_pack(folder)

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Literal
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.robots.cameras import CAMERA_NAME, PARENT_FRAMES, Parent, standard_parent
+from robocas_ms3.robots.cameras import CAMERA_NAME, PARENT_FRAMES, Parent, standard_camera_parent
 from robocas_ms3.robots.quantities import QUANTITIES, ArraySpec
 from robocas_ms3.scenes.language.embed import DIMENSIONS
 from robocas_ms3.scenes.language.templates import GOAL_TYPES
@@ -46,7 +46,7 @@ MAX_STEPS = 10_000  # four digits in image names
 
 
 EPISODE_INFO: tuple[ArraySpec, ...] = (
-    *(quantity for quantity in QUANTITIES if quantity.recorded),
+    *(quantity for quantity in QUANTITIES if quantity.record),
     ArraySpec("episode_length", "int64", (), "steps", "T"),
     ArraySpec("language_goal", "str", (), "", "the instruction"),
     ArraySpec(
@@ -87,7 +87,7 @@ def camera_parent(folder: Path) -> Parent:
     for parent in PARENT_FRAMES:
         if any((folder / name).exists() for name in pose_files(parent)):
             return parent
-    return standard_parent(folder.name)
+    return standard_camera_parent(folder.name)
 
 
 def camera_names(episode: Path) -> tuple[str, ...]:

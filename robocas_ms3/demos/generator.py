@@ -28,7 +28,7 @@ from robocas_ms3.planning.kinematics import ArmChain, Reachability
 from robocas_ms3.planning.protocol import Planner
 from robocas_ms3.planning.rrt_connect import make_planner
 from robocas_ms3.planning.skills.arm import Arm, back_out
-from robocas_ms3.robots.registry import DEFAULT, find_robot
+from robocas_ms3.robots.registry import DEFAULT_ROBOT, find_robot
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.task_specs import TASKS
 from robocas_ms3.tasks.base import RoboCASEnv
@@ -47,7 +47,7 @@ class EpisodeGenerator:
     def __init__(self, settings: EpisodeSettings, *, fork: bool = True) -> None:
         self.settings = settings
         config, robot = load_task_config(settings.config), find_robot(settings.robot)
-        chosen: dict[str, Any] = {} if settings.robot == DEFAULT else {"robot_uids": settings.robot}
+        chosen: dict[str, Any] = {} if settings.robot == DEFAULT_ROBOT else {"robot_uids": settings.robot}
         self.horizon = TASKS[settings.task].steps(settings.control_freq)
         self.env = gym.make(
             TASKS[settings.task].env_id,

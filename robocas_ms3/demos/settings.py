@@ -10,8 +10,7 @@ import tyro
 
 from robocas_ms3.core.checks import MAX_SEED, check_number
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.robots.registry import DEFAULT as DEFAULT_ROBOT
-from robocas_ms3.robots.registry import find_robot
+from robocas_ms3.robots.registry import DEFAULT_ROBOT, find_robot
 from robocas_ms3.scenes.task_specs import SIM_FREQ, STANDARD_FREQ, TASKS
 
 _NO_HINT = tyro.conf.arg(help_behavior_hint="")  # the help text describes the default

@@ -34,7 +34,7 @@ from robocas_ms3.demos.recordings.trajectory_hdf5 import (
 )
 from robocas_ms3.demos.recordings.trajectory_json import is_intervention, read_json, read_reset
 from robocas_ms3.demos.settings import ReplaySettings
-from robocas_ms3.robots.description_file import chain
+from robocas_ms3.robots.description_file import chain_poses
 from robocas_ms3.robots.ee_controller import RoboCASEEPoseController
 from robocas_ms3.robots.ee_deltas import to_ee_delta_action
 from robocas_ms3.tasks.base import RoboCASEnv
@@ -216,7 +216,7 @@ def _convert_action(action: np.ndarray, env: RoboCASEnv) -> np.ndarray:
     if env.control_mode == "pd_joint_delta_pos":
         qpos = env.agent.robot.get_qpos()[0, robot.arm_slice].cpu().numpy()
         return np.append(np.clip((arm - qpos) / _JOINT_DELTA_SCALE, -1, 1), gripper).astype(np.float32)
-    tcp_in_base = chain(env.robot_spec.files().urdf, robot.arm_base_link, robot.tcp_link, arm[None])[0]
+    tcp_in_base = chain_poses(env.robot_spec.files().urdf, robot.arm_base_link, robot.tcp_link, arm[None])[0]
     if env.control_mode == "pd_ee_pose":
         euler = Rotation.from_matrix(tcp_in_base[:3, :3]).as_euler("XYZ")
         return np.concatenate([tcp_in_base[:3, 3], euler, gripper]).astype(np.float32)

@@ -80,10 +80,10 @@ def planner() -> str:
 
 def packs() -> str:
     """Load all asset packs."""
-    from robocas_ms3.assets.pack import load_pack, pack_folders
+    from robocas_ms3.assets.pack import find_packs, load_pack
     from robocas_ms3.core.text import format_count
 
-    loaded = [load_pack(name) for name in pack_folders()]
+    loaded = [load_pack(name) for name in find_packs()]
     if not any(pack.name == "builtin" for pack in loaded):
         raise RuntimeError("the builtin pack is not installed")
     return ", ".join(f"{pack.name} ({format_count(len(pack.objects), 'object')})" for pack in loaded)

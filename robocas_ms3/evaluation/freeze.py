@@ -29,7 +29,7 @@ from robocas_ms3.evaluation.protocol import (
     Protocol,
     ProtocolEpisode,
 )
-from robocas_ms3.robots.registry import DEFAULT
+from robocas_ms3.robots.registry import DEFAULT_ROBOT
 from robocas_ms3.scenes.config import TaskConfig, bundled_configs, load_task_config
 from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.scenes.layout_table import write_frozen_layouts
@@ -127,7 +127,9 @@ def freeze(plan: ProtocolPlan, folder: Path, overrides: Sequence[str] = ()) -> I
         with atomic_file(tmp / EPISODES) as file:
             file.write_text("".join(f"{episode.model_dump_json()}\n" for episode in episodes), encoding="utf-8")
         # A protocol that names no robot has the default.
-        _write_yaml(rules.model_dump(mode="json", exclude={"robot"} if rules.robot == DEFAULT else None), tmp / RULES)
+        _write_yaml(
+            rules.model_dump(mode="json", exclude={"robot"} if rules.robot == DEFAULT_ROBOT else None), tmp / RULES
+        )
 
 
 def _configs(parts: Sequence[ConfigVariant], overrides: Sequence[str]) -> dict[str, TaskConfig]:

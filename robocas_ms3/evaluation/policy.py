@@ -20,9 +20,9 @@ from robocas_ms3.core.files import json_text
 from robocas_ms3.core.signals import forbid_exit
 from robocas_ms3.robots.cameras import CAMERA_NAME
 from robocas_ms3.robots.quantities import QUANTITIES
-from robocas_ms3.robots.registry import DEFAULT
+from robocas_ms3.robots.registry import DEFAULT_ROBOT
 
-ROBOT_QUANTITIES = {quantity.policy: quantity for quantity in QUANTITIES if quantity.policy}
+ROBOT_QUANTITIES = {quantity.policy_key: quantity for quantity in QUANTITIES if quantity.policy_key}
 """Quantities of the robot that policies observe, by their names there."""
 Language = Literal["none", "text", "embedding"]
 Reference = Literal["tcp", "target"]
@@ -136,7 +136,7 @@ class EpisodeSpec:
     pack: str
     seed: int
     instruction: str
-    robot: str = DEFAULT
+    robot: str = DEFAULT_ROBOT
 
 
 @dataclass(frozen=True)

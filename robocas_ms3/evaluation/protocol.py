@@ -30,8 +30,7 @@ from robocas_ms3.core.paths import protocols_dir
 from robocas_ms3.core.strict_model import MAX_NAME_BYTES, FileName, StrictModel, did_you_mean, parse, parse_json
 from robocas_ms3.evaluation.policy import CONVENTIONS, PolicySpec
 from robocas_ms3.evaluation.settings import EvaluationSettings
-from robocas_ms3.robots.registry import DEFAULT as DEFAULT_ROBOT
-from robocas_ms3.robots.registry import find_robot
+from robocas_ms3.robots.registry import DEFAULT_ROBOT, find_robot
 from robocas_ms3.scenes.config.load import check_no_extends, load_task_config
 from robocas_ms3.scenes.task_specs import TASKS
 

@@ -18,7 +18,7 @@ from robocas_ms3.core.text import format_error
 from robocas_ms3.planning.kinematics import ArmChain
 from robocas_ms3.planning.protocol import Array
 from robocas_ms3.planning.shapes import convex_hull, fcl_convex
-from robocas_ms3.robots.description_file import DescriptionFile, Joint
+from robocas_ms3.robots.description_file import Joint, RobotXml
 
 BASE, TCP = -1, 7  # frames of parts, next to 0 to 6 of links 1 to 7
 HULL_SUFFIX = ".convex.stl"  # a file of this suffix next to a mesh holds the mesh's convex hull
@@ -53,7 +53,7 @@ def read_collision_parts(urdf: Path | str, chain: ArmChain) -> list[CollisionPar
 
     A joint that is neither an arm joint nor a finger joint is taken at its zero position.
     """
-    robot, file = chain.robot, DescriptionFile(urdf)
+    robot, file = chain.robot, RobotXml(urdf)
     links = {file.attribute(link, "name"): link for link in file.root.iterfind("link")}
     joints_below: dict[str, list[Joint]] = {}
     for joint in file.joints():
@@ -84,8 +84,8 @@ def read_collision_parts(urdf: Path | str, chain: ArmChain) -> list[CollisionPar
 
 def read_link_pairs(urdf: Path | str, srdf: Path | str, parts: list[CollisionPart]) -> list[tuple[int, int]]:
     """Return the pairs of part indices (i < j) to check: of links neither adjacent nor disabled in the SRDF."""
-    ignored = {frozenset((joint.parent, joint.child)) for joint in DescriptionFile(urdf).joints()}
-    file = DescriptionFile(srdf)
+    ignored = {frozenset((joint.parent, joint.child)) for joint in RobotXml(urdf).joints()}
+    file = RobotXml(srdf)
     for pair in file.root.iterfind("disable_collisions"):
         ignored.add(frozenset((file.attribute(pair, "link1"), file.attribute(pair, "link2"))))
     return [
@@ -95,7 +95,7 @@ def read_link_pairs(urdf: Path | str, srdf: Path | str, parts: list[CollisionPar
     ]
 
 
-def _collision_geometries(link: Element, name: str, file: DescriptionFile) -> Iterator[tuple[Any, Array, Array]]:
+def _collision_geometries(link: Element, name: str, file: RobotXml) -> Iterator[tuple[Any, Array, Array]]:
     for collision in link.iterfind("collision"):
         origin = file.origin(collision)
         for shape in collision.iterfind("geometry/*"):
@@ -103,7 +103,7 @@ def _collision_geometries(link: Element, name: str, file: DescriptionFile) -> It
             yield geometry, corners, origin
 
 
-def _geometry(shape: Element, link: str, file: DescriptionFile) -> tuple[Any, Array]:
+def _geometry(shape: Element, link: str, file: RobotXml) -> tuple[Any, Array]:
     if shape.tag == "mesh":
         scale = np.array(file.numbers(shape, "scale", 3, "1 1 1"))
         mesh = file.path.parent / file.attribute(shape, "filename")

@@ -17,7 +17,7 @@ from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.core.extensions import load_object
 from robocas_ms3.planning.protocol import Array
 from robocas_ms3.robots.description import RobotDescription
-from robocas_ms3.robots.description_file import DescriptionFile
+from robocas_ms3.robots.description_file import RobotXml
 
 LIMIT_MARGIN = 0.02  # rad kept from every joint limit
 JOINT7_STEP = 0.25  # rad between turns of joint 7 that are tried for many poses
@@ -52,7 +52,7 @@ class ArmChain:
 
     def __init__(self, arm_urdf: Path | str, robot: RobotDescription) -> None:
         self.robot = robot
-        file = DescriptionFile(arm_urdf)
+        file = RobotXml(arm_urdf)
         chain = file.joints_between(robot.arm_base_link, robot.tcp_link)
         turning = [joint for joint in chain if joint.kind == "revolute"]
         names = tuple(joint.name for joint in turning)

@@ -10,7 +10,7 @@ import numpy as np
 from mani_skill.utils.structs import Articulation
 
 from robocas_ms3.assets.kinematics import link_poses
-from robocas_ms3.assets.pack import Part
+from robocas_ms3.assets.pack import BodyFiles
 from robocas_ms3.core.poses import from_wxyz, inverse, transform_points
 from robocas_ms3.planning.protocol import Array, Obstacle, Shape
 from robocas_ms3.tasks.base import RoboCASEnv
@@ -24,17 +24,17 @@ RADIUS = 1.5
 BASKET = "basket"  # its name among obstacles
 
 
-_SHAPES: dict[int, tuple[Part, Shape]] = {}  # by the part's id, which stays its own since the part is kept
+_SHAPES: dict[int, tuple[BodyFiles, Shape]] = {}  # by the part's id, which stays its own since the part is kept
 
 
-def shape_of(part: Part) -> Shape:
+def shape_of(part: BodyFiles) -> Shape:
     """Return the shape of an asset's part, always the same object in a process."""
     if id(part) not in _SHAPES:
         _SHAPES[id(part)] = part, Shape(tuple(part.hulls))
     return _SHAPES[id(part)][1]
 
 
-def _size(part: Part) -> float:
+def _size(part: BodyFiles) -> float:
     return max(math.sqrt(np.einsum("ij,ij->i", hull, hull).max()) for hull in part.hulls)
 
 
@@ -55,7 +55,7 @@ class PlanningScene:
 
     def _bodies(
         self, left_out: Collection[int], without_link: tuple[str, str] | None
-    ) -> Iterator[tuple[str, Part, float, Array]]:
+    ) -> Iterator[tuple[str, BodyFiles, float, Array]]:
         """Yield name, part, spacing of its samples (m) and pose in the world (4x4) of all that is there."""
         for name, asset in self.env.model.furniture.items():
             frame = self.env.model.furniture_poses[name]

@@ -28,7 +28,7 @@ from robocas_ms3.core.strict_model import parse, validate_json
 from robocas_ms3.datasets.schema import episode_folder
 from robocas_ms3.demos.recordings.trajectory_json import versions
 from robocas_ms3.plans.plan import Plan
-from robocas_ms3.robots.cameras import STANDARD_NAMES
+from robocas_ms3.robots.cameras import STANDARD_CAMERA_NAMES
 
 PLAN, REPORT, UNITS = "plan.json", "report.json", "units"
 LAYOUTS, DEMOS, DATASETS, STATISTICS = "layouts", "demos", "datasets", "statistics"
@@ -129,7 +129,7 @@ def _settings_of(record: dict[str, Any]) -> dict[str, Any]:
         plan = {key: value for key, value in plan.items() if key not in FREE}
         images = plan.get("images")
         if isinstance(images, dict) and images.get("cameras") is None:  # of an older version
-            plan["images"] = {**images, "cameras": list(STANDARD_NAMES)}
+            plan["images"] = {**images, "cameras": list(STANDARD_CAMERA_NAMES)}
     return {**record, "plan": plan}
 
 

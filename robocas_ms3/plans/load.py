@@ -9,7 +9,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from robocas_ms3.assets.pack import MANIFEST, pack_folders, sha256
+from robocas_ms3.assets.pack import MANIFEST, find_packs, sha256
 from robocas_ms3.core.checks import MAX_SEED
 from robocas_ms3.core.documents import DocumentError, load_yaml
 from robocas_ms3.core.errors import MissingExtraError, PlanError, require_extra
@@ -145,7 +145,7 @@ def _completed(part: PartConfig, number: int, path: Path) -> tuple[PartConfig, A
     loaded = load_config_for(spec, config)
     shipped = isinstance(config, str) and config in bundled_configs()  # a file may change until the next run
     stem, pack = Path(name).stem if isinstance(name, str) else part.task, part.pack
-    if pack not in pack_folders():  # a folder, relative to the plan or to the working directory
+    if pack not in find_packs():  # a folder, relative to the plan or to the working directory
         folders = [folder for folder in (path.parent / pack, Path(pack)) if folder.is_dir()]
         pack = str(folders[0].resolve()) if folders else pack
     completed = {
@@ -173,7 +173,7 @@ def _cameras(plan: Plan, configs: Sequence[TaskConfig], path: Path) -> list[str]
 
 def _digest(pack: str) -> str:
     """Return the hash of a pack's manifest, which has those of its files; empty where there is no such pack."""
-    path = pack_folders().get(pack, Path(pack)) / MANIFEST
+    path = find_packs().get(pack, Path(pack)) / MANIFEST
     return sha256(path) if path.is_file() else ""
 
 

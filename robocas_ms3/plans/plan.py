@@ -11,7 +11,7 @@ from robocas_ms3.core.strict_model import StrictModel
 from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.datasets.lerobot.variants import NEWEST, Version
 from robocas_ms3.datasets.schema import ImageFormat
-from robocas_ms3.robots.cameras import STANDARD_NAMES
+from robocas_ms3.robots.cameras import STANDARD_CAMERA_NAMES
 
 Split = Literal["train", "val"]
 Stage = Literal["layouts", "demonstrations", "datasets", "statistics"]
@@ -60,7 +60,9 @@ class ImagesConfig(StrictModel):
 
     def chosen(self) -> ImageOptions:
         """Return the settings as dataset writers take them."""
-        cameras = STANDARD_NAMES if self.cameras is None else tuple(self.cameras)  # None: a plan of an older version
+        cameras = (
+            STANDARD_CAMERA_NAMES if self.cameras is None else tuple(self.cameras)
+        )  # None: a plan of an older version
         return ImageOptions(cameras=cameras, size=self.size, depth=self.depth, image_format=self.image_format)
 
 

@@ -16,7 +16,7 @@ from mani_skill.utils.structs import Actor, Link, Pose
 
 from robocas_ms3.robots.cameras import CameraSpec
 from robocas_ms3.robots.description import RobotDescription
-from robocas_ms3.robots.drives import EvenDrives
+from robocas_ms3.robots.drives import InterpolatedDrives
 from robocas_ms3.robots.ee_controller import BODY_FRAME, RoboCASEEPoseControllerConfig, relative_pose
 from robocas_ms3.robots.ee_deltas import POSITION_SCALE, ROTATION_SCALE
 from robocas_ms3.robots.joint_controllers import (
@@ -189,7 +189,9 @@ class MobileManipulator(BaseAgent):
                 for link in self.robot.links:  # as ManiSkill does for those that it makes
                     link.disable_gravity = True
         super().set_control_mode(mode)
-        self._within_a_step = [part for part in self.controller.controllers.values() if isinstance(part, EvenDrives)]
+        self._within_a_step = [
+            part for part in self.controller.controllers.values() if isinstance(part, InterpolatedDrives)
+        ]
         if hasattr(self, "tcp"):  # not while the robot is being made
             self._still()
             if self.scene.gpu_sim_enabled and self.scene._gpu_sim_initialized:
@@ -206,7 +208,7 @@ class MobileManipulator(BaseAgent):
 
     def get_proprioception(self) -> dict[str, Any]:
         """Return the observed quantities, (N, D) each, and the controller's state."""
-        obs: dict[str, Any] = {one.name: one.observed(self) for one in QUANTITIES if one.observed}
+        obs: dict[str, Any] = {one.name: one.observe(self) for one in QUANTITIES if one.observe}
         state = self.controller.get_state()
         if state:
             obs["controller"] = state

@@ -71,12 +71,12 @@ STANDARD_CAMERAS = (
     CameraSpec("static_camera", "world", (1, 1.5, 1.5), (0, pi / 3, -pi / 2), near=0.05),
 )
 """Cameras of RoboCAS-v0. The static camera looks at a table in front of the robot."""
-STANDARD_NAMES = tuple(camera.name for camera in STANDARD_CAMERAS)
+STANDARD_CAMERA_NAMES = tuple(camera.name for camera in STANDARD_CAMERAS)
 EE_CAMERA = next(camera.name for camera in STANDARD_CAMERAS if camera.mount == "hand")
 """Camera whose pose tells how the EEF frame of a dataset is turned."""
 
 
-def standard_parent(camera: str) -> Parent:
+def standard_camera_parent(camera: str) -> Parent:
     """Return the parent of a camera by the names of the standard cameras; others are fixed in the world."""
     for spec in STANDARD_CAMERAS:
         if spec.name == camera:

@@ -16,7 +16,7 @@ from robocas_ms3.core.errors import RobotDescriptionError
 from robocas_ms3.robots.registry import RobotSpec
 
 Array = NDArray[np.float64]
-FIX = "Correct the file, or export it again."
+REPAIR_FILE = "Correct the file, or export it again."
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class Joint:
     limits: tuple[float, float] | None
 
 
-class DescriptionFile:
+class RobotXml:
     """A parsed URDF or SRDF file.
 
     Every method raises ``RobotDescriptionError`` where an element, an attribute or a number is missing or malformed.
@@ -68,7 +68,7 @@ class DescriptionFile:
             raise self.error("invalid robot description", "XML", error) from error
 
     def error(self, what: str, expected: object, found: object) -> RobotDescriptionError:
-        return RobotDescriptionError(what, where=self.path, expected=expected, found=found, fix=FIX)
+        return RobotDescriptionError(what, where=self.path, expected=expected, found=found, fix=REPAIR_FILE)
 
     def attribute(self, element: Element, key: str) -> str:
         if key not in element.attrib:
@@ -137,7 +137,7 @@ class DescriptionFile:
         return self.numbers(limit, "lower", 1)[0], self.numbers(limit, "upper", 1)[0]
 
 
-def link_poses(spec: RobotSpec, root_in_world: Array, qpos: Array) -> tuple[Array, Array]:
+def tcp_and_base_poses(spec: RobotSpec, root_in_world: Array, qpos: Array) -> tuple[Array, Array]:
     """Return poses of the TCP and of the arm's base in the world, (T, 4, 4) each.
 
     Whatever makes dataset actions of recorded states goes this way: equal states give equal numbers to the last bit,
@@ -149,11 +149,11 @@ def link_poses(spec: RobotSpec, root_in_world: Array, qpos: Array) -> tuple[Arra
         qpos: (T, 12) m, rad.
     """
     urdf, robot = spec.files().urdf, spec.description
-    base = root_in_world @ chain(urdf, robot.root_link, robot.arm_base_link, qpos[:, robot.base_slice])
-    return base @ chain(urdf, robot.arm_base_link, robot.tcp_link, qpos[:, robot.arm_slice]), base
+    base = root_in_world @ chain_poses(urdf, robot.root_link, robot.arm_base_link, qpos[:, robot.base_slice])
+    return base @ chain_poses(urdf, robot.arm_base_link, robot.tcp_link, qpos[:, robot.arm_slice]), base
 
 
-def chain(urdf: Path, root: str, tip: str, positions: Array) -> Array:
+def chain_poses(urdf: Path, root: str, tip: str, positions: Array) -> Array:
     """Return poses (T, 4, 4) of a link in another one, at positions (T, n) of the moving joints between."""
     pose = np.tile(np.eye(4), (len(positions), 1, 1))
     columns = iter(np.asarray(positions, np.float64).T)
@@ -174,4 +174,4 @@ def chain(urdf: Path, root: str, tip: str, positions: Array) -> Array:
 @lru_cache(maxsize=8)
 def read_joints(urdf: Path, root: str, tip: str) -> tuple[Joint, ...]:
     """Read the joints from one link of a URDF down to another, fixed ones included, in this order."""
-    return tuple(DescriptionFile(urdf).joints_between(root, tip))
+    return tuple(RobotXml(urdf).joints_between(root, tip))

@@ -11,7 +11,7 @@ from sapien.physx import PhysxArticulationJoint
 from robocas_ms3.core.arrays import as_tensor, clamp, to_native
 
 # Distances of a joint from its drive target (rad, m) that no motion explains: the state was set from outside.
-ARM_SET_FROM_OUTSIDE, HELD_SET_FROM_OUTSIDE = 0.3, 0.02
+ARM_RESET_DISTANCE, BASE_RESET_DISTANCE = 0.3, 0.02
 
 
 class BatchedDrives(PDJointPosController):
@@ -81,7 +81,7 @@ class DirectDrives(BatchedDrives):
             drive.set_drive_velocity_target(velocity)
 
 
-class EvenDrives(DirectDrives):
+class InterpolatedDrives(DirectDrives):
     """Moves the drive targets evenly from one to the next within a control step."""
 
     def _initialize_joints(self) -> None:

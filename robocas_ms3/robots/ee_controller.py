@@ -28,13 +28,13 @@ from robocas_ms3.core.arrays import (
     where,
 )
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.robots.drives import ARM_SET_FROM_OUTSIDE, EvenDrives
+from robocas_ms3.robots.drives import ARM_RESET_DISTANCE, InterpolatedDrives
 from robocas_ms3.robots.ee_deltas import ee_delta_target
 from robocas_ms3.robots.kinematics import SerialChain
 
 BODY_FRAME = "body_translation:body_aligned_body_rotation"
 # m and rad between the TCP and the pose it was asked for: beyond, something holds the arm back, or set it elsewhere.
-EE_HELD_BACK = (0.1, 0.5)
+EE_MAX_LAG = (0.1, 0.5)
 
 
 def relative_pose(frame: Link, link: Link) -> Pose:
@@ -82,7 +82,7 @@ class _ArmChainController(PDEEPoseController):
         return as_float(qpos), solved
 
 
-class RoboCASEEPoseController(EvenDrives, _ArmChainController):
+class RoboCASEEPoseController(InterpolatedDrives, _ArmChainController):
     """End-effector pose control: deltas in the end effector's frame, or absolute poses in the arm's base frame.
 
     Differs from ManiSkill's: rotations have their natural sign; body-frame deltas work on a GPU too, since the target
@@ -112,7 +112,7 @@ class RoboCASEEPoseController(EvenDrives, _ArmChainController):
         last = now = self._now()
         if self._target_qpos is not None:
             last = to_native(self._target_qpos)
-        start = where(abs(last - now) > ARM_SET_FROM_OUTSIDE, now, last)
+        start = where(abs(last - now) > ARM_RESET_DISTANCE, now, last)
         wanted = self._wanted_pose(reference, action)
         target, solved = self._solve(wanted, now)
         if not known_all_true(solved):
@@ -138,7 +138,7 @@ class RoboCASEEPoseController(EvenDrives, _ArmChainController):
         now = _relative_pose(cast("Link", self.root_link), self.ee_link)
         if not self.config.use_target or self._target_pose is None:
             return now
-        far, turned = EE_HELD_BACK
+        far, turned = EE_MAX_LAG
         target = to_native(self._target_pose.raw_pose)
         distance = norm(target[:, :3] - now[:, :3])
         cosine = abs((target[:, 3:] * now[:, 3:]).sum(1))  # of half the angle between them

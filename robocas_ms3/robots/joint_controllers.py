@@ -19,11 +19,11 @@ from mani_skill.utils.structs import Pose
 
 from robocas_ms3.core.arrays import as_tensor, clamp, concatenate, to_native, where
 from robocas_ms3.robots.drives import (
-    ARM_SET_FROM_OUTSIDE,
-    HELD_SET_FROM_OUTSIDE,
+    ARM_RESET_DISTANCE,
+    BASE_RESET_DISTANCE,
     BatchedDrives,
     DirectDrives,
-    EvenDrives,
+    InterpolatedDrives,
 )
 
 JOINT_SCALE = 0.1  # rad at |action| = 1, arm joints
@@ -54,7 +54,7 @@ class FingersControllerConfig(PDJointPosMimicControllerConfig):
     controller_cls = FingersController
 
 
-class SmoothJointPosController(EvenDrives):
+class SmoothJointPosController(InterpolatedDrives):
     """Joint positions, absolute or relative to the last target, whose drive target moves evenly within a control step.
 
     A target that jumps at 5 Hz makes the arm start and stop with every step, at twice the planned velocity. ManiSkill's
@@ -73,7 +73,7 @@ class SmoothJointPosController(EvenDrives):
         action = self._taken(action)
         assert self._target_qpos is not None, "the controller has not been reset"
         now, last = self._now(), to_native(self._target_qpos)
-        start = where(abs(last - now) > ARM_SET_FROM_OUTSIDE, now, last)
+        start = where(abs(last - now) > ARM_RESET_DISTANCE, now, last)
         travel = action if self.config.use_delta else action - start
         if self.config.max_speed is not None:
             furthest = self.config.max_speed / self._control_freq
@@ -112,7 +112,7 @@ class HeldJointsController(DirectDrives):
         """Keep the drive targets, unless the state was set from outside: then hold the joints where they are now."""
         assert self._target_qpos is not None, "the controller has not been reset"
         now, held = self._now(), to_native(self._target_qpos)
-        self._target_qpos = as_tensor(where(abs(held - now) > HELD_SET_FROM_OUTSIDE, now, held))
+        self._target_qpos = as_tensor(where(abs(held - now) > BASE_RESET_DISTANCE, now, held))
         self.set_drive_targets(self._target_qpos)
 
 

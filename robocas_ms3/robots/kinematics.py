@@ -30,7 +30,7 @@ class SerialChain:
     """Revolute joints between two links of a robot, with constants read from its URDF.
 
     Controllers use this class, on either array type; the planner uses `planning.kinematics.ArmChain`, datasets use
-    `description_file.link_poses`.
+    `description_file.tcp_and_base_poses`.
 
     All arrays are float64: float32 leaves errors near the tolerance, and TF32 of a GPU's products would exceed it.
 

@@ -70,15 +70,15 @@ class Quantity(ArraySpec):
         components: names of its numbers there; default: its own, numbered where it has several.
     """
 
-    observed: Callable[[Any], Any] | None = None
-    policy: str = ""
-    recorded: Callable[[Any], Any] | None = None
-    feature: str = ""
+    observe: Callable[[Any], Any] | None = None
+    policy_key: str = ""
+    record: Callable[[Any], Any] | None = None
+    lerobot_feature: str = ""
     components: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.optional and self.feature:
-            raise ValueError(f"an optional quantity has no LeRobot feature: {self.name}, {self.feature}")
+        if self.optional and self.lerobot_feature:
+            raise ValueError(f"an optional quantity has no LeRobot feature: {self.name}, {self.lerobot_feature}")
 
     @property
     def width(self) -> int:
@@ -114,8 +114,8 @@ QUANTITIES: tuple[Quantity, ...] = (
         ("T", 12),
         "m, rad",
         "base x, y, yaw; 7 arm joints; 2 fingers",
-        observed=lambda agent: agent.robot.get_qpos(),
-        policy="qpos",
+        observe=lambda agent: agent.robot.get_qpos(),
+        policy_key="qpos",
     ),
     Quantity(
         "qvel",
@@ -123,7 +123,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         ("T", 12),
         "m/s, rad/s",
         "velocities of qpos",
-        observed=lambda agent: agent.robot.get_qvel(),
+        observe=lambda agent: agent.robot.get_qvel(),
     ),
     Quantity(
         "tcp_in_arm_base",
@@ -131,8 +131,8 @@ QUANTITIES: tuple[Quantity, ...] = (
         ("T", 7),
         "m",
         "TCP in the arm base frame: position, quaternion wxyz",
-        observed=lambda agent: agent.tcp_in_arm_base.raw_pose,
-        policy="tcp_in_base",
+        observe=lambda agent: agent.tcp_in_arm_base.raw_pose,
+        policy_key="tcp_in_base",
     ),
     Quantity(
         "rel_pos",
@@ -140,7 +140,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         ("T", 3),
         "m",
         "EEF from step t to t+1, in the EEF frame at t; last row 0",
-        recorded=lambda motion: motion.tcp_motion[0],
+        record=lambda motion: motion.tcp_motion[0],
     ),
     Quantity(
         "rel_orn",
@@ -149,7 +149,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         "xyzw",
         "the same turn; last row the identity",
         quaternion=True,
-        recorded=lambda motion: motion.tcp_motion[1],
+        record=lambda motion: motion.tcp_motion[1],
     ),
     Quantity(
         "ee_pos",
@@ -157,8 +157,8 @@ QUANTITIES: tuple[Quantity, ...] = (
         ("T", 3),
         "m",
         _EE,
-        recorded=lambda motion: motion.tcp_in_base[:, :3, 3],
-        feature=STATE,
+        record=lambda motion: motion.tcp_in_base[:, :3, 3],
+        lerobot_feature=STATE,
         components=_XYZ,
     ),
     Quantity(
@@ -168,8 +168,8 @@ QUANTITIES: tuple[Quantity, ...] = (
         "xyzw",
         _EE,
         quaternion=True,
-        recorded=lambda motion: continuous_xyzw(motion.tcp_in_base),
-        feature=STATE,
+        record=lambda motion: continuous_xyzw(motion.tcp_in_base),
+        lerobot_feature=STATE,
         components=_XYZW,
     ),
     Quantity(
@@ -178,8 +178,8 @@ QUANTITIES: tuple[Quantity, ...] = (
         ("T", 7),
         "rad",
         "arm joints",
-        recorded=lambda motion: motion.qpos[:, RobotDescription.arm_slice],
-        feature=STATE,
+        record=lambda motion: motion.qpos[:, RobotDescription.arm_slice],
+        lerobot_feature=STATE,
         components=_JOINTS,
     ),
     Quantity(
@@ -188,8 +188,8 @@ QUANTITIES: tuple[Quantity, ...] = (
         ("T", 7),
         "rad/s",
         "velocities of the arm joints",
-        recorded=lambda motion: motion.qvel[:, RobotDescription.arm_slice],
-        feature="observation.joint_velocity",
+        record=lambda motion: motion.qvel[:, RobotDescription.arm_slice],
+        lerobot_feature="observation.joint_velocity",
         components=_JOINTS,
     ),
     Quantity(
@@ -198,8 +198,8 @@ QUANTITIES: tuple[Quantity, ...] = (
         ("T", 3),
         "m",
         _BASE,
-        recorded=lambda motion: motion.arm_base_in_world[:, :3, 3],
-        feature=ARM_BASE,
+        record=lambda motion: motion.arm_base_in_world[:, :3, 3],
+        lerobot_feature=ARM_BASE,
         components=_XYZ,
     ),
     Quantity(
@@ -209,8 +209,8 @@ QUANTITIES: tuple[Quantity, ...] = (
         "xyzw",
         _BASE,
         quaternion=True,
-        recorded=lambda motion: continuous_xyzw(motion.arm_base_in_world),
-        feature=ARM_BASE,
+        record=lambda motion: continuous_xyzw(motion.arm_base_in_world),
+        lerobot_feature=ARM_BASE,
         components=_XYZW,
     ),
     Quantity(
@@ -219,7 +219,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         ("T", 3),
         "m",
         "as rel_pos, of the arm base",
-        recorded=lambda motion: motion.base_motion[0],
+        record=lambda motion: motion.base_motion[0],
     ),
     Quantity(
         "base_rel_orn",
@@ -228,7 +228,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         "xyzw",
         "as rel_orn, of the arm base",
         quaternion=True,
-        recorded=lambda motion: motion.base_motion[1],
+        record=lambda motion: motion.base_motion[1],
     ),
     Quantity(
         GRIPPER_WIDTH,
@@ -237,10 +237,10 @@ QUANTITIES: tuple[Quantity, ...] = (
         "m",
         "distance between the finger pads: sum of both finger joints",
         limits=(-0.005, 0.085),
-        observed=lambda agent: agent.gripper_width[:, None],
-        policy=GRIPPER_WIDTH,
-        recorded=lambda motion: motion.qpos[:, RobotDescription.finger_slice].sum(axis=1),
-        feature=STATE,
+        observe=lambda agent: agent.gripper_width[:, None],
+        policy_key=GRIPPER_WIDTH,
+        record=lambda motion: motion.qpos[:, RobotDescription.finger_slice].sum(axis=1),
+        lerobot_feature=STATE,
     ),
     Quantity(
         "gripper_status",
@@ -248,8 +248,8 @@ QUANTITIES: tuple[Quantity, ...] = (
         ("T",),
         "",
         "command in force at this step: True = open (commanded width > 0.04 m)",
-        recorded=lambda motion: motion.gripper_open,
-        feature="observation.gripper_open",
+        record=lambda motion: motion.gripper_open,
+        lerobot_feature="observation.gripper_open",
         components=("gripper_open",),
     ),
     Quantity(
@@ -258,8 +258,8 @@ QUANTITIES: tuple[Quantity, ...] = (
         ("T", 3),
         "m, m, rad",
         "mobile base in the world: x, y, yaw, which never jumps",
-        recorded=lambda motion: motion.agv_pose,
-        feature=STATE,
+        record=lambda motion: motion.agv_pose,
+        lerobot_feature=STATE,
         components=("agv_x", "agv_y", "agv_yaw"),
     ),
     Quantity(
@@ -268,23 +268,23 @@ QUANTITIES: tuple[Quantity, ...] = (
         ("T", 3),
         "m, m, rad",
         "agv_pose[t+1] - agv_pose[t] (world frame); last row 0",
-        recorded=lambda motion: motion.agv_motion,
+        record=lambda motion: motion.agv_motion,
     ),
 )
 
 
-def features() -> dict[str, list[Quantity]]:
+def lerobot_features() -> dict[str, list[Quantity]]:
     """Return the quantities that each LeRobot feature of observations holds, in their order."""
     found: dict[str, list[Quantity]] = {}
     for quantity in QUANTITIES:
-        if quantity.feature:
-            found.setdefault(quantity.feature, []).append(quantity)
+        if quantity.lerobot_feature:
+            found.setdefault(quantity.lerobot_feature, []).append(quantity)
     return found
 
 
-def columns_of(feature: str) -> dict[str, slice]:
+def feature_columns(feature: str) -> dict[str, slice]:
     """Return the columns of each quantity in a LeRobot feature (T, D), by its name."""
     columns, first = {}, 0
-    for quantity in features()[feature]:
+    for quantity in lerobot_features()[feature]:
         columns[quantity.name] = slice(first, first := first + quantity.width)
     return columns

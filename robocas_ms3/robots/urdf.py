@@ -57,7 +57,7 @@ class RobotFiles:
     folder: Path
 
 
-def robot_files(finger_extension: float = c.finger_extension) -> RobotFiles:
+def make_robot_files(finger_extension: float = c.finger_extension) -> RobotFiles:
     """Return the robot's files, generating them where they are missing.
 
     The folder's name is a hash of all they are made from, this generator's code included.
@@ -76,7 +76,7 @@ def robot_files(finger_extension: float = c.finger_extension) -> RobotFiles:
         arm_srdf=folder / "panda_arm.srdf",
         folder=folder,
     )
-    made_once(folder, lambda tmp: _generate(tmp, source, finger_extension))
+    make_once(folder, lambda tmp: _generate(tmp, source, finger_extension))
     return files
 
 
@@ -263,7 +263,7 @@ def _write(root: Element, path: Path) -> None:
     ElementTree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
 
 
-def made_once(folder: Path, make: Callable[[Path], None]) -> None:
+def make_once(folder: Path, make: Callable[[Path], None]) -> None:
     """Make a folder, named by all that it is made from, unless it is complete; other processes wait."""
     if _is_complete(folder):
         return

@@ -18,9 +18,9 @@ from robocas_ms3.assets.physics import (
     add_component,
     add_ground,
     engine_settings,
-    new_scene,
+    make_scene,
+    make_solid,
     pose_matrix,
-    solid_of,
 )
 from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.core.poses import from_xyz_yaw, transform_points
@@ -95,7 +95,7 @@ def _fill_bucket(
     """Return poses (K, 4, 4) of objects after they have fallen into the bucket, each as one convex hull."""
     # a narrower bucket makes a higher heap, which spreads when the walls are removed
     middle, half = _middle(region), layout.bucket * np.subtract(region.max_xy, region.min_xy) / 2
-    scene = new_scene()
+    scene = make_scene()
     add_ground(scene, np.array([*middle, region.z]))
     _add_walls(scene, middle, half, region.z)
     bodies: dict[int, physx.PhysxRigidDynamicComponent] = {}
@@ -110,7 +110,7 @@ def _fill_bucket(
             (transform_points(pose_matrix(b), outlines[i])[:, 2].max() for i, b in bodies.items()), default=region.z
         )
         pose = from_xyz_yaw(x, y, top + layout.drop_height - points[:, 2].min(), 0) @ pose
-        bodies[index] = add_body(scene, replace(solid_of(asset), hulls=[outlines[index]]), pose)
+        bodies[index] = add_body(scene, replace(make_solid(asset), hulls=[outlines[index]]), pose)
         _run(scene, layout.fall_seconds, list(bodies.values()))
     _run(scene, BUCKET_SECONDS, list(bodies.values()))
     return np.stack([pose_matrix(bodies[i]) for i in range(len(assets))])
@@ -119,10 +119,10 @@ def _fill_bucket(
 def _spread(assets: Sequence[LoadedObject], poses: Array, region: Region) -> Array:
     """Return poses (K, 4, 4) of objects after bucket and fence have been removed."""
     middle = _middle(region)
-    scene = new_scene()
+    scene = make_scene()
     add_ground(scene, np.array([*middle, region.z]))
     fence = _add_walls(scene, middle, np.subtract(region.max_xy, region.min_xy) / 2, region.z)
-    bodies = [add_body(scene, solid_of(asset), pose) for asset, pose in zip(assets, poses, strict=True)]
+    bodies = [add_body(scene, make_solid(asset), pose) for asset, pose in zip(assets, poses, strict=True)]
     _run(scene, SPREAD_SECONDS, bodies)
     for wall in fence:
         wall.remove_from_scene()

@@ -7,7 +7,15 @@ from collections.abc import Callable
 
 import numpy as np
 
-from robocas_ms3.assets.physics import TIME_STEP, Solid, add_body, add_fixed, engine_settings, new_scene, pose_matrix
+from robocas_ms3.assets.physics import (
+    TIME_STEP,
+    RigidBody,
+    add_body,
+    add_static_body,
+    engine_settings,
+    make_scene,
+    pose_matrix,
+)
 from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.core.poses import from_xyz_yaw, transform_points
 from robocas_ms3.robots.description import PANDA_ENVELOPE
@@ -96,15 +104,17 @@ def is_basket_stable(model: SceneModel, basket_pose: Array) -> bool:
         for corner in itertools.product(*zip(facts.inner.min[:2], facts.inner.max[:2], strict=True)):
             load = np.array([*corner, facts.inner.min[2]])
             center = (facts.mass * own_center + LOAD * load) / mass
-            if not _stands(Solid(model.basket.hulls, mass, center, inertia, axes, facts.friction), model, basket_pose):
+            if not _stands(
+                RigidBody(model.basket.hulls, mass, center, inertia, axes, facts.friction), model, basket_pose
+            ):
                 return False
     return True
 
 
-def _stands(solid: Solid, model: SceneModel, pose: Array) -> bool:
-    scene = new_scene()
+def _stands(solid: RigidBody, model: SceneModel, pose: Array) -> bool:
+    scene = make_scene()
     add_furniture(scene, model)
-    add_fixed(scene, model.room.hulls, np.eye(4), model.room.asset.friction)
+    add_static_body(scene, model.room.hulls, np.eye(4), model.room.asset.friction)
     body = add_body(scene, solid, pose)
     for _ in range(round(STAND_SECONDS / TIME_STEP)):
         scene.step()

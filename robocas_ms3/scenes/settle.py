@@ -9,7 +9,15 @@ import sapien
 
 from robocas_ms3.assets.kinematics import link_poses
 from robocas_ms3.assets.pack import LoadedObject
-from robocas_ms3.assets.physics import TIME_STEP, add_body, add_fixed, engine_settings, new_scene, pose_matrix, solid_of
+from robocas_ms3.assets.physics import (
+    TIME_STEP,
+    add_body,
+    add_static_body,
+    engine_settings,
+    make_scene,
+    make_solid,
+    pose_matrix,
+)
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.placement import Array
 
@@ -82,13 +90,13 @@ def _simulate(
     Returns:
         Poses (K, 4, 4) at the end; whether all objects are at rest half-way and at the end.
     """
-    scene = new_scene()
+    scene = make_scene()
     add_furniture(scene, model)
     if model.basket is not None and basket_pose is not None:
-        add_fixed(scene, model.basket.hulls, basket_pose, model.basket.asset.friction)
+        add_static_body(scene, model.basket.hulls, basket_pose, model.basket.asset.friction)
     order = -1 if backwards else 1
     placed = list(zip(assets, poses, strict=True))[::order]
-    bodies = [add_body(scene, solid_of(asset), pose) for asset, pose in placed][::order]
+    bodies = [add_body(scene, make_solid(asset), pose) for asset, pose in placed][::order]
     at_rest = True
     for _ in range(2):
         for _ in range(round(seconds / TIME_STEP / 2)):
@@ -103,6 +111,6 @@ def add_furniture(scene: sapien.Scene, model: SceneModel) -> None:
     """Add the furniture as fixed bodies, with doors and drawers at their start positions."""
     for name, asset in model.furniture.items():
         frame = model.furniture_poses[name]
-        add_fixed(scene, asset.hulls, frame, asset.asset.friction)
+        add_static_body(scene, asset.hulls, frame, asset.asset.friction)
         for link, motion in link_poses(asset.asset.links, model.joint_positions(name, opened=False)).items():
-            add_fixed(scene, asset.links[link].hulls, frame @ motion, asset.asset.friction)
+            add_static_body(scene, asset.links[link].hulls, frame @ motion, asset.asset.friction)

@@ -14,7 +14,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
-from robocas_ms3.assets.pack import Part, VisualLevel
+from robocas_ms3.assets.pack import BodyFiles, VisualLevel
 from robocas_ms3.core.poses import transform_points
 from robocas_ms3.scenes.placement import Array
 
@@ -78,7 +78,7 @@ def _mesh_of(path: Path, _changed_ns: int) -> trimesh.Trimesh:
     return mesh
 
 
-def object_mesh(asset: Part, level: VisualLevel = "fast") -> trimesh.Trimesh:
+def object_mesh(asset: BodyFiles, level: VisualLevel = "fast") -> trimesh.Trimesh:
     """Return the visual mesh in the asset's frame; it is shared between callers, so don't change it."""
     path = asset.visual(level)
     return _mesh_of(path, path.stat().st_mtime_ns)

@@ -20,7 +20,7 @@ from robocas_ms3.core.arrays import Array, as_tensor
 from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.core.extensions import load_object
 from robocas_ms3.robots.agent import MobileManipulator
-from robocas_ms3.robots.registry import DEFAULT, find_robot
+from robocas_ms3.robots.registry import DEFAULT_ROBOT, find_robot
 from robocas_ms3.scenes import build
 from robocas_ms3.scenes.cache import layout_source
 from robocas_ms3.scenes.config import TaskConfig, load_config_for
@@ -83,7 +83,7 @@ class RoboCASEnv(BaseEnv):
         visual_level: VisualLevel = "fast",
         layouts: str | Path | LayoutSource | None = "auto",
         seeds: tuple[int, int] | None = None,
-        robot_uids: str | None = DEFAULT,
+        robot_uids: str | None = DEFAULT_ROBOT,
         num_envs: int = 1,
         **kwargs: Any,
     ) -> None:

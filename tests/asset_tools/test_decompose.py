@@ -11,7 +11,7 @@ from models import ball_dropped_into
 from asset_tools.decompose import GPU_LIMIT, MAX_VERTICES, decompose, few_vertices, flat_faces
 from asset_tools.prepare import prepare
 from asset_tools.quality.hulls import hull_quality
-from robocas_ms3.assets.cooked_hulls import cooking_faults
+from robocas_ms3.assets.cooked_hulls import find_hull_violations
 from robocas_ms3.assets.hulls import write_hulls
 from robocas_ms3.assets.pack import HULLS
 
@@ -37,7 +37,7 @@ def test_a_scanned_cup_stays_hollow(tmp_path):
     assert quality.hull_vertices <= 62 and max(map(flat_faces, found.hulls)) <= GPU_LIMIT  # the floor's is the largest
     (tmp_path / "asset").mkdir()
     write_hulls(tmp_path / "asset" / HULLS, found.hulls)
-    assert cooking_faults(tmp_path) == []
+    assert find_hull_violations(tmp_path) == []
     for x, y in ((0, 0), (0.02, 0), (-0.012, 0.012)):
         end = ball_dropped_into(tmp_path / "asset" / HULLS, [x, y, 0.13], BALL)
         assert end[2] == pytest.approx(0.004 + BALL, abs=2e-3)

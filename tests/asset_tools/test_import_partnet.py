@@ -13,7 +13,7 @@ from asset_tools.partnet.template import template
 from asset_tools.pipeline import write_pack
 from asset_tools.quality.furniture import examine_furniture
 from asset_tools.quality.overlap import convex, deepest
-from robocas_ms3.assets.hulls import box_of
+from robocas_ms3.assets.hulls import find_box
 from robocas_ms3.assets.kinematics import joint_motion
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.errors import AssetError
@@ -103,7 +103,7 @@ def test_what_is_too_slender_for_a_gpu_is_halved_or_becomes_a_box():
     halves = for_gpu(bars[1.6])
     assert [len(half) for half in halves] == [6, 6]
     assert sorted(half[:, 0].max() for half in halves) == pytest.approx([0.8, 1.6])
-    (box,) = [box_of(piece) for piece in for_gpu(bars[4.0])]
+    (box,) = [find_box(piece) for piece in for_gpu(bars[4.0])]
     assert box is not None and 8 * np.prod(box.half_size) == pytest.approx(4.0 * 0.03 * 0.04)
 
 

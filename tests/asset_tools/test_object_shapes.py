@@ -17,7 +17,7 @@ from asset_tools.repair import close
 from asset_tools.simplify import simplified
 from asset_tools.sources import ObjectSource
 from asset_tools.visual import to_display
-from robocas_ms3.assets.cooked_hulls import OBLONG, SHRINKAGE, cook_hulls, cooking_faults
+from robocas_ms3.assets.cooked_hulls import OBLONG, SHRINKAGE, cook_hulls, find_hull_violations
 
 
 def moved(mesh, *by):
@@ -209,7 +209,7 @@ def test_an_object_is_built(mesh, tmp_path):
     asset = build_object(source, tmp_path / "thing")
     assert asset.quality.rest_share >= 0.9
     assert asset.grasp_count >= 50 or asset.no_grasps_because
-    assert cooking_faults(tmp_path) == []
+    assert find_hull_violations(tmp_path) == []
     if mesh is DIE:  # m a2 / 6 = 2.7e-10 kg m2: rounded to a nanounit it would have none
         assert asset.inertia == pytest.approx([1e-4 * 0.004**2 / 6] * 3, rel=1e-8)
 

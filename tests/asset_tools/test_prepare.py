@@ -8,7 +8,7 @@ from asset_tools.decompose import decompose
 from asset_tools.inertia import principal_inertia
 from asset_tools.prepare import level_base, prepare
 from asset_tools.resting_poses import resting_poses
-from robocas_ms3.assets.physics import Solid
+from robocas_ms3.assets.physics import RigidBody
 from robocas_ms3.core.errors import AssetError
 
 
@@ -27,7 +27,7 @@ def carton(bulge, size=0.07, height=0.19):
 def poses_of(closed):
     inertia, axes = principal_inertia(closed, 0.3)
     hulls = decompose(closed).hulls
-    return resting_poses(Solid(hulls, 0.3, closed.center_mass, np.array(inertia), np.array(axes)))
+    return resting_poses(RigidBody(hulls, 0.3, closed.center_mass, np.array(inertia), np.array(axes)))
 
 
 def test_a_bulging_base_is_pressed_flat():

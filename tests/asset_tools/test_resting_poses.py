@@ -9,14 +9,14 @@ from sapien import physx
 
 from asset_tools.resting_poses import RestingPoses, resting_poses
 from asset_tools.stability import toppling_angle
-from robocas_ms3.assets.physics import Solid
+from robocas_ms3.assets.physics import RigidBody
 from robocas_ms3.core.errors import AssetError
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 
 
-def body(*hulls, mass=0.3, center=(0, 0, 0), inertia=(4e-5, 4e-5, 4e-5)) -> Solid:
-    return Solid(hulls, mass, np.array(center, float), np.array(inertia, float), IDENTITY)
+def body(*hulls, mass=0.3, center=(0, 0, 0), inertia=(4e-5, 4e-5, 4e-5)) -> RigidBody:
+    return RigidBody(hulls, mass, np.array(center, float), np.array(inertia, float), IDENTITY)
 
 
 def box_points(x: float, y: float, z: float) -> np.ndarray:

@@ -3,7 +3,7 @@
 import numpy as np
 import trimesh
 
-from robocas_ms3.assets.cooked_hulls import SHRINKAGE, CookingFault, cook_hulls, cooking_faults
+from robocas_ms3.assets.cooked_hulls import SHRINKAGE, HullViolation, cook_hulls, find_hull_violations
 from robocas_ms3.assets.hulls import write_hulls
 from robocas_ms3.core.paths import builtin_packs_dir
 
@@ -32,7 +32,7 @@ def test_hulls_that_a_gpu_would_cut_down_or_leave_out_are_named(tmp_path):
     written(tmp_path / "desk" / "links" / "drawer", [ball])
     # both are a metre long and 2 mm thick, but boxes are never cooked
     written(tmp_path / "rods", [box(1.0, 0.002, 0.002), prism(6, radius=0.001, length=1.0)])
-    found = cooking_faults(tmp_path)
+    found = find_hull_violations(tmp_path)
     lost = found[0].cooked.lost
     assert SHRINKAGE < lost < 0.05
     assert [str(fault) for fault in found] == [
@@ -45,8 +45,8 @@ def test_hulls_that_a_gpu_would_cut_down_or_leave_out_are_named(tmp_path):
 def test_what_the_engine_refuses_is_named():
     (cooked,) = cook_hulls([np.eye(3)])  # no body of three points
     assert cooked.lost == np.inf
-    assert str(CookingFault("dot", 2, "CPU", cooked)) == "dot: hull 2 can't be built on a CPU"
+    assert str(HullViolation("dot", 2, "CPU", cooked)) == "dot: hull 2 can't be built on a CPU"
 
 
 def test_hulls_of_the_builtin_pack_are_cooked_as_they_are():
-    assert cooking_faults(builtin_packs_dir() / "builtin") == []
+    assert find_hull_violations(builtin_packs_dir() / "builtin") == []

@@ -4,9 +4,9 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.assets.hulls import (
-    box_of,
-    center_of,
+    center_of_mass,
     convex_faces,
+    find_box,
     read_hulls,
     sample_surface,
     sample_triangles,
@@ -64,7 +64,7 @@ def test_surface_of_a_union_leaves_out_what_is_inside(tmp_path):
 
 
 def test_a_box_along_the_axes_is_not_turned():
-    box = box_of(CUBE * [1, 2, 30] + [0.5, 0, -1])
+    box = find_box(CUBE * [1, 2, 30] + [0.5, 0, -1])
     np.testing.assert_allclose(box.half_size, [0.05, 0.1, 1.5], atol=1e-12)
     np.testing.assert_allclose(box.pose[:3, 3], [0.55, 0.1, 0.5], atol=1e-12)
     np.testing.assert_array_equal(box.pose[:3, :3], np.eye(3))
@@ -75,7 +75,7 @@ def test_a_box_is_known_however_it_is_turned_and_its_corners_ordered(seed):
     rng = np.random.default_rng(seed)
     size, turn = rng.uniform(0.002, 1.0, 3), Rotation.random(random_state=seed).as_matrix()
     corners = np.round((CUBE / 0.1 - 0.5) * size @ turn.T + [0.3, -0.2, 0.7], 7)[rng.permutation(8)]
-    box = box_of(corners)
+    box = find_box(corners)
     assert sorted(box.half_size) == pytest.approx(sorted(size / 2), abs=1e-6)
     np.testing.assert_allclose(box.pose[:3, 3], [0.3, -0.2, 0.7], atol=1e-6)
     assert np.linalg.det(box.pose[:3, :3]) == pytest.approx(1)
@@ -84,13 +84,13 @@ def test_a_box_is_known_however_it_is_turned_and_its_corners_ordered(seed):
 
 
 def test_what_is_no_box_is_none():
-    assert box_of(CUBE[:7]) is None
+    assert find_box(CUBE[:7]) is None
     moved = CUBE.copy()
     moved[3] += [0, 0, 5e-5]  # a corner that is off by a twentieth of a millimetre
-    assert box_of(moved) is None
-    assert box_of(CUBE + np.outer(CUBE[:, 2], [0.1, 0, 0])) is None  # sheared
-    assert box_of(CUBE * (1 - CUBE[:, 2:])) is None  # narrower at the top
-    assert box_of(np.random.default_rng(0).uniform(size=(8, 3))) is None
+    assert find_box(moved) is None
+    assert find_box(CUBE + np.outer(CUBE[:, 2], [0.1, 0, 0])) is None  # sheared
+    assert find_box(CUBE * (1 - CUBE[:, 2:])) is None  # narrower at the top
+    assert find_box(np.random.default_rng(0).uniform(size=(8, 3))) is None
 
 
 def test_slenderness_is_reach_over_depth_from_the_centre_of_mass():
@@ -98,5 +98,5 @@ def test_slenderness_is_reach_over_depth_from_the_centre_of_mass():
     assert slenderness(CUBE * [1, 1, 12]) == pytest.approx(12)
     # a right tetrahedron: its centre of mass is a quarter up each leg, so 3/4 from its tips and 1/4 / sqrt(3) deep
     legs = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=float)
-    np.testing.assert_allclose(center_of(legs), 0.25)
+    np.testing.assert_allclose(center_of_mass(legs), 0.25)
     assert slenderness(legs) == pytest.approx(0.75 / (0.25 / np.sqrt(3)))

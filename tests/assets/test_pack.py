@@ -6,10 +6,10 @@ import pytest
 from made_up_assets import furniture_asset, object_asset
 from pydantic import ValidationError
 
-from robocas_ms3.assets.annotations import Annotations, footprints
+from robocas_ms3.assets.annotations import Annotations, compute_footprints
 from robocas_ms3.assets.hulls import write_hulls
 from robocas_ms3.assets.manifest import PackManifest
-from robocas_ms3.assets.pack import load_pack, pack_folders, sha256
+from robocas_ms3.assets.pack import find_packs, load_pack, sha256
 from robocas_ms3.core.errors import AssetError
 
 BOX = np.array([[x, y, z] for x in (-0.05, 0.05) for y in (-0.03, 0.03) for z in (-0.02, 0.02)])
@@ -22,7 +22,7 @@ def notes(**changes):
     on_end[2, 3] = 0.05
     values = {
         "resting_poses": np.stack([upright, on_end]),
-        "footprints": footprints([BOX], np.stack([upright, on_end])),
+        "footprints": compute_footprints([BOX], np.stack([upright, on_end])),
         "resting_probabilities": np.array([0.7, 0.3]),
         "display_pose": 0,
         "grasps_tcp_in_object": np.eye(4)[None],
@@ -52,7 +52,7 @@ def box_pack(tmp_path):
 
 def test_a_pack_is_found_by_name_and_by_path(box_pack, monkeypatch):
     monkeypatch.setenv("ROBOCAS_DATA", str(box_pack.parent.parent))
-    assert "boxes" in pack_folders()
+    assert "boxes" in find_packs()
     assert load_pack("boxes").objects.keys() == load_pack(box_pack).objects.keys() == {"box"}
     with pytest.raises(AssetError, match=r"spam: no such asset pack.*boxes.*import-scans.*import-partnet"):
         load_pack("spam")
@@ -192,7 +192,7 @@ def test_a_footprint_has_each_corner_once():
     slab = np.array([[x, y, z] for x, y in ((0.03, 0), (-0.02, 0.02), (-0.02, -0.02)) for z in (-0.01, 0.01)])
     poses = np.stack([np.eye(4), np.eye(4)])
     poses[1, :3, :3] = [[0, 0, -1], [0, 1, 0], [1, 0, 0]]  # on its edge: a rectangle of 0.02 x 0.04
-    found = notes(resting_poses=poses, footprints=footprints([slab], poses))
+    found = notes(resting_poses=poses, footprints=compute_footprints([slab], poses))
     assert len(found.footprint(0)) == 3 and len(found.footprint(1)) == 4
     np.testing.assert_allclose(np.ptp(found.footprint(1), axis=0), [0.02, 0.04])
 

@@ -10,8 +10,8 @@ from sapien.physx import PhysxCollisionShapeBox, PhysxCollisionShapeConvexMesh, 
 
 from robocas_ms3.assets.hulls import write_hulls
 from robocas_ms3.assets.manifest import Joint, Link
-from robocas_ms3.assets.pack import LoadedFurniture, Part
-from robocas_ms3.assets.physics import shapes_of
+from robocas_ms3.assets.pack import BodyFiles, LoadedFurniture
+from robocas_ms3.assets.physics import load_shapes
 from robocas_ms3.assets.spawn import spawn, spawn_articulation
 from robocas_ms3.core.errors import AssetError
 
@@ -30,7 +30,7 @@ def cabinet(tmp_path):
     write_hulls(tmp_path / "links" / "drawer" / "hulls.obj", [box((0, 0, 0.03), (0.2, 0.2, 0.1))])
     link = Link(name="drawer", joint=DRAWER, mass=1.5, center_of_mass=(0.1, 0.1, 0.065), inertia=(0.006, 0.006, 0.01))
     asset = furniture_asset("cabinet", extents=(0.2, 0.2, 0.1), links=(link,))
-    return LoadedFurniture(tmp_path, asset=asset, links={"drawer": Part(tmp_path / "links" / "drawer")})
+    return LoadedFurniture(tmp_path, asset=asset, links={"drawer": BodyFiles(tmp_path / "links" / "drawer")})
 
 
 @pytest.fixture
@@ -74,7 +74,7 @@ def test_furniture_without_moving_parts_is_a_static_actor(scene, cabinet):
 def test_hulls_are_built_as_boxes_where_they_are_boxes_and_each_in_its_place(scene, tmp_path):
     wedge = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
     write_hulls(tmp_path / "hulls.obj", [wedge, box((0.2, 0, 0), (0.3, 0.4, 0.6)), wedge + [0.5, 0, 0]])
-    first, second, third = shapes_of(Part(tmp_path), PhysxMaterial(0.5, 0.5, 0.0))
+    first, second, third = load_shapes(BodyFiles(tmp_path), PhysxMaterial(0.5, 0.5, 0.0))
     assert isinstance(second, PhysxCollisionShapeBox)
     np.testing.assert_allclose(second.half_size, [0.05, 0.2, 0.3], atol=1e-7)
     np.testing.assert_allclose(second.local_pose.p, [0.25, 0.2, 0.3], atol=1e-7)

@@ -16,20 +16,20 @@ from robocas_ms3.robots import quantities
 quantities.QUANTITIES = (
     quantities.Quantity(
         "yaw", "float32", ("T",), "rad", "of the base, in its root",
-        recorded=lambda motion: motion.qpos[:, 2],
-        feature="observation.state",
+        record=lambda motion: motion.qpos[:, 2],
+        lerobot_feature="observation.state",
     ),
     *quantities.QUANTITIES,
     quantities.Quantity(
         "fingers", "float32", ("T", 2), "m", "positions of both fingers",
-        observed=lambda agent: agent.robot.get_qpos()[:, 10:],
-        policy="fingers",
-        recorded=lambda motion: motion.qpos[:, 10:],
-        feature="observation.fingers",
+        observe=lambda agent: agent.robot.get_qpos()[:, 10:],
+        policy_key="fingers",
+        record=lambda motion: motion.qpos[:, 10:],
+        lerobot_feature="observation.fingers",
     ),
     quantities.Quantity(
         "gap", "float32", ("T",), "m", "between the fingers",
-        recorded=lambda motion: motion.qpos[:, 10:].sum(axis=1),
+        record=lambda motion: motion.qpos[:, 10:].sum(axis=1),
         optional=True,
     ),
 )

@@ -46,7 +46,7 @@ from robocas_ms3.evaluation.report.tables import render_markdown
 from robocas_ms3.plans.folder import OUTCOME, OUTCOMES, PLAN, Outcome, PlanFolder, WorkUnit, read_plan
 from robocas_ms3.plans.load import load_plan, shipped_plans
 from robocas_ms3.plans.status import read_status
-from robocas_ms3.robots.cameras import STANDARD_NAMES
+from robocas_ms3.robots.cameras import STANDARD_CAMERA_NAMES
 from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.scenes.layout_table import FrozenLayouts, LayoutTable, write_frozen_layouts, write_table
 from robocas_ms3.viewer.routes import Routes
@@ -65,7 +65,7 @@ LAYOUT = Layout(
 RUN = {"settings": asdict(EpisodeSettings("pick")), "first_seed": 0, "versions": {"a": "1"}}
 FAILURE = {"seed": 1, "attempt": 0, "stage": "a", "reason": "b", "seconds": 1.0}
 ENTRY = {"trajectory": "F.h5", "trajectory_episode": 0, "seed": 3, "success": True, "recording": "ab", "source": 0}
-CONVERSION = dataset_settings(5, ImageOptions(STANDARD_NAMES), False)
+CONVERSION = dataset_settings(5, ImageOptions(STANDARD_CAMERA_NAMES), False)
 
 
 # What is whole at first: functions that write it into a folder

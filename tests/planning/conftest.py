@@ -8,12 +8,12 @@ from planning_scenes import Checker
 from robocas_ms3.planning.kinematics import ArmChain, Reachability
 from robocas_ms3.planning.rrt_connect import RRTConnectPlanner
 from robocas_ms3.robots.description import MOBILE_PANDA
-from robocas_ms3.robots.urdf import RobotFiles, robot_files
+from robocas_ms3.robots.urdf import RobotFiles, make_robot_files
 
 
 @pytest.fixture(scope="session")
 def panda_files() -> RobotFiles:
-    return robot_files()
+    return make_robot_files()
 
 
 @pytest.fixture(scope="session")

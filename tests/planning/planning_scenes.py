@@ -11,7 +11,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.robots.description import MOBILE_PANDA
-from robocas_ms3.robots.description_file import DescriptionFile, chain
+from robocas_ms3.robots.description_file import RobotXml, chain_poses
 
 REST = np.array([0, -1.02, 0, -2.51, 0, 1.35, 0.78])
 
@@ -60,7 +60,7 @@ class Checker:
     """Poses of links by the URDF, and the collision shapes in it."""
 
     def __init__(self, urdf: Path) -> None:
-        self._file = DescriptionFile(urdf)
+        self._file = RobotXml(urdf)
         self.parts: list[tuple[str, np.ndarray]] = []  # link, and vertices of a convex part in its frame
         for link in self._file.root.iterfind("link"):
             for collision in link.iterfind("collision"):
@@ -76,7 +76,7 @@ class Checker:
     def poses(self, link: str, qpos: np.ndarray, finger: float = 0.04) -> np.ndarray:
         """Poses (T, 4, 4) of a link in the arm's base at configurations (T, 7)."""
         positions = np.column_stack([qpos, np.full(len(qpos), finger)])
-        return chain(self._file.path, MOBILE_PANDA.arm_base_link, link, positions)
+        return chain_poses(self._file.path, MOBILE_PANDA.arm_base_link, link, positions)
 
     def link_pose(self, link: str, qpos: np.ndarray) -> np.ndarray:
         return self.poses(link, np.asarray(qpos)[None])[0]

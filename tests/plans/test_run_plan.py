@@ -30,7 +30,7 @@ from robocas_ms3.plans.folder import Outcome, PlanFolder, WorkUnit
 from robocas_ms3.plans.run import join_plan, run_shard
 from robocas_ms3.plans.status import read_status
 from robocas_ms3.plans.worker import Recorder, WorkUnitWorker
-from robocas_ms3.robots.cameras import STANDARD_NAMES
+from robocas_ms3.robots.cameras import STANDARD_CAMERA_NAMES
 
 SUPPORT = Path(__file__).resolve().parents[1] / "support"
 
@@ -197,7 +197,7 @@ def test_another_plan_is_refused_unless_it_is_to_overwrite_but_limits_and_descri
         with pytest.raises(RobocasError, match="block: 3 -> 4"):
             start(out, other)
     limits = PLAN.limits.model_copy(update={"memory_gb": 3.0})
-    images = PLAN.images.model_copy(update={"cameras": list(STANDARD_NAMES)})  # none are in older plans
+    images = PLAN.images.model_copy(update={"cameras": list(STANDARD_CAMERA_NAMES)})  # none are in older plans
     run_here(out, PLAN.model_copy(update={"limits": limits, "description": "another", "images": images}))
     assert_same(undisturbed, out)
     assert json.loads((out / "plan.json").read_text())["plan"]["limits"]["memory_gb"] == 3.0

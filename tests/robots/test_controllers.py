@@ -9,9 +9,9 @@ from robot_checks import matrix, moved
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.robots.description import MOBILE_PANDA
-from robocas_ms3.robots.description_file import chain
+from robocas_ms3.robots.description_file import chain_poses
 from robocas_ms3.robots.ee_deltas import to_ee_delta_action
-from robocas_ms3.robots.urdf import robot_files
+from robocas_ms3.robots.urdf import make_robot_files
 
 MODES = {"pd_joint_pos": 8, "pd_joint_delta_pos": 8, "pd_ee_delta_pose": 7, "pd_ee_pose": 7}
 ALL_MODES = {**MODES, **{f"{mode}_base": size + 3 for mode, size in MODES.items()}}
@@ -75,7 +75,7 @@ def near_a_limit(agent, joint: int) -> tuple[np.ndarray, np.ndarray]:
     arms[:, joint - 1] = MOBILE_PANDA.arm_limits[joint - 1][1] + np.array([-0.01, 0.1])
     agent.reset(np.array([0, 0, 0, *arms[0], 0.04, 0.04]))
     agent.controller.reset()
-    return tuple(chain(robot_files().arm_urdf, MOBILE_PANDA.arm_base_link, MOBILE_PANDA.tcp_link, arms))
+    return tuple(chain_poses(make_robot_files().arm_urdf, MOBILE_PANDA.arm_base_link, MOBILE_PANDA.tcp_link, arms))
 
 
 def ee_action(mode: str, now: np.ndarray, goal: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ from robocas_ms3.core.errors import ExtensionError, RobocasError
 from robocas_ms3.robots.cameras import CameraSpec
 from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.quantities import Quantity
-from robocas_ms3.robots.registry import DEFAULT, PANDA, ROBOTS, find_robot
+from robocas_ms3.robots.registry import DEFAULT_ROBOT, PANDA, ROBOTS, find_robot
 
 
 def test_positions_are_where_the_slices_say():
@@ -37,8 +37,8 @@ def test_another_number_of_joints_does_not_fit(part, what):
 
 
 def test_robots_are_known_by_their_uids():
-    assert DEFAULT == "robocas_mobile_panda"
-    assert find_robot(None) is find_robot(DEFAULT) is PANDA
+    assert DEFAULT_ROBOT == "robocas_mobile_panda"
+    assert find_robot(None) is find_robot(DEFAULT_ROBOT) is PANDA
     assert {name: spec.description.uid for name, spec in ROBOTS.items()} == {name: name for name in ROBOTS}
     with pytest.raises(ExtensionError, match="here: no such robot .*Did you mean robocas_mobile_panda"):
         find_robot("robocas_mobile_pandas", where="here")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from robocas_ms3.core.errors import RobotDescriptionError
-from robocas_ms3.robots.description_file import DescriptionFile, read_joints
+from robocas_ms3.robots.description_file import RobotXml, read_joints
 
 ARM = """<robot name="arm">
   <link name="base"/><link name="upper"/><link name="lower"/><link name="pad"/>
@@ -30,7 +30,7 @@ def write(tmp_path):
 
 
 def test_joints_between_two_links_are_in_order_from_the_root(write):
-    joints = DescriptionFile(write(ARM)).joints_between("base", "lower")
+    joints = RobotXml(write(ARM)).joints_between("base", "lower")
     assert [(j.name, j.kind, j.parent, j.child) for j in joints] == [
         ("shoulder", "continuous", "base", "upper"),
         ("elbow", "prismatic", "upper", "lower"),
@@ -48,14 +48,14 @@ def test_joints_between_two_links_are_in_order_from_the_root(write):
 def test_links_that_no_joints_connect_are_an_error(write, root, tip):
     path = write(ARM)
     with pytest.raises(RobotDescriptionError) as caught:
-        DescriptionFile(path).joints_between(root, tip)
+        RobotXml(path).joints_between(root, tip)
     assert caught.value.where == path
 
 
 def test_a_loop_of_joints_is_an_error(write):
     loop = ARM.replace('<parent link="base"/>', '<parent link="lower"/>')
     with pytest.raises(RobotDescriptionError):
-        DescriptionFile(write(loop)).joints_between("base", "lower")
+        RobotXml(write(loop)).joints_between("base", "lower")
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.robots.agent import RoboCASMobilePanda, RoboCASMobilePandaStockFingers
 from robocas_ms3.robots.description import MOBILE_PANDA
-from robocas_ms3.robots.urdf import robot_files
+from robocas_ms3.robots.urdf import make_robot_files
 
 EVALUATION = dict(zip(MOBILE_PANDA.arm_joints, MOBILE_PANDA.arm_evaluation_start, strict=True))
 
@@ -23,7 +23,7 @@ def test_simulated_robot_agrees_with_the_urdf(make_env):
     root[:3, :3] = Rotation.from_euler("z", 90, degrees=True).as_matrix()
     root[:3, 3] = [0.7, 0.15, 0]
     fingers = dict.fromkeys(MOBILE_PANDA.finger_joints, 0.04)
-    for link, pose in link_poses(robot_files().urdf, EVALUATION | fingers).items():
+    for link, pose in link_poses(make_robot_files().urdf, EVALUATION | fingers).items():
         simulated = agent.robot.links_map[link].pose.sp.to_transformation_matrix()
         assert simulated == pytest.approx(root @ pose, abs=1e-5), link
 
@@ -38,7 +38,7 @@ def test_observation_of_the_robot(make_env):
         "gripper_width": (1, 1),
     }
     assert observation["gripper_width"].item() == pytest.approx(0.08)
-    expected = link_poses(robot_files().arm_urdf, EVALUATION)["panda_hand_tcp"]
+    expected = link_poses(make_robot_files().arm_urdf, EVALUATION)["panda_hand_tcp"]
     assert observation["tcp_in_arm_base"][0, :3].numpy() == pytest.approx(expected[:3, 3], abs=1e-5)
     rotation = Rotation.from_quat(observation["tcp_in_arm_base"][0, [4, 5, 6, 3]].numpy()).as_matrix()
     assert rotation == pytest.approx(expected[:3, :3], abs=1e-5)

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from robocas_ms3.robots.meshes import write_boxes_glb
-from robocas_ms3.robots.urdf import robot_files
+from robocas_ms3.robots.urdf import make_robot_files
 
 
 def colours(scene: trimesh.Scene) -> set[tuple[int, ...]]:
@@ -24,7 +24,7 @@ def test_visual_meshes_are_light_and_keep_shape_and_colours(name):
     spec = importlib.util.find_spec("mani_skill")
     source = Path(spec.submodule_search_locations[0]) / "assets/robots/panda/franka_description/meshes/visual"
     shipped = trimesh.load(source / f"{name}.glb", force="scene")
-    light = trimesh.load(robot_files().folder / "visual" / f"{name}.glb", force="scene")
+    light = trimesh.load(make_robot_files().folder / "visual" / f"{name}.glb", force="scene")
     assert triangles(shipped) > 7000
     assert triangles(light) <= 1100
     assert light.bounds == pytest.approx(shipped.bounds, abs=2.5e-3)
@@ -32,7 +32,7 @@ def test_visual_meshes_are_light_and_keep_shape_and_colours(name):
 
 
 def test_whole_robot_has_under_10_k_triangles():
-    meshes = (robot_files().folder / "visual").glob("*.glb")
+    meshes = (make_robot_files().folder / "visual").glob("*.glb")
     assert sum(triangles(trimesh.load(path, force="scene")) for path in meshes) < 10_000
 
 

@@ -13,12 +13,12 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.robots.description import MOBILE_PANDA
-from robocas_ms3.robots.description_file import chain as urdf_pose
+from robocas_ms3.robots.description_file import chain_poses as urdf_pose
 from robocas_ms3.robots.kinematics import SerialChain
-from robocas_ms3.robots.urdf import robot_files
+from robocas_ms3.robots.urdf import make_robot_files
 
 LOWER, UPPER = np.array(MOBILE_PANDA.arm_limits).T
-ARM = (robot_files().arm_urdf, MOBILE_PANDA.arm_base_link, MOBILE_PANDA.tcp_link)
+ARM = (make_robot_files().arm_urdf, MOBILE_PANDA.arm_base_link, MOBILE_PANDA.tcp_link)
 
 TWO_LINKS = """<robot name="two">
   <link name="base"/><link name="upper"/><link name="bend"/><link name="lower"/><link name="tip"/>

@@ -15,7 +15,7 @@ import robocas_ms3.robots
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.planning.collision import FclWorld
 from robocas_ms3.robots.description import MOBILE_PANDA
-from robocas_ms3.robots.urdf import robot_files
+from robocas_ms3.robots.urdf import make_robot_files
 
 REST = dict(zip(MOBILE_PANDA.arm_joints, MOBILE_PANDA.arm_rest, strict=True))
 EVALUATION = dict(zip(MOBILE_PANDA.arm_joints, MOBILE_PANDA.arm_evaluation_start, strict=True))
@@ -35,16 +35,18 @@ def output(process: subprocess.Popen) -> str:
 
 
 def test_heights_above_the_floor():
-    poses = link_poses(robot_files().urdf, REST)
+    poses = link_poses(make_robot_files().urdf, REST)
     assert poses["base_link"][2, 3] == pytest.approx(0.26)
     assert poses["panda_link0"][:3, 3] == pytest.approx([0, 0, 0.49])
     # The evaluation start holds the TCP 0.29 m above the 0.61 m table, which is why the base link stands 0.26 m high.
-    assert link_poses(robot_files().urdf, EVALUATION)["panda_hand_tcp"][2, 3] - 0.61 == pytest.approx(0.287, abs=2e-3)
+    assert link_poses(make_robot_files().urdf, EVALUATION)["panda_hand_tcp"][2, 3] - 0.61 == pytest.approx(
+        0.287, abs=2e-3
+    )
 
 
 @pytest.mark.parametrize(("extension", "distance"), [(0.03, 0.1334), (0.0, 0.1034)])
 def test_tcp_is_in_front_of_the_hand_and_not_turned(extension, distance):
-    poses = link_poses(robot_files(extension).urdf, REST)
+    poses = link_poses(make_robot_files(extension).urdf, REST)
     tcp_in_hand = np.linalg.inv(poses["panda_hand"]) @ poses["panda_hand_tcp"]
     expected = np.eye(4)
     expected[2, 3] = distance
@@ -61,7 +63,7 @@ def collision_boxes(urdf: Path, link: str) -> list[tuple[np.ndarray, np.ndarray]
 
 
 def test_finger_tips_meet_in_the_middle_and_reach_8_mm_beyond_the_tcp():
-    urdf = robot_files().urdf
+    urdf = make_robot_files().urdf
     poses = link_poses(urdf, {})
     tips = {link: collision_boxes(urdf, link)[-1] for link in MOBILE_PANDA.finger_links}
     for (size, centre), side in zip(tips.values(), (1, -1), strict=True):
@@ -71,11 +73,11 @@ def test_finger_tips_meet_in_the_middle_and_reach_8_mm_beyond_the_tcp():
     assert finger_in_tcp[:2, 3] == pytest.approx([0, 0], abs=1e-9)  # closed: both at the TCP's y = 0
     size, centre = tips["panda_leftfinger"]
     assert finger_in_tcp[2, 3] + centre[2] + size[2] / 2 == pytest.approx(0.008)
-    assert len(collision_boxes(robot_files(0.0).urdf, "panda_leftfinger")) == 4  # stock: no tip
+    assert len(collision_boxes(make_robot_files(0.0).urdf, "panda_leftfinger")) == 4  # stock: no tip
 
 
 def test_base_body_stays_off_the_floor_and_the_pedestal_carries_the_arm():
-    boxes = collision_boxes(robot_files().urdf, "base_link")
+    boxes = collision_boxes(make_robot_files().urdf, "base_link")
     assert min(centre[2] - size[2] / 2 for size, centre in boxes) + 0.26 == pytest.approx(0.01)
     pedestal = [(size, centre) for size, centre in boxes if size == pytest.approx([0.25, 0.2, 0.2])]
     assert len(pedestal) == 1
@@ -83,7 +85,7 @@ def test_base_body_stays_off_the_floor_and_the_pedestal_carries_the_arm():
 
 
 def test_arm_urdf_is_the_same_arm_rooted_at_its_base():
-    files = robot_files()
+    files = make_robot_files()
     whole = link_poses(files.urdf, EVALUATION)
     arm = link_poses(files.arm_urdf, EVALUATION)
     for link in ("panda_hand_tcp", "panda_leftfinger", "base_link"):
@@ -93,7 +95,7 @@ def test_arm_urdf_is_the_same_arm_rooted_at_its_base():
 
 
 def test_srdf_reports_true_self_collisions_only():
-    files = robot_files()
+    files = make_robot_files()
     world = FclWorld(files.arm_urdf, files.arm_srdf, MOBILE_PANDA)
     reaching = (0, 0.6, 0, -1.5, 0, 2.1, 0.78)
     for qpos in (MOBILE_PANDA.arm_rest, MOBILE_PANDA.arm_evaluation_start, reaching):
@@ -108,17 +110,17 @@ def test_srdf_reports_true_self_collisions_only():
 
 def test_files_are_made_once_and_again_when_damaged(tmp_path, monkeypatch):
     monkeypatch.setenv("ROBOCAS_CACHE", str(tmp_path))
-    files = robot_files()
+    files = make_robot_files()
     assert files.folder.parent == tmp_path / "robots"
     stamp = files.urdf.stat().st_mtime_ns
-    assert robot_files() == files
+    assert make_robot_files() == files
     assert files.urdf.stat().st_mtime_ns == stamp
     mesh = files.folder / "visual" / "hand.glb"
     mesh.unlink()
-    assert robot_files() == files
+    assert make_robot_files() == files
     assert mesh.is_file()
     assert [path.name for path in files.folder.parent.iterdir()] == [files.folder.name]  # nothing left behind
-    assert robot_files(0.0).folder != files.folder
+    assert make_robot_files(0.0).folder != files.folder
     for path in ET.parse(files.urdf).getroot().iter("mesh"):
         assert (files.folder / path.get("filename")).is_file()
 
@@ -136,7 +138,7 @@ def test_a_cache_that_cannot_be_written(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("ROBOCAS_CACHE", str(tmp_path / "file"))
     with pytest.raises(RobocasError) as caught:
-        robot_files()
+        make_robot_files()
     assert str(caught.value.where).startswith(str(tmp_path / "file"))
 
 
@@ -151,7 +153,7 @@ def test_a_mani_skill_without_the_panda_that_is_expected(tmp_path, monkeypatch, 
         folder.mkdir(parents=True)
         (folder / "panda_v2.urdf").write_text(urdf)
     with pytest.raises(RobocasError) as caught:
-        robot_files()
+        make_robot_files()
     assert "mani_skill" in caught.value.fix
 
 

@@ -11,7 +11,7 @@ from robocas_ms3.assets.hulls import Hull
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.errors import ConfigError
 from robocas_ms3.core.paths import protocols_dir
-from robocas_ms3.robots.description_file import chain
+from robocas_ms3.robots.description_file import chain_poses
 from robocas_ms3.robots.registry import PANDA
 from robocas_ms3.scenes.clearance import overlap
 from robocas_ms3.scenes.config import bundled_configs, load_task_config
@@ -106,18 +106,21 @@ def test_another_robot_is_judged_by_its_own_reach_and_one_of_which_nothing_is_kn
 
 def test_what_is_known_of_the_arm_is_so():
     urdf, robot = PANDA.files().urdf, PANDA.description
-    base = chain(urdf, robot.root_link, robot.arm_base_link, np.zeros((1, 3)))[0]
+    base = chain_poses(urdf, robot.root_link, robot.arm_base_link, np.zeros((1, 3)))[0]
     for start, qpos in (("rest", robot.arm_rest), ("evaluation", robot.arm_evaluation_start)):
         arm = np.array(qpos)[None]
         links = [
-            base @ chain(urdf, robot.arm_base_link, link, arm[:, :n])[0] for n, link in enumerate(robot.arm_links, 1)
+            base @ chain_poses(urdf, robot.arm_base_link, link, arm[:, :n])[0]
+            for n, link in enumerate(robot.arm_links, 1)
         ]
-        tcp = base @ chain(urdf, robot.arm_base_link, robot.tcp_link, arm)[0]
+        tcp = base @ chain_poses(urdf, robot.arm_base_link, robot.tcp_link, arm)[0]
         # the second link turns where the first does, the sixth where the fifth
         origins = np.array([base[:3, 3], *(links[i][:3, 3] for i in (0, 2, 3, 4, 6)), tcp[:3, 3]])
         np.testing.assert_allclose(robot.envelope.arm_at_start[start], origins, atol=1e-3)
-    shoulder = chain(urdf, robot.arm_base_link, robot.arm_links[0], np.zeros((1, 1)))[0][:3, 3]
+    shoulder = chain_poses(urdf, robot.arm_base_link, robot.arm_links[0], np.zeros((1, 1)))[0][:3, 3]
     assert shoulder[2] == pytest.approx(robot.envelope.shoulder)
     many = np.random.default_rng(0).uniform(*np.array(robot.arm_limits).T, (20_000, 7))
-    far = np.linalg.norm(chain(urdf, robot.arm_base_link, robot.tcp_link, many)[:, :3, 3] - shoulder, axis=1).max()
+    far = np.linalg.norm(
+        chain_poses(urdf, robot.arm_base_link, robot.tcp_link, many)[:, :3, 3] - shoulder, axis=1
+    ).max()
     assert robot.envelope.reach - 0.08 < far < robot.envelope.reach

@@ -26,7 +26,7 @@ from robocas_ms3.demos.failures import FAILURES_FILE, FailedAttempt
 from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
 from robocas_ms3.demos.recordings.trajectory_hdf5 import open_trajectory
 from robocas_ms3.evaluation import results
-from robocas_ms3.robots.cameras import STANDARD_NAMES
+from robocas_ms3.robots.cameras import STANDARD_CAMERA_NAMES
 
 ROOT = Path(__file__).resolve().parents[2]
 SITE = Path(__file__).resolve().parent / "fault_site"
@@ -116,7 +116,7 @@ def readable(command, out):
         return sum(bool(json.loads(line)) for line in lines if line.endswith(b"\n"))
     folders = sorted(out.glob("episode_*" if command.name == "convert" else "units/*/*/[0-9]*/episode_*"))
     for folder in folders:
-        assert find_damaged(folder, ImageOptions(STANDARD_NAMES, (64, 48), depth=False)) is None, folder
+        assert find_damaged(folder, ImageOptions(STANDARD_CAMERA_NAMES, (64, 48), depth=False)) is None, folder
     return len(folders)
 
 

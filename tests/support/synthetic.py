@@ -11,7 +11,7 @@ import numpy as np
 
 from robocas_ms3.datasets.images.image_files import ImageOptions, bounding_box
 from robocas_ms3.datasets.sources.episode_source import CameraModel, StepImages
-from robocas_ms3.robots.cameras import STANDARD_NAMES, standard_parent
+from robocas_ms3.robots.cameras import STANDARD_CAMERA_NAMES, standard_camera_parent
 from robocas_ms3.robots.description import MOBILE_PANDA
 
 STEPS = 22  # control steps: with a stride of 4 the last dataset step is a short one
@@ -56,7 +56,7 @@ class RayCaster:
     """A ``Renderer``: floor, room, table and a cube for each actor."""
 
     def __init__(self, env_info, control_mode, image_options=None):
-        self.image_options = (image_options or ImageOptions()).choose(STANDARD_NAMES, "here")
+        self.image_options = (image_options or ImageOptions()).choose(STANDARD_CAMERA_NAMES, "here")
         self.size = self.image_options.size or SIZE
         self.closed = False
 
@@ -68,7 +68,7 @@ class RayCaster:
 
     def cameras(self):
         return {
-            name: CameraModel(self.intrinsic(), CAMERA_IN_PARENT[name], standard_parent(name))
+            name: CameraModel(self.intrinsic(), CAMERA_IN_PARENT[name], standard_camera_parent(name))
             for name in self.image_options.cameras
         }
 

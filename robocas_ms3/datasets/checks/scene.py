@@ -14,10 +14,10 @@ from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.datasets.sources.arrays import EpisodeArrays, arrays_fingerprint
 from robocas_ms3.datasets.sources.file_models import ConversionRecord, SceneRecord, fill_unknown_keys
 from robocas_ms3.demos.recordings.trajectory_json import one_seed
-from robocas_ms3.robots.cameras import STANDARD_NAMES
+from robocas_ms3.robots.cameras import STANDARD_CAMERA_NAMES
 
 FILE = schema.CONVERSION_FILE
-STANDARD = ImageOptions(STANDARD_NAMES)
+STANDARD = ImageOptions(STANDARD_CAMERA_NAMES)
 
 
 def valid_values(scene: Any, file: str = schema.SCENE_FILE) -> tuple[dict[str, Any], str]:

@@ -16,7 +16,7 @@ from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.images.image_headers import LARGEST, read_image_bytes
 from robocas_ms3.datasets.images.png import encode_png
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
-from robocas_ms3.robots.cameras import STANDARD_NAMES
+from robocas_ms3.robots.cameras import STANDARD_CAMERA_NAMES
 
 _QUALITY = {
     "jpg": [cv2.IMWRITE_JPEG_QUALITY, 95],
@@ -46,7 +46,7 @@ class ImageOptions:
         if self.size is not None and not SMALLEST <= min(self.size) <= max(self.size) <= LARGEST:
             expected = f"{SMALLEST} to {LARGEST} pixels a side"
             raise DatasetError("no such size of images", where="size", expected=expected, found=list(self.size))
-        names = [*STANDARD_NAMES, *self.cameras]
+        names = [*STANDARD_CAMERA_NAMES, *self.cameras]
         object.__setattr__(self, "cameras", tuple(name for name in dict.fromkeys(names) if name in self.cameras))
 
     def choose(self, cameras: Sequence[str], where: object) -> ImageOptions:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from robocas_ms3.core.poses import from_xyzw
 from robocas_ms3.datasets.schema import EPISODE_INFO
 from robocas_ms3.demos.recordings.motion import relative_motion
-from robocas_ms3.robots.quantities import columns_of, features
+from robocas_ms3.robots.quantities import feature_columns, lerobot_features
 
 
 def frame_columns(arrays: dict[str, NDArray]) -> dict[str, NDArray]:
@@ -20,7 +20,7 @@ def frame_columns(arrays: dict[str, NDArray]) -> dict[str, NDArray]:
     status = arrays["gripper_status"].astype(np.float32)[:, None]
     command, joints = _next(status), _next(arrays["robot_joints"])
     parts = {
-        **{key: [arrays[one.name] for one in quantities] for key, quantities in features().items()},
+        **{key: [arrays[one.name] for one in quantities] for key, quantities in lerobot_features().items()},
         "action": (arrays["rel_pos"], turn, command),
         "action.joint": (joints, command),
         "action.base": (arrays["rel_agv_pose"],),
@@ -41,10 +41,10 @@ def robocas_arrays(
         "step_lang_goals": subgoals,
         "step_goal_type": types,
     }
-    for key, quantities in features().items():
+    for key, quantities in lerobot_features().items():
         column = columns[key].reshape(len(columns["action"]), -1)
         for quantity in quantities:
-            part = column[:, columns_of(key)[quantity.name]].reshape(quantity.shape_for(len(column)))
+            part = column[:, feature_columns(key)[quantity.name]].reshape(quantity.shape_for(len(column)))
             values[quantity.name] = part > 0.5 if quantity.dtype == "bool" else part
     for pos, orn, rel in (("ee_pos", "ee_orn", "rel"), ("base_pos", "base_orn", "base_rel")):
         poses = from_xyzw(values[pos].astype(np.float64), values[orn].astype(np.float64))

@@ -27,7 +27,7 @@ from robocas_ms3.datasets.lerobot.tables import INTEGER, INTEGERS, NUMBER, NUMBE
 from robocas_ms3.datasets.lerobot.variants import CHUNK_FILES, LAYOUTS
 from robocas_ms3.datasets.sources.episode_source import CameraModel
 from robocas_ms3.datasets.sources.file_models import EntryRecord
-from robocas_ms3.robots.cameras import Parent, standard_parent
+from robocas_ms3.robots.cameras import Parent, standard_camera_parent
 
 MAX_EPISODES = 10**6
 MAX_FRAMES = 10**9
@@ -163,7 +163,7 @@ class CameraRecord(_Record):
     @classmethod
     def from_model(cls, name: str, model: CameraModel) -> CameraRecord:
         intrinsic, pose = (np.asarray(array).tolist() for array in (model.intrinsic, model.camera_in_parent))
-        parent = None if model.parent == standard_parent(name) else model.parent
+        parent = None if model.parent == standard_camera_parent(name) else model.parent
         return cls(intrinsic=intrinsic, camera_in_parent=pose, parent=parent)
 
 

@@ -28,7 +28,7 @@ from robocas_ms3.datasets.sources.episode_source import EpisodeSource, ImageKind
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 from robocas_ms3.datasets.sources.reader import check_rate
 from robocas_ms3.demos.recordings.subgoals import SubGoal, subgoal_runs
-from robocas_ms3.robots.cameras import Parent, standard_parent
+from robocas_ms3.robots.cameras import Parent, standard_camera_parent
 
 _Text = TypeVar("_Text", SceneText, CamerasText)
 
@@ -179,7 +179,7 @@ class LeRobotEpisode(SourceEpisode):
         return np.array(self._camera(camera).camera_in_parent)
 
     def camera_parent(self, camera: str) -> Parent:
-        return self._camera(camera).parent or standard_parent(camera)
+        return self._camera(camera).parent or standard_camera_parent(camera)
 
     def video(self, camera: str, kind: ImageKind) -> tuple[Path, int]:
         """Return the file of a camera's video and the number of its first frame there."""

@@ -14,9 +14,9 @@ from typing import Any
 from robocas_ms3.core.documents import check_regular
 from robocas_ms3.core.errors import DatasetError, require_extra
 from robocas_ms3.datasets.lerobot.variants import Variant
-from robocas_ms3.robots.quantities import STATE, columns_of
-from robocas_ms3.robots.quantities import features as quantities_of_features
-from robocas_ms3.robots.registry import DEFAULT
+from robocas_ms3.robots.quantities import STATE, feature_columns
+from robocas_ms3.robots.quantities import lerobot_features as quantities_of_features
+from robocas_ms3.robots.registry import DEFAULT_ROBOT
 
 ROBOT_TYPE = "mobile_panda"  # of the default robot; another one's is its name
 INFO_FILE = "meta/info.json"
@@ -117,7 +117,7 @@ def robot_type(scene: dict[str, Any]) -> str:
     env_info = scene.get("env_info")
     kwargs = env_info.get("env_kwargs") if isinstance(env_info, dict) else None
     named = kwargs.get("robot_uids") if isinstance(kwargs, dict) else None
-    return ROBOT_TYPE if named in (None, DEFAULT) else str(named)
+    return ROBOT_TYPE if named in (None, DEFAULT_ROBOT) else str(named)
 
 
 def features_json(variant: Variant, videos: dict[str, dict[str, Any]]) -> dict[str, Any]:
@@ -140,7 +140,7 @@ def single_features(variant: Variant) -> tuple[Feature, ...]:
 def modality_json(cameras: Sequence[str]) -> dict[str, Any]:
     """Return ``meta/modality.json``, by which GR00T reads a dataset of format v2.1."""
     action = {"rel_pos": slice(0, 3), "rel_orn": slice(3, 6), "gripper_open": slice(6, 7)}
-    parts = {"state": columns_of(STATE), "action": action}
+    parts = {"state": feature_columns(STATE), "action": action}
     return {
         **{
             name: {key: {"start": columns.start, "end": columns.stop} for key, columns in part.items()}

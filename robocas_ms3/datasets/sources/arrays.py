@@ -215,7 +215,7 @@ def episode_arrays(motion: Motion, instruction: str, subgoals: Sequence[SubGoal]
     """Return the arrays of ``episode_info.npz``, without embeddings, from the motion at the T sampled states."""
     of_steps = [goal for goal in subgoals for _ in range(goal.last - goal.first + 1)]
     values = {
-        **{quantity.name: quantity.recorded(motion) for quantity in QUANTITIES if quantity.recorded},
+        **{quantity.name: quantity.record(motion) for quantity in QUANTITIES if quantity.record},
         "episode_length": len(motion.qpos),
         "language_goal": instruction,
         "step_lang_goals": [goal.goal_description for goal in of_steps],

@@ -22,7 +22,7 @@ from robocas_ms3.datasets.actions import action_space
 from robocas_ms3.datasets.images.image_files import Box, ImageOptions
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.demos.recordings.subgoals import SubGoal, subgoal_runs
-from robocas_ms3.robots.cameras import Parent, standard_parent
+from robocas_ms3.robots.cameras import Parent, standard_camera_parent
 
 Split = Literal["train", "val", "all"]
 """Of the split into training and validation."""
@@ -144,7 +144,7 @@ class SourceEpisode(ABC):
 
     def camera_parent(self, camera: str) -> Parent:
         """Return the frame that the pose of a camera is in; here by the names of the standard cameras."""
-        return standard_parent(camera)
+        return standard_camera_parent(camera)
 
     def camera(self, name: str) -> CameraModel:
         return CameraModel(self.intrinsic(name), self.camera_in_parent(name), self.camera_parent(name))

@@ -9,7 +9,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from robocas_ms3.assets.pack import load_pack, pack_folders
+from robocas_ms3.assets.pack import find_packs, load_pack
 from robocas_ms3.core.errors import AssetError, DatasetError, RobocasError
 from robocas_ms3.datasets.sources.arrays import episode_arrays
 from robocas_ms3.datasets.sources.episode_source import EpisodeSource, SourceEpisode, Split
@@ -165,7 +165,7 @@ def _read_entry(file: TrajectoryFile, index: int) -> EpisodeEntry | DatasetError
 def _names(pack: str) -> dict[str, str]:
     """Return the names of objects of an installed pack, by id; a file can't choose a folder."""
     try:
-        return {asset: of.asset.name for asset, of in load_pack(pack).objects.items()} if pack in pack_folders() else {}
+        return {asset: of.asset.name for asset, of in load_pack(pack).objects.items()} if pack in find_packs() else {}
     except AssetError:
         return {}
 

@@ -15,7 +15,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from robocas_ms3.assets.pack import pack_folders
+from robocas_ms3.assets.pack import find_packs
 from robocas_ms3.core.errors import DatasetError, ExtensionError
 from robocas_ms3.core.strict_model import StrictModel, list_invalid_values
 from robocas_ms3.robots.cameras import CameraSpec
@@ -79,7 +79,7 @@ class RecordedEnv:
         """Return the same with the objects of another pack, by name or folder, where one is given."""
         if pack is None:
             return self
-        named = str(pack) if str(pack) in pack_folders() else str(Path(pack).absolute())
+        named = str(pack) if str(pack) in find_packs() else str(Path(pack).absolute())
         return replace(self, kwargs={**self.kwargs, "pack": named})
 
     def robot(self, where: object = "robot_uids") -> RobotSpec:
@@ -109,8 +109,8 @@ class RecordedEnv:
         self.robot()
         for key in ("pack", "furniture_pack"):
             name = self.kwargs.get(key, "builtin")
-            if not Path(name).is_absolute() and name not in pack_folders():
-                expected = f"one of {', '.join(pack_folders())}"
+            if not Path(name).is_absolute() and name not in find_packs():
+                expected = f"one of {', '.join(find_packs())}"
                 fix = "Install it, or pass its folder with --pack." if key == "pack" else "Install it."
                 raise DatasetError("no such pack is installed", where=key, expected=expected, found=name, fix=fix)
         return gym.make(self.env_id, **{**self.kwargs, **kwargs})

@@ -14,7 +14,7 @@ from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.harness.proprioception import KEYS, WIDTHS, depth_key
 from robocas_ms3.evaluation.policy import CONVENTIONS, PolicySpec, Reference
 from robocas_ms3.evaluation.protocol import load_protocol
-from robocas_ms3.robots.cameras import STANDARD_NAMES
+from robocas_ms3.robots.cameras import STANDARD_CAMERA_NAMES
 
 
 @EnvConfig.register_subclass("robocas")
@@ -40,7 +40,7 @@ class RoboCASEnvConfig(EnvConfig):
     fps: int = 5
     protocol: str = "ms3-v1"
     split: str = ""
-    cameras: str = ",".join(STANDARD_NAMES)
+    cameras: str = ",".join(STANDARD_CAMERA_NAMES)
     observation_width: int = 640
     observation_height: int = 480
     depth: bool = False

@@ -12,15 +12,15 @@ from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.arrays import frame_columns
 from robocas_ms3.datasets.sources.arrays import episode_arrays
 from robocas_ms3.demos.recordings.motion import Motion, gripper_open
-from robocas_ms3.robots.description_file import chain
-from robocas_ms3.robots.quantities import ARM_BASE, STATE, columns_of, features
+from robocas_ms3.robots.description_file import chain_poses
+from robocas_ms3.robots.quantities import ARM_BASE, STATE, feature_columns, lerobot_features
 from robocas_ms3.robots.registry import find_robot
 
-KEYS = {"agent_pos": STATE} | {key.removeprefix("observation."): key for key in features() if key != STATE}
+KEYS = {"agent_pos": STATE} | {key.removeprefix("observation."): key for key in lerobot_features() if key != STATE}
 """Key of an environment's observation -> column of our LeRobot datasets."""
 WIDTHS = {name: next(one.width for one in schema.FEATURES if one.key == column) for name, column in KEYS.items()}
-_QUATERNIONS = {"agent_pos": columns_of(STATE)["ee_orn"], "arm_base": columns_of(ARM_BASE)["base_orn"]}
-_YAW = columns_of(STATE)["agv_pose"].stop - 1  # in agent_pos
+_QUATERNIONS = {"agent_pos": feature_columns(STATE)["ee_orn"], "arm_base": feature_columns(ARM_BASE)["base_orn"]}
+_YAW = feature_columns(STATE)["agv_pose"].stop - 1  # in agent_pos
 
 
 def depth_key(camera: str) -> str:
@@ -40,7 +40,9 @@ class Proprioception:
         poses = (agent["tcp_in_arm_base"], obs["extra"]["tcp_pose"])
         in_base, in_world = (from_wxyz(np.asarray(pose, np.float64)) for pose in poses)
         qpos = np.asarray(agent["qpos"], np.float64)
-        base_in_root = chain(self._spec.files().urdf, robot.root_link, robot.arm_base_link, qpos[:, robot.base_slice])
+        base_in_root = chain_poses(
+            self._spec.files().urdf, robot.root_link, robot.arm_base_link, qpos[:, robot.base_slice]
+        )
         self._roots = in_world @ inverse(in_base) @ inverse(base_in_root)  # (N, 4, 4) root links, which stay there
         self._widths = qpos[:, robot.finger_slice].sum(axis=1)  # m, of the grippers at the start
         self._last: dict[int, dict[str, NDArray[np.float32]]] = {}  # by env

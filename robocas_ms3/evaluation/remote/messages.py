@@ -23,7 +23,7 @@ from robocas_ms3.core.strict_model import error_from_validation
 from robocas_ms3.core.text import one_line
 from robocas_ms3.evaluation.policy import CONVENTIONS, ROBOT_QUANTITIES, EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.evaluation.remote.wire import MAX_BYTES
-from robocas_ms3.robots.registry import DEFAULT
+from robocas_ms3.robots.registry import DEFAULT_ROBOT
 
 ENV, RESET, START, PROMPT, ACTIONS, BATCH, ERROR = "env_id", "reset", "start", "prompt", "actions", "batch", "error"
 PREFIX = "observation/"
@@ -73,7 +73,7 @@ class _Start(BaseModel):
     pack: _Text = ""
     seed: _Number = 0
     instruction: _Text | None = None
-    robot: _Text = DEFAULT
+    robot: _Text = DEFAULT_ROBOT
 
 
 class Request(BaseModel):
@@ -136,7 +136,7 @@ def observation_message(
     if start is not None:
         values = {name: value for name, value in vars(start).items() if name != "env"}
         values |= {name: file_name(values[name]) for name in ("config_file", "layouts_file")}
-        if start.robot == DEFAULT:  # unknown to servers of older versions
+        if start.robot == DEFAULT_ROBOT:  # unknown to servers of older versions
             del values["robot"]
         message[START] = values
     return message

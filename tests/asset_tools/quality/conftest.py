@@ -3,7 +3,7 @@ import itertools
 import numpy as np
 import pytest
 
-from robocas_ms3.assets.physics import Solid
+from robocas_ms3.assets.physics import RigidBody
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 
@@ -18,6 +18,6 @@ def block():
 
     def make(x, y, z, mass=0.2, friction=0.99):
         inertia = mass / 12 * np.array([y * y + z * z, x * x + z * z, x * x + y * y])
-        return Solid([corners(x, y, z)], mass, np.zeros(3), inertia, IDENTITY, friction)
+        return RigidBody([corners(x, y, z)], mass, np.zeros(3), inertia, IDENTITY, friction)
 
     return make

@@ -11,7 +11,7 @@ from asset_tools.quality import measure
 from asset_tools.quality.drops import DropReport
 from asset_tools.quality.measure import differences, judge, measure_object, rows
 from asset_tools.resting_poses import resting_poses
-from robocas_ms3.assets.annotations import Annotations, footprints
+from robocas_ms3.assets.annotations import Annotations, compute_footprints
 from robocas_ms3.assets.pack import LoadedObject
 
 REPORT = DropReport(
@@ -36,7 +36,7 @@ def annotate(mesh, solid, count=60):
         resting_poses=rest.poses,
         resting_probabilities=rest.probabilities,
         display_pose=rest.display_pose,
-        footprints=footprints(list(solid.hulls), rest.poses),
+        footprints=compute_footprints(list(solid.hulls), rest.poses),
         grasps_tcp_in_object=grasps.tcp_in_object,
         grasp_widths=grasps.widths,
         grasp_qualities=grasps.qualities,

@@ -6,7 +6,7 @@ from sapien import physx
 from asset_tools.quality import drops
 from asset_tools.quality.drops import drop_test
 from asset_tools.resting_poses import resting_poses
-from robocas_ms3.assets.physics import Solid
+from robocas_ms3.assets.physics import RigidBody
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 
@@ -26,7 +26,7 @@ def can(radius, height, sections=24):
     mesh = trimesh.creation.cylinder(radius, height, sections=sections)
     across = 0.2 / 12 * (3 * radius**2 + height**2)
     inertia = np.array([across, across, 0.1 * radius**2])
-    return Solid([np.asarray(mesh.vertices)], 0.2, np.zeros(3), inertia, IDENTITY)
+    return RigidBody([np.asarray(mesh.vertices)], 0.2, np.zeros(3), inertia, IDENTITY)
 
 
 def test_a_box_comes_to_rest_on_its_faces(block):

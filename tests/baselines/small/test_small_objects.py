@@ -8,7 +8,7 @@ import pytest
 from robocas_ms3.baselines.small.objects import in_camera_parent, locate_objects
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import from_rotation
-from robocas_ms3.robots.cameras import standard_parent
+from robocas_ms3.robots.cameras import standard_camera_parent
 
 STEPS = 5
 BASE = [2.0, 1.0, 0.5]  # of the arm in the world, turned by 90 degrees about z
@@ -29,7 +29,7 @@ PROJECTIONS = {
 
 def episode(layout=LAYOUT, target="lemon"):
     scene = {"target": {"asset_id": target}}
-    return SimpleNamespace(where="here", layout=layout, scene=scene, camera_parent=standard_parent)
+    return SimpleNamespace(where="here", layout=layout, scene=scene, camera_parent=standard_camera_parent)
 
 
 def tcp(heights):

@@ -18,7 +18,7 @@ from robocas_ms3.datasets.images.image_headers import LARGEST, read_header
 from robocas_ms3.datasets.manage.copy_episodes import FilePlacer
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.demos.recordings.trajectory_hdf5 import open_trajectory
-from robocas_ms3.robots.cameras import STANDARD_NAMES
+from robocas_ms3.robots.cameras import STANDARD_CAMERA_NAMES
 from robocas_ms3.viewer.source import open_content
 
 EPISODE = "episode_0000001"
@@ -60,7 +60,7 @@ def test_readers_of_other_files(dataset, tmp_path):
         with pytest.raises(DocumentError):
             FilePlacer(link=False).place(replace_file(tmp_path / "F.h5", kind), tmp_path / "copy")
         path = replace_file(dataset / EPISODE / IMAGES[0], kind)
-        assert find_damaged(dataset / EPISODE, ImageOptions(STANDARD_NAMES)) == path
+        assert find_damaged(dataset / EPISODE, ImageOptions(STANDARD_CAMERA_NAMES)) == path
         path.unlink()
         shutil.copy(path.with_name("0001.png"), path)
 

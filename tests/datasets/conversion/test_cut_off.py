@@ -12,7 +12,7 @@ from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.conversion.episode_folder import find_damaged
 from robocas_ms3.datasets.conversion.settings import ConversionSettings
 from robocas_ms3.datasets.images.image_files import ImageOptions
-from robocas_ms3.robots.cameras import STANDARD_NAMES
+from robocas_ms3.robots.cameras import STANDARD_CAMERA_NAMES
 
 FILES = (
     "episode_info.npz",
@@ -44,7 +44,7 @@ def whole(trajectory, tmp_path_factory):
 def test_each_file_is_found(whole, tmp_path, name, left):
     out = shutil.copytree(whole, tmp_path / "out")
     harm(out / "episode_0000001" / name, left)
-    image_options = ImageOptions(STANDARD_NAMES)
+    image_options = ImageOptions(STANDARD_CAMERA_NAMES)
     assert find_damaged(out / "episode_0000000", image_options) is None
     assert find_damaged(out / "episode_0000001", image_options) == out / "episode_0000001" / name
     assert any(name.rpartition("/")[2] in str(violation) for violation in validate(out).violations)

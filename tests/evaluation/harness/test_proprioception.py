@@ -9,7 +9,7 @@ from robocas_ms3.datasets.sources.arrays import episode_arrays
 from robocas_ms3.demos.recordings.motion import Motion, gripper_open
 from robocas_ms3.evaluation.harness.proprioception import KEYS, WIDTHS, Proprioception
 from robocas_ms3.robots.description import MOBILE_PANDA
-from robocas_ms3.robots.registry import DEFAULT, PANDA
+from robocas_ms3.robots.registry import DEFAULT_ROBOT, PANDA
 
 STEPS = 60
 COMMANDS = np.where(np.arange(STEPS) // 7 % 2, -1.0, 1.0)
@@ -48,7 +48,7 @@ def observed(robots: list[Motion], step: int) -> dict:
 
 
 def test_every_step_of_two_envs_is_what_a_dataset_holds():
-    robots, state = [moving(1), moving(2)], Proprioception(DEFAULT)
+    robots, state = [moving(1), moving(2)], Proprioception(DEFAULT_ROBOT)
     state.reset(observed(robots, 0))
     read: list[list[dict]] = [[], []]
     for step in range(STEPS):
