@@ -121,7 +121,7 @@ def main() -> None:
             lift[2, 3] += rng.choice((-0.05, 0.1))
             watch.run("plan_straight", planner.plan_straight, here, lift, stage="straight")
         poses = np.array([top_down(rng) for _ in range(256)])
-        watch.run("reachability_256", reachability.reachable, poses, np.array(MOBILE_PANDA.arm_rest))
+        watch.run("reachability_256", reachability.nearest_solutions, poses, np.array(MOBILE_PANDA.arm_rest))
     result = {
         "points": int(np.median(points)),
         "trajectory_seconds_median": round(float(np.median(seconds)), 2),

@@ -22,7 +22,7 @@ from robocas_ms3.planning.grasp_choice import filter_grasps, grip_margins
 from robocas_ms3.planning.motionplanner import PandaArmMotionPlanningSolver
 from robocas_ms3.planning.protocol import AttachedBody
 from robocas_ms3.planning.scene import SPACING, PlanningScene
-from robocas_ms3.planning.skills.place import Inside, overhangs, sample_drops
+from robocas_ms3.planning.skills.place import ContainerInterior, compute_overhang, sample_drops
 from robocas_ms3.scenes.grasp_checks import is_gripper_clear
 
 
@@ -52,7 +52,7 @@ def solve_pick(env, seed=None, debug=False, vis=False):
     planner = PandaArmMotionPlanningSolver(env, base_pose=env.unwrapped.agent.robot.pose, vis=vis)
     env = env.unwrapped
     scene, slot, rise = PlanningScene(env), int(env.target_slot[0]), sapien.Pose([0, 0, 0.1])
-    everything, all_but_target = scene.obstacles_in_world(), scene.obstacles_in_world(without=slot)
+    everything, all_but_target = scene.obstacles_in_world(), scene.obstacles_in_world(exclude=slot)
 
     def reach_and_grasp(grasp_pose):
         planner.clear_collisions()
@@ -99,7 +99,7 @@ def ranked_grasps(env, scene, slot):
     target, base = env.object_assets[0][slot], scene.arm_base_in_world
     notes, object_in_world = target.annotations, base @ scene.object_in_base(slot)
     kept = filter_grasps(notes, object_in_world, base)
-    points = transform_points(base, scene.obstacles_in_base(without=slot))
+    points = transform_points(base, scene.points_in_base(exclude=slot))
     margins = grip_margins(notes.grasps_tcp_in_object[kept.index], kept.widths, target.surface_points(SPACING))
     distance = np.linalg.norm(kept.tcp_in_world[:, :3, 3] - object_in_world[:3, 3], axis=1)
     score = margins + np.exp(-distance / 0.03) - kept.tcp_in_world[:, 2, 2]
@@ -111,11 +111,11 @@ def ranked_grasps(env, scene, slot):
 def ranked_drops(env, scene, slot, held, rng):
     """Return TCP poses that hold the object above the basket; those where it fits the opening, steep ones first."""
     inner = env.model.basket.asset.inner
-    inside = Inside(scene.basket_in_base, np.array(inner.min), np.array(inner.max))
+    inside = ContainerInterior(scene.basket_in_base, np.array(inner.min), np.array(inner.max))
     center = np.array([env.object_assets[0][slot].asset.center_of_mass])
     vertices, center = transform_points(held.object_in_tcp, held.vertices), transform_points(held.object_in_tcp, center)
     drops = sample_drops(rng, 200, inside, vertices, center[0])
-    overhang = overhangs(drops, inside, vertices, margin=0.03)
+    overhang = compute_overhang(drops, inside, vertices, margin=0.03)
     order = np.lexsort((drops[:, 2, 2], np.ceil(overhang / 0.015)))
     return [sapien.Pose(scene.arm_base_in_world @ drops[i]) for i in order]
 

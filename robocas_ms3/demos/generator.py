@@ -27,7 +27,7 @@ from robocas_ms3.planning.executor import Executor
 from robocas_ms3.planning.kinematics import ArmChain, Reachability
 from robocas_ms3.planning.protocol import Planner
 from robocas_ms3.planning.rrt_connect import make_planner
-from robocas_ms3.planning.skills.arm import Arm, back_out
+from robocas_ms3.planning.skills.arm import Arm, recover
 from robocas_ms3.robots.registry import DEFAULT_ROBOT, find_robot
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.task_specs import TASKS
@@ -155,7 +155,7 @@ class _Attempts:
             try:
                 if not first < len(executor.actions) < self.generator.horizon or isinstance(last, UnrecoverableError):
                     raise last
-                back_out(arm)
+                recover(arm)
                 span = [first, len(executor.actions) - 1]
                 recoveries.append({"range": span, "stage": last.stage, "reason": last.reason})
             except PlanningError:

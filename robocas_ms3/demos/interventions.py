@@ -13,8 +13,8 @@ import numpy as np
 from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.planning.executor import OPEN
 from robocas_ms3.planning.protocol import Array, Trajectory
-from robocas_ms3.planning.skills.arm import BACK_OUT, Arm, moved_back, plan_back_out, raised
-from robocas_ms3.planning.skills.base_placement import bring_to_basket
+from robocas_ms3.planning.skills.arm import RETREAT_DISTANCES, Arm, plan_free_retreat, shift_back, shift_up
+from robocas_ms3.planning.skills.base_placement import place_in_basket
 from robocas_ms3.planning.skills.remove import raise_held_object
 
 STOP_SECONDS = 0.2  # s to hold the initial position until the arm is at rest; a step of a dataset at 5 Hz
@@ -28,8 +28,8 @@ def intervene(arm: Arm, policy: Callable[[Arm], None]) -> None:
     be unusable.
     """
     slot = arm.target
-    arm.executor.move_gripper(arm.executor.gripper, arm.at, seconds=STOP_SECONDS)
-    if arm.executor.gripper != OPEN and arm.holds(slot) and arm.path[0] % 2 == 0:
+    arm.executor.move_gripper(arm.executor.gripper, arm.qpos, seconds=STOP_SECONDS)
+    if arm.executor.gripper != OPEN and arm.is_holding(slot) and arm.path[0] % 2 == 0:
         _carry_held_target(arm, slot)
         return
     _retreat(arm)
@@ -38,15 +38,15 @@ def intervene(arm: Arm, policy: Callable[[Arm], None]) -> None:
 
 def _carry_held_target(arm: Arm, slot: int) -> None:
     if not arm.executor.flag("target_lifted"):
-        arm.begin_subgoal("move and grasp")
-        with arm.planning():
-            lift = arm.plan_rise(arm.planner.tcp(arm.at), LIFT, stage="lift")
+        arm.start_subgoal("move and grasp")
+        with arm.planning_time():
+            lift = arm.plan_rise(arm.planner.tcp(arm.qpos), LIFT, stage="lift")
         arm.follow(lift)
     if arm.approach == "top":
         raise_held_object(arm, slot)  # it may be only just above its neighbours
-    if not arm.holds(slot):
+    if not arm.is_holding(slot):
         raise PlanningError("lift", "slipped")
-    bring_to_basket(arm, slot)
+    place_in_basket(arm, slot)
 
 
 def _retreat(arm: Arm) -> None:
@@ -54,15 +54,15 @@ def _retreat(arm: Arm) -> None:
     if arm.executor.gripper != OPEN:
         arm.open_gripper()
     if arm.approach == "top":
-        arm.rise_clear()
+        arm.rise_until_free()
         return
-    with arm.planning():
+    with arm.planning_time():
         arm.planner.set_scene(arm.scene.obstacles())
-        if not arm.planner.collisions(arm.at, arm.planner.finger_width):
+        if not arm.planner.collisions(arm.qpos, arm.planner.finger_width):
             return
-        tcp = arm.planner.tcp(arm.at)
+        tcp = arm.planner.tcp(arm.qpos)
         try:
-            motion = plan_back_out(arm, [moved_back(tcp, distance) for distance in BACK_OUT])
+            motion = plan_free_retreat(arm, [shift_back(tcp, distance) for distance in RETREAT_DISTANCES])
         except PlanningError:
             motion = _plan_shortest_retreat(arm, tcp)
     arm.follow(motion)
@@ -71,14 +71,14 @@ def _retreat(arm: Arm) -> None:
 def _plan_shortest_retreat(arm: Arm, tcp_in_base: Array) -> Trajectory:
     """Plan the shortest collision-ignoring straight line to a free pose: back, up, or towards the robot."""
     arm.planner.set_scene(arm.scene.obstacles())
-    for distance in BACK_OUT[::-1]:
+    for distance in RETREAT_DISTANCES[::-1]:
         inward = tcp_in_base.copy()
         inward[:2, 3] *= 1 - distance / np.linalg.norm(tcp_in_base[:2, 3])
-        for goal in (moved_back(tcp_in_base, distance), raised(tcp_in_base, distance), inward):
+        for goal in (shift_back(tcp_in_base, distance), shift_up(tcp_in_base, distance), inward):
             try:
-                line = arm.planner.plan_straight(arm.at, goal, stage="intervention", check_collisions=False)
+                line = arm.planner.plan_straight(arm.qpos, goal, stage="intervention", check_collisions=False)
             except PlanningError:
                 continue
-            if arm.planner.free(line.qpos[-1:], arm.planner.finger_width).all():
+            if arm.planner.is_free(line.qpos[-1:], arm.planner.finger_width).all():
                 return line
     raise PlanningError("intervention", "stuck")

@@ -75,7 +75,7 @@ class EpisodeSettings:
                 is unknown.
         """
         from robocas_ms3.assets.pack import load_pack
-        from robocas_ms3.planning.rrt_connect import BACKENDS
+        from robocas_ms3.planning.rrt_connect import PLANNERS
         from robocas_ms3.scenes.config import load_config_for
         from robocas_ms3.scenes.model import SceneModel
 
@@ -101,7 +101,7 @@ class EpisodeSettings:
             )
         check_number("--after-steps", self.after_steps[0], 1)
         check_number("--after-steps", self.after_steps[1], self.after_steps[0])
-        BACKENDS.find(self.planner, where="planner")
+        PLANNERS.find(self.planner, where="planner")
         robot, config = find_robot(self.robot), load_config_for(TASKS[self.task], self.config)
         SceneModel.load(config, load_pack(self.pack), load_pack("builtin"), robot=robot.description)
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from robocas_ms3.planning.collision_geometry import BASE, TCP, read_collision_parts, read_link_pairs
 from robocas_ms3.planning.kinematics import ArmChain
 from robocas_ms3.planning.protocol import Array, AttachedBody, Obstacle
-from robocas_ms3.planning.shapes import CollisionShapes, Pieces
+from robocas_ms3.planning.shapes import CollisionShapes, ConvexPieces
 from robocas_ms3.robots.description import RobotDescription
 
 CLOUD, ATTACHED = "cloud", "attached"
@@ -27,7 +27,7 @@ SPARSE = 12  # every so manieth configuration of a path is checked before all ot
 CHUNK = 128  # configurations of a path checked at once
 
 
-class FclWorld:
+class CollisionChecker:
     """The arm, the obstacles and the held object; see `protocol.Planner` for methods without a docstring.
 
     Every instance owns all FCL objects that it moves, so that instances in several threads are independent.
@@ -47,7 +47,7 @@ class FclWorld:
         self._shapes = CollisionShapes()
         self._request, self._result = fcl.CollisionRequest(), fcl.CollisionResult()
         self._held = False
-        self._pieces: list[tuple[Pieces, int, Array]] = []
+        self._pieces: list[tuple[ConvexPieces, int, Array]] = []
         self._obstacles: dict[int, Any] = {}  # FCL object by index of the piece, placed when it is first needed
         # The held object is the last part, with no geometry until it is attached.
         parts = read_collision_parts(urdf, self.chain)
@@ -80,17 +80,17 @@ class FclWorld:
         return self.chain.tcp(np.asarray(qpos, dtype=np.float64)[None])[0]
 
     def set_scene(self, obstacles: Sequence[Obstacle] | Array) -> None:
-        bodies: list[tuple[str, Pieces, Array]] = []
+        bodies: list[tuple[str, ConvexPieces, Array]] = []
         if isinstance(obstacles, np.ndarray):
             points = np.asarray(obstacles, dtype=np.float64).reshape(-1, 3)
-            points = np.ascontiguousarray(points[self.keeps(points)])
+            points = np.ascontiguousarray(points[self.is_obstacle_point(points)])
             if len(points):
                 bodies = [(CLOUD, self._shapes.cloud(points), np.eye(4))]
         else:  # not checked against the robot's own base
-            bodies = [(o.name, self._shapes.obstacle(o.shape, o.room), o.pose_in_base) for o in obstacles]
+            bodies = [(o.name, self._shapes.obstacle(o.shape, o.clearance), o.pose_in_base) for o in obstacles]
         for index, placed in self._obstacles.items():
             pieces, piece, _ = self._pieces[index]
-            pieces.spares[piece].append(placed)
+            pieces.unused[piece].append(placed)
         self._obstacles = {}
         self._obstacle_names = [name for name, pieces, _ in bodies for _ in pieces.geometries]
         self._pieces = [(pieces, piece, pose) for _, pieces, pose in bodies for piece in range(len(pieces.geometries))]
@@ -102,7 +102,7 @@ class FclWorld:
             high.append(np.maximum.reduceat(vertices, pieces.first))
         self._low, self._high = np.concatenate(low), np.concatenate(high)
 
-    def keeps(self, points: Array) -> NDArray[np.bool_]:
+    def is_obstacle_point(self, points: Array) -> NDArray[np.bool_]:
         """Return which points (P, 3) count as obstacles: within reach and outside of the robot's own base."""
         keep = np.einsum("ij,ij->i", points, points) <= REACH**2
         for low, high in self._closed_bounds[self._frames == BASE]:
@@ -114,19 +114,19 @@ class FclWorld:
         if body is None:
             return
         pieces = self._shapes.hull(body.vertices)
-        if not pieces.spares[0]:
-            pieces.spares[0].append(fcl.CollisionObject(pieces.geometries[0]))
-        self._parts[-1] = pieces.spares[0][0]
+        if not pieces.unused[0]:
+            pieces.unused[0].append(fcl.CollisionObject(pieces.geometries[0]))
+        self._parts[-1] = pieces.unused[0][0]
         pose = self._poses[-1] = np.asarray(body.object_in_tcp, dtype=np.float64)
         vertices = pieces.vertices @ pose[:3, :3].T + pose[:3, 3]
         self._closed_bounds[-1] = self._open_bounds[-1] = vertices.min(axis=0), vertices.max(axis=0)
 
-    def free(self, qpos: Array, finger_width: float | None = None) -> NDArray[np.bool_]:
+    def is_free(self, qpos: Array, finger_width: float | None = None) -> NDArray[np.bool_]:
         qpos = np.asarray(qpos, dtype=np.float64).reshape(-1, 7)
         width = self._open_width if finger_width is None else finger_width
         return np.array([next(found, None) is None for found in self._pairs_in_contact(qpos, width, True)], dtype=bool)
 
-    def free_until(self, qpos: Array, *, obstacles: bool = True) -> int:
+    def count_free(self, qpos: Array, *, obstacles: bool = True) -> int:
         """Return how many configurations of a path (M, 7) are free before the first one that is not."""
         for first in range(0, len(qpos), CHUNK):
             chunk = qpos[first : first + CHUNK]
@@ -140,10 +140,10 @@ class FclWorld:
         if len(qpos) > 2 * SPARSE:
             qpos = np.concatenate([qpos[i::SPARSE] for i in (SPARSE - 1, *range(SPARSE - 1))])
             first = len(qpos) // SPARSE
-            if self.free_until(qpos[:first], obstacles=obstacles) < first:
+            if self.count_free(qpos[:first], obstacles=obstacles) < first:
                 return False
             qpos = qpos[first:]
-        return self.free_until(qpos, obstacles=obstacles) == len(qpos)
+        return self.count_free(qpos, obstacles=obstacles) == len(qpos)
 
     def collisions(self, qpos: Array, finger_width: float | None = None) -> list[str]:
         width = self._open_width if finger_width is None else finger_width
@@ -197,8 +197,8 @@ class FclWorld:
     def _obstacle(self, index: int) -> Any:
         if index not in self._obstacles:
             pieces, piece, pose = self._pieces[index]
-            spares = pieces.spares[piece]
-            found = self._obstacles[index] = spares.pop() if spares else fcl.CollisionObject(pieces.geometries[piece])
+            unused = pieces.unused[piece]
+            found = self._obstacles[index] = unused.pop() if unused else fcl.CollisionObject(pieces.geometries[piece])
             found.setTransform(_fcl_pose(pose))
         return self._obstacles[index]
 

@@ -85,7 +85,7 @@ class Executor:
             self._step(self._action(hold))
 
     @property
-    def drives(self) -> bool:
+    def drives_base(self) -> bool:
         return self.base_env.control_mode.endswith("_base")
 
     def drive(self, waypoints: Array, hold: Array) -> None:
@@ -95,10 +95,10 @@ class Executor:
             self._step(self._action(hold))
 
     def _action(self, qpos: Array) -> np.ndarray:
-        base = self.base if self.drives else ()
+        base = self.base if self.drives_base else ()
         return np.concatenate([qpos, [self.gripper], base]).astype(np.float32)
 
-    def label(self, goal_type: str, goal_description: str) -> None:
+    def start_subgoal(self, goal_type: str, goal_description: str) -> None:
         """Begin a sub-goal with the next action; a label that repeats the last one changes nothing."""
         if self.segments and self.segments[-1].first == len(self.actions):
             self.segments.pop()

@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 PAD_HALF_WIDTH, PAD_BEHIND_TCP, PAD_BEFORE_TCP = 0.009, -0.012, 0.008
 GRIP_SHIFTS = ((0.0, 0.0), (0.006, 0.0), (-0.006, 0.0), (0.0, -0.006), (0.004, -0.004), (-0.004, -0.004))
 PAD_POINTS = 10  # of a surface at 5 mm: a third of what fits
-ROOM_BESIDE = 0.006  # m between an object and each open finger
+FINGER_CLEARANCE = 0.006  # m between an object and each open finger
 MARGIN_WEIGHT = 1.0
 TURN_WEIGHT = 0.4  # per rad
 TEMPERATURE = 0.15
@@ -66,14 +66,14 @@ def filter_grasps(
 def grip_margins(tcp: Array, widths: Array, surface: Array) -> Array:
     """Return how much (N,) of an object is between the pads even where a grasp misses a little, 0 to 1.
 
-    1: at least ``PAD_POINTS`` lie between the pads of each of several shifted grasps, and ``ROOM_BESIDE`` is left
+    1: at least ``PAD_POINTS`` lie between the pads of each of several shifted grasps, and ``FINGER_CLEARANCE`` is left
     beside the object while the gripper is open.
 
     Args:
         tcp: (N, 4, 4) grasps, in the frame of ``surface`` (P, 3), points of the object 5 mm apart, m.
         widths: (N,) of the object there, m.
     """
-    margin = np.clip((MAX_WIDTH - np.asarray(widths)) / 2 / ROOM_BESIDE, 0, 1)
+    margin = np.clip((MAX_WIDTH - np.asarray(widths)) / 2 / FINGER_CLEARANCE, 0, 1)
     widest, deepest = np.abs(GRIP_SHIFTS).max(axis=0)
     batch = max(1, TESTED_AT_ONCE // len(surface))
     for start in range(0, len(tcp), batch):
@@ -110,7 +110,7 @@ def score_grasps(
     return score + MARGIN_WEIGHT * margins
 
 
-def draw_order(rng: np.random.Generator, scores: Array) -> NDArray[np.int_]:
+def sample_order(rng: np.random.Generator, scores: Array) -> NDArray[np.int_]:
     """Order grasps by score (N,), with some chance: one overtakes one that is 0.15 better about one time in four."""
     # Gumbel noise turns scores into draws without replacement, weighted by exp(score / TEMPERATURE).
     return np.argsort(-(scores + TEMPERATURE * rng.gumbel(size=len(scores))), kind="stable")

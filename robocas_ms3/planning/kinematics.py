@@ -22,14 +22,14 @@ from robocas_ms3.robots.description_file import RobotXml
 LIMIT_MARGIN = 0.02  # rad kept from every joint limit
 JOINT7_STEP = 0.25  # rad between turns of joint 7 that are tried for many poses
 JOINT7_FINE_STEP = 0.1  # the same for one pose
-DISTINCT = 0.3  # rad (norm over the joints) between two solutions that count as different
-MOST = 40  # solutions of one pose
+MIN_SOLUTION_DISTANCE = 0.3  # rad (norm over the joints) between two solutions that count as different
+MAX_SOLUTIONS = 40  # solutions of one pose
 LINE_STEP = 0.01  # m between two poses of a straight line
 LINE_TURN = np.deg2rad(3)  # rad between two poses of a straight line
 MAX_JUMP = 0.15  # rad that a joint may turn between two poses of a straight line
-STRIDE = 4  # poses between two first estimates
-TOGETHER = 8  # Newton steps of all poses of a line together
-IN_TURN = 60  # Newton steps of one pose
+ESTIMATE_STRIDE = 4  # poses between two first estimates
+LINE_ITERATIONS = 8  # Newton steps of all poses of a line together
+POSE_ITERATIONS = 60  # Newton steps of one pose
 TOLERANCE = 1e-7  # accepted pose error, m and rad together
 HALF_TURN = -0.99  # cosine below which a rotation counts as nearly a half turn
 DAMPING = 1e-8  # added to the diagonal of J J^T, so that it can be inverted at singularities
@@ -77,7 +77,7 @@ class ArmChain:
         self.limits = np.array([joint.limits for joint in turning])
         self.lower, self.upper = self.limits[:, 0] + LIMIT_MARGIN, self.limits[:, 1] - LIMIT_MARGIN
 
-    def ending_behind(self, distance: float) -> ArmChain:
+    def with_tool_offset(self, distance: float) -> ArmChain:
         """Return the same arm with its end a distance (m) behind the TCP, against the approach."""
         chain, back = copy(self), np.eye(4)
         back[2, 3] = -distance
@@ -119,7 +119,7 @@ class ArmChain:
         return _poses(rotations[7], positions[7]), jacobian
 
 
-def turn_between(qpos: Array, near: Array) -> Array:
+def joint_distance(qpos: Array, near: Array) -> Array:
     """Return how far apart configurations (..., 7) are: the largest turn, which sets the time, and some of all."""
     away = np.abs(qpos - near)
     return away.max(axis=-1) + 0.2 * np.sqrt((away * away).sum(axis=-1))
@@ -139,7 +139,7 @@ class Reachability:
         self.lower, self.upper = self.chain.lower, self.chain.upper
         self._geometry = load_object(self.chain.robot.inverse_kinematics)(self.chain)
 
-    def reachable(self, tcp_in_base: Array, near: Array) -> tuple[NDArray[np.bool_], Array]:
+    def nearest_solutions(self, tcp_in_base: Array, near: Array) -> tuple[NDArray[np.bool_], Array]:
         """Find for each pose (N, 4, 4) the solution that is nearest to a configuration (7,).
 
         Returns:
@@ -149,26 +149,26 @@ class Reachability:
         if len(poses) == 0:
             return np.zeros(0, dtype=bool), np.zeros((0, 7))
         found = self._solve(poses, near, JOINT7_STEP)
-        away = np.where(np.isnan(found[..., 0]), np.inf, turn_between(found, near))
+        away = np.where(np.isnan(found[..., 0]), np.inf, joint_distance(found, near))
         best = away.argmin(axis=1)
         qpos = found[np.arange(len(poses)), best]
         return np.isfinite(qpos[:, 0]), qpos
 
-    def everything(self, tcp_in_base: Array, near: Array) -> tuple[Array, NDArray[np.intp]]:
+    def all_solutions(self, tcp_in_base: Array, near: Array) -> tuple[Array, NDArray[np.intp]]:
         """Give all configurations (M, 7) that reach many poses (N, 4, 4), and of which pose each is one (M,)."""
         found = self._solve(np.asarray(tcp_in_base, dtype=np.float64), np.asarray(near, dtype=np.float64), JOINT7_STEP)
         exists = np.isfinite(found[..., 0])
         return found[exists], np.nonzero(exists)[0]
 
-    def solutions(self, tcp_in_base: Array, near: Array) -> list[Array]:
+    def distinct_solutions(self, tcp_in_base: Array, near: Array) -> list[Array]:
         """Give distinct configurations (7,) that reach one pose (4x4), nearest to ``near`` first."""
         found = self._solve(np.asarray(tcp_in_base, dtype=np.float64)[None], near, JOINT7_FINE_STEP)[0]
         found = found[np.isfinite(found[:, 0])]
         kept: list[Array] = []
-        for qpos in found[np.argsort(turn_between(found, near), kind="stable")]:
-            if all(np.linalg.norm(qpos - other) >= DISTINCT for other in kept):
+        for qpos in found[np.argsort(joint_distance(found, near), kind="stable")]:
+            if all(np.linalg.norm(qpos - other) >= MIN_SOLUTION_DISTANCE for other in kept):
                 kept.append(qpos)
-        return kept[:MOST]
+        return kept[:MAX_SOLUTIONS]
 
     def _solve(self, poses: Array, near: Array, step: float) -> Array:
         """Return solutions (N, K, 7) of poses (N, 4, 4) over joint 7, which is also tried at its value in ``near``."""
@@ -236,9 +236,9 @@ def follow_line(chain: ArmChain, start: Array, tcp_in_base: Array, *, stage: str
     """
     start = np.asarray(start, dtype=np.float64)
     goals = _line_poses(chain.tcp(start[None])[0], tcp_in_base)
-    path = _solve_together(chain, start, goals)
+    path = _solve_simultaneously(chain, start, goals)
     if path is None or _largest_jump(path) > MAX_JUMP:
-        path = _solve_in_turn(chain, start, goals)
+        path = _solve_sequentially(chain, start, goals)
     if path is None:
         raise PlanningError(stage, "line_unreachable")
     if _largest_jump(path) > MAX_JUMP:
@@ -246,15 +246,15 @@ def follow_line(chain: ArmChain, start: Array, tcp_in_base: Array, *, stage: str
     return path
 
 
-def _solve_together(chain: ArmChain, start: Array, goals: Array) -> Array | None:
+def _solve_simultaneously(chain: ArmChain, start: Array, goals: Array) -> Array | None:
     """Return a path (n + 1, 7) along poses (n, 4, 4): one step to every few poses, then steps of all poses together."""
     path = np.empty((len(goals) + 1, 7))
     path[0] = start
-    for before in range(0, len(goals), STRIDE):
-        after = min(before + STRIDE, len(goals))
+    for before in range(0, len(goals), ESTIMATE_STRIDE):
+        after = min(before + ESTIMATE_STRIDE, len(goals))
         estimate = newton_step(chain, path[before, None], goals[after - 1, None])[0][0]
         path[before : after + 1] = np.linspace(path[before], estimate, after - before + 1)
-    for _ in range(TOGETHER):
+    for _ in range(LINE_ITERATIONS):
         following, error = newton_step(chain, path[1:], goals)
         if error.max() <= TOLERANCE:
             return path
@@ -262,11 +262,11 @@ def _solve_together(chain: ArmChain, start: Array, goals: Array) -> Array | None
     return None
 
 
-def _solve_in_turn(chain: ArmChain, start: Array, goals: Array) -> Array | None:
+def _solve_sequentially(chain: ArmChain, start: Array, goals: Array) -> Array | None:
     path = [start]
     for goal in goals:
         qpos = path[-1][None]
-        for _ in range(IN_TURN):
+        for _ in range(POSE_ITERATIONS):
             following, error = newton_step(chain, qpos, goal[None])
             if error[0] <= TOLERANCE:
                 break

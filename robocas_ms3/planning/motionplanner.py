@@ -25,8 +25,8 @@ from robocas_ms3.core.checks import check_number
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.core.poses import from_wxyz, inverse
 from robocas_ms3.planning.protocol import Array, Obstacle, Shape, Trajectory
-from robocas_ms3.planning.rrt_connect import DEFAULT, make_planner
-from robocas_ms3.planning.scene import seen_from
+from robocas_ms3.planning.rrt_connect import DEFAULT_PLANNER, make_planner
+from robocas_ms3.planning.scene import to_arm_base_frame
 from robocas_ms3.robots.agent import MobileManipulator
 from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.registry import RobotSpec
@@ -75,7 +75,7 @@ class PandaArmMotionPlanningSolver:
         base_pose: sapien.Pose | Pose | None = None,
         joint_vel_limits: float = 0.9,
         joint_acc_limits: float = 0.9,
-        backend: str = DEFAULT,
+        backend: str = DEFAULT_PLANNER,
         **ignored: bool,
     ) -> None:
         if unknown := ignored.keys() - IGNORED:
@@ -185,7 +185,7 @@ class PandaArmMotionPlanningSolver:
         """Give the planner the present scene; return the start (7,) and the goal in the arm's base frame (4x4)."""
         base = self.arm_base_in_world
         goal = inverse(base) @ _matrix(pose, "pose")
-        self.planner.set_scene(seen_from(self._obstacles, base))
+        self.planner.set_scene(to_arm_base_frame(self._obstacles, base))
         self.planner.finger_width = float(self._qpos(self.description.finger_joints).sum())
         return self._arm_qpos, goal
 

@@ -11,13 +11,13 @@ import numpy as np
 
 from robocas_ms3.planning.protocol import Array
 
-FreeUntil = Callable[[Array], int]
+CountFree = Callable[[Array], int]
 
 
 SPARSE = 8  # every so manieth configuration of an edge is checked before all others
 
 
-class BudgetSpent(Exception):
+class BudgetExceeded(Exception):
     """The planner has made all the collision checks it was given."""
 
 
@@ -58,21 +58,21 @@ class PathSearch:
         spacing: distance of checks along an edge, rad (norm).
     """
 
-    def __init__(self, free_until: FreeUntil, lower: Array, upper: Array, *, step: float, spacing: float) -> None:
-        self._free_until, self._lower, self._upper = free_until, lower, upper
+    def __init__(self, count_free: CountFree, lower: Array, upper: Array, *, step: float, spacing: float) -> None:
+        self._free_until, self._lower, self._upper = count_free, lower, upper
         self._step, self.spacing = step, spacing
         self._left = 0
 
     def _checked(self, a: Array, b: Array) -> Array:
-        """Return configurations (M, n) along the edge from ``a`` (taken as free) to ``b``, and count them as checks."""
+        """Return configurations (M, n) along the edge from ``a`` (assumed free) to ``b``, and count them as checks."""
         count = max(1, int(np.ceil(np.linalg.norm(b - a) / self.spacing)))
         if self._left < count:
-            raise BudgetSpent
+            raise BudgetExceeded
         self._left -= count
         return a + (b - a) * (np.arange(1, count + 1) / count)[:, None]
 
     def edge_free(self, a: Array, b: Array) -> bool:
-        """Check the straight edge from ``a`` (taken as free) to ``b``; sparse ones first, where failures show early."""
+        """Check the straight edge from ``a`` (assumed free) to ``b``; sparse ones first, where failures show early."""
         points = self._checked(a, b)
         points = np.concatenate([points[i::SPARSE] for i in (SPARSE - 1, *range(SPARSE - 1))])
         return self._free_until(points) == len(points)
@@ -96,7 +96,7 @@ class PathSearch:
                         forward, backward = trees[0].branch(ends[0]), trees[1].branch(ends[1])
                         return forward + backward[::-1][1:]
                 grow, other = other, grow
-        except BudgetSpent:
+        except BudgetExceeded:
             return None
 
     def _sample(self, start: Array, goals: list[Array], rng: np.random.Generator) -> Array:
@@ -131,7 +131,7 @@ class PathSearch:
                 if len(path) <= 2:
                     break
                 path = self._shortcut(path, rng)
-        except BudgetSpent:
+        except BudgetExceeded:
             pass
         return path
 
@@ -144,7 +144,7 @@ class PathSearch:
                 try:
                     if self.edge_free(path[index], path[reach]):
                         break
-                except BudgetSpent:
+                except BudgetExceeded:
                     return kept + path[index + 1 :]
                 reach = index + (reach - index) // 2
             kept.append(path[reach])

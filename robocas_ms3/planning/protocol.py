@@ -58,7 +58,7 @@ class Obstacle:
     name: str
     shape: Shape
     pose_in_base: Array
-    room: float = 0.0
+    clearance: float = 0.0
 
 
 class Planner(Protocol):
@@ -101,7 +101,7 @@ class Planner(Protocol):
         """
         ...
 
-    def free(self, qpos: Array, finger_width: float | None = None) -> NDArray[np.bool_]:
+    def is_free(self, qpos: Array, finger_width: float | None = None) -> NDArray[np.bool_]:
         """Say which configurations (M, 7) touch nothing: (M,). Far cheaper than one at a time."""
         ...
 

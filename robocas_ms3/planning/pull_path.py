@@ -16,14 +16,14 @@ from robocas_ms3.planning.protocol import Array
 MAX_SLIP = np.deg2rad(50)  # of the gripper about the bar, from straight in; further on the palm meets the front
 MAX_JUMP = 0.2  # rad a joint may turn between two poses of the handle
 ITERATIONS = 14
-SETTLING = 6  # iterations in which the free motion is used to leave joint limits
+NULLSPACE_ITERATIONS = 6  # iterations in which the free motion is used to leave joint limits
 POSITION_TOLERANCE, ROTATION_TOLERANCE = 2e-4, 2e-3  # m, rad
 
 # OpenBLAS starts threads even for 6 x 6 matrices: ten times slower, and the last bits hang on their number.
 _BLAS = ThreadpoolController()
 
 
-def turned_about_bar(tcp: Array, angle: float) -> Array:
+def rotate_about_bar(tcp: Array, angle: float) -> Array:
     """Return TCP poses (..., 4, 4) turned about their own x axis by an angle, rad."""
     turn = np.eye(4)
     turn[1:3, 1:3] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
@@ -31,7 +31,7 @@ def turned_about_bar(tcp: Array, angle: float) -> Array:
 
 
 @_BLAS.wrap(limits=1, user_api="blas")
-def track(chain: ArmChain, starts: Array, goals: Array) -> Array:
+def track_handle(chain: ArmChain, starts: Array, goals: Array) -> Array:
     """Follow poses of a bar with the TCP, free to turn about the bar by up to ``MAX_SLIP``.
 
     Args:
@@ -55,8 +55,8 @@ def track(chain: ArmChain, starts: Array, goals: Array) -> Array:
     return path
 
 
-def reached(path: Array) -> NDArray[np.int_]:
-    """Return how many poses (N,) of a ``track`` (T, N, 7) were reached."""
+def count_reached(path: Array) -> NDArray[np.int_]:
+    """Return how many poses (N,) of a ``track_handle`` (T, N, 7) were reached."""
     return np.isfinite(path[:, :, 0]).sum(axis=0)
 
 
@@ -68,7 +68,7 @@ def _solve(chain: ArmChain, starts: Array, goals: Array) -> tuple[Array, NDArray
     bar = goals[:, :3, 0]
     for iteration in range(ITERATIONS):
         pose, jacobian = chain.jacobian(qpos)
-        error = twist(pose, goals)
+        error = pose_difference(pose, goals)
         lag = (error[:, 3:] * bar).sum(axis=1)
         free = np.abs(lag) <= MAX_SLIP
         error[:, 3:] -= bar * np.clip(lag, -MAX_SLIP, MAX_SLIP)[:, None]
@@ -77,11 +77,11 @@ def _solve(chain: ArmChain, starts: Array, goals: Array) -> tuple[Array, NDArray
         solved = (np.linalg.norm(error[:, :3], axis=1) <= POSITION_TOLERANCE) & (
             np.linalg.norm(error[:, 3:], axis=1) <= ROTATION_TOLERANCE
         )
-        if solved.all() and iteration >= SETTLING:
+        if solved.all() and iteration >= NULLSPACE_ITERATIONS:
             break
         square = jacobian @ jacobian.transpose(0, 2, 1) + 1e-6 * np.eye(6)
         step = (jacobian.transpose(0, 2, 1) @ np.linalg.solve(square, error[:, :, None]))[:, :, 0]
-        if iteration < SETTLING:
+        if iteration < NULLSPACE_ITERATIONS:
             away = -0.02 * ((qpos - middle) / half) ** 3
             moved = jacobian @ away[:, :, None]
             step += away - (jacobian.transpose(0, 2, 1) @ np.linalg.solve(square, moved))[:, :, 0]
@@ -90,7 +90,7 @@ def _solve(chain: ArmChain, starts: Array, goals: Array) -> tuple[Array, NDArray
     return qpos, solved
 
 
-def twist(pose: Array, goal: Array) -> Array:
+def pose_difference(pose: Array, goal: Array) -> Array:
     """Return position differences and rotation vectors (M, 6) from poses to goals (M, 4, 4), in the base frame."""
     turn = np.einsum("mij,mkj->mik", goal[:, :3, :3], pose[:, :3, :3])
     axis = 0.5 * np.stack(

@@ -16,11 +16,15 @@ TOOL_RADIUS = 0.012  # m, half the width of the closed fingers
 TIP_BELOW_TCP = 0.0085  # m, by which the pads reach beyond the TCP
 TIP_CLEARANCE = 0.012  # m kept between the finger tips and the surface
 BELOW_TOP = 0.02  # m; nearer to an object's top the tool would slide over it
-PAST_MIDDLE = 0.1  # m that the tool goes past where the object's middle was (upstream's; the paper: 2 d_ext in all)
+PUSH_BEYOND_CENTER = (
+    0.1  # m that the tool goes past where the object's middle was (upstream's; the paper: 2 d_ext in all)
+)
 EDGE_MARGIN = 0.08  # m that a pushed object keeps from the surface's edge
 WALL_MARGIN = 0.02  # m that it keeps from furniture and basket
 PUSHED_THINNED = 5  # every fifth point of an object will do for that: they are 5 mm apart
-ON_TOP = 0.01  # m; an object whose centre is closer than this to the target's has no direction of its own (upstream's)
+COINCIDENT_DISTANCE = (
+    0.01  # m; an object whose centre is closer than this to the target's has no direction of its own (upstream's)
+)
 TURNS_DEG = (0.0, 20.0, -20.0, 40.0, -40.0, 65.0, -65.0, 90.0, -90.0)  # directions tried, off the paper's one
 YAWS = 4  # turns of the tool about the vertical, of half a turn
 
@@ -40,7 +44,7 @@ class Push:
         return pose
 
 
-def candidates(
+def push_candidates(
     rng: np.random.Generator,
     points: Array,
     target: Array,
@@ -83,7 +87,7 @@ def candidates(
             tool = np.array([*center[:2], height]) - (extent + STAND_OFF + TOOL_RADIUS) * direction
             if not _tool_fits(tool, near):
                 continue
-            length = STAND_OFF + extent + PAST_MIDDLE
+            length = STAND_OFF + extent + PUSH_BEYOND_CENTER
             shift = (length - STAND_OFF) * direction
             if not _ends_on(points + shift, frame, half) or _hits(tree, points, shift):
                 continue
@@ -105,7 +109,7 @@ def push_direction(rng: np.random.Generator, center: Array, target: Array) -> Ar
     Where they are less than 1 cm apart: within 30 deg of towards the robot, which stands at the origin.
     """
     away = np.append((center - target)[:2], 0.0)
-    if np.linalg.norm(away) < ON_TOP:
+    if np.linalg.norm(away) < COINCIDENT_DISTANCE:
         home = np.append(-center[:2], 0.0)
         away = Rotation.from_euler("z", rng.uniform(-30, 30), degrees=True).apply(home)
     return away / np.linalg.norm(away)
@@ -132,7 +136,7 @@ def _ends_on(points: Array, frame: Array, half: Array) -> bool:
 def _hits(tree: KDTree | None, points: Array, shift: Array) -> bool:
     if tree is None:
         return False
-    ways = [points[::PUSHED_THINNED, :2] + share * shift[:2] for share in (0.5, 1.0)]
+    ways = [points[::PUSHED_THINNED, :2] + fraction * shift[:2] for fraction in (0.5, 1.0)]
     return bool(tree.query(np.concatenate(ways))[0].min() < WALL_MARGIN)
 
 

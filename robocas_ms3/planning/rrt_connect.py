@@ -12,11 +12,19 @@ import numpy as np
 
 from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.core.extensions import Registry
-from robocas_ms3.planning.collision import FclWorld
-from robocas_ms3.planning.kinematics import Reachability, follow_line, turn_between
+from robocas_ms3.planning.collision import CollisionChecker
+from robocas_ms3.planning.kinematics import Reachability, follow_line, joint_distance
 from robocas_ms3.planning.path_search import PathSearch
 from robocas_ms3.planning.protocol import Array, Planner, Trajectory
-from robocas_ms3.planning.time_parameterization import JointPath, blended, rounded, stopping, thinned, through, timed
+from robocas_ms3.planning.time_parameterization import (
+    JointPath,
+    blend_motions,
+    fit_spline,
+    round_corners,
+    thin_path,
+    time_path,
+    time_with_stops,
+)
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.robots.registry import RobotSpec
 
@@ -29,17 +37,17 @@ DETOUR = 1.5  # a straight motion to another goal is taken when not longer than 
 BLENDS = (0.9, 0.5)  # s by which the end of a motion and the beginning of the next overlap
 BLEND_SPACING = 0.05  # rad between the points that a blended motion's spline goes through
 SHORTCUTS = 40
-STILL = 1e-6  # rad; a shorter motion is none
+MIN_MOTION = 1e-6  # rad; a shorter motion is none
 TCP_SPEED_LIMIT = 0.45  # m/s: at 5 Hz pd_ee_delta_pose moves 0.1 m a step at most, with some lag to catch up
 
 Timed = TypeVar("Timed", Trajectory, Trajectory | None)
 
 
-class RRTConnectPlanner(FclWorld):
+class RRTConnectPlanner(CollisionChecker):
     """Plan for the arm in its base frame; see `protocol.Planner` for methods without a docstring.
 
     Args:
-        urdf, srdf, robot: see `FclWorld`.
+        urdf, srdf, robot: see `CollisionChecker`.
         dt: seconds between rows of a trajectory.
     """
 
@@ -51,7 +59,7 @@ class RRTConnectPlanner(FclWorld):
         self._dt = dt
         self._limits = {"velocity": robot.arm_velocity_limit, "acceleration": robot.arm_acceleration_limit}
         lower, upper = self.chain.lower, self.chain.upper
-        self._search = PathSearch(self.free_until, lower, upper, step=RRT_RANGE, spacing=SPACING)
+        self._search = PathSearch(self.count_free, lower, upper, step=RRT_RANGE, spacing=SPACING)
         self._rng = np.random.default_rng(0)
 
     def seed(self, seed: int) -> None:
@@ -59,10 +67,10 @@ class RRTConnectPlanner(FclWorld):
 
     def ik(self, tcp_in_base: Array, near: Array, *, avoid_collisions: bool = True) -> list[Array]:
         near = np.asarray(near, dtype=np.float64)
-        found = self._reachability.solutions(tcp_in_base, near)
+        found = self._reachability.distinct_solutions(tcp_in_base, near)
         if not avoid_collisions or not found:
             return found
-        return [qpos for qpos, ok in zip(found, self.free(np.array(found), self.finger_width), strict=True) if ok]
+        return [qpos for qpos, ok in zip(found, self.is_free(np.array(found), self.finger_width), strict=True) if ok]
 
     def plan_to_pose(self, start: Array, tcp_in_base: Array, *, stage: str) -> Trajectory:
         """Plan as `plan_to_qpos` does to the configurations of a pose (4x4); reasons: ``no_ik``, or as there."""
@@ -87,16 +95,16 @@ class RRTConnectPlanner(FclWorld):
         wanted = wanted[np.all((wanted >= lower) & (wanted <= upper), axis=1)]
         if not len(wanted):
             raise PlanningError(stage, "goal_outside_limits")
-        wanted = wanted[self.free(wanted, self.finger_width)]
+        wanted = wanted[self.is_free(wanted, self.finger_width)]
         if not len(wanted):
             raise PlanningError(stage, "goal_in_collision")
-        free = list(wanted[np.argsort(turn_between(wanted, start), kind="stable")])
-        if np.linalg.norm(free[0] - start) < STILL:
+        free = list(wanted[np.argsort(joint_distance(wanted, start), kind="stable")])
+        if np.linalg.norm(free[0] - start) < MIN_MOTION:
             return Trajectory(free[0][None].copy(), self._dt)
-        enough = DETOUR * turn_between(free[0], start) + 0.5
+        enough = DETOUR * joint_distance(free[0], start) + 0.5
         for goal in free:
-            if turn_between(goal, start) <= enough and self._straight_free(start, goal):
-                return self._timed(partial(stopping, np.array([start, goal])))
+            if joint_distance(goal, start) <= enough and self._straight_free(start, goal):
+                return self._timed(partial(time_with_stops, np.array([start, goal])))
         if not search:
             raise PlanningError(stage, "not_straight")
         reason = "rrt_timeout"
@@ -131,12 +139,12 @@ class RRTConnectPlanner(FclWorld):
         """
         start = self._checked_start(start, stage, obstacles=check_collisions)
         waypoints = follow_line(self.chain, start, np.asarray(tcp_in_base, dtype=np.float64), stage=stage)
-        if np.linalg.norm(waypoints[-1] - start) < STILL:
+        if np.linalg.norm(waypoints[-1] - start) < MIN_MOTION:
             return Trajectory(waypoints[-1:].copy(), self._dt)
-        path = through(waypoints)
+        path = fit_spline(waypoints)
         if not self._path_free(path, obstacles=check_collisions):
             raise PlanningError(stage, "straight_line_blocked")
-        trajectory = self._timed(partial(timed, path), speed)
+        trajectory = self._timed(partial(time_path, path), speed)
         if trajectory is None:
             raise PlanningError(stage, "timing_failed")
         return trajectory
@@ -148,15 +156,15 @@ class RRTConnectPlanner(FclWorld):
             rows = min(round(seconds / self._dt), len(a) - 1, len(b) - 1)
             if rows < 1:
                 continue
-            points = blended(a, b, rows)
-            path = through(thinned(points, BLEND_SPACING))
+            points = blend_motions(a, b, rows)
+            path = fit_spline(thin_path(points, BLEND_SPACING))
             driven, end = path.dense(FINE_SPACING), points[min(len(a), len(points) - 1)]
             lower, upper = self.chain.limits.T  # the sum of two motions may leave what either keeps to
             # up to the end of the corner: what follows was planned among other obstacles
             corner = int(np.linalg.norm(driven - end, axis=1).argmin()) + 1
             if not np.all((lower <= driven) & (driven <= upper)) or not self.all_free(driven[:corner]):
                 continue
-            trajectory = self._timed(partial(timed, path))
+            trajectory = self._timed(partial(time_path, path))
             if trajectory is not None and len(trajectory.qpos) < len(best.qpos):
                 return trajectory
         return best
@@ -183,14 +191,14 @@ class RRTConnectPlanner(FclWorld):
         points[-1] = waypoints[-1]
         corners = np.array(points)
         if len(points) == 2 and self._straight_free(*points):
-            return self._timed(partial(stopping, corners))
+            return self._timed(partial(time_with_stops, corners))
         for radius in CORNER_RADII:
-            path = rounded(corners, radius)
+            path = round_corners(corners, radius)
             if self._path_free(path):
-                trajectory = self._timed(partial(timed, path))
+                trajectory = self._timed(partial(time_path, path))
                 if trajectory is not None:
                     return trajectory
-        return self._timed(partial(stopping, corners)) if self.all_free(_dense(corners)) else None
+        return self._timed(partial(time_with_stops, corners)) if self.all_free(_dense(corners)) else None
 
     def _timed(self, time: Callable[..., Timed], speed: float = 1.0) -> Timed:
         """Time a motion within a fraction of the limits, and slower where the TCP would be faster than its limit."""
@@ -215,14 +223,14 @@ def _fractions(a: Array, b: Array) -> Array:
     return np.linspace(0, 1, int(np.ceil(np.linalg.norm(b - a) / FINE_SPACING)) + 1, dtype=np.float64)
 
 
-DEFAULT = "rrt_connect"
-BACKENDS: Registry[Callable[..., Planner]] = Registry(
-    "planner", "robocas_ms3.planners", Callable, {DEFAULT: RRTConnectPlanner}
+DEFAULT_PLANNER = "rrt_connect"
+PLANNERS: Registry[Callable[..., Planner]] = Registry(
+    "planner", "robocas_ms3.planners", Callable, {DEFAULT_PLANNER: RRTConnectPlanner}
 )
 """Motion planners by name; other packages add theirs by entry points ``robocas_ms3.planners``."""
 
 
 def make_planner(name: str, robot: RobotSpec, *, dt: float) -> Planner:
     """Make the planner of a name for a robot's arm, with trajectories of time step ``dt`` (s)."""
-    backend, files = BACKENDS.find(name, where="planner"), robot.files()
+    backend, files = PLANNERS.find(name, where="planner"), robot.files()
     return backend(files.arm_urdf, files.arm_srdf, robot=robot.description, dt=dt)

@@ -27,7 +27,7 @@ BASKET = "basket"  # its name among obstacles
 _SHAPES: dict[int, tuple[BodyFiles, Shape]] = {}  # by the part's id, which stays its own since the part is kept
 
 
-def shape_of(part: BodyFiles) -> Shape:
+def part_shape(part: BodyFiles) -> Shape:
     """Return the shape of an asset's part, always the same object in a process."""
     if id(part) not in _SHAPES:
         _SHAPES[id(part)] = part, Shape(tuple(part.hulls))
@@ -38,7 +38,7 @@ def _size(part: BodyFiles) -> float:
     return max(math.sqrt(np.einsum("ij,ij->i", hull, hull).max()) for hull in part.hulls)
 
 
-def seen_from(obstacles_in_world: Iterable[Obstacle], arm_base_in_world: Array) -> list[Obstacle]:
+def to_arm_base_frame(obstacles_in_world: Iterable[Obstacle], arm_base_in_world: Array) -> list[Obstacle]:
     """Return bodies with world poses in the frame of an arm's base (4x4)."""
     to_base = inverse(arm_base_in_world)
     return [replace(body, pose_in_base=to_base @ body.pose_in_base) for body in obstacles_in_world]
@@ -47,27 +47,27 @@ def seen_from(obstacles_in_world: Iterable[Obstacle], arm_base_in_world: Array) 
 class PlanningScene:
     """Reads one environment (``num_envs`` = 1) as a planner sees it: poses (4x4) and clouds in the arm's base frame.
 
-    Bodies (`obstacles`) are for planners, clouds (`obstacles_in_base`) for whatever reasons about surfaces.
+    Bodies (`obstacles`) are for planners, clouds (`points_in_base`) for whatever reasons about surfaces.
     """
 
     def __init__(self, env: RoboCASEnv) -> None:
         self.env = env
 
     def _bodies(
-        self, left_out: Collection[int], without_link: tuple[str, str] | None
+        self, excluded: Collection[int], exclude_link: tuple[str, str] | None
     ) -> Iterator[tuple[str, BodyFiles, float, Array]]:
         """Yield name, part, spacing of its samples (m) and pose in the world (4x4) of all that is there."""
         for name, asset in self.env.model.furniture.items():
             frame = self.env.model.furniture_poses[name]
             yield name, asset, FURNITURE_SPACING, frame
             for link, pose in link_poses(asset.asset.links, self.joint_positions(name)).items():
-                if (name, link) != without_link:
+                if (name, link) != exclude_link:
                     yield f"{name}/{link}", asset.links[link], FURNITURE_SPACING, frame @ pose
         if self.env.model.basket is not None:
             yield BASKET, self.env.model.basket, SPACING, from_wxyz(self.env.basket_pose[0])
         present, poses = self.env.present[0].tolist(), self.env.object_states[0, :, :7]
         for slot, asset in enumerate(self.env.object_assets[0]):
-            if present[slot] and slot not in left_out:
+            if present[slot] and slot not in excluded:
                 yield asset.asset.id, asset, SPACING, from_wxyz(poses[slot])
 
     def sample_surfaces(self) -> None:
@@ -96,7 +96,7 @@ class PlanningScene:
     def object_in_base(self, slot: int) -> Array:
         return inverse(self.arm_base_in_world) @ from_wxyz(self.env.object_states[0, slot, :7])
 
-    def object_surface(self, slot: int) -> Array:
+    def object_points(self, slot: int) -> Array:
         """Return samples (P, 3) of an object's surface."""
         return transform_points(self.object_in_base(slot), self.env.object_assets[0][slot].surface_points(SPACING))
 
@@ -107,30 +107,30 @@ class PlanningScene:
     def obstacles(
         self,
         *,
-        without: int | Collection[int] = (),
-        without_link: tuple[str, str] | None = None,
-        room: float = 0.0,
+        exclude: int | Collection[int] = (),
+        exclude_link: tuple[str, str] | None = None,
+        clearance: float = 0.0,
     ) -> list[Obstacle]:
-        """Return furniture, basket and present objects as bodies, with ``room`` (m) to furniture and basket."""
-        bodies = self.obstacles_in_world(without=without, without_link=without_link)
+        """Return furniture, basket and present objects as bodies, with ``clearance`` (m) to furniture and basket."""
+        bodies = self.obstacles_in_world(exclude=exclude, exclude_link=exclude_link)
         objects = {asset.asset.id for asset in self.env.object_assets[0]}
-        bodies = [body if body.name in objects else replace(body, room=room) for body in bodies]
-        return seen_from(bodies, self.arm_base_in_world)
+        bodies = [body if body.name in objects else replace(body, clearance=clearance) for body in bodies]
+        return to_arm_base_frame(bodies, self.arm_base_in_world)
 
     def obstacles_in_world(
         self,
         *,
-        without: int | Collection[int] = (),
-        without_link: tuple[str, str] | None = None,
+        exclude: int | Collection[int] = (),
+        exclude_link: tuple[str, str] | None = None,
     ) -> list[Obstacle]:
-        """Return the bodies of `obstacles` with their poses in the world (`seen_from`)."""
-        left_out = {without} if isinstance(without, int) else without
-        return [Obstacle(name, shape_of(part), pose) for name, part, _, pose in self._bodies(left_out, without_link)]
+        """Return the bodies of `obstacles` with their poses in the world (`to_arm_base_frame`)."""
+        excluded = {exclude} if isinstance(exclude, int) else exclude
+        return [Obstacle(name, part_shape(part), pose) for name, part, _, pose in self._bodies(excluded, exclude_link)]
 
-    def obstacles_in_base(
+    def points_in_base(
         self,
         *,
-        without: int | Collection[int] = (),
+        exclude: int | Collection[int] = (),
         radius: float = RADIUS,
         around: Array | None = None,
     ) -> Array:
@@ -140,9 +140,9 @@ class PlanningScene:
         """
         to_base = inverse(self.arm_base_in_world)
         center = np.zeros(3) if around is None else around
-        left_out = {without} if isinstance(without, int) else without
+        excluded = {exclude} if isinstance(exclude, int) else exclude
         pieces: list[Array] = [np.zeros((0, 3))]
-        for _, part, spacing, pose in self._bodies(left_out, None):
+        for _, part, spacing, pose in self._bodies(excluded, None):
             in_base, points = to_base @ pose, part.surface_points(spacing)
             middle = (center - in_base[:3, 3]) @ in_base[:3, :3]
             if np.linalg.norm(middle) + _size(part) > radius:  # not all of it is there

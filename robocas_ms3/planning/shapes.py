@@ -19,13 +19,13 @@ from robocas_ms3.planning.protocol import Array, Shape
 
 MARGIN = 0.0025  # m that obstacles are larger than they are: about what voxels of 5 mm add on average
 VOXEL = 0.005  # m, edge of the voxels of point clouds, equal to the spacing of their points
-KEPT = 16  # trees of the last clouds and hulls of the last held objects
+CACHE_SIZE = 16  # trees of the last clouds and hulls of the last held objects
 DEPTH = 16  # levels of an octree
 OCCUPIED, INNER = 2, 3  # bits per child in octomap's stream; 0: unknown
 
 
 @dataclass(frozen=True)
-class Pieces:
+class ConvexPieces:
     """The convex pieces of a shape.
 
     Attributes:
@@ -37,55 +37,55 @@ class Pieces:
     geometries: list[Any]
     vertices: Array
     first: NDArray[np.int_]
-    spares: dict[int, list[Any]] = field(default_factory=lambda: defaultdict(list))
+    unused: dict[int, list[Any]] = field(default_factory=lambda: defaultdict(list))
 
 
 class CollisionShapes:
     """Builds FCL geometries and caches them."""
 
     def __init__(self) -> None:
-        self._shapes: WeakKeyDictionary[Shape, dict[float, Pieces]] = WeakKeyDictionary()
-        self._recent: OrderedDict[bytes, Pieces] = OrderedDict()
+        self._shapes: WeakKeyDictionary[Shape, dict[float, ConvexPieces]] = WeakKeyDictionary()
+        self._recent: OrderedDict[bytes, ConvexPieces] = OrderedDict()
 
-    def obstacle(self, shape: Shape, room: float) -> Pieces:
-        """Return the pieces of an obstacle's shape, its hulls enlarged by ``room`` (m) and a margin."""
+    def obstacle(self, shape: Shape, clearance: float) -> ConvexPieces:
+        """Return the pieces of an obstacle's shape, its hulls enlarged by ``clearance`` (m) and a margin."""
         sizes = self._shapes.setdefault(shape, {})
-        if room not in sizes:
-            sizes[room] = self._pieces(shape, room)
-        return sizes[room]
+        if clearance not in sizes:
+            sizes[clearance] = self._pieces(shape, clearance)
+        return sizes[clearance]
 
-    def cloud(self, points: Array) -> Pieces:
+    def cloud(self, points: Array) -> ConvexPieces:
         """Return an octree of points (P, 3), or no piece where all of them are too far away for one."""
         return self._remember(points, self._tree)
 
-    def hull(self, vertices: Array) -> Pieces:
+    def hull(self, vertices: Array) -> ConvexPieces:
         return self._remember(np.ascontiguousarray(vertices, dtype=np.float64), self._hull)
 
-    def _pieces(self, shape: Shape, room: float) -> Pieces:
+    def _pieces(self, shape: Shape, clearance: float) -> ConvexPieces:
         if shape.points is not None:
             return self._tree(np.ascontiguousarray(shape.points))
-        hulls = [inflated(np.asarray(vertices, dtype=np.float64), MARGIN + room) for vertices in shape.hulls]
+        hulls = [inflate_hull(np.asarray(vertices, dtype=np.float64), MARGIN + clearance) for vertices in shape.hulls]
         first = np.cumsum([0, *(len(vertices) for vertices, _ in hulls[:-1])])
         geometries = [fcl_convex(vertices, faces) for vertices, faces in hulls]
-        return Pieces(geometries, np.concatenate([vertices for vertices, _ in hulls]), first)
+        return ConvexPieces(geometries, np.concatenate([vertices for vertices, _ in hulls]), first)
 
-    def _tree(self, points: Array) -> Pieces:
+    def _tree(self, points: Array) -> ConvexPieces:
         stream = encode_octree(points, VOXEL)
         if not stream:
-            return Pieces([], np.zeros((0, 3)), np.zeros(0, dtype=int))
+            return ConvexPieces([], np.zeros((0, 3)), np.zeros(0, dtype=int))
         ends = np.array([points.min(axis=0) - VOXEL, points.max(axis=0) + VOXEL])
         corners = np.array(list(itertools.product(*ends.T)))
-        return Pieces([fcl.OcTree(VOXEL, stream)], corners, np.zeros(1, dtype=int))
+        return ConvexPieces([fcl.OcTree(VOXEL, stream)], corners, np.zeros(1, dtype=int))
 
-    def _hull(self, vertices: Array) -> Pieces:
+    def _hull(self, vertices: Array) -> ConvexPieces:
         corners, faces, _ = convex_hull(vertices)
-        return Pieces([fcl_convex(corners, faces)], corners, np.zeros(1, dtype=int))
+        return ConvexPieces([fcl_convex(corners, faces)], corners, np.zeros(1, dtype=int))
 
-    def _remember(self, points: Array, make: Callable[[Array], Pieces]) -> Pieces:
+    def _remember(self, points: Array, make: Callable[[Array], ConvexPieces]) -> ConvexPieces:
         key = hashlib.blake2b(points.data).digest() + make.__name__.encode()
         made = self._recent.pop(key, None) or make(points)
         self._recent[key] = made
-        if len(self._recent) > KEPT:
+        if len(self._recent) > CACHE_SIZE:
             self._recent.popitem(last=False)
         return made
 
@@ -107,7 +107,7 @@ def convex_hull(vertices: Array) -> tuple[Array, NDArray[np.int32], Array]:
     return vertices[used], faces.reshape(-1, 3).astype(np.int32), hull.equations[:, :3]
 
 
-def inflated(vertices: Array, margin: float) -> tuple[Array, NDArray[np.int32]]:
+def inflate_hull(vertices: Array, margin: float) -> tuple[Array, NDArray[np.int32]]:
     """Return corners and triangles of a convex hull with its faces moved out by ``margin`` (m), sharp edges less."""
     corners, faces, normals = convex_hull(vertices)
     square, total = np.tile(1e-3 * np.eye(3), (len(corners), 1, 1)), np.zeros((len(corners), 3))

@@ -64,7 +64,7 @@ class JointPath:
         return points[np.concatenate([[True], np.diff(points) > 1e-6 * self.length])]
 
 
-def rounded(waypoints: Array, radius: float) -> JointPath:
+def round_corners(waypoints: Array, radius: float) -> JointPath:
     """Round the corners of a polyline (m, n) by parabolas that begin at most ``radius`` rad before each corner."""
     points = np.asarray(waypoints, dtype=np.float64)
     steps = np.diff(points, axis=0)
@@ -86,14 +86,14 @@ def rounded(waypoints: Array, radius: float) -> JointPath:
     return JointPath(PPoly(np.array(pieces).transpose(1, 0, 2), np.array(breaks)), points[-1])
 
 
-def through(waypoints: Array) -> JointPath:
+def fit_spline(waypoints: Array) -> JointPath:
     """Lay a cubic spline through dense configurations (m, n) of a smooth motion."""
     points = np.asarray(waypoints, dtype=np.float64)
     ends = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     return JointPath(CubicSpline(ends, points, bc_type="not-a-knot" if len(points) > 3 else "natural"), points[-1])
 
 
-def blended(first: Array, second: Array, rows: int) -> Array:
+def blend_motions(first: Array, second: Array, rows: int) -> Array:
     """Lay the end of a motion over the beginning of the next, which cuts the corner between them.
 
     Args:
@@ -109,14 +109,14 @@ def blended(first: Array, second: Array, rows: int) -> Array:
     return np.concatenate([first[:-rows], first[-rows:] + second[:rows] - first[-1], second[rows:]])
 
 
-def thinned(points: Array, spacing: float) -> Array:
+def thin_path(points: Array, spacing: float) -> Array:
     """Return configurations (T, n) about ``spacing`` rad apart, first and last included."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     kept = np.unique(np.searchsorted(along, np.arange(0, max(along[-1] - spacing / 2, spacing / 2), spacing)))
     return points[[*kept, len(points) - 1]]
 
 
-def timed(path: JointPath, *, velocity: float, acceleration: float, dt: float) -> Trajectory | None:
+def time_path(path: JointPath, *, velocity: float, acceleration: float, dt: float) -> Trajectory | None:
     """Time a path as fast as the limits of every joint allow, from rest to rest; None if TOPP-RA fails.
 
     The motion is stretched to a whole number of steps, so that row i lies exactly at ``(i + 1) * dt``.
@@ -129,7 +129,7 @@ def timed(path: JointPath, *, velocity: float, acceleration: float, dt: float) -
     if motion is None:
         return None
     duration = float(motion.path_interval[1])
-    return sampled(motion, duration, path.goal, dt) if np.isfinite(duration) else None
+    return sample_motion(motion, duration, path.goal, dt) if np.isfinite(duration) else None
 
 
 @lru_cache(maxsize=64)  # making them takes a quarter of the time that timing takes: TOPP-RA words what it prints
@@ -143,7 +143,7 @@ def _bounds(dof: int, velocity: float, acceleration: float) -> list[Any]:
     ]
 
 
-def stopping(waypoints: Array, *, velocity: float, acceleration: float, dt: float) -> Trajectory:
+def time_with_stops(waypoints: Array, *, velocity: float, acceleration: float, dt: float) -> Trajectory:
     """Time a polyline (m, n) as straight segments that each begin and end at rest: slow, and exactly on the path."""
     points = np.asarray(waypoints, dtype=np.float64)
     steps = np.diff(points, axis=0)
@@ -164,10 +164,10 @@ def stopping(waypoints: Array, *, velocity: float, acceleration: float, dt: floa
         )
         return points[index] + (done / largest[index])[:, None] * steps[index]
 
-    return sampled(at, float(ends[-1]), points[-1], dt)
+    return sample_motion(at, float(ends[-1]), points[-1], dt)
 
 
-def sampled(motion: Callable[[Array], Array], duration: float, goal: Array, dt: float) -> Trajectory:
+def sample_motion(motion: Callable[[Array], Array], duration: float, goal: Array, dt: float) -> Trajectory:
     """Sample a motion at exact steps; the last row is ``goal``, a vanishing motion has that row alone."""
     count = max(1, int(np.ceil(duration / dt - 1e-9)))
     qpos = np.array(motion(np.arange(1, count + 1, dtype=np.float64) * (duration / count)), dtype=np.float64)

@@ -146,7 +146,7 @@ def waiting(steps):
     def policy(arm):
         begun.append(len(arm.executor.actions))
         number = next(numbers)
-        arm.executor.move_gripper(1.0, arm.at, seconds=abs(number) * arm.executor.dt)
+        arm.executor.move_gripper(1.0, arm.qpos, seconds=abs(number) * arm.executor.dt)
         if number < 0:
             raise PlanningError("grasp", "missed")
 
@@ -201,13 +201,13 @@ def stirring(log):
 
     def stir(arm, steps):
         for _ in range(steps):
-            arm.at = arm.at + np.eye(7)[1] * 0.06  # the shoulder: down into the heap
-            arm.executor.follow(Trajectory(arm.at[None], arm.executor.dt))
+            arm.qpos = arm.qpos + np.eye(7)[1] * 0.06  # the shoulder: down into the heap
+            arm.executor.follow(Trajectory(arm.qpos[None], arm.executor.dt))
             arm.executor.facts["stirred"] = len(arm.executor.actions)
 
     def policy(arm):
         stir(arm, 12)
-        arm.come_back_here()
+        arm.add_backtracking_point()
         state = hashlib.sha256(arm.env.get_state().numpy().tobytes()).hexdigest()
         found = [state, arm.executor.facts["stirred"], len(arm.executor.actions), float(arm.rng.random())]
         with log.open("a") as file:
@@ -274,7 +274,7 @@ def test_recoveries_stay_unless_the_episode_is_lost(tmp_path, monkeypatch, searc
 
     def policy(arm):
         begun.append(len(arm.executor.actions))
-        arm.executor.move_gripper(-1.0, arm.at, seconds=0.2)
+        arm.executor.move_gripper(-1.0, arm.qpos, seconds=0.2)
         failure = next(failures, None)
         if failure:
             raise failure

@@ -24,10 +24,10 @@ def test_it_is_a_planner_by_name(site):
         "-c",
         f"""
 import numpy as np
-from robocas_ms3.planning.rrt_connect import BACKENDS, make_planner
+from robocas_ms3.planning.rrt_connect import PLANNERS, make_planner
 from robocas_ms3.robots.registry import PANDA
 planner = make_planner("straight", PANDA, dt=0.05)
-print(list(BACKENDS), all(hasattr(planner, name) for name in {members!r}))
+print(list(PLANNERS), all(hasattr(planner, name) for name in {members!r}))
 start = np.array([0, -1.02, 0, -2.51, 0, 1.35, 0.78])
 goal = planner.tcp(start)
 goal[:3, 3] += [0.1, 0.1, 0.05]

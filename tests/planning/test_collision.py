@@ -12,14 +12,14 @@ from planning_scenes import REST, Box, cloud, corners, table_scene
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.poses import transform_points
-from robocas_ms3.planning.collision import FclWorld
+from robocas_ms3.planning.collision import CollisionChecker
 from robocas_ms3.planning.protocol import AttachedBody, Obstacle, Shape
 from robocas_ms3.robots.description import MOBILE_PANDA
 
 
 @pytest.fixture
-def world(panda_files) -> FclWorld:
-    return FclWorld(panda_files.arm_urdf, panda_files.arm_srdf, MOBILE_PANDA)
+def world(panda_files) -> CollisionChecker:
+    return CollisionChecker(panda_files.arm_urdf, panda_files.arm_srdf, MOBILE_PANDA)
 
 
 def test_a_cloud_of_5_mm_spacing_has_no_holes(world):
@@ -35,7 +35,7 @@ def test_a_cloud_of_5_mm_spacing_has_no_holes(world):
         world.set_scene((plane + shift + [0, 0, -0.004]) @ tcp[:3, :3].T + lowest)
         assert world.collisions(REST, 0.08) == ["cloud", "panda_leftfinger", "panda_rightfinger"]
         world.set_scene((plane + shift + [0, 0, 0.010]) @ tcp[:3, :3].T + lowest)
-        assert world.free(REST[None])[0]
+        assert world.is_free(REST[None])[0]
 
 
 def test_cached_clouds_give_the_same_verdicts(world):
@@ -43,10 +43,10 @@ def test_cached_clouds_give_the_same_verdicts(world):
     clouds = [cloud([Box((0.6, 0, 0.1 * i), (0.1, 0.1, 0.1))]) for i in range(20)]
     for _ in range(2):
         world.set_scene(wide)
-        assert not world.free(REST[None])[0]
+        assert not world.is_free(REST[None])[0]
         for points in clouds:
             world.set_scene(points)
-            assert world.free(REST[None])[0]
+            assert world.is_free(REST[None])[0]
 
 
 def test_points_in_the_base_and_out_of_reach_are_dropped(world):
@@ -60,7 +60,7 @@ def test_points_in_the_base_and_out_of_reach_are_dropped(world):
     points = np.array(
         [[0, 0, -0.05], [0.05, 0, 0.1], [0.2, 0, -0.3], [0.3, 0, 0], [0, 0.2, -0.1], [1.51, 0, 0], [1.49, 0, 0]]
     )
-    np.testing.assert_array_equal(world.keeps(points), [False, False, False, True, True, False, True])
+    np.testing.assert_array_equal(world.is_obstacle_point(points), [False, False, False, True, True, False, True])
 
 
 def test_points_beyond_the_octree_are_no_obstacles(world):
@@ -76,7 +76,7 @@ def test_points_beyond_the_octree_are_no_obstacles(world):
 
 def test_self_collisions_are_checked_without_obstacles(world):
     world.set_scene(cloud([Box(tuple(world.tcp(REST)[:3, 3]), (0.09, 0.09, 0.03))]))
-    assert not world.free(REST[None])[0]
+    assert not world.is_free(REST[None])[0]
     assert world.all_free(REST[None], obstacles=False)
     folded = np.array([0.0, -1.7, 0.0, -3.0, 0.0, 0.0, 0.0])
     assert not world.all_free(folded[None], obstacles=False)
@@ -95,29 +95,29 @@ def test_bodies_and_their_clouds_give_the_same_verdicts(world):
     low, high = world.chain.lower, world.chain.upper
     qpos = np.clip(REST + np.random.default_rng(0).normal(0, 0.6, (400, 7)), low, high)
     world.set_scene(cloud(boxes))
-    by_points = world.free(qpos)
+    by_points = world.is_free(qpos)
     world.set_scene([body(box) for box in boxes])
-    by_bodies = world.free(qpos)
+    by_bodies = world.is_free(qpos)
     assert 20 < np.sum(~by_bodies) < 380
     assert np.mean(by_points == by_bodies) > 0.98
     assert [world.all_free(q[None]) for q in qpos] == by_bodies.tolist()
     first = int(np.argmin(by_bodies))
-    assert world.free_until(qpos) == first
-    assert world.free_until(qpos[by_bodies]) == by_bodies.sum()
+    assert world.count_free(qpos) == first
+    assert world.count_free(qpos[by_bodies]) == by_bodies.sum()
     assert not world.all_free(qpos)
     assert world.all_free(qpos[by_bodies])
 
 
 def verdicts(panda_files) -> bytes:
     """The verdicts of a world of its own on the same configurations, obstacles and held object."""
-    world, boxes = FclWorld(panda_files.arm_urdf, panda_files.arm_srdf, MOBILE_PANDA), table_scene(0)
+    world, boxes = CollisionChecker(panda_files.arm_urdf, panda_files.arm_srdf, MOBILE_PANDA), table_scene(0)
     qpos = REST + np.random.default_rng(0).uniform(-0.8, 0.8, (300, 7))
     found = []
     for obstacles in (cloud(boxes), [body(box) for box in boxes]):
         world.set_scene(obstacles) if isinstance(obstacles, np.ndarray) else world.set_scene(obstacles)
         for held in (None, AttachedBody(corners(0.05, 0.05, 0.1), np.eye(4))):
             world.attach(held)
-            found.append(world.free(qpos))
+            found.append(world.is_free(qpos))
     assert 0.1 < np.mean(found) < 0.9
     return np.array(found).tobytes()
 
@@ -167,5 +167,5 @@ def test_the_comparison_of_boxes_loses_no_contact(world, monkeypatch):
     assert 20 < sum(map(bool, found)) < 80
     assert sum("attached" in names for names in found) > 5
     assert contacts(transform_points(pose, held), np.eye(4)) == found
-    monkeypatch.setattr(FclWorld, "_broad_phase", everything)
+    monkeypatch.setattr(CollisionChecker, "_broad_phase", everything)
     assert contacts(held, pose) == found

@@ -15,7 +15,7 @@ from planning_scenes import REST, Checker, corners
 
 from robocas_ms3.assets.annotations import GRIPPER_BOXES
 from robocas_ms3.core.errors import RobotDescriptionError
-from robocas_ms3.planning.collision import FclWorld
+from robocas_ms3.planning.collision import CollisionChecker
 from robocas_ms3.planning.protocol import Obstacle, Shape
 from robocas_ms3.planning.shapes import MARGIN
 from robocas_ms3.robots.description import MOBILE_PANDA
@@ -33,8 +33,8 @@ def files(panda_files, tmp_path) -> Path:
     return tmp_path
 
 
-def load(files: Path) -> FclWorld:
-    return FclWorld(files / "panda_arm.urdf", files / "panda_arm.srdf", MOBILE_PANDA)
+def load(files: Path) -> CollisionChecker:
+    return CollisionChecker(files / "panda_arm.urdf", files / "panda_arm.srdf", MOBILE_PANDA)
 
 
 def replace_hand(files: Path, shape: Element, *, position: str = "0 0 0.6", angles: str = "0 0 0") -> None:
@@ -49,7 +49,7 @@ def replace_hand(files: Path, shape: Element, *, position: str = "0 0 0.6", angl
     tree.write(files / "panda_arm.urdf")
 
 
-def touches_cube(world: FclWorld, checker: Checker, position: np.ndarray) -> bool:
+def touches_cube(world: CollisionChecker, checker: Checker, position: np.ndarray) -> bool:
     """Whether the hand touches a cube of 5.2 mm with its margin, at a position relative to ``AHEAD``."""
     pose = checker.link_pose("panda_hand", REST).copy()
     pose[:3, 3] += pose[:3, :3] @ (AHEAD + position)

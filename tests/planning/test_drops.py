@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from robocas_ms3.planning.skills.place import Inside, overhangs, sample_drops
+from robocas_ms3.planning.skills.place import ContainerInterior, compute_overhang, sample_drops
 
 CONTAINER = np.array([[0, -1, 0, 0.6], [1, 0, 0, 0.2], [0, 0, 1, 0.1], [0, 0, 0, 1.0]])  # turned by 90 degrees
-INSIDE = Inside(CONTAINER, np.array([-0.2, -0.1, -0.1]), np.array([0.2, 0.1, 0.1]))
+INSIDE = ContainerInterior(CONTAINER, np.array([-0.2, -0.1, -0.1]), np.array([0.2, 0.1, 0.1]))
 BOX = np.array([[x, y, z] for x in (-0.03, 0.03) for y in (-0.02, 0.02) for z in (-0.1, 0.1)]) + [0, 0, 0.05]
 
 
@@ -42,5 +42,5 @@ def test_overhang_is_what_sticks_out_sideways():
     pose[:3, 3] = [0.6, 0.2, 0.5]
     bar = np.array([[x, 0, 0] for x in (-0.15, 0.15)])
     turned = pose @ np.array([[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
-    assert overhangs(np.stack([pose, turned]), INSIDE, bar) == pytest.approx([0.05, 0.0])
-    assert overhangs(np.stack([pose, turned]), INSIDE, bar, 0.06) == pytest.approx([0.11, 0.01])
+    assert compute_overhang(np.stack([pose, turned]), INSIDE, bar) == pytest.approx([0.05, 0.0])
+    assert compute_overhang(np.stack([pose, turned]), INSIDE, bar, 0.06) == pytest.approx([0.11, 0.01])

@@ -13,9 +13,9 @@ from robocas_ms3.assets.kinematics import joint_motion
 from robocas_ms3.assets.manifest import Handle, Joint
 from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.planning.protocol import AttachedBody, Obstacle, Shape
-from robocas_ms3.planning.pull_path import MAX_SLIP, reached, track
-from robocas_ms3.planning.skills.drive import Surroundings, free_route
-from robocas_ms3.planning.skills.handles import Part
+from robocas_ms3.planning.pull_path import MAX_SLIP, count_reached, track_handle
+from robocas_ms3.planning.skills.drive import Surroundings, find_free_route
+from robocas_ms3.planning.skills.handles import MovingPart
 from robocas_ms3.robots.description import MOBILE_PANDA
 
 SLIDE = Joint(name="slide", kind="prismatic", axis=(-1.0, 0.0, 0.0), limits=(0.0, 0.6), friction=0, damping=0)
@@ -42,10 +42,10 @@ def angle_about_bar(found: np.ndarray, goal: np.ndarray) -> float:
 def test_every_pose_of_a_pull_holds_the_bar_where_the_joint_has_it(reachability, joint, end):
     hold = level_hold(0.7, 0.1, 0.5)
     goals = np.array([joint_motion(joint, q) @ hold for q in np.linspace(0, end, 25)])
-    solved, start = reachability.reachable(goals[:1], np.array(REST))
+    solved, start = reachability.nearest_solutions(goals[:1], np.array(REST))
     assert solved.all()
-    path = track(reachability.chain, start, goals)[:, 0]
-    assert reached(path[:, None])[0] == 25
+    path = track_handle(reachability.chain, start, goals)[:, 0]
+    assert count_reached(path[:, None])[0] == 25
     assert np.abs(np.diff(path, axis=0)).max() <= 0.2
     assert (path >= reachability.lower).all()
     assert (path <= reachability.upper).all()
@@ -60,9 +60,9 @@ def test_pull_ends_at_the_limit_of_the_reach(reachability):
     hold = level_hold(0.6, 0.1, 0.5)
     away = Joint(name="away", kind="prismatic", axis=(1, 0, 0), limits=(0, 2), friction=0, damping=0)
     goals = np.array([joint_motion(away, q) @ hold for q in np.arange(0, 1.0, 0.02)])
-    _, start = reachability.reachable(goals[:1], np.array(REST))
-    path = track(reachability.chain, start, goals)
-    count = int(reached(path)[0])
+    _, start = reachability.nearest_solutions(goals[:1], np.array(REST))
+    path = track_handle(reachability.chain, start, goals)
+    count = int(count_reached(path)[0])
     assert 0.6 + 0.02 * count < 1.2  # the Panda's reach, long fingers included
     assert count > 3
     assert np.isnan(path[count:]).all()
@@ -72,36 +72,36 @@ def test_pull_ends_at_the_limit_of_the_reach(reachability):
 def test_drive_keeps_the_held_object_free_of_collisions(planner):
     robot = SimpleNamespace(pose=SimpleNamespace(raw_pose=torch.tensor([[0.0, 0, 0, 1, 0, 0, 0]])))
     env = SimpleNamespace(agent=SimpleNamespace(robot=robot))
-    arm = SimpleNamespace(env=env, robot=MOBILE_PANDA, planner=planner, at=np.array(REST))
+    arm = SimpleNamespace(env=env, robot=MOBILE_PANDA, planner=planner, qpos=np.array(REST))
     start, goal = np.zeros(3), np.array([0.24, 0.0, 0.0])
     planner.finger_width = 0.04
-    beyond = planner.tcp(arm.at) @ np.array(
+    beyond = planner.tcp(arm.qpos) @ np.array(
         [0, 0, 0.10, 1]
     )  # 0.10 m beyond the tips, where the base stands at the goal
     spot, there = np.random.default_rng(0).uniform(-0.01, 0.01, (600, 3)), np.eye(4)
     there[:3, 3] = beyond[:3] + [0.24, 0, 0.49]
     spot = Surroundings([Obstacle("spot", Shape(points=spot), there)], spot + there[:3, 3])
-    assert len(free_route(arm, start, goal, spot, leaving=False)) == 1
+    assert len(find_free_route(arm, start, goal, spot, leaving=False)) == 1
     corners = np.stack(np.meshgrid((-0.02, 0.02), (-0.02, 0.02), (-0.02, 0.15)), axis=-1).reshape(-1, 3)
     planner.attach(AttachedBody(corners, np.eye(4)))
-    assert free_route(arm, start, goal, spot, leaving=False) is None
+    assert find_free_route(arm, start, goal, spot, leaving=False) is None
 
 
 def standing_at(position, joint, monkeypatch):
-    monkeypatch.setattr(Part, "position", lambda self, arm: position)
+    monkeypatch.setattr(MovingPart, "position", lambda self, arm: position)
     handle = Handle(link="door", position=(0, 0, 0), wxyz=(1, 0, 0, 0), width=0.02)
-    return Part("cabinet", handle, joint)
+    return MovingPart("cabinet", handle, joint)
 
 
 @pytest.mark.parametrize("towards", [1, -1])
 def test_pull_continues_from_the_position_of_the_joint(towards, monkeypatch):
     limits = tuple(sorted((0.0, towards * 0.4)))
     joint = Joint(name="slide", kind="prismatic", axis=(1, 0, 0), limits=limits, friction=0, damping=0)
-    way = standing_at(towards * 0.1, joint, monkeypatch).way(None)
+    way = standing_at(towards * 0.1, joint, monkeypatch).pull_positions(None)
     assert way[[0, -1]] == pytest.approx([towards * 0.1, towards * 0.38])  # 0.95 of the range
     assert len(way) == 20  # 0.28 m in steps of at most 0.015 m
     part = standing_at(towards * 0.35, joint, monkeypatch)
-    assert part.least(None) == pytest.approx(0.03)  # a quarter of the range is more than what is left
+    assert part.min_pull(None) == pytest.approx(0.03)  # a quarter of the range is more than what is left
     for position in (0.37, 0.38, 0.4):
         with pytest.raises(PlanningError, match="at_the_end"):
-            standing_at(towards * position, joint, monkeypatch).way(None)
+            standing_at(towards * position, joint, monkeypatch).pull_positions(None)

@@ -35,7 +35,7 @@ def test_a_line_is_straight_and_ends_at_its_goal(chain, checker, seed):
         [[Rotation.from_rotvec(rng.uniform(-0.5, 0.5, 3)).as_matrix(), np.zeros((3, 1))], [0, 0, 0, 1]]
     )
     goal[:3, 3] += rng.uniform((-0.05, -0.05, -0.15), (0.05, 0.05, 0.05))
-    start = Reachability(chain).solutions(above, REST)[0]
+    start = Reachability(chain).distinct_solutions(above, REST)[0]
     path = follow_line(chain, start, goal, stage="x")
     np.testing.assert_array_equal(path[0], start)
     assert (path >= chain.lower).all() and (path <= chain.upper).all()
@@ -58,12 +58,12 @@ def refusal(chain, start, goal) -> str:
 
 
 def test_a_line_out_of_reach_is_refused(chain):
-    start = Reachability(chain).solutions(top_down(0.5, 0, 0.3), REST)[0]
+    start = Reachability(chain).distinct_solutions(top_down(0.5, 0, 0.3), REST)[0]
     assert refusal(chain, start, top_down(1.2, 0, 0.3)) in ("line_unreachable", "line_joint_jump")
 
 
 def test_a_line_through_a_joint_limit_is_refused(chain):
     """The last joint starts near its limit and would have to turn further."""
-    start = max(Reachability(chain).solutions(top_down(0.5, 0, 0.3), REST), key=lambda qpos: qpos[6])
+    start = max(Reachability(chain).distinct_solutions(top_down(0.5, 0, 0.3), REST), key=lambda qpos: qpos[6])
     assert len(follow_line(chain, start, top_down(0.5, 0, 0.3, yaw=1.0), stage="x")) > 15
     assert refusal(chain, start, top_down(0.5, 0, 0.3, yaw=-2.0)) == "line_unreachable"

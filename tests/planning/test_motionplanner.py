@@ -105,12 +105,12 @@ def test_an_obstacle_blocks_the_straight_line_and_is_passed_on_another_path(env,
         solver.move_to_pose_with_screw(across)
     assert caught.value.reason == "straight_line_blocked"
     around = solver.move_to_pose_with_RRTConnect(across, dry_run=True)
-    assert solver.planner.free(around.qpos).all()
+    assert solver.planner.is_free(around.qpos).all()
     solver.clear_collisions()
     straight = solver.move_to_pose_with_screw(across, dry_run=True)
     add(solver, between)
     solver.move_to_pose_with_RRTConnect(across, dry_run=True)
-    assert not solver.planner.free(straight.qpos).all()
+    assert not solver.planner.is_free(straight.qpos).all()
 
 
 def test_the_gripper_moves_while_the_arm_stays_and_vis_shows_each_step(env, monkeypatch):

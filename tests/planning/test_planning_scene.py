@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from robocas_ms3.planning.scene import PlanningScene, seen_from
+from robocas_ms3.planning.scene import PlanningScene, to_arm_base_frame
 
 
 class Parked(PlanningScene):
@@ -49,23 +49,27 @@ def environment(present):
     ("present", "without", "heights"),
     [([1, 1, 1], (), [1, 2, 3]), ([1, 0, 1], (), [1, 3]), ([1, 0, 1], 2, [1]), ([0, 1, 1], [0, 1], [3])],
 )
-def test_objects_that_wait_elsewhere_are_no_obstacles(present, without, heights):
+def test_objects_that_wait_elsewhere_are_no_obstacles(present, exclude, heights):
     scene = Parked(environment(present))
-    assert scene.obstacles_in_base(without=without, radius=np.inf)[:, 2].tolist() == [0, 0, *heights]
-    bodies = scene.obstacles(without=without)
+    assert scene.points_in_base(exclude=exclude, radius=np.inf)[:, 2].tolist() == [0, 0, *heights]
+    bodies = scene.obstacles(exclude=exclude)
     assert [body.name for body in bodies[:2]] == ["table", "basket"]
     assert [body.pose_in_base[2, 3] for body in bodies[2:]] == heights
 
 
 def test_room_is_kept_to_furniture_and_basket_not_to_objects():
-    bodies = Parked(environment([1, 1, 1])).obstacles(room=0.02)
-    assert [(body.name, body.room) for body in bodies[:3]] == [("table", 0.02), ("basket", 0.02), ("object 0", 0.0)]
+    bodies = Parked(environment([1, 1, 1])).obstacles(clearance=0.02)
+    assert [(body.name, body.clearance) for body in bodies[:3]] == [
+        ("table", 0.02),
+        ("basket", 0.02),
+        ("object 0", 0.0),
+    ]
 
 
 def test_only_what_is_near_a_place_is_sampled():
     scene = Parked(environment([1, 1, 1]))
-    assert scene.obstacles_in_base()[:, 2].tolist() == [0, 1]  # within 1.5 m of the arm's base
-    assert scene.obstacles_in_base(radius=0.5, around=np.array([0, 0, 2.2]))[:, 2].tolist() == [2]
+    assert scene.points_in_base()[:, 2].tolist() == [0, 1]  # within 1.5 m of the arm's base
+    assert scene.points_in_base(radius=0.5, around=np.array([0, 0, 2.2]))[:, 2].tolist() == [2]
 
 
 def test_a_part_has_one_shape_and_a_body_is_seen_from_another_base():
@@ -73,4 +77,4 @@ def test_a_part_has_one_shape_and_a_body_is_seen_from_another_base():
     (*_, first), (*_, again) = scene.obstacles(), scene.obstacles()
     assert first.shape is again.shape
     world = scene.obstacles_in_world()
-    assert seen_from(world, at(0.5, 0, 1))[-1].pose_in_base[:3, 3].tolist() == [-0.5, 0, 0]
+    assert to_arm_base_frame(world, at(0.5, 0, 1))[-1].pose_in_base[:3, 3].tolist() == [-0.5, 0, 0]

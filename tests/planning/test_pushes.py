@@ -30,7 +30,7 @@ NOTHING = np.zeros((0, 3))
 
 
 def pushes(target=TARGET, others=NOTHING, points=OBSTACLE, half=HALF, fixed=NOTHING) -> list[pushing.Push]:
-    return list(pushing.candidates(np.random.default_rng(0), points, target, others, (TABLE, half), fixed))
+    return list(pushing.push_candidates(np.random.default_rng(0), points, target, others, (TABLE, half), fixed))
 
 
 def test_right_above_the_target_the_push_goes_towards_the_robot():
@@ -53,7 +53,9 @@ def test_the_first_push_is_the_papers():
     assert push.start[:3, 2] == pytest.approx([0, 0, -1])  # tool down
     assert push.end[:3, 3] - push.start[:3, 3] == pytest.approx(push.length * push.direction)
     for turn in (30.0, -30.0):
-        found = pushing.candidates(np.random.default_rng(0), OBSTACLE, TARGET, NOTHING, (TABLE, HALF), NOTHING, turn)
+        found = pushing.push_candidates(
+            np.random.default_rng(0), OBSTACLE, TARGET, NOTHING, (TABLE, HALF), NOTHING, turn
+        )
         first = next(found).direction
         assert np.rad2deg(np.arctan2(first[1], first[0])) == pytest.approx(90 + turn)
 
@@ -74,7 +76,7 @@ def test_where_something_stands_the_tool_does_not_come_down():
 def test_every_push_ends_on_the_surface(x, y, seed):
     points = OBSTACLE - OBSTACLE.mean(axis=0) + [x, y, 0.15]
     rng = np.random.default_rng(seed)
-    for push in pushing.candidates(rng, points, np.array([0.6, 0.0, 0.12]), NOTHING, (TABLE, HALF), NOTHING):
+    for push in pushing.push_candidates(rng, points, np.array([0.6, 0.0, 0.12]), NOTHING, (TABLE, HALF), NOTHING):
         moved = points + (push.length - pushing.STAND_OFF) * push.direction
         assert np.all(np.abs(moved[:, :2] - TABLE[:2, 3]) <= HALF - pushing.EDGE_MARGIN)
         assert push.start[2, 3] - pushing.TIP_BELOW_TCP >= SURFACE + pushing.TIP_CLEARANCE - 1e-9

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.planning.analytic import PandaGeometry
-from robocas_ms3.planning.kinematics import DISTINCT, ArmChain, Reachability, turn_between
-from robocas_ms3.planning.pull_path import twist
+from robocas_ms3.planning.kinematics import MIN_SOLUTION_DISTANCE, ArmChain, Reachability, joint_distance
+from robocas_ms3.planning.pull_path import pose_difference
 from robocas_ms3.robots.description import MOBILE_PANDA
 
 
@@ -31,7 +31,7 @@ def test_jacobian_is_the_derivative(reachability):
         step = np.zeros(7)
         step[joint] = 1e-6
         moved, _ = reachability.chain.jacobian(qpos + step)
-        np.testing.assert_allclose(twist(pose, moved) / 1e-6, jacobian[:, :, joint], atol=1e-5)
+        np.testing.assert_allclose(pose_difference(pose, moved) / 1e-6, jacobian[:, :, joint], atol=1e-5)
 
 
 def anywhere(chain: ArmChain, count: int, seed: int) -> np.ndarray:
@@ -54,7 +54,7 @@ def test_every_configuration_is_found_at_its_own_joint_7(reachability):
 
 def test_found_configurations_reach_their_poses_inside_the_limits(reachability, checker):
     poses = grasp_poses(60, 0)
-    solved, qpos = reachability.reachable(poses, REST)
+    solved, qpos = reachability.nearest_solutions(poses, REST)
     assert solved.dtype == bool and qpos.shape == (60, 7)
     assert 20 < solved.sum() < 60
     assert np.isnan(qpos[~solved]).all()
@@ -67,29 +67,29 @@ def test_found_configurations_reach_their_poses_inside_the_limits(reachability, 
 def test_the_preferred_configuration_decides_between_solutions(reachability):
     for near in (REST, REST + [0.3, 0.2, -0.2, 0.1, 0.2, 0.1, -0.5]):
         pose = reachability.chain.tcp(near[None])
-        solved, qpos = reachability.reachable(pose, near)
+        solved, qpos = reachability.nearest_solutions(pose, near)
         assert solved[0]
         assert np.linalg.norm(qpos[0] - near) < 1e-6
-        assert np.linalg.norm(reachability.solutions(pose[0], near)[0] - near) < 1e-6
+        assert np.linalg.norm(reachability.distinct_solutions(pose[0], near)[0] - near) < 1e-6
 
 
 def test_solutions_of_one_pose_differ_the_nearest_first(reachability):
-    found = reachability.solutions(top_down(0.5, 0.1, 0.2), REST)
+    found = reachability.distinct_solutions(top_down(0.5, 0.1, 0.2), REST)
     assert len(found) > 5
-    away = [float(turn_between(qpos, REST)) for qpos in found]
+    away = [float(joint_distance(qpos, REST)) for qpos in found]
     assert away == sorted(away)
     for i, qpos in enumerate(found):
-        assert all(np.linalg.norm(qpos - other) >= DISTINCT for other in found[:i])
+        assert all(np.linalg.norm(qpos - other) >= MIN_SOLUTION_DISTANCE for other in found[:i])
         np.testing.assert_allclose(reachability.chain.tcp(qpos[None])[0], top_down(0.5, 0.1, 0.2), atol=1e-9)
     for place in ((1.2, 0, 0.3), (0.0, 0.0, -0.3), (0.5, 0, 1.3)):
-        assert reachability.solutions(top_down(*place), REST) == []
+        assert reachability.distinct_solutions(top_down(*place), REST) == []
 
 
 def test_everything_returns_all_configurations_of_all_poses(reachability):
     poses = np.concatenate([grasp_poses(20, 3), top_down(1.2, 0, 0.3)[None]])  # the last one is out of reach
-    qpos, of_pose = reachability.everything(poses, REST)
+    qpos, of_pose = reachability.all_solutions(poses, REST)
     np.testing.assert_allclose(reachability.chain.tcp(qpos), poses[of_pose], atol=1e-9)
-    solved, nearest = reachability.reachable(poses, REST)
+    solved, nearest = reachability.nearest_solutions(poses, REST)
     np.testing.assert_array_equal(np.unique(of_pose), np.flatnonzero(solved))
     for pose in np.flatnonzero(solved):
         own = qpos[of_pose == pose]
@@ -100,10 +100,10 @@ def test_everything_returns_all_configurations_of_all_poses(reachability):
 def test_results_do_not_depend_on_memory_alignment(reachability):
     """numpy's arctan2 of strided numbers does: one call in a hundred differed in the last bit."""
     pose, kept = top_down(0.5, -0.25, 0.2, yaw=0.3), []
-    first = np.array(reachability.solutions(pose, REST))
+    first = np.array(reachability.distinct_solutions(pose, REST))
     for size in np.random.default_rng(0).integers(1, 400, 600):
         kept = [*kept[-20:], np.zeros(size)]
-        np.testing.assert_array_equal(np.array(reachability.solutions(pose, REST)), first)
+        np.testing.assert_array_equal(np.array(reachability.distinct_solutions(pose, REST)), first)
 
 
 def test_closed_form_of_another_arm_is_an_error(panda_files):

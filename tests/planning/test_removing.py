@@ -20,7 +20,7 @@ from robocas_ms3.planning.skills import push
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.planning.skills.heap import Heap, Move
 from robocas_ms3.planning.skills.push import push_away
-from robocas_ms3.planning.skills.remove import blockers, clear_grasps, remove
+from robocas_ms3.planning.skills.remove import count_clear_grasps, find_grasp_blockers, remove_object
 from robocas_ms3.planning.solvers import search
 
 pytestmark = pytest.mark.slow
@@ -45,7 +45,7 @@ def begin(generator, seed):
 
 
 def surface(arm, slot):
-    return arm.scene.object_surface(slot)
+    return arm.scene.object_points(slot)
 
 
 def first_that_works(skill, slots):
@@ -70,7 +70,7 @@ def test_a_removed_object_stands_on_a_free_place_of_the_table(generator, monkeyp
         turns.append(arm.scene.object_in_base(moved)[:3, :3])
 
     monkeypatch.setattr(arm, "follow", followed)
-    remove(arm, moved)
+    remove_object(arm, moved)
     let_go, left = turns[-2:]
     leant = np.degrees(np.arccos(let_go[2] @ left[2]))  # between the object's upright axis then and now
     assert leant < 3  # as it was put down it stays
@@ -107,7 +107,7 @@ def test_push_that_moves_nothing_is_a_failure(generator, monkeypatch):
             pushed.set_pose(Pose.create_from_pq(pushed.pose.p + torch.tensor([[by, 0.0, 0.0]]), pushed.pose.q))
 
         monkeypatch.setattr(heap, "push_away", move)
-        heap.make(Move("push", slots[0], 30))
+        heap.execute(Move("push", slots[0], 30))
 
     with pytest.raises(PlanningError, match="in_vain"):
         push(0.015)
@@ -116,17 +116,17 @@ def test_push_that_moves_nothing_is_a_failure(generator, monkeypatch):
     assert facts == {"pushes": 1, "removals": 0}
     facts["removals"] = heap.MOVES - 1
     with pytest.raises(UnrecoverableError, match="too_many_obstacles"):
-        next(heap.moves())
+        next(heap.candidate_moves())
 
 
 def test_moves_begin_with_pushes_of_what_is_highest_and_looking_changes_nothing(generator):
     arm, target, _ = begin(generator, 3)
     state = arm.rng.bit_generator.state
-    seen = [(clear_grasps(arm, target), blockers(arm, target)) for _ in range(2)]
+    seen = [(count_clear_grasps(arm, target), find_grasp_blockers(arm, target)) for _ in range(2)]
     assert seen[0] == seen[1]
     assert arm.rng.bit_generator.state == state
     heap = Heap(arm, target)
-    moves = list(heap.moves())
+    moves = list(heap.candidate_moves())
     assert target not in {move.slot for move in moves}
     assert len(set(moves)) == len(moves)
     in_the_way = np.flatnonzero(heap.env.clutter().obstacles[0].numpy()).tolist()
@@ -141,8 +141,8 @@ def test_where_nothing_can_be_moved_the_target_is_grasped_as_it_lies(generator, 
     def refuse(*_):
         raise PlanningError("push", "no_room")
 
-    monkeypatch.setattr(Heap, "make", refuse)
-    monkeypatch.setattr(Heap, "visible", True)
+    monkeypatch.setattr(Heap, "execute", refuse)
+    monkeypatch.setattr(Heap, "target_visible", True)
     for name in ("grasp", "raise_held_object", "carry_to_basket", "release_into_basket"):
         monkeypatch.setattr(search, name, lambda *_, name=name, **how: skills.append(name))
     search.attempt(arm)
@@ -176,8 +176,8 @@ def test_after_a_push_the_arm_rises_clear_of_furniture_and_basket(generator, mon
 @pytest.mark.parametrize("which", ["target", "another"])
 def test_what_lies_on_the_floor_ends_an_attempt_even_one_that_begins_after_the_fall(generator, which):
     arm, target, slots = begin(generator, 3)
-    Heap(arm, target).check_surface()
+    Heap(arm, target).check_objects_on_surface()
     fallen = arm.env.objects[target if which == "target" else slots[0]]
     fallen.set_pose(Pose.create_from_pq(torch.tensor([[-1.0, -1.0, 0.1]]), fallen.pose.q))
     with pytest.raises(UnrecoverableError, match="fell_off_table"):
-        Heap(arm, target).check_surface()
+        Heap(arm, target).check_objects_on_surface()

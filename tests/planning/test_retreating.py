@@ -12,7 +12,7 @@ from planning_scenes import REST, top_down
 
 from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.planning.protocol import Trajectory
-from robocas_ms3.planning.skills.arm import Arm, back_out
+from robocas_ms3.planning.skills.arm import Arm, recover
 
 TARGET = 3
 LEVEL = np.eye(4)  # points ahead, closes level
@@ -27,28 +27,28 @@ class Way(Arm):
         self._env = SimpleNamespace(
             task_config=SimpleNamespace(target=SimpleNamespace(approach=approach)), target_slot=torch.tensor([TARGET])
         )
-        self.at, self.planner, self.blocking = REST, self, blocking
-        self.scene = SimpleNamespace(tcp_in_base=tcp, obstacles=lambda without=None: without)
+        self.qpos, self.planner, self.blocking = REST, self, blocking
+        self.scene = SimpleNamespace(tcp_in_base=tcp, obstacles=lambda exclude=None: exclude)
         self.lines, self.followed, self.opened = [], [], False
 
     env = property(lambda self: self._env)
 
-    def tcp(self, at):
+    def tcp(self, qpos):
         return self.scene.tcp_in_base
 
-    def set_scene(self, left_out):
-        self.left_out = left_out
+    def set_scene(self, excluded):
+        self.excluded = excluded
 
     def plan_straight(self, start, goal, *, stage, check_collisions=True, speed=1.0):
-        if check_collisions and self.left_out in self.blocking:
+        if check_collisions and self.excluded in self.blocking:
             raise PlanningError(stage, "straight_line_blocked")
-        self.lines.append((goal, check_collisions, self.left_out))
+        self.lines.append((goal, check_collisions, self.excluded))
         return Trajectory(start[None], 0.05)
 
-    def planning(self):
+    def planning_time(self):
         return nullcontext()
 
-    def hold_nothing(self):
+    def clear_attached(self):
         pass
 
     def open_gripper(self):
@@ -59,7 +59,7 @@ class Way(Arm):
 
 
 @pytest.mark.parametrize(
-    ("tcp", "approach", "blocking", "moved", "checked", "left_out"),
+    ("tcp", "approach", "blocking", "moved", "checked", "excluded"),
     [
         # above a table it rises through what it touches
         (top_down(0.6, 0.1, 0.05), "top", (None, TARGET), (0, 0, 0.1), False, None),
@@ -69,13 +69,13 @@ class Way(Arm):
         (LEVEL, "front", (None,), (-0.25, 0, 0), True, TARGET),  # from the target that it stands against too
     ],
 )
-def test_the_way_out_of_a_failure(tcp, approach, blocking, moved, checked, left_out):
+def test_the_way_out_of_a_failure(tcp, approach, blocking, moved, checked, excluded):
     arm = Way(tcp, approach, blocking)
-    back_out(arm)
+    recover(arm)
     ((goal, *how),) = arm.lines
     assert goal[:3, 3] == pytest.approx(tcp[:3, 3] + moved)
     assert how[0] == checked
-    assert not checked or how[1] == left_out
+    assert not checked or how[1] == excluded
     assert arm.opened and len(arm.followed) == 1
 
 
@@ -83,5 +83,5 @@ def test_the_way_out_of_a_failure(tcp, approach, blocking, moved, checked, left_
 def test_before_a_shelf_it_stays_where_no_way_is_free(tcp):
     arm = Way(tcp, "front", blocking=(None, TARGET))
     with pytest.raises(PlanningError, match="straight_line_blocked"):
-        back_out(arm)
+        recover(arm)
     assert not arm.followed and not arm.lines

@@ -47,7 +47,7 @@ def test_trajectories_are_free_everywhere(make_planner, checker, seed):
             continue
         planned += 1
         check_limits(here, trajectory)
-        assert planner.free(trajectory.qpos).all()
+        assert planner.is_free(trajectory.qpos).all()
         here = trajectory.qpos[-1]
         distance, angle = pose_error(checker.link_pose("panda_hand_tcp", here), goal)
         assert distance < 2e-4 and angle < 2e-3
@@ -58,7 +58,7 @@ def test_trajectories_are_free_everywhere(make_planner, checker, seed):
             continue
         straight += 1
         check_limits(here, down)
-        assert planner.free(down.qpos).all()
+        assert planner.is_free(down.qpos).all()
     assert planned >= 2
     assert straight >= 1
 
@@ -79,8 +79,8 @@ def test_path_leads_around_a_wall_with_what_is_held(planner, held):
     trajectory = planner.plan_to_qpos(start, [goal], stage="x")
     check_limits(start, trajectory)
     np.testing.assert_array_equal(trajectory.qpos[-1], goal)
-    assert planner.free(trajectory.qpos).all()
-    assert not planner.free(np.linspace(start, goal, 50)).all()
+    assert planner.is_free(trajectory.qpos).all()
+    assert not planner.is_free(np.linspace(start, goal, 50)).all()
 
 
 @pytest.mark.parametrize("dt", [0.05, 0.2])

@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 from planning_scenes import corners
 
-from robocas_ms3.planning.shapes import DEPTH, convex_hull, encode_octree, inflated
+from robocas_ms3.planning.shapes import DEPTH, convex_hull, encode_octree, inflate_hull
 
 
 def test_an_inflated_box_has_its_faces_moved_out():
     box = corners(0.05, 0.03, 0.02)
-    larger, faces = inflated(box, 0.002)
+    larger, faces = inflate_hull(box, 0.002)
     assert np.abs(larger).max(axis=0) == pytest.approx([0.052, 0.032, 0.022], abs=1e-4)
     assert len(larger) == 8 and len(faces) == 12
     # a flat wedge: its sharp edge moves out by twice the margin at most
     wedge = np.array([[0, 0, 0], [0, 0.1, 0], [0.1, 0, 0.005], [0.1, 0.1, 0.005], [0.1, 0, -0.005], [0.1, 0.1, -0.005]])
-    larger, _ = inflated(wedge, 0.002)
+    larger, _ = inflate_hull(wedge, 0.002)
     assert larger[:, 0].min() >= -0.004 - 1e-9
 
 

@@ -22,7 +22,7 @@ class _Planner:
     def set_scene(self, obstacles) -> None:
         assert obstacles == []
 
-    def free(self, qpos) -> np.ndarray:
+    def is_free(self, qpos) -> np.ndarray:
         away = np.abs(qpos[:, None] - self.blocked[None]).max(axis=2)
         return (away > 1e-6).all(axis=1)
 
@@ -32,7 +32,7 @@ def arm(reachability):
     robot = SimpleNamespace(pose=SimpleNamespace(raw_pose=np.array([[0.0, 0, 0, 1, 0, 0, 0]])))
     env = SimpleNamespace(agent=SimpleNamespace(robot=robot))
     tools = {"robot": MOBILE_PANDA, "reachability": reachability, "planner": _Planner()}
-    return SimpleNamespace(env=env, at=REST, approach="top", **tools)
+    return SimpleNamespace(env=env, qpos=REST, approach="top", **tools)
 
 
 def grasps_in_world(arm) -> np.ndarray:
@@ -47,30 +47,30 @@ def grasps_in_world(arm) -> np.ndarray:
 
 def test_thorough_check_finds_a_free_configuration_besides_the_nearest(arm):
     grasps, here = grasps_in_world(arm), np.zeros(3)
-    assert base_placement.reach_share(arm, here, grasps, []) == 1.0
-    assert base_placement.reach_share(arm, here, grasps, [], thorough=True) == 1.0
-    poses = base_placement._poses_of_some(arm, arm_base_in_world(arm, here), grasps, len(grasps))
-    solved, nearest = arm.reachability.reachable(poses, REST)
+    assert base_placement.reachable_fraction(arm, here, grasps, []) == 1.0
+    assert base_placement.reachable_fraction(arm, here, grasps, [], thorough=True) == 1.0
+    poses = base_placement._sample_grasp_poses(arm, arm_base_in_world(arm, here), grasps, len(grasps))
+    solved, nearest = arm.reachability.nearest_solutions(poses, REST)
     assert solved.all()
     arm.planner.blocked = nearest
-    assert base_placement.reach_share(arm, here, grasps, []) == 0.0
-    assert base_placement.reach_share(arm, here, grasps, [], thorough=True) == 1.0
+    assert base_placement.reachable_fraction(arm, here, grasps, []) == 0.0
+    assert base_placement.reachable_fraction(arm, here, grasps, [], thorough=True) == 1.0
 
 
 def test_a_grasp_counts_only_with_its_pregrasp(arm):
     grasps, here = grasps_in_world(arm), np.zeros(3)
-    poses = base_placement._poses_of_some(arm, arm_base_in_world(arm, here), grasps, len(grasps))
+    poses = base_placement._sample_grasp_poses(arm, arm_base_in_world(arm, here), grasps, len(grasps))
     half = len(poses) // 2
-    everything, of_pose = arm.reachability.everything(poses, REST)
+    everything, of_pose = arm.reachability.all_solutions(poses, REST)
     arm.planner.blocked = everything[of_pose >= half]  # each way in
-    assert base_placement.reach_share(arm, here, grasps, [], thorough=True) == 0.0
+    assert base_placement.reachable_fraction(arm, here, grasps, [], thorough=True) == 0.0
     one_and_its_twin = np.isin(of_pose, [half, half + len(grasps)])
     arm.planner.blocked = everything[one_and_its_twin]
-    assert base_placement.reach_share(arm, here, grasps, [], thorough=True) == pytest.approx(7 / 8)
+    assert base_placement.reachable_fraction(arm, here, grasps, [], thorough=True) == pytest.approx(7 / 8)
 
 
 def test_unreachable_grasps_and_no_grasps_score_zero(arm):
     grasps = grasps_in_world(arm)
     for far in (grasps + np.array([[0, 0, 0, 2.0]] + [[0, 0, 0, 0]] * 3), grasps[:0]):
-        assert base_placement.reach_share(arm, np.zeros(3), far, []) == 0.0
-        assert base_placement.reach_share(arm, np.zeros(3), far, [], thorough=True) == 0.0
+        assert base_placement.reachable_fraction(arm, np.zeros(3), far, []) == 0.0
+        assert base_placement.reachable_fraction(arm, np.zeros(3), far, [], thorough=True) == 0.0

@@ -13,7 +13,7 @@ from robot_checks import link_poses, numbers
 
 import robocas_ms3.robots
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.planning.collision import FclWorld
+from robocas_ms3.planning.collision import CollisionChecker
 from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.urdf import make_robot_files
 
@@ -96,7 +96,7 @@ def test_arm_urdf_is_the_same_arm_rooted_at_its_base():
 
 def test_srdf_reports_true_self_collisions_only():
     files = make_robot_files()
-    world = FclWorld(files.arm_urdf, files.arm_srdf, MOBILE_PANDA)
+    world = CollisionChecker(files.arm_urdf, files.arm_srdf, MOBILE_PANDA)
     reaching = (0, 0.6, 0, -1.5, 0, 2.1, 0.78)
     for qpos in (MOBILE_PANDA.arm_rest, MOBILE_PANDA.arm_evaluation_start, reaching):
         for width in (0.0, 0.08):

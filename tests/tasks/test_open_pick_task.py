@@ -20,9 +20,9 @@ from robocas_ms3.demos.settings import EpisodeSettings, ReplaySettings
 from robocas_ms3.demos.trajectory_replay import replay
 from robocas_ms3.planning.executor import Executor
 from robocas_ms3.planning.skills.base_placement import drive_to_handle
-from robocas_ms3.planning.skills.drive import base_at, drive
+from robocas_ms3.planning.skills.drive import current_base_pose, drive
 from robocas_ms3.planning.skills.grasp import plan_grasp
-from robocas_ms3.planning.skills.handles import Part, open_part, pull_share
+from robocas_ms3.planning.skills.handles import MovingPart, open_furniture_part, pull_fraction
 from robocas_ms3.scenes.config import bundled_configs, load_task_config
 from robocas_ms3.scenes.language.templates import subgoal
 
@@ -69,9 +69,9 @@ def driven(tmp_path_factory):
     seen = {}
 
     def policy(arm) -> None:
-        arm.executor.label(**subgoal("operate the target", "object", "cabinet"))
+        arm.executor.start_subgoal(**subgoal("operate the target", "object", "cabinet"))
         drive(arm, np.array([0.2, -0.1, 0.3]))
-        seen["arm"], seen["base"] = arm.scene.arm_qpos - arm.at, arm.scene.arm_base_in_world
+        seen["arm"], seen["base"] = arm.scene.arm_qpos - arm.qpos, arm.scene.arm_base_in_world
 
     generator.policy = policy
     with done_early():
@@ -142,15 +142,15 @@ def test_a_pull_opens_by_contact_and_leaves_the_handle(tmp_path):
     generator = EpisodeGenerator(EpisodeSettings("open_pick", "open_pick_container", "builtin", max_attempts=1))
 
     def policy(arm) -> None:
-        part, touched = Part.of(arm), watch(arm)
+        part, touched = MovingPart.of(arm), watch(arm)
         assert part.position(arm) == pytest.approx(0, abs=1e-3)
-        open_part(arm)
+        open_furniture_part(arm)
         assert set(touched) == {part.handle.link}  # and nothing else in the scene
         assert touched[part.handle.link] < 0.002
         assert part.position(arm) == pytest.approx(0.95 * part.end, abs=0.01)
         assert bool(arm.env.furniture_opened()[0])
         # the gripper is open and off the handle
-        bar = part.in_world(arm, np.array([part.position(arm)]))[0] @ part.hold
+        bar = part.in_world(arm, np.array([part.position(arm)]))[0] @ part.grasp_in_part
         assert (np.linalg.inv(bar) @ arm.scene.arm_base_in_world @ arm.scene.tcp_in_base)[2, 3] < -0.05
         arm.planner.set_scene(arm.scene.obstacles())
         assert arm.planner.collisions(arm.scene.arm_qpos) == []
@@ -178,17 +178,17 @@ def test_it_drives_to_a_handle_that_is_out_of_reach(tmp_path):
     generator = EpisodeGenerator(EpisodeSettings("open_pick", config, "builtin", max_attempts=1))
 
     def share(arm) -> float:
-        part = Part.of(arm)
-        others = arm.scene.obstacles(without_link=(part.furniture, part.handle.link))
-        return pull_share(arm, part, arm.scene.arm_base_in_world, others)
+        part = MovingPart.of(arm)
+        others = arm.scene.obstacles(exclude_link=(part.furniture, part.handle.link))
+        return pull_fraction(arm, part, arm.scene.arm_base_in_world, others)
 
     def policy(arm) -> None:
         assert share(arm) < 0.5
         drive_to_handle(arm)
-        assert base_at(arm)[0] > 0.1
-        stands = base_at(arm)  # where it is within comfortable reach: it drives no further
+        assert current_base_pose(arm)[0] > 0.1
+        stands = current_base_pose(arm)  # where it is within comfortable reach: it drives no further
         drive_to_handle(arm)
-        assert (base_at(arm) == stands).all()
+        assert (current_base_pose(arm) == stands).all()
 
     generator.policy = policy
     with done_early():

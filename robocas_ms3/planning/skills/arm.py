@@ -23,11 +23,11 @@ T = TypeVar("T")
 Plan = TypeVar("Plan")
 GRIPPER_SECONDS = 0.5  # a dataset at 5 Hz may give its command 0.2 s later
 # m kept to furniture and basket where there is a way that does, as a robot may be off: on straight ways, while carrying
-ROOM, CARRYING_ROOM = 0.012, 0.024
-RISE, RISES = 0.04, 4  # m a step, steps
-BACK_OUT_RISE = 0.10  # m
-BACK_OUT = (0.25, 0.15, 0.10, 0.06)  # m against the approach; the first one to which the way is free
-POINTS_DOWN = -0.7  # upright component of an approach that is rather from above than level
+CLEARANCE, CARRY_CLEARANCE = 0.012, 0.024
+RISE, MAX_RISES = 0.04, 4  # m a step, steps
+RECOVERY_RISE = 0.10  # m
+RETREAT_DISTANCES = (0.25, 0.15, 0.10, 0.06)  # m against the approach; the first one to which the way is free
+MAX_TOP_APPROACH_Z = -0.7  # upright component of an approach that is rather from above than level
 
 
 @dataclass
@@ -39,7 +39,7 @@ class Arm:
         decisions: plays what `choose` is given.
         path: the attempt's number, and which candidate was taken at each decision since.
         rng: source of all randomness, made anew for each candidate: what was tried before must not matter.
-        at: (7,) rad, last commanded position of the arm; at first its position.
+        qpos: (7,) rad, last commanded position of the arm; at first its position.
     """
 
     planner: Planner
@@ -48,17 +48,17 @@ class Arm:
     decisions: Decisions
     path: tuple[int, ...] = (0,)
     rng: np.random.Generator = field(init=False)
-    at: Array = field(init=False)
+    qpos: Array = field(init=False)
 
     def __post_init__(self) -> None:
         self.scene = PlanningScene(self.env)
-        self.at = self.scene.arm_qpos
-        self.hold_nothing()
+        self.qpos = self.scene.arm_qpos
+        self.clear_attached()
         self._seed()
-        with self.planning():  # before the first decision: what is kept for as long as the process runs
+        with self.planning_time():  # before the first decision: what is kept for as long as the process runs
             self.scene.sample_surfaces()
-            for room in (CARRYING_ROOM, ROOM, 0.0):
-                self.planner.set_scene(self.scene.obstacles(room=room))
+            for clearance in (CARRY_CLEARANCE, CLEARANCE, 0.0):
+                self.planner.set_scene(self.scene.obstacles(clearance=clearance))
 
     def _seed(self) -> None:
         entropy = np.random.SeedSequence([self.executor.seed, *self.path])
@@ -76,7 +76,7 @@ class Arm:
 
         return self.decisions.choose(enumerate(candidates), play_one, limits)[1]
 
-    def come_back_here(self) -> None:
+    def add_backtracking_point(self) -> None:
         """Let what comes next begin again from here when it fails, with other random numbers."""
         self.choose(range(MAX_CONTINUED), lambda _: 0.0)
 
@@ -97,36 +97,36 @@ class Arm:
     def approach(self) -> Approach:
         return self.env.task_config.target.approach
 
-    def begin_subgoal(self, goal_type: str) -> None:
+    def start_subgoal(self, goal_type: str) -> None:
         words = self.env.target_asset().asset.name, self.env.task_config.support
-        self.executor.label(**subgoal(goal_type, *words))
+        self.executor.start_subgoal(**subgoal(goal_type, *words))
 
-    def planning(self):
+    def planning_time(self):
         return self.executor.seconds.measure("planning")
 
     def follow(self, *motions: Trajectory, until: str | None = None) -> bool:
         reached = True
         for motion in motions:
             reached = self.executor.follow(motion, until=until)
-            self.at = motion.qpos[-1]
+            self.qpos = motion.qpos[-1]
         return reached
 
     def open_gripper(self) -> None:
-        self.executor.move_gripper(OPEN, self.at, seconds=GRIPPER_SECONDS)
+        self.executor.move_gripper(OPEN, self.qpos, seconds=GRIPPER_SECONDS)
 
     def close_gripper(self) -> None:
-        self.executor.move_gripper(CLOSED, self.at, seconds=GRIPPER_SECONDS)
+        self.executor.move_gripper(CLOSED, self.qpos, seconds=GRIPPER_SECONDS)
 
-    def hold_nothing(self) -> None:
+    def clear_attached(self) -> None:
         """Tell the planner that the gripper is empty and open."""
         self.planner.attach(None)
         self.planner.finger_width = self.robot.open_width
 
-    def holds(self, slot: int) -> bool:
+    def is_holding(self, slot: int) -> bool:
         """Whether both fingers press on an object right now."""
         return bool(self.env.grasped()[0, slot])
 
-    def first_line(
+    def plan_first_line(
         self, start: Array, goals: Iterable[Array], *, stage: str, check_collisions: bool = True
     ) -> Trajectory:
         return first_plan(
@@ -138,24 +138,24 @@ class Arm:
     def plan_home(self, start: Array) -> Trajectory:
         return self.planner.plan_to_qpos(start, [np.array(self.robot.arm_rest)], stage="home")
 
-    def rise_clear(self, *, without: int | Collection[int] = ()) -> None:
-        """Rise in small steps, through whatever is touched, until arm and held object (``without``) touch nothing."""
-        for rises in range(RISES + 1):
-            with self.planning():
-                self.planner.set_scene(self.scene.obstacles(without=without))
-                if not self.planner.collisions(self.at, self.planner.finger_width):
+    def rise_until_free(self, *, exclude: int | Collection[int] = ()) -> None:
+        """Rise in small steps, through whatever is touched, until arm and held object (``exclude``) touch nothing."""
+        for rises in range(MAX_RISES + 1):
+            with self.planning_time():
+                self.planner.set_scene(self.scene.obstacles(exclude=exclude))
+                if not self.planner.collisions(self.qpos, self.planner.finger_width):
                     return
-                if rises == RISES:
+                if rises == MAX_RISES:
                     raise PlanningError("rise", "still_touching")
-                motion = self.plan_rise(self.planner.tcp(self.at), RISE, stage="rise")
+                motion = self.plan_rise(self.planner.tcp(self.qpos), RISE, stage="rise")
             self.follow(motion)
 
     def plan_rise(self, tcp_in_base: Array, height: float, *, stage: str) -> Trajectory:
         """Plan straight up, through whatever is touched; at the end of its reach the arm rises towards the robot."""
-        up = raised(tcp_in_base, height)
+        up = shift_up(tcp_in_base, height)
         inward = up.copy()
         inward[:2, 3] *= 1 - height / np.linalg.norm(up[:2, 3])
-        return self.first_line(self.at, [up, inward], stage=stage, check_collisions=False)
+        return self.plan_first_line(self.qpos, [up, inward], stage=stage, check_collisions=False)
 
 
 def first_plan(candidates: Iterable[T], plan: Callable[[T], Plan], failure: PlanningError) -> Plan:
@@ -168,47 +168,47 @@ def first_plan(candidates: Iterable[T], plan: Callable[[T], Plan], failure: Plan
     raise failure
 
 
-def raised(tcp_in_base: Array, height: float) -> Array:
+def shift_up(tcp_in_base: Array, height: float) -> Array:
     """Return poses (..., 4, 4) moved straight up by ``height`` metres (the arm's base stands upright)."""
     result = tcp_in_base.copy()
     result[..., 2, 3] += height
     return result
 
 
-def moved_back(tcp_in_base: Array, distance: float) -> Array:
+def shift_back(tcp_in_base: Array, distance: float) -> Array:
     """Return poses (..., 4, 4) moved against their approach by ``distance`` metres."""
     result = tcp_in_base.copy()
     result[..., :3, 3] -= distance * tcp_in_base[..., :3, 2]
     return result
 
 
-def plan_step_back(arm: Arm, start: Array, goals: list[Array]) -> Trajectory:
+def plan_retreat(arm: Arm, start: Array, goals: list[Array]) -> Trajectory:
     """Plan a straight line to the first of several TCP poses (best first), through whatever is touched."""
-    return arm.first_line(start, goals, stage="retreat", check_collisions=False)
+    return arm.plan_first_line(start, goals, stage="retreat", check_collisions=False)
 
 
-def plan_back_out(arm: Arm, goals: list[Array]) -> Trajectory:
+def plan_free_retreat(arm: Arm, goals: list[Array]) -> Trajectory:
     """Plan a straight line to the first of several TCP poses (best first), free of all but the target."""
     try:
-        return arm.first_line(arm.at, goals, stage="retreat")
+        return arm.plan_first_line(arm.qpos, goals, stage="retreat")
     except PlanningError:
-        arm.planner.set_scene(arm.scene.obstacles(without=arm.target))
-        return arm.first_line(arm.at, goals, stage="retreat")
+        arm.planner.set_scene(arm.scene.obstacles(exclude=arm.target))
+        return arm.plan_first_line(arm.qpos, goals, stage="retreat")
 
 
-def back_out(arm: Arm) -> None:
+def recover(arm: Arm) -> None:
     """Open the gripper and leave, after a failed attempt that stays in the record.
 
     Above an open surface the arm rises, through what it touches. Where it reached in level, as into a shelf or for a
     handle, it steps straight back on a way that is free of all but the target.
     """
-    arm.hold_nothing()
+    arm.clear_attached()
     arm.open_gripper()
-    with arm.planning():
-        tcp = arm.planner.tcp(arm.at)
+    with arm.planning_time():
+        tcp = arm.planner.tcp(arm.qpos)
         arm.planner.set_scene(arm.scene.obstacles())
-        if arm.approach == "top" and tcp[2, 2] < POINTS_DOWN:
-            motion = arm.plan_rise(arm.scene.tcp_in_base, BACK_OUT_RISE, stage="recover")
+        if arm.approach == "top" and tcp[2, 2] < MAX_TOP_APPROACH_Z:
+            motion = arm.plan_rise(arm.scene.tcp_in_base, RECOVERY_RISE, stage="recover")
         else:
-            motion = plan_back_out(arm, [moved_back(tcp, distance) for distance in BACK_OUT])
+            motion = plan_free_retreat(arm, [shift_back(tcp, distance) for distance in RETREAT_DISTANCES])
     arm.follow(motion)

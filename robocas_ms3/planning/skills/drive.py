@@ -13,23 +13,23 @@ import numpy as np
 from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.core.poses import from_wxyz, from_xyz_yaw, transform_points
 from robocas_ms3.planning.protocol import Array, Obstacle
-from robocas_ms3.planning.scene import seen_from
+from robocas_ms3.planning.scene import to_arm_base_frame
 from robocas_ms3.planning.skills.arm import Arm
-from robocas_ms3.planning.time_parameterization import stopping
+from robocas_ms3.planning.time_parameterization import time_with_stops
 from robocas_ms3.robots.description import Limits, RobotDescription
 from robocas_ms3.scenes import robot_placement
 
 SPEED, ACCELERATION = 0.25, 0.4  # m/s and rad/s; m/s^2 and rad/s^2
 SETTLE_SECONDS = 0.4
-ARRIVED = 0.01  # m, rad
+MAX_BASE_ERROR = 0.01  # m, rad
 CHECK_STEP = 0.08  # m or rad between poses at which a drive is checked
 THINNED = 3  # every third point of the clouds will do: nothing thinner than 2 cm could slip between them
 LIMIT_MARGIN = 0.01  # m, rad
 MAX_YAW = 0.6  # rad
-SAMPLES, TRIED = 400, 14  # base poses drawn; those of them that are judged
+SAMPLES, POSES_SCORED = 400, 14  # base poses drawn; those of them that are judged
 DISTANCES = (0.45, 0.80)  # m from the arm's base to what it reaches for, level
 BEST_DISTANCE = 0.58
-DETOURS = (0.15, 0.30)  # m straight back first
+BACK_DISTANCES = (0.15, 0.30)  # m straight back first
 
 
 @dataclass(frozen=True)
@@ -40,13 +40,13 @@ class Surroundings:
     cloud: Array
 
 
-def surroundings(arm: Arm, *, without: int | tuple[()] = ()) -> Surroundings:
-    cloud = arm.scene.obstacles_in_base(without=without, radius=np.inf)[::THINNED]
-    obstacles = arm.scene.obstacles_in_world(without=without)
+def read_surroundings(arm: Arm, *, exclude: int | tuple[()] = ()) -> Surroundings:
+    cloud = arm.scene.points_in_base(exclude=exclude, radius=np.inf)[::THINNED]
+    obstacles = arm.scene.obstacles_in_world(exclude=exclude)
     return Surroundings(obstacles, transform_points(arm.scene.arm_base_in_world, cloud))
 
 
-def base_at(arm: Arm) -> Array:
+def current_base_pose(arm: Arm) -> Array:
     return np.array(arm.executor.base, dtype=float)
 
 
@@ -59,17 +59,19 @@ def arm_base_in_world(arm: Arm, base: Array) -> Array:
 def drive(arm: Arm, *goals: Array) -> None:
     """Drive straight to one base pose after the other and let the base settle."""
     for goal in goals:
-        if np.abs(goal - base_at(arm)).max() < 1e-6:
+        if np.abs(goal - current_base_pose(arm)).max() < 1e-6:
             continue
-        motion = stopping(np.array([base_at(arm), goal]), velocity=SPEED, acceleration=ACCELERATION, dt=arm.executor.dt)
+        motion = time_with_stops(
+            np.array([current_base_pose(arm), goal]), velocity=SPEED, acceleration=ACCELERATION, dt=arm.executor.dt
+        )
         wait = np.repeat(goal[None], max(1, round(SETTLE_SECONDS / arm.executor.dt)), axis=0)
-        arm.executor.drive(np.concatenate([motion.qpos, wait]), arm.at)
+        arm.executor.drive(np.concatenate([motion.qpos, wait]), arm.qpos)
         now = arm.env.agent.robot.get_qpos()[0, :3].cpu().numpy()
-        if np.abs(now - goal).max() > ARRIVED:
+        if np.abs(now - goal).max() > MAX_BASE_ERROR:
             raise PlanningError("drive", "held_up")
 
 
-def places_before(arm: Arm, center: Array) -> Array:
+def sample_base_poses(arm: Arm, center: Array) -> Array:
     """Return base poses (N, 3) in front of a point (3,) in the world, the most promising first."""
     low, high = np.array(arm.robot.base_limits).T + np.array([[LIMIT_MARGIN], [-LIMIT_MARGIN]])
     high[2], low[2] = MAX_YAW, -MAX_YAW
@@ -77,17 +79,17 @@ def places_before(arm: Arm, center: Array) -> Array:
     frames = np.array([arm_base_in_world(arm, goal) for goal in goals])
     distance = np.linalg.norm((frames[:, :2, 3] - center[:2]), axis=1)
     ahead = np.einsum("ni,ni->n", frames[:, :2, 0], center[:2] - frames[:, :2, 3]) / distance
-    order = np.argsort(np.abs(distance - BEST_DISTANCE) + 0.2 * np.linalg.norm(goals - base_at(arm), axis=1))
+    order = np.argsort(np.abs(distance - BEST_DISTANCE) + 0.2 * np.linalg.norm(goals - current_base_pose(arm), axis=1))
     possible = (distance > DISTANCES[0]) & (distance < DISTANCES[1]) & (ahead > 0.7)
     return goals[order[possible[order]]]
 
 
-def best_route(
-    arm: Arm, goals: Array, around: Surroundings, judge: Callable[[Array], float], *, enough: float
+def find_best_route(
+    arm: Arm, goals: Array, around: Surroundings, score_pose: Callable[[Array], float], *, enough: float
 ) -> list[Array]:
     """Return base poses that lead to the best of the first few goals (N, 3) where the body is free.
 
-    ``judge`` returns the value of a base pose (3,), 0: useless; at a value of ``enough`` no other goal is judged.
+    ``score_pose`` returns the value of a base pose (3,), 0: useless; at a value of ``enough`` no other goal is judged.
     """
     best: tuple[float, list[Array]] = (0.0, [])
     tried = 0
@@ -95,10 +97,10 @@ def best_route(
         if not is_body_clear(arm.robot, arm_base_in_world(arm, goal), around.cloud):
             continue
         tried += 1
-        if tried > TRIED:
+        if tried > POSES_SCORED:
             break
-        share = judge(goal)
-        if share > best[0] and (route := free_route(arm, base_at(arm), goal, around, leaving=False)):
+        share = score_pose(goal)
+        if share > best[0] and (route := find_free_route(arm, current_base_pose(arm), goal, around, leaving=False)):
             best = share, route
             if share >= enough:
                 break
@@ -107,7 +109,7 @@ def best_route(
     return best[1]
 
 
-def free_route(arm: Arm, start: Array, goal: Array, around: Surroundings, *, leaving: bool) -> list[Array] | None:
+def find_free_route(arm: Arm, start: Array, goal: Array, around: Surroundings, *, leaving: bool) -> list[Array] | None:
     """Return base poses to drive to one after the other: straight, or by way of a place behind the narrower end.
 
     With ``leaving``, ``start`` is the narrower end, so that the robot backs out first; else it moves up last.
@@ -122,7 +124,7 @@ def free_route(arm: Arm, start: Array, goal: Array, around: Surroundings, *, lea
 def _routes(start: Array, goal: Array, leaving: bool, limits: Limits) -> Iterator[list[Array]]:
     yield [goal]
     narrow = start if leaving else goal
-    for distance in DETOURS:
+    for distance in BACK_DISTANCES:
         via = narrow - distance * np.array([np.cos(narrow[2]), np.sin(narrow[2]), 0])
         if all(a <= v <= b for v, (a, b) in zip(via, limits, strict=True)):
             yield [via, goal]
@@ -135,8 +137,8 @@ def _leg_is_free(arm: Arm, start: Array, goal: Array, around: Surroundings) -> b
         frame = arm_base_in_world(arm, pose)
         if not is_body_clear(arm.robot, frame, around.cloud):
             return False
-        arm.planner.set_scene(seen_from(around.obstacles, frame))
-        if arm.planner.collisions(arm.at, width):
+        arm.planner.set_scene(to_arm_base_frame(around.obstacles, frame))
+        if arm.planner.collisions(arm.qpos, width):
             return False
     return True
 

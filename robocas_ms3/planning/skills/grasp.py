@@ -13,70 +13,70 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.core.poses import inverse
-from robocas_ms3.planning.grasp_choice import draw_order, filter_grasps, grip_margins, score_grasps
+from robocas_ms3.planning.grasp_choice import filter_grasps, grip_margins, sample_order, score_grasps
 from robocas_ms3.planning.protocol import Array, AttachedBody, Trajectory
 from robocas_ms3.planning.scene import SPACING
-from robocas_ms3.planning.skills.arm import ROOM, Arm, moved_back, raised
+from robocas_ms3.planning.skills.arm import CLEARANCE, Arm, shift_back, shift_up
 from robocas_ms3.scenes.grasp_checks import NEIGHBOURHOOD, PREGRASP_DISTANCE, is_gripper_clear
 
 GRASPS_CHECKED = 48  # grasps of which a check of collisions says whether to try them early
 CLEARED_AT_ONCE = 12
-ENTRIES = 4  # pre-grasp configurations of one grasp
-WAYS = 6  # pre-grasp configurations that are searched for together
+MAX_PREGRASPS = 4  # pre-grasp configurations of one grasp
+MAX_PREGRASP_GOALS = 6  # pre-grasp configurations that are searched for together
 GRASPS_COMPARED = 96  # of which kinds are told apart
-ALIKE = 0.02, np.deg2rad(30)  # m, rad between two grasps of a kind
+KIND_TOLERANCES = 0.02, np.deg2rad(30)  # m, rad between two grasps of a kind
 GRASPS_PLANNED = 12  # grasps that motions are planned for before an attempt gives up
 # m; the least makes a stage of the tasks (3 cm), the others go over what stands in front: the first with a way out
 FRONT_LIFTS = (0.04, 0.08, 0.14, 0.2)
 WITHDRAWALS = (0.25, 0.18, 0.12)  # m, straight back; the first one that can be reached
 
-Out = tuple[Trajectory, ...]
+ExitMotions = tuple[Trajectory, ...]
 
 
-def grasp(arm: Arm, slot: int, *, lift_height: float = 0.10, other_than: int = 0) -> None:
+def grasp(arm: Arm, slot: int, *, lift_height: float = 0.10, skip_kinds: int = 0) -> None:
     """Plan a grasp of an object, run it, and lift (from the front: lift and withdraw) the object.
 
     Args:
         lift_height: when grasping from above, m (RoboCAS-v0: 0.10 when picking, 0.15 when searching).
         other_than: how many kinds of grasps to leave out, the best first.
     """
-    with arm.planning():
-        way_in, out = plan_grasp(arm, slot, lift_height, other_than)
+    with arm.planning_time():
+        way_in, out = plan_grasp(arm, slot, lift_height, skip_kinds)
     arm.follow(way_in)
     arm.close_gripper()
-    if not arm.holds(slot):
+    if not arm.is_holding(slot):
         raise PlanningError("grasp", "missed")
     arm.follow(*out)
-    if not arm.holds(slot):
+    if not arm.is_holding(slot):
         raise PlanningError("lift", "slipped")
 
 
-def plan_grasp(arm: Arm, slot: int, lift_height: float, other_than: int = 0) -> tuple[Trajectory, Out]:
+def plan_grasp(arm: Arm, slot: int, lift_height: float, skip_kinds: int = 0) -> tuple[Trajectory, ExitMotions]:
     """Plan from where the arm is to the best grasp that has a way in and out, and out of the object's surroundings."""
     planner, failure = arm.planner, PlanningError("grasp_sampling", "no_feasible_grasp")
-    everything, others = arm.scene.obstacles(), arm.scene.obstacles(without=slot)
-    with_room = arm.scene.obstacles(room=ROOM)
-    ways: list[tuple[Array, Trajectory, Out]] = []  # pre-grasp configuration, way in, way out
+    everything, others = arm.scene.obstacles(), arm.scene.obstacles(exclude=slot)
+    with_room = arm.scene.obstacles(clearance=CLEARANCE)
+    ways: list[tuple[Array, Trajectory, ExitMotions]] = []  # pre-grasp configuration, way in, way out
 
-    def finished(reach: Trajectory, inward: Trajectory, out: Out) -> tuple[Trajectory, Out]:
+    def finished(reach: Trajectory, inward: Trajectory, out: ExitMotions) -> tuple[Trajectory, ExitMotions]:
         planner.set_scene(everything)
-        return planner.join(arm.at, reach, inward), out
+        return planner.join(arm.qpos, reach, inward), out
 
-    def searched() -> tuple[Trajectory, Out]:
+    def searched() -> tuple[Trajectory, ExitMotions]:
         planner.set_scene(everything)
-        reach = planner.plan_to_qpos(arm.at, [way[0] for way in ways], stage="reach")
+        reach = planner.plan_to_qpos(arm.qpos, [way[0] for way in ways], stage="reach")
         _, inward, out = min(ways, key=lambda way: float(np.abs(way[0] - reach.qpos[-1]).max()))
         return finished(reach, inward, out)
 
-    for tcp_in_base in candidates(arm, slot, other_than):
+    for tcp_in_base in grasp_candidates(arm, slot, skip_kinds):
         # in and out of the target's surroundings, where the target itself is no obstacle; it is one on the way there
         planner.set_scene(others)
-        starts = planner.ik(moved_back(tcp_in_base, PREGRASP_DISTANCE), arm.at)[:ENTRIES]
+        starts = planner.ik(shift_back(tcp_in_base, PREGRASP_DISTANCE), arm.qpos)[:MAX_PREGRASPS]
         failure = failure if starts else PlanningError("approach", "no_ik")
         for start in starts:
             try:
                 planner.set_scene(with_room)
-                reach = planner.plan_to_qpos(arm.at, [start], stage="reach", search=False)
+                reach = planner.plan_to_qpos(arm.qpos, [start], stage="reach", search=False)
             except PlanningError:
                 reach = None
             try:
@@ -89,7 +89,7 @@ def plan_grasp(arm: Arm, slot: int, lift_height: float, other_than: int = 0) -> 
                 return finished(reach, inward, out)
             ways.append((start, inward, out))
         # a search for a way round costs as much as all else, and takes several goals at once
-        if len(ways) >= WAYS:
+        if len(ways) >= MAX_PREGRASP_GOALS:
             try:
                 return searched()
             except PlanningError as error:
@@ -99,14 +99,16 @@ def plan_grasp(arm: Arm, slot: int, lift_height: float, other_than: int = 0) -> 
     raise failure
 
 
-def candidates(arm: Arm, slot: int, other_than: int) -> Iterator[Array]:
-    """Yield grasps worth planning for, best first, as TCP poses 4x4; without the best few kinds (``other_than``)."""
+def grasp_candidates(arm: Arm, slot: int, skip_kinds: int) -> Iterator[Array]:
+    """Yield grasps worth planning for, best first, as TCP poses 4x4; without the best few kinds (``skip_kinds``)."""
     notes = arm.env.object_assets[0][slot].annotations
     base, object_in_base = arm.scene.arm_base_in_world, arm.scene.object_in_base(slot)
     kept = filter_grasps(notes, base @ object_in_base, base, arm.approach)
     tcp_in_base = inverse(base) @ kept.tcp_in_world
-    solved, qpos = arm.reachability.reachable(tcp_in_base, arm.at)
-    solved_before, qpos_before = arm.reachability.reachable(moved_back(tcp_in_base, PREGRASP_DISTANCE), arm.at)
+    solved, qpos = arm.reachability.nearest_solutions(tcp_in_base, arm.qpos)
+    solved_before, qpos_before = arm.reachability.nearest_solutions(
+        shift_back(tcp_in_base, PREGRASP_DISTANCE), arm.qpos
+    )
     reachable = np.flatnonzero(solved & solved_before)
     if not len(reachable):
         raise PlanningError("grasp_sampling", "unreachable" if len(kept) else "all_filtered")
@@ -115,22 +117,22 @@ def candidates(arm: Arm, slot: int, other_than: int) -> Iterator[Array]:
         tcp_in_base[reachable],
         kept.qualities[reachable],
         grip_margins(notes.grasps_tcp_in_object[kept.index[reachable]], kept.widths[reachable], surface),
-        np.abs(qpos[reachable] - arm.at).max(axis=1),
+        np.abs(qpos[reachable] - arm.qpos).max(axis=1),
         object_in_base[:3, 3],
         arm.approach,
     )
-    ranks = draw_order(arm.rng, scores)
-    near = arm.scene.obstacles_in_base(without=slot, radius=NEIGHBOURHOOD, around=object_in_base[:3, 3])
-    clear = _clear(tcp_in_base, reachable[ranks], near)
+    ranks = sample_order(arm.rng, scores)
+    near = arm.scene.points_in_base(exclude=slot, radius=NEIGHBOURHOOD, around=object_in_base[:3, 3])
+    clear = _filter_clear(tcp_in_base, reachable[ranks], near)
     if arm.approach == "front":  # where it is narrow, first those whose arm is free as inverse kinematics found it
         looked_at = list(islice(clear, GRASPS_CHECKED))
-        arm.planner.set_scene(arm.scene.obstacles(without=slot))
+        arm.planner.set_scene(arm.scene.obstacles(exclude=slot))
         ways = np.stack([qpos_before[looked_at], qpos[looked_at]], axis=1)
-        free = arm.planner.free(ways.reshape(-1, 7)).reshape(-1, 2).all(axis=1)
+        free = arm.planner.is_free(ways.reshape(-1, 7)).reshape(-1, 2).all(axis=1)
         clear = iter([looked_at[i] for i in np.argsort(~free, kind="stable")])
-    if other_than:
+    if skip_kinds:
         looked_at = list(islice(clear, GRASPS_COMPARED))
-        clear = (looked_at[i] for i in _of_other_kinds(tcp_in_base[looked_at], other_than))
+        clear = (looked_at[i] for i in _skip_kinds(tcp_in_base[looked_at], skip_kinds))
     found = False
     for index in islice(clear, GRASPS_PLANNED):
         found = True
@@ -139,20 +141,20 @@ def candidates(arm: Arm, slot: int, other_than: int) -> Iterator[Array]:
         raise PlanningError("grasp_sampling", "all_filtered")
 
 
-def _of_other_kinds(tcp: Array, count: int) -> list[int]:
-    """Return indices of the grasps (N, 4, 4) without the first few kinds; a kind is all ``ALIKE`` its first."""
+def _skip_kinds(tcp: Array, count: int) -> list[int]:
+    """Return indices of the grasps (N, 4, 4) without the first few kinds; tolerances: KIND_TOLERANCES."""
     left = np.ones(len(tcp), dtype=bool)
     for _ in range(count):
         if not left.any():
             break
         first = tcp[int(np.argmax(left))]
-        near = np.linalg.norm(tcp[:, :3, 3] - first[:3, 3], axis=1) <= ALIKE[0]
+        near = np.linalg.norm(tcp[:, :3, 3] - first[:3, 3], axis=1) <= KIND_TOLERANCES[0]
         turned = [np.abs(tcp[:, :3, axis] @ first[:3, axis]) for axis in (1, 2)]  # the closing axis has no sign
-        left &= ~(near & (np.min(turned, axis=0) >= np.cos(ALIKE[1])))
+        left &= ~(near & (np.min(turned, axis=0) >= np.cos(KIND_TOLERANCES[1])))
     return np.flatnonzero(left).tolist()
 
 
-def _clear(tcp_in_base: Array, order: NDArray[np.int_], points_in_base: Array) -> Iterator[int]:
+def _filter_clear(tcp_in_base: Array, order: NDArray[np.int_], points_in_base: Array) -> Iterator[int]:
     """Yield the grasps, in their order, whose gripper meets no point on its way in; a few are tested at a time."""
     for first in range(0, len(order), CLEARED_AT_ONCE):
         some = order[first : first + CLEARED_AT_ONCE]
@@ -161,10 +163,10 @@ def _clear(tcp_in_base: Array, order: NDArray[np.int_], points_in_base: Array) -
 
 def _plan_way_in_and_out(
     arm: Arm, slot: int, qpos: Array, tcp_in_base: Array, lift_height: float
-) -> tuple[Trajectory, Out]:
+) -> tuple[Trajectory, ExitMotions]:
     inward = arm.planner.plan_straight(qpos, tcp_in_base, stage="approach")
     if arm.approach == "top":
-        return inward, (arm.first_line(inward.qpos[-1], _ways_up(tcp_in_base, lift_height), stage="lift"),)
+        return inward, (arm.plan_first_line(inward.qpos[-1], _lift_poses(tcp_in_base, lift_height), stage="lift"),)
     return inward, _plan_withdrawal(arm, slot, inward.qpos[-1], tcp_in_base)
 
 
@@ -176,16 +178,16 @@ def _plan_withdrawal(arm: Arm, slot: int, start: Array, tcp_in_base: Array) -> t
     back = -tcp_in_base[:2, 2] / np.linalg.norm(tcp_in_base[:2, 2])
     for height in FRONT_LIFTS:
         try:
-            lift = arm.planner.plan_straight(start, raised(tcp_in_base, height), stage="lift")
+            lift = arm.planner.plan_straight(start, shift_up(tcp_in_base, height), stage="lift")
         except PlanningError as error:
             raise error if height == FRONT_LIFTS[0] else failure from error
         goals = []
         for distance in WITHDRAWALS:
-            goals.append(raised(tcp_in_base, height))
+            goals.append(shift_up(tcp_in_base, height))
             goals[-1][:2, 3] += distance * back
         arm.planner.attach(held)
         try:
-            return lift, arm.first_line(lift.qpos[-1], goals, stage="withdraw")
+            return lift, arm.plan_first_line(lift.qpos[-1], goals, stage="withdraw")
         except PlanningError as error:
             failure = error
         finally:
@@ -193,7 +195,7 @@ def _plan_withdrawal(arm: Arm, slot: int, start: Array, tcp_in_base: Array) -> t
     raise failure
 
 
-def _ways_up(tcp_in_base: Array, lift_height: float) -> list[Array]:
+def _lift_poses(tcp_in_base: Array, lift_height: float) -> list[Array]:
     """Return where to lift to: straight up, or between that and back the way the gripper came in."""
     up, back = np.array([0, 0, 1.0]), -tcp_in_base[:3, 2]
     goals = []

@@ -17,10 +17,10 @@ from robocas_ms3.assets.manifest import Handle, Joint
 from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.core.poses import inverse, transform_points
 from robocas_ms3.planning.protocol import Array, Obstacle, Shape, Trajectory
-from robocas_ms3.planning.pull_path import reached, track, turned_about_bar
-from robocas_ms3.planning.scene import SPACING, shape_of
-from robocas_ms3.planning.skills.arm import Arm, first_plan, moved_back, plan_step_back
-from robocas_ms3.planning.time_parameterization import through, timed
+from robocas_ms3.planning.pull_path import count_reached, rotate_about_bar, track_handle
+from robocas_ms3.planning.scene import SPACING, part_shape
+from robocas_ms3.planning.skills.arm import Arm, first_plan, plan_retreat, shift_back
+from robocas_ms3.planning.time_parameterization import fit_spline, time_path
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.scenes.grasp_checks import HALF_TURN
 from robocas_ms3.scenes.lookup import MAX_OPENED_FRACTION
@@ -28,27 +28,27 @@ from robocas_ms3.tasks import terms
 from robocas_ms3.tasks.bodies import contact_forces
 from robocas_ms3.tasks.open_pick import RoboCASOpenPickEnv
 
-PULLS = 3  # with a new hold each, where one doesn't open far enough
-COMFORT = 0.15  # of the way from where it counts as opened to where a pull ends at most
-NEAR = 0.15  # m around the handle, in which what the fingers take hold of is looked for
-BETWEEN = (0.008, 0.01)  # m from the TCP along x and z: what is between the pads
-JUDGED = 4  # ways to hold the handle that are checked for collisions where only reach is judged
-DEEPER = 0.012  # m by which the bar is farther in than the TCP, where it fits: the pads end 8 mm before the TCP
+MAX_PULLS = 3  # with a new hold each, where one doesn't open far enough
+COMFORT_FRACTION = 0.15  # of the way from where it counts as opened to where a pull ends at most
+HANDLE_RADIUS = 0.15  # m around the handle, in which what the fingers take hold of is looked for
+PAD_HALF_EXTENT = (0.008, 0.01)  # m from the TCP along x and z: what is between the pads
+HOLDS_CHECKED = 4  # ways to hold the handle that are checked for collisions where only reach is judged
+DEPTH_OFFSET = 0.012  # m by which the bar is farther in than the TCP, where it fits: the pads end 8 mm before the TCP
 SHIFTS = (0.0, -0.03, 0.03)  # m along the bar
 TURNS = np.deg2rad((0, -20, 20, -40, 40))  # about the bar
 TURN_WEIGHT = 1.0  # rad of a joint that a rad about the bar is worth: pads that lean push a bar aside as they close
 STANDOFF = 0.08  # m that the gripper comes in straight
 RETREATS = (0.15, 0.10, 0.06)  # m straight back; the first one that can be reached
-CUT = 0.06  # m around the place held, within which the gripper may be near the part it pulls
+HANDLE_CLEARANCE = 0.06  # m around the place held, within which the gripper may be near the part it pulls
 PULLS_PLANNED = 8  # ways to hold the handle that motions are planned for
-CHECKED = 6  # positions of the part at which the arm is checked against it
+POSITIONS_CHECKED = 6  # positions of the part at which the arm is checked against it
 SPEED = 0.8  # share of the arm's limits
-LEAST_SHARE = 0.25  # of the joint's range; a pull that can't even do this is not worth it
+MIN_RANGE_FRACTION = 0.25  # of the joint's range; a pull that can't even do this is not worth it
 STEP = {"prismatic": 0.015, "revolute": 0.03}  # m, rad between poses of a pull
 
 
 @dataclass(frozen=True)
-class Part:
+class MovingPart:
     """What is opened: a moving part of a piece of furniture."""
 
     furniture: str
@@ -56,7 +56,7 @@ class Part:
     joint: Joint
 
     @classmethod
-    def of(cls, arm: Arm) -> Part:
+    def of(cls, arm: Arm) -> MovingPart:
         model = arm.env.model
         opening, joint = model.config.opening, model.opened_joint
         assert opening is not None  # the task has one
@@ -64,25 +64,25 @@ class Part:
         return cls(opening.furniture, model.furniture[opening.furniture].asset.handles[opening.handle], joint)
 
     @property
-    def end(self) -> float:
+    def open_limit(self) -> float:
         """Limit of the joint that it opens towards, m or rad."""
         return max(self.joint.limits, key=abs)
 
     def position(self, arm: Arm) -> float:
         return arm.scene.joint_positions(self.furniture)[self.joint.name]
 
-    def way(self, arm: Arm) -> Array:
+    def pull_positions(self, arm: Arm) -> Array:
         """Return joint positions (T,) of a pull, from the present one to the greatest at which a pull ends."""
-        start, far = self.position(arm), MAX_OPENED_FRACTION[self.joint.kind] * self.end
+        start, far = self.position(arm), MAX_OPENED_FRACTION[self.joint.kind] * self.open_limit
         left = (far - start) * np.sign(far)
         if left < STEP[self.joint.kind]:
             raise PlanningError("pull", "at_the_end")
         return np.linspace(start, far, int(np.ceil(left / STEP[self.joint.kind])) + 1, dtype=np.float64)
 
-    def least(self, arm: Arm) -> float:
+    def min_pull(self, arm: Arm) -> float:
         """Return the least useful length of a pull, m or rad."""
-        way = self.way(arm)
-        return min(LEAST_SHARE * abs(self.end), abs(way[-1] - way[0]))
+        way = self.pull_positions(arm)
+        return min(MIN_RANGE_FRACTION * abs(self.open_limit), abs(way[-1] - way[0]))
 
     def in_world(self, arm: Arm, positions: Array) -> Array:
         """Return poses (T, 4, 4) of the part's frame in the world, at joint positions (T,)."""
@@ -91,20 +91,20 @@ class Part:
 
     def obstacle(self, arm: Arm, pose_in_base: Array) -> Obstacle:
         part = arm.env.model.furniture[self.furniture].links[self.handle.link]
-        return Obstacle(self.handle.link, shape_of(part), pose_in_base)
+        return Obstacle(self.handle.link, part_shape(part), pose_in_base)
 
     def surface(self, arm: Arm) -> Array:
         return arm.env.model.furniture[self.furniture].links[self.handle.link].surface_points(SPACING)
 
     @property
-    def hold(self) -> Array:
+    def grasp_in_part(self) -> Array:
         """4x4 TCP that holds the handle squarely, in the part's frame."""
         w, x, y, z = self.handle.wxyz
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = Rotation.from_quat([x, y, z, w]).as_matrix(), self.handle.position
         return pose
 
-    def pressed(self, arm: Arm) -> bool:
+    def is_grasped(self, arm: Arm) -> bool:
         env = arm.env
         furniture = env.fixtures.furniture[self.furniture]
         assert isinstance(furniture, Articulation)
@@ -115,10 +115,10 @@ class Part:
         return bool(terms.is_grasped(forces[:, 0], forces[:, 1], closing)[0, 0])
 
 
-def open_part(arm: Arm) -> None:
-    part = Part.of(arm)
-    for _ in range(PULLS):
-        pull(arm, part)
+def open_furniture_part(arm: Arm) -> None:
+    part = MovingPart.of(arm)
+    for _ in range(MAX_PULLS):
+        pull_handle(arm, part)
         if is_opened(arm):
             return
     raise PlanningError("pull", "not_far_enough")
@@ -130,52 +130,52 @@ def is_opened(arm: Arm) -> bool:
     return bool(env.furniture_opened()[0])
 
 
-def pull(arm: Arm, part: Part) -> None:
+def pull_handle(arm: Arm, part: MovingPart) -> None:
     """Take hold of the handle, pull as far as the arm leads, let go and step back."""
-    with arm.planning():
+    with arm.planning_time():
         way_in, opening = plan_pull(arm, part)
-        before, least = part.position(arm), 0.5 * part.least(arm)
+        before, least = part.position(arm), 0.5 * part.min_pull(arm)
     arm.follow(way_in)
     arm.close_gripper()
-    if not part.pressed(arm):
+    if not part.is_grasped(arm):
         raise PlanningError("handle", "missed")
     arm.follow(opening)
     if abs(part.position(arm) - before) < least:
         raise PlanningError("pull", "slipped")
     arm.open_gripper()
-    with arm.planning():
-        arm.hold_nothing()
+    with arm.planning_time():
+        arm.clear_attached()
         arm.planner.set_scene(arm.scene.obstacles())
-        goals = [moved_back(arm.planner.tcp(arm.at), distance) for distance in RETREATS]
+        goals = [shift_back(arm.planner.tcp(arm.qpos), distance) for distance in RETREATS]
         lines = (True, False)  # if possible without touching anything
         back = first_plan(
             lines,
-            lambda free: arm.first_line(arm.at, goals, stage="retreat", check_collisions=free),
+            lambda free: arm.plan_first_line(arm.qpos, goals, stage="retreat", check_collisions=free),
             PlanningError("retreat", "no_goal"),
         )
     arm.follow(back)
 
 
-def plan_pull(arm: Arm, part: Part) -> tuple[Trajectory, Trajectory]:
+def plan_pull(arm: Arm, part: MovingPart) -> tuple[Trajectory, Trajectory]:
     """Plan to the hold that leads furthest, with the bar deep between the fingers where it fits, and the pull."""
     failure = PlanningError("pull", "no_plan")
-    return first_plan((DEEPER, 0.0), lambda deeper: _plan_pull(arm, part, deeper), failure)
+    return first_plan((DEPTH_OFFSET, 0.0), lambda depth_offset: _plan_pull(arm, part, depth_offset), failure)
 
 
-def _plan_pull(arm: Arm, part: Part, deeper: float) -> tuple[Trajectory, Trajectory]:
-    positions = part.way(arm)
+def _plan_pull(arm: Arm, part: MovingPart, depth_offset: float) -> tuple[Trajectory, Trajectory]:
+    positions = part.pull_positions(arm)
     frames = inverse(arm.scene.arm_base_in_world) @ part.in_world(arm, positions)
-    paths, ends, turned = _paths(arm, part, frames, deeper)
-    least = part.least(arm) / abs(positions[-1] - positions[0]) * len(positions)
+    paths, ends, turned = _paths(arm, part, frames, depth_offset)
+    least = part.min_pull(arm) / abs(positions[-1] - positions[0]) * len(positions)
     # the furthest first, in coarse steps; of those the squarest, and nearest to where the arm is
-    cost = np.abs(paths[0] - arm.at).max(axis=1) + TURN_WEIGHT * turned + arm.rng.uniform(0, 0.3, len(ends))
+    cost = np.abs(paths[0] - arm.qpos).max(axis=1) + TURN_WEIGHT * turned + arm.rng.uniform(0, 0.3, len(ends))
     order = np.lexsort((cost, -ends // 5))
     order = [i for i in order if ends[i] >= least]
     if not order:
         raise PlanningError("pull", "unreachable")
     everything = arm.scene.obstacles()
-    others = arm.scene.obstacles(without_link=(part.furniture, part.handle.link))
-    order = _fitting(arm, part, paths[0], order, frames, others, deeper)
+    others = arm.scene.obstacles(exclude_link=(part.furniture, part.handle.link))
+    order = _filter_holds(arm, part, paths[0], order, frames, others, depth_offset)
     if not order:
         raise PlanningError("handle", "blocked")
 
@@ -184,107 +184,109 @@ def _plan_pull(arm: Arm, part: Part, deeper: float) -> tuple[Trajectory, Traject
         free = _free_length(arm, part, path, frames, others)
         if free < least:
             raise PlanningError("pull", "blocked")
-        free = _retreatable(arm, path[:free], int(np.ceil(least)))
+        free = _retreatable_length(arm, path[:free], int(np.ceil(least)))
         arm.planner.set_scene(everything)
-        away = arm.planner.plan_straight(path[0], moved_back(arm.planner.tcp(path[0]), STANDOFF), stage="approach")
-        reach = arm.planner.plan_to_qpos(arm.at, [away.qpos[-1]], stage="reach")
+        away = arm.planner.plan_straight(path[0], shift_back(arm.planner.tcp(path[0]), STANDOFF), stage="approach")
+        reach = arm.planner.plan_to_qpos(arm.qpos, [away.qpos[-1]], stage="reach")
         inward = Trajectory(np.concatenate([away.qpos[-2::-1], path[:1]]), away.dt)
-        return arm.planner.join(arm.at, reach, inward), _timed(path[:free], arm.robot, away.dt)
+        return arm.planner.join(arm.qpos, reach, inward), _timed(path[:free], arm.robot, away.dt)
 
     return first_plan(order[:PULLS_PLANNED], plan, PlanningError("pull", "no_plan"))
 
 
-def pull_share(arm: Arm, part: Part, arm_base_in_world: Array, others: list[Obstacle]) -> float:
+def pull_fraction(arm: Arm, part: MovingPart, arm_base_in_world: Array, others: list[Obstacle]) -> float:
     """Return how far towards open the arm could pull a part in one go with its base elsewhere; 1: comfortably open."""
-    positions = part.way(arm)
+    positions = part.pull_positions(arm)
     opened = arm.env.model.opened_position
-    enough = 1 + int(np.sum(np.abs(positions) < abs(opened + COMFORT * (positions[-1] - opened))))
+    enough = 1 + int(np.sum(np.abs(positions) < abs(opened + COMFORT_FRACTION * (positions[-1] - opened))))
     frames = inverse(arm_base_in_world) @ part.in_world(arm, positions)
     try:
         paths, ends, _ = _paths(arm, part, frames)
     except PlanningError:
         return 0.0
-    share = 0.0
+    fraction = 0.0
     order = [i for i in np.argsort(-ends, kind="stable") if ends[i]]
-    for index in _fitting(arm, part, paths[0], order, frames, others)[:JUDGED]:
+    for index in _filter_holds(arm, part, paths[0], order, frames, others)[:HOLDS_CHECKED]:
         path = paths[: ends[index], index]
-        if share < 1:
-            share = max(share, min(1.0, _free_length(arm, part, path, frames, others) / enough))
-    return share
+        if fraction < 1:
+            fraction = max(fraction, min(1.0, _free_length(arm, part, path, frames, others) / enough))
+    return fraction
 
 
-def _paths(arm: Arm, part: Part, frames: Array, deeper: float = 0.0) -> tuple[Array, NDArray[np.int_], Array]:
+def _paths(
+    arm: Arm, part: MovingPart, frames: Array, depth_offset: float = 0.0
+) -> tuple[Array, NDArray[np.int_], Array]:
     """Return ways to hold the handle and follow it.
 
     Returns:
         Configurations (T, N, 7); how many of the part's T poses (N,) each reaches; rad (N,) turned about the bar.
     """
     goals, starts, beyond = [], [], np.eye(4)
-    beyond[2, 3] = deeper
+    beyond[2, 3] = depth_offset
     for shift in SHIFTS:
         for half_turn in (False, True):
-            hold = part.hold @ HALF_TURN if half_turn else part.hold
-            hold[:3, 3] += shift * part.hold[:3, 0]
+            hold = part.grasp_in_part @ HALF_TURN if half_turn else part.grasp_in_part
+            hold[:3, 3] += shift * part.grasp_in_part[:3, 0]
             for turn in TURNS:
                 goals.append(frames @ hold)
-                starts.append(turned_about_bar(goals[-1][0], turn) @ beyond)
+                starts.append(rotate_about_bar(goals[-1][0], turn) @ beyond)
     held = np.stack(goals, axis=1)
-    solved, qpos = arm.reachability.reachable(np.array(starts), arm.at)
+    solved, qpos = arm.reachability.nearest_solutions(np.array(starts), arm.qpos)
     if not solved.any():
         raise PlanningError("handle", "unreachable")
-    path = track(arm.reachability.chain.ending_behind(deeper), qpos[solved], held[:, solved])
+    path = track_handle(arm.reachability.chain.with_tool_offset(depth_offset), qpos[solved], held[:, solved])
     turned = np.tile(np.abs(TURNS), len(goals) // len(TURNS))[solved]
-    return path, reached(path), turned
+    return path, count_reached(path), turned
 
 
-def _fitting(
+def _filter_holds(
     arm: Arm,
-    part: Part,
+    part: MovingPart,
     starts: Array,
     order: list[int],
     frames: Array,
     others: list[Obstacle],
-    deeper: float = 0.0,
+    depth_offset: float = 0.0,
 ) -> list[int]:
     """Return the ways in the order that have the handle between the open fingers and touch nothing."""
     surface = transform_points(frames[0], part.surface(arm))
-    near = surface[np.linalg.norm(surface - (frames[0] @ part.hold)[:3, 3], axis=1) < NEAR]
+    near = surface[np.linalg.norm(surface - (frames[0] @ part.grasp_in_part)[:3, 3], axis=1) < HANDLE_RADIUS]
     arm.planner.set_scene([*others, part.obstacle(arm, frames[0])])
 
     width = arm.robot.open_width
 
-    def holds(start: Array) -> bool:
-        bar = transform_points(inverse(arm.planner.tcp(start)), near) + (0, 0, deeper)
-        between = np.abs(bar) < (BETWEEN[0], width / 2, BETWEEN[1])
+    def has_handle_between_pads(start: Array) -> bool:
+        bar = transform_points(inverse(arm.planner.tcp(start)), near) + (0, 0, depth_offset)
+        between = np.abs(bar) < (PAD_HALF_EXTENT[0], width / 2, PAD_HALF_EXTENT[1])
         return bool(between.all(axis=1).any())
 
-    order = [i for i in order if holds(starts[i])]
-    return [i for i, free in zip(order, arm.planner.free(starts[order], width), strict=True) if free]
+    order = [i for i in order if has_handle_between_pads(starts[i])]
+    return [i for i, free in zip(order, arm.planner.is_free(starts[order], width), strict=True) if free]
 
 
-def _free_length(arm: Arm, part: Part, path: Array, frames: Array, others: list[Obstacle]) -> int:
+def _free_length(arm: Arm, part: MovingPart, path: Array, frames: Array, others: list[Obstacle]) -> int:
     """Return how many configurations of a path (T, 7) are clear of all else, and of the part at its poses (T, 4, 4)."""
     planner, width = arm.planner, part.handle.width
     planner.set_scene(others)
-    blocked = np.flatnonzero(~planner.free(path[::3], width))
+    blocked = np.flatnonzero(~planner.is_free(path[::3], width))
     length = 3 * int(blocked[0]) if len(blocked) else len(path)
     if not length:
         return 0
     points, held = part.surface(arm), transform_points(inverse(frames[0]), planner.tcp(path[0])[None, :3, 3])
-    rest = Shape(points=points[np.linalg.norm(points - held, axis=1) > CUT])
-    for i in np.linspace(0, length - 1, CHECKED).round().astype(int):
+    rest = Shape(points=points[np.linalg.norm(points - held, axis=1) > HANDLE_CLEARANCE])
+    for i in np.linspace(0, length - 1, POSITIONS_CHECKED).round().astype(int):
         planner.set_scene([Obstacle(part.handle.link, rest, frames[i])])
         if planner.collisions(path[i], width):
-            return int(i * (1 - 1 / CHECKED))
+            return int(i * (1 - 1 / POSITIONS_CHECKED))
     return length
 
 
-def _retreatable(arm: Arm, path: Array, least: int) -> int:
+def _retreatable_length(arm: Arm, path: Array, least: int) -> int:
     """Return the length of a pull (T, 7) after which the gripper can step back, at least ``least``."""
     for length in range(len(path), max(least, 1) - 1, -3):
         tcp = arm.planner.tcp(path[length - 1])
         try:
-            plan_step_back(arm, path[length - 1], [moved_back(tcp, distance) for distance in RETREATS])
+            plan_retreat(arm, path[length - 1], [shift_back(tcp, distance) for distance in RETREATS])
             return length
         except PlanningError:
             continue
@@ -292,8 +294,8 @@ def _retreatable(arm: Arm, path: Array, least: int) -> int:
 
 
 def _timed(path: Array, robot: RobotDescription, dt: float) -> Trajectory:
-    motion = timed(
-        through(path),
+    motion = time_path(
+        fit_spline(path),
         velocity=SPEED * robot.arm_velocity_limit,
         acceleration=SPEED * robot.arm_acceleration_limit,
         dt=dt,

@@ -14,21 +14,21 @@ from robocas_ms3.planning.protocol import Array
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.planning.skills.look import hidden_fraction
 from robocas_ms3.planning.skills.push import push_away, surface_in_base
-from robocas_ms3.planning.skills.remove import blockers, clear_grasps, remove
+from robocas_ms3.planning.skills.remove import count_clear_grasps, find_grasp_blockers, remove_object
 from robocas_ms3.tasks.occlusion import MAX_HIDDEN_FRACTION
 from robocas_ms3.tasks.search import RoboCASSearchEnv
 from robocas_ms3.tasks.terms import FALLEN
 
-FACTS = ("pushes", "removals")  # what is counted
-MOVES = 8  # pushes and removals a demonstration may hold
-MOVED = 0.02  # m by which a push moves its object at least; less is one in vain
-LOOKED_AT = 4  # obstacles, of those that are highest
+COUNTERS = ("pushes", "removals")  # what is counted
+MAX_MOVES = 8  # pushes and removals a demonstration may hold
+MIN_DISPLACEMENT = 0.02  # m by which a push moves its object at least; less is one in vain
+MAX_OBSTACLES = 4  # obstacles, of those that are highest
 TURNS_DEG = (30.0, -30.0)  # off the paper's direction of a push, where that one does not do
-AT_EDGE = 0.01  # m from the surface's edge, nearer than which no object may come
+EDGE_MARGIN = 0.01  # m from the surface's edge, nearer than which no object may come
 
 # What a move is worth, in seconds of the demonstration that it makes needless or costs
-PER_OBSTACLE, PER_HIDDEN_SHARE, NO_GRASP, PER_METRE_OF_TARGET = 10.0, 30.0, 8.0, 400.0
-PUSHED = 8.0  # what is pushed comes to lie elsewhere each time, and so may all that it meets
+COST_PER_OBSTACLE, PER_HIDDEN_SHARE, COST_WITHOUT_GRASP, COST_PER_METRE_OF_TARGET = 10.0, 30.0, 8.0, 400.0
+COST_PER_PUSH = 8.0  # what is pushed comes to lie elsewhere each time, and so may all that it meets
 
 
 @dataclass(frozen=True)
@@ -55,29 +55,29 @@ class Heap:
 
     @property
     def moves_made(self) -> int:
-        return sum(self.arm.executor.facts[fact] for fact in FACTS)
+        return sum(self.arm.executor.facts[fact] for fact in COUNTERS)
 
     @property
-    def visible(self) -> bool:
+    def target_visible(self) -> bool:
         """Whether the gripper's camera sees most of the target."""
-        with self.arm.planning():
+        with self.arm.planning_time():
             return hidden_fraction(self.arm, self.target) <= MAX_HIDDEN_FRACTION
 
     @property
-    def uncovered(self) -> bool:
+    def target_uncovered(self) -> bool:
         """Whether the target is free, by the paper's rule, as the camera above sees it."""
         return bool(self.env.clutter().cleared[0])
 
     @property
-    def cleared(self) -> bool:
-        return self.uncovered and self.visible
+    def target_cleared(self) -> bool:
+        return self.target_uncovered and self.target_visible
 
-    def moves(self) -> Iterator[Move]:
+    def candidate_moves(self) -> Iterator[Move]:
         """Yield moves of the highest obstacles, then of those that block grasps; pushes first, as they are faster."""
-        if self.moves_made >= MOVES:
+        if self.moves_made >= MAX_MOVES:
             raise UnrecoverableError("horizon", "too_many_obstacles")
-        with self.arm.planning():
-            slots = self._in_the_way()
+        with self.arm.planning_time():
+            slots = self._find_obstacles()
         yield from (Move(skill, slot) for slot in slots[:2] for skill in ("push", "lift"))
         yield from (Move("push", slot) for slot in slots[2:])
         yield from (Move("push", slot, turn) for slot in slots[:2] for turn in TURNS_DEG)
@@ -85,43 +85,47 @@ class Heap:
         if not slots:  # no grasp comes from above as it lies: it has to lie otherwise
             yield from (Move("push", self.target, turn) for turn in (0.0, 90.0, -90.0, 180.0))
 
-    def _in_the_way(self) -> list[int]:
+    def _find_obstacles(self) -> list[int]:
         """Return slots of what hides or surrounds the target, the highest first, then of what blocks its grasps."""
         obstacles = np.flatnonzero(self.env.clutter().obstacles[0].cpu().numpy()).tolist()
-        obstacles.sort(key=lambda slot: -self.arm.scene.object_surface(slot)[:, 2].max())
-        order = dict.fromkeys(obstacles[:LOOKED_AT])
-        order |= dict.fromkeys(slot for slot in blockers(self.arm, self.target)[:LOOKED_AT] if slot not in order)
-        return [slot for slot in order if slot != self.target][:LOOKED_AT]
+        obstacles.sort(key=lambda slot: -self.arm.scene.object_points(slot)[:, 2].max())
+        order = dict.fromkeys(obstacles[:MAX_OBSTACLES])
+        order |= dict.fromkeys(
+            slot for slot in find_grasp_blockers(self.arm, self.target)[:MAX_OBSTACLES] if slot not in order
+        )
+        return [slot for slot in order if slot != self.target][:MAX_OBSTACLES]
 
-    def make(self, move: Move) -> float:
+    def execute(self, move: Move) -> float:
         """Make a move; return its value in seconds."""
         arm, facts = self.arm, self.arm.executor.facts
-        before, target, begun = self.middle(move.slot), self.middle(self.target), len(arm.executor.actions)
-        arm.rise_clear()
+        before, target, start = self.centroid(move.slot), self.centroid(self.target), len(arm.executor.actions)
+        arm.rise_until_free()
         if move.skill == "push":
             push_away(arm, move.slot, self.target, turn_deg=move.turn_deg)
-            if np.linalg.norm(self.middle(move.slot) - before) <= MOVED:
+            if np.linalg.norm(self.centroid(move.slot) - before) <= MIN_DISPLACEMENT:
                 raise PlanningError("push", "in_vain")
             facts["pushes"] += 1
         else:
             arm.executor.gripper = OPEN  # it opens on the way
-            remove(arm, move.slot)
+            remove_object(arm, move.slot)
             facts["removals"] += 1
-        self.check_surface()
-        seconds = PUSHED * (move.skill == "push") + (len(arm.executor.actions) - begun) * arm.executor.dt
+        self.check_objects_on_surface()
+        seconds = COST_PER_PUSH * (move.skill == "push") + (len(arm.executor.actions) - start) * arm.executor.dt
         return (
-            -seconds - self.work_left() - PER_METRE_OF_TARGET * float(np.linalg.norm(self.middle(self.target) - target))
+            -seconds
+            - self.remaining_cost()
+            - COST_PER_METRE_OF_TARGET * float(np.linalg.norm(self.centroid(self.target) - target))
         )
 
-    def work_left(self) -> float:
+    def remaining_cost(self) -> float:
         """Return the time that the remaining obstacles may take, s."""
-        with self.arm.planning():
+        with self.arm.planning_time():
             clutter = self.env.clutter()
             hidden, obstacles = float(clutter.hidden_fraction[0]), int(clutter.obstacles[0].sum())
-            work = PER_OBSTACLE * max(0, obstacles - 1) + PER_HIDDEN_SHARE * max(0.0, hidden - MAX_HIDDEN_FRACTION)
-            return work + NO_GRASP * (not clear_grasps(self.arm, self.target))
+            work = COST_PER_OBSTACLE * max(0, obstacles - 1) + PER_HIDDEN_SHARE * max(0.0, hidden - MAX_HIDDEN_FRACTION)
+            return work + COST_WITHOUT_GRASP * (not count_clear_grasps(self.arm, self.target))
 
-    def check_surface(self) -> None:
+    def check_objects_on_surface(self) -> None:
         """See that nothing has been moved to the edge, or over it."""
         frame, half = surface_in_base(self.arm)
         present = np.flatnonzero(self.env.present[0].cpu().numpy()).tolist()
@@ -129,8 +133,8 @@ class Heap:
         if (places[:, 2] < frame[2, 3] - FALLEN).any():
             raise UnrecoverableError("clear", "fell_off_table")
         local = (places - frame[:3, 3]) @ frame[:3, :3]
-        if (np.abs(local[:, :2]) > half - AT_EDGE).any():
+        if (np.abs(local[:, :2]) > half - EDGE_MARGIN).any():
             raise PlanningError("clear", "at_the_edge")
 
-    def middle(self, slot: int) -> Array:
-        return self.arm.scene.object_surface(slot).mean(axis=0)
+    def centroid(self, slot: int) -> Array:
+        return self.arm.scene.object_points(slot).mean(axis=0)

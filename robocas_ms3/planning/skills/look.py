@@ -21,33 +21,33 @@ VIEWS_SAMPLED, VIEWS_PLANNED = 96, 6
 
 def look_at(arm: Arm, point_in_base: Array, distance: tuple[float, float]) -> None:
     """Move the gripper's camera to where it looks at a point (3,) from above, at a least and greatest distance (m)."""
-    arm.rise_clear()
-    with arm.planning():
-        motion = plan_look(arm, point_in_base, distance)
+    arm.rise_until_free()
+    with arm.planning_time():
+        motion = plan_view(arm, point_in_base, distance)
     arm.follow(motion)
 
 
-def plan_look(arm: Arm, point_in_base: Array, distance: tuple[float, float]) -> Trajectory:
+def plan_view(arm: Arm, point_in_base: Array, distance: tuple[float, float]) -> Trajectory:
     """Plan to one of the nearest views of a point; arguments as in `look_at`."""
     tcp_in_camera = inverse(inverse(arm.scene.tcp_in_base) @ camera_in_base(arm))
     for least, greatest in (distance, (NEAR[0], FAR[1])):  # where a high table leaves no such view, any other
         views = sample_views(arm.rng, point_in_base, (least, greatest), VIEWS_SAMPLED)
-        solved, qpos = arm.reachability.reachable(views @ tcp_in_camera, arm.at)
+        solved, qpos = arm.reachability.nearest_solutions(views @ tcp_in_camera, arm.qpos)
         if solved.any():
             break
     else:
         raise PlanningError("look", "unreachable")
     qpos = qpos[solved]
     arm.planner.set_scene(arm.scene.obstacles())
-    near = qpos[np.argsort(np.abs(qpos - arm.at).max(axis=1), kind="stable")]
+    near = qpos[np.argsort(np.abs(qpos - arm.qpos).max(axis=1), kind="stable")]
     near = near[: 4 * VIEWS_PLANNED]
-    goals = near[arm.planner.free(near, arm.planner.finger_width)][:VIEWS_PLANNED]
+    goals = near[arm.planner.is_free(near, arm.planner.finger_width)][:VIEWS_PLANNED]
     if not len(goals):
         raise PlanningError("look", "goal_in_collision")
-    return arm.planner.plan_to_qpos(arm.at, list(goals), stage="look")
+    return arm.planner.plan_to_qpos(arm.qpos, list(goals), stage="look")
 
 
-def prepare_looks(arm: Arm) -> None:
+def load_object_meshes(arm: Arm) -> None:
     """Read the objects' meshes before the first decision: each branch that looks would read them again."""
     for asset, present in zip(arm.env.object_assets[0], arm.env.present[0].tolist(), strict=True):
         if present:

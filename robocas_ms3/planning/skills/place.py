@@ -10,22 +10,22 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.core.poses import from_wxyz, inverse, transform_points
-from robocas_ms3.planning.kinematics import turn_between
+from robocas_ms3.planning.kinematics import joint_distance
 from robocas_ms3.planning.protocol import Array, AttachedBody, Trajectory
-from robocas_ms3.planning.skills.arm import CARRYING_ROOM, Arm, first_plan, moved_back, plan_step_back, raised
+from robocas_ms3.planning.skills.arm import CARRY_CLEARANCE, Arm, first_plan, plan_retreat, shift_back, shift_up
 
 DROPS_SAMPLED, DROPS_CHECKED, DROPS_PLANNED = 192, 64, 10
 DROP_MARGIN = 0.045  # m, as far as a robot may be off by then
 LEAN_WEIGHT = 0.7  # rad of a joint that a rad of the gripper's is worth
 ELBOW, STRETCHED, STRETCH_WEIGHT = 3, -0.7, 5.0  # joint; rad from which on the arm is nearly straight
 RETREAT_HEIGHT = 0.05  # m, upstream's
-CLEARANCE = (0.03, 0.07)  # m, least and greatest height of the object's lowest point above the rim
+RIM_CLEARANCE = (0.03, 0.07)  # m, least and greatest height of the object's lowest point above the rim
 MAX_TILT_DEG = 70.0  # RoboCAS-v0: 30 to 70
-SPREAD = 0.25  # of the inside's half size: how far from the middle the centre of mass may be
+MAX_OFFSET_FRACTION = 0.25  # of the inside's half size: how far from the middle the centre of mass may be
 
 
 @dataclass(frozen=True)
-class Inside:
+class ContainerInterior:
     """The box inside a container, from ``low`` to ``high`` (3,) m in the container's frame, which is 4x4."""
 
     container_in_base: Array
@@ -34,25 +34,25 @@ class Inside:
 
 
 def carry_to_basket(arm: Arm, slot: int) -> None:
-    with arm.planning():
+    with arm.planning_time():
         motion = plan_carry(arm, slot)
     arm.follow(motion)
-    if not arm.holds(slot):
+    if not arm.is_holding(slot):
         raise PlanningError("transfer", "dropped")
 
 
 def release_into_basket(arm: Arm, slot: int) -> None:
-    start = arm.at
+    start = arm.qpos
     arm.open_gripper()
-    with arm.planning():
-        arm.hold_nothing()
-        arm.planner.set_scene(arm.scene.obstacles(without=slot))
-        retreat = plan_step_back(arm, start, _ways_off(arm.planner.tcp(start)))
+    with arm.planning_time():
+        arm.clear_attached()
+        arm.planner.set_scene(arm.scene.obstacles(exclude=slot))
+        retreat = plan_retreat(arm, start, _retreat_poses(arm.planner.tcp(start)))
         home = arm.plan_home(retreat.qpos[-1])
     arm.follow(retreat)
     # The object settles while the arm goes home; the demonstration ends as soon as it lies still.
     if not arm.follow(home, until="success"):
-        raise PlanningError("release", _why_not(arm))
+        raise PlanningError("release", _failure_reason(arm))
 
 
 def plan_carry(arm: Arm, slot: int) -> Trajectory:
@@ -60,45 +60,45 @@ def plan_carry(arm: Arm, slot: int) -> Trajectory:
 
     Where possible it keeps off basket and furniture by the error of a robot: both may be pushed away.
     """
-    drops = drop_poses(arm, slot, arm.scene.arm_base_in_world)
-    solved, qpos = arm.reachability.reachable(drops, arm.at)
+    drops = sample_drop_poses(arm, slot, arm.scene.arm_base_in_world)
+    solved, qpos = arm.reachability.nearest_solutions(drops, arm.qpos)
     if not solved.any():
         raise PlanningError("transfer", "unreachable")
-    order = _ranked(arm, slot, drops[solved], qpos[solved])
+    order = _rank_drops(arm, slot, drops[solved], qpos[solved])
     drops, qpos = drops[solved][order], qpos[solved][order]
     attach_held(arm, slot)
 
-    def plan(room: float) -> Trajectory:
-        arm.planner.set_scene(arm.scene.obstacles(without=slot, room=room))
+    def plan(clearance: float) -> Trajectory:
+        arm.planner.set_scene(arm.scene.obstacles(exclude=slot, clearance=clearance))
         return _plan_to_one_of(arm, drops, qpos)
 
-    return first_plan((CARRYING_ROOM, 0.0), plan, PlanningError("transfer", "no_plan"))
+    return first_plan((CARRY_CLEARANCE, 0.0), plan, PlanningError("transfer", "no_plan"))
 
 
-def _ranked(arm: Arm, slot: int, drops: Array, qpos: Array) -> NDArray[np.int_]:
+def _rank_drops(arm: Arm, slot: int, drops: Array, qpos: Array) -> NDArray[np.int_]:
     """Return the order of drops (N, 4, 4), reached at (N, 7): those that fit through the opening first.
 
     Of those the near and steep ones, since an object slides off a leaning gripper, and none at the end of the reach.
     """
     inside = _inside_basket(arm, arm.scene.arm_base_in_world)
-    overhang = overhangs(drops, inside, transform_points(*held_object(arm, slot)), DROP_MARGIN)
+    overhang = compute_overhang(drops, inside, transform_points(*held_object(arm, slot)), DROP_MARGIN)
     lean = np.arccos(np.clip(-drops[:, 2, 2], -1, 1))
     stretched = np.maximum(qpos[:, ELBOW] - STRETCHED, 0)
-    cost = turn_between(qpos, arm.at) + LEAN_WEIGHT * lean + STRETCH_WEIGHT * stretched
+    cost = joint_distance(qpos, arm.qpos) + LEAN_WEIGHT * lean + STRETCH_WEIGHT * stretched
     return np.lexsort((cost, np.ceil(overhang / 0.015)))
 
 
 def _plan_to_one_of(arm: Arm, drops: Array, qpos: Array) -> Trajectory:
     """Plan to the first of several drops (N, 4, 4), reached at (N, 7), that is free."""
-    start = arm.at
-    chosen = np.flatnonzero(arm.planner.free(qpos[:DROPS_CHECKED], arm.planner.finger_width))[:DROPS_PLANNED]
+    start = arm.qpos
+    chosen = np.flatnonzero(arm.planner.is_free(qpos[:DROPS_CHECKED], arm.planner.finger_width))[:DROPS_PLANNED]
     if not len(chosen):
         raise PlanningError("transfer", "no_free_place")
     drops, qpos = drops[chosen], qpos[chosen]
     for drop, goal in zip(drops, qpos, strict=True):
         try:
             carry = arm.planner.plan_to_qpos(start, [goal], stage="transfer", search=False)
-            plan_step_back(arm, carry.qpos[-1], _ways_off(drop))  # no way up from there: no place to let go
+            plan_retreat(arm, carry.qpos[-1], _retreat_poses(drop))  # no way up from there: no place to let go
             return carry
         except PlanningError:
             continue
@@ -107,7 +107,7 @@ def _plan_to_one_of(arm: Arm, drops: Array, qpos: Array) -> Trajectory:
         carry = arm.planner.plan_to_qpos(start, list(qpos[left]), stage="transfer")
         reached = int(np.argmin(np.abs(qpos[left] - carry.qpos[-1]).max(axis=1)))
         try:
-            plan_step_back(arm, carry.qpos[-1], _ways_off(drops[left[reached]]))
+            plan_retreat(arm, carry.qpos[-1], _retreat_poses(drops[left[reached]]))
             return carry
         except PlanningError as error:
             failure, left = error, np.delete(left, reached)
@@ -126,7 +126,7 @@ def attach_held(arm: Arm, slot: int) -> None:
     arm.planner.finger_width = float(arm.env.agent.gripper_width[0])
 
 
-def drop_poses(arm: Arm, slot: int, arm_base_in_world: Array) -> Array:
+def sample_drop_poses(arm: Arm, slot: int, arm_base_in_world: Array) -> Array:
     """Return TCP poses (N, 4, 4) that bring the held object above the basket, in the frame of an arm's base (4x4)."""
     object_in_tcp, vertices = held_object(arm, slot)
     center_of_mass = np.array([arm.env.object_assets[0][slot].asset.center_of_mass])
@@ -139,28 +139,30 @@ def drop_poses(arm: Arm, slot: int, arm_base_in_world: Array) -> Array:
     )
 
 
-def _inside_basket(arm: Arm, arm_base_in_world: Array) -> Inside:
+def _inside_basket(arm: Arm, arm_base_in_world: Array) -> ContainerInterior:
     basket = arm.env.model.basket
     assert basket is not None  # the task has one
     inner = basket.asset.inner
     assert inner is not None  # the model saw to it
     basket_in_base = inverse(arm_base_in_world) @ from_wxyz(arm.env.basket_pose[0])
-    return Inside(basket_in_base, np.array(inner.min), np.array(inner.max))
+    return ContainerInterior(basket_in_base, np.array(inner.min), np.array(inner.max))
 
 
-def _ways_off(tcp_in_base: Array) -> list[Array]:
-    back, up = moved_back(tcp_in_base, RETREAT_HEIGHT), RETREAT_HEIGHT
-    return [raised(tcp_in_base, up), back, raised(back, up / 2), raised(tcp_in_base, up / 2)]
+def _retreat_poses(tcp_in_base: Array) -> list[Array]:
+    back, up = shift_back(tcp_in_base, RETREAT_HEIGHT), RETREAT_HEIGHT
+    return [shift_up(tcp_in_base, up), back, shift_up(back, up / 2), shift_up(tcp_in_base, up / 2)]
 
 
-def _why_not(arm: Arm) -> str:
+def _failure_reason(arm: Arm) -> str:
     for measure, reached in arm.env.success_conditions().items():
         if not bool(reached[0]):
             return f"not_{measure}"
     return "unstable"
 
 
-def sample_drops(rng: np.random.Generator, count: int, inside: Inside, vertices: Array, center_of_mass: Array) -> Array:
+def sample_drops(
+    rng: np.random.Generator, count: int, inside: ContainerInterior, vertices: Array, center_of_mass: Array
+) -> Array:
     """Sample TCP poses (count, 4, 4) at which a held object hangs above a container, its lowest point clear of the rim.
 
     The approach axis is tilted from straight down, away from the arm, so that far containers are within reach; half of
@@ -168,7 +170,10 @@ def sample_drops(rng: np.random.Generator, count: int, inside: Inside, vertices:
     """
     middle, half = (inside.low + inside.high) / 2, (inside.high - inside.low) / 2
     local = np.column_stack(
-        [middle[:2] + rng.uniform(-SPREAD, SPREAD, (count, 2)) * half[:2], np.full(count, inside.high[2])]
+        [
+            middle[:2] + rng.uniform(-MAX_OFFSET_FRACTION, MAX_OFFSET_FRACTION, (count, 2)) * half[:2],
+            np.full(count, inside.high[2]),
+        ]
     )
     above = local @ inside.container_in_base[:3, :3].T + inside.container_in_base[:3, 3]
     tilt = np.deg2rad(MAX_TILT_DEG) * rng.uniform(0, 1, count) ** 2
@@ -183,11 +188,11 @@ def sample_drops(rng: np.random.Generator, count: int, inside: Inside, vertices:
     lowest = (poses[:, 2, :3] @ vertices.T).min(axis=1)
     center = np.einsum("nij,j->ni", poses[:, :3, :3], center_of_mass)
     poses[:, :2, 3] = above[:, :2] - center[:, :2]
-    poses[:, 2, 3] = above[:, 2] + rng.uniform(*CLEARANCE, count) - lowest
+    poses[:, 2, 3] = above[:, 2] + rng.uniform(*RIM_CLEARANCE, count) - lowest
     return poses
 
 
-def overhangs(tcp_in_base: Array, inside: Inside, vertices: Array, margin: float = 0.0) -> Array:
+def compute_overhang(tcp_in_base: Array, inside: ContainerInterior, vertices: Array, margin: float = 0.0) -> Array:
     """Return how far (n,) a held object sticks out sideways of the opening below it, m; 0 where it falls straight in.
 
     Args:

@@ -12,10 +12,10 @@ from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.core.poses import inverse
 from robocas_ms3.planning.executor import CLOSED
 from robocas_ms3.planning.protocol import Array, Obstacle, Trajectory
-from robocas_ms3.planning.pushes import STAND_OFF, YAWS, Push, candidates
-from robocas_ms3.planning.skills.arm import Arm, raised
+from robocas_ms3.planning.pushes import STAND_OFF, YAWS, Push, push_candidates
+from robocas_ms3.planning.skills.arm import Arm, shift_up
 
-ABOVE = 0.08  # m above the start of the push, from where the tool comes straight down
+APPROACH_HEIGHT = 0.08  # m above the start of the push, from where the tool comes straight down
 LIFT = 0.05  # m after the push (upstream's)
 SPEED = 0.6  # of the arm's limits while pushing: what is pushed neither rolls far nor jumps
 PUSHES_TRIED, PUSHES_PLANNED = 24, 6
@@ -36,17 +36,17 @@ class PushPlan:
 
 def push_away(arm: Arm, slot: int, target: int, *, turn_deg: float = 0.0) -> None:
     """Push an object away from the target until it has moved far enough or resists, then rise."""
-    arm.rise_clear()
-    with arm.planning():
+    arm.rise_until_free()
+    with arm.planning_time():
         plan = plan_push(arm, slot, target, turn_deg)
     arm.executor.gripper = CLOSED  # it closes on the way
     arm.follow(plan.way_in)
-    lift = plan.lift if _push_on(arm, plan.push, plan.direction) else _plan_lift(arm, plan.direction)
+    lift = plan.lift if _execute_push(arm, plan.push, plan.direction) else _plan_lift(arm, plan.direction)
     arm.follow(lift)
-    arm.executor.move_gripper(CLOSED, arm.at, seconds=SETTLE_SECONDS)
+    arm.executor.move_gripper(CLOSED, arm.qpos, seconds=SETTLE_SECONDS)
 
 
-def _push_on(arm: Arm, push: Trajectory, direction: Array) -> bool:
+def _execute_push(arm: Arm, push: Trajectory, direction: Array) -> bool:
     """Run a push step by step; False where it was cut short, since what was pushed resisted."""
     resisted = 0
     ahead = torch.as_tensor(arm.scene.arm_base_in_world[:3, :3] @ direction, dtype=torch.float32)
@@ -64,20 +64,20 @@ def _plan_lift(arm: Arm, direction: Array) -> Trajectory:
     width, arm.planner.finger_width = arm.planner.finger_width, 0.0
     try:
         arm.planner.set_scene(_fixed_bodies(arm))
-        tcp = arm.planner.tcp(arm.at)
-        return arm.first_line(arm.at, [_lifted(tcp, direction), raised(tcp, LIFT)], stage="push")
+        tcp = arm.planner.tcp(arm.qpos)
+        return arm.plan_first_line(arm.qpos, [_lift_pose(tcp, direction), shift_up(tcp, LIFT)], stage="push")
     finally:
         arm.planner.finger_width = width
 
 
-def _lifted(tcp_in_base: Array, direction: Array) -> Array:
-    back = raised(tcp_in_base, LIFT)
+def _lift_pose(tcp_in_base: Array, direction: Array) -> Array:
+    back = shift_up(tcp_in_base, LIFT)
     back[:3, 3] -= STAND_OFF * direction
     return back
 
 
 def _fixed_bodies(arm: Arm) -> list[Obstacle]:
-    return arm.scene.obstacles(without=range(len(arm.env.objects)))
+    return arm.scene.obstacles(exclude=range(len(arm.env.objects)))
 
 
 def plan_push(arm: Arm, slot: int, target: int, turn_deg: float = 0.0) -> PushPlan:
@@ -89,7 +89,7 @@ def plan_push(arm: Arm, slot: int, target: int, turn_deg: float = 0.0) -> PushPl
     planner = arm.planner
     width, planner.finger_width = planner.finger_width, 0.0
     try:
-        starts = _starts(arm, slot, target, turn_deg)
+        starts = _plan_starts(arm, slot, target, turn_deg)
         try:
             return _plan_along(arm, starts, movable={slot})
         except PlanningError:
@@ -98,11 +98,11 @@ def plan_push(arm: Arm, slot: int, target: int, turn_deg: float = 0.0) -> PushPl
         planner.finger_width = width
 
 
-def _starts(arm: Arm, slot: int, target: int, turn_deg: float) -> list[tuple[Push, Array, Trajectory]]:
+def _plan_starts(arm: Arm, slot: int, target: int, turn_deg: float) -> list[tuple[Push, Array, Trajectory]]:
     """Return pushes with a free way down to the object: with a configuration (7,) above, and that way."""
     arm.planner.set_scene(arm.scene.obstacles())
     failure, starts = PlanningError("push", "no_room"), []
-    for push, qpos in reachable_pushes(arm, slot, target, arm.scene.obstacles_in_base(without=slot), turn_deg):
+    for push, qpos in reachable_pushes(arm, slot, target, arm.scene.points_in_base(exclude=slot), turn_deg):
         try:
             starts.append((push, qpos, arm.planner.plan_straight(qpos, push.start, stage="push")))
         except PlanningError as error:
@@ -117,7 +117,7 @@ def _starts(arm: Arm, slot: int, target: int, turn_deg: float) -> list[tuple[Pus
 def _plan_along(arm: Arm, starts: list[tuple[Push, Array, Trajectory]], movable: set[int]) -> PushPlan:
     """Plan on from where pushes begin, with some objects that may be moved on the way along."""
     planner, failure = arm.planner, PlanningError("push", "no_room")
-    along_scene, fixed = arm.scene.obstacles(without=movable), _fixed_bodies(arm)
+    along_scene, fixed = arm.scene.obstacles(exclude=movable), _fixed_bodies(arm)
     ways: list[tuple[Array, Trajectory, Trajectory, Trajectory]] = []
     first = np.zeros(3)
     for push, qpos, down in starts:
@@ -127,7 +127,7 @@ def _plan_along(arm: Arm, starts: list[tuple[Push, Array, Trajectory]], movable:
             planner.set_scene(along_scene)  # what may move is no obstacle on the way along
             along = planner.plan_straight(down.qpos[-1], push.end, stage="push", speed=SPEED)
             planner.set_scene(fixed)  # the pushed object may lean on the tool
-            lift = planner.plan_straight(along.qpos[-1], _lifted(push.end, push.direction), stage="push")
+            lift = planner.plan_straight(along.qpos[-1], _lift_pose(push.end, push.direction), stage="push")
             ways.append((qpos, down, along, lift))
             first = push.direction
         except PlanningError as error:
@@ -136,26 +136,26 @@ def _plan_along(arm: Arm, starts: list[tuple[Push, Array, Trajectory]], movable:
         raise failure
     planner.set_scene(arm.scene.obstacles())
     # one direction, several turns of the tool: the one that is nearest
-    reach = planner.plan_to_qpos(arm.at, [way[0] for way in ways], stage="push")
+    reach = planner.plan_to_qpos(arm.qpos, [way[0] for way in ways], stage="push")
     _, down, along, lift = min(ways, key=lambda way: float(np.abs(way[0] - reach.qpos[-1]).max()))
-    return PushPlan(planner.join(arm.at, reach, down), along, lift, direction=first)
+    return PushPlan(planner.join(arm.qpos, reach, down), along, lift, direction=first)
 
 
 def reachable_pushes(
     arm: Arm, slot: int, target: int, others: Array, turn_deg: float = 0.0
 ) -> Iterator[tuple[Push, Array]]:
     """Yield pushes within reach and a configuration (7,) above each start: the paper's direction first."""
-    points, middle = arm.scene.object_surface(slot), arm.scene.object_surface(target).mean(axis=0)
-    fixed = arm.scene.obstacles_in_base(without=range(len(arm.env.objects)))
-    pushes = list(candidates(arm.rng, points, middle, others, surface_in_base(arm), fixed, turn_deg))
+    points, middle = arm.scene.object_points(slot), arm.scene.object_points(target).mean(axis=0)
+    fixed = arm.scene.points_in_base(exclude=range(len(arm.env.objects)))
+    pushes = list(push_candidates(arm.rng, points, middle, others, surface_in_base(arm), fixed, turn_deg))
     if not pushes:
         return
     starts, ends = np.stack([push.start for push in pushes]), np.stack([push.end for push in pushes])
-    reachable, qpos = arm.reachability.reachable(raised(starts, ABOVE), arm.at)
+    reachable, qpos = arm.reachability.nearest_solutions(shift_up(starts, APPROACH_HEIGHT), arm.qpos)
     for poses in (starts, ends):
-        reachable[reachable] = arm.reachability.reachable(poses[reachable], arm.at)[0]
+        reachable[reachable] = arm.reachability.nearest_solutions(poses[reachable], arm.qpos)[0]
     turn = np.repeat(np.arange(len(pushes) // YAWS), YAWS)
-    order = np.lexsort((np.abs(qpos - arm.at).max(axis=1), turn))
+    order = np.lexsort((np.abs(qpos - arm.qpos).max(axis=1), turn))
     yield from [(pushes[i], qpos[i]) for i in order if reachable[i]][:PUSHES_TRIED]
 
 

@@ -13,7 +13,7 @@ from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.core.poses import transform_points
 from robocas_ms3.planning.protocol import Array, Trajectory
 from robocas_ms3.planning.shapes import convex_hull
-from robocas_ms3.planning.skills.arm import Arm, first_plan, moved_back, plan_step_back, raised
+from robocas_ms3.planning.skills.arm import Arm, first_plan, plan_retreat, shift_back, shift_up
 from robocas_ms3.planning.skills.grasp import grasp
 from robocas_ms3.planning.skills.place import attach_held
 from robocas_ms3.planning.skills.push import surface_in_base
@@ -21,37 +21,37 @@ from robocas_ms3.scenes.grasp_checks import MAX_WIDTH, check_directions, is_grip
 
 GRID = 0.04  # m between places tried
 TURNS = 8  # of the object about the vertical
-ROOM = 0.03  # m kept to everything else, seen from above
+PLACEMENT_CLEARANCE = 0.03  # m kept to everything else, seen from above
 EDGE_MARGINS = (0.1, 0.03)  # m kept from the surface's edge, where there is room for it
 RELEASE_HEIGHT = 0.012  # m of the object's lowest point above the surface when let go
-COME_DOWN = 0.06  # m above that, from where it comes straight down
+PLACE_APPROACH_HEIGHT = 0.06  # m above that, from where it comes straight down
 RETREAT = 0.08  # m
 ARM_REACH = 0.8  # m from its base
-LIFTS = (0.08, 0.2)  # m, least and greatest
-GRASPS_LOOKED_AT = 150
+LIFT_RANGE = (0.08, 0.2)  # m, least and greatest
+GRASPS_TESTED = 150
 RIM_SPACING = 0.015  # m
 PLACES_SOLVED, PLACES_PLANNED = 96, 12
 
 
-def remove(arm: Arm, slot: int) -> None:
+def remove_object(arm: Arm, slot: int) -> None:
     """Grasp an object, put it down on a free place of the surface, step back."""
     grasp(arm, slot, lift_height=lift_height(arm, slot))
     raise_held_object(arm, slot)
-    with arm.planning():
+    with arm.planning_time():
         way = plan_place(arm, slot)
     arm.follow(way)
-    if not arm.holds(slot):
+    if not arm.is_holding(slot):
         raise PlanningError("remove", "dropped")
     arm.open_gripper()
-    with arm.planning():
-        arm.hold_nothing()
-        retreat = plan_step_back(arm, arm.at, _ways_off(arm.planner.tcp(arm.at)))
+    with arm.planning_time():
+        arm.clear_attached()
+        retreat = plan_retreat(arm, arm.qpos, _retreat_poses(arm.planner.tcp(arm.qpos)))
     arm.follow(retreat)
 
 
 def raise_held_object(arm: Arm, slot: int) -> None:
     attach_held(arm, slot)
-    arm.rise_clear(without=slot)
+    arm.rise_until_free(exclude=slot)
 
 
 def lift_height(arm: Arm, slot: int) -> float:
@@ -59,24 +59,24 @@ def lift_height(arm: Arm, slot: int) -> float:
     points = transform_points(arm.scene.object_in_base(slot), np.concatenate(arm.env.object_assets[0][slot].hulls))
     middle = points.mean(axis=0)
     radius = float(np.linalg.norm((points - middle)[:, :2], axis=1).max())
-    others = arm.scene.obstacles_in_base(without=slot)
-    near = others[np.linalg.norm((others - middle)[:, :2], axis=1) <= radius + ROOM]
-    return float(np.clip(near[:, 2].max(initial=0.0) + 0.02 - points[:, 2].min(), *LIFTS))
+    others = arm.scene.points_in_base(exclude=slot)
+    near = others[np.linalg.norm((others - middle)[:, :2], axis=1) <= radius + PLACEMENT_CLEARANCE]
+    return float(np.clip(near[:, 2].max(initial=0.0) + 0.02 - points[:, 2].min(), *LIFT_RANGE))
 
 
-def clear_grasps(arm: Arm, slot: int) -> int:
+def count_clear_grasps(arm: Arm, slot: int) -> int:
     """Return how many of an object's (sampled) grasps from above are clear."""
     grasps = _grasps_from_above(arm, slot)
-    near = arm.scene.obstacles_in_base(without=slot)
+    near = arm.scene.points_in_base(exclude=slot)
     return int(is_gripper_clear(grasps, near).sum())
 
 
-def blockers(arm: Arm, slot: int) -> list[int]:
+def find_grasp_blockers(arm: Arm, slot: int) -> list[int]:
     """Return slots of what blocks an object's grasps from above, those first that alone block most of them."""
     grasps, in_the_way = _grasps_from_above(arm, slot), {}
     for other, used in enumerate(arm.env.present[0].tolist()):
         if used and other != slot:
-            in_the_way[other] = ~is_gripper_clear(grasps, arm.scene.object_surface(other))
+            in_the_way[other] = ~is_gripper_clear(grasps, arm.scene.object_points(other))
     count = np.sum(list(in_the_way.values()), axis=0)
     score = {other: float(np.sum(blocked / np.maximum(count, 1) ** 2)) for other, blocked in in_the_way.items()}
     return sorted((other for other in score if score[other] > 0), key=lambda other: -score[other])
@@ -88,7 +88,7 @@ def _grasps_from_above(arm: Arm, slot: int) -> Array:
     passed = np.logical_and.reduce(list(check_directions(grasps, frame[:3, 3]).values()))
     grasps = grasps[passed & (notes.grasp_widths <= MAX_WIDTH)]
     # evenly spread, not drawn: a look must not change what comes after it
-    return grasps[np.linspace(0, len(grasps) - 1, min(len(grasps), GRASPS_LOOKED_AT)).astype(int)]
+    return grasps[np.linspace(0, len(grasps) - 1, min(len(grasps), GRASPS_TESTED)).astype(int)]
 
 
 def plan_place(arm: Arm, slot: int) -> Trajectory:
@@ -99,14 +99,14 @@ def plan_place(arm: Arm, slot: int) -> Trajectory:
     """
     scene, asset, held = arm.scene, arm.env.object_assets[0][slot], arm.scene.object_in_base(slot)
     vertices = transform_points(held, np.concatenate(asset.hulls))
-    standing = turn_to_stand(vertices, transform_points(held, np.array([asset.asset.center_of_mass]))[0])
-    others = scene.obstacles_in_base(without=slot)
-    arm.planner.set_scene(scene.obstacles(without=slot))
+    standing = upright_rotation(vertices, transform_points(held, np.array([asset.asset.center_of_mass]))[0])
+    others = scene.points_in_base(exclude=slot)
+    arm.planner.set_scene(scene.obstacles(exclude=slot))
     attach_held(arm, slot)
 
     def free_poses() -> Iterator[Array]:
         for turn, margin in itertools.product((standing, np.eye(4)), EDGE_MARGINS):
-            motions = free_places(transform_points(turn, vertices), others, *surface_in_base(arm), margin) @ turn
+            motions = find_free_places(transform_points(turn, vertices), others, *surface_in_base(arm), margin) @ turn
             if len(motions):
                 yield motions @ scene.tcp_in_base
 
@@ -116,13 +116,13 @@ def plan_place(arm: Arm, slot: int) -> Trajectory:
 
 def _plan_to_one_of(arm: Arm, places: Array) -> Trajectory:
     """Plan to above one of several TCP poses (N, 4, 4), in the arm's base frame, and down to it."""
-    start = arm.at
+    start = arm.qpos
     nearest = np.argsort(np.linalg.norm(places[:, :2, 3] - arm.scene.tcp_in_base[:2, 3], axis=1), kind="stable")
     # near and far ones: all of them would take inverse kinematics seconds
     places = places[nearest[:: max(1, len(places) // PLACES_SOLVED)]]
-    above = raised(places, COME_DOWN)
-    solved, qpos = arm.reachability.reachable(above, start)
-    solved[solved] = arm.reachability.reachable(places[solved], start)[0]
+    above = shift_up(places, PLACE_APPROACH_HEIGHT)
+    solved, qpos = arm.reachability.nearest_solutions(above, start)
+    solved[solved] = arm.reachability.nearest_solutions(places[solved], start)[0]
     places, above, qpos = places[solved], above[solved], qpos[solved]
 
     def plan(index: int) -> Trajectory:
@@ -134,7 +134,7 @@ def _plan_to_one_of(arm: Arm, places: Array) -> Trajectory:
     return first_plan(order, plan, PlanningError("remove", "unreachable"))
 
 
-def turn_to_stand(vertices: Array, center_of_mass: Array) -> Array:
+def upright_rotation(vertices: Array, center_of_mass: Array) -> Array:
     """Return the least turn (4x4) after which a body with vertices (V, 3), z up, stands on level ground and stays."""
     corners, faces, normals = convex_hull(vertices)
     a, b, c = corners[faces.T]
@@ -150,7 +150,9 @@ def turn_to_stand(vertices: Array, center_of_mass: Array) -> Array:
     return turn
 
 
-def free_places(vertices: Array, others: Array, frame: Array, half: Array, margin: float = EDGE_MARGINS[-1]) -> Array:
+def find_free_places(
+    vertices: Array, others: Array, frame: Array, half: Array, margin: float = EDGE_MARGINS[-1]
+) -> Array:
     """Return motions (n, 4, 4) that bring a held object above a free place of a surface, turned about the vertical.
 
     Args:
@@ -169,16 +171,16 @@ def free_places(vertices: Array, others: Array, frame: Array, half: Array, margi
     standing = others[others[:, 2] > frame[2, 3] + 0.005]
     tree = KDTree(standing[:, :2])
     distance, _ = tree.query(spots)
-    spots = spots[distance >= ROOM]  # nothing stands in the middle of the place at least
+    spots = spots[distance >= PLACEMENT_CLEARANCE]  # nothing stands in the middle of the place at least
     rise = frame[2, 3] + RELEASE_HEIGHT - vertices[:, 2].min()
     motions = []
     for turn in np.arange(TURNS) * 2 * np.pi / TURNS:
         rotation = Rotation.from_euler("z", turn).as_matrix()
-        corners = spots[:, None] + _rim(outline @ rotation[:2, :2].T)  # (n, V, 2)
+        corners = spots[:, None] + _outline_points(outline @ rotation[:2, :2].T)  # (n, V, 2)
         local = (corners - frame[:2, 3]) @ frame[:2, :2]
         inside = np.all(np.abs(local) <= limit, axis=(1, 2))
         free = np.zeros(len(spots), dtype=bool)
-        free[inside] = tree.query(corners[inside])[0].min(axis=1) >= ROOM
+        free[inside] = tree.query(corners[inside])[0].min(axis=1) >= PLACEMENT_CLEARANCE
         for spot in spots[free]:
             motion = np.eye(4)
             motion[:3, :3] = rotation
@@ -187,7 +189,7 @@ def free_places(vertices: Array, others: Array, frame: Array, half: Array, margi
     return np.array(motions).reshape(-1, 4, 4)
 
 
-def _rim(outline: Array) -> Array:
+def _outline_points(outline: Array) -> Array:
     """Return points (n, 2) along the convex hull of an outline (V, 2), and its middle."""
     corners = outline[ConvexHull(outline).vertices]
     points = [np.zeros((1, 2))]
@@ -198,6 +200,6 @@ def _rim(outline: Array) -> Array:
     return np.concatenate(points)
 
 
-def _ways_off(tcp_in_base: Array) -> list[Array]:
-    back = moved_back(tcp_in_base, RETREAT)
-    return [raised(tcp_in_base, RETREAT), raised(back, RETREAT / 2), back, raised(tcp_in_base, RETREAT / 2)]
+def _retreat_poses(tcp_in_base: Array) -> list[Array]:
+    back = shift_back(tcp_in_base, RETREAT)
+    return [shift_up(tcp_in_base, RETREAT), shift_up(back, RETREAT / 2), back, shift_up(tcp_in_base, RETREAT / 2)]

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from robocas_ms3.planning.skills.arm import Arm
-from robocas_ms3.planning.skills.base_placement import open_from_reach
+from robocas_ms3.planning.skills.base_placement import drive_and_open
 from robocas_ms3.planning.skills.handles import is_opened
 from robocas_ms3.planning.solvers import pick
 
 
 def attempt(arm: Arm) -> None:
     if not is_opened(arm):
-        arm.begin_subgoal("operate the target")
-        open_from_reach(arm)
+        arm.start_subgoal("operate the target")
+        drive_and_open(arm)
         arm.executor.check_open_loop()
-        arm.come_back_here()
+        arm.add_backtracking_point()
     pick.attempt(arm)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from robocas_ms3.planning.skills.arm import Arm
-from robocas_ms3.planning.skills.base_placement import bring_to_basket, grasp_from_reach
+from robocas_ms3.planning.skills.base_placement import drive_and_grasp, place_in_basket
 
 
 def attempt(arm: Arm) -> None:
-    arm.begin_subgoal("move and grasp")
-    grasp_from_reach(arm, arm.target)
+    arm.start_subgoal("move and grasp")
+    drive_and_grasp(arm, arm.target)
     arm.executor.check_open_loop()
-    bring_to_basket(arm, arm.target)
+    place_in_basket(arm, arm.target)

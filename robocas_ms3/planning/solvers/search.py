@@ -10,8 +10,8 @@ from robocas_ms3.planning.decisions import SearchLimits
 from robocas_ms3.planning.executor import OPEN
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.planning.skills.grasp import grasp
-from robocas_ms3.planning.skills.heap import FACTS, Heap
-from robocas_ms3.planning.skills.look import FAR, NEAR, look_at, prepare_looks
+from robocas_ms3.planning.skills.heap import COUNTERS, Heap
+from robocas_ms3.planning.skills.look import FAR, NEAR, load_object_meshes, look_at
 from robocas_ms3.planning.skills.place import carry_to_basket, release_into_basket
 from robocas_ms3.planning.skills.remove import raise_held_object
 
@@ -23,36 +23,36 @@ GRASPS = 3  # kinds of grasps of the target that are tried
 
 def attempt(arm: Arm) -> None:
     slot, heap = arm.target, Heap(arm, arm.target)
-    for fact in FACTS:
+    for fact in COUNTERS:
         arm.executor.facts.setdefault(fact, 0)
-    with arm.planning():
-        prepare_looks(arm)
-    arm.begin_subgoal("find the object")
-    look_at(arm, heap.middle(slot), FAR)
+    with arm.planning_time():
+        load_object_meshes(arm)
+    arm.start_subgoal("find the object")
+    look_at(arm, heap.centroid(slot), FAR)
     while True:
-        if heap.cleared:
-            arm.begin_subgoal("move and grasp")
+        if heap.target_cleared:
+            arm.start_subgoal("move and grasp")
             if _grasp(arm, slot):
                 break
-            arm.begin_subgoal("find the object")
+            arm.start_subgoal("find the object")
         done = len(arm.executor.actions)
         try:
-            arm.choose(heap.moves(), heap.make, SearchLimits(AHEAD, tries(heap.moves_made), ENOUGH))
+            arm.choose(heap.candidate_moves(), heap.execute, SearchLimits(AHEAD, tries(heap.moves_made), ENOUGH))
         except PlanningError:
             if len(arm.executor.actions) > done:
                 raise
             # nothing can be moved: perhaps it can be grasped as things stand
-            arm.begin_subgoal("move and grasp")
-            if not heap.visible or not _grasp(arm, slot):
+            arm.start_subgoal("move and grasp")
+            if not heap.target_visible or not _grasp(arm, slot):
                 raise
             break
         arm.executor.check_open_loop()
-        if heap.uncovered and not heap.visible:
-            look_at(arm, heap.middle(slot), NEAR)
+        if heap.target_uncovered and not heap.target_visible:
+            look_at(arm, heap.centroid(slot), NEAR)
     arm.executor.check_open_loop()
-    arm.begin_subgoal("transfer object")
+    arm.start_subgoal("transfer object")
     carry_to_basket(arm, slot)
-    heap.check_surface()
+    heap.check_objects_on_surface()
     release_into_basket(arm, slot)
 
 
@@ -67,7 +67,7 @@ def _grasp(arm: Arm, slot: int) -> bool:
 
     def play(kind: int) -> float:
         arm.executor.gripper = OPEN  # it opens on the way
-        grasp(arm, slot, lift_height=LIFT_HEIGHT, other_than=kind)
+        grasp(arm, slot, lift_height=LIFT_HEIGHT, skip_kinds=kind)
         raise_held_object(arm, slot)
         return 0.0
 
