@@ -1,4 +1,4 @@
-"""The environment in which policies act: it executes actions of any convention and measures each step."""
+"""Environment wrapper that executes actions of any convention and measures each policy step."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ _STIFFNESS, _DAMPING = 1e8, 1e5
 
 
 class PolicyActionWrapper(gym.Wrapper):
-    """Execute the actions of a policy, and add measures to ``info`` (`metrics`), for one env or a batch.
+    """Wrapper that executes the actions of a policy and adds metrics to ``info``, for one env or a batch.
 
     Args:
         env: a RoboCAS environment made with `env_kwargs`.
-        spec: meaning of the actions, and how often the policy looks at images; those of other steps are black.
+        spec: action convention, and the number of steps between images; images of other steps are black.
         stepping: ``timed``: a policy step is one control step. ``upstream``: a policy step moves the gripper until it
-            stands, then the TCP on a straight line, until it is there or 0.4 s are over. Envs of a batch that have
-            finished wait.
-        weld: whether lifted objects are welded to the hand (`Weld`); only with one env on a CPU.
+            stops, then the TCP along a straight line until it arrives, at most 0.4 s. Envs of a batch that have
+            finished wait for the others.
+        weld: whether lifted objects are fixed to the hand (`Weld`); only for one env on the CPU.
     """
 
     def __init__(self, env: gym.Env, spec: PolicySpec, stepping: Stepping, *, weld: bool = False) -> None:
@@ -56,8 +56,8 @@ class PolicyActionWrapper(gym.Wrapper):
         self.single_observation_space = self._base.single_observation_space
         self._metrics = EpisodeMetrics(self._base)
         self._weld = Weld(self._base) if weld else None
-        self._open = np.ones(count, dtype=bool)  # whether the last command of each gripper was to open
-        self._width_change = np.zeros(count)  # m in the last control step
+        self._open = np.ones(count, dtype=bool)  # whether the last command to each gripper was to open
+        self._width_change = np.zeros(count)  # change of the gripper width in the last control step, m
         self._image_period, self._steps = spec.observe_every, np.zeros(count, dtype=np.int64)  # steps by env
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
@@ -72,21 +72,21 @@ class PolicyActionWrapper(gym.Wrapper):
 
     @property
     def gripper_open(self) -> bool:
-        """Whether the last command of the first env's gripper was to open."""
+        """Return whether the last command to the gripper of the first env was to open."""
         return bool(self._open[0])
 
     def get_info(self) -> dict[str, Any]:
-        """Return the info of the present state, whose entries workers share."""
+        """Return the ``info`` of the present state."""
         info = self._base.get_info()
         return {**info, **self._measures(info)}
 
     def step(self, action: Any) -> tuple[Any, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """Execute one policy step: (A,) or (N, A) of the convention."""
+        """Execute one policy step with actions (A,) or (N, A) of the convention."""
         actions = np.asarray(action.cpu() if isinstance(action, torch.Tensor) else action, np.float64)
         actions = actions.reshape(self._base.num_envs, self._convention.size)
         if not np.isfinite(actions).all():
-            raise EvaluationError("an action is not finite", where="action", found=actions.tolist())
-        self._base.renders_images = False  # not before the last of its control steps, and not after each of these
+            raise EvaluationError("NaN or infinite action", where="action", found=actions.tolist())
+        self._base.renders_images = False  # cameras render only at the end of the policy step
         try:
             obs, *others, info = self._act(actions)
         finally:
@@ -114,7 +114,7 @@ class PolicyActionWrapper(gym.Wrapper):
         return self._move_to(*_apply_motion(start, motion), motion.open)
 
     def _upstream(self, motion: TcpMotion) -> tuple:
-        """Gripper, then motion; an env that is done with either waits."""
+        """Move the grippers, then the arms; an env that has finished either phase waits for the others."""
         result, here = None, self._target()
         turned = motion.open != self._open
         for _ in range(_GRIPPER_STEPS):
@@ -152,7 +152,7 @@ class PolicyActionWrapper(gym.Wrapper):
         return _pose(self._base.agent.tcp_in_arm_base)
 
     def _target(self) -> tuple[np.ndarray, Rotation]:
-        """Where the last action sent the TCPs."""
+        """Return the target poses of the last action."""
         return _pose(self._base.agent.controller.controllers["arm"].reference_pose())
 
     def _width(self) -> np.ndarray:
@@ -166,10 +166,10 @@ class PolicyActionWrapper(gym.Wrapper):
 
 
 class Weld:
-    """RoboCAS-v0's weld: fixes at most one lifted object to the hand, in an environment with one env on a CPU.
+    """RoboCAS-v0's weld: a drive that fixes at most one lifted object to the hand, for one env on the CPU.
 
-    The evaluator of the paper does this, and it helps policies that drop lifted objects. RoboCAS-v0 lets go at the end
-    of the step in which the gripper was commanded to open; here the object is released when it begins to open.
+    The evaluator of the paper uses the weld; it helps policies that drop lifted objects. RoboCAS-v0 releases the object
+    at the end of the step that opens the gripper; this class releases it when the gripper starts to open.
     """
 
     def __init__(self, env: Any) -> None:
@@ -178,9 +178,9 @@ class Weld:
         self._count = 0
 
     def update(self) -> None:
-        """Weld an object that both fingers touch, if it is raised and nothing is welded.
+        """Weld a raised object that both fingers touch, unless an object is welded already.
 
-        To be called after a policy step in which the gripper was commanded to close, as RoboCAS-v0 does.
+        Call it after each policy step that commands the gripper to close, as RoboCAS-v0 does.
         """
         if self._welded is not None:
             return
@@ -193,6 +193,7 @@ class Weld:
             self._fix(env.objects[int(found[0])]._bodies[0])
 
     def open(self) -> None:
+        """Release the welded object."""
         if self._welded is None:
             return
         body, drive = self._welded
@@ -201,11 +202,12 @@ class Weld:
         self._welded = None
 
     def reset(self) -> None:
+        """Release the welded object and set the number of welds to 0."""
         self.open()
         self._count = 0
 
     def read(self, info: dict[str, Any]) -> dict[str, Any]:
-        """Return entries of an info: the number of ``welds`` (1,), and no ``success`` while anything is welded."""
+        """Return entries of ``info``: number of ``welds`` (1,); ``success``, False while an object is welded."""
         welded = torch.tensor([self._welded is not None])
         return {"welds": torch.tensor([float(self._count)]), "success": info["success"] & ~welded}
 
@@ -223,32 +225,33 @@ class Weld:
 
 
 def check_weld(stepping: str, backend: str) -> None:
-    """Check that objects can be welded with a protocol's steps, on a backend."""
+    """Check that the weld is available for a protocol's stepping and a backend."""
     if stepping != "upstream":
-        what, fix = "the weld belongs to upstream's steps", "Leave --weld out, or take paper-v1."
+        what, fix = "the weld needs RoboCAS-v0's steps", "Omit --weld, or pass --protocol paper-v1."
         raise EvaluationError(what, where="--weld", expected="stepping upstream", found=stepping, fix=fix)
-    if backend == "gpu":  # where nothing can be built once a batch runs
-        what, fix = "nothing can be welded on a GPU", "Pass --backend processes."
+    if backend == "gpu":  # a running GPU batch accepts no new components
+        what, fix = "the weld is not available on a GPU", "Pass --backend processes."
         raise EvaluationError(what, where="--weld", found=backend, fix=fix)
 
 
 def control_mode(convention: str) -> str:
+    """Return the control mode that executes an action convention."""
     return "pd_joint_pos" if CONVENTIONS[convention].decode is None else "pd_ee_delta_pose"
 
 
 def env_kwargs(spec: PolicySpec, rate: int, *, renders: bool = False) -> dict[str, Any]:
-    """Return keyword arguments of an environment in which a policy acts.
+    """Return keyword arguments for the environment of a policy.
 
     Args:
-        spec: of the policy.
+        spec: specification of the policy.
         rate: control steps per second.
-        renders: whether the environment's ``render`` is used.
+        renders: whether ``env.render`` is used.
     """
     common = {
         "control_mode": control_mode(spec.convention),
         "reward_mode": "none",
         "sim_config": {"control_freq": rate},
-        "max_episode_steps": 10**9,  # `rollout.EndConditions` end episodes
+        "max_episode_steps": 10**9,  # `rollout.EndConditions` ends episodes
     }
     if not spec.cameras:
         return {**common, "obs_mode": "state_dict", **({} if renders else {"render_backend": "none"})}

@@ -1,4 +1,4 @@
-"""The outcome of one episode, as results record it."""
+"""Outcome of an episode, as recorded in results."""
 
 from __future__ import annotations
 
@@ -12,17 +12,24 @@ from pydantic import Field
 
 from robocas_ms3.scenes.task_specs import STAGES as DEFAULT_STAGES
 
-# evaluation_v0.md and the paper's table: reach, pick, recognise, clear
+# Abbreviations of the paper's table (evaluation_v0.md): reach, pick, recognise, clear.
 PAPER_STAGES = {"RA": "reached_any", "PA": "picked_any", "RR": "reached_target", "CO": "obstacles_cleared"}
 
-Measure = Annotated[int | float, Field(ge=0, le=1e12)]  # whole if the file has it whole, so that it is written the same
+Measure = Annotated[int | float, Field(ge=0, le=1e12)]  # int stays int, so that a value is written as it was read
 Fraction = Annotated[int | float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=0, le=10**12)]
 
 
 @dataclass(frozen=True)
 class MovedObject:
-    """An object that was moved before the target: at which policy step, and whether it had to be and came in order."""
+    """An object that was moved before the target.
+
+    Attributes:
+        object: id of the object.
+        step: policy step after which the object was first moved.
+        needed: whether the object had to be moved.
+        in_order: whether it was needed and moved after the objects on top of it.
+    """
 
     object: str
     step: Count
@@ -32,15 +39,14 @@ class MovedObject:
 
 @dataclass(frozen=True)
 class Retrieval:
-    """The order in which objects were moved before the target of a heap.
+    """Order in which objects were moved before the target of a heap.
 
     Attributes:
-        moved: by step.
+        moved: moved objects, sorted by step.
         needed: ids of the objects that had to be moved (`metrics.RetrievalOrder`).
-        left: number of needed objects that had not been moved when the target was taken from a heap that was not
-            cleared.
-        score: share of the objects moved or left that were needed and moved in order; 1 if there are none; None if the
-            target was never held.
+        left: number of needed objects that were not moved before the target was grasped; 0 if the heap was cleared.
+        score: fraction of the moved and left objects that were needed and moved in order; 1 without such objects;
+            None if the target was never held.
     """
 
     moved: list[MovedObject]
@@ -52,10 +58,13 @@ class Retrieval:
     def from_record(
         cls, record: NDArray[np.integer], objects: Sequence[str], held_at: int | None, *, cleared: bool
     ) -> Retrieval:
-        """Make it from a record (K, 3) of `metrics.RetrievalOrder.read`, and the ids of the objects by slot.
+        """Return the order from a record of `metrics.RetrievalOrder.read`.
 
-        ``held_at``: policy step after which the target was first held; ``cleared``: whether the obstacles had been
-        cleared before.
+        Args:
+            record: (K, 3) values of each object.
+            objects: ids of the objects by slot.
+            held_at: policy step after which the target was first held; None: never.
+            cleared: whether the obstacles were cleared in the episode.
         """
         slots: list[int] = [slot for slot in np.argsort(record[:, 0], kind="stable").tolist() if record[slot, 0]]
         moved = [
@@ -67,6 +76,7 @@ class Retrieval:
 
 
 def retrieval_score(moved: Sequence[MovedObject], left: int, held_at: int | None) -> float | None:
+    """Return the score of a retrieval order, 0..1; None if the target was never held (`Retrieval`)."""
     if held_at is None:
         return None
     right, total = sum(move.needed and move.in_order for move in moved), len(moved) + left
@@ -75,27 +85,27 @@ def retrieval_score(moved: Sequence[MovedObject], left: int, held_at: int | None
 
 @dataclass(frozen=True)
 class Outcome:
-    """The outcome of an episode: a line of ``episodes.jsonl``.
+    """Outcome of an episode: a line of ``episodes.jsonl``.
 
     Attributes:
-        episode: its number in the protocol.
-        task: short name.
-        config: name of its configuration.
-        seed: of its scene.
-        split: of the protocol.
+        episode: number of the episode in the protocol.
+        task: short name of the evaluated task.
+        config: name of the task configuration.
+        seed: seed of the scene.
+        split: split of the protocol.
         success: whether the task succeeded at some step.
-        success_at_end: whether it succeeded at the last step.
-        success_v0: whether RoboCAS-v0's rule held at the last step; never without a basket.
-        steps: policy steps.
+        success_at_end: whether the task succeeded at the last step.
+        success_v0: whether RoboCAS-v0's rule held at the last step; False without a basket.
+        steps: number of policy steps.
         seconds: simulated time.
-        failure_stage: see `failure_stage`; empty: success.
-        error: why it was ended early; empty: it was not.
-        flags: by stage or rule, the policy step after which it first held.
-        flag_seconds: the same in s of simulated time.
+        failure_stage: first stage not reached (`failure_stage`); empty: success.
+        error: error that ended the episode; empty: no error.
+        flags: policy step after which each stage or rule first held; None: never.
+        flag_seconds: simulated time after which each stage or rule first held; None: never.
         measures: ``path_length`` m, ``contact_impulse`` N s, ``disturbed_most``, ``fallen``; ``welds`` with the weld.
         inference_ms: clock time of the policy per step.
-        p_vis: share of the target that is visible from above.
-        retrieval: in tasks with obstacles to clear, the order in which objects were moved.
+        p_vis: visible fraction of the target from above.
+        retrieval: order in which objects were moved, only in tasks with obstacles to clear.
     """
 
     episode: Count
@@ -118,16 +128,16 @@ class Outcome:
     retrieval: Retrieval | None = None
 
     def reproducible_values(self) -> dict[str, Any]:
-        """Return the values that are the same for the same seed and policy."""
+        """Return the values that are equal for equal seed and policy: all but clock times."""
         return {name: value for name, value in asdict(self).items() if name != "inference_ms"}
 
 
 def failure_stage(flags: dict[str, int | None], error: str = "", order: Sequence[str] = DEFAULT_STAGES) -> str:
-    """Return the first stage that an episode did not reach after the furthest one that it reached.
+    """Return the first stage not reached: the stage after the furthest reached stage.
 
-    Stages that were skipped do not count: a target can be pulled out of a heap that was never cleared. Stages that are
-    missing in ``flags`` do not exist in the environment. ``placed``: it reached all of them, but did not succeed;
-    ``error``: it was ended by an error; empty: success.
+    Skipped stages do not count: a target can be pulled out of a heap that was never cleared. Stages that are missing
+    in ``flags`` do not exist in the environment. ``placed``: the episode reached all stages, but did not succeed;
+    ``error``: an error ended the episode; empty: success.
     """
     if error:
         return "error"

@@ -1,4 +1,4 @@
-"""The interface of policies: what they observe, what their actions mean, and how they are asked for actions."""
+"""Interface of policies: specification, observations, action conventions, and the `Policy` protocol."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from robocas_ms3.robots.quantities import QUANTITIES
 from robocas_ms3.robots.registry import DEFAULT_ROBOT
 
 ROBOT_QUANTITIES = {quantity.policy_key: quantity for quantity in QUANTITIES if quantity.policy_key}
-"""Quantities of the robot that policies observe, by their names there."""
+"""Quantities of the robot that policies observe, by their names in `Observations.robot`."""
 Language = Literal["none", "text", "embedding"]
 Reference = Literal["tcp", "target"]
 Pixels = Annotated[int, Field(ge=1, le=4096)]
@@ -33,7 +33,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class TcpMotion:
-    """Relative motions of E TCPs, each in its own frame (z approach, y closing): (E, 3) m, E rotations, (E,) bool."""
+    """Relative motions of E TCPs in their own frames (z approach, y closing direction).
+
+    Attributes:
+        translation: (E, 3) m.
+        rotation: E rotations.
+        open: (E,) whether the gripper is commanded to open.
+    """
 
     translation: Array
     rotation: Rotation
@@ -42,7 +48,12 @@ class TcpMotion:
 
 @dataclass(frozen=True)
 class Convention:
-    """A convention of actions: numbers per action, and how actions (E, size) become motions; None: joint targets."""
+    """An action convention.
+
+    Attributes:
+        size: numbers per action.
+        decode: converts actions (E, size) to motions; None: the actions are joint targets.
+    """
 
     size: int
     decode: Callable[[Array], TcpMotion] | None
@@ -63,7 +74,7 @@ def _quaternions(wxyz: Array) -> Rotation:
 
 _euler = partial(Rotation.from_euler, "xyz")
 # Translation in m, then rotation (Euler angles about fixed axes x, y, z in rad, a rotation vector in rad, or a
-# quaternion wxyz), both in the TCP's frame; the last number is the gripper's, open above 0, of the paper's above 0.5.
+# quaternion wxyz), both in the TCP's frame. The last number commands the gripper: open above 0, in `robocas` above 0.5.
 CONVENTIONS: dict[str, Convention] = {
     "robocas": Convention(7, _motions(_euler, 0.5)),
     "delta_euler": Convention(7, _motions(_euler)),
@@ -71,26 +82,26 @@ CONVENTIONS: dict[str, Convention] = {
     "delta_quaternion": Convention(8, _motions(_quaternions)),
     "joint_positions": Convention(8, None),  # seven joint targets, rad; gripper, -1 closed to 1 open
 }
-"""By name."""
+"""Action conventions by name."""
 
 
 @dataclass(frozen=True)
 class PolicySpec:
-    """What a policy declares; a mismatch with the protocol is refused before the first step.
+    """Specification that a policy declares; a policy that does not fit the protocol is refused before the first step.
 
     Attributes:
-        convention: meaning of its actions, one of `CONVENTIONS`.
-        reference: motions are relative to where the TCP is, or to where the last action sent it.
-        rate_hz: actions per second; None: the protocol's.
-        cameras: (width, height) in pixels by camera; empty: no images.
-        depth: whether images come with depth.
-        state: whether it observes privileged state (docs/rl.md).
+        convention: action convention, one of `CONVENTIONS`.
+        reference: pose that motions are relative to: ``tcp`` (present TCP pose) or ``target`` (last commanded pose).
+        rate_hz: actions per second; None: the protocol's rate.
+        cameras: (width, height) in pixels by camera name; empty: no images.
+        depth: whether the policy observes depth images.
+        state: whether the policy observes privileged state (docs/rl.md).
         language: form of the instruction.
-        observe_every: number of steps between two images that it looks at, from the first step on; those in between may
-            be black, as rendering is most of the cost of an evaluation. Its chunks have a multiple of this length.
+        observe_every: number of policy steps between rendered images, from the first step on. Images of other steps
+            are black, which saves rendering time. Chunk lengths must be multiples of this number.
     """
 
-    __pydantic_config__ = ConfigDict(extra="forbid")  # of specifications in messages and addresses
+    __pydantic_config__ = ConfigDict(extra="forbid")  # for specifications in messages and addresses
 
     convention: str = "robocas"
     reference: Reference = "target"
@@ -107,25 +118,28 @@ class PolicySpec:
             ("convention", self.convention in CONVENTIONS, f"one of {sorted(CONVENTIONS)}"),
             ("reference", self.reference in get_args(Reference), f"one of {list(get_args(Reference))}"),
             ("language", self.language in get_args(Language), f"one of {list(get_args(Language))}"),
-            ("cameras", not wrong_cameras, "names like side_camera"),
+            ("cameras", not wrong_cameras, "camera names such as side_camera"),
             ("observe_every", self.observe_every >= 1, "1 or more"),
         ):
             if not fits:
                 found = repr(wrong_cameras[0] if name == "cameras" else getattr(self, name))
-                raise EvaluationError("a policy can't want that", where=name, expected=expected, found=found)
+                raise EvaluationError("invalid policy specification", where=name, expected=expected, found=found)
 
 
 @dataclass(frozen=True)
 class EpisodeSpec:
-    """An episode as a policy gets to know it.
+    """Specification of an episode, as policies receive it.
 
     Attributes:
-        env: number of the env that runs it, as in `Observations.envs`.
-        episode: its number in the protocol's list.
-        task: short name.
-        config_file, layouts_file: of its configuration and its scene.
-        pack: name of the object pack, or its folder.
-        seed: of its scene.
+        env: index of the env that runs the episode, as in `Observations.envs`.
+        episode: number of the episode in the protocol.
+        task: short name of the task.
+        config_file: YAML file of the task configuration.
+        layouts_file: NumPy file of the scene layouts.
+        pack: name or folder of the object pack.
+        seed: seed of the scene.
+        instruction: text of the instruction.
+        robot: name of the robot.
     """
 
     env: int
@@ -141,15 +155,15 @@ class EpisodeSpec:
 
 @dataclass(frozen=True)
 class Observations:
-    """Observations of E envs, a row each; NumPy arrays.
+    """Observations of E envs as NumPy arrays with one row per env.
 
     Attributes:
-        envs: (E,) numbers of the envs.
-        instructions: E texts; empty strings with language ``none``.
+        envs: (E,) indices of the envs.
+        instructions: E texts; empty with language ``none``.
         embeddings: (E, 384) float32 sentence embeddings, or None.
-        images: by camera (E, H, W, 3) uint8.
-        depths: by camera (E, H, W, 1) int16, mm.
-        robot: (E, D) by name, the quantities of `ROBOT_QUANTITIES`; they are attributes too, such as ``qpos``.
+        images: (E, H, W, 3) uint8 by camera.
+        depths: (E, H, W, 1) int16 in mm by camera.
+        robot: (E, D) by name of `ROBOT_QUANTITIES`. Each quantity is also an attribute, such as ``qpos``.
         state: (E, D) privileged state, or None.
     """
 
@@ -168,22 +182,30 @@ class Observations:
 
 
 def privileged_state(extra: Mapping[str, Any]) -> NDArray[np.float32]:
-    """Return the privileged state (N, D) of an environment's ``obs["extra"]``, arrays (N, ...)."""
+    """Return the privileged state (N, D) from ``obs["extra"]`` of an environment, arrays (N, ...)."""
     return np.concatenate([np.asarray(value) for name, value in extra.items() if name != "tcp_pose"], axis=1)
 
 
 class Policy(Protocol):
-    """A policy, which runs several episodes at a time."""
+    """A policy that runs several episodes at a time.
+
+    Optional methods: ``describe()`` returns a dict that results record. ``protocol_warnings(configs)`` gets the task
+    configurations of an evaluation by name and returns warnings, such as scenes that are not in the training data.
+    ``close()`` is called at the end.
+    """
 
     @property
     def spec(self) -> PolicySpec: ...
 
     def reset(self, episodes: list[EpisodeSpec]) -> None:
-        """Start episodes in some envs, and forget what was kept of these envs."""
+        """Start one episode in each of some envs and drop the state of their previous episodes."""
         ...
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
-        """Return actions (E, A), or chunks (E, H, A) that are executed whole before the next call for the env."""
+        """Return actions (E, A) or action chunks (E, H, A).
+
+        All H steps of a chunk are executed before the next call for the env.
+        """
         ...
 
 
@@ -191,7 +213,7 @@ def as_action_chunks(actions: ArrayLike, count: int, size: int | None, *, where:
     """Return actions (E, A) or (E, H, A) of ``count`` envs as chunks (E, H, A).
 
     Raises:
-        EvaluationError: they are no numbers, or have another shape; ``size`` None: of any A.
+        EvaluationError: the actions are not numeric or have another shape; ``size`` None: any A is valid.
     """
     found = np.asarray(actions)
     chunks = found[:, None] if found.ndim == 2 else found
@@ -199,12 +221,12 @@ def as_action_chunks(actions: ArrayLike, count: int, size: int | None, *, where:
     if found.dtype.kind not in "iuf" or not fits:
         expected = f"({count}, {size or 'size'}) or ({count}, chunk, {size or 'size'}) numbers"
         what = f"{found.shape} {found.dtype}"
-        raise EvaluationError("actions don't fit", where=where, expected=expected, found=what)
+        raise EvaluationError("invalid shape or type of actions", where=where, expected=expected, found=what)
     return chunks.astype(np.float32)
 
 
 class ExternalPolicy:
-    """Stand for the policy of an external loop, which calls `EvaluationSession.reset` and `step`."""
+    """Placeholder policy of an external loop that calls `EvaluationSession.reset` and `step`."""
 
     def __init__(self, spec: PolicySpec) -> None:
         self.spec = spec
@@ -213,28 +235,28 @@ class ExternalPolicy:
         pass
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
-        raise EvaluationError("this policy has no actions", where="ExternalPolicy", fix="Call reset and step.")
+        raise EvaluationError("ExternalPolicy returns no actions", fix="Call EvaluationSession.reset and step.")
 
 
 def policy_spec_values(spec: PolicySpec) -> dict[str, Any]:
-    """Return JSON values of a specification; ``observe_every`` only if it is not 1, which older readers do not know."""
+    """Return a specification as JSON values; ``observe_every`` is left out if it is 1."""
     values = {**vars(spec), "cameras": {name: list(size) for name, size in spec.cameras.items()}}
     return {key: value for key, value in values.items() if key != "observe_every" or value != 1}
 
 
 def describe(policy: Policy) -> dict[str, Any]:
-    """Return what a result says of a policy: class, specification, and the entries of its optional ``describe()``."""
+    """Return the description of a policy for results: class, specification, and its optional ``describe()``."""
     where = f"policy {_class_name(policy)}, describe()"
     with policy_exit_guard(policy):
         spec, added = policy_spec_values(policy.spec), getattr(policy, "describe", dict)()
     if not isinstance(added, dict):
         raise EvaluationError("invalid policy description", where=where, expected="a dict", found=type(added).__name__)
-    said = {"class": _class_name(policy), "spec": spec, **added}
-    return json.loads(json_text(said, where, error=EvaluationError))
+    description = {"class": _class_name(policy), "spec": spec, **added}
+    return json.loads(json_text(description, where, error=EvaluationError))
 
 
 def policy_exit_guard(policy: Policy) -> AbstractContextManager[None]:
-    """Call a policy inside: if its code tries to end the process, that is an error (`forbid_exit`)."""
+    """Return a context in which a policy that tries to end the process raises an error (`forbid_exit`)."""
     return forbid_exit(f"policy {_class_name(policy)}")
 
 

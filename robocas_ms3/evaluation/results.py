@@ -1,11 +1,11 @@
-"""Results of evaluations: one line per episode, appended as it ends, and a record of what was measured.
+"""Results of evaluations: a record of the settings, and one line per episode, appended as the episode ends.
 
 ::
 
     run.json            protocol and its hash, policy, versions, backend, packs, machine (`RunRecord`)
-    episodes.jsonl      an `Outcome` per line, in any order; a line that a kill left half-written is dropped
+    episodes.jsonl      one `Outcome` per line, in any order; an incomplete last line is dropped
 
-Parts of a result, such as shards, are read as one (`read_result`) or written as one (`merge_results`).
+Partial results of one evaluation, such as shards, are read (`read_result`) or written (`merge_results`) as one result.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ from robocas_ms3.evaluation.statistics import SuccessRate, success_rate
 
 RUN, OUTCOMES = "run.json", "episodes.jsonl"
 _PACKAGES = ("robocas_ms3", "mani_skill", "sapien", "gymnasium", "numpy", "torch")
-_NO_RESULT = "no result of an evaluation"
+_NO_RESULT = "invalid evaluation result"
 
 
 class PolicyRecord(BaseModel):
-    """The policy of a result. A policy adds entries of its own (`policy.describe`).
+    """The policy of a result. The policy may add entries (`policy.describe`).
 
     Attributes:
-        name: as the user gave it.
-        spec: the policy's specification, `PolicySpec`.
-        server: description of a policy that is behind a server.
+        name: name of the policy as given by the user.
+        spec: specification of the policy, `PolicySpec`.
+        server: description by the policy server, if any.
     """
 
     model_config = ConfigDict(strict=True, extra="allow")
@@ -50,7 +50,7 @@ class PolicyRecord(BaseModel):
 
 
 class MergedFolder(BaseModel):
-    """One of the folders that were merged into a result."""
+    """A folder that was merged into a result."""
 
     model_config = ConfigDict(strict=True)
 
@@ -60,7 +60,12 @@ class MergedFolder(BaseModel):
 
 
 class RunRecord(BaseModel):
-    """``run.json``: what a result was measured with."""
+    """Settings of a result: ``run.json``.
+
+    Attributes:
+        played_as: tasks that were evaluated in the episodes of another task (`LoadedProtocol.played_as`).
+        merged_from: folders of the partial results, if the result was merged.
+    """
 
     model_config = ConfigDict(strict=True, extra="allow")
 
@@ -68,6 +73,7 @@ class RunRecord(BaseModel):
     protocol_hash: str
     policy: PolicyRecord
     weld: bool = False
+    played_as: dict[str, str] = {}
     backend: str
     versions: dict[str, str]
     pack_hashes: dict[str, str]
@@ -76,22 +82,26 @@ class RunRecord(BaseModel):
 
     @classmethod
     def from_values(cls, values: dict[str, Any], where: object) -> RunRecord:
-        """Return the record of these values, which can be written and read back; ``where`` is for errors."""
-        return parse(cls, values, EvaluationError, where=where, about="this evaluation can't be recorded")
+        """Return the validated record of some values; ``where`` is for error messages."""
+        return parse(cls, values, EvaluationError, where=where, about="invalid record of the evaluation")
 
     def to_dict(self) -> dict[str, Any]:
+        """Return the values that were set, for ``run.json``."""
         return self.model_dump(exclude_unset=True)
 
     def identity(self) -> dict[str, Any]:
-        """Return the values that match in the parts of one result; a server's policy counts, not its address."""
+        """Return the values that are equal in partial results of one evaluation.
+
+        A policy server is identified by its policy, not by its address.
+        """
         policy = self.policy.model_dump(exclude_unset=True)
         if self.policy.server and self.policy.name.startswith(("ws://", "wss://")):
             del policy["name"]
-        names = ("protocol", "protocol_hash", "weld", "backend", "versions", "pack_hashes")
+        names = ("protocol", "protocol_hash", "weld", "played_as", "backend", "versions", "pack_hashes")
         return {"policy": policy, **{name: getattr(self, name) for name in names}}
 
     def settings(self) -> dict[str, Any]:
-        """Return the values that have to match to continue a result."""
+        """Return the values that must be equal to continue a result."""
         return {**self.identity(), "machine": self.machine}
 
 
@@ -104,12 +114,12 @@ OUTPUT = FolderKind("robocas eval", (RUN,), "protocol_hash", upgrade=_recorded_s
 
 @dataclass(frozen=True)
 class Result:
-    """A result that was read.
+    """A result in memory.
 
     Attributes:
-        folder: of the result; of several parts, the first one.
-        run: what it was measured with; of several parts, the first one's record, with their ``parts``.
-        outcomes: by number of the episode, in its order.
+        folder: folder of the result, or of the first partial result.
+        run: settings of the result; for several partial results, the record of the first with ``merged_from``.
+        outcomes: outcomes by episode number, in ascending order.
     """
 
     folder: Path
@@ -117,20 +127,24 @@ class Result:
     outcomes: dict[int, Outcome]
 
     def rate(self, name: str = "success", outcomes: Iterable[Outcome] | None = None) -> SuccessRate:
-        """Return the share of episodes in which a flag ever held, of all or of some (at least one)."""
+        """Return the success rate of a flag: the episodes in which it held at some step.
+
+        ``outcomes``: at least one outcome; None: all of the result.
+        """
         chosen = list(self.outcomes.values() if outcomes is None else outcomes)
         held = [getattr(one, name) if hasattr(one, name) else one.flags.get(name) is not None for one in chosen]
         return success_rate(sum(held), len(held))
 
     def repeats_scenes(self) -> bool:
-        """Return whether a scene occurs several times, as in several splits: then episodes must not be pooled."""
+        """Return whether a scene occurs in several episodes, such as splits; these episodes must not be pooled."""
         return len({(one.task, one.seed) for one in self.outcomes.values()}) < len(self.outcomes)
 
     def error_count(self) -> int:
+        """Return the number of episodes that an error ended."""
         return sum(bool(one.error) for one in self.outcomes.values())
 
     def group_by(self, name: str) -> dict[str, list[Outcome]]:
-        """Return the outcomes by an attribute such as ``config``, sorted; splits in the protocol's order."""
+        """Return the outcomes by an attribute such as ``config``, sorted; splits in the order of the protocol."""
         found: dict[str, list[Outcome]] = {}
         for outcome in self.outcomes.values():
             found.setdefault(getattr(outcome, name), []).append(outcome)
@@ -141,13 +155,13 @@ class Result:
 def open_result(
     folder: Path, run: RunRecord, *, overwrite: bool = False, retry_errors: bool = False
 ) -> Iterator[dict[int, Outcome]]:
-    """Lock the folder of a result, start or continue it, and yield the outcomes that exist, by number of the episode.
+    """Lock a result folder, start or continue the result, and yield the existing outcomes by episode number.
 
-    With ``retry_errors`` episodes that an error ended are dropped, so that they run again.
+    With ``retry_errors`` the outcomes of episodes that an error ended are dropped, so that these episodes run again.
 
     Raises:
-        OutputExistsError: it was measured with something else, or the folder is not of an evaluation.
-        RobocasError: another process writes there; or somebody removed the folder.
+        OutputExistsError: the result has other settings, or the folder holds no result.
+        RobocasError: another process writes to the folder, or the folder was removed.
     """
     with OutputFolder(folder, OUTPUT, run.settings(), overwrite=overwrite) as output:
         output.start(output.recorded or run.to_dict())
@@ -159,12 +173,18 @@ def open_result(
 
 
 def append_outcome(folder: Path, outcome: Outcome) -> None:
-    """Add an episode; on the disk when this returns."""
+    """Append an outcome and flush it to disk."""
     _ledger(folder).append([outcome], sync=True)
 
 
 def read_result(*folders: Path) -> Result:
-    """Read a result, or parts of one, which may share episodes if their outcomes are the same."""
+    """Read a result, or partial results of one evaluation.
+
+    Partial results may have common episodes if their outcomes are equal.
+
+    Raises:
+        EvaluationError: a result is invalid, or the partial results have other settings or contradict each other.
+    """
     parts = [_read(folder) for folder in folders]
     first, outcomes = parts[0], dict[int, Outcome]()
     for part in parts:
@@ -172,7 +192,9 @@ def read_result(*folders: Path) -> Result:
         if key := next((key for key in found if expected[key] != found[key]), ""):
             changes = "; ".join(list_setting_changes(expected[key], found[key], key))
             raise EvaluationError(
-                f"no part of one result with {first.folder}: another {key}", where=part.folder, found=changes
+                f"not a partial result of the same evaluation as {first.folder}: different {key}",
+                where=part.folder,
+                found=changes,
             )
         for outcome in part.outcomes.values():
             _add(outcomes, outcome, str(part.folder))
@@ -203,7 +225,7 @@ def group_partial_results(folders: Iterable[Path]) -> list[list[Path]]:
 
 
 def merge_results(folders: Sequence[Path], out: Path) -> Result:
-    """Write parts of a result as one, into a folder that appears whole."""
+    """Merge partial results into one result folder, which is written atomically."""
     result = read_result(*folders)
     check_replaceable(out)
     with atomic_folder(out) as folder:
@@ -213,6 +235,7 @@ def merge_results(folders: Sequence[Path], out: Path) -> Result:
 
 
 def package_versions() -> dict[str, str]:
+    """Return the installed versions of the packages that can change a result."""
     return {name: version(name) for name in _PACKAGES}
 
 
@@ -230,20 +253,20 @@ def _read(folder: Path) -> Result:
 
 
 def _outcomes(folder: Path) -> dict[int, Outcome]:
-    """Return the outcomes of a result, which a run may be writing."""
+    """Return the outcomes of a result; another process may be writing it."""
     ledger, found = _ledger(folder), dict[int, Outcome]()
     for line in ledger.lines():
         if line.record is not None:
             _add(found, line.record, f"{ledger.path}:{line.number}")
         elif not line.cut_off:
-            raise ledger.line_error(line, EvaluationError, "no outcome of an episode") from line.problem
+            raise ledger.line_error(line, EvaluationError, "invalid outcome of an episode") from line.problem
     return found
 
 
 def _add(outcomes: dict[int, Outcome], outcome: Outcome, where: str) -> None:
-    """Add an episode, which may exist already with the same outcome."""
+    """Add an outcome; an existing outcome of the episode must be equal."""
     before = outcomes.setdefault(outcome.episode, outcome).reproducible_values()
     now = outcome.reproducible_values()
     if changes := [change for key in now for change in list_setting_changes(before[key], now[key], key)]:
-        what = f"two outcomes of episode {outcome.episode} disagree"
+        what = f"contradicting outcomes of episode {outcome.episode}"
         raise EvaluationError(what, where=where, found="; ".join(changes))

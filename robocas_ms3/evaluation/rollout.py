@@ -1,4 +1,4 @@
-"""Run episodes in several envs at a time: one loop for every backend."""
+"""Run episodes in several envs at a time, with one loop for all backends."""
 
 from __future__ import annotations
 
@@ -29,18 +29,19 @@ from robocas_ms3.evaluation.protocol import ProtocolEpisode
 from robocas_ms3.scenes.language.embed import TextEmbedder
 from robocas_ms3.scenes.task_specs import TASKS
 
-NOT_FINITE = "the policy's action is not finite"
-_WELDS = "welds"  # in an info, where objects are welded (`action_wrapper.Weld`)
+NOT_FINITE = "NaN or infinite action of the policy"
+_WELDS = "welds"  # key of ``info`` with the weld (`action_wrapper.Weld`)
 
 
 @dataclass
 class Rollout:
-    """An episode that runs or has ended; see `Outcome`.
+    """An episode that is running or has ended; see `Outcome` for the other fields.
 
     Attributes:
-        at_end: by flag, whether it held after the last step.
-        retrieval: (K, 3) in search, see `metrics.RetrievalOrder.read`.
-        inference_seconds: clock time of the policy: of each batch the time per env.
+        spec: specification of the episode.
+        at_end: value of each flag after the last step.
+        retrieval: (K, 3) array of `metrics.RetrievalOrder.read`, only in search.
+        inference_seconds: clock time of the policy; the time of a batch is divided by its number of envs.
     """
 
     spec: EpisodeSpec
@@ -55,7 +56,7 @@ class Rollout:
     error: str = ""
 
     def outcome(self, episode: ProtocolEpisode, objects: Sequence[str]) -> Outcome:
-        """Return the outcome of the episode, in which objects have these ids by slot."""
+        """Return the outcome of the episode; ``objects`` are the ids of the objects by slot."""
         flags, order = self.flags, None
         if self.retrieval is not None:
             cleared = flags.get("obstacles_cleared") is not None
@@ -72,7 +73,7 @@ class Rollout:
             steps=self.steps,
             seconds=round(self.seconds, 4),
             failure_stage=failure_stage(flags, self.error, TASKS[episode.task].stages),
-            error=escape_controls(self.error),  # a text of the policy's code
+            error=escape_controls(self.error),  # may come from the code of the policy
             flags=flags,
             flag_seconds=self.flag_seconds,
             measures=self.measures,
@@ -84,12 +85,12 @@ class Rollout:
 
 @dataclass(frozen=True)
 class EndConditions:
-    """When an episode ends.
+    """Conditions that end an episode.
 
     Attributes:
-        max_steps: policy steps.
-        ends_on: flags at which it ends at once, such as ``success`` and ``fail``.
-        max_v0_steps: number of policy steps with the success of RoboCAS-v0 at which it ends; None: never.
+        max_steps: maximum number of policy steps.
+        ends_on: flags that end the episode at once, such as ``success`` and ``fail``.
+        max_v0_steps: number of policy steps with RoboCAS-v0's success that ends the episode; None: no such end.
     """
 
     max_steps: int
@@ -98,16 +99,18 @@ class EndConditions:
 
 
 class EpisodeBatch:
-    """Run one episode in each of several envs; the caller chooses the action of every step.
+    """Several envs that run one episode each; the caller chooses the actions.
 
     Args:
         env: vector environment (`make_vec`, NumPy arrays, no automatic resets) of `PolicyActionWrapper` envs.
-        control_dt: simulated time of a control step, s.
-        refill: whether an env can be reset while others run. In a GPU's batch all envs are reset together.
+        spec: specification of the policy.
+        ends: conditions that end an episode.
+        control_dt: simulated time per control step, s.
+        refill: whether an env can be reset while others run. Envs of a GPU batch are reset together.
 
     Attributes:
         obs: last observation of the environment, arrays (N, ...).
-        running: by env, the episode that it runs. An entry with an ``error`` ends at the next step.
+        running: running episodes by env. An episode with an ``error`` ends at the next step.
     """
 
     def __init__(self, env: Any, spec: PolicySpec, ends: EndConditions, control_dt: float, *, refill: bool) -> None:
@@ -117,19 +120,19 @@ class EpisodeBatch:
         self.running: dict[int, Rollout] = {}
         self.obs: Any = None
         self._info: dict[str, Any] = {}
-        self._flags: list[str] = []  # names of an info's flags
-        self._held = np.zeros((0, self.num_envs), dtype=bool)  # by flag and env, whether it has held in its episode
+        self._flags: list[str] = []  # names of the flags in ``info``
+        self._held = np.zeros((0, self.num_envs), dtype=bool)  # (flags, N) whether a flag has held
         self._embed = TextEmbedder() if spec.language == "embedding" else None
 
     def start(self, pairs: list[tuple[int, EpisodeSpec]]) -> list[EpisodeSpec]:
-        """Reset envs to the first state of episodes, and return the episodes, with ``env`` set."""
+        """Reset envs to the initial states of episodes; return the specifications with ``env`` set."""
         envs = [env for env, _ in pairs]
         seeds = [start.seed for _, start in pairs]
         starts = [replace(start, env=env) for env, start in pairs]
         self.running.update({start.env: Rollout(start) for start in starts})
         if self.refill:
             self.obs, info = self.env.reset(seed=seeds, options={"env_idx": np.array(envs)})
-        else:  # a batch is reset as a whole, with the objects of these seeds
+        else:  # a GPU batch is reset as a whole
             rest = [seeds[0]] * (self.num_envs - len(seeds))
             self.obs, info = self.env.reset(seed=seeds + rest, options={"reconfigure": True})
         self._info = info
@@ -141,6 +144,7 @@ class EpisodeBatch:
         return starts
 
     def observe(self, envs: list[int]) -> Observations:
+        """Return the last observations of some envs, one row per env."""
         obs, spec, index = self.obs, self._spec, np.array(envs)
         agent, cameras = obs["agent"], obs.get("sensor_data", {})
         starts = [self.running[env].spec for env in envs]
@@ -156,40 +160,40 @@ class EpisodeBatch:
         )
 
     def step(self, actions: NDArray[np.float32]) -> Iterator[Rollout]:
-        """Step all envs once with actions (N, A), and yield the episodes that end."""
-        for env in [env for env, played in self.running.items() if played.error]:
+        """Step all envs once with actions (N, A) and yield the episodes that end."""
+        for env in [env for env, episode in self.running.items() if episode.error]:
             yield self._end(env)
         if not self.running:
             return
         self.obs, _, _, _, self._info = self.env.step(actions)
-        for played in self.running.values():
-            played.steps += 1
+        for episode in self.running.values():
+            episode.steps += 1
         self._record_flags()
-        for env in [env for env, played in self.running.items() if self._is_over(played)]:
+        for env in [env for env, episode in self.running.items() if self._is_over(episode)]:
             yield self._end(env)
 
     def fail_lost(self, envs: Sequence[int], why: str) -> Iterator[Rollout]:
-        """Yield the running episodes of envs whose process died, as failures without measures."""
+        """Yield the running episodes of envs whose worker crashed, as failures without metrics."""
         for env in envs:
             if env in self.running:
-                played = Rollout(self.running[env].spec, error=why)
-                played.flags = played.flag_seconds = dict.fromkeys(self._flags)
-                played.measures = dict.fromkeys((*MEASURES, *([_WELDS] if _WELDS in self._info else [])), 0.0)
-                yield played
+                episode = Rollout(self.running[env].spec, error=why)
+                episode.flags = episode.flag_seconds = dict.fromkeys(self._flags)
+                episode.measures = dict.fromkeys((*MEASURES, *([_WELDS] if _WELDS in self._info else [])), 0.0)
+                yield episode
 
     def _end(self, env: int) -> Rollout:
-        played, info = self.running.pop(env), self._info
-        played.seconds = self._seconds(env)
+        episode, info = self.running.pop(env), self._info
+        episode.seconds = self._seconds(env)
         for name in self._flags:
-            played.at_end[name] = bool(info[name][env])
-            played.flags.setdefault(name, None)
-            played.flag_seconds.setdefault(name, None)
-        played.measures = {name: round(float(read_sum(info, name)[env]), 4) for name in MEASURES}
+            episode.at_end[name] = bool(info[name][env])
+            episode.flags.setdefault(name, None)
+            episode.flag_seconds.setdefault(name, None)
+        episode.measures = {name: round(float(read_sum(info, name)[env]), 4) for name in MEASURES}
         if _WELDS in info:
-            played.measures[_WELDS] = float(info[_WELDS][env])
+            episode.measures[_WELDS] = float(info[_WELDS][env])
         if "retrieval" in info:
-            played.retrieval = info["retrieval"][env].copy()
-        return played
+            episode.retrieval = info["retrieval"][env].copy()
+        return episode
 
     def _record_flags(self) -> None:
         new = np.array([self._info[name] for name in self._flags]) & ~self._held
@@ -198,23 +202,23 @@ class EpisodeBatch:
         for flag, env in np.argwhere(new):
             self._held[flag, env] = True
             if env in self.running:
-                played, name = self.running[env], self._flags[flag]
-                played.flags[name], played.flag_seconds[name] = played.steps, round(self._seconds(env), 4)
+                episode, name = self.running[env], self._flags[flag]
+                episode.flags[name], episode.flag_seconds[name] = episode.steps, round(self._seconds(env), 4)
 
     def _seconds(self, env: int) -> float:
         return float(self._info["elapsed_steps"][env]) * self._dt
 
-    def _is_over(self, played: Rollout) -> bool:
-        ends, info, env = self._ends, self._info, played.spec.env
+    def _is_over(self, episode: Rollout) -> bool:
+        ends, info, env = self._ends, self._info, episode.spec.env
         v0 = ends.max_v0_steps is not None and read_sum(info, "v0_steps")[env] >= ends.max_v0_steps
-        return v0 or played.steps >= ends.max_steps or any(info[name][env] for name in ends.ends_on if name in info)
+        return v0 or episode.steps >= ends.max_steps or any(info[name][env] for name in ends.ends_on if name in info)
 
 
 def rollout(batch: EpisodeBatch, policy: Policy, episodes: Sequence[EpisodeSpec]) -> Iterator[Rollout]:
-    """Run episodes with a policy in envs in which none runs, and yield each episode as it ends, in any order.
+    """Run episodes with a policy in idle envs; yield each episode as it ends, in any order.
 
-    In processes an env whose episode has ended starts the next one at once. In a GPU batch, where the objects of all
-    envs are built together, it waits until all episodes of the batch have ended.
+    In worker processes an env starts the next episode at once. In a GPU batch, where the objects of all envs are built
+    together, it waits until all episodes of the batch have ended.
     """
     waiting, chunks = list(reversed(episodes)), dict[int, list[NDArray[np.floating]]]()
     while waiting or batch.running:
@@ -233,7 +237,7 @@ def rollout(batch: EpisodeBatch, policy: Policy, episodes: Sequence[EpisodeSpec]
 
 
 def _request_actions(batch: EpisodeBatch, policy: Policy, chunks: dict[int, list[NDArray[np.floating]]]) -> None:
-    """Ask the policy for the actions of running envs that have none left; where it fails, set the episode's error."""
+    """Request action chunks for running envs without actions; if the policy fails, set the error of the episode."""
     running = batch.running
     envs = [env for env in running if not chunks[env]]
     if not envs:
@@ -254,9 +258,9 @@ def _request_actions(batch: EpisodeBatch, policy: Policy, chunks: dict[int, list
     period = policy.spec.observe_every
     if new.shape[1] > 1 and new.shape[1] % period:
         raise EvaluationError(
-            "the first observation of the next chunk would have no images",
+            "chunk length does not fit observe_every: the next chunk would start without images",
             where=type(policy).__name__,
-            expected=f"chunks of a multiple of {period} steps",
+            expected=f"a multiple of {period} steps",
             found=new.shape[1],
         )
     for env, chunk in zip(envs, new, strict=True):

@@ -1,4 +1,4 @@
-"""Run the episodes of a protocol: with a policy, or for an external loop that chooses the actions."""
+"""Run the episodes of a protocol with a policy, or for an external loop that chooses the actions."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
+from dataclasses import replace
 from functools import cache, partial
 from typing import Any
 
@@ -21,41 +22,50 @@ from robocas_ms3.datasets.conversion.env_renderer import require_renderer
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.action_wrapper import UPSTREAM_HZ, PolicyActionWrapper, check_weld, env_kwargs
 from robocas_ms3.evaluation.outcomes import Outcome
-from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, Policy, as_action_chunks, describe
+from robocas_ms3.evaluation.policy import (
+    EpisodeSpec,
+    Observations,
+    Policy,
+    as_action_chunks,
+    describe,
+    policy_exit_guard,
+)
 from robocas_ms3.evaluation.protocol import ProtocolEpisode, load_protocol
 from robocas_ms3.evaluation.rollout import NOT_FINITE, EndConditions, EpisodeBatch, Rollout, rollout
 from robocas_ms3.evaluation.settings import EvaluationSettings
+from robocas_ms3.scenes.config import TaskConfig, load_task_config
 from robocas_ms3.scenes.layout_table import FrozenLayouts
 from robocas_ms3.scenes.task_specs import TASKS
 from robocas_ms3.tasks.vector import choose_backend, make_vec
 
 MAX_STARTS = 2
-"""How often an episode, or an environment, is started whose process dies."""
+"""Number of starts of an episode or environment whose worker process crashes."""
 _NO_EPISODE = -1
 _log = logging.getLogger(__name__)
 
 
 class EvaluationSession:
-    """Run episodes of a protocol, several at a time. Close it at the end.
+    """A session that runs episodes of a protocol, several at a time. Close it at the end.
 
-    `run` writes a result; `play` runs some episodes with the policy. `reset` and `step` let an external loop run them:
-    then each env has one episode. Steps, ends and measures are the same. An environment stays open while the
+    `run` writes a result. `run_episodes` runs some episodes with the policy. With `reset` and `step` an external loop
+    runs the episodes, one per env, by the same steps, end conditions and metrics. The environment stays open while the
     configuration of the episodes stays the same.
 
     Args:
         policy: the policy, or an `ExternalPolicy`.
-        settings: protocol, episodes, number of envs and where they run, and the output folder.
-        wrap_env: called with each vector environment that is opened; returns the one to use.
+        settings: protocol, episodes, number of envs, backend and output folder.
+        wrap_env: called with each vector environment after it is made; returns the environment to use.
 
     Attributes:
-        episodes: the episodes of the protocol that the settings choose.
+        episodes: the selected episodes of the protocol.
+        played_as: tasks that are evaluated in the episodes of another task (`LoadedProtocol.played_as`).
         rate: control steps per second; with RoboCAS-v0's steps, see `PolicyActionWrapper`.
-        outcomes: by env, the outcome of each episode that has ended since the last `reset`.
+        outcomes: outcomes by env of the episodes that have ended since the last `reset`.
 
     Raises:
-        EvaluationError: there is no such protocol, the policy or the weld does not fit it, the settings choose no
-            episode, or the object pack is not the protocol's.
-        DatasetError: the policy uses cameras, and there is no render device.
+        EvaluationError: the protocol does not exist, the policy or the weld does not fit it, no episode is selected,
+            or the hash of the object pack is another one than the protocol's.
+        DatasetError: the policy uses cameras and there is no render device.
     """
 
     def __init__(
@@ -69,30 +79,32 @@ class EvaluationSession:
         backend = choose_backend(settings.backend)
         if settings.weld:
             check_weld(rules.stepping, backend)
+        self.played_as = self.protocol.played_as(settings.tasks)
         self.episodes = self.protocol.select_episodes(settings)
         if self.spec.cameras:
             self.protocol.check_cameras(self.spec, self.episodes)
             require_renderer()
+        self._log_policy_warnings()
         self.run_record = self._make_run_record(backend)
-        self.folder = settings.folder(rules.name)
+        self.folder = settings.folder(rules.name, self.played_as)
         self.outcomes: dict[int, Outcome] = {}
         objects = load_pack(rules.pack).objects
         self._layouts_of = cache(lambda config: FrozenLayouts(self.protocol.layouts_file(config), objects))
         self._refill = backend != "gpu"
         self._env: Any = None
         self._batch: EpisodeBatch | None = None
-        self._open_for: tuple[str, int, int] | None = None  # configuration, number of envs and of steps of `_batch`
-        self._current: list[ProtocolEpisode] = []  # by env, of an external loop
+        self._open_for: tuple[str, int, int] | None = None  # configuration, number of envs and step limit of `_batch`
+        self._current: list[ProtocolEpisode] = []  # episodes of an external loop, by env
         self._observed = 0.0  # clock time at which the external loop received the last observation, s
 
     def run(self, on_start: Callable[[int], None] = lambda count: None) -> Iterator[Outcome]:
-        """Start or continue a result: run the episodes that it lacks, write and yield each outcome as its episode ends.
+        """Run the episodes that are missing in the result; write and yield each outcome as its episode ends.
 
         ``on_start`` is called with the number of episodes to run.
 
         Raises:
-            OutputExistsError: the result was measured with something else.
-            RobocasError: another process writes to the folder, or somebody removed it.
+            OutputExistsError: the existing result has other settings.
+            RobocasError: another process writes to the folder, or the folder was removed.
         """
         settings = self.settings
         opened = results.open_result(
@@ -106,12 +118,13 @@ class EvaluationSession:
                 yield outcome
 
     def max_steps(self, task: str) -> int:
+        """Return the maximum number of policy steps per episode of a task."""
         steps = self.protocol.rules.step_limit(task, self.rate)
         assert steps is not None  # `load_protocol` checks it
         return steps
 
     def episode_spec(self, episode: ProtocolEpisode) -> EpisodeSpec:
-        """Return what a policy gets to know about an episode, before it has an env."""
+        """Return the specification of an episode for policies; ``env`` is -1 until an env runs it."""
         return EpisodeSpec(
             env=-1,
             episode=episode.episode,
@@ -125,12 +138,12 @@ class EvaluationSession:
         )
 
     def run_episodes(self, episodes: Sequence[ProtocolEpisode], max_steps: int | None = None) -> Iterator[Outcome]:
-        """Run episodes with the policy, configuration by configuration, and yield each outcome as its episode ends.
+        """Run episodes with the policy, configuration by configuration; yield each outcome as its episode ends.
 
         ``max_steps`` replaces the protocol's maximum number of policy steps per episode.
 
         Raises:
-            VectorEnvCrashError: a process died twice in which no episode ran.
+            VectorEnvCrashError: a worker process crashed twice while it ran no episode.
         """
         try:
             for config in dict.fromkeys(episode.config for episode in episodes):
@@ -140,15 +153,17 @@ class EvaluationSession:
             raise
 
     def reset(self, numbers: Sequence[int]) -> Observations:
-        """Start an episode in each env, by number, all of one configuration; running episodes are dropped.
+        """Start an episode in each env, by number in the protocol; running episodes are dropped.
 
         Raises:
-            EvaluationError: there is no such episode, or the configurations differ.
+            EvaluationError: an episode does not exist, or the episodes have different configurations.
         """
         where, known, count = self.protocol.rules.name, self.protocol.episodes, self.settings.envs
         for number in numbers:
             if not 0 <= number < len(known):
-                raise EvaluationError("no such episode", where=where, expected=f"0 to {len(known) - 1}", found=number)
+                raise EvaluationError(
+                    "unknown episode number", where=where, expected=f"0 to {len(known) - 1}", found=number
+                )
         if len(numbers) != count:
             raise EvaluationError("wrong number of episodes", where=where, expected=count, found=len(numbers))
         episodes = [known[number] for number in numbers]
@@ -163,14 +178,14 @@ class EvaluationSession:
         return self._observe(batch)
 
     def step(self, actions: ArrayLike) -> Observations | None:
-        """Step the running episodes of `reset` by actions (N, A), or by all steps of chunks (N, H, A).
+        """Step the running episodes by actions (N, A) or by all steps of chunks (N, H, A).
 
-        Rows of envs whose episode has ended have no effect. An episode whose actions are not finite ends with an error.
+        Rows of envs whose episode has ended have no effect. An episode with NaN or infinite actions ends with an error.
         Returns the observations of the envs with a running episode; None if all episodes have ended.
 
         Raises:
-            EvaluationError: no episode runs, or the actions have another shape.
-            VectorEnvCrashError: a process of the environment died.
+            EvaluationError: no episode is running, or the actions have another shape.
+            VectorEnvCrashError: a worker process of the environment crashed.
         """
         batch = self._batch
         if batch is None or not batch.running:
@@ -197,11 +212,12 @@ class EvaluationSession:
 
     @property
     def observation(self) -> dict[str, Any]:
+        """Return the last observation of the environment, arrays (N, ...)."""
         assert self._batch is not None
         return self._batch.obs
 
     def open_batch(self, episode: ProtocolEpisode, num_envs: int, max_steps: int | None = None) -> EpisodeBatch:
-        """Return envs for the episodes of the configuration of an episode; they are opened if needed."""
+        """Return envs for the configuration of an episode; make them if no fitting envs are open."""
         steps = self.max_steps(episode.task) if max_steps is None else max_steps
         wanted, rules = (episode.config, num_envs, steps), self.protocol.rules
         if self._batch is not None and self._open_for == wanted:
@@ -215,7 +231,7 @@ class EvaluationSession:
         return self._batch
 
     def close(self) -> None:
-        """Close the environment. A later call opens another one."""
+        """Close the environment; the next episode opens a new environment."""
         env, self._env, self._batch, self._open_for = self._env, None, None, None
         if env is not None:
             env.close()
@@ -230,18 +246,33 @@ class EvaluationSession:
                     yield self._outcome(ended, left.pop(ended.spec.episode))
             except VectorEnvCrashError as error:
                 self.close()
-                lost = [] if batch is None else list(batch.fail_lost(error.envs, f"its process died: {error.found}"))
+                lost = (
+                    []
+                    if batch is None
+                    else list(batch.fail_lost(error.envs, f"the worker process of the env crashed: {error.found}"))
+                )
                 deaths.update([ended.spec.episode for ended in lost] or [_NO_EPISODE])
                 if deaths[_NO_EPISODE] == MAX_STARTS:
                     raise
                 if not lost:
-                    _log.warning("environments are made again, without an episode lost: %s", error)
+                    _log.warning("the environments are restarted, no episode was interrupted: %s", error)
                 for ended in lost:
                     number = ended.spec.episode
                     if deaths[number] < MAX_STARTS:
-                        _log.warning("episode %d: %s; it is started again", number, ended.error)
+                        _log.warning("episode %d: %s; the episode is retried once", number, ended.error)
                     else:
                         yield self._outcome(ended, left.pop(number))
+
+    def _log_policy_warnings(self) -> None:
+        """Log the warnings of a policy about the configurations of the episodes."""
+        warn: Callable[[dict[str, TaskConfig]], list[str]] | None = getattr(self.policy, "protocol_warnings", None)
+        if warn is None:
+            return
+        names = dict.fromkeys(episode.config for episode in self.episodes)
+        configs = {name: load_task_config(self.protocol.config_file(name)) for name in names}
+        with policy_exit_guard(self.policy):
+            for warning in warn(configs):
+                _log.warning("%s", warning)
 
     def _observe(self, batch: EpisodeBatch) -> Observations:
         observations = batch.observe(sorted(batch.running))
@@ -250,7 +281,9 @@ class EvaluationSession:
 
     def _outcome(self, ended: Rollout, episode: ProtocolEpisode) -> Outcome:
         layouts = self._layouts_of(episode.config)
-        return ended.outcome(episode, layouts(episode.seed, episode.seed).object_ids)
+        outcome = ended.outcome(episode, layouts(episode.seed, episode.seed).object_ids)
+        task = next((task for task, other in self.played_as.items() if other == episode.task), episode.task)
+        return replace(outcome, task=task)
 
     def _make_env(self, episode: ProtocolEpisode, num_envs: int) -> Any:
         rules, settings = self.protocol.rules, self.settings
@@ -282,13 +315,14 @@ class EvaluationSession:
         rules, name = self.protocol.rules, self.settings.policy
         pack = sha256(load_pack(rules.pack).root / MANIFEST)
         if pack != rules.pack_hash:
-            what = "the installed object pack is not the protocol's"
+            what = "the object pack has another hash than the protocol requires"
             raise EvaluationError(what, where=rules.name, expected=rules.pack_hash, found=pack)
         values = {
             "protocol": rules.name,
             "protocol_hash": self.protocol.hash,
             "policy": {"name": name} | describe(self.policy) | {"name": name},  # a description may not rename it
             "weld": self.settings.weld,
+            **({"played_as": self.played_as} if self.played_as else {}),
             "backend": backend,
             "versions": results.package_versions(),
             "pack_hashes": {rules.pack: pack},

@@ -1,8 +1,9 @@
-"""Settings of an evaluation: the options of `robocas eval run`. Loads no simulator."""
+"""Settings of an evaluation: the options of `robocas eval run`. Imports no simulator."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -12,52 +13,55 @@ import tyro
 from robocas_ms3.core.checks import check_number, parse_shard
 from robocas_ms3.core.errors import EvaluationError
 
-_NO_HINT = tyro.conf.arg(help_behavior_hint="")  # the help text says what the default is
+_NO_HINT = tyro.conf.arg(help_behavior_hint="")  # the help text states the default
 
 
 @dataclass(frozen=True)
 class EvaluationSettings:
-    """Measure a policy by a protocol: every episode of its list once, written as it ends.
+    """Evaluate a policy in the episodes of a protocol and write the outcome of each episode as it ends.
 
     Example: robocas eval pick --policy runs/pick --protocol paper-v1 --out eval/pick
     """
 
     tasks: Annotated[tuple[str, ...], tyro.conf.Positional, _NO_HINT] = ()
-    """Only the episodes of these tasks. Default: all."""
+    """Tasks to evaluate, such as pick. Default: all tasks of the protocol. In paper-v1, select runs in the episodes of
+    pick, as in RoboCAS-v0."""
     policy: str = "scripted"
-    """Policy: scripted (joint targets), scripted-ee-delta (RoboCAS' 7 numbers), scripted-perturbed (these, off by some
-    cm), random, noop, replay:TRAJECTORY.h5, a folder of `robocas train`, module:Class of your own, one that an
-    installed package brings (`robocas list`), or ws://HOST:PORT, a server's (`robocas serve-policy`)."""
+    """Policy to evaluate. One of: scripted (joint targets), scripted-ee-delta (RoboCAS' 7-D actions),
+    scripted-perturbed (7-D actions with an offset of 1 to 5 cm), random, noop, another name from `robocas list`,
+    replay:TRAJECTORY.h5, a run folder of `robocas train`, module:Class of your own code, or ws://HOST:PORT of a policy
+    server (`robocas serve-policy`)."""
     protocol: str = "ms3-v1"
-    """Name of a bundled protocol, or its folder."""
+    """Name of a bundled protocol (`robocas eval protocols`), or a protocol folder."""
     out: Annotated[Path | None, _NO_HINT] = None
-    """Folder to write to. Default: eval/PROTOCOL/POLICY, with the weld eval/PROTOCOL/POLICY_weld."""
+    """Output folder. Default: eval/PROTOCOL/POLICY; with the weld, eval/PROTOCOL/POLICY_weld."""
     overwrite: bool = False
-    """Start again. Default: continue a result with the same settings, or add episodes to it."""
+    """Delete an existing result and start again. Default: continue a result that has the same settings."""
     retry_errors: bool = False
-    """Run episodes again that ended with an error, such as a server that was gone."""
+    """Repeat episodes that ended with an error, such as a lost connection to a policy server."""
     envs: int = 2
-    """Envs at a time; the outcome does not depend on it."""
+    """Number of environments that run at the same time; outcomes do not depend on it."""
     workers: Annotated[int | None, _NO_HINT] = None
-    """Processes. Default: one per env, no more than cores."""
+    """Number of worker processes. Default: one per environment, at most one per CPU core."""
     step_seconds: float = 300.0
-    """Seconds that envs of a process may take for a step or a reset. If they take longer, or more memory, or crash,
-    the episode is run again once; then it counts as failed, with an error. Policies have no limit."""
+    """Time limit in seconds for a step or reset of the environments in a worker process. If a worker exceeds a limit or
+    crashes, the episode is retried once; after the second time it counts as failed, with an error. The time of the
+    policy is not limited."""
     memory_gb: float = 8.0
-    """GB of memory that a process of envs may use."""
+    """Memory limit per worker process in GB."""
     backend: Literal["auto", "processes", "gpu"] = "auto"
-    """Where envs run. Auto: a GPU if there is one."""
+    """Where the simulation runs. auto: on a GPU if there is one, else in worker processes."""
     shard: str = "0/1"
-    """K/N: only every N-th episode, from the K-th on (K = 0 ... N - 1). `robocas eval merge` joins the results."""
+    """K/N: run only every N-th episode, from episode K on (0 <= K < N). `robocas eval merge` joins the results."""
     split: Annotated[str, _NO_HINT] = ""
-    """Only the episodes of this split, such as `seen`."""
+    """Run only the episodes of this split, such as `seen`. Default: all splits."""
     episodes: Annotated[int | None, _NO_HINT] = None
-    """Only the first so many of each configuration."""
+    """Maximum number of episodes per configuration. Default: all."""
     weld: bool = False
-    """Weld what closed fingers have lifted to the hand, as RoboCAS-v0 does, until the gripper is commanded to open.
-    Only in protocols with RoboCAS-v0's steps (paper-v1), in processes; never compare it with results without."""
+    """Fix lifted objects to the hand until the gripper is commanded to open, as RoboCAS-v0 does. Only for protocols
+    with RoboCAS-v0's steps (paper-v1), in worker processes. Results with and without the weld are not comparable."""
     render_size: Annotated[tuple[int, int] | None, tyro.conf.Suppress] = None
-    """Width and height of the images of the env's ``render``, pixels; None: it renders none."""
+    """Width and height in pixels of the images of ``env.render``; None: no images."""
 
     def __post_init__(self) -> None:
         for name in ("envs", "episodes", "workers"):
@@ -67,6 +71,8 @@ class EvaluationSettings:
         check_number("--memory-gb", self.memory_gb, 0.1)
         parse_shard(self.shard, EvaluationError)
 
-    def folder(self, protocol: str) -> Path:
-        name = re.sub(r"[^\w.-]+", "_", self.policy) + ("_weld" if self.weld else "")
+    def folder(self, protocol: str, played_as: Iterable[str] = ()) -> Path:
+        """Return the output folder; tasks that are played as another task have a folder of their own by default."""
+        suffixes = [*played_as, *(["weld"] if self.weld else [])]
+        name = "_".join([re.sub(r"[^\w.-]+", "_", self.policy), *suffixes])
         return self.out or (Path("eval") / protocol / name).absolute()

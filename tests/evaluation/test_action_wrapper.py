@@ -96,7 +96,7 @@ def test_upstreams_step_waits_for_the_gripper_and_for_the_motion():
         env.step(action)
         return int(base.elapsed_steps) - before
 
-    with pytest.raises(EvaluationError, match="not finite"):
+    with pytest.raises(EvaluationError, match="NaN or infinite action"):
         env.step(np.full(7, np.nan))
     assert steps(along(0.01)) == 1  # there within the first fifth of a second
     before = tcp(env)

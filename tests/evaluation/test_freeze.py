@@ -81,7 +81,7 @@ def test_a_configuration_is_found_beside_the_plan(tmp_path, monkeypatch):
 @pytest.mark.parametrize("text", ["parts: []", "rules: [", "rules: {}\nparts: [{config: x}]"])
 def test_no_plan(tmp_path, text):
     (tmp_path / "plan.yaml").write_text(text)
-    with pytest.raises(EvaluationError, match=r"plan.yaml: no plan of a protocol") as caught:
+    with pytest.raises(EvaluationError, match=r"plan.yaml: invalid protocol plan") as caught:
         command.freeze(command.Freeze(tmp_path / "plan.yaml", tmp_path / "out"))
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "out").exists()

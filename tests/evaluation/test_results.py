@@ -44,7 +44,7 @@ def test_a_damaged_line_is_an_error_with_its_number(tmp_path):
     write(tmp_path / "a", [outcome(0)])
     with (tmp_path / "a" / OUTCOMES).open("a") as file:
         file.write('{"episode": 1}\n')
-    with pytest.raises(EvaluationError, match=r"episodes.jsonl:2: no outcome"):
+    with pytest.raises(EvaluationError, match=r"episodes.jsonl:2: invalid outcome"):
         read_result(tmp_path / "a")
 
 
@@ -52,7 +52,7 @@ def test_a_damaged_line_is_an_error_with_its_number(tmp_path):
 def test_a_folder_without_a_valid_record_is_no_result(tmp_path, record):
     if record is not None:
         (tmp_path / RUN).write_text(json.dumps(record))
-    with pytest.raises(EvaluationError, match="no result of an evaluation"):
+    with pytest.raises(EvaluationError, match="invalid evaluation result"):
         read_result(tmp_path)
 
 
@@ -98,12 +98,12 @@ def test_parts_are_merged_whatever_the_clock_and_the_machine(tmp_path):
         merge_results([tmp_path / "a", tmp_path / "b"], tmp_path / "c")
 
 
-def test_parts_that_disagree_are_refused(tmp_path):
+def test_contradicting_partial_results_are_refused(tmp_path):
     write(tmp_path / "a", [outcome(0)])
     write(tmp_path / "b", [outcome(0, seconds=3.6)])
-    with pytest.raises(EvaluationError, match=r"two outcomes of episode 0 disagree.*seconds: 3\.5 -> 3\.6"):
+    with pytest.raises(EvaluationError, match=r"contradicting outcomes of episode 0.*seconds: 3\.5 -> 3\.6"):
         merge_results([tmp_path / "a", tmp_path / "b"], tmp_path / "both")
-    with pytest.raises(EvaluationError, match=r"jsonl:2: two outcomes of episode 0 disagree"):
+    with pytest.raises(EvaluationError, match=r"jsonl:2: contradicting outcomes of episode 0"):
         write(tmp_path / "c", [outcome(0), outcome(0, came_to=3)])
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b", "c"]
 
@@ -124,7 +124,7 @@ def test_results_of_different_runs_are_neither_continued_nor_joined(tmp_path, ke
     with pytest.raises(OutputExistsError, match=key):
         start(tmp_path / "a", {**RUN_OF, key: OTHERS[key]})
     write(tmp_path / "b", [outcome(1)], **{key: OTHERS[key]})
-    with pytest.raises(EvaluationError, match=f"another {key}.*{key}"):
+    with pytest.raises(EvaluationError, match=f"different {key}.*{key}"):
         merge_results([tmp_path / "a", tmp_path / "b"], tmp_path / "both")
     assert group_partial_results([tmp_path / "a", tmp_path / "b"]) == [[tmp_path / "a"], [tmp_path / "b"]]
     assert start(tmp_path / "a", {**RUN_OF, key: OTHERS[key]}, overwrite=True) == []
@@ -157,7 +157,7 @@ def test_failure_stage(reached, stage):
     assert failure_stage({"reached_any": 5}, "policy died") == "error"
 
 
-SERVED = {"server": {"name": "mine", "class": "m:Mine"}, "play": None, "spec": {}}
+SERVED = {"server": {"name": "mine", "class": "m:Mine"}, "n_action_steps": None, "spec": {}}
 
 
 def test_where_a_server_was_is_not_who_it_served(tmp_path):
@@ -174,7 +174,7 @@ def test_where_a_server_was_is_not_who_it_served(tmp_path):
     silent = {**SERVED, "server": None}  # a plain openpi server: nobody knows what it serves
     write(tmp_path / "c", [outcome(0)], policy={"name": "ws://a:1", **silent})
     write(tmp_path / "d", [outcome(1)], policy={"name": "ws://a:2", **silent})
-    with pytest.raises(EvaluationError, match="another policy"):
+    with pytest.raises(EvaluationError, match="different policy"):
         read_result(tmp_path / "c", tmp_path / "d")
 
 

@@ -87,7 +87,7 @@ def test_an_episode_whose_policy_fails_or_acts_by_nan_ends_alone(fails):
 
     policy.act = sick
     played = sorted(play(CountingEnv(2, None), policy, starts(4, 5, 3), 7), key=lambda one: one.spec.seed)
-    error = "no plan" if fails else "the policy's action is not finite"
+    error = "no plan" if fails else "NaN or infinite action of the policy"
     assert [(one.error, one.steps) for one in played] == [("", 3), (error, 0), ("", 5)]
     outcome = played[1].outcome(load_protocol("smoke").episodes[0], ())
     assert (outcome.success, outcome.failure_stage, outcome.error) == (False, "error", error)

@@ -64,7 +64,7 @@ def test_an_env_stays_open_as_long_as_its_configuration(made):
 def test_after_an_error_of_the_env_the_next_reset_opens_another(made):
     external = open_session()
     external.reset([0])
-    with pytest.raises(EvaluationError, match=r"actions don't fit"):  # which is no error of the env
+    with pytest.raises(EvaluationError, match=r"invalid shape or type of actions"):  # which is no error of the env
         external.step(np.zeros((1, 6)))
     with pytest.raises(RuntimeError, match="the env broke"):
         external.step(ones(1, BREAKS))
@@ -88,12 +88,16 @@ def test_each_env_of_a_batch_ends_by_itself(made):
     assert seen is not None and seen.envs.tolist() == [0]
     assert {env: (one.steps, one.success, one.error) for env, one in batch.outcomes.items()} == {
         1: (2, True, ""),
-        2: (1, False, "the policy's action is not finite"),
+        2: (1, False, "NaN or infinite action of the policy"),
     }
     assert batch.step(np.tile(ones(3), (3, 1, 1))) is None
     assert batch.outcomes[0].steps == 5
     assert not np.stack(made[0].actions)[2:, 1:].any()  # ended envs are sent zeros
-    for numbers, message in (([0, 4, 5], "several configurations"), ([0, 1], "wrong number"), ([0, 1, 8], "no such")):
+    for numbers, message in (
+        ([0, 4, 5], "one configuration"),
+        ([0, 1], "wrong number"),
+        ([0, 1, 8], "unknown episode"),
+    ):
         with pytest.raises(EvaluationError, match=message):
             batch.reset(numbers)
     batch.close()
@@ -106,21 +110,25 @@ def no_renderer() -> None:
 @pytest.mark.parametrize(
     ("settings", "spec", "message"),
     [
-        ({"protocol": "paper-v1"}, PolicySpec("joint_positions"), "convention is none of this protocol's"),
-        ({"protocol": "paper-v1"}, PolicySpec(reference="tcp", rate_hz=10), "another rate .*10 Hz"),
+        ({"protocol": "paper-v1"}, PolicySpec("joint_positions"), "does not allow this convention of a policy"),
+        ({"protocol": "paper-v1"}, PolicySpec(reference="tcp", rate_hz=10), "another action rate .*10 Hz"),
         ({}, PolicySpec(rate_hz=7), "divisor of 100"),
-        ({"tasks": ("nothing",)}, AT_5_HZ, "no such task .expected pick, select, search, open_pick, found nothing"),
-        ({"split": "seen"}, AT_5_HZ, "no such split .expected test, found seen"),
+        (
+            {"tasks": ("nothing",)},
+            AT_5_HZ,
+            "no episodes of this task .expected pick, select, search, open_pick, found nothing",
+        ),
+        ({"split": "seen"}, AT_5_HZ, "no episodes of this split .expected test, found seen"),
         ({"tasks": ("pick",), "shard": "90/100"}, AT_5_HZ, "no episodes in this shard"),
         ({"shard": "3/2"}, AT_5_HZ, "invalid shard"),
-        ({}, PolicySpec(cameras={"side_camera": (8, 8)}), "no such camera"),
+        ({}, PolicySpec(cameras={"side_camera": (8, 8)}), "unknown camera"),
         ({}, PolicySpec(cameras={"base_camera": (8, 8)}), "no render device"),
         ({"backend": "threads"}, AT_5_HZ, "no such backend"),
-        ({"weld": True}, AT_5_HZ, "the weld belongs to upstream's steps"),
+        ({"weld": True}, AT_5_HZ, "the weld needs RoboCAS-v0's steps"),
         (
             {"protocol": "paper-v1", "weld": True, "backend": "gpu"},
             PolicySpec(reference="tcp", rate_hz=5),
-            "nothing can be welded on a GPU",
+            "the weld is not available on a GPU",
         ),
     ],
 )
@@ -140,6 +148,38 @@ def test_episodes_are_chosen_by_task_count_and_shard():
     assert chosen(episodes=1) == [0, 2, 4, 6]
     assert chosen(shard="1/3") == [1, 4, 7]
     assert chosen(load_protocol("objects-v1"), split="new", tasks=("pick",)) == [*range(50, 100)]
+
+
+def test_select_runs_in_the_episodes_of_pick_in_paper_v1_and_the_result_records_it(made, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    settings = EvaluationSettings(("select",), "noop", "paper-v1", episodes=2, backend="processes")
+    evaluation = EvaluationSession(make_policy("noop"), settings)
+    assert {(episode.task, episode.config) for episode in evaluation.episodes} == {("pick", "pick_upstream_eval")}
+    assert evaluation.episode_spec(evaluation.episodes[0]).task == "pick"
+    assert evaluation.folder == tmp_path / "eval" / "paper-v1" / "noop_select"
+    assert {outcome.task for outcome in evaluation.run()} == {"select"}
+    result = results.read_result(evaluation.folder)
+    assert result.run.played_as == {"select": "pick"}
+    assert find_violations(result, evaluation.protocol) == ["398 of 400 episodes missing"]
+    with pytest.raises(OutputExistsError, match="played_as"):
+        list(opened(evaluation.folder, "noop", protocol="paper-v1", tasks=("pick",), episodes=2).run())
+
+
+def test_other_protocols_have_no_alias_of_select_and_pick_cannot_run_twice():
+    with pytest.raises(EvaluationError, match="no episodes of this task .*found select"):
+        load_protocol("clutter-v1").select_episodes(EvaluationSettings(("select",)))
+    with pytest.raises(EvaluationError, match="two tasks have the same episodes.*found select, pick"):
+        load_protocol("paper-v1").select_episodes(EvaluationSettings(("pick", "select")))
+
+
+def test_warnings_of_a_policy_about_the_configurations_are_logged(caplog):
+    class Specialist(ExternalPolicy):
+        def protocol_warnings(self, configs) -> list[str]:
+            return [f"{name} has {config.objects.count} objects" for name, config in configs.items()]
+
+    EvaluationSession(Specialist(AT_5_HZ), EvaluationSettings(("pick",), protocol="smoke", backend="processes"))
+    (record,) = caplog.records
+    assert record.levelname == "WARNING" and record.getMessage().startswith("pick_table_scattered has ")
 
 
 def opened(folder, policy="random", **settings) -> EvaluationSession:
@@ -166,18 +206,15 @@ def test_an_episode_whose_process_dies_runs_again_once_and_then_counts_as_failed
     found = evaluate(out, "noop", protocol=str(short), tasks=("pick", "select"))
     assert sorted(found) == [0, 1, 2, 3]
     assert [number for number, one in found.items() if one["error"]] == ([1] if times == 2 else [])
-    assert found[1]["error"] == ("its process died: SIGSEGV" if times == 2 else "")
+    assert found[1]["error"] == ("the worker process of the env crashed: SIGSEGV" if times == 2 else "")
     assert (found[1]["failure_stage"] == "error") == (times == 2)
     assert found[0]["steps"] == 20  # from its beginning, whatever happened to the other
     assert [record.getMessage() for record in caplog.records] == [
-        "episode 1: its process died: SIGSEGV; it is started again"
+        "episode 1: the worker process of the env crashed: SIGSEGV; the episode is retried once"
     ]
     assert all(env.closed for env in made)
-    assert not [
-        one
-        for one in find_violations(results.read_result(out), protocol)
-        if one.startswith("episode 1:") and times == 2
-    ]
+    violations = find_violations(results.read_result(out), protocol)
+    assert not [one for one in violations if one.startswith("episode 1:") and times == 2]
     command = ["eval", "--policy", "noop", "--protocol", short, "--backend", "processes", "--out", out]
     assert cli([str(word) for word in command]) == times - 1  # continues, and does not run the failed episode again
     assert results.read_result(out).error_count() == times - 1
@@ -210,7 +247,7 @@ def test_an_interrupted_command_tells_how_to_continue_and_it_takes_one_thread(tm
         raise KeyboardInterrupt
 
     before = torch.get_num_threads()
-    monkeypatch.setattr(EvaluationSession, "play", interrupted)
+    monkeypatch.setattr(EvaluationSession, "run_episodes", interrupted)
     torch.set_num_threads(2)
     try:
         open_session()  # whoever makes a session keeps its threads

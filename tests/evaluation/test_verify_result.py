@@ -46,22 +46,22 @@ def tamper_run(folder, **values):
 @pytest.mark.parametrize(
     ("values", "said"),
     [
-        ({"seed": 5}, "episode 0: seed is 5, not 110000"),
-        ({"task": "search"}, "episode 0: task is search, not pick"),
-        ({"config": "easier"}, "episode 0: config is easier, not pick_table_scattered"),
-        ({"split": "train"}, "episode 0: split is train, not test"),
-        ({"p_vis": 0.9}, "episode 0: p_vis is 0.9, not None"),
-        ({"success": False}, "episode 0: success does not agree with its flags"),
-        ({"failure_stage": "placed"}, "episode 0: failure_stage is placed, by its flags none"),
-        ({"steps": 801}, "episode 0: 801 steps, 800 allowed"),  # 40 s at 20 Hz
-        ({"steps": 71}, "episode 0: it went on after success, 70 of 71 steps"),
-        ({"steps": 69}, "episode 0: success, success_v0 held first after its 69 steps"),
-        ({"success_at_end": True, "success": False}, "episode 0: success_at_end, but no success"),
-        ({"flags": {"success_v0": None}}, "episode 0: success_v0 does not agree with its flags"),
-        ({"seconds": 3.0}, "episode 0: 3 s, its 70 steps should take 3.5"),
-        ({"flag_seconds": {"success": 3.6}}, "episode 0: success held first after its 3.5 s"),
-        ({"flag_seconds": {}}, "episode 0: flag_seconds are not of its flags"),
-        ({"episode": 99}, "episode 99: the protocol has none of this number"),
+        ({"seed": 5}, "episode 0: seed is 5, expected 110000"),
+        ({"task": "search"}, "episode 0: task is search, expected pick"),
+        ({"config": "easier"}, "episode 0: config is easier, expected pick_table_scattered"),
+        ({"split": "train"}, "episode 0: split is train, expected test"),
+        ({"p_vis": 0.9}, "episode 0: p_vis is 0.9, expected None"),
+        ({"success": False}, "episode 0: success contradicts the flags"),
+        ({"failure_stage": "placed"}, "episode 0: failure_stage is placed, expected empty from the flags"),
+        ({"steps": 801}, "episode 0: 801 steps, expected at most 800"),  # 40 s at 20 Hz
+        ({"steps": 71}, "episode 0: continued after success, which held at step 70 of 71"),
+        ({"steps": 69}, "episode 0: success, success_v0 held first after the last of 69 steps"),
+        ({"success_at_end": True, "success": False}, "episode 0: success_at_end without success"),
+        ({"flags": {"success_v0": None}}, "episode 0: success_v0 contradicts the flags"),
+        ({"seconds": 3.0}, "episode 0: 3 s, expected 3.5 s for 70 steps"),
+        ({"flag_seconds": {"success": 3.6}}, "episode 0: success held first after the end at 3.5 s"),
+        ({"flag_seconds": {}}, "episode 0: flag_seconds and flags have different keys or values"),
+        ({"episode": 99}, "episode 99: not in the protocol"),
     ],
 )
 def test_a_changed_episode_is_found(folder, protocol, values, said):
@@ -69,7 +69,7 @@ def test_a_changed_episode_is_found(folder, protocol, values, said):
     tamper(folder, 0, **values)
     found = find_violations(read_result(folder), protocol)
     assert said in found
-    assert ("missing: 1 of 8 episodes" in found) == ("episode" in values)
+    assert ("1 of 8 episodes missing" in found) == ("episode" in values)
 
 
 @pytest.mark.parametrize(
@@ -91,18 +91,34 @@ def test_a_value_out_of_range_makes_no_result(folder, values):
 
 def test_another_protocol_or_pack_or_a_weld_where_none_can_be_is_found(folder, protocol):
     tamper(folder, 0, measures=read_result(folder).outcomes[0].measures | {"welds": 1.0})
-    assert find_violations(read_result(folder), protocol) == ["episode 0: it counts welds, the run says weld: False"]
+    assert find_violations(read_result(folder), protocol) == [
+        "episode 0: a number of welds, but the run has weld: False"
+    ]
     tamper_run(folder, weld=True)
     found = find_violations(read_result(folder), protocol)
-    assert "it was measured with upstream's weld, which does not belong to this protocol's steps" in found
-    assert "episode 1: it counts no welds, the run says weld: True" in found
+    assert "weld: true, but the weld needs RoboCAS-v0's steps" in found
+    assert "episode 1: no number of welds, but the run has weld: True" in found
     assert len(found) == 8
     tamper_run(folder, protocol_hash="ef" * 32, pack_hashes={"builtin": "00"})
     protocol_and_pack = find_violations(read_result(folder), protocol)[:2]
-    assert [problem.split(" than")[0].split(":")[0] for problem in protocol_and_pack] == [
-        "it is of another protocol",
-        "it was measured with another pack",
-    ]
+    assert [problem.partition(": ")[0][:13] for problem in protocol_and_pack] == ["protocol hash", "hash of pack "]
+
+
+def test_an_outcome_of_select_is_valid_only_if_the_run_has_played_as(tmp_path):
+    protocol = load_protocol("paper-v1")
+    folder = of_protocol(tmp_path / "result", protocol).folder
+    assert find_violations(read_result(folder), protocol) == []
+    tamper(folder, 0, task="select")
+    assert find_violations(read_result(folder), protocol) == ["episode 0: task is select, expected pick"]
+    tamper_run(folder, played_as={"select": "pick"})
+    violations = find_violations(read_result(folder), protocol)
+    assert len(violations) == 199 and set(violations) == {
+        f"episode {number}: task is pick, expected select" for number in range(1, 200)
+    }
+    tamper_run(folder, played_as={"search": "pick"})
+    assert "played_as is {'search': 'pick'}, but the protocol has no such rule" in find_violations(
+        read_result(folder), protocol
+    )
 
 
 @pytest.mark.parametrize(
@@ -115,7 +131,7 @@ def test_an_order_of_retrieval_agrees_with_itself(folder, protocol, changed, wel
     tamper(folder, 0, flags=flags, flag_seconds=seconds, retrieval={**ORDER, **changed})
     assert len(find_violations(read_result(folder), protocol)) == (0 if well else 1)
     tamper(folder, 1, retrieval=ORDER)
-    assert "episode 1: its order of retrieval does not agree with itself" in find_violations(
+    assert "episode 1: the retrieval order contradicts its score or the flags" in find_violations(
         read_result(folder), protocol
     )
 
@@ -131,7 +147,7 @@ def test_the_stages_of_an_episode_are_those_of_its_task(folder, protocol, monkey
     assert find_violations(read_result(folder), protocol) == []
     monkeypatch.undo()
     assert find_violations(read_result(folder), protocol) == [
-        "episode 0: failure_stage is aligned, by its flags placed"
+        "episode 0: failure_stage is aligned, expected placed from the flags"
     ]
 
 
@@ -141,7 +157,7 @@ def test_the_command_fails_where_something_is_wrong_and_a_result_chooses_no_fold
     monkeypatch.chdir(tmp_path)
     (tmp_path / "ms3-v1").mkdir()  # the default's name is none that was given
     assert verify(Verify((folder,))) == 0
-    assert "8 episodes of smoke, all well" in capsys.readouterr().out
+    assert "8 episodes of smoke, no violations" in capsys.readouterr().out
     shutil.copytree(load_protocol("smoke").folder, tmp_path / "easy")
     tamper_run(folder, protocol="easy")
     with pytest.raises(EvaluationError, match="its protocol is not shipped.*found easy.*--protocol FOLDER"):

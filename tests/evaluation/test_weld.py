@@ -184,4 +184,4 @@ def test_an_evaluation_with_it_counts_it_and_says_so(tmp_path):
     assert outcome.success and outcome.measures["welds"] == 1
     result = results.read_result(folder)
     assert result.run.weld
-    assert find_violations(result, protocol) == ["missing: 399 of 400 episodes"]
+    assert find_violations(result, protocol) == ["399 of 400 episodes missing"]

@@ -160,7 +160,7 @@ def test_a_protocol_of_its_own_is_frozen_and_measured_with(measured):
     assert "| push_zone | 2 | 100 % (16 to 100) | 100 % |  | 100 % | 0 % | 100 % |  |" in scripted
     assert "| configuration | n | failed | an object touched |" in noop
     assert "| push_zone | 2 | 2 | 2 |" in noop
-    assert "2 episodes of push-zone-v1, all well" in verified
+    assert "2 episodes of push-zone-v1, no violations" in verified
     assert "| push_zone | A, B | 2 | 0 | 2 |" in compared
     page = (folder / "eval" / "noop" / "report.html").read_text()
     assert "target in zone" in page
@@ -175,13 +175,13 @@ def test_its_results_are_measured_in_parts_and_merged(site, measured):
         robocas(site, *words, "--shard", f"{number}/2", "--out", f"eval/{number}", cwd=folder)
     robocas(site, "eval", "merge", "eval/0", "eval/1", "--out", "eval/whole", cwd=folder)
     verified = robocas(site, "eval", "verify", "eval/whole", "--protocol", "protocols/push-zone-v1", cwd=folder)
-    assert "2 episodes of push-zone-v1, all well" in verified
+    assert "2 episodes of push-zone-v1, no violations" in verified
     outcomes = [json.loads(line) for line in (folder / "eval" / "whole" / "episodes.jsonl").read_text().splitlines()]
     assert [outcome["task"] for outcome in outcomes] == ["push_zone"] * 2
     assert "success_v0" not in outcomes[0]["flags"]
 
 
-ELSEWHERE = r"no such task .*found push_zone\)\. Name a protocol that has it, or make one: robocas eval freeze"
+ELSEWHERE = r"no episodes of this task .*found push_zone\)\. Choose another protocol .*robocas eval freeze"
 
 
 def test_a_protocol_that_has_not_the_task_says_what_to_do(site):

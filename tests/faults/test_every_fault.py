@@ -134,7 +134,7 @@ def test_a_task_whose_process(command, undisturbed, tmp_path, row, fault, times)
     found = content(command, out)
     row.judge(expected, found, without=(1,))
     if command.name == "eval":
-        assert dict(found)[1]["error"] == "its process died: SIGSEGV"
+        assert dict(found)[1]["error"] == "the worker process of the env crashed: SIGSEGV"
         row.note = "counted as failed"
     else:
         row.note = "another seed in its place"

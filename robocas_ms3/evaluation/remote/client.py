@@ -87,12 +87,12 @@ class RemotePolicy:
         except BaseException:
             self.close()
             raise
-        # With `play` the server is asked before a chunk ends, so each observation needs images.
-        self.spec: PolicySpec = replace(spec, observe_every=1) if self._address.play else spec
+        # With `n_action_steps` the server is asked before a chunk ends, so each observation needs images.
+        self.spec: PolicySpec = replace(spec, observe_every=1) if self._address.n_action_steps else spec
 
     def describe(self) -> dict[str, Any]:
         rename = {"rename": self._address.rename} if self._address.rename else {}
-        return {"server": self._metadata.policy, "play": self._address.play, **rename}
+        return {"server": self._metadata.policy, "n_action_steps": self._address.n_action_steps, **rename}
 
     def reset(self, episodes: list[EpisodeSpec]) -> None:
         """Start episodes; the server learns of them with their first observation."""
@@ -146,7 +146,7 @@ class RemotePolicy:
     def _chunk(self, answer: Any) -> NDArray[np.float32]:
         if isinstance(answer, EvaluationError):
             raise answer
-        chunk = parse_actions(answer, self.spec.convention)[: self._address.play]
+        chunk = parse_actions(answer, self.spec.convention)[: self._address.n_action_steps]
         self._chunk_length = self._chunk_length or len(chunk)
         if len(chunk) != self._chunk_length:
             raise WireError("chunks differ in length", expected=self._chunk_length, found=len(chunk))

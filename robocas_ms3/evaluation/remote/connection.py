@@ -45,7 +45,7 @@ class Address:
         url: without options.
         spec: the policy's specification, for servers that do not announce it; None: not given.
         rename: other keys of an observation, by name: of a camera, ``qpos``, ``prompt``, ...
-        play: number of actions of a chunk that are executed before the server is asked again; None: all.
+        n_action_steps: number of actions of a chunk that are executed before the server is asked again; None: all.
         max_in_flight: number of requests without an answer, for servers without batches; None: one per env.
         timeout_s: clock time in which the server has to answer one of the requests.
         connect_s: clock time in which a connection has to be open, when an episode starts.
@@ -56,7 +56,7 @@ class Address:
     url: str
     spec: PolicySpec | None = None
     rename: dict[_Text, _Text] = field(default_factory=dict)
-    play: PositiveInt | None = None
+    n_action_steps: PositiveInt | None = None
     max_in_flight: PositiveInt | None = None
     timeout_s: _Seconds = 120.0
     connect_s: _Seconds = 30.0

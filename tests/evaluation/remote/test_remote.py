@@ -136,7 +136,7 @@ def test_batches_are_split_and_failures_end_their_episodes_alone():
 
 def test_with_play_each_observation_has_images():
     with serving(Told(PolicySpec(observe_every=3))) as url:
-        for address, looks in ((url, 3), (f"{url}?play=2", 1)):
+        for address, looks in ((url, 3), (f"{url}?n_action_steps=2", 1)):
             remote = RemotePolicy(address)
             assert remote.spec.observe_every == looks
             remote.close()
@@ -251,7 +251,7 @@ def test_our_client_asks_a_plain_openpi_server():
         return openpi.packb({"actions": np.ones((10, 8), np.float32) / 10, "server_timing": timing})
 
     with answering(answer, {"reset_pose": np.zeros(3)}) as url:
-        options = "convention=joint_positions&cameras=base_camera:6x4&play=4&language=text"
+        options = "convention=joint_positions&cameras=base_camera:6x4&n_action_steps=4&language=text"
         remote = RemotePolicy(f"{url}?{options}&rename=base_camera:observation/image,prompt:text")
         assert remote.spec == PolicySpec(convention="joint_positions", cameras={"base_camera": (6, 4)})
         remote.reset([a_start(1)])
@@ -289,12 +289,12 @@ def test_the_server_of_the_documentation():
 def test_addresses_have_options():
     assert read_address("ws://127.0.0.1:8000") == Address("ws://127.0.0.1:8000")
     assert read_address("wss://[::1]/policy").url == "wss://[::1]/policy"
-    text = "ws://host:1?cameras=base_camera:320x240,gripper_camera:64x64&depth=1&rate_hz=5&rename=qpos:state&play=5"
+    text = "ws://host:1?cameras=base_camera:320x240,gripper_camera:64x64&depth=1&rate_hz=5&rename=qpos:state&n_action_steps=5"
     assert read_address(f"{text}&max_in_flight=2&timeout_s=9") == Address(
         "ws://host:1",
         spec=PolicySpec(cameras={"base_camera": (320, 240), "gripper_camera": (64, 64)}, depth=True, rate_hz=5.0),
         rename={"qpos": "state"},
-        play=5,
+        n_action_steps=5,
         max_in_flight=2,
         timeout_s=9.0,
     )
@@ -306,11 +306,17 @@ def test_addresses_have_options():
     "text",
     [
         *("ws://", "ws://host:99999", "ws://host:0", "ws://[::1", "ws://[1]:2"),
-        *(f"ws://host:1?{option}={'9' * 5000}" for option in ("play", "cameras=base_camera:2x")),
+        *(f"ws://host:1?{option}={'9' * 5000}" for option in ("n_action_steps", "cameras=base_camera:2x")),
         *(
             f"ws://host:1?{option}"
             for option in (
-                *("camera=base_camera:2x2", "cameras=base_camera:2", "cameras=base_camera", "depth=maybe", "play=0"),
+                *(
+                    "camera=base_camera:2x2",
+                    "cameras=base_camera:2",
+                    "cameras=base_camera",
+                    "depth=maybe",
+                    "n_action_steps=0",
+                ),
                 *("max_in_flight=0", "timeout_s=-1", "rate_hz=nan", "rename="),
             )
         ),
