@@ -1,4 +1,4 @@
-"""``robocas convert``: write a dataset from recorded episodes."""
+"""``robocas convert``: convert recorded episodes or a dataset to a dataset."""
 
 from __future__ import annotations
 
@@ -24,26 +24,28 @@ def main(settings: ConversionSettings) -> int:
     with ProgressBar("episodes written") as bar:
         done = write(settings, on_start=bar.start, on_episode=bar.advance)
     count = len(done.episodes)
-    words = [f"{settings.out}: {format_count(count, 'episode')}"] + ([f"{done.existing} kept"] if done.existing else [])
+    words = [f"{settings.out}: {format_count(count, 'episode')}"] + (
+        [f"{done.existing} already there"] if done.existing else []
+    )
     if count:
         megabytes = sum(episode.size for episode in done.episodes) / 1e6
         steps = format_count(sum(episode.steps for episode in done.episodes), "step")
-        words += [steps, f"{megabytes:.0f} MB", f"{done.seconds / count:.1f} s an episode"]
+        words += [steps, f"{megabytes:.0f} MB", f"{done.seconds / count:.1f} s per episode"]
     print_line(", ".join(words))
     if count and settings.video and settings.to == "robocas" and not done.previews:
-        print_line("no videos of so many episodes: --all-videos makes them, and robocas video those of some")
+        print_line("no preview videos (more than 20 episodes): pass --all-videos, or run robocas video")
     return 0
 
 
 def _find_format(settings: ConversionSettings) -> Format:
-    """Return the format to write; raise an error if there is none, or an option does not suit it."""
+    """Return the format to write; raise DatasetError if it is unknown or an option does not apply to it."""
     from robocas_ms3.core.text import did_you_mean
     from robocas_ms3.datasets.formats import FORMATS
 
     writable = [name for name, known in FORMATS.items() if known.writer]
     if settings.to not in writable:
         what, expected, fix = (
-            "no such dataset format to write",
+            "unknown dataset format",
             f"one of {writable}",
             did_you_mean(settings.to, writable),
         )
@@ -53,5 +55,5 @@ def _find_format(settings: ConversionSettings) -> Format:
     for field in fields(settings):
         if field.name in of_others and getattr(settings, field.name) != field.default:
             flag = f"--{field.name.replace('_', '-')}"
-            raise DatasetError(f"not for {chosen.title}s", where=flag, fix="Leave it out.")
+            raise DatasetError(f"this option does not apply to a {chosen.title}", where=flag, fix="Omit it.")
     return chosen

@@ -1,4 +1,4 @@
-"""``robocas import-robocas``: bring a dataset in upstream's format into this one's."""
+"""``robocas import-robocas``: import a dataset in the format of RoboCAS-v0."""
 
 from __future__ import annotations
 
@@ -17,10 +17,12 @@ if TYPE_CHECKING:
 
 @dataclass
 class ImportRobocas:
-    """Repair a dataset in the format of RoboCAS-v0 and write it as a valid dataset; without --out only check it.
+    """Repair a dataset in the format of RoboCAS-v0 and write it as a valid dataset.
 
-    Repairs: types, missing arrays that follow from others, either name of the pose of a camera, the turned EEF frame.
-    Episodes that can't be repaired are skipped and named. Exit code 1 if no episode is left.
+    Without --out the dataset is only checked.
+
+    Repairs: types, missing arrays that follow from others, names of camera pose files, a rotated EEF frame. Episodes
+    that can't be repaired are skipped and listed. Exit code 1 if no episode can be imported.
 
     Example: robocas import-robocas downloads/robocas --out datasets/robocas
     """
@@ -30,17 +32,17 @@ class ImportRobocas:
     out: Maybe[Path] = None
     """Folder of the new dataset; episodes keep their numbers."""
     rate: Maybe[float] = None
-    """Steps per second of the dataset. Default: as in conversion.json, without one 5, as RoboCAS-v0 has it."""
+    """Rate of the dataset in Hz. Default: the rate in conversion.json, or 5 Hz (RoboCAS-v0) without that file."""
     turn_eef: bool = True
-    """Turn the EEF frame to the TCP frame of ManiSkill if the pose of the gripper camera shows that it is turned."""
+    """Rotate the EEF frame to the TCP frame of ManiSkill if the pose of the gripper camera shows a rotation."""
     embeddings: bool = False
-    """Add missing embeddings of instruction and sub-goals (needs the extra 'language')."""
+    """Compute missing embeddings of the instruction and the sub-goals (needs the extra 'language')."""
     link: bool = False
     """Hard-link the images instead of copying them."""
     json: bool = False
-    """Print a machine-readable report."""
+    """Print the report as JSON."""
     overwrite: bool = False
-    """Start again. Default: continue an import of the same inputs that was interrupted."""
+    """Start again. Default: continue an interrupted import of the same inputs."""
 
 
 def main(cfg: ImportRobocas) -> int:
@@ -55,7 +57,9 @@ def main(cfg: ImportRobocas) -> int:
 
     if cfg.out is not None:
         check_apart(cfg.out, [cfg.dataset])
-        OutputFolder(cfg.out, DATASET, overwrite=cfg.overwrite).read()  # before minutes of reading
+        OutputFolder(
+            cfg.out, DATASET, overwrite=cfg.overwrite
+        ).read()  # checked before the dataset is read, which takes minutes
     embed = None
     if cfg.embeddings:
         from robocas_ms3.scenes.language.embed import TextEmbedder
@@ -67,13 +71,14 @@ def main(cfg: ImportRobocas) -> int:
         print_json(found.as_json())
     else:
         _table(found)
-    if not found.taken or cfg.out is None:
-        return 0 if found.taken else 1
+    if not found.importable or cfg.out is None:
+        return 0 if found.importable else 1
     with ProgressBar("episodes written") as bar:
         options = CopyOptions(cfg.link, cfg.overwrite, bar.start, bar.advance)
         kept = import_robocas(found, cfg.out, embed=embed, options=options)
     if not cfg.json:
-        print_line(f"{cfg.out}: {format_count(len(found.taken), 'episode')}{f', {kept} kept' if kept else ''}")
+        existing = f", {kept} already there" if kept else ""
+        print_line(f"{cfg.out}: {format_count(len(found.importable), 'episode')}{existing}")
     return 0
 
 
@@ -89,6 +94,6 @@ def _table(found: Survey) -> None:
         if finding.episode is not None:
             numbers.append(finding.episode)
     cells = [(format_ranges(numbers) or "all", *key) for key, numbers in sorted(rows.items())]
-    print_table(("episodes", "what", "where", "problem"), cells, box=None, pad_edge=False, header_style="bold")
-    counts = f"can be taken: {len(found.taken)}, left out: {len(found.left_out)}"
+    print_table(("episodes", "outcome", "where", "finding"), cells, box=None, pad_edge=False, header_style="bold")
+    counts = f"{len(found.importable)} can be imported, {len(found.skipped)} skipped"
     print_line(f"{found.root}: {format_count(found.episodes, 'episode')}, {counts}")

@@ -1,4 +1,4 @@
-"""``robocas merge``: join datasets."""
+"""``robocas merge``: merge several datasets into one."""
 
 from __future__ import annotations
 
@@ -10,21 +10,23 @@ from robocas_ms3.cli.options import Folders
 
 @dataclass
 class Merge:
-    """Join datasets into one. Episodes are numbered in the given order and keep their side of the split.
+    """Merge several datasets into one.
+
+    Episodes are numbered in the given order and stay in training or validation.
 
     Example: robocas merge datasets/pick datasets/search --out datasets/both
     """
 
     datasets: Folders
-    """Folders of datasets with the same settings."""
+    """Folders of the datasets; their settings must be equal."""
     out: Path
     """Folder of the new dataset."""
     skip_duplicates: bool = False
-    """Keep one copy of a recording that is in several datasets, instead of an error."""
+    """Keep one copy of a recording that is in several datasets. Default: stop with an error."""
     copy: bool = False
     """Copy files instead of hard-linking them."""
     overwrite: bool = False
-    """Start again. Default: continue a merge of the same inputs that was interrupted."""
+    """Start again. Default: continue an interrupted merge of the same inputs."""
 
 
 def main(cfg: Merge) -> int:

@@ -14,19 +14,21 @@ from robocas_ms3.core.text import format_count
 
 @dataclass
 class Stats:
-    """Write statistics of a dataset as plots and JSON: lengths, objects, layouts, instructions, actions, sub-goals.
+    """Write statistics of a dataset as plots and JSON.
+
+    They cover lengths, objects, layouts, instructions, actions and sub-goals.
 
     Example: robocas stats datasets/pick
     """
 
     path: Annotated[Path, tyro.conf.Positional]
-    """Folder of a RoboCAS dataset, or a trajectory.h5, whose failed episodes count too."""
+    """Folder of a dataset, or a trajectory.h5 (failed episodes are counted too)."""
     out: Maybe[Path] = None
     """Output folder. Default: DATASET/preview/stats, or TRAJECTORY_stats next to a trajectory."""
     json: bool = False
-    """Print the JSON; files are written only with --out."""
+    """Print the statistics as JSON; files are written only with --out."""
     rate: Maybe[float] = None
-    """Steps per second, for a trajectory. Default: 5."""
+    """Sampling rate of a trajectory in Hz. Default: 5."""
 
 
 def main(cfg: Stats) -> int:

@@ -1,4 +1,4 @@
-"""``robocas validate``: check a dataset."""
+"""``robocas validate``: check a dataset against its format."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 
 @dataclass
 class Validate:
-    """Check a dataset of any format and list every violation of the format; exit code 1 if there is one.
+    """Check a dataset against its format and list every violation; exit code 1 if there is one.
 
-    With --replay, each episode is also replayed open loop from its 7-D actions in its rebuilt scene. The report says
-    how many succeed again and how far the gripper deviates. This changes the exit code only with --min-success.
+    With --replay, each episode is also replayed open loop from its 7-D actions in its rebuilt scene. The report gives
+    the success rate and the tracking error of the gripper. The exit code depends on them only with --min-success.
 
     Example: robocas validate datasets/pick --replay
     """
@@ -33,14 +33,14 @@ class Validate:
     dataset: Annotated[Path, tyro.conf.Positional]
     """Folder of the dataset."""
     replay: bool = False
-    """Replay the actions too (RoboCAS folders; simulated, not rendered)."""
+    """Replay the 7-D actions of each episode in simulation, without rendering (RoboCAS folders only)."""
     min_success: Maybe[float] = None
-    """With --replay: exit code 1 if a smaller fraction of the episodes of a task succeeds again (0 to 1), or if none of
-    them could be replayed."""
+    """With --replay: lowest accepted success rate per task, 0 to 1. Exit code 1 if a task is below it or if none of
+    its episodes could be replayed."""
     pack: Maybe[str] = None
-    """With --replay: object pack to use instead of the recorded one: its name, or its folder."""
+    """With --replay: name or folder of the object pack to use instead of the recorded one."""
     json: bool = False
-    """Print a machine-readable report."""
+    """Print the report as JSON."""
 
 
 def main(cfg: Validate) -> int:
@@ -48,12 +48,13 @@ def main(cfg: Validate) -> int:
     from robocas_ms3.datasets.formats import detect_format
 
     if cfg.min_success is not None and not cfg.replay:
-        raise DatasetError("a share of replayed episodes needs --replay", where="--min-success")
+        raise DatasetError("this option needs --replay", where="--min-success", fix="Add --replay.")
     if cfg.min_success is not None and not 0 <= cfg.min_success <= 1:
-        raise DatasetError("no such share", where="--min-success", expected="0 to 1", found=cfg.min_success)
+        raise DatasetError("invalid success rate", where="--min-success", expected="0 to 1", found=cfg.min_success)
     found = detect_format(cfg.dataset)
     if found and found.name != "robocas" and cfg.replay:
-        raise DatasetError("only RoboCAS folders can be replayed", where=cfg.dataset)
+        what, expected = "this dataset can't be replayed", "a RoboCAS folder"
+        raise DatasetError(what, where="--replay", expected=expected, found=f"{cfg.dataset}, a {found.title}")
     with ProgressBar("episodes checked", transient=True) as bar:
         check = found.load("checker") if found and found.checker else validate
         report: ValidationReport = check(cfg.dataset, on_episode=bar.update)
@@ -68,7 +69,7 @@ def main(cfg: Validate) -> int:
         replays = _replay(cfg.dataset, cfg.pack)
         content["replay"] = replays.as_json()
         least = cfg.min_success or 0.0
-        wrong |= any((of_task["share"] or 0.0) < least for of_task in replays.by_task().values())
+        wrong |= any((of_task["success_rate"] or 0.0) < least for of_task in replays.by_task().values())
         if not cfg.json:
             for line in _lines(replays):
                 print_line(line)
@@ -92,15 +93,16 @@ def _lines(report: ReplayReport) -> Iterator[str]:
         if episode.skipped:
             yield f"episode {episode.number}: not replayed: {episode.skipped}"
         elif not episode.success:
-            strayed = f"strayed {episode.max_error * 1000:.0f} mm at most"
-            yield f"episode {episode.number}: its own actions do not succeed again; {strayed}"
+            error = f"largest tracking error {episode.max_error * 1000:.0f} mm"
+            yield f"episode {episode.number}: the replay does not succeed; {error}"
     for task, of_task in report.by_task().items():
         name = task or "unknown task"
-        if not of_task["tried"]:
-            yield f"{name}: none of {format_count(of_task['skipped'], 'episode')} could be replayed: no share is known"
+        if not of_task["replayed"]:
+            count = format_count(of_task["skipped"], "episode")
+            yield f"{name}: none of {count} could be replayed; success rate unknown"
         else:
             yield (
                 f"{name}: {of_task['succeeded']} of {of_task['tried']} replayed episodes succeed"
-                f" again ({of_task['share']:.0%}); tracking error {of_task['mean_error'] * 1000:.1f} mm on average,"
-                f" {of_task['max_error'] * 1000:.0f} mm at most"
+                f" ({of_task['share']:.0%}); mean tracking error {of_task['mean_error'] * 1000:.1f} mm,"
+                f" largest {of_task['max_error'] * 1000:.0f} mm"
             )

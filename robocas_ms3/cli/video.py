@@ -1,7 +1,8 @@
-"""``robocas video``: write videos of a dataset."""
+"""``robocas video``: write videos and a contact sheet of a dataset."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -9,11 +10,12 @@ from typing import Annotated, Literal
 import tyro
 
 from robocas_ms3.cli.options import Maybe, Several
+from robocas_ms3.core.errors import DatasetError
 
 
 @dataclass
 class Video:
-    """Write videos and a contact sheet of a dataset.
+    """Write a video per episode and a contact sheet of a dataset.
 
     Example: robocas video datasets/pick --episodes 0 3 --kind depth
     """
@@ -21,13 +23,13 @@ class Video:
     dataset: Annotated[Path, tyro.conf.Positional]
     """Folder of the dataset."""
     out: Maybe[Path] = None
-    """Folder to write to; Default: DATASET/preview."""
+    """Output folder. Default: DATASET/preview."""
     episodes: Several[int] = ()
-    """Numbers of the episodes. Default: all."""
+    """Episode numbers. Default: all; the contact sheet shows the first ten."""
     kind: Literal["rgb", "depth"] = "rgb"
-    """Images to show; depth is shown in colours."""
+    """Kind of images; depth is shown in colours."""
     speed: float = 1.0
-    """Playback speed; 1: real time."""
+    """Playback speed as a multiple of real time."""
 
 
 def main(cfg: Video) -> int:
@@ -37,13 +39,15 @@ def main(cfg: Video) -> int:
     from robocas_ms3.datasets.images.video import contact_sheet, write_video
     from robocas_ms3.datasets.schema import PREVIEW_FOLDER, episode_folder
 
+    if not 0 < cfg.speed < math.inf:
+        raise DatasetError("invalid speed", where="--speed", expected="> 0", found=cfg.speed)
     dataset = open_source(cfg.dataset)
     out = cfg.out or cfg.dataset / PREVIEW_FOLDER
     numbers = list(cfg.episodes) or dataset.numbers
     for number in numbers:  # before anything is written
         dataset.episode(number)
     suffix = "" if cfg.kind == "rgb" else f"_{cfg.kind}"
-    with ProgressBar("episodes filmed") as bar:
+    with ProgressBar("videos written") as bar:
         bar.start(len(numbers))
         for number in numbers:
             path = out / f"{episode_folder(number)}{suffix}.mp4"

@@ -1,4 +1,4 @@
-"""``robocas view``: show a dataset or a recording in a browser."""
+"""``robocas view``: show a dataset or a trajectory file in a browser."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from robocas_ms3.core.text import format_count
 
 @dataclass
 class View:
-    """Show a trajectory file, a RoboCAS folder or a LeRobot folder in a browser; docs/view.md.
+    """Show a trajectory file, a RoboCAS folder or a LeRobot dataset in a browser.
 
     Example: robocas view datasets/pick
     """
 
     path: Annotated[Path, tyro.conf.Positional]
-    """trajectory.h5 (with trajectory.json next to it), or the folder of a dataset."""
+    """A trajectory.h5 (with trajectory.json next to it), or the folder of a dataset."""
     port: int = 0
-    """Port of 127.0.0.1 to serve at; 0 takes a free one."""
+    """Port on 127.0.0.1; 0 chooses a free port."""
     open: bool = True
     """Open the page in the default browser."""
     static: Maybe[Path] = None
-    """Write the page into this folder, which opens from disk, instead of serving it."""
+    """Write the page into this folder instead of serving it; OUT/index.html opens from disk."""
     episodes: Several[int] = ()
-    """With --static: numbers of the episodes to write. Default: all."""
+    """With --static: episode numbers. Default: all."""
     width: int = 480
-    """With --static: width of the images, pixels."""
+    """With --static: width of the images in pixels."""
     depth: bool = True
-    """With --static: write depth too."""
+    """With --static: write depth images too."""
     overwrite: bool = False
-    """With --static: replace the folder if it is there."""
+    """With --static: replace an existing folder."""
 
 
 def main(cfg: View) -> int:
@@ -51,16 +51,16 @@ def main(cfg: View) -> int:
 
     with Viewer(source, cfg.port) as server:
         server.warm_up()
-        print_line(f"{cfg.path} at {server.url} (Ctrl-C ends)")
-        # a supervisor's stop is as clean as Ctrl-C, which is ignored where a shell started this in the background
-        for ending in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(ending, signal.default_int_handler)
+        print_line(f"{cfg.path} at {server.url} (press Ctrl-C to stop)")
+        # SIGTERM stops the server like Ctrl-C; shells let background processes ignore SIGINT
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, signal.default_int_handler)
         if cfg.open:
             webbrowser.open(server.url)
         try:
             server.serve_forever(poll_interval=0.1)
         except KeyboardInterrupt:
-            print_line("ended")
+            print_line("stopped")
     return 0
 
 

@@ -1,4 +1,4 @@
-"""The 7-D action of RoboCAS, from a dataset's arrays, and its scale."""
+"""7-D actions of RoboCAS: computed from the arrays of an episode, normalized, and converted."""
 
 from __future__ import annotations
 
@@ -16,40 +16,41 @@ from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 from robocas_ms3.demos.recordings.motion import stored_actions
 
 ACTION_NAMES = ("x", "y", "z", "roll", "pitch", "yaw", "gripper")
-"""Motion in m and Euler xyz angles in rad, both in the EEF frame at the step; gripper command, 1 = open."""
+"""Translation in m and Euler xyz angles in rad, both in the EEF frame at the step; gripper command, 1 = open."""
 ACTION_ARRAYS = ("rel_pos", "rel_orn", "gripper_status")
-"""Keys of ``episode_info.npz`` that actions are made of."""
+"""Keys of ``episode_info.npz`` from which actions are computed."""
 
 
 def episode_actions(arrays: Mapping[str, NDArray]) -> NDArray[np.float32]:
-    """Actions (T, 7) of an episode; row t leads from step t to t + 1, so the last one, which leads nowhere, holds.
+    """Return the actions (T, 7) of an episode; row t leads to step t + 1, the last row does not move.
 
-    Position and turn are ``rel_pos[t]`` and ``rel_orn[t]`` as Euler angles about the fixed axes x, y, z (scipy's
-    "xyz", the convention of ``action_space``); the gripper command is ``gripper_status[t + 1]``.
+    Translation is ``rel_pos[t]`` in m. Rotation is ``rel_orn[t]`` as Euler angles in rad about the fixed axes x, y, z
+    (scipy's "xyz", the convention of ``action_space``). The gripper command is ``gripper_status[t + 1]``.
     """
     return stored_actions(arrays["rel_pos"], arrays["rel_orn"], arrays["gripper_status"])
 
 
 def require_actions(arrays: Mapping[str, NDArray], where: str) -> NDArray[np.float32]:
-    """Return `episode_actions` of arrays that may be damaged, or raise DatasetError."""
+    """Return `episode_actions` of arrays that may be damaged; raise DatasetError if they are."""
     check_finite(arrays, where)
     try:
         return episode_actions(arrays)
     except ValueError as error:
-        what, found = "these arrays make no actions", one_line(error)
+        what, found = "no actions can be computed from these arrays", one_line(error)
         raise DatasetError(what, where=where, found=found, fix=SEE_VALIDATE) from error
 
 
 def check_finite(arrays: Mapping[str, NDArray], where: str) -> None:
+    """Raise DatasetError if an array of floats holds NaN or infinite values."""
     for key, array in arrays.items():
         if array.dtype.kind == "f" and not np.isfinite(array).all():
-            raise DatasetError("not a number", where=f"{where}, {key}", fix=SEE_VALIDATE)
+            raise DatasetError("NaN or infinite value", where=f"{where}, {key}", fix=SEE_VALIDATE)
 
 
 def action_space(rel_pos: Sequence[NDArray], rel_orn: Sequence[NDArray]) -> dict[str, list[list[float]]]:
-    """Return the range of the relative motion: percentiles 1 and 99 of each axis of (T, 3) and (T, 4) xyzw.
+    """Return the range of the relative motion: 1st and 99th percentile of each axis, m and rad.
 
-    The last row of an episode, which is no motion, does not count.
+    ``rel_pos`` and ``rel_orn`` hold one array per episode, (T, 3) and (T, 4) xyzw. The last row of each is ignored.
     """
     positions = np.concatenate([rows[:-1] for rows in rel_pos]).astype(np.float64)
     quaternions = np.concatenate([rows[:-1] for rows in rel_orn]).astype(np.float64)
@@ -62,7 +63,7 @@ def action_space(rel_pos: Sequence[NDArray], rel_orn: Sequence[NDArray]) -> dict
 
 @dataclass(frozen=True)
 class ActionScale:
-    """Maps motion between ``low`` and ``high``, (6,) m and rad, to [-1, 1]; the gripper stays 0 or 1."""
+    """Linear scale that maps motion from ``low`` to ``high``, (6,) m and rad, to [-1, 1]."""
 
     low: NDArray[np.float64]
     high: NDArray[np.float64]
@@ -73,21 +74,23 @@ class ActionScale:
         try:
             rows = [np.asarray(action_space[key], float) for key in ("relative_position", "relative_rotation")]
         except (KeyError, TypeError, ValueError) as error:
-            raise DatasetError("no range of actions", where=where, found=str(error)) from error
+            raise DatasetError("invalid range of actions", where=where, found=str(error)) from error
         if any(row.shape != (2, 3) or not np.isfinite(row).all() for row in rows):
             found = [row.tolist() for row in rows]
-            raise DatasetError("no range of actions", where=where, expected="[low (3), high (3)] each", found=found)
+            raise DatasetError(
+                "invalid range of actions", where=where, expected="[low (3), high (3)] each", found=found
+            )
         low, high = np.concatenate(rows, axis=1)
         return cls(low, high)
 
     def encode(self, actions: NDArray) -> NDArray[np.float32]:
-        """Actions (..., 7), clipped to the range; an axis that never moves gives 0."""
+        """Return normalized actions (..., 7), clipped to the range; an axis without a range becomes 0."""
         span = self.high - self.low
         scaled = 2 * (actions[..., :6] - self.low) / np.where(span > 0, span, 1) - 1
         motion = np.where(span > 0, np.clip(scaled, -1, 1), 0)
         return np.concatenate([motion, actions[..., 6:]], axis=-1).astype(np.float32)
 
     def decode(self, actions: NDArray) -> NDArray[np.float32]:
-        """The inverse of ``encode``, within the range."""
+        """Return actions (..., 7) in m and rad from normalized actions: the inverse of ``encode``."""
         motion = self.low + (actions[..., :6] + 1) / 2 * (self.high - self.low)
         return np.concatenate([motion, actions[..., 6:]], axis=-1).astype(np.float32)

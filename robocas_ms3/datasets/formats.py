@@ -1,6 +1,6 @@
-"""The formats of episodes, in one table: what lies on disk tells which one it is.
+"""Registry of dataset formats; the format of a path is detected from its files.
 
-Another package adds one through an entry point of the group ``robocas_ms3.formats`` that names a `Format`;
+Another package adds a format through an entry point of the group ``robocas_ms3.formats`` that names a `Format`; see
 docs/extending.md.
 """
 
@@ -25,17 +25,17 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Format:
-    """A format. What it does is named, ``module:function``, and imported when it is asked for.
+    """A format of episodes. Its functions are named as ``module:function`` and imported at first use.
 
     Attributes:
-        name: of ``robocas convert --to``.
-        title: for people.
-        matches: whether a path matches such episodes, whole or not; reads little.
+        name: name in ``robocas convert --to``.
+        title: name in messages, such as "LeRobot dataset".
+        matches: function that says whether a path holds episodes in this format, complete or not; it reads little.
         reader: (path, *, rate_hz=None, include_failed=False) -> `EpisodeSource`.
-        writer: (`writing.settings.ConversionSettings`, *, on_start=None, on_episode=None) -> `Conversion`, see
-            `writing.convert.convert`; empty: it can't be written.
+        writer: (`conversion.settings.ConversionSettings`, *, on_start=None, on_episode=None) -> `Conversion`, see
+            `conversion.convert.convert`; empty: the format can't be written.
         checker: (root, *, on_episode=None) -> `checks.dataset.ValidationReport`; empty: there is none.
-        options: flags of ``robocas convert`` that not every format has, of those that the writer heeds.
+        options: options of ``robocas convert`` that apply to this format and not to all formats.
     """
 
     name: str
@@ -47,9 +47,10 @@ class Format:
     options: tuple[str, ...] = ()
 
     def load(self, name: str) -> Callable[..., Any]:
+        """Import and return a function of the format: ``reader``, ``writer`` or ``checker``."""
         path: str = getattr(self, name)
         if not path:
-            raise DatasetError(f"this format has no {name}", where=self.title)
+            raise DatasetError(f"this format has no {name}", where=self.name)
         module, _, function = path.partition(":")
         try:
             with forbid_exit(f"{name} {path}"):
@@ -95,24 +96,24 @@ FORMATS: Registry[Format] = Registry("dataset format", GROUP, Format, {one.name:
 
 
 def detect_format(path: Path) -> Format | None:
-    """Return the format of a path, None if it has none; formats of other packages are asked first."""
+    """Return the format of a path, None if no format matches; formats of other packages are tested first."""
     for name in reversed(list(FORMATS)):
         try:
             if FORMATS[name].matches(path):
                 return FORMATS[name]
-        except Exception as error:  # another package's, of a path that it did not think of
-            _log.debug("%s: whether it matches %s can't be told: %s", name, path, error)
+        except Exception as error:  # of another package
+            _log.debug("format %s: testing %s failed: %s", name, path, error)
     return None
 
 
 def open_source(path: Path | str, *, rate_hz: float | None = None, include_failed: bool = False) -> EpisodeSource:
-    """Open a trajectory file or dataset of any format.
+    """Open a trajectory file or a dataset of any format.
 
-    ``rate_hz`` (default 5) and ``include_failed`` are for trajectories; a dataset has its own rate.
+    ``rate_hz`` (default 5) and ``include_failed`` apply to trajectory files; a dataset has its own rate.
 
     Raises:
-        DatasetError: it can't be read, or the dataset is of another rate.
+        DatasetError: the path can't be read, or the dataset has another rate.
     """
     path = Path(path)
-    found = detect_format(path) or FORMATS["robocas"]  # which says what is wrong, and what may have been meant
+    found = detect_format(path) or FORMATS["robocas"]  # its error suggests a nearby dataset
     return found.load("reader")(path, rate_hz=rate_hz, include_failed=include_failed)

@@ -1,18 +1,18 @@
-"""The RoboCAS folder, declared once: writer, reader, validator, documentation and tests all read it here.
+"""Schema of the RoboCAS folder, which writer, reader, validator, documentation and tests share.
 
 ::
 
-    data_info.json                    overview and split, see `records.DataInfoRecord`
-    conversion.json                   settings, and which recording became which episode; the released loader ignores it
+    data_info.json                    overview and split, see `file_models.DataInfoRecord`
+    conversion.json                   settings and the recording of each episode; not read by the RoboCAS-v0 loader
     episode_0000000/
-      scene.json                      how the episode was made, see `SceneRecord`; the released loader ignores it
-      episode_info.npz                arrays over T steps, see EPISODE_INFO; holds no pickles
-      <camera>/                       of each camera, see `robots.cameras`
-        cam_pos_wrt_<parent>.npy      4x4 OpenCV camera frame (x right, y down, z forward) in its parent; the paper's
-        cam_pose_wrt_<parent>.npy     name and upstream's, the same content
+      scene.json                      how the episode was recorded, see `SceneRecord`; not read by the RoboCAS-v0 loader
+      episode_info.npz                arrays over T steps, see EPISODE_INFO; no pickles
+      <camera>/                       one folder per camera, see `robots.cameras`
+        cam_pos_wrt_<parent>.npy      4x4 OpenCV camera frame (x right, y down, z forward) in its parent; name of
+        cam_pose_wrt_<parent>.npy     the paper, and of RoboCAS-v0 (same content)
         intrinsic.npy                 (4,) fx, fy, cx, cy in pixels
-        rgb/0000.png ...              8-bit RGB, one a step; jpg or webp where that was asked for
-        depth/0000.png ...            16-bit grey, millimetres along the optical axis, 0 = nothing; may be left out
+        rgb/0000.png ...              8-bit RGB, one per step; .jpg or .webp with --image-format
+        depth/0000.png ...            16-bit grey, millimetres along the optical axis, 0 = no depth; optional
 
 Metres and radians; quaternions are xyzw.
 """
@@ -30,7 +30,7 @@ from robocas_ms3.scenes.language.embed import DIMENSIONS
 from robocas_ms3.scenes.language.templates import GOAL_TYPES
 
 SCHEMA_VERSION = 2
-"""Raised when older datasets have to be converted again. 1: no ``scene.json``; 0: upstream's, see docs/dataset.md."""
+"""Increased if older datasets must be converted again. 1: no ``scene.json``; 0: RoboCAS-v0, see docs/dataset.md."""
 
 EPISODE_FILE = "episode_info.npz"
 SCENE_FILE = "scene.json"
@@ -41,7 +41,7 @@ INTRINSIC_FILE = "intrinsic.npy"
 IMAGE_KINDS = ("rgb", "depth")
 ImageFormat = Literal["png", "jpg", "webp"]
 IMAGE_FORMATS: tuple[ImageFormat, ...] = ("png", "jpg", "webp")
-"""Of RGB; the released loader opens ``png`` only. Depth is always PNG, which loses nothing."""
+"""Formats of RGB images; the RoboCAS-v0 loader opens ``png`` only. Depth is always stored as PNG."""
 MAX_STEPS = 10_000  # four digits in image names
 
 
@@ -58,32 +58,32 @@ EPISODE_INFO: tuple[ArraySpec, ...] = (
         "step_goal_embs", "float32", ("T", DIMENSIONS), "", "step_lang_goals, by all-MiniLM-L6-v2", embedding=True
     ),
 )
-"""Arrays of ``episode_info.npz``: the recorded quantities of the robot, and texts."""
+"""Arrays of ``episode_info.npz``: the recorded quantities of the robot, and the texts."""
 
 RELATIVE_PAIRS = (("ee_pos", "ee_orn", "rel_pos", "rel_orn"), ("base_pos", "base_orn", "base_rel_pos", "base_rel_orn"))
-"""Keys of absolute position and orientation, and of the same as relative motion."""
+"""Keys of absolute position and orientation, and of the corresponding relative motion."""
 
 
 def check_version(found: object, where: Path, what: str = "a dataset") -> None:
-    """Raise DatasetError if the schema version of a file or folder is another."""
+    """Raise DatasetError if the schema version of a file or folder is not the current version."""
     if found != SCHEMA_VERSION:
-        fix = "Convert it again from its recording."
+        fix = "Convert the recording again."
         if found == 0:
             fix = "Import it first: robocas import-robocas."
         elif isinstance(found, int) and found > SCHEMA_VERSION:
-            fix = "Use a newer robocas."
+            fix = "Update robocas_ms3."
         raise DatasetError(
-            f"{what} of another schema version", where=where, expected=SCHEMA_VERSION, found=found, fix=fix
+            f"{what} with another schema version", where=where, expected=SCHEMA_VERSION, found=found, fix=fix
         )
 
 
 def pose_files(parent: Parent) -> tuple[str, str]:
-    """Return both names of the file with the pose of a camera, by the frame that the pose is in."""
+    """Return both names of the pose file of a camera whose pose is in the frame ``parent``."""
     return f"cam_pos_wrt_{parent}.npy", f"cam_pose_wrt_{parent}.npy"
 
 
 def camera_parent(folder: Path) -> Parent:
-    """Return the frame that the pose in a camera's folder is in, by the name of its file; without one, the usual."""
+    """Return the parent frame of a camera pose by its file name; default: that of the standard camera."""
     for parent in PARENT_FRAMES:
         if any((folder / name).exists() for name in pose_files(parent)):
             return parent
@@ -91,22 +91,23 @@ def camera_parent(folder: Path) -> Parent:
 
 
 def camera_names(episode: Path) -> tuple[str, ...]:
-    """Return the cameras that have a folder in an episode's folder, sorted."""
+    """Return the names of the cameras with a folder in the folder of an episode, sorted."""
     if not episode.is_dir():
         return ()
     return tuple(sorted(p.name for p in episode.iterdir() if re.fullmatch(CAMERA_NAME, p.name) and p.is_dir()))
 
 
 def episode_folder(number: int) -> str:
+    """Return the folder name of an episode."""
     return f"episode_{number:07d}"
 
 
 def episode_number(folder: str) -> int | None:
-    """Number of an episode's folder, None for other folders."""
+    """Return the episode number of a folder name, None for other folders."""
     digits = folder.removeprefix("episode_")
     return int(digits) if folder.startswith("episode_") and len(digits) == 7 and digits.isdecimal() else None
 
 
 def image_path(episode: Path, camera: str, kind: str, step: int, image_format: ImageFormat = "png") -> Path:
-    """Path of an image; ``kind`` is ``rgb`` or ``depth``, the format that of RGB."""
+    """Return the path of an image; ``kind`` is ``rgb`` or ``depth``, ``image_format`` that of RGB images."""
     return episode / camera / kind / f"{step:04d}.{image_format if kind == 'rgb' else 'png'}"

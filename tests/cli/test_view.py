@@ -38,7 +38,7 @@ def test_it_serves_until_it_is_interrupted(trajectory, ending):
             out, err = process.communicate(timeout=30)
         finally:
             process.kill()  # else a failure would wait for it for ever
-    assert (process.returncode, out, err) == (0, "ended\n", "")
+    assert (process.returncode, out, err) == (0, "stopped\n", "")
 
 
 def test_it_writes_a_folder(trajectory, tmp_path, capsys):

@@ -99,7 +99,7 @@ def test_a_format_that_there_is_not(stranger, tmp_path, capsys):
     assert run(["convert", str(file), "--to", "rlds", "--out", str(tmp_path / "out")]) == 2
     assert "expected one of ['lerobot', 'robocas', 'toy']" in capsys.readouterr().err
     assert run(["convert", str(file), "--to", "toy", "--append", "--out", str(tmp_path / "out")]) == 2
-    assert "--append: not for toy datasets" in capsys.readouterr().err
+    assert "--append: this option does not apply to a toy dataset" in capsys.readouterr().err
 
 
 def test_a_format_that_fails_at_a_path_holds_it_not(both, monkeypatch):

@@ -1,1 +1,1 @@
-"""What is wrong with a dataset: functions from content to violations."""
+"""Checks of RoboCAS folders: functions that take content and yield violations."""

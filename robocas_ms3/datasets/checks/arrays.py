@@ -1,4 +1,4 @@
-"""Checks of the arrays of an episode: file, keys, shapes and types; poses and the motion between them; values."""
+"""Checks of the arrays of an episode: file, keys, shapes, types, values, poses and motion."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from robocas_ms3.demos.recordings.motion import planar_motion, relative_motion
 from robocas_ms3.scenes.language.templates import GOAL_TYPES
 
 Check = Callable[[EpisodeArrays], Iterator[Violation]]
-"""Yields the violations of one rule. Only `check_keys` reports missing arrays."""
+"""Function that yields the violations of one rule. Only `check_keys` reports missing arrays."""
 UNIT_TOLERANCE = 1e-3  # of lengths of unit vectors and quaternions
 POSITION_TOLERANCE = 1e-4  # m
 ANGLE_TOLERANCE = 1e-3  # rad
 
 
 def check_file(stored: EpisodeArrays) -> Iterator[Violation]:
-    """Check that the file and all of its arrays could be read."""
+    """Check that the file and all of its arrays can be read."""
     for key, error in stored.unreadable.items():
         if isinstance(error, FileNotFoundError):
             yield Violation(stored.file, "", "this file", NO_FILE, "missing")
@@ -37,12 +37,12 @@ def check_keys(stored: EpisodeArrays) -> Iterator[Violation]:
     if "" in stored.unreadable:
         return
     embedded = any(spec.name in stored.arrays for spec in schema.EPISODE_INFO if spec.embedding)
-    there = {*stored.arrays, *stored.unreadable, *stored.ignored}
+    present = {*stored.arrays, *stored.unreadable, *stored.ignored}
     for spec in schema.EPISODE_INFO:
-        if spec.name not in there and not spec.optional and (embedded or not spec.embedding):
+        if spec.name not in present and not spec.optional and (embedded or not spec.embedding):
             yield Violation(stored.file, spec.name, "this key", "no such key", "missing")
-    for key in sorted(there - set(SPECS)):
-        yield Violation(stored.file, key, "keys of the schema only", "an unknown key", "unexpected")
+    for key in sorted(present - set(SPECS)):
+        yield Violation(stored.file, key, "no keys outside the schema", "an unknown key", "unexpected")
 
 
 def check_shapes(stored: EpisodeArrays) -> Iterator[Violation]:
@@ -55,15 +55,15 @@ def check_shapes(stored: EpisodeArrays) -> Iterator[Violation]:
         elif spec.name == "episode_length" and not 0 < array <= schema.MAX_STEPS:
             yield Violation(stored.file, spec.name, f"1 to {schema.MAX_STEPS} steps", str(array))
         elif spec.name == "episode_length" and array != stored.steps:
-            yield Violation(stored.file, spec.name, f"{stored.steps}, as the arrays have", str(array))
+            yield Violation(stored.file, spec.name, f"{stored.steps}, the length of the arrays", str(array))
 
 
 def check_finite(stored: EpisodeArrays) -> Iterator[Violation]:
-    """Check that numbers are finite, also those of unknown keys."""
+    """Check that all numbers are finite, including those of unknown keys."""
     for key, array in stored.arrays.items():
         wrong = np.sum(~np.isfinite(array)) if array.dtype.kind == "f" else 0
         if wrong:
-            yield Violation(stored.file, key, "finite numbers", f"{wrong} others")
+            yield Violation(stored.file, key, "finite numbers", f"{wrong} NaN or infinite values")
 
 
 def check_units(stored: EpisodeArrays) -> Iterator[Violation]:
@@ -78,7 +78,7 @@ def check_units(stored: EpisodeArrays) -> Iterator[Violation]:
 
 
 def check_motion(stored: EpisodeArrays) -> Iterator[Violation]:
-    """Check that relative poses are the motion between absolute ones, with quaternions xyzw."""
+    """Check that relative poses are the motion between absolute poses, with quaternions xyzw."""
     for keys in schema.RELATIVE_PAIRS:
         yield from check_pair(stored, keys)
 
@@ -89,7 +89,7 @@ def check_pair(stored: EpisodeArrays, keys: tuple[str, str, str, str]) -> Iterat
     if not set(keys) <= stored.arrays.keys():
         return
     if any(np.linalg.norm(stored.arrays[key], axis=1).min() < 0.5 for key in (orientation, rel_orientation)):
-        return  # no quaternions, see `check_units`
+        return  # reported by `check_units`
     shift, turn = motion_errors(stored, keys)
     if (shift <= POSITION_TOLERANCE).all() and (turn <= ANGLE_TOLERANCE).all():
         return
@@ -103,7 +103,7 @@ def check_pair(stored: EpisodeArrays, keys: tuple[str, str, str, str]) -> Iterat
     ):
         if error.max() > limit:
             rows = f"{int(np.sum(error > limit))} of {len(error)} rows off"
-            text = f"{rows}, by {error.max():.3g} {unit} in row {int(error.argmax())}"
+            text = f"{rows}, at most {error.max():.3g} {unit} (row {int(error.argmax())})"
             yield Violation(stored.file, key, f"the motion between rows of {position}, {orientation}", text)
 
 
@@ -125,7 +125,7 @@ def check_base_motion(stored: EpisodeArrays) -> Iterator[Violation]:
 
 
 def check_values(stored: EpisodeArrays) -> Iterator[Violation]:
-    """Check that numbers are within their limits, sub-goals are of known types, and there is an instruction."""
+    """Check limits of numbers, types of sub-goals, and that there is an instruction."""
     for spec, array in _known(stored):
         if spec.limits and not spec.limits[0] <= array.min() <= array.max() <= spec.limits[1]:
             expected = f"{spec.limits[0]:g} to {spec.limits[1]:g} {spec.unit}"
@@ -134,15 +134,16 @@ def check_values(stored: EpisodeArrays) -> Iterator[Violation]:
     for goal_type in sorted(set(types.tolist()) - set(GOAL_TYPES)):
         yield Violation(stored.file, "step_goal_type", f"one of {', '.join(GOAL_TYPES)}", goal_type)
     if "language_goal" in stored.arrays and not str(stored.arrays["language_goal"]).strip():
-        yield Violation(stored.file, "language_goal", "an instruction", "nothing")
+        yield Violation(stored.file, "language_goal", "an instruction", "an empty text")
 
 
 FORM: tuple[Check, ...] = (check_file, check_keys, check_shapes, check_finite)
-"""The other checks need arrays without violations of these."""
+"""Checks that arrays must pass before the other checks run."""
 CONTENT: tuple[Check, ...] = (check_motion, check_base_motion, check_values)
 
 
 def violations_of(stored: EpisodeArrays, checks: tuple[Check, ...]) -> Iterator[Violation]:
+    """Yield the violations that some checks find in the arrays of an episode."""
     return (violation for check in checks for violation in check(stored))
 
 

@@ -1,4 +1,4 @@
-"""Checks a RoboCAS folder against the schema, and lists every violation."""
+"""Check a RoboCAS folder against the schema and list every violation."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _Arrays = Mapping[str, NDArray]
 
 @dataclass(frozen=True)
 class ValidationReport:
-    """Numbers of episodes and steps that were checked, and all violations."""
+    """Result of a check: the number of checked episodes and steps, and all violations."""
 
     episodes: int
     steps: int
@@ -47,10 +47,10 @@ class ValidationReport:
 
 
 def validate(root: str | Path, *, on_episode: Callable[[int, int], None] | None = None) -> ValidationReport:
-    """Check a dataset; ``on_episode`` is called with (done, all) after each episode.
+    """Check a RoboCAS folder; ``on_episode`` is called with (done, total) after each episode.
 
     Raises:
-        DatasetError: there is no such folder, or it is something else.
+        DatasetError: the folder does not exist, or is not a dataset.
     """
     root = Path(root)
     if not root.is_dir():
@@ -73,7 +73,7 @@ def validate(root: str | Path, *, on_episode: Callable[[int, int], None] | None 
         if on_episode:
             on_episode(done, len(numbers))
     if len(embedded) > 1:
-        violations.append(Violation("", "language_embedding", "in all episodes or none", "in some"))
+        violations.append(Violation("", "language_embedding", "in all episodes or in none", "in some episodes"))
     violations += check_entries(settings, episodes)
     violations += check_info(root, {number: stored.arrays for number, (stored, _) in episodes.items()})
     positions = (stored.arrays.get("ee_pos") for stored, _ in episodes.values())
@@ -83,6 +83,7 @@ def validate(root: str | Path, *, on_episode: Callable[[int, int], None] | None 
 
 
 def check_episode(folder: Path, stored: EpisodeArrays, image_options: ImageOptions, sizes: Sizes) -> list[Violation]:
+    """Return the violations in the arrays, cameras and images of an episode."""
     wrong, values = list(array_checks.violations_of(stored, array_checks.FORM)), []
     if not wrong:
         wrong, values = (
@@ -100,7 +101,9 @@ def check_episode(folder: Path, stored: EpisodeArrays, image_options: ImageOptio
 
 def check_info(root: Path, episodes: Mapping[int, _Arrays]) -> Iterator[Violation]:
     """Check ``data_info.json`` against the arrays of the episodes on disk."""
-    unfinished = " (not finished: convert again)" if (root / schema.CONVERSION_FILE).is_file() else ""
+    unfinished = (
+        " (unfinished conversion: run robocas convert again)" if (root / schema.CONVERSION_FILE).is_file() else ""
+    )
     info, wrong = read_object(root, INFO, DataInfoRecord, absent=f"this file{unfinished}")
     if wrong:
         yield from wrong
@@ -117,13 +120,13 @@ def check_info(root: Path, episodes: Mapping[int, _Arrays]) -> Iterator[Violatio
     for key in ("ep_length", "language_goal", "step_goals"):
         wanted, found = {str(number) for number in episodes}, set(info[key])
         if wanted != found:
-            yield Violation(INFO, key, "the episodes on disk", f"{len(wanted ^ found)} others or missing")
+            yield Violation(INFO, key, "the episodes on disk", f"{len(wanted ^ found)} missing or unknown")
     for number, arrays in sorted(episodes.items()):
         declared = {key: array for key, array in arrays.items() if key in SPECS and is_declared(key, array)}
         for key, array, kind in (("ep_length", "episode_length", int), ("language_goal", "language_goal", str)):
-            said = info[key].get(str(number))
-            if said is not None and array in declared and said != (expected := kind(declared[array])):
-                yield Violation(INFO, f"{key}.{number}", repr(expected), repr(said))
+            listed = info[key].get(str(number))
+            if listed is not None and array in declared and listed != (expected := kind(declared[array])):
+                yield Violation(INFO, f"{key}.{number}", repr(expected), repr(listed))
         if str(number) in info["step_goals"] and {"step_lang_goals", "step_goal_type"} <= declared.keys():
             yield from _check_goals(f"step_goals.{number}", info["step_goals"][str(number)], declared)
     yield from _check_range(info["action_space"], episodes)
@@ -140,7 +143,7 @@ def _check_goals(key: str, goals: list[dict[str, Any]], arrays: _Arrays) -> Iter
         next_step = last + 1
         stored = {*zip(types[first:next_step], texts[first:next_step], strict=False)}
         if stored - {(goal["goal_type"], goal["goal_description"])}:
-            expected = f"the sub-goal that {schema.EPISODE_FILE} has at steps {first} to {last}"
+            expected = f"the sub-goal of {schema.EPISODE_FILE} at steps {first} to {last}"
             yield Violation(INFO, key, expected, repr(goal["goal_description"]))
     if next_step != len(texts):
         yield Violation(INFO, key, f"ranges up to step {len(texts) - 1}", f"up to {next_step - 1}")
@@ -151,8 +154,8 @@ def _check_range(space: Mapping[str, Any], episodes: Mapping[int, _Arrays]) -> I
     try:
         expected = action_space([a["rel_pos"] for a in complete], [a["rel_orn"] for a in complete])
     except ValueError:
-        return  # damaged arrays, which other checks name
+        return  # damaged arrays, which other checks report
     for key, rows in expected.items():
         worst = np.abs(np.subtract(space[key], rows)).max()
         if worst > _RANGE_TOLERANCE:
-            yield Violation(INFO, f"action_space.{key}", "percentiles of the episodes", f"off by {worst:.3g}")
+            yield Violation(INFO, f"action_space.{key}", "the percentiles of the episodes", f"off by {worst:.3g}")

@@ -1,11 +1,11 @@
-"""Check that depth agrees with intrinsics and poses of the cameras, whatever is occluded.
+"""Check that depth images agree with the intrinsics and poses of the cameras.
 
-Three rules hold in any scene; wrong poses, intrinsics, axes or units break one of them:
+Three rules hold in any scene; wrong poses, intrinsics, axes or units violate at least one of them:
 
-- Nothing is below the floor. Level surfaces near the floor are the floor, except bottoms of furniture, which the
+- No point is below the floor. Horizontal surfaces near the floor are the floor, except bottoms of furniture, which the
   gripper camera sees.
-- No camera looks through a surface that another camera sees.
-- All cameras see the workspace, so at some step the depth of each agrees with that of another.
+- No camera sees through a surface that another camera sees.
+- All cameras see the workspace, so at some step the depth of each camera agrees with the depth of another camera.
 """
 
 from __future__ import annotations
@@ -21,22 +21,23 @@ from robocas_ms3.core.poses import inverse
 
 Array = NDArray[np.float64]
 
-POINT_ROWS = 80  # of the points looked at
-JUMP = 0.2  # m between neighbours that are not of one surface
-MIN_POINTS = 100  # fewer say nothing
+POINT_ROWS = 80  # rows of pixels that are compared
+JUMP = 0.2  # m between neighbouring points of different surfaces
+MIN_POINTS = 100  # fewer points are not significant
 FLOOR_TOLERANCE = 0.03  # m
-FLOOR_BAND = 0.15  # m; what is level and within it is taken for the floor
-LEVEL = np.cos(np.deg2rad(20))  # of the angle between a surface's normal and the vertical: not a wall's foot
-SEEN_THROUGH = 0.05  # share of points
-AGREEING = 0.1  # share of points, at the step and with the camera where it is highest; the rest may be hidden
-NEAR = 0.15  # m; nearer than this a pixel covers less than the depth's millimetre
+FLOOR_BAND = 0.15  # m; horizontal surfaces within it count as floor
+LEVEL = np.cos(np.deg2rad(20))  # largest angle between surface normal and vertical; excludes the lower edge of a wall
+SEEN_THROUGH = 0.05  # fraction of points
+AGREEING = 0.1  # fraction of points, at the best step and with the best camera; the other points may be hidden
+NEAR = 0.15  # m; at smaller depth a pixel covers less than 1 mm, the resolution of depth
 
 
 @dataclass(frozen=True)
 class View:
-    """Depth (H, W) in mm, 0 = nothing, of a camera with (4,) fx, fy, cx, cy and its OpenCV frame in the world.
+    """Depth image (H, W) in mm, 0 = no depth, with intrinsics and pose.
 
-    A camera ``on_hand``, of the gripper, looks into furniture.
+    ``intrinsic`` is (4,) fx, fy, cx, cy in pixels, ``camera_in_world`` (4, 4) the pose of the OpenCV camera frame.
+    ``on_hand`` marks the gripper camera, which sees the inside of furniture.
     """
 
     camera: str
@@ -46,15 +47,15 @@ class View:
     on_hand: bool = False
 
     def points(self) -> Array:
-        """Return the seen points (N, 3) in the world, m; of large images every few pixels."""
+        """Return the visible points (N, 3) in the world frame, m; large images are subsampled."""
         grid, known = self._grid()
         return grid[known]
 
     def reach(self) -> Array:
-        """Return how far the surface around each of `points` continues (N,), m, as far as this camera can tell.
+        """Return the distance (N,) from each of `points` to the nearest visible edge of its surface, m.
 
-        The inverse depth of a plane is linear in the pixels: a pixel that departs from the line through its neighbours
-        may be an edge.
+        The inverse depth of a plane is linear in the pixel coordinates: a pixel off the line through its neighbours may
+        be an edge.
         """
         z = self.depth.astype(np.float64) / 1000
         inverse = np.divide(1, z, out=np.zeros_like(z), where=z > 0)
@@ -70,6 +71,7 @@ class View:
         return (pixels[rows, columns] * seen / self.intrinsic[:2].max())[seen > 0]
 
     def level_points(self) -> Array:
+        """Return the points (N, 3) of horizontal surfaces in the world frame, m."""
         grid, known = self._grid()
         across, down = np.diff(grid, axis=1)[:-1], np.diff(grid, axis=0)[:, :-1]
         normals = np.cross(across, down)
@@ -78,11 +80,11 @@ class View:
         return grid[:-1, :-1][level & joined & known[:-1, :-1] & known[1:, :-1] & known[:-1, 1:]]
 
     def _grid(self) -> tuple[Array, NDArray[np.bool_]]:
-        """Return points (R, C, 3) in the world, m, and whether something was seen (R, C)."""
+        """Return points (R, C, 3) in the world frame, m, and whether their depth is known (R, C)."""
         rows, columns = self._pixels()
         z = self.depth[rows, columns].astype(np.float64) / 1000
         fx, fy, cx, cy = self.intrinsic
-        # SAPIEN's rays go through pixel centres, which lie at + 0.5.
+        # SAPIEN's rays go through pixel centres, at + 0.5.
         local = np.stack([(columns + 0.5 - cx) / fx * z, (rows + 0.5 - cy) / fy * z, z], axis=-1)
         return local @ self.camera_in_world[:3, :3].T + self.camera_in_world[:3, 3], z > 0
 
@@ -92,13 +94,13 @@ class View:
 
 
 def check(steps: Sequence[Sequence[View]]) -> Iterator[tuple[int, str, str, str]]:
-    """Yield (index into ``steps``, camera, expected, found) of broken rules, each rule once per camera."""
+    """Yield (index into ``steps``, camera, expected, found) of violations, each rule once per camera."""
     reported: set[tuple[str, str]] = set()
-    agreement: dict[str, float] = {}  # of cameras that others may agree with
+    agreement: dict[str, float] = {}  # camera -> highest fraction of agreeing points
     for index, views in enumerate(steps):
         clouds = {view.camera: view.points() for view in views}
         reaches = {view.camera: view.reach() for view in views}
-        broken = [rule for view in views for rule in _floor(view, clouds[view.camera])]
+        violations = [violation for view in views for violation in _floor(view, clouds[view.camera])]
         seen = {camera for camera, points in clouds.items() if len(points) >= MIN_POINTS}
         for camera in clouds:
             if seen - {camera}:
@@ -114,14 +116,14 @@ def check(steps: Sequence[Sequence[View]]) -> Iterator[tuple[int, str, str, str]
                     agreement[camera] = max(agreement.get(camera, 0.0), agree)
                 if through > SEEN_THROUGH:
                     found = f"{through:.0%} of {count} points seen through"
-                    broken.append((view.camera, f"no looking through what {other.camera} sees", found))
-        for camera, expected, found in broken:
+                    violations.append((view.camera, f"no view through surfaces that {other.camera} sees", found))
+        for camera, expected, found in violations:
             if (camera, expected) not in reported:
                 reported.add((camera, expected))
                 yield index, camera, expected, found
-    for camera, share in agreement.items():
-        if share < AGREEING:
-            yield 0, camera, "depth that agrees with another camera's", f"at most {share:.0%} of the points agree"
+    for camera, fraction in agreement.items():
+        if fraction < AGREEING:
+            yield 0, camera, "depth that agrees with another camera", f"at most {fraction:.0%} of the points agree"
 
 
 def _floor(view: View, points: Array) -> Iterator[tuple[str, str, str]]:
@@ -130,19 +132,19 @@ def _floor(view: View, points: Array) -> Iterator[tuple[str, str, str]]:
     heights = points[:, 2]
     below = np.mean(heights < -FLOOR_TOLERANCE)
     if below > 0.01:
-        yield view.camera, "nothing below the floor", f"{below:.0%} of the depth, down to {heights.min():.2f} m"
+        yield view.camera, "no points below the floor", f"{below:.0%} of the points, down to {heights.min():.2f} m"
     if view.on_hand:
         return
     level = np.abs(view.level_points()[:, 2])
     near = level[level < FLOOR_BAND]
     if len(near) > MIN_POINTS and np.median(near) > FLOOR_TOLERANCE:
-        yield view.camera, "floor at height 0", f"a floor {np.median(near) * 100:.0f} cm off"
+        yield view.camera, "the floor at height 0", f"the floor {np.median(near) * 100:.0f} cm off"
 
 
 def compare(points: Array, view: View, reach: Array) -> tuple[int, float, float]:
-    """Compare points (N, 3) that another camera saw, with their `View.reach` (N,), with a view.
+    """Compare the points (N, 3) of another camera and their `View.reach` (N,) with a view.
 
-    Return the number of points in the image, and the fractions that the view looks through and that are at its depth.
+    Return the number of points in the image, the fraction that the view sees through, and the fraction at its depth.
     """
     local = (points - view.camera_in_world[:3, 3]) @ inverse(view.camera_in_world)[:3, :3].T
     local, reach = local[local[:, 2] > NEAR], reach[local[:, 2] > NEAR]
@@ -162,10 +164,10 @@ def compare(points: Array, view: View, reach: Array) -> tuple[int, float, float]
     z, nearest, farthest = z[known], around[:, known].min(axis=0), around[:, known].max(axis=0)
     tolerance = _tolerance(z)
     through = nearest > z + tolerance
-    telling = reach[known] > z / view.intrinsic[:2].min()
+    significant = reach[known] > z / view.intrinsic[:2].min()
     agree = ~through & (farthest > z - tolerance)
-    looked = float(np.mean(through[telling])) if np.sum(telling) >= MIN_POINTS else 0.0
-    return len(z), looked, float(np.mean(agree))
+    seen_through = float(np.mean(through[significant])) if np.sum(significant) >= MIN_POINTS else 0.0
+    return len(z), seen_through, float(np.mean(agree))
 
 
 def _tolerance(z: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Checks of what the cameras of an episode saw: intrinsics and poses, image files, depth against both."""
+"""Checks of the cameras of an episode: intrinsics, poses, image files and depth."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ from robocas_ms3.datasets.sources.arrays import EpisodeArrays
 from robocas_ms3.datasets.sources.files import CAMERA_LIMIT
 from robocas_ms3.robots.cameras import Parent
 
-_UNEXPECTED = "a file beyond them"
-_SOUND = "a sound image"
-_GEOMETRY_STEPS = 3  # whose depth is decoded
-_READERS = 4  # threads: reading and checksums run outside of Python's lock
+_UNEXPECTED = "an additional file"
+_INTACT = "an intact image"
+_GEOMETRY_STEPS = 3  # steps whose depth is decoded
+_READERS = 4  # threads; reading and checksums release the GIL
 _HEADERS = {"rgb": (8, 3), "depth": (16, 1)}
 Sizes = dict[str, tuple[int, int]]
 """Camera -> width and height of its images."""
 ReadHeader = Callable[[Path], ImageHeader | None]
-"""`read_header`, or `check_ends`, which gives none; raises ValueError or OSError."""
+"""`read_header`, or `check_ends`, which returns None; raises ValueError or OSError for a damaged image."""
 
 
 def check_cameras(folder: Path, image_options: ImageOptions) -> Iterator[Violation]:
-    """Check that each camera has valid intrinsics and its pose under both names, and that there are no others."""
+    """Check that each camera has valid intrinsics and pose files, and that there are no other cameras."""
     for camera in schema.camera_names(folder):
         if camera not in image_options.cameras:
-            expected = f"the cameras of {schema.CONVERSION_FILE} only"
+            expected = f"the cameras listed in {schema.CONVERSION_FILE}"
             yield Violation(f"{folder.name}/{camera}", "", expected, "another camera")
     for camera in image_options.cameras:
         poses: list[NDArray] = []
@@ -58,7 +58,7 @@ def check_cameras(folder: Path, image_options: ImageOptions) -> Iterator[Violati
             poses += [found] if name in pose_files and not wrong else []
         if len(poses) == 2 and not np.allclose(poses[0], poses[1], atol=1e-6):
             file = f"{folder.name}/{camera}/{pose_files[1]}"
-            yield Violation(file, "", f"the same as {pose_files[0]}", "another pose")
+            yield Violation(file, "", f"the pose of {pose_files[0]}", "another pose")
 
 
 def check_camera_file(file: str, array: NDArray, *, pose: bool) -> Iterator[Violation]:
@@ -81,7 +81,7 @@ def _is_rigid(matrix: NDArray) -> bool:
 def check_images(
     folder: Path, image_options: ImageOptions, steps: int, sizes: Sizes, read: ReadHeader = read_header
 ) -> Iterator[Violation]:
-    """Check that there is an intact image of each step, all of one size (see `Sizes`), and nothing else."""
+    """Check that there is an intact image of each step, all with one size per camera, and no other file."""
     places = [(camera, kind) for camera in image_options.cameras for kind in image_options.kinds]
     with ThreadPoolExecutor(_READERS) as pool:
         headers = list(pool.map(partial(_read_headers, folder, image_options.image_format, steps, read), places))
@@ -90,12 +90,12 @@ def check_images(
         for name, header in found.items():
             file = f"{folder.name}/{camera}/{kind}/{name}"
             if header == NO_FILE:
-                yield Violation(file, "", "an image of every step", NO_FILE, "missing")
+                yield Violation(file, "", "an image of each step", NO_FILE, "missing")
             elif header == _UNEXPECTED:
                 expected = f"{format_count(len(wanted), 'image')} from {min(wanted, default='none')}"
                 yield Violation(file, "", expected, _UNEXPECTED, "unexpected")
             elif isinstance(header, str):
-                yield Violation(file, "", _SOUND, header)
+                yield Violation(file, "", _INTACT, header)
             elif header is not None:
                 size = sizes.setdefault(camera, (header.width, header.height))
                 expected = ImageHeader(*(image_options.size or size), *_HEADERS[kind])
@@ -107,19 +107,19 @@ def _read_headers(
     folder: Path, image_format: schema.ImageFormat, steps: int, read: ReadHeader, place: tuple[str, str]
 ) -> dict[str, ImageHeader | str | None]:
     first = schema.image_path(folder, *place, 0, image_format)
-    there = {path.name for path in first.parent.iterdir()} if first.parent.is_dir() else set()
+    present = {path.name for path in first.parent.iterdir()} if first.parent.is_dir() else set()
     wanted = [f"{step:04d}{first.suffix}" for step in range(min(steps, schema.MAX_STEPS))]
     found: dict[str, ImageHeader | str | None] = {}
     for name in wanted:
         try:
-            found[name] = read(first.with_name(name)) if name in there else NO_FILE
+            found[name] = read(first.with_name(name)) if name in present else NO_FILE
         except (OSError, ValueError) as error:
             found[name] = getattr(error, "strerror", None) or one_line(error)
-    return {**found, **dict.fromkeys(sorted(there - set(wanted)), _UNEXPECTED)}
+    return {**found, **dict.fromkeys(sorted(present - set(wanted)), _UNEXPECTED)}
 
 
 def check_depth(folder: Path, stored: EpisodeArrays, image_options: ImageOptions) -> Iterator[Violation]:
-    """Check depth at a few steps against intrinsics and poses, see `geometry.check`; nothing else may be wrong."""
+    """Check depth at a few steps with `depth.check`; all other checks of the episode must have passed."""
     arrays = {key: array.astype(np.float64) for key, array in stored.arrays.items() if array.dtype.kind == "f"}
     base = from_xyzw(arrays["base_pos"], arrays["base_orn"])
     ee = base @ from_xyzw(arrays["ee_pos"], arrays["ee_orn"])
@@ -141,12 +141,12 @@ def check_depth(folder: Path, stored: EpisodeArrays, image_options: ImageOptions
             file = f"{folder.name}/{path.relative_to(folder)}"
             image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)  # `check_images` has checked file and size
             if image is None:
-                yield Violation(file, "", _SOUND, "damage")
+                yield Violation(file, "", _INTACT, "a damaged image")
                 return
             if not image.any():
                 yield Violation(file, "", "depth", "only zeros")
             intrinsic, pose = cameras[camera]
-            placed = parents[parent] @ pose
-            views[-1].append(geometry.View(camera, image.astype(np.uint16), intrinsic, placed, parent == "ee"))
+            camera_in_world = parents[parent] @ pose
+            views[-1].append(geometry.View(camera, image.astype(np.uint16), intrinsic, camera_in_world, parent == "ee"))
     for index, camera_name, expected, found in geometry.check(views):
         yield Violation(f"{folder.name}/{camera_name}/depth/{steps[index]:04d}.png", "", expected, found)

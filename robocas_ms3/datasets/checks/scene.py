@@ -1,4 +1,4 @@
-"""Checks of how a dataset was made: ``conversion.json``, the ``scene.json`` of each episode, no episode twice."""
+"""Checks of ``conversion.json``, of the ``scene.json`` of each episode, and for duplicate episodes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ STANDARD = ImageOptions(STANDARD_CAMERA_NAMES)
 
 
 def valid_values(scene: Any, file: str = schema.SCENE_FILE) -> tuple[dict[str, Any], str]:
-    """Return the usable part of a ``scene.json``, and what is wrong with the rest; missing keys are allowed."""
+    """Return the valid entries of a ``scene.json`` and a text on the invalid ones; keys may be missing."""
     if not isinstance(scene, Mapping):
         return {}, "" if scene is None else f"{file}: expected an object, found {shorten(scene)}"
     wrong = check_form(SceneRecord, fill_unknown_keys(scene), file)
@@ -29,19 +29,22 @@ def valid_values(scene: Any, file: str = schema.SCENE_FILE) -> tuple[dict[str, A
 
 
 def _usable(content: Mapping[str, Any], wrong: list[Violation]) -> dict[str, Any]:
-    spoilt = {violation.key.partition(".")[0] for violation in wrong}
-    return {key: value for key, value in content.items() if key not in spoilt}
+    invalid = {violation.key.partition(".")[0] for violation in wrong}
+    return {key: value for key, value in content.items() if key not in invalid}
 
 
 def read_settings(root: Path) -> tuple[dict[str, Any], ImageOptions, list[Violation]]:
-    """Return what is usable of ``conversion.json``, the images it promises (else all standard ones), and faults."""
+    """Return the valid entries of ``conversion.json``, its image options, and its violations.
+
+    Default image options: the standard cameras.
+    """
     absent = "this file (robocas import-robocas writes one)"
     content, wrong = read_object(root, FILE, absent=absent)
     if wrong:
         return {}, STANDARD, wrong
     version = content.get("schema_version", 1)
     if version != schema.SCHEMA_VERSION:
-        expected = f"{schema.SCHEMA_VERSION} (convert it again from its recording)"
+        expected = f"{schema.SCHEMA_VERSION} (convert the recording again)"
         return {}, STANDARD, [Violation(FILE, "schema_version", expected, str(version))]
     wrong = check_form(ConversionRecord, content, FILE)
     usable, image_options = _usable(content, wrong), STANDARD
@@ -50,31 +53,33 @@ def read_settings(root: Path) -> tuple[dict[str, Any], ImageOptions, list[Violat
         try:
             image_options = ImageOptions(tuple(content["cameras"]), size, content["depth"], content["image_format"])
         except DatasetError as error:
-            wrong.append(Violation(FILE, "", "settings of a dataset", one_line(error)))
+            wrong.append(Violation(FILE, "", "valid image options", one_line(error)))
     first: dict[str, str] = {}
     for number, entry in usable.get("episodes", {}).items():
         other = first.setdefault(str(entry.get("recording") or number), number)
         if other != number:
-            wrong.append(Violation(FILE, f"episodes.{number}", "each recording once", f"that of episode {other}"))
+            wrong.append(
+                Violation(FILE, f"episodes.{number}", "each recording once", f"the recording of episode {other}")
+            )
     return usable, image_options, wrong
 
 
 def check_entries(
     settings: Mapping[str, Any], episodes: Mapping[int, tuple[EpisodeArrays, dict[str, Any]]]
 ) -> Iterator[Violation]:
-    """Check that the settings list the episodes on disk as they are, and that no two have the same arrays."""
-    ledger = settings.get("episodes")
-    for number, entry in (ledger or {}).items():
+    """Check that the settings list the episodes on disk, and that no two episodes have the same arrays."""
+    entries = settings.get("episodes")
+    for number, entry in (entries or {}).items():
         if int(number) not in episodes:
             file = entry.get("trajectory")
-            again = f" (convert {file} again, or with --append)" if file else ""
-            yield Violation(FILE, f"episodes.{number}", "the episodes on disk", f"no folder{again}")
+            fix = f" (convert {file} again, or with --append)" if file else ""
+            yield Violation(FILE, f"episodes.{number}", "the episodes on disk", f"no folder{fix}")
     first: dict[str, str] = {}
     for number, (stored, scene) in episodes.items():
         name = schema.episode_folder(number)
-        if ledger is not None and str(number) not in ledger:
-            yield Violation(FILE, f"episodes.{number}", "an entry of every episode", "none")
-        entry, known = (ledger or {}).get(str(number), {}), valid_values(scene)[0]
+        if entries is not None and str(number) not in entries:
+            yield Violation(FILE, f"episodes.{number}", "an entry for each episode", "no entry")
+        entry, known = (entries or {}).get(str(number), {}), valid_values(scene)[0]
         for key, expected, found in (
             ("source.recording", entry.get("recording"), known.get("source", {}).get("recording")),
             ("seed", one_seed(entry.get("seed")), one_seed(known.get("seed"))),

@@ -1,4 +1,4 @@
-"""Differences between a dataset and its declared form; those of JSON files are found by their models."""
+"""Violations of the schema of a dataset, and the checks of JSON files against their models."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ _WORDS = {"int_type": "an integer", "string_type": "text", "dict_type": "an obje
 
 @dataclass(frozen=True)
 class Violation:
-    """A difference from the schema in a key of a file; no key: of the file; no file: of the dataset as a whole."""
+    """Violation of the schema by a key of a file.
+
+    An empty ``key`` stands for the file as a whole, an empty ``file`` for the dataset as a whole.
+    """
 
     file: str
     key: str
@@ -42,7 +45,7 @@ class Violation:
 def read_object(
     root: Path, name: str, model: type[BaseModel] | None = None, *, absent: str = "this file"
 ) -> tuple[dict[str, Any], list[Violation]]:
-    """Return the object in a JSON file of a dataset, empty if it can't be read, and what is wrong with it."""
+    """Return the object in a JSON file of a dataset, empty if it can't be read, and its violations."""
     try:
         content = load_json(root / name)
     except FileNotFoundError:
@@ -55,7 +58,7 @@ def read_object(
 
 
 def check_form(model: type[BaseModel], content: Mapping[str, Any], file: str) -> list[Violation]:
-    """Compare the content of a JSON file with its declared form; of each list only the first faulty item is named."""
+    """Return the violations of the model of a JSON file, one per key (the first of a list)."""
     try:
         model.model_validate(content)
     except ValidationError as error:
@@ -74,6 +77,6 @@ def check_form(model: type[BaseModel], content: Mapping[str, Any], file: str) ->
 
 
 def shorten(value: Any) -> str:
-    """Return a JSON value in at most 60 characters."""
+    """Return a JSON value as a text of at most 60 characters."""
     text = json.dumps(value, default=str)
     return text if len(text) <= 60 else text[:57] + "..."

@@ -1,1 +1,1 @@
-"""From recordings to a RoboCAS folder."""
+"""Conversion of recordings to RoboCAS folders."""

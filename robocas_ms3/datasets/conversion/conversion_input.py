@@ -1,4 +1,4 @@
-"""Opens what is converted: a trajectory file, which is rendered, or a dataset of any format, whose images are read."""
+"""Input of a conversion: a trajectory file to render, or a dataset of any format with images."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from robocas_ms3.datasets.sources.episode_source import EpisodeSource, SourceEpi
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 
 NEEDED = frozenset(spec.name for spec in schema.EPISODE_INFO if not (spec.embedding or spec.optional)) - {
-    *schema.RELATIVE_PAIRS[1][2:]  # which follow from the base poses
+    *schema.RELATIVE_PAIRS[1][2:]  # derived from the base poses
 }
 """Arrays that an episode must have to be converted."""
 _log = logging.getLogger(__name__)
@@ -32,9 +32,9 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ConversionInput:
-    """An open source, and what of it is converted: ``images`` are those that are wanted and there.
+    """Open source of a conversion, with the image options that are requested and available.
 
-    ``sizes`` has width and height of the stored images, by camera; it is empty where images are rendered.
+    ``sizes`` has width and height of the stored images by camera; it is empty if images are rendered.
     """
 
     source: EpisodeSource
@@ -43,24 +43,24 @@ class ConversionInput:
     sizes: Mapping[str, tuple[int, int]] = field(default_factory=dict)
 
     def entries(self) -> list[dict[str, Any]]:
-        """Return the recording of each episode to convert, in order, with ``source``, its number in the source."""
+        """Return the recording of each episode to convert, with its number in the source as ``source``."""
         entries = ((number, self._entry(number)) for number in self.source.numbers)
         chosen = [{"source": number, **entry} for number, entry in entries if entry is not None]
         if not chosen:
-            some = bool(self.source.numbers)
+            has_episodes = bool(self.source.numbers)
             raise DatasetError(
-                "no successful episodes to convert" if some else "no episodes to convert",
+                "no successful episodes to convert" if has_episodes else "no episodes to convert",
                 where=self.source.root,
                 found=format_count(len(self.source.numbers), "episode"),
-                fix="Pass --include-failed to convert them all the same." if some else "",
+                fix="Pass --include-failed to convert failed episodes." if has_episodes else "",
             )
         if isinstance(self.source, RenderedSource):
-            _warn_of_other_rates(self.source, chosen)
-            return _distinct(self.source, chosen)
+            _warn_unchecked_rate(self.source, chosen)
+            return _drop_duplicates(self.source, chosen)
         return chosen
 
     def _entry(self, number: int) -> dict[str, Any] | None:
-        """Return the recording of an episode, as ``conversion.json`` has it; None if it is not wanted."""
+        """Return the entry of an episode in ``conversion.json``; None if the episode is not converted."""
         known = self.source.entry(number)
         if isinstance(self.source, RenderedSource):
             return dict(known) if self.include_failed or known["success"] else None
@@ -80,14 +80,17 @@ class ConversionInput:
         }
 
     def frames(self, episode: SourceEpisode) -> Generator[StepImages, None, None]:
-        """Yield the images of every step; close the generator unless it is read to the end."""
+        """Yield the images of each step; close the generator if it is not exhausted."""
         with closing(episode.images(self.image_options)) as frames:
             for step, frame in enumerate(frames):
                 for kind, images in (("rgb", frame.rgb), ("depth", frame.depth)) if self.sizes else ():
                     for camera, image in images.items():
                         expected, found = (f"{w} x {h}" for w, h in (self.sizes[camera], _size(image)))
                         if found != expected:
-                            what, where = "not of the dataset's size", f"{episode.where}, {camera}/{kind}, step {step}"
+                            what, where = (
+                                "this image has another size than the dataset",
+                                f"{episode.where}, {camera}/{kind}, step {step}",
+                            )
                             raise DatasetError(what, where=where, expected=expected, found=found, fix=SEE_VALIDATE)
                 yield frame
 
@@ -96,6 +99,7 @@ class ConversionInput:
 
 
 def open_input(settings: ConversionSettings) -> ConversionInput:
+    """Open the source of a conversion; raise DatasetError for unknown cameras or another image size."""
     if settings.is_trajectory:
         rendered = open_trajectory(settings)
         return ConversionInput(rendered, rendered.image_options, settings.include_failed)
@@ -106,7 +110,7 @@ def open_input(settings: ConversionSettings) -> ConversionInput:
     different = sorted(set(sizes.values()))
     size = different[0] if len(different) == 1 else None
     if wanted.size not in (None, size):
-        what, fix = "a dataset keeps the size of its images", "Convert the trajectory with this size."
+        what, fix = "the images of a dataset can't be resized", "Convert the trajectory file with this --size."
         expected = ", ".join(f"{width} x {height}" for width, height in different)
         raise DatasetError(what, where=source.root, expected=expected, found=list(wanted.size or ()), fix=fix)
     image_options = replace(image_options, size=size, depth=wanted.depth and source.has_depth)
@@ -114,6 +118,7 @@ def open_input(settings: ConversionSettings) -> ConversionInput:
 
 
 def open_trajectory(settings: ConversionSettings) -> RenderedSource:
+    """Open a trajectory file whose episodes are rendered."""
     return RenderedSource(
         settings.source,
         rate_hz=settings.rate_hz,
@@ -124,21 +129,21 @@ def open_trajectory(settings: ConversionSettings) -> RenderedSource:
 
 
 def require_complete_arrays(episode: SourceEpisode) -> dict[str, NDArray]:
-    """Return the arrays of an episode, or raise DatasetError if it lacks any that it must have."""
+    """Return the arrays of an episode; raise DatasetError if required arrays are missing or damaged."""
     try:
         arrays = episode.arrays
     except DAMAGED_FILE_ERRORS as error:
-        what, found = "these arrays can't be read", one_line(error)
+        what, found = "the arrays can't be read", one_line(error)
         raise DatasetError(what, where=episode.where, found=found, fix=SEE_VALIDATE) from error
     missing, lengths = sorted(NEEDED - set(arrays)), set()
     for key in sorted(NEEDED & set(arrays)):
         if arrays[key].dtype.kind == "f" and not np.isfinite(arrays[key]).all():
             where = f"{episode.where}/{schema.EPISODE_FILE}, {key}"
-            raise DatasetError("this array holds NaN or infinity", where=where, fix=SEE_VALIDATE)
+            raise DatasetError("NaN or infinite value in this array", where=where, fix=SEE_VALIDATE)
         lengths |= {len(arrays[key])} if arrays[key].ndim else set()
     if missing or lengths != {episode.steps}:
         found = f"no {', '.join(missing)}" if missing else f"lengths {sorted(lengths)}"
-        raise DatasetError("this episode is not complete", where=episode.where, found=found, fix=SEE_VALIDATE)
+        raise DatasetError("this episode is incomplete", where=episode.where, found=found, fix=SEE_VALIDATE)
     return arrays
 
 
@@ -146,23 +151,23 @@ def _size(image: NDArray) -> tuple[int, int]:
     return image.shape[1], image.shape[0]
 
 
-def _distinct(source: EpisodeSource, entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the first entry of each recording; those that can't be read count as different."""
+def _drop_duplicates(source: EpisodeSource, entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the first entry of each recording; recordings that can't be read count as different."""
     first = {entry["recording"]: entry for entry in reversed(entries)}
-    once = [entry for entry in entries if entry["recording"] is None or first[entry["recording"]] is entry]
-    if len(once) < len(entries):
-        again = [str(entry["trajectory_episode"]) for entry in entries if entry not in once]
-        _log.warning("%s: the same recordings again, left out: %s", source.root, ", ".join(again))
-    return once
+    distinct = [entry for entry in entries if entry["recording"] is None or first[entry["recording"]] is entry]
+    if len(distinct) < len(entries):
+        duplicates = [str(entry["trajectory_episode"]) for entry in entries if entry not in distinct]
+        _log.warning("%s: skipped duplicate recordings: episodes %s", source.root, ", ".join(duplicates))
+    return distinct
 
 
-def _warn_of_other_rates(source: RenderedSource, entries: list[dict[str, Any]]) -> None:
+def _warn_unchecked_rate(source: RenderedSource, entries: list[dict[str, Any]]) -> None:
     recorded = [source.file.episodes[entry["source"]].get("robocas") for entry in entries]
     checked = [one.get("check_rate") for one in recorded if isinstance(one, dict)]
-    rates = {float(rate) for rate in checked if isinstance(rate, int | float) and rate}  # others are not checked
+    rates = {float(rate) for rate in checked if isinstance(rate, int | float) and rate}
     others = sorted(rate for rate in rates if abs(rate - source.rate_hz) > 1e-9)
     if others:
         _log.warning(
-            "actions were tried at %s Hz; at %g Hz they were not: robocas validate --replay tells (of RoboCAS folders)",
+            "the open-loop check of the recording used %s Hz, not %g Hz: run robocas validate --replay on the dataset",
             *(" and ".join(f"{rate:g}" for rate in others), source.rate_hz),
         )

@@ -1,4 +1,4 @@
-"""Convert a ManiSkill trajectory to a RoboCAS dataset."""
+"""Convert a trajectory file to a RoboCAS folder."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from robocas_ms3.datasets.images.video import MAX_PREVIEWS, finish_previews, she
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.demos.recordings.trajectory_json import versions
 
-_FIX = "The dataset is complete without, and valid; the same command tries again, --skip-errors takes it as it is."
+_FIX = "The dataset of the other episodes is valid. Run the same command to retry, or pass --skip-errors."
 _log = logging.getLogger(__name__)
 
 
@@ -46,20 +46,20 @@ def convert(
     on_start: Callable[[int], None] | None = None,
     on_episode: Callable[[WrittenEpisode], None] | None = None,
 ) -> Conversion:
-    """Write a RoboCAS dataset from a trajectory file. A ``failures.jsonl`` in the file's folder is copied.
+    """Write a RoboCAS folder from a trajectory file.
 
-    Called again after a kill at any moment, it continues, with the same result.
-    An episode that can't be written does not end the others: at the end there is a dataset of the others, and an error.
-    ``on_start`` is called with the number of episodes to write, ``on_episode`` after each.
+    A ``failures.jsonl`` in the folder of the trajectory file is copied. The same call continues an interrupted
+    conversion, with the same result. If an episode can't be written, all others are written before the error is raised.
+    ``on_start`` is called with the number of episodes to write, ``on_episode`` after each episode.
 
     Raises:
-        DatasetError: the input is unusable, nothing to convert, no render device.
-        IncompleteDatasetError: episodes can't be written; the dataset is complete without, ``left_out`` in its
-            ``conversion.json`` says why, and the same call tries again.
-        OutputExistsError: ``out`` is no dataset, or one of other settings or versions, or, without ``append``, of other
+        DatasetError: the input is damaged or has no episodes to convert, or there is no render device.
+        IncompleteDatasetError: some episodes can't be written. The dataset of the others is valid, ``skipped`` in
+            ``conversion.json`` has the reasons, and the same call tries the missing episodes again.
+        OutputExistsError: ``out`` is not a dataset, has other settings or versions, or, without ``append``, other
             recordings.
-        RobocasError: another conversion is running.
-        MissingExtraError: embeddings are wanted and the ``language`` extra is not installed.
+        RobocasError: another conversion writes to ``out``.
+        MissingExtraError: embeddings are requested and the extra ``language`` is not installed.
     """
     start, out = time.perf_counter(), settings.out
     with ExitStack() as stack:
@@ -68,17 +68,17 @@ def convert(
         stored = dataset_settings(source.rate_hz, image_options, settings.embeddings)
         recorded = {**stored, "made_with": versions()}
         output = stack.enter_context(OutputFolder(out, DATASET, recorded, overwrite=settings.overwrite))
-        # Everything that may fail comes before the output is touched.
+        # Everything that may fail runs before the output changes.
         entries = ConversionInput(source, image_options, settings.include_failed).entries()
         content, tasks = plan_episodes(output, entries, stored, append=settings.append)
         settings.check_device()
         embed = partial(_look_up, embed_texts(source, entries)) if settings.embeddings else None
         output.start(content)
         remove_leftovers(out / schema.PREVIEW_FOLDER)
-        before = _split_before(out)
+        previous = _previous_split(out)
         for folder in (out / schema.episode_folder(number) for number, _ in tasks):
             if folder.is_dir() and (path := find_damaged(folder, image_options)):
-                _log.warning("%s: cut off, or gone, since it was written; its episode is written again", path)
+                _log.warning("%s is missing or truncated; its episode is written again", path)
                 shutil.rmtree(folder)
         missing = [task for task in tasks if not (out / schema.episode_folder(task[0])).is_dir()]
         if on_start:
@@ -91,11 +91,11 @@ def convert(
             written, incomplete = write_episodes(job, output, on_episode)
         finally:
             for folder in (out, out / schema.PREVIEW_FOLDER):
-                remove_leftovers(folder)  # left by workers that died; others wrote it again
+                remove_leftovers(folder)  # of workers that crashed
         if incomplete:
             write_json(out / schema.CONVERSION_FILE, remove_unwritten(out, content, incomplete.reasons))
         add_failures(settings.source.parent, out, source.file.env_info)
-        write_info(out, planned_split(content, before))
+        write_info(out, planned_split(content, previous))
         if sheet is not None:
             rows = {episode.number: episode.row for episode in written if episode.row is not None}
             finish_previews(Dataset(out), rows)
@@ -103,23 +103,24 @@ def convert(
             raise incomplete
         if incomplete:
             _log.warning("%s", incomplete)
-        if left := missing_episodes(out, content):
-            _log.warning("%s: %s are still missing: convert that with --append", out, " and ".join(left))
+        if missing_names := missing_episodes(out, content):
+            _log.warning("%s: %s are missing; convert them with --append", out, " and ".join(missing_names))
     return Conversion(written, len(tasks) - len(missing), time.perf_counter() - start, previews=sheet is not None)
 
 
-def _split_before(out: Path) -> tuple[list[int], list[int]]:
+def _previous_split(out: Path) -> tuple[list[int], list[int]]:
     if not (out / schema.DATA_INFO_FILE).is_file():
         return [], []
     try:
         return Dataset(out).splits
     except DatasetError as error:
-        fix = "Delete it, and it is made anew; where there was an --append, episodes may change sides."
+        fix = "Delete the file to split again; after an --append, episodes may move between training and validation."
         where = out / schema.DATA_INFO_FILE
         raise DatasetError("the split can't be read", where=where, found=error.found, fix=fix) from error
 
 
 def embed_texts(source: RenderedSource, entries: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return the embedding (384,) of each instruction and sub-goal text of some episodes, by text."""
     from robocas_ms3.scenes.language.embed import TextEmbedder
 
     embedder = TextEmbedder()
@@ -132,7 +133,7 @@ def _look_up(vectors: dict[str, Any], texts: list[str]) -> NDArray[np.float32]:
 
 
 def _texts(source: RenderedSource, number: int) -> list[str]:
-    """Return the texts of an episode; none if it can't be read, which is an error when it is written."""
+    """Return the texts of an episode; none if it can't be read (writing it raises the error)."""
     try:
         return source.texts(number)
     except DatasetError:

@@ -1,4 +1,4 @@
-"""Overviews of a RoboCAS folder: ``data_info.json``, which has the split, and ``failures.jsonl``."""
+"""Overview files of a RoboCAS folder: ``data_info.json``, which has the split, and ``failures.jsonl``."""
 
 from __future__ import annotations
 
@@ -27,12 +27,13 @@ from robocas_ms3.demos.recordings.subgoals import subgoal_runs
 _NEEDED = ("episode_length", "language_goal", "step_goal_type", "step_lang_goals", "rel_pos", "rel_orn")
 
 
-def write_info(root: Path, before: tuple[Iterable[int], Iterable[int]] = ((), ())) -> None:
-    write_json(root / schema.DATA_INFO_FILE, build_info(root, before))
+def write_info(root: Path, previous: tuple[Iterable[int], Iterable[int]] = ((), ())) -> None:
+    """Write ``data_info.json`` of the episodes on disk; see `build_info`."""
+    write_json(root / schema.DATA_INFO_FILE, build_info(root, previous))
 
 
-def build_info(root: Path, before: tuple[Iterable[int], Iterable[int]] = ((), ())) -> dict[str, Any]:
-    """Return ``data_info.json``; ``before``: both sides so far, see `split_by_seed`."""
+def build_info(root: Path, previous: tuple[Iterable[int], Iterable[int]] = ((), ())) -> dict[str, Any]:
+    """Return the content of ``data_info.json``; ``previous`` is the current split, see `split_by_seed`."""
     dataset = Dataset(root)
     seeds, lengths, instructions, goals = {}, {}, {}, {}
     positions, orientations = [], []
@@ -42,7 +43,7 @@ def build_info(root: Path, before: tuple[Iterable[int], Iterable[int]] = ((), ()
         arrays = read_arrays(path, _NEEDED).needed(_NEEDED)
         for key in ("rel_pos", "rel_orn"):
             if not np.isfinite(arrays[key]).all():
-                what, expected = "this episode's motion is no numbers", "finite numbers"
+                what, expected = "NaN or infinite value in the motion of this episode", "finite numbers"
                 raise DatasetError(what, where=f"{path}, {key}", expected=expected, fix=SEE_VALIDATE)
         seeds[number] = episode.scene.get("seed")
         lengths[str(number)] = int(arrays["episode_length"])
@@ -51,7 +52,7 @@ def build_info(root: Path, before: tuple[Iterable[int], Iterable[int]] = ((), ()
         goals[str(number)] = [goal.model_dump() for goal in runs]
         positions.append(arrays["rel_pos"])
         orientations.append(arrays["rel_orn"])
-    train, val = split_by_seed(seeds, before)
+    train, val = split_by_seed(seeds, previous)
     info: dict[str, Any] = {
         "train_eps": train,
         "val_eps": val,
@@ -62,22 +63,24 @@ def build_info(root: Path, before: tuple[Iterable[int], Iterable[int]] = ((), ()
     try:
         info["action_space"] = action_space(positions, orientations)
         DataInfoRecord.model_validate(info)
-    except (ValueError, IndexError) as error:  # quaternions of length 0; no episode of two steps
+    except (ValueError, IndexError) as error:  # a quaternion of length 0, or no episode with two steps
         where = f"{root / schema.DATA_INFO_FILE}, action_space"
         found = one_line(error)
-        raise DatasetError("the motion has no range", where=where, found=found, fix=SEE_VALIDATE) from error
+        raise DatasetError(
+            "the range of actions can't be computed", where=where, found=found, fix=SEE_VALIDATE
+        ) from error
     return info
 
 
 def add_failures(run: Path, out: Path, env_info: Mapping[str, Any]) -> None:
-    """Add the failures of the run in a folder to a dataset, each once, with task and environment."""
+    """Add the failures of a run to a dataset, each once, with the task and environment of the run."""
     made_in = {"task": task_of(str(env_info.get("env_id"))), "environment": environment_id(env_info)}
     there: JsonLinesFile[dict[str, Any]] = JsonLinesFile(out / FAILURES_FILE, dict[str, Any])
     failures: JsonLinesFile[dict[str, Any]] = JsonLinesFile(run / FAILURES_FILE, dict[str, Any])
     known = {_key(line) for line in there.read()}
     marked = ((line, {**line, **made_in}) for line in failures.read())
     new = [line for before, line in marked if not {_key(before), _key(line)} & known]
-    if new:  # rewritten, as the file may be linked from another dataset
+    if new:  # rewritten, because the file may be hard-linked from another dataset
         there.rewrite([*there.read(), *new])
 
 

@@ -1,4 +1,4 @@
-"""Renders recorded states with ManiSkill's cameras: the scene is rebuilt from its seed, physics never steps."""
+"""Render recorded states with the cameras of ManiSkill in the scene of the seed, without physics."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _SAME_PLACE = 1e-3  # m
 
 
 class EnvRenderer:
-    """Renders recorded states, with all images or some, in the environment that recorded them."""
+    """Renderer of recorded states in the environment that recorded them, for the requested images."""
 
     def __init__(self, env: RecordedEnv, control_mode: str, image_options: ImageOptions | None = None) -> None:
         sensors = dict(env.kwargs.get("sensor_configs") or {})
@@ -47,32 +47,34 @@ class EnvRenderer:
         self.env.close()
 
     def load(self, recording: Recording) -> None:
+        """Build the scene of a recording; raise DatasetError if it differs from the recorded scene."""
         self.env.reset(seed=recording.seed, options=dict(recording.reset_options))
         for name in set(self._base._sensors) - set(self._image_options.cameras):
-            del self._base._sensors[name]  # they are made anew at each reset; what is there is rendered
+            del self._base._sensors[name]  # made again at each reset; all remaining sensors are rendered
         self._check_scene(recording)
 
     def _check_scene(self, recording: Recording) -> None:
 
         def refuse(name: str, expected: object, found: object) -> None:
             where = f"episode {recording.episode_id}, seed {recording.seed}{f', {name}' if name else ''}"
-            what, fix = "the seed builds another scene", "Use the pack, configuration and versions of the recording."
+            what, fix = "the rebuilt scene differs", "Use the pack, configuration and versions of the recording."
             raise DatasetError(what, where=where, expected=expected, found=found, fix=fix)
 
         built = self._base.get_state_dict()
         for kind in ("actors", "articulations"):
-            mine, theirs = set(built.get(kind, {})), set(recording.states.get(kind, {}))
-            if mine != theirs:
-                refuse("", sorted(theirs), sorted(mine))
+            rebuilt, recorded = set(built.get(kind, {})), set(recording.states.get(kind, {}))
+            if rebuilt != recorded:
+                refuse("", sorted(recorded), sorted(rebuilt))
         for name, states in () if recording.is_intervention else recording.states.get("actors", {}).items():
             distance = float(np.linalg.norm(built["actors"][name][0, :3].cpu().numpy() - states[0, :3]))
             if distance > _SAME_PLACE:
-                refuse(name, "the recorded place", f"{distance * 1000:.1f} mm away")
+                refuse(name, "the recorded position", f"{distance * 1000:.1f} mm off")
         instruction = self._base.get_language_instruction()[0]
         if instruction != recording.instruction:
             refuse("", recording.instruction, instruction)
 
     def frames(self, recording: Recording, samples: NDArray[np.int64]) -> Iterator[StepImages]:
+        """Yield the images of some states of the loaded recording, by index."""
         for index in samples:
             yield self._frame(recording.state(int(index)))
 
@@ -90,13 +92,14 @@ class EnvRenderer:
         )
 
     def _boxes(self, textures: dict[str, Any], shaders: dict[str, ShaderConfig]) -> dict[str, Box]:
-        """Return the box of the target's visible pixels in the cameras that see it."""
+        """Return the bounding box of the visible pixels of the target, by the cameras that see it."""
         slot = int(self._base.target_slot[0])
         number = int(self._base.scene.actors[f"object_{slot}"].per_scene_id[0])
         masks = {name: _segmentation_of(textures[name], shader) == number for name, shader in shaders.items()}
         return {name: box for name, mask in masks.items() if (box := bounding_box(mask)) is not None}
 
     def cameras(self) -> dict[str, CameraModel]:
+        """Return intrinsics and poses of the rendered cameras, by name."""
         agent = self._base.agent
         parents = {"ee": agent.tcp.pose, "arm_base": agent.arm_base_link.pose}
         models = {}
@@ -115,6 +118,7 @@ class EnvRenderer:
         return models
 
     def scene(self) -> dict[str, Any]:
+        """Return task, configuration, layout and objects of the scene, as in ``scene.json``."""
         env = self._base
         layout = env.layout()
         return {
@@ -143,12 +147,13 @@ def _numbers(pose: NDArray[np.float64]) -> list[float]:
 
 
 def require_renderer() -> None:
+    """Raise DatasetError if there is no render device."""
     import sapien
 
     try:
-        sapien.render.RenderMaterial()  # the cheapest thing that needs the device
+        sapien.render.RenderMaterial()  # cheapest call that needs the device
     except RuntimeError as error:
-        fix = "Run scripts/setup.sh or install a Vulkan driver; robocas doctor says more."
+        fix = "Run scripts/setup.sh or install a Vulkan driver; robocas doctor shows details."
         raise DatasetError("no render device", fix=fix) from error
 
 
@@ -161,14 +166,14 @@ def _rgb_of(textures: dict[str, torch.Tensor], shader: ShaderConfig) -> NDArray[
 
 
 def _depth_of(textures: dict[str, torch.Tensor], shader: ShaderConfig) -> NDArray[np.uint16]:
-    """Return depth (H, W) in mm; nothing, or something behind the camera, is 0."""
+    """Return depth (H, W) in mm; 0 = no surface in front of the camera."""
     name = next(name for name, kinds in shader.texture_names.items() if "depth" in kinds)
     depth = shader.texture_transforms[name](textures[name])["depth"][0, ..., 0]  # int16
     return depth.clamp(min=0).cpu().numpy().astype(np.uint16)
 
 
 def _segmentation_of(textures: dict[str, torch.Tensor], shader: ShaderConfig) -> NDArray[np.int16]:
-    """Return the number of the actor or link in each pixel (H, W), 0 = none."""
+    """Return the scene id of the actor or link in each pixel (H, W), 0 = none."""
     name = next(name for name, kinds in shader.texture_names.items() if "segmentation" in kinds)
     return shader.texture_transforms[name](textures[name])["segmentation"][0, ..., 0].cpu().numpy()
 

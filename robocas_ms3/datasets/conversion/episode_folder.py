@@ -1,4 +1,4 @@
-"""Writes the folder of an episode: images while they are rendered, the rest at the end."""
+"""Writer of episode folders: images are written while they are rendered, other files at the end."""
 
 from __future__ import annotations
 
@@ -26,13 +26,16 @@ from robocas_ms3.datasets.images.video import open_preview
 from robocas_ms3.datasets.sources.arrays import add_embeddings, read_arrays
 from robocas_ms3.datasets.sources.episode_source import CameraModel, StepImages
 
-ENCODERS = 2  # threads; ISA-L and OpenCV work outside Python's lock
-_MAX_WAITING = 24  # images, which bounds memory
+ENCODERS = 2  # threads; libdeflate and OpenCV release the GIL
+_MAX_WAITING = 24  # images, to bound memory
 
 
 @dataclass(frozen=True)
 class FolderWriter(EpisodeWriter):
-    """Writes episodes of a RoboCAS folder; with a ``sheet`` of episodes also their previews."""
+    """Writer of the episodes of a RoboCAS folder.
+
+    ``sheet`` has the numbers of the episodes on the contact sheet; None: no previews are written.
+    """
 
     out: Path
     embed: Callable[[list[str]], NDArray[np.float32]] | None = None
@@ -71,7 +74,7 @@ class FolderWriter(EpisodeWriter):
 def write_episode_files(
     folder: Path, arrays: dict[str, NDArray], cameras: Mapping[str, CameraModel], scene: Mapping[str, Any]
 ) -> None:
-    """Write all of an episode but its images."""
+    """Write the arrays, camera files and ``scene.json`` of an episode."""
     for camera, model in cameras.items():
         np.save(folder / camera / schema.INTRINSIC_FILE, model.intrinsic)
         for name in schema.pose_files(model.parent):
@@ -83,7 +86,7 @@ def write_episode_files(
 
 @contextmanager
 def _encoder(threads: int = ENCODERS) -> Generator[Callable[..., None], None, None]:
-    """Give a function that calls others in threads, while the next state renders; it waits if too many are waiting."""
+    """Give a function that runs calls in threads; it blocks while too many calls are waiting."""
     waiting: deque[Future[Any]] = deque()
 
     def collect(limit: int) -> None:
@@ -103,7 +106,7 @@ def _encoder(threads: int = ENCODERS) -> Generator[Callable[..., None], None, No
 
 
 def find_damaged(folder: Path, image_options: ImageOptions) -> Path | None:
-    """Return the first file of an episode that is missing or lacks its end, as one that was cut off does."""
+    """Return the first missing or truncated file of an episode, None if all are complete."""
     steps = read_arrays(folder / schema.EPISODE_FILE, ("episode_length",)).arrays.get("episode_length")
     if steps is None or steps.ndim:
         return folder / schema.EPISODE_FILE
@@ -113,6 +116,6 @@ def find_damaged(folder: Path, image_options: ImageOptions) -> Path | None:
         *check_cameras(folder, image_options),
         *check_images(folder, image_options, int(steps), {}, check_ends),
     ):
-        if wrong.kind != "unexpected" and not (root / wrong.file).is_dir():  # the folder of a camera too many
+        if wrong.kind != "unexpected" and not (root / wrong.file).is_dir():  # folder of an unexpected camera
             return root / wrong.file
     return None

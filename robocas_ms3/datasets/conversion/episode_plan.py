@@ -1,6 +1,6 @@
-"""``conversion.json``: the settings of a dataset, and which recording becomes which episode.
+"""``conversion.json``: the settings of a dataset, and the recording of each episode.
 
-It is written before the first episode, so that a conversion that was killed continues with the same numbers.
+The file is written before the first episode, so that an interrupted conversion continues with the same numbers.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from robocas_ms3.datasets.sources.split import SPLIT_RULE, split_by_seed
 from robocas_ms3.demos.recordings.trajectory_json import versions
 
 Entries = Sequence[dict[str, Any]]
-"""See `inputs.ConversionInput.entries`."""
+"""See `conversion_input.ConversionInput.entries`."""
 SETTINGS = tuple(SettingsRecord.model_fields)
 """Keys of the settings."""
-SKIPPED = "left_out"
-"""Key of the episodes that could not be written, each with ``why``; a continued conversion tries them again."""
+SKIPPED = "skipped"
+"""Key of the episodes that could not be written, each with a ``reason``; a continued conversion tries them again."""
 MARKS = (schema.CONVERSION_FILE, schema.DATA_INFO_FILE)
-"""A folder with one of these is a RoboCAS dataset, whole or not."""
+"""Files that mark a folder as a RoboCAS dataset, complete or not."""
 
 
 def add_versions(record: dict[str, Any]) -> dict[str, Any]:
-    """Return a record with the versions of today if it does not name them all, as that of merged datasets."""
+    """Return a record with the current versions if some are missing, as in merged datasets."""
     now, made_with = versions(), record.get("made_with")
     is_whole = isinstance(made_with, dict) and now.keys() <= made_with.keys()
     return record if is_whole else {**record, "made_with": now}
@@ -41,6 +41,7 @@ DATASET = FolderKind("robocas convert", (schema.CONVERSION_FILE,), "rate_hz", ma
 
 
 def dataset_settings(rate_hz: float, image_options: ImageOptions, embeddings: bool) -> dict[str, Any]:
+    """Return the settings of a dataset, as in ``conversion.json``."""
     settings = SettingsRecord(
         rate_hz=float(rate_hz),
         cameras=list(image_options.cameras),
@@ -53,6 +54,7 @@ def dataset_settings(rate_hz: float, image_options: ImageOptions, embeddings: bo
 
 
 def header(settings: Mapping[str, Any], split_rule: str = SPLIT_RULE) -> dict[str, Any]:
+    """Return ``conversion.json`` without the episodes."""
     version = {"format": "robocas", "schema_version": schema.SCHEMA_VERSION, "made_with": versions()}
     return {**version, **settings, "split": split_rule}
 
@@ -60,9 +62,10 @@ def header(settings: Mapping[str, Any], split_rule: str = SPLIT_RULE) -> dict[st
 def plan_episodes(
     output: OutputFolder, entries: Entries, settings: dict[str, Any], *, append: bool
 ) -> tuple[dict[str, Any], list[tuple[int, int]]]:
-    """Number the episodes of a source: as recorded, new ones, which ``append`` allows, after those of the dataset.
+    """Assign dataset numbers to the episodes of a source; known recordings keep theirs.
 
-    Return ``conversion.json``, and (number in the dataset, number in the source) of each episode, written or not.
+    ``append`` allows new recordings, which are numbered after the existing ones. Return ``conversion.json``, and
+    (number in the dataset, number in the source) of each episode, written or not.
     """
     path, content = output.path / schema.CONVERSION_FILE, output.recorded
     if content is None:
@@ -72,54 +75,54 @@ def plan_episodes(
     else:
         schema.check_version(content.get("schema_version", 1), path)
         parse(ConversionRecord, content, DatasetError, where=path)
-    episodes, left_out = dict(content.get("episodes", {})), dict(content.get(SKIPPED, {}))
+    episodes, skipped = dict(content.get("episodes", {})), dict(content.get(SKIPPED, {}))
     planned = {entry["recording"]: number for number, entry in episodes.items() if entry.get("recording")}
     unread = {number: entry for number, entry in episodes.items() if not entry.get("recording")}
-    again = {_place(entry): number for number, entry in {**unread, **left_out}.items()}
-    first_new = max(map(int, [*episodes, *left_out]), default=-1) + 1
+    again = {_place(entry): number for number, entry in {**unread, **skipped}.items()}
+    first_new = max(map(int, [*episodes, *skipped]), default=-1) + 1
     tasks, new = [], 0
     for entry in entries:
         number = planned.get(entry["recording"]) or again.get(_place(entry))
         if number is None:
             number, new = str(first_new + new), new + 1
         if number not in episodes or number in unread:
-            left_out.pop(number, None)
+            skipped.pop(number, None)
             episodes[number] = {key: value for key, value in entry.items() if key != "source"}
         tasks.append((int(number), entry["source"]))
     if new and output.recorded is not None and not append:
-        found, fix = f"{new} of {len(entries)} are new", "Pass --append to add them, --overwrite to start again."
-        raise OutputExistsError("a dataset of other recordings", where=path, found=found, fix=fix)
-    return json.loads(json.dumps(_content(content, episodes, left_out))), tasks
+        found, fix = f"{new} of {len(entries)} are new", "Pass --append to add them, or --overwrite to start again."
+        raise OutputExistsError("this dataset has other recordings", where=path, found=found, fix=fix)
+    return json.loads(json.dumps(_content(content, episodes, skipped))), tasks
 
 
 def remove_unwritten(out: Path, content: Mapping[str, Any], reasons: Mapping[str, str]) -> dict[str, Any]:
-    """Return ``conversion.json`` without the episodes that could not be written; reasons by name of their folder."""
-    episodes, left_out = dict(content["episodes"]), dict(content.get(SKIPPED, {}))
-    for folder, why in reasons.items():
+    """Return ``conversion.json`` with unwritten episodes under ``skipped``; reasons by episode folder."""
+    episodes, skipped = dict(content["episodes"]), dict(content.get(SKIPPED, {}))
+    for folder, reason in reasons.items():
         if not (out / folder).is_dir():
             number = str(schema.episode_number(folder))
-            left_out[number] = {**episodes.pop(number), "why": why}
-    return _content(content, episodes, left_out)
+            skipped[number] = {**episodes.pop(number), "reason": reason}
+    return _content(content, episodes, skipped)
 
 
-def _content(content: Mapping[str, Any], episodes: Mapping[str, Any], left_out: Mapping[str, Any]) -> dict[str, Any]:
-    lists = {"episodes": episodes, **({SKIPPED: left_out} if left_out else {})}
+def _content(content: Mapping[str, Any], episodes: Mapping[str, Any], skipped: Mapping[str, Any]) -> dict[str, Any]:
+    lists = {"episodes": episodes, **({SKIPPED: skipped} if skipped else {})}
     in_order = {key: {number: entries[number] for number in sorted(entries, key=int)} for key, entries in lists.items()}
     return {key: value for key, value in content.items() if key not in ("episodes", SKIPPED)} | in_order
 
 
 def _place(entry: Mapping[str, Any]) -> str:
-    """Return what distinguishes recordings that may have been unreadable."""
+    """Return a key that identifies a recording without a fingerprint."""
     return json.dumps([entry.get(key) for key in ("trajectory", "trajectory_episode", "seed")])
 
 
-def planned_split(content: Mapping[str, Any], before: tuple[list[int], list[int]]) -> tuple[list[int], list[int]]:
-    """Return the split of all planned episodes, so that missing ones change the side of no other."""
-    return split_by_seed({int(number): entry.get("seed") for number, entry in content["episodes"].items()}, before)
+def planned_split(content: Mapping[str, Any], previous: tuple[list[int], list[int]]) -> tuple[list[int], list[int]]:
+    """Return the split of all planned episodes, so that it does not depend on missing episodes."""
+    return split_by_seed({int(number): entry.get("seed") for number, entry in content["episodes"].items()}, previous)
 
 
 def missing_episodes(out: Path, content: Mapping[str, Any]) -> list[str]:
-    """Return which planned episodes are not there, one text per trajectory: ``episodes 4-6 of select.h5``."""
+    """Return the missing episodes, one text per trajectory: ``episodes 4-6 of select.h5``."""
     missing: dict[str, list[int]] = {}
     for number, entry in content["episodes"].items():
         if not (out / schema.episode_folder(int(number))).is_dir():

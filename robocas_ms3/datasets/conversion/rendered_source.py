@@ -1,4 +1,4 @@
-"""Renders the recordings of a trajectory file: an episode source whose episodes have images."""
+"""Episode source that renders the recordings of a trajectory file."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def open_env(env: RecordedEnv, control_mode: str, image_options: ImageOptions) -
 
 
 class RenderedSource(TrajectorySource):
-    """A trajectory file whose episodes, failed ones included, are rendered. The environment is made once."""
+    """Trajectory file whose episodes, including failed ones, are rendered in one environment."""
 
     def __init__(
         self,
@@ -50,11 +50,11 @@ class RenderedSource(TrajectorySource):
         self._control_mode = ""
 
     def switch_file(self, path: Path) -> None:
-        """Read another file of the same environment, which stays open."""
+        """Read another file of the same environment; the environment stays open."""
         env, control_freq = self.file.env, self.file.control_freq
         with TrajectoryFile(path, pack=self._pack) as file:
             if (file.env, file.control_freq) != (env, control_freq):
-                raise DatasetError("this file is of another environment", where=path, expected=self.root)
+                raise DatasetError("this file was recorded in another environment", where=path, expected=self.root)
         super().__init__(path, rate_hz=self.rate_hz, include_failed=True, pack=self._pack)
 
     def entry(self, number: int) -> dict[str, Any]:
@@ -74,7 +74,9 @@ class RenderedSource(TrajectorySource):
         samples = sample_states(recording.control_steps, self.stride)
         if len(samples) > schema.MAX_STEPS:
             where = f"episode {recording.episode_id}"
-            raise DatasetError("too many steps", where=where, expected=f"<= {schema.MAX_STEPS}", found=len(samples))
+            raise DatasetError(
+                "too many steps", where=where, expected=f"at most {schema.MAX_STEPS}", found=len(samples)
+            )
         if self._renderer is None or recording.control_mode != self._control_mode:
             self.close()
             self._renderer = self._open_renderer(self.file.env, recording.control_mode, self.image_options)
@@ -89,7 +91,7 @@ class RenderedSource(TrajectorySource):
 
 
 class RenderedEpisode(RecordedEpisode):
-    """An episode of a `RenderedSource`: its images are rendered once, in order; camera models follow after that."""
+    """Episode of a `RenderedSource`; ask for camera models after the images were rendered."""
 
     def __init__(self, source: RenderedSource, number: int, recording: Recording, renderer: EnvRenderer) -> None:
         super().__init__(source, number)

@@ -1,4 +1,4 @@
-"""Settings of a conversion, which are the options of `robocas convert`, and its result. Loads no simulator."""
+"""Settings of a conversion, which are the options of ``robocas convert``, and its result."""
 
 from __future__ import annotations
 
@@ -19,79 +19,90 @@ if TYPE_CHECKING:
     from robocas_ms3.core.workers import Limits
     from robocas_ms3.datasets.images.image_files import ImageOptions
 
-_NO_HINT = tyro.conf.arg(help_behavior_hint="")  # the help text says what the default is
+_NO_HINT = tyro.conf.arg(help_behavior_hint="")  # the help text states the default
 
 
 @dataclass(frozen=True)
 class ConversionSettings:
-    """Render a trajectory file of `robocas generate` into a dataset, or turn a RoboCAS dataset into a LeRobot dataset.
+    """Convert a trajectory file to a dataset, or a RoboCAS dataset to a LeRobot dataset.
 
     Example: robocas convert demos/pick/trajectory.h5 --out datasets/pick --jobs 2
     """
 
     source: Annotated[Path, tyro.conf.Positional]
-    """F.h5, with F.json next to it. With --to lerobot also the folder of a RoboCAS dataset, whose images are used."""
+    """Trajectory file F.h5 (with F.json next to it). With --to lerobot also the folder of a dataset with images."""
     out: Path
-    """Folder of the dataset."""
+    """Output folder of the dataset."""
     to: str = "robocas"
-    """Format of the dataset: robocas, lerobot (needs the extra 'lerobot'), or one of another package."""
+    """Output format: robocas, lerobot (needs the extra 'lerobot'), or a format of another package."""
     lerobot_version: Version = NEWEST
-    """Reader of the LeRobot dataset. 0.6: LeRobot 0.6 and later (format v3.0, language columns, depth as video);
+    """LeRobot version that reads the dataset. 0.6: LeRobot 0.6 and later (format v3.0, language columns, depth as video);
     0.5: LeRobot 0.4.4 to 0.5.1 (v3.0, subtask_index); 2.1: readers of format v2.1, such as openpi and GR00T."""
     codec: Literal["h264", "av1"] = "h264"
-    """Codec of the videos of a LeRobot dataset; AV1 takes half the space."""
+    """Video codec of a LeRobot dataset; av1 needs half the disk space of h264."""
     rate_hz: Annotated[float | None, tyro.conf.arg(name="rate", help_behavior_hint="")] = None
-    """Steps per second; must divide the control frequency. Default: 5, or the rate of the RoboCAS dataset."""
+    """Rate of the dataset in Hz; must divide the control frequency. Default: 5, or the rate of the input dataset."""
     embeddings: bool = True
-    """Embed instruction and sub-goals (needs the extra 'language'; not for lerobot)."""
+    """Store embeddings of the instruction and the sub-goals (needs the extra 'language'; not for lerobot)."""
     video: bool = True
-    """Write a video of each episode and a contact sheet into OUT/preview, if there are at most 20 episodes (not for
+    """Write a video per episode and a contact sheet to OUT/preview, if there are at most 20 episodes (not for
     lerobot)."""
     all_videos: bool = False
-    """Write videos and contact sheet of more than 20 episodes too."""
+    """Write videos and a contact sheet for more than 20 episodes too."""
     cameras: Annotated[tuple[str, ...], _NO_HINT] = ()
-    """Cameras to render, or to take from the dataset. Default: all that there are."""
+    """Names of the cameras. Default: all cameras of the input; with --append those of the output dataset."""
     size: Annotated[tuple[int, int] | None, _NO_HINT] = None
-    """Width and height of the images. Default: those of the cameras, 640 480."""
+    """Image width and height in pixels. Default: that of the cameras, 640 480; with --append that of the dataset."""
     depth: bool = True
-    """Store depth in addition to RGB."""
+    """Store depth images in addition to RGB."""
     image_format: Literal["png", "jpg", "webp"] = "png"
-    """Format of RGB images; the loader released with RoboCAS opens png only. Not for lerobot, which stores videos."""
+    """Format of RGB images (not for lerobot); the RoboCAS-v0 loader reads png only."""
     include_failed: bool = False
-    """Also convert episodes without success."""
+    """Convert failed episodes too."""
     overwrite: bool = False
-    """Start again. Default: continue a conversion with the same settings that was interrupted."""
+    """Start again. Default: continue an interrupted conversion with the same settings."""
     append: bool = False
-    """Add to the dataset that is there; its episodes keep their numbers and their side of the split."""
+    """Add episodes to an existing dataset; its episodes keep their numbers and stay in training or validation."""
     skip_errors: bool = False
-    """Warn of episodes that can't be written, in place of an error in the end; LeRobot datasets are joined without."""
+    """Skip episodes that can't be written, with a warning. Default: write the other episodes, then report an error."""
     jobs: int = 1
-    """Processes that render."""
+    """Number of processes that render."""
     episode_seconds: float = 3600.0
-    """Seconds that an episode may take. An episode that takes longer, needs more memory or crashes its process is
-    retried once, then skipped and named at the end, like one that can't be rendered or stored."""
+    """Time limit per episode in seconds. An episode that exceeds the time or memory limit or crashes its process is
+    retried once, then treated as an episode that can't be written."""
     memory_gb: float = 8.0
-    """GB of memory that a process may use."""
+    """Memory limit per process in GB."""
     pack: Annotated[str | None, _NO_HINT] = None
-    """Object pack to use instead of the recorded one: its name, or its folder."""
+    """Name or folder of the object pack to use instead of the recorded one."""
     boxes: Annotated[bool, tyro.conf.Suppress] = False
-    """Determine the box of the target in each image."""
+    """Compute the bounding box of the target in each image."""
     open_renderer: Annotated[Any, tyro.conf.Suppress, tyro.conf.Fixed] = None
-    """Opens what renders, see `rendered_source.OpenRenderer`; importable by workers. None: the recorded environment."""
+    """Function that opens a renderer, see `rendered_source.OpenRenderer`. Default: `env_renderer.EnvRenderer`."""
 
     def __post_init__(self) -> None:
-        excluding = "--overwrite --append" if self.overwrite and self.append else ""
-        excluding = "--no-video --all-videos" if self.all_videos and not self.video else excluding
-        if excluding:
-            raise DatasetError("these exclude each other", where="convert", expected="one of them", found=excluding)
+        for first, second, both in (
+            ("--overwrite", "--append", self.overwrite and self.append),
+            ("--no-video", "--all-videos", self.all_videos and not self.video),
+        ):
+            if both:
+                raise DatasetError(f"can't be combined with {second}", where=first, fix="Pass one of them.")
         if self.jobs < 1:
-            raise DatasetError("not a number of processes", where="--jobs", expected="1 or more", found=self.jobs)
-        if not (self.episode_seconds >= 1 and self.memory_gb > 0):
-            found = f"--episode-seconds {self.episode_seconds:g} --memory-gb {self.memory_gb:g}"
-            raise DatasetError("no episode can be written within that", where="convert", found=found)
+            what, expected = "invalid number of processes", "1 or more"
+            raise DatasetError(what, where="--jobs", expected=expected, found=self.jobs)
+        if not self.episode_seconds >= 1:
+            expected = "1 or more seconds"
+            raise DatasetError(
+                "invalid time limit", where="--episode-seconds", expected=expected, found=self.episode_seconds
+            )
+        if not self.memory_gb > 0:
+            raise DatasetError("invalid memory limit", where="--memory-gb", expected="> 0 GB", found=self.memory_gb)
         if len(set(self.cameras)) < len(self.cameras):
             found = " ".join(self.cameras)
-            raise DatasetError("a camera is named twice", where="--cameras", expected="each once", found=found)
+            raise DatasetError("repeated camera", where="--cameras", expected="each name once", found=found)
+        if self.size is not None:
+            from robocas_ms3.datasets.images.image_files import check_size
+
+            check_size(self.size, "--size")
 
     @property
     def image_options(self) -> ImageOptions:
@@ -101,7 +112,10 @@ class ConversionSettings:
 
     @property
     def limits(self) -> Limits | None:
-        """Time and memory per episode. With limits, one job is a separate process too if it renders."""
+        """Limits of time and memory per episode, None without limits.
+
+        With limits, a single renderer runs in a separate process too.
+        """
         from robocas_ms3.core.workers import Limits
 
         if math.isinf(self.episode_seconds) and math.isinf(self.memory_gb):
@@ -128,7 +142,7 @@ class ConversionSettings:
 
 @dataclass(frozen=True)
 class WrittenEpisode:
-    """An episode on disk: T, bytes, and its row of the contact sheet, (H, W, 3) RGB, if one was wanted."""
+    """Episode on disk: steps T, size in bytes, and its row (H, W, 3) RGB of the contact sheet, if any."""
 
     number: int
     steps: int
@@ -138,7 +152,7 @@ class WrittenEpisode:
 
 @dataclass(frozen=True)
 class Conversion:
-    """Result of a conversion: new episodes by number, number of those that were there, wall-clock time."""
+    """Result of a conversion: new episodes, number of existing episodes, wall-clock time in s."""
 
     episodes: list[WrittenEpisode]
     existing: int

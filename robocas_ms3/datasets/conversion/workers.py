@@ -1,4 +1,4 @@
-"""Writes the episodes of a conversion: a loop, in this process or shared among several."""
+"""Writing of the episodes of a conversion, in this process or in several worker processes."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from robocas_ms3.datasets.conversion.settings import ConversionSettings, Written
 from robocas_ms3.datasets.schema import episode_folder
 from robocas_ms3.datasets.sources.episode_source import SourceEpisode, StepImages
 
-_ENOUGH = 3  # failures before any success: the other episodes would fail too
-_LISTED = 5  # failures that an error lists
+_MAX_FIRST_FAILURES = 3  # without any success; then all episodes are assumed to fail
+_MAX_LISTED = 5  # failures in an error message
 _log = logging.getLogger(__name__)
 
 Task = tuple[int, int]
@@ -36,7 +36,7 @@ Task = tuple[int, int]
 
 @dataclass(frozen=True)
 class InputEpisode:
-    """An episode that is being written: its number in the dataset, and all arrays that it must have."""
+    """Episode to write: its number in the dataset, its source episode, and its checked arrays."""
 
     number: int
     episode: SourceEpisode
@@ -45,17 +45,17 @@ class InputEpisode:
 
 
 class EpisodeWriter(ABC):
-    """Writes the episodes of one format; can be sent to another process."""
+    """Writer of the episodes of one format; picklable."""
 
     @abstractmethod
     def folder(self, number: int) -> Path:
-        """Return the folder of an episode, which appears whole."""
+        """Return the folder of an episode, which is created atomically."""
 
     @abstractmethod
     def write_files(
         self, folder: Path, wanted: InputEpisode, frames: Generator[StepImages, None, None]
     ) -> NDArray[np.uint8] | None:
-        """Write an episode into a folder; return its row of the contact sheet, if there is one."""
+        """Write an episode into a folder; return its row of the contact sheet, if any."""
 
     def write(self, number: int, given: ConversionInput, source: int) -> WrittenEpisode:
         """Write episode ``source`` of the input as episode ``number`` of the dataset."""
@@ -70,7 +70,7 @@ class EpisodeWriter(ABC):
 
 @dataclass(frozen=True)
 class PendingEpisodes:
-    """The episodes of a conversion that are missing; ``continued``: whether there are others already."""
+    """Missing episodes of a conversion; ``continued``: whether some episodes exist already."""
 
     settings: ConversionSettings
     writer: EpisodeWriter
@@ -82,18 +82,19 @@ class PendingEpisodes:
 def write_episodes(
     job: PendingEpisodes, output: OutputFolder, on_episode: Callable[[WrittenEpisode], None] | None
 ) -> tuple[list[WrittenEpisode], IncompleteDatasetError | None]:
-    """Write episodes; return them by number, and an error that names those that can't be written.
+    """Write episodes; return them by number, and an error that lists the episodes that can't be written.
 
-    An episode that fails does not end the others, unless all share its error: the disk, an extra, or the first three.
+    A failure does not stop the other episodes unless it concerns all: a full disk, a missing extra, or failures of the
+    first three episodes.
     """
     settings = job.settings
     renders, processes = settings.is_trajectory, min(settings.jobs, len(job.tasks))
-    apart = settings.limits is not None and settings.needs_device  # a crash of the renderer ends that process alone
+    apart = settings.limits is not None and settings.needs_device  # survives a crash of the renderer
     here = processes <= 1 and not apart
     threads = _one_torch_thread() if renders and here else nullcontext()
     open_worker = partial(_EpisodeWorker, job, one_rasterizer_thread=processes > 1, shared=here)
     pool: WorkerPool[Task, WrittenEpisode | _Failure] = WorkerPool(
-        open_worker, 0 if here else processes, on_crash=_death, limits=settings.limits or NO_LIMITS
+        open_worker, 0 if here else processes, on_crash=_crash_failure, limits=settings.limits or NO_LIMITS
     )
     written: list[WrittenEpisode] = []
     failures: list[_Failure] = []
@@ -108,7 +109,7 @@ def write_episodes(
             failures.append(result)
             if written or job.continued:
                 _log.warning("%s could not be written: %s", result.episode, result.reason)
-            elif len(failures) == _ENOUGH:
+            elif len(failures) == _MAX_FIRST_FAILURES:
                 break
     if failures and not (written or job.continued):
         raise failures[0].sent.with_traceback()
@@ -128,27 +129,31 @@ class _Failure:
         return format_error(self.sent.error).rstrip(".")
 
 
-def _death(task: Task, why: str) -> _Failure:
+def _crash_failure(task: Task, why: str) -> _Failure:
     episode = episode_folder(task[0])
-    return _Failure(episode, RemoteError.of(DatasetError(f"its process died twice: {why}", where=episode), "a worker"))
+    return _Failure(
+        episode, RemoteError.of(DatasetError(f"its worker process crashed twice: {why}", where=episode), "a worker")
+    )
 
 
 def _incomplete(failures: list[_Failure], job: PendingEpisodes) -> IncompleteDatasetError:
     reasons = {one.episode: one.reason for one in sorted(failures, key=lambda one: one.episode)}
     listed = [why if why.startswith(f"{one}: ") else f"{one}: {why}" for one, why in reasons.items()]
-    more = f"; and {len(listed) - _LISTED} more" if len(listed) > _LISTED else ""
+    more = f"; and {len(listed) - _MAX_LISTED} more" if len(listed) > _MAX_LISTED else ""
     what = f"{format_count(len(listed), 'episode')} could not be written"
-    error = IncompleteDatasetError(what, where=job.settings.out, found="; ".join(listed[:_LISTED]) + more, fix=job.fix)
+    error = IncompleteDatasetError(
+        what, where=job.settings.out, found="; ".join(listed[:_MAX_LISTED]) + more, fix=job.fix
+    )
     error.reasons, error.__cause__ = reasons, failures[0].sent.with_traceback()
     return error
 
 
 class _EpisodeWorker:
-    """Writes the episodes of one process. The source stays open, and is opened again after a failure."""
+    """Worker that writes episodes; the source stays open, and is opened again after a failure."""
 
     def __init__(self, job: PendingEpisodes, *, one_rasterizer_thread: bool, shared: bool) -> None:
         if job.settings.is_trajectory and not shared:
-            if one_rasterizer_thread:  # processes that render in software on all cores get in each other's way
+            if one_rasterizer_thread:  # software renderers on all cores slow each other down
                 os.environ.setdefault("LP_NUM_THREADS", "1")
             use_one_torch_thread()
         self._job = job
@@ -160,7 +165,7 @@ class _EpisodeWorker:
             self._given = self._given or open_input(self._job.settings)
             return self._job.writer.write(number, self._given, source)
         except Exception as error:
-            if _is_shared(error):
+            if _concerns_all(error):
                 raise
             self.close()
             return _Failure(episode_folder(number), RemoteError.of(error, "a worker"))
@@ -171,14 +176,16 @@ class _EpisodeWorker:
             given.close()
 
 
-def _is_shared(error: Exception) -> bool:
-    """Return whether all episodes share an error: of the system (FFmpeg has other numbers), or of the installation."""
-    return isinstance(error, MissingExtraError) or (isinstance(error, OSError) and error.errno in errno.errorcode)
+def _concerns_all(error: Exception) -> bool:
+    """Return whether an error concerns all episodes: an error of the system or the installation."""
+    return isinstance(error, MissingExtraError) or (
+        isinstance(error, OSError) and error.errno in errno.errorcode
+    )  # FFmpeg uses other numbers
 
 
 @contextmanager
 def _one_torch_thread() -> Iterator[None]:
-    """Use one thread in torch inside: next to a renderer its other threads spin, which doubles the CPU time."""
+    """Use one torch thread: next to a renderer, spinning threads of torch double the CPU time."""
     import torch
 
     before = torch.get_num_threads()

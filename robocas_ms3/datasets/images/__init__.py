@@ -1,1 +1,1 @@
-"""Images of a dataset: their files, and what is drawn of them for people."""
+"""Images of a dataset: files, videos and contact sheets."""

@@ -1,4 +1,4 @@
-"""Which images a dataset holds, and how they are encoded; boxes of objects in them."""
+"""Image options of a dataset, encoding and decoding of images, and bounding boxes in them."""
 
 from __future__ import annotations
 
@@ -24,16 +24,24 @@ _QUALITY = {
 }
 
 SMALLEST = 16
-"""Pixels per side of an image that shows something."""
+"""Smallest width and height of an image in pixels."""
 Box = tuple[int, int, int, int]
-"""x_min, y_min, x_max, y_max: first and last column and row of the pixels, from 0 at the top left."""
+"""x_min, y_min, x_max, y_max: first and last column and row in pixels, from 0 at the top left."""
+
+
+def check_size(size: tuple[int, int], where: str = "size") -> None:
+    """Raise DatasetError if the width and height of images are out of range."""
+    if not SMALLEST <= min(size) <= max(size) <= LARGEST:
+        expected = f"{SMALLEST} to {LARGEST} pixels"
+        raise DatasetError("invalid image size", where=where, expected=expected, found=list(size))
 
 
 @dataclass(frozen=True)
 class ImageOptions:
-    """What is rendered and stored; no cameras: all that there are, no size: the cameras' own.
+    """Options of rendered and stored images; empty ``cameras``: all, ``size`` None: that of the cameras.
 
-    The standard cameras come first, in their order. ``boxes``: the box of the target is determined in each image.
+    The standard cameras come first, in their order. ``size`` is width and height in pixels. ``boxes`` computes the
+    bounding box of the target in each image.
     """
 
     cameras: tuple[str, ...] = ()
@@ -43,17 +51,17 @@ class ImageOptions:
     boxes: bool = False
 
     def __post_init__(self) -> None:
-        if self.size is not None and not SMALLEST <= min(self.size) <= max(self.size) <= LARGEST:
-            expected = f"{SMALLEST} to {LARGEST} pixels a side"
-            raise DatasetError("no such size of images", where="size", expected=expected, found=list(self.size))
+        if self.size is not None:
+            check_size(self.size)
         names = [*STANDARD_CAMERA_NAMES, *self.cameras]
         object.__setattr__(self, "cameras", tuple(name for name in dict.fromkeys(names) if name in self.cameras))
 
     def choose(self, cameras: Sequence[str], where: object) -> ImageOptions:
-        """Return the same of those cameras that there are, in their order; ``where`` they are, for messages."""
-        wrong = sorted(set(self.cameras) - set(cameras))
-        if wrong:
-            raise DatasetError("no such camera", where=where, expected=f"some of {', '.join(cameras)}", found=wrong)
+        """Return the options for the requested ones of the available ``cameras``, in their order."""
+        unknown = sorted(set(self.cameras) - set(cameras))
+        if unknown:
+            expected, found = f"some of {', '.join(cameras)}", ", ".join(unknown)
+            raise DatasetError("no such camera", where=where, expected=expected, found=found)
         return replace(self, cameras=tuple(name for name in cameras if name in (self.cameras or cameras)))
 
     @property
@@ -62,12 +70,12 @@ class ImageOptions:
 
 
 def write_image(path: Path, image: NDArray) -> None:
-    """Encode (H, W, 3) RGB or (H, W) depth by the file's suffix."""
+    """Write an image, (H, W, 3) uint8 RGB or (H, W) uint16 depth, in the format of the suffix."""
     try:
         data = encode_png(image) if path.suffix == ".png" else _encode(image, path.suffix)
     except (ValueError, cv2.error) as error:
         raise DatasetError("can't encode this image", where=path, found=one_line(error)) from error
-    path.write_bytes(data)  # unlike cv2.imwrite this says when the disk is full
+    path.write_bytes(data)  # unlike cv2.imwrite, raises an error if the disk is full
 
 
 def _encode(image: NDArray[np.uint8], suffix: str) -> bytes:
@@ -78,7 +86,7 @@ def _encode(image: NDArray[np.uint8], suffix: str) -> bytes:
 
 
 def read_image(path: Path) -> NDArray:
-    """Decode an image: (H, W, 3) RGB uint8 or (H, W) uint16."""
+    """Read an image: (H, W, 3) uint8 RGB or (H, W) uint16 depth."""
     try:
         data = np.frombuffer(read_image_bytes(path), np.uint8)
     except (OSError, ValueError) as error:
@@ -91,7 +99,7 @@ def read_image(path: Path) -> NDArray:
 
 
 def bounding_box(mask: NDArray[np.bool_]) -> Box | None:
-    """Return the box around the pixels of a mask (H, W), or None where there are none."""
+    """Return the bounding box of a mask (H, W), None if the mask is empty."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if not len(rows):
         return None

@@ -1,4 +1,4 @@
-"""Reads an image's bytes and header within bounds, and checks that it is whole: a PNG without decoding it."""
+"""Read image files and headers within size limits, and check that they are complete."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from robocas_ms3.core.documents import DocumentError, check_regular, read_bytes
 from robocas_ms3.datasets.images.png import SIGNATURE
 
 LARGEST = 8192
-"""Pixels per side."""
+"""Largest width and height in pixels."""
 BYTES_LIMIT = 2**28
-"""Of a file: the largest image without compression has 200 MB."""
+"""Largest file in bytes; the largest image has 200 MB without compression."""
 _END = 32  # bytes
 _FORMATS = {".png": "PNG", ".jpg": "JPEG", ".webp": "WEBP"}
 _CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
@@ -25,7 +25,7 @@ _CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """Size in pixels, bits a channel, channels."""
+    """Width and height in pixels, bits per channel, number of channels."""
 
     width: int
     height: int
@@ -37,12 +37,13 @@ class ImageHeader:
 
 
 def read_header(path: Path) -> ImageHeader:
+    """Return the header of an image; raise ValueError or OSError if the file is damaged."""
     data = read_image_bytes(path)
     return _read_png(data) if path.suffix == ".png" else _decode(data, _FORMATS[path.suffix])
 
 
 def check_ends(path: Path) -> None:
-    """Check that an image begins and ends as its format does, which is quick; read it whole if it does not."""
+    """Check the first and last bytes of an image; read the whole file if they are not as expected."""
     if not _has_both_ends(path):
         read_header(path)
 
@@ -61,17 +62,17 @@ def _has_both_ends(path: Path) -> bool:
 
 
 def read_image_bytes(path: Path) -> bytes:
-    """Read a file that a decoder can be given: its image has at most `LARGEST` pixels per side."""
+    """Return the bytes of an image file; raise DocumentError if it is damaged or larger than `LARGEST`."""
     data, wanted = read_bytes(path, BYTES_LIMIT), _FORMATS[path.suffix]
     try:
         with Image.open(BytesIO(data), formats=[wanted]) as image:
             size = image.size
     except Image.DecompressionBombError as error:
         raise DocumentError(str(error)) from error
-    except (UnidentifiedImageError, SyntaxError) as error:  # the latter of a damaged PNG
+    except (UnidentifiedImageError, SyntaxError) as error:  # SyntaxError: a damaged PNG
         raise DocumentError(f"not a {wanted}, or damaged") from error
     if max(size) > LARGEST:
-        raise DocumentError(f"{size[0]} x {size[1]} pixels, more than {LARGEST} per side")
+        raise DocumentError(f"{size[0]} x {size[1]} pixels, more than {LARGEST} in width or height")
     return data
 
 
@@ -104,4 +105,4 @@ def _read_png(data: bytes) -> ImageHeader:
                 raise ValueError("PNG without an image")
             return header
         offset = end + 4
-    raise ValueError("PNG cut off")
+    raise ValueError("truncated PNG")

@@ -1,4 +1,4 @@
-"""Draws the images of an episode with its texts: frames of a video, rows of a contact sheet."""
+"""Drawing of video frames and contact sheet rows from the images and texts of an episode."""
 
 from __future__ import annotations
 
@@ -12,31 +12,31 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 Images = Mapping[str, NDArray[np.uint8]]
-"""Camera -> (H, W, 3) RGB, of one step."""
+"""Images (H, W, 3) RGB of one step, by camera."""
 Size = tuple[int, int]
-"""Width and height, pixels."""
+"""Width and height in pixels."""
 
 COLUMNS = 8
 """Images in a row of a contact sheet."""
 THUMBNAIL = (213, 160)
-"""Their size."""
+"""Width and height of an image on a contact sheet, pixels."""
 _BAND = 64  # height of the text below the images
 _LEFT, _CAPTION, _GAP, _BELOW = 110, 30, 3, 10  # of a row
 _INK, _FAINT, _PAPER = (245, 245, 245), (170, 180, 190), (24, 26, 30)
 
 
 class EpisodeDrawing:
-    """Draws the images of an episode, with texts of its arrays."""
+    """Drawing of the images of an episode with its instruction, sub-goals and gripper state."""
 
     def __init__(self, number: int, arrays: Mapping[str, NDArray], rate_hz: float) -> None:
         self.number, self.rate_hz = number, rate_hz
         self._instruction, self._open = str(arrays["language_goal"]), arrays["gripper_status"]
         self._goals, self._types = arrays["step_lang_goals"].tolist(), arrays["step_goal_type"].tolist()
         self.row_steps: list[int] = np.linspace(0, len(self._goals) - 1, COLUMNS).round().astype(int).tolist()
-        """Steps of the row of a contact sheet: evenly spaced, from the first to the last."""
+        """Evenly spaced steps of the contact sheet, from the first to the last."""
 
     def frame(self, step: int, images: Images, panel: Size) -> NDArray[np.uint8]:
-        """Return a frame of a video, (H, W, 3) RGB: the cameras side by side, each in a panel, and texts below."""
+        """Return a video frame, (H, W, 3) RGB: the cameras next to each other, texts below."""
         width, height = panel
         canvas = Image.new("RGB", (width * len(images), height + _BAND), _PAPER)
         draw = ImageDraw.Draw(canvas)
@@ -53,7 +53,7 @@ class EpisodeDrawing:
         return np.asarray(canvas)
 
     def row(self, shown: Mapping[int, Images]) -> NDArray[np.uint8]:
-        """Return the part of a contact sheet, (H, W, 3) RGB, from the images of `row_steps`: one line per camera."""
+        """Return a row of the contact sheet, (H, W, 3) RGB, from the images of `row_steps` by step."""
         width, height = THUMBNAIL
         cameras = list(shown[0])
         size = _LEFT + COLUMNS * (width + _GAP), _CAPTION + len(cameras) * (height + _GAP) + _BELOW
@@ -81,7 +81,7 @@ def _fit(image: NDArray[np.uint8], size: Size) -> Image.Image:
 
 @lru_cache
 def _font(size: int) -> Any:
-    return ImageFont.load_default(size)  # Pillow's own scalable font: no file needed
+    return ImageFont.load_default(size)  # built into Pillow
 
 
 def _text(draw: ImageDraw.ImageDraw, at: tuple[int, int], text: str, size: int, ink, width: int) -> None:

@@ -1,4 +1,4 @@
-"""Videos and contact sheets of a dataset, for people to look at: of stored images, and of those that are written."""
+"""Videos and contact sheets, from the stored images of a dataset or during a conversion."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from robocas_ms3.datasets.images.preview_frames import EpisodeDrawing, Images
 from robocas_ms3.datasets.sources.episode_source import EpisodeSource, ImageKind, iter_images
 
 PANEL, PREVIEW_PANEL = (426, 320), (320, 240)
-"""Width and height of one camera's image in a video, and in a preview."""
+"""Width and height of the image of a camera in a video and in a preview, pixels."""
 SHEET_EPISODES = 10
-"""Episodes on a contact sheet."""
+"""Number of episodes on a contact sheet."""
 MAX_PREVIEWS = 20
-"""Up to so many episodes have previews by default."""
-_NEAR_MM, _FAR_MM = 30, 5000  # colours of depth
-# Of a preview x264's default preset takes three times as long, and its threads get in the renderer's way.
+"""Largest number of episodes that get previews by default."""
+_NEAR_MM, _FAR_MM = 30, 5000  # range of the colour map of depth
+# The default preset of x264 takes three times as long; more threads slow the renderer down.
 _PREVIEW_OPTIONS = ("-preset", "veryfast", "-threads", "1")
 
 
@@ -43,22 +43,22 @@ def open_video(path: Path, fps: float, *options: str, quality: float = 8) -> Ite
         ffmpeg_log_level="error",
         output_params=list(options),
     )
-    with closing(writer):  # after an error its own `with` would leave FFmpeg running, which makes the file again
+    with closing(writer):  # its own `with` leaves FFmpeg running after an error
         yield writer
 
 
 def write_video(
     dataset: EpisodeSource, number: int, path: Path | str, *, speed: float = 1.0, kind: ImageKind = "rgb"
 ) -> Path:
-    """Write an episode as MP4 (H.264, yuv420p): the cameras side by side, instruction and sub-goal below.
+    """Write an episode as MP4 (H.264, yuv420p): cameras next to each other, texts below.
 
-    A speed of 1 is real time; depth is shown in colours.
+    ``speed`` 1 is real time; depth is shown in colours.
 
     Raises:
-        DatasetError: no such episode, or no such speed.
+        DatasetError: the episode does not exist, or the speed is invalid.
     """
     if not 0 < speed < np.inf:
-        raise DatasetError("no such speed", where="speed", expected="> 0", found=speed)
+        raise DatasetError("invalid speed", where="speed", expected="> 0", found=speed)
     path = Path(path)
     episode = dataset.episode(number)
     drawing = EpisodeDrawing(number, episode.arrays, dataset.rate_hz)
@@ -75,21 +75,22 @@ def write_video(
 def contact_sheet(
     dataset: EpisodeSource, out: Path | str, *, episodes: Sequence[int] | None = None, kind: ImageKind = "rgb"
 ) -> Path:
-    """Write a PNG with a row for each episode (default: the first ten) and camera, of evenly spaced steps."""
+    """Write a PNG with evenly spaced steps of each episode (default: the first ten) and camera."""
     numbers = dataset.numbers[:SHEET_EPISODES] if episodes is None else list(episodes)
     return _write_sheet([_row(dataset, number, kind) for number in numbers], out)
 
 
 class Preview:
-    """Video and row of the contact sheet of an episode that is being written; see `open_preview`."""
+    """Video and contact sheet row of an episode that is being converted; see `open_preview`."""
 
     def __init__(self, video: Any, drawing: EpisodeDrawing, *, row: bool) -> None:
         self.row: NDArray[np.uint8] | None = None
-        """(H, W, 3) RGB, after the last frame, if it is wanted."""
+        """Row of the contact sheet, (H, W, 3) RGB; set after the last frame, if requested."""
         self._video, self._drawing, self._wanted = video, drawing, drawing.row_steps if row else []
         self._shown: dict[int, Images] = {}
 
     def add(self, step: int, rgb: Images) -> None:
+        """Add the RGB images of a step."""
         self._video.append_data(self._drawing.frame(step, rgb, PREVIEW_PANEL))
         if step in self._wanted:
             self._shown[step] = rgb
@@ -99,18 +100,19 @@ class Preview:
 
 @contextmanager
 def open_preview(root: Path, drawing: EpisodeDrawing, *, row: bool) -> Iterator[Preview]:
-    """Open the preview of an episode, with a row of the contact sheet or without; the video appears whole."""
+    """Open the preview of an episode; ``row``: with a row of the contact sheet."""
     path = make_folder(root / schema.PREVIEW_FOLDER) / f"{schema.episode_folder(drawing.number)}.mp4"
     with atomic_file(path) as tmp, open_video(tmp, drawing.rate_hz, *_PREVIEW_OPTIONS, quality=6) as video:
         yield Preview(video, drawing, row=row)
 
 
 def sheet_episodes(numbers: Iterable[int]) -> tuple[int, ...]:
+    """Return the numbers of the episodes on the contact sheet: the first ten."""
     return tuple(sorted(numbers)[:SHEET_EPISODES])
 
 
 def finish_previews(dataset: EpisodeSource, rows: dict[int, NDArray[np.uint8]]) -> None:
-    """Write the contact sheet of a dataset, from rows of new episodes and stored images of the others, if it is new."""
+    """Write the contact sheet of a dataset from new rows and, for other episodes, stored images."""
     path = dataset.root / schema.PREVIEW_FOLDER / "contact_sheet.png"
     if rows or not path.is_file():
         numbers = sheet_episodes(dataset.numbers)
@@ -133,10 +135,10 @@ def _write_sheet(rows: Sequence[NDArray[np.uint8]], path: Path | str) -> Path:
 
 
 def colour_depth(depth: NDArray[np.uint16]) -> NDArray[np.uint8]:
-    """Return depth as colours, (H, W, 3) RGB, on a logarithmic scale: near is red, far is blue, nothing is black."""
+    """Return depth in colours, (H, W, 3) RGB, on a log scale: near red, far blue, no depth black."""
     near, far = np.log(_NEAR_MM), np.log(_FAR_MM)
-    share = np.clip((far - np.log(np.maximum(depth, 1))) / (far - near), 0, 1)
-    colours = cv2.applyColorMap((share * 255).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1].copy()
+    fraction = np.clip((far - np.log(np.maximum(depth, 1))) / (far - near), 0, 1)
+    colours = cv2.applyColorMap((fraction * 255).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1].copy()
     colours[depth == 0] = 0
     return colours.astype(np.uint8)
 

@@ -164,14 +164,14 @@ def _missing_parts(settings: ConversionSettings, variant: Variant, episodes: lis
 
 
 def _without_missing(plan: dict[str, Any], parts: Path, incomplete: IncompleteDatasetError) -> dict[str, Any]:
-    """Return the plan of the parts that are there; the other episodes are in ``left_out``, with the reason."""
+    """Return the plan of the parts that are there; the other episodes are in ``skipped``, with the reason."""
     episodes = list(enumerate(plan["episodes"]))
     there = [number for number, _ in episodes if (parts / episode_folder(number)).is_dir()]
     place = {number: new for new, number in enumerate(there)}
     sides = {side: [place[number] for number in plan[side] if number in place] for side in ("train_eps", "val_eps")}
     reasons = incomplete.reasons
-    left_out = [{**entry, "why": reasons.get(episode_folder(n))} for n, entry in episodes if n not in place]
-    return {**plan, **sides, "episodes": [entry for n, entry in episodes if n in place], SKIPPED: left_out}
+    skipped = [{**entry, "reason": reasons.get(episode_folder(n))} for n, entry in episodes if n not in place]
+    return {**plan, **sides, "episodes": [entry for n, entry in episodes if n in place], SKIPPED: skipped}
 
 
 def _join(out: Path, plan: Mapping[str, Any]) -> None:

@@ -150,7 +150,7 @@ class ConversionRecord(_Record):
     train_eps: list[NonNegativeInt] = []
     val_eps: list[NonNegativeInt] = []
     episodes: list[SourceEntryRecord] = []
-    left_out: list[SourceEntryRecord] = []
+    skipped: list[SourceEntryRecord] = []
 
 
 class CameraRecord(_Record):

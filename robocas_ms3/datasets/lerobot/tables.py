@@ -37,7 +37,7 @@ class Column:
     least: float = 0
     greatest: float = 2**53
 
-    def fault(self, values: pa.ChunkedArray) -> tuple[str, str] | None:
+    def violation(self, values: pa.ChunkedArray) -> tuple[str, str] | None:
         if not _is_kind(values.type, self.kind):
             return self.kind, str(values.type)
         if values.null_count:
@@ -57,7 +57,7 @@ def column_violations(table: pa.Table, columns: Mapping[str, Column]) -> Iterato
     for key, column in columns.items():
         if key not in table.column_names:
             yield key, "a column", "nothing"
-        elif fault := column.fault(table.column(key)):
+        elif fault := column.violation(table.column(key)):
             yield key, *fault
 
 

@@ -51,7 +51,7 @@ def import_robocas(
         DatasetError: no episode can be imported, or the output is the input.
         OutputExistsError: ``out`` is another dataset, or none.
     """
-    if not surveyed.taken or surveyed.image_options is None:
+    if not surveyed.importable or surveyed.image_options is None:
         found = f"{format_count(surveyed.episodes, 'episode')}, nothing whole"
         fix = "robocas import-robocas without --out says what is wrong."
         raise DatasetError("no episode can be taken", where=surveyed.root, found=found, fix=fix)
@@ -61,7 +61,7 @@ def import_robocas(
     check_apart(out, [surveyed.root])
     with dataset_output(out, _record(dataset, surveyed, embedded), options.overwrite):
         placer = FilePlacer(options.link)
-        missing = [n for n in surveyed.taken if not (out / schema.episode_folder(n)).is_dir()]
+        missing = [n for n in surveyed.importable if not (out / schema.episode_folder(n)).is_dir()]
         if options.on_start:
             options.on_start(len(missing))
         for number in missing:
@@ -76,7 +76,7 @@ def import_robocas(
                 options.on_episode(number)
         write_json(out / REPORT_FILE, surveyed.as_json())
         write_info(out, (info.get("train_eps", []), info.get("val_eps", [])))
-    return len(surveyed.taken) - len(missing)
+    return len(surveyed.importable) - len(missing)
 
 
 def _record(dataset: Dataset, surveyed: Survey, embedded: bool) -> dict[str, Any]:
@@ -86,7 +86,8 @@ def _record(dataset: Dataset, surveyed: Survey, embedded: bool) -> dict[str, Any
     before = dataset.settings.get("episodes", {})
     name = surveyed.root.resolve().name
     episodes = {
-        str(n): {**unknown, **before.get(str(n), {}), "from": {"dataset": name, "episode": n}} for n in surveyed.taken
+        str(n): {**unknown, **before.get(str(n), {}), "from": {"dataset": name, "episode": n}}
+        for n in surveyed.importable
     }
     return {
         **copied_header(dataset_settings(surveyed.rate_hz, surveyed.image_options, embedded), SPLIT_RULE),

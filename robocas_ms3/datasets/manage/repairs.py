@@ -22,7 +22,7 @@ EMBEDDINGS = tuple(spec.name for spec in schema.EPISODE_INFO if spec.embedding)
 _ESSENTIAL = ("ee_pos", "ee_orn", "gripper_status", "language_goal", "step_lang_goals", "step_goal_type")
 _CAMERA_OFFSET = (0.03, 0.07)  # m: the gripper camera is 0.05 m from the axis of the hand
 
-Outcome = Literal["left out", "repaired", "noted"]
+Outcome = Literal["skipped", "repaired", "warning"]
 """The episode is skipped; the fault is repaired; the episode is taken with the fault."""
 Keys = tuple[str, str, str, str]
 """One of ``schema.RELATIVE_PAIRS``."""
@@ -60,13 +60,13 @@ class ImportedEpisode:
 
     @property
     def usable(self) -> bool:
-        return all(found.outcome != "left out" for found in self.findings)
+        return all(found.outcome != "skipped" for found in self.findings)
 
     @property
     def embedded(self) -> bool:
         return set(EMBEDDINGS) <= self.stored.arrays.keys()
 
-    def note(self, violation: Violation, outcome: Outcome, repair: str = "") -> None:
+    def add_finding(self, violation: Violation, outcome: Outcome, repair: str = "") -> None:
         self.findings.append(Finding(self.number, violation, outcome, repair))
 
     def put(self, arrays: Mapping[str, NDArray]) -> None:
@@ -77,15 +77,15 @@ def add_key_findings(episode: ImportedEpisode, loaded: EpisodeArrays) -> None:
     """Note missing, unreadable and unknown keys of what was read, before it was completed."""
     for wrong in (*array_checks.check_file(loaded), *array_checks.check_keys(loaded)):
         if wrong.kind == "unexpected":
-            episode.note(wrong, "noted", "not taken")
+            episode.add_finding(wrong, "warning", "not taken")
         elif wrong.key in episode.stored.derived:
-            episode.note(wrong, "repaired", f"made of {episode.stored.derived[wrong.key]}")
+            episode.add_finding(wrong, "repaired", f"made of {episode.stored.derived[wrong.key]}")
         elif wrong.key in EMBEDDINGS:
-            episode.note(wrong, "noted", "not taken")
+            episode.add_finding(wrong, "warning", "not taken")
         elif wrong.kind != "missing" or wrong.key in _ESSENTIAL:
-            episode.note(wrong, "left out")
+            episode.add_finding(wrong, "skipped")
         else:
-            episode.note(wrong, "noted", "it can't be made")
+            episode.add_finding(wrong, "warning", "it can't be made")
 
 
 def repair_arrays(episode: ImportedEpisode) -> None:
@@ -100,7 +100,7 @@ def _repair_shapes(episode: ImportedEpisode) -> None:
     for wrong in [*array_checks.check_shapes(stored), *array_checks.check_finite(stored)]:
         if wrong.key == "episode_length" and 0 < stored.steps <= schema.MAX_STEPS:
             episode.put({wrong.key: SPECS[wrong.key].cast(stored.steps)})
-            episode.note(wrong, "repaired")
+            episode.add_finding(wrong, "repaired")
         else:
             _drop(episode, wrong)
 
@@ -113,11 +113,11 @@ def _repair_units(episode: ImportedEpisode) -> None:
 def _drop(episode: ImportedEpisode, wrong: Violation) -> None:
     """Drop an embedding; without any other array the episode is left out."""
     if wrong.key not in EMBEDDINGS:
-        episode.note(wrong, "left out")
+        episode.add_finding(wrong, "skipped")
         return
     arrays = {key: array for key, array in episode.stored.arrays.items() if key != wrong.key}
     episode.stored = replace(episode.stored, arrays=arrays)
-    episode.note(wrong, "noted", "not taken")
+    episode.add_finding(wrong, "warning", "not taken")
 
 
 def _repair_content(episode: ImportedEpisode) -> None:
@@ -125,9 +125,9 @@ def _repair_content(episode: ImportedEpisode) -> None:
         _repair_motion(episode, keys)
     for wrong in [*array_checks.check_base_motion(episode.stored)]:
         episode.put({wrong.key: SPECS[wrong.key].cast(planar_motion(episode.stored.arrays["agv_pose"]))})
-        episode.note(wrong, "repaired", "made of agv_pose")
+        episode.add_finding(wrong, "repaired", "made of agv_pose")
     for wrong in array_checks.check_values(episode.stored):
-        episode.note(wrong, "left out" if wrong.key == "language_goal" else "noted")
+        episode.add_finding(wrong, "skipped" if wrong.key == "language_goal" else "warning")
 
 
 def _repair_motion(episode: ImportedEpisode, keys: Keys) -> None:
@@ -138,10 +138,10 @@ def _repair_motion(episode: ImportedEpisode, keys: Keys) -> None:
         if not any(array_checks.check_pair(_with(stored, converted(stored.arrays, keys)), keys)):
             episode.put(repaired(stored.arrays, keys))
             for wrong in found:
-                episode.note(wrong, "repaired", repair)
+                episode.add_finding(wrong, "repaired", repair)
             return
     for wrong in found:
-        episode.note(wrong, "left out")
+        episode.add_finding(wrong, "skipped")
 
 
 def _with(stored: EpisodeArrays, arrays: Mapping[str, NDArray]) -> EpisodeArrays:
@@ -189,4 +189,4 @@ def turn_eef_frame(episode: ImportedEpisode, degrees: int) -> None:
     episode.put({**arrays, **motion_arrays(arrays, schema.RELATIVE_PAIRS[0])})
     episode.turn_deg = degrees
     wrong = Violation(episode.stored.file, "ee_orn, rel_pos, rel_orn", "ManiSkill's TCP frame", "another frame")
-    episode.note(wrong, "repaired", f"turned by {degrees} degrees about z")
+    episode.add_finding(wrong, "repaired", f"turned by {degrees} degrees about z")

@@ -35,29 +35,29 @@ _FULL_SIZE = (640, 480)
 
 @dataclass
 class Survey:
-    """Result of a survey: ``taken`` is number -> T of the episodes that can be imported, ``images`` are theirs."""
+    """Result of a survey: ``importable`` is number -> T of the episodes that can be imported, ``images`` are theirs."""
 
     root: Path
     rate_hz: float
     turn_eef: bool
     episodes: int
-    taken: dict[int, int]
+    importable: dict[int, int]
     image_options: ImageOptions | None
     embeddings: bool
     findings: list[Finding]
 
     @property
-    def left_out(self) -> list[int]:
-        return sorted({f.episode for f in self.findings if f.outcome == "left out" and f.episode is not None})
+    def skipped(self) -> list[int]:
+        return sorted({f.episode for f in self.findings if f.outcome == "skipped" and f.episode is not None})
 
     def as_json(self) -> dict[str, Any]:
         return {
             "dataset": self.root.resolve().name,
             "rate_hz": self.rate_hz,
             "episodes": self.episodes,
-            "taken": len(self.taken),
-            "steps": sum(self.taken.values()),
-            "left_out": self.left_out,
+            "importable": len(self.importable),
+            "steps": sum(self.importable.values()),
+            "skipped": self.skipped,
             "images": asdict(self.image_options) if self.image_options else None,
             "embeddings": self.embeddings,
             "findings": [found.as_json() for found in self.findings],
@@ -109,9 +109,9 @@ def survey(
         name = schema.episode_folder(episode.number)
         if episode.image_options != most:
             wrong = Violation(name, "", f"{_describe(most)}, as most", _describe(episode.image_options))
-            episode.note(wrong, "left out")
+            episode.add_finding(wrong, "skipped")
         elif (other := first.setdefault(fingerprints[episode.number], episode.number)) != episode.number:
-            episode.note(Violation(name, "", "each episode once", f"the arrays of episode {other}"), "left out")
+            episode.add_finding(Violation(name, "", "each episode once", f"the arrays of episode {other}"), "skipped")
         findings += episode.findings
     taken = {episode.number: episode for episode in usable if episode.usable}
     lacking = [number for number, episode in taken.items() if not episode.embedded]
@@ -152,7 +152,7 @@ def read_episode(
     try:
         loaded = load_arrays(path)
     except DatasetError as error:
-        episode.note(_unreadable(f"{source.folder.name}/{path.name}", "a numpy archive", error), "left out")
+        episode.add_finding(_unreadable(f"{source.folder.name}/{path.name}", "a numpy archive", error), "skipped")
         return episode
     episode.stored = derive_missing_arrays(loaded, said, rate_hz)
     add_key_findings(episode, loaded)
@@ -162,7 +162,7 @@ def read_episode(
         for key, value in (("ep_length", episode.stored.steps), ("language_goal", str(arrays["language_goal"]))):
             if said.get(key, value) != value:
                 wrong = Violation(file, key, f"{said[key]!r} ({schema.DATA_INFO_FILE})", repr(value))
-                episode.note(wrong, "repaired", "the array counts")
+                episode.add_finding(wrong, "repaired", "the array counts")
         _check_files(episode, source)
     if episode.usable and turn_eef and EE_CAMERA in source.cameras and not source.scene.get("env_info"):
         turn = eef_turn(source.camera_in_parent(EE_CAMERA))
@@ -179,27 +179,27 @@ def _check_files(episode: ImportedEpisode, source: Episode) -> None:
     """Note cameras that can't be used, and files of today's schema that are missing."""
     name = source.folder.name
     if not source.cameras:
-        episode.note(Violation(name, "", "cameras", "none"), "left out")
+        episode.add_finding(Violation(name, "", "cameras", "none"), "skipped")
     for camera in source.cameras:
         try:
             model = source.camera(camera)
         except DatasetError as error:
-            episode.note(_unreadable(f"{name}/{camera}", "intrinsics and a pose", error), "left out")
+            episode.add_finding(_unreadable(f"{name}/{camera}", "intrinsics and a pose", error), "skipped")
             continue
         intrinsic = f"{name}/{camera}/{schema.INTRINSIC_FILE}"
         for wrong in (
             *check_camera_file(intrinsic, model.intrinsic.astype(np.float64), pose=False),
             *check_camera_file(f"{name}/{camera}", model.camera_in_parent.astype(np.float64), pose=True),
         ):
-            episode.note(wrong, "left out")
+            episode.add_finding(wrong, "skipped")
         files = schema.pose_files(model.parent)
         for file, other in zip(files, files[::-1], strict=True):
             if not (source.folder / camera / file).is_file():
                 wrong = Violation(f"{name}/{camera}/{file}", "", "this file", NO_FILE)
-                episode.note(wrong, "repaired", f"a copy of {other}")
+                episode.add_finding(wrong, "repaired", f"a copy of {other}")
     if not (source.folder / schema.SCENE_FILE).is_file():
         wrong = Violation(f"{name}/{schema.SCENE_FILE}", "", "this file", NO_FILE)
-        episode.note(wrong, "noted", "seed, target, layout and configuration are not known")
+        episode.add_finding(wrong, "warning", "seed, target, layout and configuration are not known")
 
 
 def _check_images(episode: ImportedEpisode, source: Episode) -> None:
@@ -211,13 +211,13 @@ def _check_images(episode: ImportedEpisode, source: Episode) -> None:
         folders.setdefault((wrong.file.rpartition("/")[0], wrong.kind == "unexpected"), []).append(wrong)
     for found in folders.values():
         more = f"and {format_count(len(found) - 1, 'other')}" if len(found) > 1 else ""
-        episode.note(found[0], "noted" if found[0].kind == "unexpected" else "left out", more)
+        episode.add_finding(found[0], "warning" if found[0].kind == "unexpected" else "skipped", more)
     different = set(sizes.values())
     size = None if len(different) != 1 or _FULL_SIZE in different else different.pop()
     try:
         episode.image_options = replace(image_options, size=size)
     except DatasetError as error:  # too small
-        episode.note(Violation(source.folder.name, "", str(error.expected), str(error.found)), "left out")
+        episode.add_finding(Violation(source.folder.name, "", str(error.expected), str(error.found)), "skipped")
 
 
 def _describe(image_options: ImageOptions | None) -> str:

@@ -118,11 +118,11 @@ class EntryRecord(_Part):
 
 
 class EpisodesRecord(_Part):
-    """The episodes of ``conversion.json``; those left out could not be written, with ``why``."""
+    """The episodes of ``conversion.json``; those left out could not be written, with ``reason``."""
 
     made_with: dict[str, str] = {}
     episodes: dict[EpisodeNumber, EntryRecord] = {}
-    left_out: dict[EpisodeNumber, EntryRecord] = {}
+    skipped: dict[EpisodeNumber, EntryRecord] = {}
 
 
 class SettingsRecord(_Part):

@@ -130,12 +130,12 @@ class Stats:
                 name: {**summarize_values(column), **histogram(column)}
                 for name, column in zip(ACTION_NAMES, self.actions.T, strict=True)
             },
-            "still": round_values(float(noop.mean())) if len(noop) else None,
+            "noop_fraction": round_values(float(noop.mean())) if len(noop) else None,
             "gripper_changes": summarize_values(self.gripper_changes),
             "subgoals": {
                 kind: {
                     **summarize_values(np.array(steps) / self.rate_hz),
-                    "share": round_values(sum(steps) / self.steps),
+                    "fraction": round_values(sum(steps) / self.steps),
                 }
                 for kind, steps in sorted(self.subgoals.items())
             },

@@ -38,7 +38,7 @@ def test_schema_versions_that_are_mixed(dataset, trajectory):
     edit(dataset / "conversion.json", lambda content: content.pop("schema_version"))
     assert "schema_version" in {violation.key for violation in validate(dataset).violations}
     before = files_of(dataset)
-    with pytest.raises(DatasetError, match="again from its recording"):
+    with pytest.raises(DatasetError, match="Convert the recording again"):
         convert_made_up(trajectory, dataset, append=True, embeddings=True)
     assert files_of(dataset) == before
 

@@ -95,5 +95,5 @@ def test_two_right_views_and_one_wrong():
     # The third one's floor is 6 cm below the others'.
     broken = {(index, camera, expected) for index, camera, expected, _ in check([named[:2], named])}
     assert (1, "c", "floor at height 0") in broken
-    assert (1, "c", "no looking through what a sees") in broken
+    assert (1, "c", "no view through surfaces that a sees") in broken
     assert (0, "c", "depth that agrees with another camera's") in broken

@@ -85,7 +85,7 @@ def test_actions_are_the_datasets_own(dataset, player):
         assert actions[:, 6].tolist() == arrays["gripper_status"][1:].tolist()
     assert [episode.success for episode in report.episodes] == [True, False]
     of_task = report.by_task()["pick"]
-    assert (of_task["tried"], of_task["succeeded"], of_task["share"], of_task["skipped"]) == (2, 1, 0.5, 0)
+    assert (of_task["replayed"], of_task["succeeded"], of_task["success_rate"], of_task["skipped"]) == (2, 1, 0.5, 0)
 
 
 def test_tracking_error_by_hand(dataset):
@@ -101,12 +101,12 @@ def test_tracking_error_by_hand(dataset):
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
-        ({"env_info": None}, "does not say how to build the scene"),
-        ({"success": False}, "recorded without success"),
-        ({"layout": {"object_ids": ["cube", "cup", "cube"]}}, "another scene now: other objects"),
+        ({"env_info": None}, "so the scene can't be built"),
+        ({"success": False}, "no success"),
+        ({"layout": {"object_ids": ["cube", "cup", "cube"]}}, "the seed builds another scene: other objects"),
         (
             {"layout": {"object_ids": ["cube"] * 3, "poses": [[0, y, 0, 1, 0, 0, 0] for y in (0, 0.5, 0)]}},
-            "another scene now: objects up to 500 mm away",
+            "the seed builds another scene: objects displaced by up to 500 mm",
         ),
         ({"env_info": {"env_id": "X-v1", "env_kwargs": {"pack": "gone"}}}, "no such pack"),
         (
@@ -128,7 +128,7 @@ def test_what_can_not_be_tried_is_named_and_the_rest_goes_on(dataset, changes, r
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
-        ({"rel_pos": np.full((7, 3), np.nan, np.float32)}, "its arrays hold NaN"),
+        ({"rel_pos": np.full((7, 3), np.nan, np.float32)}, "NaN or infinite values in the arrays"),
         ({"ee_pos": np.zeros((5, 3), np.float32)}, "operands could not be broadcast"),
         ({"rel_orn": np.zeros((7, 4), np.float32)}, "zero norm"),
     ],
@@ -156,7 +156,7 @@ def test_a_base_that_drives_and_damage_are_named(dataset):
     edit_arrays(dataset, 0, base_pos=moving)
     (dataset / "episode_0000001" / "scene.json").write_text("{")
     first, second = replay_dataset(dataset).episodes
-    assert "its base drives" in first.skipped
+    assert "the base moves" in first.skipped
     assert second.success is None
     assert second.skipped
 
@@ -164,14 +164,14 @@ def test_a_base_that_drives_and_damage_are_named(dataset):
 def test_the_command_tells_it_and_may_ask_for_a_share(dataset, capsys):
     assert run(["validate", str(dataset), "--replay"]) == 0
     out = capsys.readouterr().out
-    assert "episode 1: its own actions do not succeed again" in out
-    assert "pick: 1 of 2 replayed episodes succeed again (50%)" in out
+    assert "episode 1: the replay does not succeed" in out
+    assert "pick: 1 of 2 replayed episodes succeed (50%)" in out
     assert run(["validate", str(dataset), "--replay", "--min-success", "0.9"]) == 1
     assert run(["validate", str(dataset), "--replay", "--min-success", "0.5"]) == 0
     capsys.readouterr()
     assert run(["validate", str(dataset), "--replay", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
-    assert report["replay"]["by_task"]["pick"]["share"] == 0.5
+    assert report["replay"]["by_task"]["pick"]["success_rate"] == 0.5
 
 
 @pytest.mark.parametrize("words", ["--min-success 0.5", "--replay --min-success 50", "--replay --min-success nan"])
@@ -187,7 +187,7 @@ def test_a_share_that_nobody_could_see_is_not_enough(dataset, capsys, json_too):
         edit_scene(dataset, number, env_info={"env_id": "X-v1", "env_kwargs": {"pack": "gone"}})
     command = ["validate", str(dataset), "--replay", *json_too]
     assert run(command) == 0
-    said = "pick: none of 2 episodes could be replayed: no share is known"
+    said = "pick: none of 2 episodes could be replayed; success rate unknown"
     assert json_too or said in capsys.readouterr().out
     assert run([*command, "--min-success", "0.9"]) == 1
     edit_scene(dataset, 0, env_info={"env_id": "Y-v1", "env_kwargs": {}}, task="select")

@@ -65,14 +65,14 @@ def test_an_empty_folder(tmp_path):
     [
         ("ee_pos", np.zeros((7, 3)), "expected float32, found float64"),
         ("gripper_status", np.ones(7, np.int64), "expected bool, found int64"),
-        ("gripper_width", np.full(7, np.nan, np.float32), "expected finite numbers, found 7 others"),
+        ("gripper_width", np.full(7, np.nan, np.float32), "expected finite numbers, found 7 NaN or infinite values"),
         ("step_lang_goals", np.array([b"x"] * 7), "expected str, found |S1"),
         ("episode_length", np.array([7, 7]), "expected shape (), found shape (2,)"),
         ("episode_length", np.array(10**9), "expected 1 to 10000 steps, found 1000000000"),
         ("rel_pos", np.array(0, np.float32), "expected shape (7, 3), found shape ()"),
         ("step_goal_type", np.array(["grasp"] * 6), "expected shape (7,), found shape (6,)"),
         ("step_goal_type", np.array(["dance"] * 7), "expected one of"),
-        ("episode_length", np.array(6), "expected 7, as the arrays have, found 6"),
+        ("episode_length", np.array(6), "expected 7, the length of the arrays, found 6"),
     ],
 )
 def test_types_and_shapes(dataset, key, value, text):
@@ -114,7 +114,7 @@ def test_a_image_without_pixels(dataset):
     head = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", 64, 48, 16, 0, 0, 0, 0))
     path.write_bytes(head + chunk(b"IEND"))
     place = "episode_0000001/base_camera/depth/0000.png"
-    assert found(dataset) == [f"{place}: expected a sound image, found PNG without an image"]
+    assert found(dataset) == [f"{place}: expected an intact image, found PNG without an image"]
     pixels = chunk(b"IDAT", b"no deflated data")
     path.write_bytes(head + pixels + chunk(b"IEND"))
     assert any(place in violation for violation in found(dataset))
@@ -129,7 +129,7 @@ def put(a, key, row, value):
 @pytest.mark.parametrize(
     ("new", "texts"),
     [
-        (lambda a: {"speed": np.zeros(7)}, ["speed: expected keys of the schema only"]),
+        (lambda a: {"speed": np.zeros(7)}, ["speed: expected no keys outside the schema"]),
         (
             lambda a: put(a, "ee_orn", 3, a["ee_orn"][3] * 1.1),
             ["ee_orn: expected unit quaternions, found off by 0.1"],
@@ -165,7 +165,7 @@ def test_wxyz_is_recognised(dataset):
 
 def test_embeddings_in_one_episode_only(dataset):
     change(dataset, language_embedding=None, step_goal_embs=None)
-    assert_only(dataset, "language_embedding: expected in all episodes or none, found in some")
+    assert_only(dataset, "language_embedding: expected in all episodes or in none, found in some episodes")
 
 
 def test_images(dataset):
@@ -182,11 +182,11 @@ def test_images(dataset):
     place = "episode_0000000/static_camera"
     assert sorted(found(dataset)) == [
         f"{place}/depth/0006.png: expected 64 x 48, 1 x 16 bit, found 64 x 48, 1 x 8 bit",
-        f"{place}/rgb/0002.png: expected an image of every step, found no file",
-        f"{place}/rgb/0003.png: expected a sound image, found PNG cut off",
-        f"{place}/rgb/0004.png: expected a sound image, found damaged PNG",
+        f"{place}/rgb/0002.png: expected an image of each step, found no file",
+        f"{place}/rgb/0003.png: expected an intact image, found truncated PNG",
+        f"{place}/rgb/0004.png: expected an intact image, found damaged PNG",
         f"{place}/rgb/0005.png: expected 64 x 48, 3 x 8 bit, found 64 x 40, 3 x 8 bit",
-        f"{place}/rgb/0007.png: expected 7 images from 0000.png, found a file beyond them",
+        f"{place}/rgb/0007.png: expected 7 images from 0000.png, found an additional file",
     ]
 
 
@@ -199,7 +199,7 @@ def test_camera_files(dataset):
     assert sorted(found(dataset)) == [
         "episode_0000000/base_camera/intrinsic.npy: expected this file, found no file",
         "episode_0000000/gripper_camera/cam_pose_wrt_ee.npy: expected a rigid transform, found another matrix",
-        f"{static}: expected the same as cam_pos_wrt_world.npy, found another pose",
+        f"{static}: expected the pose of cam_pos_wrt_world.npy, found another pose",
     ]
 
 
@@ -249,13 +249,19 @@ def test_wrong_poses_intrinsics_and_depth_show_in_the_depth_of_that_episode(data
         (lambda info: info["train_eps"].extend(info["val_eps"]), "expected no episode in both"),
         (lambda info: info.update(train_eps="all"), "train_eps: expected a list"),
         (lambda info: info["ep_length"].update({"1": 8}), "ep_length.1: expected 7, found 8"),
-        (lambda info: info["ep_length"].pop("0"), "ep_length: expected the episodes on disk, found 1 others"),
+        (
+            lambda info: info["ep_length"].pop("0"),
+            "ep_length: expected the episodes on disk, found 1 missing",
+        ),
         (lambda info: info["language_goal"].update({"0": "dance"}), "language_goal.0: expected 'grasp the cube 3"),
         (lambda info: info["step_goals"]["0"][0].update(goal_range=[0, 1]), "step_goals.0: expected a range from 2"),
         (lambda info: info["step_goals"]["0"].pop(), "step_goals.0: expected ranges up to step 6, found up to 2"),
         (lambda info: info["step_goals"]["0"][0].update(goal_type="dance"), "step_goals.0: expected the sub-goal"),
         (lambda info: info["action_space"].pop("relative_rotation"), "action_space.relative_rotation: expected"),
-        (lambda info: info["action_space"]["relative_position"][0].__setitem__(0, 9.0), "expected percentiles of the"),
+        (
+            lambda info: info["action_space"]["relative_position"][0].__setitem__(0, 9.0),
+            "expected the percentiles",
+        ),
         (
             lambda info: info["action_space"]["relative_position"][0].__setitem__(0, math.nan),
             "is not a finite number",
@@ -278,7 +284,7 @@ def test_command(dataset, capsys):
     assert main(Validate(dataset, json=True)) == 1
     report = json.loads(capsys.readouterr().out)
     assert report["violations"] == [
-        {"file": NPZ, "key": "speed", "expected": "keys of the schema only", "found": "an unknown key"}
+        {"file": NPZ, "key": "speed", "expected": "no keys outside the schema", "found": "an unknown key"}
     ]
 
 
@@ -286,10 +292,12 @@ def test_the_ledger_lists_the_episodes_on_disk_each_once(dataset):
     shutil.copytree(dataset / "episode_0000001", dataset / "episode_0000002")
     violations = found(dataset)
     assert "episode_0000002: expected each episode once, found the arrays of episode_0000001" in violations
-    assert "conversion.json, episodes.2: expected an entry of every episode, found none" in violations
+    assert "conversion.json, episodes.2: expected an entry for each episode, found no entry" in violations
     path = dataset / "conversion.json"
     managing.edit(path, lambda content: content["episodes"].update({"2": content["episodes"]["1"]}))
-    assert "conversion.json, episodes.2: expected each recording once, found that of episode 1" in found(dataset)
+    assert "conversion.json, episodes.2: expected each recording once, found the recording of episode 1" in found(
+        dataset
+    )
     shutil.rmtree(dataset / "episode_0000002")
     managing.edit(path, lambda content: content["episodes"]["2"].update(recording="another"))
     assert_only(dataset, "conversion.json, episodes.2: expected the episodes on disk, found no folder")

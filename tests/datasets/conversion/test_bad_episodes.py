@@ -68,8 +68,8 @@ def test_a_broken_recording(many, tmp_path, how):
     different = {name for name in expected if name not in found or found[name] != expected[name]}
     assert {name.partition("/")[0] for name in different} == {"conversion.json", "data_info.json", "episode_0000003"}
     said = json.loads((out / "conversion.json").read_text())
-    assert list(said["left_out"]) == ["3"]
-    assert said["left_out"]["3"]["why"] in str(error.value)
+    assert list(said["skipped"]) == ["3"]
+    assert said["skipped"]["3"]["reason"] in str(error.value)
     for side, sides in zip(("train", "val"), Dataset(whole).splits, strict=True):
         assert Dataset(out).split(side) == [number for number in sides if number != 3]
     run(write_trajectory(trajectory, seeds=SEEDS, steps=16), out)  # repaired
@@ -101,14 +101,14 @@ def test_others_are_appended_meanwhile(many, tmp_path):
     run(more, tmp_path / "out", append=True)
     assert validate(tmp_path / "out").violations == []
     ledger = json.loads((tmp_path / "out" / "conversion.json").read_text())
-    assert list(ledger["left_out"]) == ["1", "3", "5"]
+    assert list(ledger["skipped"]) == ["1", "3", "5"]
     assert [ledger["episodes"][number]["seed"] for number in ("4", "6", "7")] == [14, 50, 51]
     done = run(trajectory, tmp_path / "out")
     assert [episode.number for episode in done.episodes] == [1, 3, 5]
     assert validate(tmp_path / "out").violations == []
     ledger = json.loads((tmp_path / "out" / "conversion.json").read_text())
     assert list(ledger["episodes"]) == [str(number) for number in range(8)]
-    assert "left_out" not in ledger
+    assert "skipped" not in ledger
 
 
 def test_texts_that_cannot_be_read(many, tmp_path, monkeypatch):

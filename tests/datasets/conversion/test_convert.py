@@ -267,5 +267,5 @@ def test_a_recording_that_is_there_twice_is_converted_once(tmp_path, caplog):
     trajectory = write_trajectory(tmp_path / "trajectory.h5", seeds=(3, 4, 3))
     done = run(trajectory, tmp_path / "out")
     assert [episode.number for episode in done.episodes] == [0, 1]
-    assert "the same recordings again, left out: 2" in caplog.text
+    assert "skipped duplicate recordings: episodes 2" in caplog.text
     assert validate(tmp_path / "out").violations == []

@@ -41,7 +41,7 @@ def tried(path, *rates):
     ("rates", "rate_hz", "said"),
     [
         ((5, 5), 5, ""),
-        ((5, 20), 10, "actions were tried at 5 and 20 Hz; at 10 Hz they were not: robocas validate --replay tells"),
+        ((5, 20), 10, "the open-loop check of the recording used 5 and 20 Hz, not 10 Hz: "),
         ((None, 0), 10, ""),  # not tried at any rate: the base drives, or nobody wanted it
         (([5], "5"), 10, ""),  # not ours
     ],
@@ -66,9 +66,9 @@ def test_only_the_recordings_that_are_converted_count(tmp_path, caplog):
 @pytest.mark.parametrize(
     ("flags", "code", "said"),
     [
-        ("--append --overwrite", 1, "expected one of them, found --overwrite --append"),
+        ("--append --overwrite", 2, "--overwrite: can't be combined with --append"),
         ("--jobs 0", 2, "expected 1 or more, found 0"),
-        ("--cameras base_camera base_camera", 2, "expected each once, found base_camera base_camera"),
+        ("--cameras base_camera base_camera", 2, "expected each name once, found base_camera base_camera"),
     ],
 )
 def test_flags_that_make_no_sense(made, trajectory, capsys, flags, code, said):

@@ -56,7 +56,7 @@ def test_its_episode_is_written_again(whole, trajectory, tmp_path, caplog):
     harm(path, 0.97)
     done = run(trajectory, out)
     assert (done.existing, [episode.number for episode in done.episodes]) == (1, [1])
-    assert f"{path}: cut off, or gone" in caplog.text
+    assert f"{path} is missing or truncated" in caplog.text
     assert files_of(out) == files_of(whole)
 
 

@@ -181,11 +181,11 @@ def test_another_scene_is_refused(source, recording):
 
     moved = {kind: dict(arrays) for kind, arrays in recording.states.items()}
     moved["actors"]["object_3"] = moved["actors"]["object_3"] + np.float32(0.01)
-    with pytest.raises(DatasetError, match="seed 11, object_3: the seed builds another scene.* 17.3 mm away"):
+    with pytest.raises(DatasetError, match="seed 11, object_3: the rebuilt scene differs.* 17.3 mm off"):
         source.load(spoiled(states=moved))
     fewer = {kind: dict(arrays) for kind, arrays in recording.states.items()}
     del fewer["actors"]["object_3"]
-    with pytest.raises(DatasetError, match="the seed builds another scene"):
+    with pytest.raises(DatasetError, match="the rebuilt scene differs"):
         source.load(spoiled(states=fewer))
     with pytest.raises(DatasetError, match="expected fly away"):
         source.load(spoiled(instruction="fly away"))
@@ -197,7 +197,7 @@ def test_a_scene_that_is_another_leaves_nothing_behind(recorded, tmp_path):
     metadata = json.loads(recorded[0].with_suffix(".json").read_text())
     metadata["episodes"][0]["episode_seed"] = 12
     (tmp_path / "F.json").write_text(json.dumps(metadata))
-    with pytest.raises(DatasetError, match="episode 0, seed 12, object_0: the seed builds another scene"):
+    with pytest.raises(DatasetError, match="episode 0, seed 12, object_0: the rebuilt scene differs"):
         convert(ConversionSettings(path, tmp_path / "out", embeddings=False, video=False, size=SIZE))
     assert {entry.name for entry in tmp_path.iterdir()} == {"F.h5", "F.json"}
 

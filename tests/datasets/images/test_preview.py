@@ -72,7 +72,7 @@ def test_of_what_is_new(made_up_images, tmp_path):
 
 
 def test_of_many_episodes_on_request(made_up_images, tmp_path, monkeypatch, capsys):
-    hint = "no videos of so many episodes: --all-videos"
+    hint = "no preview videos (more than 20 episodes): pass --all-videos"
     monkeypatch.setattr(conversion, "MAX_PREVIEWS", 2)  # of 20 they take seconds
     monkeypatch.setattr(video, "SHEET_EPISODES", 2)
     path = write_trajectory(tmp_path / "three.h5", seeds=(1, 2, 3))
@@ -94,7 +94,7 @@ def test_none_where_they_are_not_wanted(trajectory, made_up_images, tmp_path, ca
     assert shown(tmp_path / "out") == []
     assert "video" not in capsys.readouterr().out
     assert converted(trajectory, tmp_path / "other", "--no-video", "--all-videos") == 1
-    assert "--no-video --all-videos" in capsys.readouterr().err
+    assert "--no-video: can't be combined with --all-videos" in capsys.readouterr().err
     assert not (tmp_path / "other").exists()
 
 

@@ -57,7 +57,7 @@ def test_what_upstream_writes_becomes_a_valid_dataset(dataset, made, tmp_path, p
         assert {key for key, value in scene.items() if value is not None} == {"schema_version", "rate_hz", "source"}
         assert scene["source"]["format"] == "robocas v0"
         assert scene["source"]["derived"] == {"agv_pose": "base_pos, base_orn", "rel_agv_pose": "agv_pose"}
-    assert read(out / "import_report.json")["taken"] == 2
+    assert read(out / "import_report.json")["importable"] == 2
     contact_sheet(Dataset(out), tmp_path / "sheet.png")
     assert files_of(root) == before
 
@@ -80,7 +80,7 @@ def test_other_types_and_axes(upstream, made, tmp_path):
     fx, fy, cx, cy = intrinsic
     np.save(episode / "base_camera" / "intrinsic.npy", np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
     np.testing.assert_array_equal(Dataset(upstream).episode(0).intrinsic("base_camera"), intrinsic)
-    assert (0, f"{NPZ}, speed", "an unknown key", "not taken") in problems(upstream, "noted")
+    assert (0, f"{NPZ}, speed", "an unknown key", "not taken") in problems(upstream, "warning")
     new = imported(upstream, tmp_path / "out")
     assert validate(new.root).violations == []
     old = arrays_of(made / "episode_0000000")
@@ -95,7 +95,7 @@ def test_pickles_are_never_loaded(upstream, tmp_path):
     pickled = "pickled objects, which are never loaded"
     with pytest.raises(DatasetError, match=f"robot_joints: this array can't be read .found {pickled}"):
         _ = Dataset(upstream).episode(0).arrays
-    assert (0, f"{NPZ}, robot_joints", pickled, "") in problems(upstream, "left out")
+    assert (0, f"{NPZ}, robot_joints", pickled, "") in problems(upstream, "skipped")
     # Texts are in data_info.json, too.
     assert (1, f"{NPZ}, step_lang_goals", pickled, "made of data_info.json") in problems(upstream, "repaired")
     new = imported(upstream, tmp_path / "out")
@@ -140,7 +140,7 @@ def test_quaternions_wxyz(upstream, tmp_path):
 def test_values_that_are_taken_as_they_are(upstream, tmp_path):
     widths = arrays_of(upstream / "episode_0000000")["gripper_width"]
     change(upstream / "episode_0000000", gripper_width=np.full_like(widths, 0.5))
-    assert (0, f"{NPZ}, gripper_width", "0.500 to 0.500", "") in problems(upstream, "noted")
+    assert (0, f"{NPZ}, gripper_width", "0.500 to 0.500", "") in problems(upstream, "warning")
     assert imported(upstream, tmp_path / "out").numbers == [0, 1]
     (violation,) = validate(tmp_path / "out").violations
     assert (violation.key, violation.found) == ("gripper_width", "0.500 to 0.500")
@@ -192,10 +192,10 @@ def test_bad_arrays_leave_their_episode_out(upstream, tmp_path, new, key, found)
     change(upstream / "episode_0000001", **new)
     assert any(
         (episode, where) == (1, f"{NPZ}, {key}") and text.startswith(found)
-        for episode, where, text, _ in problems(upstream, "left out")
+        for episode, where, text, _ in problems(upstream, "skipped")
     )
     report = survey(upstream).as_json()
-    assert (report["left_out"], report["taken"]) == ([1], 1)
+    assert (report["skipped"], report["importable"]) == ([1], 1)
     json.dumps(report)
     out = imported(upstream, tmp_path / "out")
     assert out.numbers == [0]
@@ -207,7 +207,7 @@ def test_arrays_that_can_not_be_made_are_told(upstream, tmp_path):
     new = imported(upstream, tmp_path / "out")
     missing = ["robot_joints", "arm_joint_vel", "base_pos", "agv_pose", "rel_agv_pose"]
     assert new.episode(1).scene["source"]["missing"] == missing
-    assert (1, f"{NPZ}, base_pos", "no such key", "it can't be made") in problems(upstream, "noted")
+    assert (1, f"{NPZ}, base_pos", "no such key", "it can't be made") in problems(upstream, "warning")
     assert {violation.key for violation in validate(new.root).violations} == set(missing)
 
 
@@ -221,7 +221,7 @@ def test_embeddings_of_all_or_none_or_made(dataset, made, tmp_path):
     (dataset / "conversion.json").unlink()
     assert imported(dataset, tmp_path / "all").settings["embeddings"] is True
     change(dataset / "episode_0000000", language_embedding=np.ones(512, np.float32))
-    assert (0, f"{NPZ}, language_embedding", "shape (512,)", "not taken") in problems(dataset, "noted")
+    assert (0, f"{NPZ}, language_embedding", "shape (512,)", "not taken") in problems(dataset, "warning")
     assert (None, f"{NPZ}, embeddings", "1 episode without", "not taken") in problems(dataset, "repaired")
     assert imported(dataset, tmp_path / "none").settings["embeddings"] is False
     assert validate(tmp_path / "none").violations == []
@@ -250,10 +250,10 @@ def test_ours_with_damage_keeps_what_it_says(dataset, made, tmp_path):
 def test_nothing_to_take(copy, tmp_path, capsys):
     for path in copy.glob("*/episode_info.npz"):
         path.write_bytes(b"")
-    with pytest.raises(DatasetError, match="no episode can be taken"):
+    with pytest.raises(DatasetError, match="no episode can be imported"):
         imported(copy, tmp_path / "out")
     assert run(["import-robocas", str(copy), "--out", str(tmp_path / "out")]) == 1
-    assert "4 episodes, can be taken: 0, left out: 4" in capsys.readouterr().out
+    assert "4 episodes, 0 can be imported, 4 skipped" in capsys.readouterr().out
     assert not (tmp_path / "out").exists()
 
 
@@ -262,15 +262,15 @@ def test_command(copy, tmp_path, capsys):
     change(root / "episode_0000002", rel_pos=np.zeros((7, 3)))
     assert run(["import-robocas", str(root)]) == 0
     text = capsys.readouterr().out
-    assert "4 episodes, can be taken: 3, left out: 1" in text
+    assert "4 episodes, 3 can be imported, 1 skipped" in text
     assert "made of base_pos, base_orn" in " ".join(text.split())
     assert run(["import-robocas", str(root), "--out", str(out), "--json", "--link"]) == 0
     report = json.loads(capsys.readouterr().out)
-    assert report["left_out"] == [2]
+    assert report["skipped"] == [2]
     assert report == read(out / "import_report.json")
     image = "episode_0000001/base_camera/rgb/0003.png"
     assert (root / image).stat().st_ino == (out / image).stat().st_ino
     assert run(["import-robocas", str(root), "--out", str(out)]) == 0
-    assert "3 episodes, 3 kept" in capsys.readouterr().out
+    assert "3 episodes, 3 already there" in capsys.readouterr().out
     assert run(["import-robocas", str(root), "--out", str(out), "--rate", "10"]) == 1
     assert "rate_hz: 5.0 -> 10.0" in capsys.readouterr().err

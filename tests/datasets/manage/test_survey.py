@@ -24,7 +24,7 @@ def test_what_all_episodes_lack_is_one_finding(copy):
             (None, f"{camera}/cam_pose_wrt_{parent}.npy", "repaired")
             for camera, parent in (("base_camera", "arm_base"), ("gripper_camera", "ee"), ("static_camera", "world"))
         ),
-        (None, "scene.json", "noted"),
+        (None, "scene.json", "warning"),
     ]
     poses = copy / "episode_0000002" / "static_camera"
     shutil.copy(poses / "cam_pos_wrt_world.npy", poses / "cam_pose_wrt_world.npy")
@@ -71,12 +71,12 @@ def test_images_that_are_missing_damaged_or_of_another_kind(copy, tmp_path):
     shutil.copy(depth / "0006.png", depth / "0007.png")
     for path in (copy / "episode_0000000").glob("*/depth/*.png"):
         cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(np.uint8))
-    assert problems(copy, "left out") == [
+    assert problems(copy, "skipped") == [
         *((0, f"{name}_camera/depth/0000.png", "64 x 48, 1 x 8 bit", "and 6 others") for name in NAMES),
         (1, "base_camera/rgb/0002.png", "no file", "and 1 other"),
         (2, "static_camera/depth/0000.png", "no file", "and 6 others"),
     ]
-    assert (3, "gripper_camera/depth/0007.png", "a file beyond them", "") in problems(copy, "noted")
+    assert (3, "gripper_camera/depth/0007.png", "an additional file", "") in problems(copy, "warning")
     new = imported(copy, tmp_path / "out")
     assert new.numbers == [3]
     assert validate(new.root).violations == []
@@ -88,7 +88,7 @@ def test_images_of_another_size_and_episodes_twice(copy, tmp_path):
     for path in (copy / "episode_0000001").glob("*/*/*.png"):
         cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[:40])
     size = "base_camera, gripper_camera, static_camera, 64 x 40 png, with depth"
-    assert problems(copy, "left out") == [
+    assert problems(copy, "skipped") == [
         (1, "episode_0000001", size, ""),
         (8, "episode_0000008", "the arrays of episode 2", ""),
     ]
@@ -99,7 +99,7 @@ def test_cameras(copy, tmp_path):
     (copy / "episode_0000000" / "base_camera" / "intrinsic.npy").unlink()
     (copy / "episode_0000001" / "base_camera" / "cam_pos_wrt_arm_base.npy").unlink()
     np.save(copy / "episode_0000002" / "static_camera" / "cam_pos_wrt_world.npy", np.ones((4, 4)))
-    found = problems(copy, "left out")
+    found = problems(copy, "skipped")
     assert [(episode, file) for episode, file, *_ in found] == [
         (0, "base_camera"), (1, "base_camera"), (2, "static_camera")
     ]  # fmt: skip

@@ -55,7 +55,7 @@ def test_counts_of_a_folder(told):
     assert sorted(found["instructions"].values()) == [1, 1]
     # 22 control steps, 12 of them grasp: of the states 0, 4, .. 20, 22 the first three.
     grasp, carry = found["subgoals"]["move and grasp"], found["subgoals"]["transfer object"]
-    assert (grasp["count"], grasp["median"], grasp["share"]) == (2, 0.6, pytest.approx(3 / 7, abs=1e-6))
+    assert (grasp["count"], grasp["median"], grasp["fraction"]) == (2, 0.6, pytest.approx(3 / 7, abs=1e-6))
     assert (carry["count"], carry["median"]) == (2, 0.8)
     assert list(found["actions"]) == list(ACTION_NAMES)
     assert all(sum(part["counts"]) == part["count"] == 12 for part in found["actions"].values())
