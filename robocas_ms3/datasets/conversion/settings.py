@@ -36,7 +36,7 @@ class ConversionSettings:
     to: str = "robocas"
     """Output format: robocas, lerobot (needs the extra 'lerobot'), or a format of another package."""
     lerobot_version: Version = NEWEST
-    """LeRobot version that reads the dataset. 0.6: LeRobot 0.6 and later (format v3.0, language columns, depth as video);
+    """LeRobot version that reads the dataset. 0.6: LeRobot 0.6 and later (v3.0, language columns, depth as video);
     0.5: LeRobot 0.4.4 to 0.5.1 (v3.0, subtask_index); 2.1: readers of format v2.1, such as openpi and GR00T."""
     codec: Literal["h264", "av1"] = "h264"
     """Video codec of a LeRobot dataset; av1 needs half the disk space of h264."""
