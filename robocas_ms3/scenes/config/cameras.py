@@ -1,4 +1,4 @@
-"""The cameras of a task configuration: changes of the robot's cameras, and further ones."""
+"""The cameras of a task configuration: changes of the robot's cameras, and additional cameras."""
 
 from __future__ import annotations
 
@@ -19,29 +19,32 @@ _Pixels = Annotated[int, Field(ge=16, le=8192, multiple_of=2)]
 
 
 class CameraConfig(StrictModel):
-    """A camera by its name, which ends in `_camera`. A further camera needs `position` or `overview`."""
+    """A camera; its name ends in `_camera`. An additional camera needs `position` or `overview`."""
 
-    mount: Mount | None = Field(default=None, description="what it is fixed to; default: world")
+    mount: Mount | None = Field(default=None, description="frame to which the camera is fixed; default: world")
     position: tuple[_Coordinate, _Coordinate, _Coordinate] | None = Field(
-        default=None, description="in the frame of the world, of the base link or of the hand link, m"
+        default=None, description="position in the frame of the mount (world, base link or hand link), m"
     )
     rotation_deg: tuple[_Angle, _Angle, _Angle] | None = Field(
-        default=None, description="roll, pitch, yaw in that frame; a camera looks along x, and z is up"
+        default=None, description="roll, pitch, yaw in the frame of the mount; the camera looks along x, z is up"
     )
     look_at: tuple[_Coordinate, _Coordinate, _Coordinate] | None = Field(
-        default=None, description="point in that frame that it looks at, m, instead of `rotation_deg`"
+        default=None,
+        description="point in the frame of the mount at which the camera looks, m; replaces `rotation_deg`",
     )
-    overview: bool | None = Field(default=None, description="the task places it, where it sees the whole scene")
+    overview: bool | None = Field(
+        default=None, description="the task places the camera so that it sees the whole scene"
+    )
     fov_deg: Annotated[float, Field(gt=0, lt=180)] | None = Field(
         default=None, description="vertical field of view; default: 90"
     )
-    width: _Pixels | None = Field(default=None, description="default: 640")
-    height: _Pixels | None = Field(default=None, description="default: 480")
+    width: _Pixels | None = Field(default=None, description="image width, pixels; default: 640")
+    height: _Pixels | None = Field(default=None, description="image height, pixels; default: 480")
 
     @model_validator(mode="after")
     def _one_direction(self) -> CameraConfig:
         if self.rotation_deg is not None and self.look_at is not None:
-            raise ValueError("rotation_deg and look_at exclude each other")
+            raise ValueError("expected rotation_deg or look_at, found both")
         return self
 
     def change(self, camera: CameraSpec) -> CameraSpec:
@@ -69,18 +72,18 @@ CamerasConfig = Annotated[dict[str, CameraConfig], AfterValidator(_check_names)]
 def apply_camera_changes(
     cameras: tuple[CameraSpec, ...], changes: list[tuple[str, CameraConfig]]
 ) -> tuple[CameraSpec, ...]:
-    """Return cameras with changes, and the further ones, in this order.
+    """Return the changed cameras, followed by the additional ones.
 
     Raises:
-        ConfigError: a further camera has no place.
+        ConfigError: an additional camera has neither `position` nor `overview`.
     """
     specs = {camera.name: camera for camera in cameras}
     for name, change in changes:
         if name not in specs and change.position is None and not change.overview:
             raise ConfigError(
-                "no such camera, and no place for a further one",
+                "unknown camera, and an additional camera needs a position",
                 where=f"cameras.{name}",
-                expected=f"one of {list(specs)}, or `position`",
+                expected=f"one of {list(specs)}, or `position` or `overview`",
                 fix=did_you_mean(name, specs),
             )
         specs[name] = change.change(specs.get(name, CameraSpec(name)))

@@ -1,7 +1,7 @@
-"""Composition of configurations: one mapping is merged into another, and the source of each key is kept.
+"""Compose configurations: merge one mapping into another, and record the source of each key.
 
-The rules are those of docs/configuration.md: mappings are merged key by key, other values are replaced, a block whose
-``kind`` changes is replaced as a whole, and ``null`` removes a key where it is not a value of that key.
+docs/configuration.md has the rules: mappings are merged key by key, other values are replaced, a block whose ``kind``
+changes is replaced as a whole, and ``null`` removes a key unless null is a valid value of that key.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from robocas_ms3.core.strict_model import did_you_mean
 from robocas_ms3.scenes.config.task import TaskConfig
 
 EXTENDS = "extends"
-"""The key of a file that names its base; no mapping inside another file may have it."""
+"""The key of a file that names its base configuration; only YAML files may have it."""
 _KIND = "kind"
 _NULL = ("~", "null", "Null", "NULL")
 
@@ -42,7 +42,7 @@ def parse_override(text: str, error: type[RobocasError], example: str) -> dict[s
         example: a valid override, for the message.
 
     Raises:
-        RobocasError: ``error``, if there is no key, no ``=``, or the value is empty or not YAML.
+        RobocasError: ``error``, if the key or ``=`` is missing, or the value is empty or not YAML.
     """
     key, sign, word = text.partition("=")
     names = key.split(".")
@@ -62,11 +62,11 @@ def parse_override(text: str, error: type[RobocasError], example: str) -> dict[s
 
 
 class Composition:
-    """A configuration under construction.
+    """A configuration that is being composed.
 
     Attributes:
-        values: the mapping, as YAML has it.
-        sources: dotted key -> file or command line option that set it last.
+        values: the merged mapping, as read from YAML.
+        sources: dotted key -> file or command line option that set the key last.
     """
 
     def __init__(self) -> None:
@@ -74,19 +74,19 @@ class Composition:
         self.sources: dict[str, str] = {}
 
     def merge(self, changes: Mapping[Any, Any], source: str, *, removes: bool = True) -> None:
-        """Merge a mapping, which may be incomplete, over the present values.
+        """Merge a mapping, which may be incomplete, over the current values.
 
         Args:
             changes: the mapping.
-            source: file or option that it comes from, for messages.
+            source: its file or command line option, for messages.
             removes: whether ``null`` removes a key, see above.
 
         Raises:
-            ConfigError: it removes a name that is not there, or names a base.
+            ConfigError: the mapping removes a name that does not exist, or has the key ``extends``.
         """
         if EXTENDS in changes:
             raise ConfigError(
-                f"{EXTENDS!r} is a key of YAML files only",
+                f"the key {EXTENDS!r} is allowed in YAML files only",
                 where=source,
                 expected="the keys of the configuration",
                 found=repr(changes[EXTENDS])[:80],
@@ -95,7 +95,7 @@ class Composition:
         self._merge(self.values, changes, (), source, removes)
 
     def source_of(self, key: str, default: str) -> str:
-        """Return the source of a dotted key, or of the block that it is in; ``default`` if several or none set it."""
+        """Return the source of a dotted key or of its block; ``default`` if several or no sources set it."""
         names = key.split(".") if key else []
         for end in range(len(names), 0, -1):
             place = ".".join(names[:end])
@@ -110,15 +110,15 @@ class Composition:
         self, values: dict[Any, Any], changes: Mapping[Any, Any], path: tuple[str, ...], source: str, removes: bool
     ) -> None:
         if len(path) > YAML_DEPTH:  # a mapping that contains itself, by a YAML alias
-            what = "a value here has no place in this file"
-            raise ConfigError(what, where=source, found=f"mappings nested more than {YAML_DEPTH} deep")
+            expected, found = f"at most {YAML_DEPTH} levels of mappings", "more levels"
+            raise ConfigError("mappings are nested too deeply", where=source, expected=expected, found=found)
         replaced = False
         for key, new in changes.items():
             place, old = (*path, " ".join(str(key).split())), values.get(key)
             if new is None and removes and (declared := _declaration(place)) in {"key", "name"}:
                 if declared == "name" and key not in values:
                     expected, fix = f"one of {sorted(map(str, values))}", did_you_mean(str(key), map(str, values))
-                    what = f"there is no {'.'.join(place)!r} to remove"
+                    what = f"can't remove {'.'.join(place)!r}: it does not exist"
                     raise ConfigError(what, where=source, expected=expected, found=repr(str(key)), fix=fix)
                 values.pop(key, None)
                 replaced = replaced or declared == "name"
@@ -132,23 +132,23 @@ class Composition:
             elif not (isinstance(new, Mapping) and isinstance(old, dict)):
                 values[key] = copy.deepcopy(new)
                 self._set_source(place, source, old)
-        if replaced:  # furniture is built in this order: a piece takes the place of the one that it replaces
+        if replaced:  # furniture is built in this order: a new piece takes the position of the removed one
             first = {key: values[key] for key in changes if key in values}
             ordered = first | {key: value for key, value in values.items() if key not in first}
             values.clear()
             values.update(ordered)
 
     def _set_source(self, place: tuple[str, ...], source: str, old: Any) -> None:
-        """Set the source of a key, and forget those of the keys inside its old value."""
+        """Set the source of a key, and remove the sources of the keys inside its old value."""
         key = ".".join(place)
-        if isinstance(old, dict):  # only then: a file may have very many keys
+        if isinstance(old, dict):  # otherwise there is nothing to remove, and a file may have very many keys
             for inside in [name for name in self.sources if name.startswith(f"{key}.")]:
                 del self.sources[inside]
         self.sources[key] = source
 
 
 def _declaration(place: Sequence[str]) -> Literal["nullable", "key", "name", "unknown"]:
-    """Return how the configuration declares a key: with null as a value, without, as a free name, or not at all."""
+    """Return how the configuration declares a key: nullable, not nullable, as a free name, or not at all."""
     nodes, found = [_schema()], "unknown"
     for name in place:
         found, inner = "unknown", []

@@ -1,4 +1,4 @@
-"""Load task configurations. Each mistake is one error that names file, key, expected and found value."""
+"""Load task configurations. An invalid one is an error that names file, key, expected and found value."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from robocas_ms3.scenes.language.texts import synonym_texts
 from robocas_ms3.scenes.task_specs import TaskSpec
 
 CHAIN_LIMIT = 8
-"""Files that a configuration and its bases may be."""
+"""Greatest number of files of a configuration and its bases."""
 _SUFFIXES = (".yaml", ".yml")
 _log = logging.getLogger(__name__)
 
 
 def bundled_configs() -> dict[str, Path]:
-    """Return name -> file of the configurations that are part of the package."""
+    """Return the files of the bundled configurations by name."""
     return {path.stem: path for path in sorted(task_configs_dir().glob("*.yaml"))}
 
 
 def load_config_for(spec: TaskSpec, config: str | Path | dict | TaskConfig | None = None) -> TaskConfig:
-    """Load a configuration of a task; see `load_task_config`.
+    """Load a configuration for a task; see `load_task_config`.
 
     Args:
-        spec: of the task.
-        config: default: the task's own.
+        spec: the task.
+        config: the configuration; default: the task's default configuration.
 
     Raises:
-        ConfigError: the configuration is wrong, or another task's.
+        ConfigError: the configuration is invalid, or belongs to another task.
     """
     loaded = load_task_config(spec.default_config if config is None else config)
     if loaded.task != spec.name:
@@ -50,16 +50,16 @@ def load_config_for(spec: TaskSpec, config: str | Path | dict | TaskConfig | Non
 def load_task_config(
     config: str | Path | dict | TaskConfig, changes: Mapping[str, Any] | None = None, overrides: Sequence[str] = ()
 ) -> TaskConfig:
-    """Load a task configuration. A file whose ``support`` has no words in ``synonyms.yaml`` gets a warning.
+    """Load a task configuration; warn about a ``support`` that is not in ``synonyms.yaml``.
 
     Args:
-        config: name of a shipped configuration (``pick_table_scattered``), path of a YAML file, a mapping of the same
+        config: name of a bundled configuration (``pick_table_scattered``), path of a YAML file, a mapping of the same
             form, or a loaded configuration. Only files may have the key ``extends``.
-        changes: mapping that is merged over it.
-        overrides: ``KEY=VALUE`` each, such as ``objects.count=12``; they are merged last.
+        changes: mapping that is merged over the configuration.
+        overrides: ``KEY=VALUE`` strings such as ``objects.count=12``; they are merged last.
 
     Raises:
-        ConfigError: no such file, not YAML, a chain of bases that does not end, an unknown key, a wrong type or value.
+        ConfigError: the file does not exist or is not YAML, its bases form a cycle, or a key or value is invalid.
     """
     if isinstance(config, TaskConfig):
         if not changes and not overrides:
@@ -80,28 +80,28 @@ def load_task_config(
     parsed = parse(TaskConfig, composition.values, ConfigError, where=where)
     supports = synonym_texts().supports
     if parsed.support not in supports and not isinstance(config, dict):
-        message = "%s: texts know no support %r: they say 'on the %s' and no synonyms; known are %s"
+        message = "%s: unknown support %r: instructions say 'on the %s' and use no synonyms; known supports: %s"
         _log.warning(message, where("support"), parsed.support, parsed.support, ", ".join(sorted(supports)))
     return parsed
 
 
 def check_no_extends(path: Path) -> None:
-    """Check that a file of a frozen protocol has no base, on which it would depend."""
+    """Check that a file of a frozen protocol does not depend on a base configuration."""
     try:
         text = read_text(path, YAML_LIMIT)
     except (OSError, DocumentError) as error:
         raise ConfigError("can't read this file", where=path, found=error) from error
-    if EXTENDS not in text and "\\" not in text:  # parsing takes long; the key may be written with escapes
+    if EXTENDS not in text and "\\" not in text:  # parsing is slow; the key may be written with escapes
         return
     data = _read(path)
     if EXTENDS in data:
-        found, fix = f"{EXTENDS}: {data[EXTENDS]}"[:80], "robocas eval freeze writes whole configurations."
+        found, fix = f"{EXTENDS}: {data[EXTENDS]}"[:80], "Freeze the protocol again: robocas eval freeze."
         what = f"{EXTENDS!r} is not allowed in a protocol"
-        raise ConfigError(what, where=path, expected="a whole configuration", found=found, fix=fix)
+        raise ConfigError(what, where=path, expected="a complete configuration", found=found, fix=fix)
 
 
 def _merge_file(composition: Composition, config: str | Path) -> str:
-    """Merge a file over its bases; returns what messages call it."""
+    """Merge a file over its bases; return the description of the file for messages."""
     chain = _chain(_find(config))
     first = str(chain[0][0])
     for number, (path, data) in reversed(list(enumerate(chain))):
@@ -112,7 +112,7 @@ def _merge_file(composition: Composition, config: str | Path) -> str:
 
 
 def _chain(path: Path) -> list[tuple[Path, dict[Any, Any]]]:
-    """Read a file and its bases, the file first; without their keys ``extends``."""
+    """Read a file and its bases, the file first; their keys ``extends`` are removed."""
     chain: list[tuple[Path, dict[Any, Any]]] = []
     found: Path | None = path
     while found is not None:
@@ -131,7 +131,7 @@ def _chain(path: Path) -> list[tuple[Path, dict[Any, Any]]]:
         if EXTENDS in data:
             named = data.pop(EXTENDS)
             if not isinstance(named, str) or not named:
-                what, expected = f"wrong value for {EXTENDS!r}", "a shipped name or a YAML file"
+                what, expected = f"invalid value for {EXTENDS!r}", "the name of a bundled configuration or a YAML file"
                 raise ConfigError(what, where=where, expected=expected, found=repr(named)[:80])
             found = _find(named, path.parent, where)
         chain.append((path, data))
@@ -142,11 +142,12 @@ def _read(path: Path) -> dict[Any, Any]:
     try:
         data = load_yaml(path)
     except DocumentError as error:
-        raise ConfigError("this is not valid YAML", where=path, found=error) from error
+        raise ConfigError("invalid YAML", where=path, found=error) from error
     except OSError as error:
         raise ConfigError("can't read this file", where=path, found=error.strerror) from error
     if not isinstance(data, dict):
-        raise ConfigError("a task configuration is a mapping", where=path, found=type(data).__name__)
+        what = "invalid task configuration"
+        raise ConfigError(what, where=path, expected="a mapping", found=type(data).__name__)
     for key in data:
         if key != EXTENDS and key not in TaskConfig.model_fields and (likely := did_you_mean(str(key), [EXTENDS])):
             expected = f"one of {[EXTENDS, *sorted(TaskConfig.model_fields)]}"
@@ -155,7 +156,7 @@ def _read(path: Path) -> dict[Any, Any]:
 
 
 def _find(config: str | Path, folder: Path | None = None, where: str = "") -> Path:
-    """Return the file of a name or path, which is relative to a folder where one is given."""
+    """Return the file of a configuration name or path; a path is relative to ``folder`` if given."""
     shipped, name = bundled_configs(), str(config)
     if name in shipped:
         return shipped[name]
@@ -165,10 +166,11 @@ def _find(config: str | Path, folder: Path | None = None, where: str = "") -> Pa
         if is_yaml and path.is_file():
             return path
     likely = did_you_mean(path.stem if is_yaml else name, shipped)
-    what, expected = "no such task configuration", "a YAML file (.yaml, .yml) or a shipped name"
+    what, expected = "no such task configuration", "a YAML file (.yaml, .yml) or a bundled configuration"
     if folder is not None:
         files = [str(path.relative_to(folder)) for end in _SUFFIXES for path in sorted(folder.glob(f"*{end}"))]
-        what, expected = "no such base", f"a shipped name or a YAML file (.yaml, .yml) relative to {folder}"
+        expected = f"a bundled configuration or a YAML file (.yaml, .yml) relative to {folder}"
+        what = "no such base configuration"
         likely = did_you_mean(name, [*shipped, *files]) or did_you_mean(f"{name}.yaml", files) or likely
     if is_yaml and not likely:
         raise ConfigError("no such file", where=where or name, expected=expected, found=str(path.absolute()))
@@ -177,5 +179,5 @@ def _find(config: str | Path, folder: Path | None = None, where: str = "") -> Pa
         where=where or name,
         expected=expected + ("" if likely else f": {', '.join(sorted(shipped))}"),
         found=repr(name) if where else "",
-        fix=f"{likely} `robocas list` has all names." if likely else "",
+        fix=f"{likely} All names: `robocas list`." if likely else "",
     )

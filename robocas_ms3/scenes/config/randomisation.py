@@ -1,4 +1,4 @@
-"""What of a scene a seed decides beside its layout: the block ``randomisation`` of a task configuration."""
+"""The block ``randomisation`` of a task configuration: what a seed decides in addition to the layout."""
 
 from __future__ import annotations
 
@@ -11,33 +11,39 @@ from robocas_ms3.core.strict_model import StrictModel
 
 def _rising(values: tuple[float, float]) -> tuple[float, float]:
     if values[0] > values[1]:
-        raise ValueError(f"{list(values)} is no range: the least comes first")
+        raise ValueError(f"invalid range {list(values)}: expected [least, greatest]")
     return values
 
 
 Range = Annotated[
     tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]],
-    Field(description="least and greatest"),
+    Field(description="least and greatest value"),
     AfterValidator(_rising),
 ]
 Ids = Annotated[list[str | StrictInt], Field(min_length=1)]
 
 
 class LightRandomisation(StrictModel):
-    """Lights are drawn for every episode."""
+    """Random intensity and direction of the lights, drawn for every episode."""
 
     ambient: Range = (0.25, 0.6)
     directional: Range = (0.6, 1.4)
-    direction_deg: Annotated[float, Field(ge=0, le=60)] = Field(default=20.0, description="greatest turn")
+    direction_deg: Annotated[float, Field(ge=0, le=60)] = Field(
+        default=20.0, description="greatest rotation of the light's direction"
+    )
 
 
 class CameraRandomisation(StrictModel):
-    """Cameras are shifted and turned for every episode."""
+    """Random shift and rotation of the cameras, drawn for every episode."""
 
-    position: Annotated[float, Field(ge=0, le=0.2)] = Field(default=0.02, description="greatest shift an axis, m")
-    rotation_deg: Annotated[float, Field(ge=0, le=20)] = Field(default=2.0, description="greatest turn an axis")
-    min_position: Annotated[float, Field(ge=0)] = Field(default=0.0, description="least shift an axis, m")
-    min_rotation_deg: Annotated[float, Field(ge=0)] = Field(default=0.0, description="least turn an axis")
+    position: Annotated[float, Field(ge=0, le=0.2)] = Field(
+        default=0.02, description="greatest shift along each axis, m"
+    )
+    rotation_deg: Annotated[float, Field(ge=0, le=20)] = Field(
+        default=2.0, description="greatest rotation about each axis"
+    )
+    min_position: Annotated[float, Field(ge=0)] = Field(default=0.0, description="least shift along each axis, m")
+    min_rotation_deg: Annotated[float, Field(ge=0)] = Field(default=0.0, description="least rotation about each axis")
 
     @model_validator(mode="after")
     def _ordered(self) -> CameraRandomisation:
@@ -49,38 +55,40 @@ class CameraRandomisation(StrictModel):
 
 
 class PoseRandomisation(StrictModel):
-    """Something that stands is shifted and turned for every episode."""
+    """Random shift and turn of the robot or the basket, drawn for every episode."""
 
     position: Annotated[float, Field(ge=0, le=0.5)] = Field(default=0.03, description="greatest shift in x and y, m")
-    yaw_deg: Annotated[float, Field(ge=0, le=180)] = Field(default=5.0, description="greatest turn either way")
+    yaw_deg: Annotated[float, Field(ge=0, le=180)] = Field(
+        default=5.0, description="greatest turn about the vertical in either direction"
+    )
 
 
 class DistractorConfig(StrictModel):
-    """Further objects that are never the target."""
+    """Additional objects that are never the target."""
 
     ids: Ids = Field(description="asset ids of the object pack, or their numbers in GraspNet-1Billion")
     count: Annotated[
         tuple[Annotated[int, Field(ge=0, le=16)], Annotated[int, Field(ge=0, le=16)]], AfterValidator(_rising)
-    ] = Field(default=(1, 3), description="least and greatest number of them")
+    ] = Field(default=(1, 3), description="least and greatest number of distractors")
 
 
 class RandomisationConfig(StrictModel):
-    """What else a seed decides. Each block is off unless given; all draws come from the episode's seed."""
+    """What the episode's seed decides in addition to the layout. A block that is not given is off."""
 
     room: list[str] | None = Field(
-        default=None, description="parts of the room whose finish is drawn: wall, floor, ..."
+        default=None, description="parts of the room whose finish is random: wall, floor, ..."
     )
     finishes: dict[str, Annotated[list[str], Field(min_length=1)]] = Field(
-        default={}, description="part of `room` -> finishes it is drawn from; others: all that there are"
+        default={}, description="part of `room` -> finishes to draw from; parts without an entry: all finishes"
     )
     lights: LightRandomisation | None = None
     cameras: CameraRandomisation | None = None
     robot: PoseRandomisation | None = None
     basket: PoseRandomisation | None = None
     object_sets: Annotated[list[Ids], Field(min_length=1)] | None = Field(
-        default=None, description="one of them in place of `ids`"
+        default=None, description="sets of ids; one set, chosen at random, replaces `objects.ids`"
     )
     count: tuple[Annotated[int, Field(ge=1, le=64)], Annotated[int, Field(ge=1, le=64)]] | None = Field(
-        default=None, description="number of objects, at most objects.count"
+        default=None, description="least and greatest number of objects; at most objects.count"
     )
     distractors: DistractorConfig | None = None

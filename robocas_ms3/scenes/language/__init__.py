@@ -1,1 +1,1 @@
-"""Instructions, sub-goal texts, and their sentence embeddings."""
+"""Instructions, texts of sub-goals, and their sentence embeddings."""

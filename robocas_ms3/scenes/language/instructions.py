@@ -1,4 +1,4 @@
-"""Instructions: upstream's words, or one of many paraphrases, with or without synonyms."""
+"""Instructions: RoboCAS-v0's template or one of many paraphrases, with or without synonyms."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from robocas_ms3.scenes.config import TaskConfig
     from robocas_ms3.scenes.layout import Layout
 
-_LANGUAGE = 100  # stream of an episode's seed; those of layouts are in scenes/sample.py
+_LANGUAGE = 100  # random stream of the instruction; scenes/sample.py has the streams of layouts
 SPLITS: tuple[Split, ...] = get_args(Split)
 
 _T = TypeVar("_T")
@@ -25,18 +25,18 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True)
 class InstructionSlots:
-    """What an instruction is about, in plain names.
+    """The content of an instruction, in plain names.
 
     Attributes:
-        task: its name, ``pick``.
-        object: the target's name, ``sugar box``.
-        support: what the objects are on or in, ``table``.
-        relation: which one of several identical objects, where the task has that slot; None: the nearest, which
-            upstream does not say.
-        part: what has to be opened, ``left door``, where the task has that slot; see `part_name`.
+        task: name of the task, ``pick``.
+        object: name of the target, ``sugar box``.
+        support: place of the objects, ``table``.
+        relation: relation that distinguishes the target from identical objects, if the task has this slot; None: the
+            instruction has no relation, and the nearest object is the target.
+        part: part that must be opened, ``left door``, if the task has this slot; see `part_name`.
 
     Raises:
-        RobocasError: there is no such task, the part is missing, or the task has no slot for relation or part.
+        RobocasError: the task is unknown, the part is missing, or the task has no slot for relation or part.
     """
 
     task: str
@@ -48,11 +48,11 @@ class InstructionSlots:
     def __post_init__(self) -> None:
         slots = TASKS.find(self.task).slots
         if self.relation and "relation" not in slots:
-            what = f"the task {_tasks_with('relation')}, and no other, may have a relation"
-            raise RobocasError(what, where=self.task, found=repr(self.relation))
+            what = f"only the task {_tasks_with('relation')} may have a relation"
+            raise RobocasError(what, where=self.task, expected="no relation", found=repr(self.relation))
         if bool(self.part) != ("part" in slots):
             what, found = (
-                f"the task {_tasks_with('part')}, and no other, needs a part",
+                f"the task {_tasks_with('part')} needs a part, and other tasks may not have one",
                 repr(self.part) if self.part else "none",
             )
             raise RobocasError(what, where=self.task, found=found)
@@ -60,15 +60,15 @@ class InstructionSlots:
 
 @dataclass(frozen=True)
 class Instruction:
-    """An instruction, and what it was made of.
+    """An instruction with its template and words.
 
     Attributes:
-        text: what the robot is told.
-        template_id: task, split and place in the split's list: ``pick/train/07``. It stays when templates are added.
-        split: of the template, and of synonyms.
-        object_word: what the target is called: its name or a synonym.
-        support_word: the same of the support; the template need not mention it.
-        relation_phrase: how the relation is said, ``closest {object}``; empty where there is none.
+        text: the instruction.
+        template_id: task, split and index in the split's list: ``pick/train/07``. Added templates don't change it.
+        split: split of the template and of the synonyms.
+        object_word: name of the target or a synonym.
+        support_word: name of the support or a synonym; not every template contains it.
+        relation_phrase: phrase of the relation, ``closest {object}``; empty without a relation.
     """
 
     text: str
@@ -80,10 +80,10 @@ class Instruction:
 
 
 def make_instruction(slots: InstructionSlots, template_id: str = "") -> Instruction:
-    """Return the instruction of a template in plain names; default: upstream's template.
+    """Return the instruction of a template with plain names; default: RoboCAS-v0's template.
 
     Raises:
-        RobocasError: there is no such template.
+        RobocasError: the template does not exist.
     """
     template_id = template_id or f"{slots.task}/upstream/00"
     for split in SPLITS:
@@ -102,16 +102,16 @@ def choose_instruction(
     others: Iterable[str] = (),
     synonyms: bool = True,
 ) -> Instruction:
-    """Draw an instruction: a template of the split, then a word each for object, support and relation.
+    """Draw an instruction: a template of the split, and words for object, support and relation.
 
-    Held-out texts never share templates or synonyms with those of ``train``; plain names are in both.
+    The splits ``train`` and ``held_out`` have no template and no synonym in common; both contain plain names.
 
     Args:
-        rng: moved on by four draws, whatever the arguments.
-        slots: what the instruction is about.
-        split: ``upstream`` (its template, plain names), ``train`` or ``held_out``.
-        others: names of the other objects in the scene; synonyms that could mean one of them are left out.
-        synonyms: False: plain names and plain relations in every template.
+        rng: random generator; each call makes four draws.
+        slots: content of the instruction.
+        split: ``upstream`` (RoboCAS-v0's template with plain names), ``train`` or ``held_out``.
+        others: names of the other objects in the scene; synonyms that fit one of them are not used.
+        synonyms: whether synonyms may replace plain names and relations.
 
     Raises:
         RobocasError: the task has no templates of the split.
@@ -133,7 +133,15 @@ def choose_instruction(
 
 
 def episode_instruction(config: TaskConfig, layout: Layout, seed: int, name: str, names: Iterable[str]) -> Instruction:
-    """Draw the instruction of an episode by its layout's seed, from the target's name and those of all objects."""
+    """Return the instruction of an episode, drawn with the seed of its layout.
+
+    Args:
+        config: the task configuration.
+        layout: layout of the episode.
+        seed: seed of the layout.
+        name: name of the target.
+        names: names of all objects in the scene.
+    """
     opening, language = config.opening, config.language
     slots = InstructionSlots(
         config.task,
@@ -151,9 +159,9 @@ def template_ids(task: str, split: Split) -> list[str]:
 
 
 def part_name(link: str) -> str:
-    """Return what to call a part of furniture that is named as the builtin ones are.
+    """Return the name of a furniture part in instructions, from the name of its link in a bundled pack.
 
-    ``door_left`` is the 'left door', as seen by who stands before it; ``freezer_door`` the 'freezer door'.
+    ``door_left`` is the 'left door', seen from the front; ``freezer_door`` is the 'freezer door'.
     """
     *noun, last = link.split("_")
     sided = noun and last in {"left", "right", "top", "middle", "bottom", "upper", "lower"}
@@ -161,12 +169,12 @@ def part_name(link: str) -> str:
 
 
 def could_mean(word: str, name: str) -> bool:
-    """Return whether a word fits an object of that name: 'shampoo bottle' fits the 'white shampoo bottle'."""
+    """Return whether a word fits an object's name: 'shampoo bottle' fits 'white shampoo bottle'."""
     return set(word.lower().split()) <= set(name.lower().split())
 
 
 def is_plural(word: str) -> bool:
-    """Return whether a thing is 'them': 'scissors', but not a 'pair of scissors'."""
+    """Return whether the pronoun of a word is 'them': 'scissors', but not 'pair of scissors'."""
     return word.partition(" of ")[0].split()[-1] in synonym_texts().plurals
 
 

@@ -1,4 +1,4 @@
-"""The texts of instructions and their words, read from the two YAML files beside this one."""
+"""Templates, relations and synonyms of instructions, read from two YAML files of this package."""
 
 from __future__ import annotations
 
@@ -27,52 +27,52 @@ _REPEATABLE = {"it", "on"}
 
 
 class Synonyms(StrictModel):
-    """Other words for a thing."""
+    """Synonyms of a name, by split."""
 
     train: Words = ()
     held_out: Words = ()
 
     def of(self, split: Split) -> Words:
-        """Return the words of one split; upstream has none."""
+        """Return the words of a split; the split ``upstream`` has no synonyms."""
         return getattr(self, split, ())
 
 
 class Templates(Synonyms):
-    """The templates of a task; ``upstream`` is the default."""
+    """Instruction templates of a task, by split; ``upstream`` is the default."""
 
     upstream: Annotated[Words, Field(min_length=1)]
 
     @classmethod
     def for_task(cls, spec: TaskSpec) -> Templates:
-        """Return the templates of a task: those of its row, or of ``instructions.yaml``.
+        """Return the templates of a task from its `TaskSpec` or from ``instructions.yaml``.
 
         Raises:
-            ConfigError: a template is wrong.
+            ConfigError: a template is invalid.
         """
         if not spec.instructions:
             return instruction_texts().tasks[spec.name]
         try:
             templates = cls.model_validate(spec.instructions)
             templates.check(spec)
-        except ValueError as error:  # pydantic's as well
-            raise ConfigError("wrong instructions", where=f"task {spec.name}", found=one_line(error)) from error
+        except ValueError as error:  # also pydantic's ValidationError
+            raise ConfigError("invalid instructions", where=f"task {spec.name}", found=one_line(error)) from error
         return templates
 
     def check(self, spec: TaskSpec) -> None:
-        """Raise ValueError where a template lacks a field that the task needs, or has another one."""
+        """Raise ValueError if a template has a missing, unknown or repeated field."""
         needed = {"object", *({"part"} & set(spec.slots))}
         for template in (*self.upstream, *self.train, *self.held_out):
             _check_fields(template, needed=needed, allowed=needed | {"support"} | _REPEATABLE)
 
 
 class SupportWords(Synonyms):
-    """Other words for a support, and whether things are in it (cabinet) or on it (table)."""
+    """Synonyms of a support, and whether objects are inside of it (cabinet) or on it (table)."""
 
     inside: bool = False
 
 
 class RelationPhrases(Synonyms):
-    """How a relation is said; a phrase has one ``{object}``."""
+    """Phrases of a relation, by split; each phrase has the field ``{object}`` once."""
 
     plain: str
 
@@ -119,7 +119,7 @@ def read_texts(path: Path, model: type[_Model]) -> _Model:
 
 
 def _check_fields(template: str, *, needed: set[str], allowed: set[str]) -> None:
-    """Raise ValueError unless each needed field is there once, and others at most once; only {it} and {on} repeat."""
+    """Raise ValueError if a field is missing, unknown or repeated; {it} and {on} may repeat."""
     fields = [field for _, field, _, _ in Formatter().parse(template) if field is not None]
     wrong = (set(fields) - allowed) | (needed - set(fields))
     wrong |= {field for field in fields if fields.count(field) > 1} - _REPEATABLE

@@ -91,7 +91,7 @@ def test_a_recorded_configuration_can_not_extend_a_file(tmp_path):
     (tmp_path / "base.yaml").write_text("extends: pick_table_scattered\n")
     config = {"extends": str(tmp_path / "base.yaml")}
     env = read_env({"env_id": ID, "env_kwargs": {"config": config}}, "F.json")
-    with pytest.raises(ConfigError, match="'extends' is a key of YAML files only"):
+    with pytest.raises(ConfigError, match="'extends' is allowed in YAML files only"):
         env.make(obs_mode="none", render_backend="none")
 
 
