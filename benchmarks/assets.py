@@ -1,4 +1,4 @@
-"""Seconds that each step of making an asset takes, over builtin objects; prints JSON.
+"""Measure the seconds that each step of making an asset takes, for builtin objects; print JSON.
 
 python benchmarks/assets.py --ids banana drink large_elephant
 """
@@ -31,14 +31,14 @@ from robocas_ms3.assets.physics import RigidBody
 
 @dataclass
 class Benchmark:
-    """Time the steps of making builtin objects."""
+    """Measure the steps of making builtin objects."""
 
     ids: tuple[str, ...] = ()
-    """Which objects. Default: all 46."""
+    """Ids of the objects. Default: all 46."""
 
 
 def main(cfg: Benchmark) -> None:
-    """Run it."""
+    """Run the benchmark."""
     seconds: dict[str, dict[str, float]] = defaultdict(dict)
     for spec in products().values():
         if cfg.ids and spec.id not in cfg.ids:

@@ -1,9 +1,9 @@
-"""CPU time of conversions beside that of rendering alone; prints JSON.
+"""Measure the CPU time of conversions and that of rendering alone; print JSON.
 
-The bare loop sets each state, renders the three cameras and fetches their images as the shader leaves them, and does
-nothing else: it says what no conversion can be without. Conversions are whole: scenes, environment, files, previews.
-They take turns with the bare loop, over the same recordings; a case's figure is the median of its turns. CPU time is of
-this process and its children together, which other programs disturb less than the wall clock; --jobs is judged by that.
+The bare loop sets each state, renders the three cameras and fetches the raw images of the shader, which every
+conversion has to do. Conversions are complete: scenes, environment, files, previews. They alternate with the bare loop,
+on the same recordings; the result of a case is the median of its rounds. CPU time is the sum over this process and its
+children; other programs affect it less than the wall-clock time. --jobs is measured by wall-clock time.
 
 Run: python benchmarks/convert.py [demos/pick/trajectory.h5] [--episodes 2] [--turns 3] [--jobs 2]
 """
@@ -48,44 +48,44 @@ TEXTURES = {True: ("Color", "PositionSegmentation"), False: ("Color",)}  # of th
 @dataclass
 class Benchmark:
     trajectory: Annotated[Path | None, tyro.conf.Positional] = None
-    """F.h5, with F.json beside it; default: pick, generated first."""
+    """File F.h5, next to F.json. Default: pick demonstrations, which are generated first."""
     episodes: int = 2
-    """How many of its successful recordings, which begin anew where they end."""
+    """Number of successful recordings; a file with fewer is repeated."""
     turns: int = 3
-    """Of the bare loop and of each case."""
+    """Number of rounds of the bare loop and of each case."""
     cases: tuple[str, ...] = tuple(CASES)
-    """Which conversions."""
+    """Conversions to measure."""
     size: tuple[int, int] = (640, 480)
-    """Of the images."""
+    """Width and height of the images in pixels."""
     rate: float = 5.0
-    """Steps a second."""
+    """Rate of the dataset in Hz."""
     jobs: int = 0
-    """Convert with so many processes as well, and with one, and compare by the wall clock. 0: not."""
+    """Number of processes to compare with one process by wall-clock time. 0: no comparison."""
     jobs_episodes: int = 8
-    """How many recordings for that: starting a process takes seconds."""
+    """Number of recordings for that comparison; starting a process takes seconds."""
 
 
 def main(cfg: Benchmark) -> None:
-    """Run it."""
+    """Run the benchmark."""
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
         source = cfg.trajectory or generated(work / "demos", cfg.episodes)
         trajectory = repeated(source, cfg.episodes, work / "trajectory.h5")
         report: dict[str, Any] = {"cores": os.cpu_count(), "load": os.getloadavg()[1], "size": cfg.size}
-        report |= in_turns(cfg, trajectory, work)
+        report |= measure_cases(cfg, trajectory, work)
         if cfg.jobs > 1:
             more = repeated(source, cfg.jobs_episodes, work / "more.h5")
             walls: dict[int, list[float]] = {1: [], cfg.jobs: []}
             for _ in range(cfg.turns):
                 for jobs, spent in walls.items():
-                    spent.append(spent_on(partial(convert_one, cfg, more, work, "robocas", True, jobs))[1])
+                    spent.append(time_of(partial(convert_one, cfg, more, work, "robocas", True, jobs))[1])
             faster = median(walls[1]) / median(walls[cfg.jobs])
-            report["jobs"] = {"times as fast": round(faster, 2), "wall s": {n: rounded(w) for n, w in walls.items()}}
+            report["jobs"] = {"speedup": round(faster, 2), "wall s": {n: rounded(w) for n, w in walls.items()}}
     print(json.dumps(report, indent=2))
 
 
-def in_turns(cfg: Benchmark, trajectory: Path, work: Path) -> dict[str, Any]:
-    """The bare loop and the cases, each once a turn."""
+def measure_cases(cfg: Benchmark, trajectory: Path, work: Path) -> dict[str, Any]:
+    """Return the CPU and wall-clock times of the bare loop and the cases; each runs once per round."""
     bare: dict[bool, list[tuple[float, float]]] = {True: [], False: []}
     cases: dict[str, list[tuple[float, float]]] = {name: [] for name in cfg.cases}
     with TrajectoryFile(trajectory) as file:
@@ -98,11 +98,11 @@ def in_turns(cfg: Benchmark, trajectory: Path, work: Path) -> dict[str, Any]:
                     spent.append(alone(cfg, file, source, TEXTURES[depth]))
                 for name, spent in cases.items():
                     to, depth = CASES[name]
-                    spent.append(spent_on(partial(convert_one, cfg, trajectory, work, to, depth)))
+                    spent.append(time_of(partial(convert_one, cfg, trajectory, work, to, depth)))
 
     def figures(spent: list[tuple[float, float]]) -> dict[str, Any]:
         cpu, wall = zip(*spent, strict=True)
-        return {"cpu ms a step": round(1000 * median(cpu) / steps, 1), "cpu s": rounded(cpu), "wall s": rounded(wall)}
+        return {"cpu ms per step": round(1000 * median(cpu) / steps, 1), "cpu s": rounded(cpu), "wall s": rounded(wall)}
 
     per_step = {depth: median(cpu for cpu, _ in spent) for depth, spent in bare.items()}
     return {
@@ -110,14 +110,17 @@ def in_turns(cfg: Benchmark, trajectory: Path, work: Path) -> dict[str, Any]:
         "bare, depth": figures(bare[True]),
         "bare": figures(bare[False]),
         **{
-            name: {"over bare": round(median(cpu for cpu, _ in spent) / per_step[CASES[name][1]], 2), **figures(spent)}
+            name: {
+                "/ bare": round(median(cpu for cpu, _ in spent) / per_step[CASES[name][1]], 2),
+                **figures(spent),
+            }
             for name, spent in cases.items()
         },
     }
 
 
 def alone(cfg: Benchmark, file: TrajectoryFile, source: EnvRenderer, textures: tuple[str, ...]) -> tuple[float, float]:
-    """CPU and wall seconds of rendering the recordings; scenes are built outside."""
+    """Return the CPU and wall-clock seconds of rendering the recordings, without the time of building scenes."""
     total = (0.0, 0.0)
     env: Any = source.env.unwrapped
     for index in range(cfg.episodes):
@@ -141,13 +144,13 @@ def alone(cfg: Benchmark, file: TrajectoryFile, source: EnvRenderer, textures: t
                     for texture in textures:
                         camera.get_picture(texture)
 
-        spent = spent_on(loop)
+        spent = time_of(loop)
         total = (total[0] + spent[0], total[1] + spent[1])
     return total
 
 
 def convert_one(cfg: Benchmark, trajectory: Path, work: Path, to: str, depth: bool, jobs: int = 1) -> None:
-    """Convert, previews included."""
+    """Convert the recordings, with previews."""
     common: dict[str, Any] = {"rate_hz": cfg.rate, "size": cfg.size, "depth": depth, "jobs": jobs}
     common |= {"episode_seconds": math.inf, "memory_gb": math.inf}  # without limits, one job runs in this process
     with tempfile.TemporaryDirectory(dir=work) as out:
@@ -158,21 +161,21 @@ def convert_one(cfg: Benchmark, trajectory: Path, work: Path, to: str, depth: bo
 
 
 def generated(out: Path, episodes: int) -> Path:
-    """Pick demonstrations, from seed 0 on."""
+    """Generate pick demonstrations from seed 0."""
     command = [sys.executable, ROOT / "robocas_cli.py", "generate", "pick", "-n", str(episodes), "--out", out]
     subprocess.run(command, check=True, stdout=sys.stderr)
     return out / "trajectory.h5"
 
 
-def spent_on(call: Callable[[], object]) -> tuple[float, float]:
-    """CPU and wall seconds."""
+def time_of(call: Callable[[], object]) -> tuple[float, float]:
+    """Return the CPU and wall-clock seconds of a call."""
     before, begun = cpu(), time.perf_counter()
     call()
     return cpu() - before, time.perf_counter() - begun
 
 
 def cpu() -> float:
-    """Seconds of CPU time that this process and its children that have ended have used."""
+    """Return the CPU seconds of this process and its finished children."""
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(one.ru_utime + one.ru_stime for one in used)
 

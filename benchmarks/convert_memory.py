@@ -1,4 +1,4 @@
-"""Seconds an episode by part, and memory, of conversions to RoboCAS and to LeRobot. Prints JSON.
+"""Measure the seconds per episode by part, and the memory, of conversions to RoboCAS and to LeRobot; print JSON.
 
 python benchmarks/convert_memory.py demos/pick/trajectory.h5 --episodes 20 200 --size 64 48
 """
@@ -20,38 +20,37 @@ import h5py
 import numpy as np
 import tyro
 
-_MB = 1024 / 1e6  # Linux counts kilobytes
+_MB = 1024 / 1e6  # Linux reports kilobytes
 _SHOWN = (1, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 
 @dataclass
 class Benchmark:
-    """Convert so many episodes, and more: where the time goes, and whether memory grows with their number.
+    """Measure the time of conversion by part, and whether memory grows with the number of episodes.
 
-    Where the trajectory has fewer episodes, its recordings are repeated into a temporary larger one. Each conversion is
-    a process of its own, and its peak that of the whole process: Python, torch, PhysX, the renderer and a scene are in
-    it. Full images take seconds an episode where rendering is done in software; --size 64 48 shows as well whether
-    memory grows, and so does --stand-in, in a minute.
+    The recordings of a trajectory with fewer episodes are repeated in a temporary file. Each conversion runs in a new
+    process, whose peak memory includes Python, torch, PhysX, the renderer and a scene. With a software renderer, full
+    images take seconds per episode; --size 64 48 or --stand-in shows in a minute whether memory grows.
     """
 
     trajectory: Annotated[Path, tyro.conf.Positional]
-    """F.h5, with F.json beside it."""
+    """File F.h5, next to F.json."""
     episodes: tuple[int, ...] = (20, 200)
-    """How many episodes, one conversion to each format for each number."""
+    """Numbers of episodes; each is converted to each format."""
     to: tuple[Literal["robocas", "lerobot"], ...] = ("robocas", "lerobot")
     """Formats."""
     size: tuple[int, int] | None = None
-    """Width and height of the images; default: the cameras' own."""
+    """Width and height of the images in pixels. Default: those of the cameras."""
     rate: float = 5.0
-    """Steps a second."""
+    """Rate of the dataset in Hz."""
     jobs: int = 1
-    """Processes that render."""
+    """Number of processes that render."""
     stand_in: bool = False
-    """Do not render: grey ramps are the images. Everything else is done."""
+    """Write grey ramps instead of rendered images; all other work is done."""
 
 
 class StandIn:
-    """A ``FrameSource`` of grey ramps."""
+    """Renderer stand-in that returns grey ramps."""
 
     def __init__(self, _env_info: dict[str, Any], _control_mode: str, image_options: Any) -> None:
         self.image_options = image_options
@@ -60,10 +59,10 @@ class StandIn:
         self.rgb, self.depth = np.repeat(ramp[..., None] % 256, 3, 2).astype(np.uint8), ramp.astype(np.uint16)
 
     def load(self, recording: Any) -> None:
-        """Nothing to build."""
+        """Build nothing."""
 
     def frames(self, _recording: Any, samples: np.ndarray) -> Iterator[Any]:
-        """A ramp that moves."""
+        """Yield frames with a moving ramp."""
         from robocas_ms3.datasets.sources.episode_source import StepImages
 
         for sample in samples:
@@ -72,36 +71,36 @@ class StandIn:
             yield StepImages(rgb, depth)
 
     def cameras(self) -> dict[str, Any]:
-        """All in one place."""
+        """Return cameras at one pose."""
         from robocas_ms3.datasets.sources.episode_source import CameraModel
 
         model = CameraModel(np.array([24.0, 24.0, 32.0, 24.0]), np.eye(4), "world")
         return dict.fromkeys(self.image_options.cameras, model)
 
     def scene(self) -> dict[str, Any]:
-        """Nothing is known."""
+        """Return no scene."""
         return {"task": None, "config": None, "layout": None, "objects": None}
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Close nothing."""
 
 
 def main(cfg: Benchmark) -> None:
-    """Run it."""
+    """Run the benchmark."""
     results = []
     for count in cfg.episodes:
         for to in cfg.to:
             with tempfile.TemporaryDirectory() as folder:
-                trajectory = repeated(cfg.trajectory, count, Path(folder) / "trajectory.h5")
-                # A fresh process: a peak of before does not hide this one's.
+                trajectory = repeat_recordings(cfg.trajectory, count, Path(folder) / "trajectory.h5")
+                # in a new process, because the peak memory of a process never decreases
                 with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
                     results.append(pool.submit(measure, cfg, trajectory, to, Path(folder) / "out").result())
     about = {"size": cfg.size, "rate": cfg.rate, "jobs": cfg.jobs, "stand_in": cfg.stand_in}
     print(json.dumps({**about, "conversions": results}, indent=2))
 
 
-def repeated(source: Path, count: int, target: Path) -> Path:
-    """A trajectory of so many successful recordings of another, which begin anew where they end, a little changed."""
+def repeat_recordings(source: Path, count: int, target: Path) -> Path:
+    """Write a trajectory of `count` successful recordings; repeated recordings are slightly changed."""
     metadata = json.loads(source.with_suffix(".json").read_text(encoding="utf-8"))
     good = [episode for episode in metadata["episodes"] if episode["success"]]
     episodes = []
@@ -109,14 +108,16 @@ def repeated(source: Path, count: int, target: Path) -> Path:
         for number in range(count):
             episode = good[number % len(good)]
             old.copy(f"traj_{episode['episode_id']}", new, f"traj_{number}")
-            new[f"traj_{number}/actions"][0, 0] += 1e-5 * (number // len(good))  # a recording is converted once
+            new[f"traj_{number}/actions"][0, 0] += 1e-5 * (
+                number // len(good)
+            )  # a recording with an equal hash would be converted only once
             episodes.append({**episode, "episode_id": number})
     target.with_suffix(".json").write_text(json.dumps({**metadata, "episodes": episodes}), encoding="utf-8")
     return target
 
 
 def measure(cfg: Benchmark, trajectory: Path, to: str, out: Path) -> dict[str, Any]:
-    """One conversion, in the process that this is called in."""
+    """Run one conversion in this process, and return its measurements."""
     from robocas_ms3.datasets import ConversionSettings, convert
 
     peaks: list[int] = []
@@ -146,10 +147,10 @@ def measure(cfg: Benchmark, trajectory: Path, to: str, out: Path) -> dict[str, A
         "episodes": count,
         "steps": sum(episode.steps for episode in done.episodes),
         "seconds": round(done.seconds, 1),
-        "seconds_an_episode": round(done.seconds / count, 3),
+        "seconds_per_episode": round(done.seconds / count, 3),
         "peak_mb": _peak(resource.RUSAGE_SELF),
         "peak_mb_after_episode": {number: peaks[number - 1] for number in _SHOWN if number <= count},
-        "peak_mb_of_largest_child": _peak(resource.RUSAGE_CHILDREN),  # with --jobs a process that renders
+        "peak_mb_of_largest_child": _peak(resource.RUSAGE_CHILDREN),  # with --jobs: a process that renders
     }
 
 

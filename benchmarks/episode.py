@@ -1,8 +1,8 @@
-"""What demonstrations cost and how good they are, without rendering; prints JSON.
+"""Measure the cost and quality of demonstrations, without rendering; print JSON.
 
-For each configuration, over seeds: CPU seconds an episode by part, beside those of bare PhysX under its actions;
-success, length, attempts, memory; and whether the episodes' own 7-D actions succeed again open loop, as a dataset would
-hold them, clean and with fresh noise.
+For each configuration, over seeds: the CPU seconds per episode by part, and those of bare PhysX for the same actions;
+success, length, attempts and memory; and the success of the 7-D actions of a dataset in open loop, with and without
+noise.
 
 python benchmarks/episode.py pick_table_scattered search_table_stacked --seeds 60000:60020
 """
@@ -37,7 +37,7 @@ from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.registry import PANDA
 from robocas_ms3.scenes.config import load_task_config
 
-FRESH = 1000  # first number of the noise drawn here; trials while generating have smaller ones
+FRESH = 1000  # first number of the noise seeds here; the checks during generation use smaller ones
 
 
 @dataclass
@@ -49,20 +49,20 @@ class Args:
     pack: str = "builtin"
     """Object pack."""
     draws: int = 5
-    """Noisy trials of each episode."""
+    """Number of noise checks per episode."""
     noise: tuple[float, float] = (0.5, 0.2)
-    """Its standard deviations, mm and degrees, of each component of each action."""
+    """Standard deviations of the noise per component of each action, in mm and degrees."""
     jobs: int = 1
-    """Processes. One, on a machine that does nothing else, where times are to be compared."""
+    """Number of processes. To compare times, use 1 on an idle machine."""
     fork: bool = True
-    """Undo what fails by forking."""
+    """Undo failed decisions by forked processes."""
     memory: bool = False
-    """Sample the memory of the process and all its branches together (PSS), which takes time of its own."""
+    """Sample the memory of the process and its branches (PSS); this takes time."""
 
 
 @dataclass
 class Seed:
-    """What came of a seed."""
+    """Measurements of one seed."""
 
     seed: int
     success: bool
@@ -100,7 +100,7 @@ def run(args: Args, config: str, seeds: list[int]) -> list[Seed]:
     generator = EpisodeGenerator(settings, fork=args.fork)
     found = []
     with tempfile.TemporaryDirectory() as folder:
-        generator.generate(seeds[0] - 1, Path(folder), "warm")  # loads packs, starts planners
+        generator.generate(seeds[0] - 1, Path(folder), "warm")  # loads packs and starts planners
         for seed in seeds:
             before = cpu()
             with sampled_memory(args.memory) as memory:
@@ -120,7 +120,7 @@ def run(args: Args, config: str, seeds: list[int]) -> list[Seed]:
 
 
 def cpu() -> float:
-    """CPU seconds of this process and of the children it has waited for."""
+    """Return the CPU seconds of this process and of its finished children."""
     spent = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(usage.ru_utime + usage.ru_stime for usage in spent)
 
@@ -132,7 +132,7 @@ def rss_mb() -> int:
 
 @contextmanager
 def sampled_memory(wanted: bool) -> Iterator[list[int]]:
-    """MB of this process and its branches, shared pages counted once, every half a second while inside."""
+    """Sample the memory in MB (PSS) of this process and its branches twice per second."""
     samples: list[int] = []
     over = threading.Event()
 
@@ -152,7 +152,7 @@ def sampled_memory(wanted: bool) -> Iterator[list[int]]:
 
 
 def family(pid: int) -> list[int]:
-    """A process and all that descend from it."""
+    """Return the ids of a process and all its descendants."""
     try:
         children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
     except OSError:
@@ -169,7 +169,7 @@ def pss_kb(pid: int) -> int:
 
 
 def judge(found: Seed, generator: EpisodeGenerator, path: Path, args: Args) -> None:
-    """Play the recorded actions in bare PhysX, and the episode's own 7-D actions open loop."""
+    """Replay the recorded actions in bare PhysX, and the 7-D actions of the episode in open loop."""
     with open_trajectory(path) as file:
         group: Any = file["traj_0"]
         actions = np.array(group["actions"])
@@ -192,7 +192,7 @@ def judge(found: Seed, generator: EpisodeGenerator, path: Path, args: Args) -> N
 
 
 def bare_physx(generator: EpisodeGenerator, seed: int, actions: np.ndarray) -> float:
-    """CPU seconds that PhysX takes for an episode's actions."""
+    """Return the CPU seconds that PhysX takes for the actions of an episode."""
     generator.env.reset(seed=seed)
     env: Any = generator.env.unwrapped
     substeps, spent = env._sim_steps_per_control, 0.0

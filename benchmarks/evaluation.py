@@ -1,8 +1,8 @@
-"""CPU time of the evaluation's loop beside a bare one over the same scenes and actions; prints JSON.
+"""Measure the CPU time of the evaluation loop and of a bare loop over the same scenes and actions; print JSON.
 
-The bare loop resets the same vector environment and steps it: no policy, no stages, no measures, nothing written. Both
-play one episode in each env, with the same joint targets, to the same last step; resets are not timed. The two take
-turns, and a case's figure is the median of its turns. CPU time is of this process and its workers together.
+The bare loop only resets and steps the same vector environment, without policy, stages, measures and files. Both loops
+run one episode in each env, with the same joint targets and the same number of steps; resets are not timed. The loops
+alternate, and the result of a case is the median of its rounds. CPU time is the sum over this process and its workers.
 
 Run: python benchmarks/evaluation.py [--tasks pick search] [--turns 5] [--steps 300]
 """
@@ -36,25 +36,25 @@ from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.scenes.task_specs import TASKS
 
 RATE = 20  # Hz
-REACH = 0.3  # rad that the joints go to and fro
+REACH = 0.3  # rad, amplitude of the joint motion
 
 
 @dataclass
 class Args:
     tasks: tuple[str, ...] = ("pick", "search")
-    """Of the protocol."""
+    """Tasks of the protocol."""
     protocol: str = "ms3-v1"
-    """Whose scenes."""
+    """Protocol with the scenes."""
     envs: int = 2
-    """Envs at a time."""
+    """Number of envs."""
     turns: int = 5
-    """Of each case."""
+    """Number of rounds of each case."""
     steps: int = 300
-    """Of each env a turn."""
+    """Steps of each env per round."""
 
 
-class Waving:
-    """Joints that go to and fro about where they are, gripper open."""
+class JointWavePolicy:
+    """Policy that moves the joints back and forth about their initial positions, with an open gripper."""
 
     spec = PolicySpec("joint_positions", rate_hz=RATE, language="none")
 
@@ -62,15 +62,15 @@ class Waving:
         self._step, self._from = 0, np.zeros((0, 7))
 
     def reset(self, episodes: list[EpisodeSpec]) -> None:
-        """Begin anew, all envs at once."""
+        """Start episodes in all envs."""
         self._step = 0
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
-        """(E, 8) joint targets."""
+        """Return joint targets (E, 8)."""
         return self.targets(observations.qpos)
 
     def targets(self, qpos: NDArray[np.floating]) -> NDArray[np.floating]:
-        """The next targets, from what the joints are at the first step."""
+        """Return the next targets from the joint positions at the first step."""
         if self._step == 0:
             self._from = np.array(qpos[:, MOBILE_PANDA.arm_slice])
         self._step += 1
@@ -101,14 +101,14 @@ def main(args: Args) -> None:
             max_episode_steps=10**9,
         )
         settings = EvaluationSettings(protocol=args.protocol, envs=args.envs, backend="processes")
-        ours = EvaluationSession(Waving(), settings)
+        ours = EvaluationSession(JointWavePolicy(), settings)
         spent: dict[str, list[float]] = {"bare": [], "evaluation": []}
         for _ in range(args.turns):
             spent["bare"].append(alone(bare, [one.seed for one in episodes], args.steps))
             spent["evaluation"].append(evaluated(ours, episodes, args.steps))
         per_step = {name: 1000 * float(np.median(turns)) / args.steps / args.envs for name, turns in spent.items()}
         cases[task] = {
-            **{f"{name}, cpu ms a step": round(value, 3) for name, value in per_step.items()},
+            **{f"{name}, cpu ms per step": round(value, 3) for name, value in per_step.items()},
             "evaluation / bare": round(per_step["evaluation"] / per_step["bare"], 3),
             "turns": {name: [round(turn, 2) for turn in turns] for name, turns in spent.items()},
         }
@@ -118,8 +118,8 @@ def main(args: Args) -> None:
 
 
 def alone(env: Any, seeds: list[int], steps: int) -> float:
-    """CPU seconds of a bare loop."""
-    policy = Waving()
+    """Return the CPU seconds of a bare loop."""
+    policy = JointWavePolicy()
     policy.reset([])
     obs, _ = env.reset(seed=seeds, options={"env_idx": np.arange(len(seeds))})
     before = cpu(env)
@@ -129,29 +129,29 @@ def alone(env: Any, seeds: list[int], steps: int) -> float:
 
 
 def evaluated(session: EvaluationSession, episodes: list[ProtocolEpisode], steps: int) -> float:
-    """CPU seconds of the evaluation's loop from the first step on."""
+    """Return the CPU seconds of the evaluation loop from the first step on."""
     batch = session.open_batch(episodes[0], len(episodes), steps)
-    policy = Counting(batch.env)
+    policy = TimedPolicy(batch.env)
     ended = list(rollout(batch, policy, [session.episode_spec(one) for one in episodes]))
     assert [one.steps for one in ended] == [steps] * len(episodes)
     return cpu(batch.env) - policy.before
 
 
-class Counting(Waving):
-    """Notes the CPU time at the first step."""
+class TimedPolicy(JointWavePolicy):
+    """Policy that records the CPU time at the first step."""
 
     def __init__(self, env: Any) -> None:
         super().__init__()
         self.before, self._env = 0.0, env
 
     def reset(self, episodes: list[EpisodeSpec]) -> None:
-        """Begin anew, all envs at once."""
+        """Start episodes in all envs."""
         super().reset(episodes)
         self.before = cpu(self._env)
 
 
 def cpu(env: Any) -> float:
-    """Seconds of CPU time that this process and an environment's workers have used."""
+    """Return the CPU seconds of this process and the workers of an environment."""
     workers = [int(Path(f"/proc/{pid}/schedstat").read_text().split()[0]) / 1e9 for pid in env.unwrapped.pids]
     return time.process_time() + sum(workers)
 

@@ -1,7 +1,7 @@
-"""Environment steps a second of many envs at once, beside ManiSkill's PickCube-v1 and a bare scene of as many bodies.
+"""Measure the steps per second of batched envs, of ManiSkill's PickCube-v1, and of a bare scene with as many bodies.
 
-Without PhysX on a GPU only one env of each runs: several are processes there (`benchmarks/vector.py`). Actions are
-random, time is wall-clock time after a warm-up, resets are not in it. Prints JSON.
+Without PhysX on a GPU only one env runs; `benchmarks/vector.py` measures several envs in processes. Actions are random.
+Time is wall-clock time after a warm-up, without resets. Prints JSON.
 
 Run: python benchmarks/fps.py [--envs 1 16 256 1024 4096] [--modes state rgb] [--size 128 128] [--steps 100]
 """
@@ -41,11 +41,11 @@ from robocas_ms3.tasks.engine import gpu_memory
 
 @register_env("RoboCASBare-v1", max_episode_steps=10_000)
 class BareEnv(BaseEnv):
-    """ManiSkill's Panda above the furniture and objects of a configuration; nothing is evaluated.
+    """Env with ManiSkill's Panda and the furniture and objects of a configuration, without evaluation.
 
     Args:
         scene_config: name of a task configuration; every env has the layout of seed 0.
-        kwargs: of ``BaseEnv``.
+        kwargs: arguments of ``BaseEnv``.
     """
 
     SUPPORTED_ROBOTS = ["panda"]  # noqa: RUF012  (ManiSkill's form)
@@ -91,7 +91,7 @@ class BareEnv(BaseEnv):
             thing.set_pose(Pose.create_from_pq(position[None].float(), torch.as_tensor(turn)[None]))
 
     def evaluate(self) -> dict:
-        """Nothing."""
+        """Evaluate nothing."""
         return {}
 
 
@@ -100,20 +100,20 @@ class Args:
     envs: tuple[int, ...] = (1, 16, 64, 256, 1024, 4096)
     """Numbers of envs."""
     modes: tuple[Literal["state", "rgb"], ...] = ("state", "rgb")
-    """Observations: states, or three cameras (of PickCube-v1 one)."""
+    """Observation modes: states, or three cameras (one for PickCube-v1)."""
     configs: tuple[str, ...] = ("pick_table_scattered", "search_table_stacked")
     """Task configurations."""
     size: tuple[int, int] = (128, 128)
     """Width and height of the images in pixels."""
     steps: int = 100
-    """Control steps that are timed."""
+    """Number of control steps to measure."""
     seconds: float = 60.0
-    """Time after which a case stops early."""
+    """Seconds after which a case stops early."""
 
 
 def main(args: Args) -> None:
     torch.set_num_threads(1)
-    problem = start_physx()  # which can't be done any more once a CPU env was made
+    problem = start_physx()  # must happen before the first env on the CPU
     device = torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu"
     report: dict[str, Any] = {"device": device, "size": args.size, "steps_per_second": {}}
     failed = 0
@@ -128,7 +128,7 @@ def main(args: Args) -> None:
                 if count == 1 or not problem:
                     try:
                         rates[name][count] = round(rate(env_id, count, mode, args, kwargs), 1)
-                    except Exception as error:  # one case that fails, such as for memory, leaves the others
+                    except Exception as error:  # for example too little memory; the other cases still run
                         rates[name][count] = f"{type(error).__name__}: {error}"
                         failed += 1
         report["steps_per_second"][mode] = rates
@@ -148,19 +148,19 @@ def main(args: Args) -> None:
 
 
 def start_physx() -> str:
-    """Start PhysX on the GPU; return why there is none."""
+    """Start PhysX on the GPU; return the reason if that fails, else ""."""
     if not torch.cuda.is_available():
         return "no CUDA device"
     try:
-        with redirect_stdout(sys.stderr):  # SAPIEN says there that it downloads
+        with redirect_stdout(sys.stderr):  # SAPIEN prints there that it downloads the library
             physx.enable_gpu()
-    except Exception as error:  # such as requests' for a library that cannot be downloaded
+    except Exception as error:  # for example of requests, if the library cannot be downloaded
         return f"PhysX does not start on the GPU: {format_error(error)}"
     return ""
 
 
 def rate(env_id: str, count: int, mode: str, args: Args, kwargs: dict[str, Any]) -> float:
-    """Steps of all envs together, a second."""
+    """Return the steps per second of all envs together."""
     kwargs = kwargs if mode == "rgb" else {**kwargs, "render_backend": "none"}
     sensors = dict(zip(("width", "height"), args.size, strict=True))
     kwargs = {**kwargs, "obs_mode": mode, "control_mode": "pd_joint_delta_pos", "sensor_configs": sensors}

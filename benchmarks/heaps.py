@@ -1,4 +1,4 @@
-"""How high heaps are, how much of them is hidden, and what they take to make; prints JSON.
+"""Measure the height of heaps, the hidden fraction of objects, and the time to make a heap; print JSON.
 
 python benchmarks/heaps.py --seeds 50
 """
@@ -29,15 +29,15 @@ class Benchmark:
     pack: str = "builtin"
     """Object pack."""
     seeds: int = 50
-    """How many, from 0 on."""
+    """Number of seeds, from 0 on."""
 
 
 def main(cfg: Benchmark) -> None:
-    """Run it."""
+    """Run the benchmark."""
     pack = load_pack(cfg.pack)
     model = SceneModel.load(load_task_config(cfg.config), pack, load_pack("builtin"))
     support = transform_points(model.support_pose, np.array([[0, 0, model.region.z]]))[0, 2]
-    for asset in pack.objects.values():  # read once a process, and not part of what a layout takes
+    for asset in pack.objects.values():  # read once per process; not part of the time of a layout
         _ = asset.hulls, asset.annotations, asset.surface_points()
     heights, shares, targets, seconds, failures = [], [], [], [], []
     for seed in range(cfg.seeds):

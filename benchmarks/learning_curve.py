@@ -1,4 +1,4 @@
-"""Draws what several runs of `robocas train ppo` have learned. Writes a JPEG.
+"""Draw the learning curves of runs of `robocas train ppo`; write a JPEG.
 
 Run: python benchmarks/learning_curve.py out/ppo_1 out/ppo_2 out/ppo_3 [--out docs/images/ppo.jpg]
 """
@@ -19,7 +19,7 @@ COLOURS = ("#2f6fa8", "#e08a2e", "#4f9a6a", "#9a5fa8", "#7a7a7a")
 @dataclass
 class Args:
     runs: tyro.conf.Positional[list[Path]]
-    """Folders with a metrics.csv each."""
+    """Folders of the runs, each with a metrics.csv."""
     out: Path = Path("docs/images/ppo.jpg")
 
 
@@ -34,7 +34,7 @@ def main(args: Args) -> None:
             left.plot(steps, found["return"], color=colour)
             middle.plot(steps, 100 * found["held"], color=colour)
             right.plot(found["seconds"] / 60, 100 * found["held"], color=colour, label=run.name)
-        left.set(title="return of an episode", xlabel="thousand steps")
+        left.set(title="return per episode", xlabel="thousand steps")
         middle.set(title="held at the end, %", xlabel="thousand steps", ylim=(0, 100))
         right.set(title="held at the end, %", xlabel="minutes", ylim=(0, 100))
         right.legend(frameon=False)
@@ -46,7 +46,7 @@ def main(args: Args) -> None:
 
 
 def read(path: Path) -> dict[str, np.ndarray]:
-    """What a metrics.csv says of training, by column."""
+    """Return the columns of the training rows of a metrics.csv."""
     with path.open(newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["split"] == "train"]
     names = ("step", "seconds", "return", "held")

@@ -1,4 +1,4 @@
-"""What a plan costs, by a few episodes of each part: CPU hours, hours on some cores, gigabytes; prints JSON.
+"""Estimate the cost of a plan from a few episodes of each part: CPU hours, hours on N cores, gigabytes; print JSON.
 
 python benchmarks/plan_cost.py paper --episodes 4 --seed 0
 """
@@ -25,22 +25,22 @@ from robocas_ms3.plans.status import PartStatus, read_status
 
 @dataclass
 class Benchmark:
-    """Run a plan of fewer episodes, part by part as many, and multiply."""
+    """Run a plan with the same number of episodes for each part, and extrapolate."""
 
     plan: Annotated[str, tyro.conf.Positional] = "paper"
-    """Name of a shipped plan, or a YAML file."""
+    """Name of a bundled plan, or a YAML file."""
     episodes: int = 4
-    """Of each part."""
+    """Number of episodes of each part."""
     seed: int = 0
-    """The first of all parts; take ones that were never used."""
+    """First seed of all parts; choose unused seeds."""
     jobs: int = os.cpu_count() or 1
-    """Episodes at once: one a core, as the plan itself is run."""
+    """Number of parallel jobs: one per core, as for the plan."""
     cores: tuple[int, ...] = (2, 64)
-    """Machines to say the hours of."""
+    """Numbers of cores for which to print the hours."""
 
 
 def main(cfg: Benchmark) -> None:
-    """Run it."""
+    """Run the benchmark."""
     plan = load_plan(cfg.plan)
     with tempfile.TemporaryDirectory() as folder:
         path, out = Path(folder) / "sample.yaml", Path(folder) / "out"
@@ -52,7 +52,7 @@ def main(cfg: Benchmark) -> None:
 
 
 def sample_of(plan: Plan, cfg: Benchmark) -> dict[str, Any]:
-    """The plan with fewer episodes, in units of one; texts are not embedded, which costs next to nothing."""
+    """Return the plan with fewer episodes, work units of one episode, and no embeddings (their cost is negligible)."""
     sample = plan.model_dump(mode="json", exclude_none=True)
     for number, part in enumerate(sample["parts"]):
         part |= {"episodes": cfg.episodes, "seed": cfg.seed + 1000 * number}
@@ -60,7 +60,7 @@ def sample_of(plan: Plan, cfg: Benchmark) -> dict[str, Any]:
 
 
 def report(plan: Plan, cfg: Benchmark, parts: list[PartStatus], wall: float) -> dict[str, Any]:
-    """The figures, with the sum that leads to them."""
+    """Return the costs and the measurements that they follow from."""
     rows = {}
     for part, measured in zip(plan.parts, parts, strict=True):
         each = measured.record_seconds + measured.render_seconds

@@ -1,4 +1,4 @@
-"""What a plan's engine and ledgers cost beside the work: units that only wait a second, on many workers; prints JSON.
+"""Measure the overhead of the executor and files of a plan with work units that only wait; print JSON.
 
 python benchmarks/plan_overhead.py --units 10000 --workers 64
 """
@@ -25,33 +25,33 @@ from robocas_ms3.plans.run import run_shard
 
 @dataclass
 class Benchmark:
-    """Run a plan of made-up units, of a seed each, until all are done; nothing is joined."""
+    """Run a plan of synthetic work units of one seed each; nothing is joined."""
 
     units: int = 10_000
-    """How many."""
+    """Number of work units."""
     workers: int = 64
-    """Processes that do them."""
+    """Number of worker processes."""
     seconds: float = 1.0
-    """How long a unit takes."""
+    """Seconds per work unit."""
 
 
 @dataclass
 class Wait:
-    """A stage that takes its time, and none of the processor's: `plan.limits.render_seconds`."""
+    """Stage that sleeps for `plan.limits.render_seconds`."""
 
     plan: Plan
 
     def run(self, files: SeedFiles) -> dict[str, Any]:
-        """Do nothing for a while."""
+        """Sleep."""
         time.sleep(self.plan.limits.render_seconds)
         return {"success": True, "steps": 1}
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Close nothing."""
 
 
 def main(cfg: Benchmark) -> None:
-    """Run it."""
+    """Run the benchmark."""
     plan = Plan.model_validate(
         {
             "parts": [PartConfig(task="pick", config="pick_table_scattered", episodes=cfg.units, name="waits")],
@@ -69,7 +69,7 @@ def main(cfg: Benchmark) -> None:
         cpu = time.process_time() - cpu
         units = [WorkUnit(0, block) for block in range(cfg.units)]
         at = np.sort([one.at for unit in units for one in folder.outcomes(unit) or ()])
-    # from when every worker has started until the first has nothing left to do
+    # from the start of the last worker until the first worker is idle
     first, last = 2 * cfg.workers, cfg.units - cfg.workers
     rate = (last - first) / (at[last] - at[first])
     report = {
@@ -77,7 +77,7 @@ def main(cfg: Benchmark) -> None:
         "workers": cfg.workers,
         "cores": os.cpu_count(),
         "seconds_a_unit": cfg.seconds,
-        "units_a_second": round(float(rate), 2),
+        "units_per_second": round(float(rate), 2),
         "overhead_percent": round(100 * (cfg.workers / cfg.seconds / float(rate) - 1), 2),
         "wall_seconds": round(float(at[-1] - start), 1),
         "seconds_to_start": round(float(at[cfg.workers - 1] - start) - cfg.seconds, 1),

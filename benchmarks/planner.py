@@ -1,7 +1,7 @@
-"""How fast the planner is: inverse kinematics, joint-space plans, straight lines, batched reachability. Prints JSON.
+"""Measure the planner: inverse kinematics, joint-space plans, straight lines, batched reachability; print JSON.
 
-Each scene is a table with 15 boxes as a cloud of 5 mm spacing (about 50,000 points). The arm goes to top-down poses
-over the table and straight down or up from there.
+Each scene is a table with 15 boxes as a point cloud with 5 mm spacing (about 50,000 points). The arm moves to top-down
+poses over the table, and straight down or up from there.
 
     python benchmarks/planner.py --scenes 5 --plans 20
 """
@@ -27,7 +27,7 @@ SPACING = 0.005
 
 
 def box_surface(center: Array, size: Array, yaw: float) -> Array:
-    """Points (P, 3) on the six faces of a box."""
+    """Return points (P, 3) on the six faces of a box, in m."""
     faces = []
     for axis in range(3):
         u, v = (i for i in range(3) if i != axis)
@@ -42,7 +42,7 @@ def box_surface(center: Array, size: Array, yaw: float) -> Array:
 
 
 def table(rng: np.random.Generator) -> Array:
-    """Cloud of a table top 4 cm below the arm's base with 15 boxes on it."""
+    """Return the point cloud of a table top 4 cm below the arm's base with 15 boxes on it."""
     pieces = [box_surface(np.array([0.6, 0, -0.05]), np.array([0.5, 0.7, 0.02]), 0.0)]
     for _ in range(15):
         size = rng.uniform(0.03, 0.1, 3)
@@ -52,7 +52,7 @@ def table(rng: np.random.Generator) -> Array:
 
 
 def top_down(rng: np.random.Generator) -> Array:
-    """A pose of the TCP over the table, pointing down."""
+    """Return a random pose of the TCP over the table, pointing down."""
     yaw = rng.uniform(-np.pi, np.pi)
     c, s = np.cos(yaw), np.sin(yaw)
     pose = np.eye(4)
@@ -62,14 +62,14 @@ def top_down(rng: np.random.Generator) -> Array:
 
 
 class Stopwatch:
-    """Collects milliseconds and outcomes by name."""
+    """Milliseconds and outcomes by name."""
 
     def __init__(self) -> None:
         self.milliseconds: dict[str, list[float]] = {}
         self.outcomes: dict[str, Counter[str]] = {}
 
     def run(self, name: str, call: Callable, *args, **kwargs):
-        """Time a call; a failure to plan counts as an outcome and gives none."""
+        """Measure a call; a planning failure counts as an outcome and returns None."""
         start = time.perf_counter()
         try:
             result, outcome = call(*args, **kwargs), "ok"
@@ -80,7 +80,7 @@ class Stopwatch:
         return result
 
     def summary(self) -> dict:
-        """Median and 95th percentile (ms) and outcomes of every name."""
+        """Return median and 95th percentile in ms, and outcomes, by name."""
         return {
             name: {
                 "median_ms": round(float(np.median(values)), 2),

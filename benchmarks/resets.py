@@ -1,4 +1,4 @@
-"""What a reset takes that finds its layout in the cache, state only; prints JSON.
+"""Measure resets whose layout is in the layout cache, without images; print JSON.
 
 python benchmarks/resets.py --seeds 60
 """
@@ -21,21 +21,21 @@ from robocas_ms3.tasks import TASKS
 
 @dataclass
 class Benchmark:
-    """Fill the cache, then reset to each of its seeds."""
+    """Fill the layout cache, then reset to each of its seeds."""
 
     config: str = "search_table_stacked"
-    """Task configuration; this one has 15 objects."""
+    """Task configuration; the default has 15 objects."""
     pack: str = "builtin"
     """Object pack."""
     seeds: int = 60
-    """How many, from 0 on."""
+    """Number of seeds, from 0 on."""
     rounds: int = 3
-    """Times each seed is reset to, at least 2. In the first, objects are read from the pack."""
+    """Resets to each seed, at least 2. The first one reads objects from the pack."""
 
 
 def main(cfg: Benchmark) -> None:
-    """Run it."""
-    torch.set_num_threads(1)  # as generation does; the tensors are small
+    """Run the benchmark."""
+    torch.set_num_threads(1)  # as in generation; the tensors are small
     config = load_task_config(cfg.config)
     env = gym.make(TASKS[config.task].env_id, config=cfg.config, pack=cfg.pack, obs_mode="none", render_backend="none")
     base = env.unwrapped
@@ -60,7 +60,7 @@ def main(cfg: Benchmark) -> None:
 
 
 def _figures(rounds: list[list[tuple[float, float]]]) -> dict[str, dict[str, float]]:
-    """Of the wall's clock, and of this thread's CPU time, which a busy machine disturbs less."""
+    """Return statistics of the wall-clock time and of the CPU time of this thread, which depends less on other load."""
     figures = {}
     for name, seconds in zip(("wall", "cpu"), np.concatenate(rounds).T, strict=True):
         values = {"median": np.median(seconds), "mean": np.mean(seconds), "p95": np.percentile(seconds, 95)}

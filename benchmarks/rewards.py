@@ -1,4 +1,4 @@
-"""Draws the dense reward of a demonstration of each task, and of idlers who stop on the way. Writes a JPEG.
+"""Draw the dense reward of a demonstration of each task, and of runs that stop on the way; write a JPEG.
 
 Run: python benchmarks/rewards.py [--out docs/images/rewards.jpg]
 """
@@ -23,7 +23,7 @@ from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.tasks import TASKS
 
 BLUE, ORANGE, GREY = "#2f6fa8", "#e08a2e", "#9aa3ab"
-AFTER = 3.0  # s for which demonstration and idlers are watched beyond the demonstration's end
+AFTER = 3.0  # s that are drawn after the end of the demonstration
 SHADES = ("#f2f4f6", "#e4e8ec")
 
 
@@ -33,9 +33,9 @@ class Args:
         default_factory=lambda: ["pick_table_scattered", "select_table_orderly", "search_table_stacked",
                                  "open_pick_drawer"]
     )  # fmt: skip
-    """Task configurations, a demonstration of each."""
+    """Task configurations; one demonstration is drawn for each."""
     seed: int = 1
-    """The first that is tried."""
+    """First seed to try."""
     out: Path = Path("docs/images/rewards.jpg")
 
 
@@ -63,15 +63,16 @@ def draw(axes: Any, config: str, seed: int) -> None:
         if after - first > 0.035 * len(at):
             name = [*stages, "success"][at[first]]
             axes.text((first + after) / 2 / freq, 1.04, name, ha="center", color="#555", size=8)
-    for stop in idle_from(infos, actions):
+    for stop in stop_steps(infos, actions):
         idle, _ = play(env, seed, actions[:stop], len(levels) - stop)
         axes.plot(times[stop - 1 :], idle[stop - 1 :], color=ORANGE, lw=1.2, ls=(0, (4, 2)), zorder=3)
         axes.plot(times[stop - 1], idle[stop - 1], "o", color=ORANGE, ms=4, zorder=4)
-        print(f"{config} seed {seed}: who stops after {stop / freq:.1f} s gets {idle[-1]:.3f} a step from then on")
+        print(f"{config} seed {seed}: a run that stops after {stop / freq:.1f} s gets {idle[-1]:.3f} per step then")
     axes.plot(times, levels, color=BLUE, lw=1.8, zorder=5)
     print(f"{config} seed {seed}: {len(actions) / freq:.1f} s, mean of each fifth "
           f"{[round(float(part.mean()), 2) for part in np.array_split(levels[: len(actions)], 5)]}")  # fmt: skip
-    axes.set(title=config, ylim=(0, 1.14), xlim=(0, times[-1]), ylabel="reward a step", yticks=np.arange(0, 1.1, 0.25))
+    axes.set(title=config, ylim=(0, 1.14), xlim=(0, times[-1]), ylabel="reward per step")
+    axes.set(yticks=np.arange(0, 1.1, 0.25))
     axes.title.set_y(1.0)
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
@@ -79,7 +80,7 @@ def draw(axes: Any, config: str, seed: int) -> None:
 
 
 def demonstrate(config: str, seed: int) -> tuple[gym.Env, np.ndarray, int]:
-    """An environment with dense rewards, the actions of a demonstration, and its seed."""
+    """Return an environment with dense rewards, the actions of a demonstration, and its seed."""
     task = load_task_config(config).task
     generator = EpisodeGenerator(EpisodeSettings(task, config, "builtin"))
     with tempfile.TemporaryDirectory() as folder:
@@ -95,7 +96,7 @@ def demonstrate(config: str, seed: int) -> tuple[gym.Env, np.ndarray, int]:
 
 
 def play(env: gym.Env, seed: int, actions: np.ndarray, then: int) -> tuple[np.ndarray, list[dict]]:
-    """Rewards and infos of actions, and of the last one's repetition."""
+    """Return rewards and infos of the actions, followed by `then` repetitions of the last action."""
     env.reset(seed=seed)
     levels, infos = [], []
     for action in [*actions, *[actions[-1]] * then]:
@@ -106,13 +107,13 @@ def play(env: gym.Env, seed: int, actions: np.ndarray, then: int) -> tuple[np.nd
 
 
 def stage_of(table: Any, info: dict) -> int:
-    """The stage that the rewards' terms tell of: the first whose terms don't all count in full."""
+    """Return the index of the first stage with a reward term below 1."""
     full = [all(info["reward_terms"][name] == 1 for name in own) for own in table.stages.values()]
     return [*full, False].index(False)
 
 
-def idle_from(infos: list[dict], actions: np.ndarray) -> list[int]:
-    """Steps at which idlers stop: before the first touch of the target, holding it, lifted, above the basket."""
+def stop_steps(infos: list[dict], actions: np.ndarray) -> list[int]:
+    """Return steps at which to stop: before the first touch of the target, grasped, lifted, above the basket."""
     first = {
         flag: next(i for i, info in enumerate(infos) if info[flag])
         for flag in ("reached_target", "target_grasped", "target_lifted")

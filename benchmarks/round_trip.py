@@ -1,4 +1,4 @@
-"""Takes trajectories through every format and back, and compares; prints JSON.
+"""Convert trajectories to every format and back, and compare; print JSON.
 
 python benchmarks/round_trip.py demos/pick/trajectory.h5 demos/select/trajectory.h5 --out round_trip
 """
@@ -33,18 +33,18 @@ _NOT_UPSTREAMS = {"agv_pose", "rel_agv_pose", "language_embedding", "step_goal_e
 
 @dataclass
 class Benchmark:
-    """HDF5 to RoboCAS, to LeRobot, to upstream's form and back; all merged, and split by task again."""
+    """Convert HDF5 to RoboCAS, LeRobot, RoboCAS-v0 and back; merge all datasets, and split them by task."""
 
     trajectories: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Files F.h5 in folders named as their task."""
+    """Trajectory files F.h5, in folders named after their tasks."""
     out: Path
     """Folder for the datasets; must not exist."""
     size: tuple[int, int] | None = None
-    """Of the images; default 640 480."""
+    """Width and height of the images in pixels. Default: 640 480."""
 
 
 def main(cfg: Benchmark) -> None:
-    """Run it."""
+    """Run the benchmark."""
     cfg.out.mkdir(parents=True)
     report: dict[str, Any] = {}
     roots: list[Path] = []
@@ -68,7 +68,7 @@ def main(cfg: Benchmark) -> None:
 
 
 def _one(trajectory: Path, ours: Path, size: tuple[int, int] | None) -> dict[str, Any]:
-    """One trajectory through the formats."""
+    """Convert one trajectory to each format and back; return the differences."""
     report: dict[str, Any] = {}
     base = str(ours).removesuffix("_robocas")
     with _timed(report, "robocas"):
@@ -82,8 +82,8 @@ def _one(trajectory: Path, ours: Path, size: tuple[int, int] | None) -> dict[str
             convert_lerobot(ConversionSettings(source, root, size=kept, lerobot_version=version))
         report[name] |= _compare(Dataset(ours), LeRobotDataset(root))
         report[name]["violations"] = len(check_lerobot(root, decode=True).violations)
-    theirs, back = Path(f"{base}_upstream"), Path(f"{base}_imported")
-    _as_upstream(ours, theirs)
+    theirs, back = Path(f"{base}_v0"), Path(f"{base}_imported")
+    _write_v0(ours, theirs)
     with _timed(report, "import"):
         import_robocas(survey(theirs), back, options=CopyOptions())
     changed = _different(Dataset(ours), Dataset(back))
@@ -99,7 +99,7 @@ def _timed(report: dict[str, Any], name: str) -> Iterator[None]:
 
 
 def _compare(ours: Dataset, theirs: LeRobotDataset) -> dict[str, Any]:
-    """How LeRobot's episodes differ from RoboCAS' ones: arrays, depth, and RGB, which its codec changes a little."""
+    """Return the differences of LeRobot from RoboCAS episodes: arrays, depth, and RGB (lossy codec)."""
     errors, depth, wrong = [], 0, 0
     for number in ours.numbers:
         a, b = ours.episode(number), theirs.episode(number)
@@ -117,7 +117,7 @@ def _compare(ours: Dataset, theirs: LeRobotDataset) -> dict[str, Any]:
 
 
 def _different(a: Dataset, b: Dataset) -> int:
-    """How many episodes differ, in the order of their numbers: arrays to 1e-6, files of images byte for byte."""
+    """Return how many episodes differ, in the order of their numbers: arrays by 1e-6, image files by any byte."""
     if len(a.numbers) != len(b.numbers):
         return max(len(a.numbers), len(b.numbers))
     wrong = 0
@@ -132,26 +132,26 @@ def _different(a: Dataset, b: Dataset) -> int:
 def _same_arrays(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> bool:
     if a.keys() != b.keys():
         return False
-    a, b = _without_turns(a), _without_turns(b)
+    a, b = _with_continuous_yaw(a), _with_continuous_yaw(b)
     numeric = [key for key in a if a[key].dtype.kind in "fiu"]
     close = all(a[key].shape == b[key].shape and np.allclose(a[key], b[key], rtol=0, atol=1e-6) for key in numeric)
     return close and all(np.array_equal(a[key], b[key]) for key in a.keys() - numeric)
 
 
-def _without_turns(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The base's yaw by sine and cosine: -pi and pi are one angle."""
+def _with_continuous_yaw(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return arrays with the yaw of the base as sine and cosine, because -pi and pi are the same angle."""
     agv = arrays["agv_pose"]
     return {**arrays, "agv_pose": np.column_stack([agv[:, :2], np.sin(agv[:, 2]), np.cos(agv[:, 2])])}
 
 
-def _as_upstream(root: Path, out: Path) -> None:
-    """Leave what upstream writes, under the paper's names."""
+def _write_v0(root: Path, out: Path) -> None:
+    """Write a dataset in the form of RoboCAS-v0, with the names of the paper."""
     ours = (schema.SCENE_FILE, schema.CONVERSION_FILE, "cam_pose_wrt_*")
     shutil.copytree(root, out, copy_function=os.link, ignore=shutil.ignore_patterns(*ours))
     for path in out.glob(f"*/{schema.EPISODE_FILE}"):
         with np.load(path) as loaded:
             kept = {key: loaded[key] for key in loaded.files if key not in _NOT_UPSTREAMS}
-        path.unlink()  # it is a link
+        path.unlink()  # the file is a link
         np.savez(path, **kept)
 
 

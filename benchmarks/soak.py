@@ -1,4 +1,4 @@
-"""A plan run for a while and then interrupted: episodes an hour, seconds and memory they take; prints JSON.
+"""Run a plan for some time and interrupt it: episodes per hour, seconds and memory per episode; print JSON.
 
 python benchmarks/soak.py --minutes 60 --jobs 2
 """
@@ -26,39 +26,39 @@ from robocas_ms3.plans.folder import Outcome, read_plan
 from robocas_ms3.plans.progress import Progress
 from robocas_ms3.plans.status import read_status
 
-LOOK = 5.0  # s between two looks at memory
+LOOK = 5.0  # s between two samples of memory
 
 
 @dataclass
 class Benchmark:
-    """Run `robocas plan run` on a plan that is longer than the time, then press Ctrl-C."""
+    """Run `robocas plan run` on a plan that is longer than the time, then send Ctrl-C."""
 
     minutes: float = 60.0
-    """For how long."""
+    """Minutes until Ctrl-C."""
     jobs: int = 2
-    """Episodes at once."""
+    """Number of parallel jobs."""
     tasks: tuple[str, ...] = ("pick", "select", "search")
-    """Which take turns."""
+    """Tasks, in turns."""
     turn: int = 10
-    """Episodes of a turn."""
+    """Episodes of a task per turn."""
     images: bool = True
-    """Whether they are rendered: three cameras, RGB-D, 5 Hz."""
+    """Render the episodes: three cameras, RGB-D, 5 Hz."""
     size: tuple[int, int] = (640, 480)
-    """Of them; small ones cost little, and memory grows by what scenes hold."""
+    """Width and height of the images in pixels; small images take little time, and memory grows with the scenes."""
     seed: int = 0
-    """The first; take ones that were never used."""
+    """First seed; choose unused seeds."""
 
 
 @dataclass
 class Memory:
-    """Of one process, as it was seen."""
+    """Memory samples of one process."""
 
     at: list[float] = field(default_factory=list)
     megabytes: list[float] = field(default_factory=list)
 
 
 def main(cfg: Benchmark) -> None:
-    """Run it."""
+    """Run the benchmark."""
     with tempfile.TemporaryDirectory() as folder:
         plan, out = Path(folder) / "soak.yaml", Path(folder) / "out"
         plan.write_text(yaml.safe_dump(plan_of(cfg)), encoding="utf-8")
@@ -78,7 +78,7 @@ def main(cfg: Benchmark) -> None:
 
 
 def plan_of(cfg: Benchmark) -> dict[str, Any]:
-    """Turns of the tasks, more than can be done."""
+    """Return a plan with the tasks in turns, longer than the time."""
     turns, apart = max(1, int(cfg.minutes * cfg.jobs)), max(1000, 10 * cfg.turn)
     parts = [
         {"task": task, "episodes": cfg.turn, "seed": cfg.seed + apart * turn, "name": f"{task}-{turn:04d}"}
@@ -90,12 +90,12 @@ def plan_of(cfg: Benchmark) -> dict[str, Any]:
 
 
 def watch(process: subprocess.Popen[bytes], until: float) -> dict[int, Memory]:
-    """Look at the memory of the runner's processes until it is time, or it ends."""
+    """Sample the memory of the processes of the run until a time, or until the run ends."""
     memory: dict[int, Memory] = defaultdict(Memory)
     runner = psutil.Process(process.pid)
     while time.monotonic() < until:
         if process.poll() is not None:
-            raise SystemExit(f"the run ended by itself: exit code {process.returncode}")
+            raise SystemExit(f"the run ended before Ctrl-C: exit code {process.returncode}")
         for child in runner.children():
             try:
                 memory[child.pid].megabytes.append(child.memory_info().rss / 2**20)
@@ -107,7 +107,7 @@ def watch(process: subprocess.Popen[bytes], until: float) -> dict[int, Memory]:
 
 
 def report(cfg: Benchmark, out: Path, wall: float, ctrl_c: float, memory: dict[int, Memory]) -> dict[str, Any]:
-    """The figures."""
+    """Return the measurements."""
     progress = Progress(read_plan(out))
     found: dict[str, list[Outcome]] = defaultdict(list)
     for unit, outcomes in [*progress.done.items(), *progress.partial.items()]:
@@ -124,13 +124,13 @@ def report(cfg: Benchmark, out: Path, wall: float, ctrl_c: float, memory: dict[i
         "episodes": {task: len(made) for task, made in good.items()},
         "seeds": {task: len(made) for task, made in found.items()},
         "episodes_per_hour": round(3600 * episodes / wall, 1),
-        "episodes_an_hour_lately": read_status(out).episodes_per_hour,
-        "cpu_seconds_an_episode": {task: round(seconds, 2) for task, seconds in cpu.items()},
-        "wall_seconds_times_jobs_an_episode": round(wall * cfg.jobs / max(1, episodes), 2),
-        "steps_an_episode": {
+        "recent_episodes_per_hour": read_status(out).episodes_per_hour,
+        "cpu_seconds_per_episode": {task: round(seconds, 2) for task, seconds in cpu.items()},
+        "wall_seconds_times_jobs_per_episode": round(wall * cfg.jobs / max(1, episodes), 2),
+        "steps_per_episode": {
             task: round(sum(one.steps for one in made) / max(1, len(made))) for task, made in good.items()
         },
-        "megabytes_an_episode": {
+        "megabytes_per_episode": {
             task: round(sum(one.size for one in made) / 1e6 / max(1, len(made)), 2) for task, made in good.items()
         },
         "crashes": sum(len(one.crashes) for made in found.values() for one in made),
@@ -139,8 +139,8 @@ def report(cfg: Benchmark, out: Path, wall: float, ctrl_c: float, memory: dict[i
     }
 
 
-def growth(memory: Memory, episodes_a_second: float) -> dict[str, float]:
-    """How a process grew, from its third minute on: before, it loads what it needs."""
+def growth(memory: Memory, episodes_per_second: float) -> dict[str, float]:
+    """Return the memory growth of a process from its third minute on; before, it loads its modules and packs."""
     at, megabytes = np.array(memory.at), np.array(memory.megabytes)
     later = at > at[0] + 120
     slope = float(np.polyfit(at[later], megabytes[later], 1)[0]) if later.sum() > 10 else float("nan")
@@ -149,7 +149,9 @@ def growth(memory: Memory, episodes_a_second: float) -> dict[str, float]:
         "first_mb": round(float(megabytes[: max(1, len(megabytes) // 10)].mean())),
         "last_mb": round(float(megabytes[-max(1, len(megabytes) // 10) :].mean())),
         "peak_mb": round(float(megabytes.max())),
-        "growth_mb_in_500_episodes": round(500 * slope / episodes_a_second, 1) if episodes_a_second else float("nan"),
+        "growth_mb_per_500_episodes": round(500 * slope / episodes_per_second, 1)
+        if episodes_per_second
+        else float("nan"),
     }
 
 

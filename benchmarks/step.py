@@ -1,7 +1,7 @@
-"""What a control step costs, beside ManiSkill's PickCube-v1 and the physics in it, without rendering. Prints JSON.
+"""Measure the CPU time of a control step, next to PickCube-v1 of ManiSkill and to the physics alone; print JSON.
 
-All arms make the same motion in the air. The cases take turns, so that what else the machine does meets them all; times
-are CPU time of this process, and ratios are medians over the rounds.
+Nothing is rendered. All arms make the same motion in the air. The cases alternate, so that other load affects all of
+them. Times are CPU times of this process, and ratios are medians over the rounds.
 
 Run: python benchmarks/step.py [--rounds 5] [--steps 100]
 """
@@ -37,9 +37,9 @@ AGAINST = {
 @dataclass
 class Args:
     rounds: int = 5
-    """How often every case has its turn."""
+    """Number of rounds of each case."""
     steps: int = 100
-    """Control steps a turn, 20 a second."""
+    """Control steps per round, at 20 Hz."""
 
 
 def main(args: Args) -> None:
@@ -84,7 +84,7 @@ def steps(env: gym.Env, actions: np.ndarray) -> None:
 
 
 def bare_steps(env: gym.Env, actions: np.ndarray) -> None:
-    """What PhysX does while ``pd_joint_pos`` actions are played, and nothing else."""
+    """Step only PhysX with ``pd_joint_pos`` actions."""
     base: Any = env.unwrapped
     system, joints = base.scene.px, base.agent.robot.joints_map
     drives = [joints[name]._objs[0] for name in (*MOBILE_PANDA.arm_joints, *MOBILE_PANDA.finger_joints)]

@@ -1,10 +1,11 @@
-"""Steps per second and memory of several environments on a CPU, states only: `make_vec`, one plain environment, and
-gymnasium's ``AsyncVectorEnv`` with ManiSkill's ``CPUGymWrapper``. Prints JSON.
+"""Measure steps per second and memory of several environments on a CPU, without images; print JSON.
 
-Random actions; resets are not timed. The cases take turns, so that other load meets them all. ``steps_per_second`` is
-the median of wall-clock times. CPU time does not depend on other load: ``on_two_cores`` is the rate that this process
-and then the workers, spread over two cores, would reach on a quiet machine. ``pss_mb`` is of the workers of a case that
-runs alone, and what the case adds to this process.
+The cases are `make_vec`, one plain environment, and gymnasium's ``AsyncVectorEnv`` with ManiSkill's ``CPUGymWrapper``.
+Actions are random; resets are not timed. The cases alternate, so that other load affects all of them.
+
+``steps_per_second`` is the median of wall-clock times. CPU time does not depend on other load: ``on_two_cores`` is the
+rate that this process and then the workers, distributed over two cores, would reach on an idle machine. ``pss_mb`` is
+the memory of the workers of a case that runs alone, plus the growth of this process.
 
 Run: python benchmarks/vector.py [--turns 5] [--steps 100] [--envs 8]
 """
@@ -39,19 +40,19 @@ class Args:
     env_id: str = "RoboCASPick-v1"
     """Environment."""
     control_mode: str = "pd_joint_delta_pos"
-    """Of the actions."""
+    """Control mode of the actions."""
     obs_mode: str = "state"
-    """Observations; with images drop --render-backend none."""
+    """Observation mode; for images, leave out --render-backend none."""
     render_backend: str = "none"
     """None needs no renderer."""
     turns: int = 5
-    """Of each case."""
+    """Number of rounds of each case."""
     steps: int = 100
-    """Of each env per turn."""
+    """Steps of each env per round."""
     envs: tuple[int, ...] = (8,)
     """Numbers of environments."""
     memory_of: str = ""
-    """Case whose memory to print; used by this script itself."""
+    """Case whose memory to print; the script passes it to itself."""
 
 
 def main(args: Args) -> None:
@@ -94,7 +95,7 @@ def make_cases(args: Args) -> dict[str, Callable[[], Any]]:
 
 
 def make_async(env_id: str, count: int, kwargs: dict[str, Any]) -> gym.vector.AsyncVectorEnv:
-    multiprocessing.set_forkserver_preload(["robocas_ms3.tasks"])  # so that the processes share what they import
+    multiprocessing.set_forkserver_preload(["robocas_ms3.tasks"])  # so that the processes share imported modules
     makes = [partial(make_unbatched, env_id, kwargs)] * count
     return gym.vector.AsyncVectorEnv(makes, context="forkserver", autoreset_mode=gym.vector.AutoresetMode.SAME_STEP)
 
@@ -107,14 +108,14 @@ def make_unbatched(env_id: str, kwargs: dict[str, Any]) -> gym.Env:
 
 
 def workers_of(env: Any) -> list[int]:
-    """Ids of the processes of a vector environment."""
+    """Return the process ids of a vector environment."""
     if isinstance(env, gym.vector.AsyncVectorEnv):
         return [process.pid for process in env.processes if process.pid is not None]
     return getattr(env.unwrapped, "pids", [])
 
 
 def turn(env: Any, workers: Sequence[int], steps: int) -> tuple[float, float, float, float]:
-    """Seconds, and CPU seconds of this process, of the busiest worker and of all workers."""
+    """Return seconds, and CPU seconds of this process, of the busiest worker and of all workers."""
     env.reset(seed=0)
     env.action_space.seed(0)
     actions = [env.action_space.sample() for _ in range(steps)]
@@ -127,12 +128,12 @@ def turn(env: Any, workers: Sequence[int], steps: int) -> tuple[float, float, fl
 
 
 def cpu_of(pid: int) -> float:
-    """CPU seconds that a process has used."""
+    """Return the CPU seconds that a process has used."""
     return int(Path(f"/proc/{pid}/schedstat").read_text().split()[0]) / 1e9
 
 
 def memory(make: Callable[[], Any]) -> float:
-    """MB (PSS) that a case takes: all child processes, and what this process grows by."""
+    """Return the memory of a case in MB (PSS): all child processes and the growth of this process."""
     me = psutil.Process()
     before = me.memory_full_info().pss
     env = make()

@@ -1,9 +1,9 @@
-"""How quickly the page of `robocas view` stands, by a real Chromium; prints JSON, in seconds.
+"""Measure the seconds until the page of `robocas view` is shown in Chromium; print JSON.
 
 python benchmarks/view.py --episodes 1000
 
-``first_paint`` and ``first_contentful_paint`` are the browser's own, from when it is sent to the address; so are the
-other times of the page. ``server`` is from the command to its address, most of it Python's start.
+The browser measures ``first_paint`` and ``first_contentful_paint`` from the navigation on, like the other times of the
+page. ``server`` is the time from the command to its printed address, mostly the start of Python.
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ class Benchmark:
     """Open a page of many episodes."""
 
     episodes: int = 1000
-    """How many."""
+    """Number of episodes."""
     dataset: Path | None = None
-    """RoboCAS folder whose episodes are multiplied; default: made-up ones of 7 steps, 640 x 480, with depth."""
+    """RoboCAS folder whose episodes are multiplied. Default: synthetic episodes of 7 steps, 640 x 480, with depth."""
     runs: int = 3
-    """How often; each with a new server and a new browser."""
+    """Number of rounds, each with a new server and a new browser."""
 
 
 def main(cfg: Benchmark) -> None:
-    """Run it."""
+    """Run the benchmark."""
     with tempfile.TemporaryDirectory(prefix="robocas-view-") as folder:
-        source = cfg.dataset or _made_up(Path(folder))
+        source = cfg.dataset or _make_dataset(Path(folder))
         dataset = Path(folder) / "dataset"
         _multiply(shutil.copytree(source, Path(folder) / "source"), dataset, cfg.episodes)
         runs = [_measure(dataset, cfg.episodes) for _ in range(cfg.runs)]
@@ -55,7 +55,7 @@ def main(cfg: Benchmark) -> None:
     print(json.dumps({"episodes": cfg.episodes, "median": medians, "runs": runs}, indent=2))
 
 
-def _made_up(folder: Path) -> Path:
+def _make_dataset(folder: Path) -> Path:
     import synthetic  # pyright: ignore[reportMissingImports]
 
     trajectory = synthetic.write_trajectory(folder / "trajectory.h5")
@@ -73,7 +73,7 @@ def _made_up(folder: Path) -> Path:
 
 
 def _multiply(source: Path, out: Path, count: int) -> None:
-    """A dataset whose images and arrays are links to those of a few episodes; seeds and failures are its own."""
+    """Write a dataset whose images and arrays are links to those of a few episodes, with new seeds and failures."""
     settings = json.loads((source / schema.CONVERSION_FILE).read_text())
     info = json.loads((source / schema.DATA_INFO_FILE).read_text())
     numbers = sorted(settings["episodes"], key=int)
@@ -108,7 +108,7 @@ def _measure(dataset: Path, count: int) -> dict[str, float]:
             found = {}
             try:
                 address = re.search(r"http\S+", server.stdout.readline())
-                assert address, "robocas view told no address"
+                assert address, "robocas view printed no address"
                 found["server"] = time.perf_counter() - begun
                 found.update(_page(page, address[0], count))
             finally:

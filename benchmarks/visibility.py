@@ -1,6 +1,6 @@
-"""How fast p_vis is, and what a lower resolution costs: heaps of search, all objects at once, one core. Prints JSON.
+"""Measure the time of p_vis by resolution, and its error: heaps of search, all objects, one core; print JSON.
 
-Milliseconds are medians of CPU time per view; the first view of a mesh builds its search tree as well.
+Milliseconds are medians of CPU time per view; the first view of a mesh also builds its search tree.
 
 Run: python benchmarks/visibility.py [--heaps 5] [--pack builtin]
 """
@@ -29,13 +29,13 @@ SIZES = (512, 256, 128, 64)
 @dataclass
 class Args:
     heaps: int = 5
-    """Heaps, one a seed."""
+    """Number of heaps, one per seed."""
     pack: str = "builtin"
     """Object pack."""
     config: str = "search_table_stacked"
     """Configuration."""
     repeats: int = 10
-    """Views a heap and a size."""
+    """Views per heap and size."""
 
 
 def milliseconds(work: Callable[[], object], repeats: int) -> float:

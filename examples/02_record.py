@@ -1,4 +1,4 @@
-"""Record an episode with the scripted policy, then replay its actions: the same states come out.
+"""Record an episode with the scripted policy, replay its actions, and compare the states.
 
 python examples/02_record.py OUT
 """
@@ -13,4 +13,4 @@ summary = generate(GenerateSettings(episode, Path(sys.argv[1]), episodes=1, over
 print(f"{summary.episodes} of {summary.seeds} seeds succeeded; {summary.mean_steps:.0f} steps")
 
 for result in replay(ReplaySettings(summary.trajectory)):
-    print(f"replayed seed {result.seed}: success {result.success}, states differ by {result.state_error}")
+    print(f"replayed seed {result.seed}: success {result.success}, largest state difference {result.state_error}")

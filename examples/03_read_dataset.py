@@ -1,4 +1,4 @@
-"""Convert a recording and read it as training data: instruction, images, actions, as RoboCAS-v0's loader takes them.
+"""Convert a recording and read it as training data, as the loader of RoboCAS-v0: instruction, images and actions.
 
 python examples/03_read_dataset.py TRAJECTORY.h5 OUT
 """
@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from robocas_ms3.datasets import ConversionSettings, Dataset, convert
 
 if len(sys.argv) != 3:
-    sys.exit("python examples/03_read_dataset.py TRAJECTORY.h5 OUT")
+    sys.exit("usage: python examples/03_read_dataset.py TRAJECTORY.h5 OUT")
 trajectory, out = map(Path, sys.argv[1:])
 convert(ConversionSettings(trajectory, out, rate_hz=5, embeddings=False, video=False, size=(320, 240), overwrite=True))
 
@@ -26,8 +26,8 @@ for number in dataset.numbers:
     print(f"{number}: {arrays['language_goal']} ({episode.steps} steps)")
     for step in range(episode.steps - 1):
         image = episode.rgb("gripper_camera", step)
-        turn = Rotation.from_quat(arrays["rel_orn"][step]).as_euler("xyz")  # xyzw
-        open_gripper = arrays["gripper_status"][step + 1]  # the command given between this step and the next
-        action = np.concatenate([arrays["rel_pos"][step], turn, [open_gripper]])
+        euler = Rotation.from_quat(arrays["rel_orn"][step]).as_euler("xyz")  # from xyzw; angles about fixed axes
+        open_gripper = arrays["gripper_status"][step + 1]  # command between this step and the next
+        action = np.concatenate([arrays["rel_pos"][step], euler, [open_gripper]])
         if step % 5 == 0:
             print(f"{step:4d} {arrays['step_goal_type'][step]:18s} {image.shape} {np.round(action, 3)}")

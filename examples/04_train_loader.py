@@ -1,4 +1,4 @@
-"""Train a tiny policy on a dataset for a few steps: images and instruction of two steps in, a chunk of actions out.
+"""Train a small policy on a dataset for a few steps: from images and state of two steps to a chunk of actions.
 
 python examples/04_train_loader.py DATASET
 """
@@ -21,17 +21,17 @@ class Policy(nn.Module):
         layers = []
         for inputs, outputs in ((2 * OBSERVED * 3, 16), (16, 32), (32, 64)):
             layers += [nn.Conv2d(inputs, outputs, 5, stride=3), nn.GroupNorm(4, outputs), nn.ReLU()]
-        self.eyes = nn.Sequential(*layers, nn.AdaptiveAvgPool2d(3), nn.Flatten())
+        self.encoder = nn.Sequential(*layers, nn.AdaptiveAvgPool2d(3), nn.Flatten())
         self.head = nn.Sequential(nn.Linear(64 * 9 + 8 * OBSERVED, 128), nn.ReLU(), nn.Linear(128, CHUNK * 7))
 
     def forward(self, batch):
-        seen = self.eyes(batch["rgb"].flatten(1, 3).float() / 255)  # (B, H, C, 3, h, w): all of them as channels
-        return self.head(torch.cat([seen, batch["state"].flatten(1)], dim=1)).unflatten(1, (CHUNK, 7))
+        features = self.encoder(batch["rgb"].flatten(1, 3).float() / 255)  # from (B, H, C, 3, h, w)
+        return self.head(torch.cat([features, batch["state"].flatten(1)], dim=1)).unflatten(1, (CHUNK, 7))
 
 
 def loss(policy: Policy, batch) -> torch.Tensor:
-    chunk, real = batch["action"][:, -CHUNK:], batch["action_mask"][:, -CHUNK:]
-    return (policy(batch) - chunk).abs()[real].mean()
+    chunk, is_real = batch["action"][:, -CHUNK:], batch["action_mask"][:, -CHUNK:]
+    return (policy(batch) - chunk).abs()[is_real].mean()
 
 
 if __name__ == "__main__":
@@ -53,13 +53,13 @@ if __name__ == "__main__":
     loader = DataLoader(data, batch_size=8, sampler=sampler, num_workers=2)
     policy = Policy()
     optimizer = torch.optim.AdamW(policy.parameters(), lr=1e-3)
-    begun, losses = time.perf_counter(), []
+    start, losses = time.perf_counter(), []
     for batch in loader:
         value = loss(policy, batch)
         optimizer.zero_grad()
         value.backward()
         optimizer.step()
         losses.append(value.item())
-    rate = 8 * STEPS / (time.perf_counter() - begun)
+    rate = 8 * STEPS / (time.perf_counter() - start)
     first, last = sum(losses[:5]) / 5, sum(losses[-5:]) / 5
-    print(f"{STEPS} steps, {rate:.0f} samples a second, loss {first:.3f} -> {last:.3f}")
+    print(f"{STEPS} steps, {rate:.0f} samples per second, loss {first:.3f} -> {last:.3f}")

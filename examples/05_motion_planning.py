@@ -1,4 +1,4 @@
-"""Solve ManiSkill's PickCube-v1 or RoboCASPick-v1 with motion planning, written as ManiSkill's own solutions are.
+"""Solve ManiSkill's PickCube-v1 or RoboCASPick-v1 by motion planning, in the style of ManiSkill's solutions.
 
 python examples/05_motion_planning.py --env PickCube-v1 --seed 0 --episodes 10
 python examples/05_motion_planning.py --env RoboCASPick-v1 --image end.png
@@ -47,23 +47,23 @@ def solve_pick_cube(env, seed=None, debug=False, vis=False):
 
 
 def solve_pick(env, seed=None, debug=False, vis=False):
-    """Solve RoboCASPick-v1 with a table; ``debug`` prints why poses were given up."""
+    """Solve RoboCASPick-v1 with a table; ``debug`` prints why poses were rejected."""
     env.reset(seed=seed)
     planner = PandaArmMotionPlanningSolver(env, base_pose=env.unwrapped.agent.robot.pose, vis=vis)
     env = env.unwrapped
     scene, slot, rise = PlanningScene(env), int(env.target_slot[0]), sapien.Pose([0, 0, 0.1])
-    everything, all_but_target = scene.obstacles_in_world(), scene.obstacles_in_world(exclude=slot)
+    all_obstacles, other_obstacles = scene.obstacles_in_world(), scene.obstacles_in_world(exclude=slot)
 
     def reach_and_grasp(grasp_pose):
         planner.clear_collisions()
-        planner.add_obstacles(everything)
+        planner.add_obstacles(all_obstacles)
         planner.move_to_pose_with_RRTConnect(grasp_pose * sapien.Pose([0, 0, -0.1]))
         planner.clear_collisions()
-        planner.add_obstacles(all_but_target)
+        planner.add_obstacles(other_obstacles)
         planner.move_to_pose_with_screw(grasp_pose)
-        planner.move_to_pose_with_screw(rise * grasp_pose, dry_run=True)  # a grasp without a way up is of no use
+        planner.move_to_pose_with_screw(rise * grasp_pose, dry_run=True)  # can the object be lifted from this grasp?
 
-    grasp_pose = first_that_works(reach_and_grasp, ranked_grasps(env, scene, slot), debug)
+    grasp_pose = first_reachable(reach_and_grasp, ranked_grasps(env, scene, slot), debug)
     planner.close_gripper(t=10)
     planner.move_to_pose_with_screw(rise * grasp_pose)
 
@@ -72,7 +72,7 @@ def solve_pick(env, seed=None, debug=False, vis=False):
     )
     planner.planner.attach(held)
     drops = ranked_drops(env, scene, slot, held, np.random.default_rng(seed))
-    first_that_works(planner.move_to_pose_with_RRTConnect, drops, debug)
+    first_reachable(planner.move_to_pose_with_RRTConnect, drops, debug)
     planner.open_gripper(t=10)
     planner.planner.attach(None)
     res = planner.move_to_pose_with_RRTConnect(rise * grasp_pose)  # the object comes to rest during this motion
@@ -80,8 +80,8 @@ def solve_pick(env, seed=None, debug=False, vis=False):
     return res
 
 
-def first_that_works(move, poses, debug):
-    """Return the first pose to which a motion could be planned."""
+def first_reachable(move, poses, debug):
+    """Return the first pose to which a motion is found."""
     failure = PlanningError("example", "no_pose")
     for pose in poses:
         try:
@@ -95,21 +95,22 @@ def first_that_works(move, poses, debug):
 
 
 def ranked_grasps(env, scene, slot):
-    """Return the annotated grasps that touch no other object; firm, central and steep ones first."""
+    """Return the annotated grasps that touch no other object, sorted: firm, central and steep grasps first."""
     target, base = env.object_assets[0][slot], scene.arm_base_in_world
     notes, object_in_world = target.annotations, base @ scene.object_in_base(slot)
-    kept = filter_grasps(notes, object_in_world, base)
+    candidates = filter_grasps(notes, object_in_world, base)
     points = transform_points(base, scene.points_in_base(exclude=slot))
-    margins = grip_margins(notes.grasps_tcp_in_object[kept.index], kept.widths, target.surface_points(SPACING))
-    distance = np.linalg.norm(kept.tcp_in_world[:, :3, 3] - object_in_world[:3, 3], axis=1)
-    score = margins + np.exp(-distance / 0.03) - kept.tcp_in_world[:, 2, 2]
-    score[~is_gripper_clear(kept.tcp_in_world, points)] = -np.inf
+    grasps_in_object = notes.grasps_tcp_in_object[candidates.index]
+    margins = grip_margins(grasps_in_object, candidates.widths, target.surface_points(SPACING))
+    distance = np.linalg.norm(candidates.tcp_in_world[:, :3, 3] - object_in_world[:3, 3], axis=1)
+    score = margins + np.exp(-distance / 0.03) - candidates.tcp_in_world[:, 2, 2]
+    score[~is_gripper_clear(candidates.tcp_in_world, points)] = -np.inf
     order = np.argsort(-score, kind="stable")
-    return [sapien.Pose(kept.tcp_in_world[i]) for i in order if np.isfinite(score[i])]
+    return [sapien.Pose(candidates.tcp_in_world[i]) for i in order if np.isfinite(score[i])]
 
 
 def ranked_drops(env, scene, slot, held, rng):
-    """Return TCP poses that hold the object above the basket; those where it fits the opening, steep ones first."""
+    """Return TCP poses with the object above the basket, sorted by overhang over the opening, then by steepness."""
     inner = env.model.basket.asset.inner
     inside = ContainerInterior(scene.basket_in_base, np.array(inner.min), np.array(inner.max))
     center = np.array([env.object_assets[0][slot].asset.center_of_mass])
@@ -135,9 +136,9 @@ def main(
 
     Args:
         env: environment to solve.
-        seed: of the first episode, from 0 on.
-        episodes: how many.
-        image: file for an image of the last step, such as ``last.png``.
+        seed: seed of the first episode, at least 0.
+        episodes: number of episodes.
+        image: file for an image of the last step, such as ``end.png``.
         debug: print why grasps and motions are rejected.
         vis: open ManiSkill's viewer, which needs a display.
     """
@@ -146,11 +147,11 @@ def main(
             raise SystemExit(f"--image {image}: unknown image format, expected for example {image.with_suffix('.png')}")
         image.parent.mkdir(parents=True, exist_ok=True)
     no_renderer = dict(render_backend="none") if env == "RoboCASPick-v1" and not (image or vis) else {}
-    made = gym.make(env, obs_mode="state", control_mode="pd_joint_pos", sim_backend="cpu", **no_renderer)
+    environment = gym.make(env, obs_mode="state", control_mode="pd_joint_pos", sim_backend="cpu", **no_renderer)
     successes = 0
     for number in range(seed, seed + episodes):
         try:
-            *_, info = SOLUTIONS[env](made, seed=number, debug=debug, vis=vis)
+            *_, info = SOLUTIONS[env](environment, seed=number, debug=debug, vis=vis)
             success = bool(info["success"][0])
             print(f"seed {number}: success {success}, {int(info['elapsed_steps'][0])} steps")
         except PlanningError as error:
@@ -158,9 +159,9 @@ def main(
             print(f"seed {number}: {error}")
         successes += success
     print(f"{successes} of {episodes} episodes succeeded")
-    if image and not cv2.imwrite(str(image), made.unwrapped.render_rgb_array()[0].cpu().numpy()[..., ::-1]):
-        raise SystemExit(f"--image {image}: the file can't be written")
-    made.close()
+    if image and not cv2.imwrite(str(image), environment.unwrapped.render_rgb_array()[0].cpu().numpy()[..., ::-1]):
+        raise SystemExit(f"--image {image}: the file cannot be written")
+    environment.close()
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""PPO learns to reach for one of a few fruits and hold it, on a CPU: the baseline `ppo`, from Python.
+"""Train the baseline `ppo` from Python: it learns on a CPU to reach for one of a few fruits and to hold it.
 
     python examples/ppo.py --seed 1 --out out/ppo_1
 
-is `robocas train ppo --seed 1 --out out/ppo_1`; docs/rl.md says what comes of it.
+does the same as `robocas train ppo --seed 1 --out out/ppo_1`. The results are in docs/rl.md.
 """
 
 from dataclasses import dataclass
@@ -19,26 +19,26 @@ class Args:
     out: Path = Path("out/ppo")
     """Folder of the run."""
     seed: int = 1
-    """Of the policy and its noise."""
+    """Seed of the policy and its noise."""
     steps: int = 102_400
-    """Of all environments together."""
+    """Training steps, of all environments together."""
     batch: int = 512
-    """Steps of all environments together between updates."""
+    """Steps between updates, of all environments together."""
     envs: int = 8
-    """Environments."""
+    """Number of environments."""
     workers: int | None = None
-    """Processes that they are in; default: one an environment, but no more than cores."""
+    """Number of processes for the environments. Default: one per environment, at most one per core."""
     layouts: int = 64
-    """Different scenes to learn from."""
-    trials: int = 50
-    """Episodes at the end, in layouts that were not learned from, without noise."""
+    """Number of layouts for training."""
+    test_episodes: int = 50
+    """Number of test episodes after the training, in other layouts and without noise."""
 
 
 def main(args: Args) -> None:
     torch.set_num_threads(1)
     train = {"seed": args.seed, "steps": args.steps, "batch_size": args.batch}
-    more = {"envs": args.envs, "workers": args.workers, "layouts": args.layouts, "trials": args.trials}
-    train_run(RunOptions("ppo", None, args.out, {**more, "train": train}, overwrite=True), Progress(note=print))
+    config = {"envs": args.envs, "workers": args.workers, "layouts": args.layouts, "trials": args.test_episodes}
+    train_run(RunOptions("ppo", None, args.out, {**config, "train": train}, overwrite=True), Progress(note=print))
 
 
 if __name__ == "__main__":

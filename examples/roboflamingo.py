@@ -1,6 +1,6 @@
-"""Serve a RoboFlamingo model as a policy: an adapter around its `ModelWrapper`, without torch.
+"""Serve a RoboFlamingo model as a policy: an adapter for its `ModelWrapper`. This file does not import torch.
 
-RoboFlamingo pins torch 2.0.1, so this file runs in an environment of its own; docs/baselines_lerobot.md has the script.
+RoboFlamingo pins torch 2.0.1, so this file runs in a separate environment; docs/baselines_lerobot.md has the script.
 """
 
 from collections import deque
@@ -18,12 +18,12 @@ from robocas_ms3.datasets import ActionScale
 from robocas_ms3.evaluation import EpisodeSpec, Observations, PolicySpec
 
 HORIZON = 11  # frames, as in the paper's appendix
-MODEL_SIZE = (320, 256)  # width, height in pixels: the paper trains it on the images of its RT-1
-DATASET_SIZE = (640, 480)  # squeezed to MODEL_SIZE; a camera that renders 320 x 256 sees another part of the scene
+MODEL_SIZE = (320, 256)  # width, height in pixels; the paper uses the images of its RT-1
+DATASET_SIZE = (640, 480)  # resized to MODEL_SIZE; a camera of 320 x 256 has another field of view
 RATE_HZ = 5.0
 
 WindowModel = Callable[[NDArray[np.uint8], NDArray[np.uint8], str], Any]
-"""(11, H, W, 3) images of the base camera and of the gripper camera, and the instruction, to actions.
+"""Model that maps images (11, H, W, 3) of the base camera and the gripper camera, and the instruction, to actions.
 
 Returns one action (7,) or one per frame (11, 7), of which the last is used: position and Euler angles from -1 to 1 over
 the dataset's ranges, and the gripper's opening from 0 to 1.
@@ -31,7 +31,7 @@ the dataset's ranges, and the gripper's opening from 0 to 1.
 
 
 class StepModel(Protocol):
-    """RoboFlamingo's `ModelWrapper`: takes one frame at a time and keeps the frames itself."""
+    """Interface of RoboFlamingo's `ModelWrapper`, which takes one frame at a time and keeps the frames."""
 
     def reset(self) -> None: ...
 
@@ -41,12 +41,12 @@ class StepModel(Protocol):
 
 
 class Stepwise:
-    """Make a `WindowModel` of a `StepModel`: reset it and show it the whole window at each step.
+    """`WindowModel` around a `StepModel`, which is reset and gets the whole window at each step.
 
-    One model serves several envs this way, at 11 model steps per action.
+    Therefore one model serves several envs, with 11 model steps per action.
 
     Args:
-        model: with `use_state` and `tcp_rel` off: there is no robot state, and actions are in the TCP's frame.
+        model: step model with `use_state` and `tcp_rel` off: no robot state, actions in the TCP frame.
     """
 
     def __init__(self, model: StepModel) -> None:
@@ -62,14 +62,14 @@ class Stepwise:
 
 
 class RoboFlamingoPolicy:
-    """Policy that shows the model the last 11 frames of each env; the first frame is repeated at the start.
+    """Policy that passes the last 11 frames of each env to the model; the first frame is repeated at the start.
 
     Args:
-        model: to ask.
+        model: model that predicts the actions.
         scale: action ranges of the training dataset, see `load_scale`.
         model_size: (width, height) in pixels of the images that the model takes.
         dataset_size: (width, height) in pixels of the images in the training dataset.
-        rate_hz: of the dataset.
+        rate_hz: rate of the dataset.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class RoboFlamingoPolicy:
         self._frames: dict[int, deque[tuple[NDArray[np.uint8], NDArray[np.uint8]]]] = {}
 
     def describe(self) -> dict[str, Any]:
-        """Return what results record about the policy."""
+        """Return the description of the policy for results."""
         ranges = {"low": self._scale.low.tolist(), "high": self._scale.high.tolist()}
         return {"model": type(self._model).__qualname__, "horizon": HORIZON, "ranges": ranges}
 
@@ -101,7 +101,7 @@ class RoboFlamingoPolicy:
 
     def _act(self, env: int, observations: Observations, row: int) -> NDArray[np.float32]:
         frames, images = self._frames[env], observations.images
-        frame = self._squeezed(images["base_camera"][row]), self._squeezed(images["gripper_camera"][row])
+        frame = self._resize(images["base_camera"][row]), self._resize(images["gripper_camera"][row])
         frames.extend([frame] if frames else [frame] * HORIZON)
         base, gripper = (np.stack(window) for window in zip(*frames, strict=True))
         action = np.asarray(self._model(base, gripper, observations.instructions[row]), np.float64)
@@ -109,11 +109,11 @@ class RoboFlamingoPolicy:
             action = action[-1]
         if action.shape != (7,) or not np.isfinite(action).all():
             expected = f"7 numbers, or {HORIZON} times 7"
-            raise EvaluationError("invalid action of RoboFlamingo", expected=expected, found=action.tolist())
+            raise EvaluationError("invalid action of the RoboFlamingo model", expected=expected, found=action.tolist())
         return self._scale.decode(np.append(np.clip(action[:6], -1, 1), np.clip(action[6:], 0, 1)))
 
-    def _squeezed(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return a copy in the model's size, resampled by areas as samples of a dataset are."""
+    def _resize(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return a copy in the size of the model, resampled by area like the samples of a dataset."""
         if image.shape[1::-1] == self._model_size:
             return image.copy()
         resized: Any = cv2.resize(image, self._model_size, interpolation=cv2.INTER_AREA)
@@ -125,7 +125,9 @@ def load_scale(data_info: Path) -> ActionScale:
     try:
         info = load_json(data_info)
     except (OSError, ValueError) as error:
-        raise EvaluationError("no data_info.json of a RoboCAS dataset", where=data_info, found=error) from error
+        raise EvaluationError(
+            "no readable data_info.json of a RoboCAS dataset", where=data_info, found=error
+        ) from error
     return ActionScale.from_action_space(
         info.get("action_space", {}) if isinstance(info, dict) else {}, where=data_info
     )

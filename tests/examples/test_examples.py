@@ -1,4 +1,4 @@
-"""The examples, and the first programs of pages of the docs, run as they stand, each in a process of its own."""
+"""Run the examples and the programs on pages of the docs, each in a separate process."""
 
 import csv
 import os
@@ -23,7 +23,7 @@ def server() -> ForkServer:
 
 
 def run(path: str | Path, *words: object, cwd: Path) -> list[str]:
-    """What an example, or another program, prints."""
+    """Run an example or another program; return the lines that it prints."""
     done = server().run(EXAMPLES / path, *words, cwd=cwd)
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines()
@@ -35,13 +35,13 @@ def recorded(tmp_path_factory) -> tuple[Path, list[str]]:
     return folder / "out", run("02_record.py", "out", cwd=folder)
 
 
-def test_no_example_is_left_out():
+def test_every_example_is_tested():
     tested = "".join(path.read_text() for path in Path(__file__).parent.glob("test_*.py"))
     assert all(f'"{path.name}"' in tested for path in EXAMPLES.glob("*.py"))
 
 
 def test_environment(tmp_path):
-    command = [sys.executable, EXAMPLES / "01_environment.py"]  # from nothing; the others run as if they had been
+    command = [sys.executable, EXAMPLES / "01_environment.py"]  # a new process; the other tests use the fork server
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
     instruction, stages = done.stdout.splitlines()[-2:]
     assert instruction.startswith("grasp the ")
@@ -51,7 +51,7 @@ def test_environment(tmp_path):
 def test_record(recorded):
     _, lines = recorded
     assert lines[-1].startswith("replayed seed ")
-    assert "success True, states differ by 0.0" in lines[-1]
+    assert "success True, largest state difference 0.0" in lines[-1]
 
 
 def test_read_dataset(recorded, needs_renderer, tmp_path):
@@ -79,11 +79,11 @@ def test_motion_planning_solves_pick(tmp_path):
     assert lines[-1] == "4 of 4 episodes succeeded"
 
 
-def test_ppo_in_a_shortened_form(tmp_path):
-    small = ["--steps", 128, "--envs", 2, "--workers", 1, "--batch", 64, "--layouts", 2, "--trials", 2]
-    begun, tried = run("ppo.py", *small, cwd=tmp_path)
-    assert begun.startswith("ppo: 0.05 M parameters, 128 steps in 2 layouts")
-    assert tried.startswith("test without noise, 2 other layouts: return ")
+def test_ppo_trains_for_a_few_steps(tmp_path):
+    small = ["--steps", 128, "--envs", 2, "--workers", 1, "--batch", 64, "--layouts", 2, "--test-episodes", 2]
+    started, tested = run("ppo.py", *small, cwd=tmp_path)
+    assert started.startswith("ppo: 0.05 M parameters, 128 steps in 2 layouts")
+    assert tested.startswith("test without noise, 2 other layouts: return ")
     with (tmp_path / "out/ppo/metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [(row["step"], row["split"]) for row in rows] == [("64", "train"), ("128", "train"), ("128", "val")]
@@ -91,31 +91,31 @@ def test_ppo_in_a_shortened_form(tmp_path):
     assert (tmp_path / "out/ppo/weights.safetensors").stat().st_size > 10_000
 
 
-def test_missing_arguments_are_a_line(tmp_path):
+def test_missing_arguments_print_the_usage(tmp_path):
     command = [sys.executable, str(EXAMPLES / "03_read_dataset.py"), "F.h5"]
     done = subprocess.run(command, cwd=tmp_path, env=os.environ, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (1, "python examples/03_read_dataset.py TRAJECTORY.h5 OUT\n")
+    assert (done.returncode, done.stderr) == (1, "usage: python examples/03_read_dataset.py TRAJECTORY.h5 OUT\n")
 
 
 def program_of(page: str, cwd: Path, number: int = 0) -> Path:
-    """Write a Python program of a page to a file."""
+    """Write a Python program of a page to a file; return its path."""
     text = (ROOT / "docs" / page).read_text(encoding="utf-8")
     program = re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE)[number]
     (cwd / "program.py").write_text(program.replace("learn(100_000)", "learn(300)"), encoding="utf-8")
     return cwd / "program.py"
 
 
-def test_the_program_about_batches(tmp_path):
+def test_program_of_batched(tmp_path):
     about, *ends = run(program_of("batched.md", tmp_path), cwd=tmp_path)
     assert about.startswith("torch.Size([4, 142]) grasp the ")
     assert ends == ["4 ended, 0.0 succeeded"] * 2
 
 
-def test_the_program_about_motion_planning(needs_renderer, tmp_path):
+def test_program_of_motion_planning(needs_renderer, tmp_path):
     assert run(program_of("motion_planning.md", tmp_path), cwd=tmp_path)[-1].startswith("success True after ")
 
 
-def test_the_programs_about_reinforcement_learning(tmp_path):
+def test_programs_of_reinforcement_learning(tmp_path):
     rewards = [float(line.split()[0]) for line in run(program_of("rl.md", tmp_path), cwd=tmp_path)]
     assert len(rewards) == 5
     assert rewards == sorted(rewards)

@@ -1,4 +1,4 @@
-"""The adapter for RoboFlamingo around stub models: what they are shown, and how their actions are read."""
+"""The adapter for RoboFlamingo with stub models: images of a window, and conversion of actions."""
 
 import importlib.util
 import json
@@ -21,19 +21,19 @@ SCALE = ActionScale(np.array([-0.1, -0.2, 0.0, -0.5, -1.0, 0.2]), np.array([0.1,
 WIDTH, HEIGHT = 4, 2
 
 
-class Windows:
-    """Keeps the windows that it is shown."""
+class StubWindowModel:
+    """Window model that keeps its inputs."""
 
     def __init__(self, action=(0, 0, 0, 0, 0, 0, 1)):
-        self.action, self.seen = action, []
+        self.action, self.inputs = action, []
 
     def __call__(self, base, gripper, instruction):
-        self.seen.append((base, gripper, instruction))
+        self.inputs.append((base, gripper, instruction))
         return self.action
 
 
-class Steps:
-    """Like upstream's ModelWrapper: keeps frames itself; opens the gripper when it has seen a whole window."""
+class StubStepModel:
+    """Step model like ModelWrapper of RoboFlamingo: keeps frames; opens the gripper after a whole window."""
 
     def __init__(self):
         self.frames = []
@@ -48,7 +48,7 @@ class Steps:
 
 
 def started(model, *envs, **sizes):
-    """A policy that has started episodes in some envs."""
+    """Return a policy that has started episodes in some envs."""
     sizes = sizes or {"model_size": (WIDTH, HEIGHT)}
     policy = roboflamingo.RoboFlamingoPolicy(model, SCALE, **sizes)
     policy.reset([start(env) for env in envs])
@@ -60,7 +60,7 @@ def start(env):
 
 
 def observe(frames, texts=None):
-    """Frame numbers by env: base images are filled with them, gripper images with the number plus 100."""
+    """Return observations with constant images: the frame number of the env, plus 100 in gripper images."""
     envs = sorted(frames)
     images = np.stack([np.full((HEIGHT, WIDTH, 3), frames[env], np.uint8) for env in envs])
     zeros = np.zeros((len(envs), 12), np.float32)
@@ -79,62 +79,62 @@ def numbers(window):
     return window[:, 0, 0, 0].tolist()
 
 
-def test_images_are_squeezed_whole():
-    """As samples of a dataset are: what is at the edge stays there, at another aspect."""
-    model = Windows()
+def test_images_are_resized_to_the_size_of_the_model():
+    """The whole image is kept, at another aspect ratio, as in samples of a dataset."""
+    model = StubWindowModel()
     policy = started(model, 0, model_size=(8, 3), dataset_size=(16, 12))
     seen = observe({0: 1})
     seen.images.update(gripper_camera=np.ones((1, 12, 16, 3), np.uint8))
     seen.images["base_camera"] = np.ones((1, 12, 16, 3), np.uint8)
     seen.images["base_camera"][0, :, 8:] = 200
     policy.act(seen)
-    base = model.seen[0][0][0]
+    base = model.inputs[0][0][0]
     assert base.shape == (3, 8, 3)
     assert (base[:, :4] == 1).all() and (base[:, 4:] == 200).all()
 
 
-def test_the_first_frame_is_repeated_and_copies_of_eleven_are_kept():
-    model = Windows()
+def test_window_has_copies_of_eleven_frames_and_repeats_the_first():
+    model = StubWindowModel()
     policy = started(model, 0)
     for frame in range(1, 14):
         seen = observe({0: frame})
         policy.act(seen)
         seen.images["base_camera"][:] = 99
-    assert model.seen[0][0].shape == model.seen[0][1].shape == (11, HEIGHT, WIDTH, 3)
-    assert model.seen[0][0].dtype == np.uint8
-    assert numbers(model.seen[2][0]) == [1] * 9 + [2, 3]
-    assert numbers(model.seen[12][0]) == list(range(3, 14))
-    assert numbers(model.seen[12][1]) == list(range(103, 114))
+    assert model.inputs[0][0].shape == model.inputs[0][1].shape == (11, HEIGHT, WIDTH, 3)
+    assert model.inputs[0][0].dtype == np.uint8
+    assert numbers(model.inputs[2][0]) == [1] * 9 + [2, 3]
+    assert numbers(model.inputs[12][0]) == list(range(3, 14))
+    assert numbers(model.inputs[12][1]) == list(range(103, 114))
 
 
-def test_envs_have_frames_and_instructions_of_their_own():
-    model = Windows()
+def test_each_env_has_its_frames_and_instruction():
+    model = StubWindowModel()
     policy = started(model, 0, 3)
     policy.act(observe({0: 1, 3: 51}, {0: "take the pear", 3: "take the lemon"}))
     policy.reset([start(3)])  # while the episode of env 0 continues
     policy.act(observe({0: 2, 3: 61}))
-    assert [text for _, _, text in model.seen[:2]] == ["take the pear", "take the lemon"]
-    assert [numbers(base) for base, _, _ in model.seen] == [[1] * 11, [51] * 11, [1] * 10 + [2], [61] * 11]
+    assert [text for _, _, text in model.inputs[:2]] == ["take the pear", "take the lemon"]
+    assert [numbers(base) for base, _, _ in model.inputs] == [[1] * 11, [51] * 11, [1] * 10 + [2], [61] * 11]
 
 
 def test_actions_are_scaled_by_the_ranges_of_the_dataset():
-    actions = started(Windows([-1, 0, 0.5, 1, 3, 0.7, 0.25]), 0, 1).act(observe({0: 1, 1: 2}))
+    actions = started(StubWindowModel([-1, 0, 0.5, 1, 3, 0.7, 0.25]), 0, 1).act(observe({0: 1, 1: 2}))
     # low; middle; three quarters of 0 to 0.4; high; 3 is clipped to 1: high; an axis without a range; gripper as it is
     expected = [-0.1, -0.1, 0.3, 0.5, 3.0, 0.2, 0.25]
     np.testing.assert_allclose(actions, [expected, expected], atol=1e-6)
-    of_each_frame = np.zeros((11, 7))
-    of_each_frame[:, 6] = np.arange(11) / 10
-    assert started(Windows(of_each_frame), 0).act(observe({0: 1}))[0, 6] == pytest.approx(1.0)  # the last
+    per_frame = np.zeros((11, 7))
+    per_frame[:, 6] = np.arange(11) / 10
+    assert started(StubWindowModel(per_frame), 0).act(observe({0: 1}))[0, 6] == pytest.approx(1.0)  # the last
 
 
 @pytest.mark.parametrize("action", [np.zeros(6), np.zeros((10, 7)), [0, 0, 0, 0, 0, 0, np.nan]])
 def test_invalid_actions_are_refused(action):
     with pytest.raises(EvaluationError):
-        started(Windows(action), 0).act(observe({0: 1}))
+        started(StubWindowModel(action), 0).act(observe({0: 1}))
 
 
-def test_a_step_model_is_shown_the_window_of_each_env():
-    model = Steps()
+def test_step_model_gets_the_window_of_each_env():
+    model = StubStepModel()
     policy = started(roboflamingo.Stepwise(model), 0, 1)
     policy.act(observe({0: 1, 1: 51}))
     actions = policy.act(observe({0: 2, 1: 52}, {0: "take it", 1: "take the lemon"}))
@@ -159,7 +159,7 @@ def test_ranges_come_from_data_info(tmp_path):
     assert caught.value.where == tmp_path / "nothing.json"
 
 
-def test_it_loads_without_torch_or_a_simulator():
+def test_adapter_loads_without_torch_and_simulator():
     code = (
         "import sys; import roboflamingo, robocas_ms3.evaluation.remote.server; "
         "print([name for name in ('torch', 'sapien', 'mani_skill') if name in sys.modules])"
